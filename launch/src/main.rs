@@ -1,0 +1,2 @@
+//! The carff command.
+fn main() {}

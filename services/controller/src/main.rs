@@ -1,0 +1,2 @@
+//! The controller stage.
+fn main() {}

@@ -1,0 +1,2 @@
+//! The encoder stage.
+fn main() {}

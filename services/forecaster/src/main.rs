@@ -1,0 +1,2 @@
+//! The forecaster stage.
+fn main() {}

@@ -1,0 +1,2 @@
+//! The prober stage.
+fn main() {}

@@ -1,0 +1,2 @@
+//! The renderer stage.
+fn main() {}

@@ -1,0 +1,1 @@
+//! The graph file: one typed, documented configuration per stage.

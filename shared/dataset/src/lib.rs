@@ -1,0 +1,1 @@
+//! Posed image sets: reading, writing, checking, splitting.

@@ -1,0 +1,1 @@
+//! The latent-conditioned radiance field: native kernels, rendering, training.

@@ -1,0 +1,1 @@
+//! Figures that reports print: percentiles, intervals, picture quality.

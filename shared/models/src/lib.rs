@@ -1,0 +1,1 @@
+//! The learned models in tch, their weights and manifests.

@@ -1,0 +1,1 @@
+//! From a probed belief to an action: the decision rules.

@@ -1,0 +1,1 @@
+//! From densities in a hypothesis to the state it shows.

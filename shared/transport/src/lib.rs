@@ -1,0 +1,1 @@
+//! The typed layer over iceoryx2: topics, limits, deadlines.
