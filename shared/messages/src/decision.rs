@@ -1,0 +1,60 @@
+//! The controller's action.
+
+use crate::check::{at_most, probability};
+use crate::{ActionCode, Header, Invalid, MAX_SAMPLES, Reason, message};
+use iceoryx2::prelude::ZeroCopySend;
+
+/// What the car does until the next action, and why.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, ZeroCopySend)]
+#[type_name("carff.Action.v1")]
+pub struct Action {
+    /// Header of the frame that it rests on.
+    pub header: Header,
+    /// Code of an [`ActionCode`].
+    pub action: u32,
+    /// Code of a [`Reason`].
+    pub reason: u32,
+    /// Code of the decision rule (see `carff-planning`).
+    pub rule: u32,
+    /// Samples that the belief rested on.
+    pub sample_count: u32,
+    /// How sure, 0..=1.
+    pub confidence: f32,
+    /// Probability that the hazard is met at any step looked ahead, 0..=1.
+    pub hazard_probability: f32,
+    /// 1 when this action is the first that rests on its frame; 0 when it repeats or is the safe action.
+    pub is_decision: u32,
+    /// Not used; 0.
+    pub reserved: u32,
+    /// Until when it stands: monotonic clock, nanoseconds.
+    pub valid_until_ns: u64,
+    /// The frame that it rests on; `u64::MAX` for none.
+    pub based_on_frame: u64,
+    /// Time from capture to the decision, nanoseconds; 0 when it rests on no frame.
+    pub latency_ns: u64,
+}
+
+impl Action {
+    /// What the car does.
+    pub fn code(&self) -> Result<ActionCode, Invalid> {
+        ActionCode::try_from(self.action)
+    }
+
+    /// Why.
+    pub fn reason(&self) -> Result<Reason, Invalid> {
+        Reason::try_from(self.reason)
+    }
+
+    fn check(&self) -> Result<(), Invalid> {
+        self.header.validate()?;
+        ActionCode::try_from(self.action)?;
+        Reason::try_from(self.reason)?;
+        at_most("sample_count", self.sample_count.into(), MAX_SAMPLES as u64)?;
+        at_most("is_decision", self.is_decision.into(), 1)?;
+        probability("confidence", self.confidence)?;
+        probability("hazard_probability", self.hazard_probability)
+    }
+}
+
+message!(Action);

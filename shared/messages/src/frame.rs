@@ -1,0 +1,187 @@
+//! Pictures: the camera's frames and the renderer's views. The bytes lie in the slice beside these.
+
+use crate::check::{at_most, finite, finite_f64, in_range, within};
+use crate::{
+    Header, Invalid, LATENT_DIM, MAX_PICTURE_BYTES, MAX_SAMPLES, MAX_SIDE_PX, MAX_STATES, Observability, PictureMeta,
+    ViewKind, message,
+};
+use iceoryx2::prelude::ZeroCopySend;
+
+/// An ideal pinhole camera's intrinsics, pixels.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, ZeroCopySend)]
+#[type_name("carff.Intrinsics.v1")]
+pub struct Intrinsics {
+    /// Focal length along x.
+    pub fl_x_px: f64,
+    /// Focal length along y.
+    pub fl_y_px: f64,
+    /// Principal point, x.
+    pub cx_px: f64,
+    /// Principal point, y.
+    pub cy_px: f64,
+}
+
+impl Intrinsics {
+    fn check(&self) -> Result<(), Invalid> {
+        finite_f64("intrinsics", [&self.fl_x_px, &self.fl_y_px, &self.cx_px, &self.cy_px])?;
+        for value in [self.fl_x_px, self.fl_y_px] {
+            if value <= 0.0 {
+                return Err(Invalid::OutOfRange {
+                    field: "intrinsics.fl_px",
+                    value,
+                    min: f64::MIN_POSITIVE,
+                    max: f64::MAX,
+                });
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Where in a data set a frame comes from: the truth, for reports alone. No stage of the decision path reads it.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ZeroCopySend)]
+#[type_name("carff.DatasetView.v1")]
+pub struct DatasetView {
+    /// 1 when the rest is known, else 0.
+    pub known: u32,
+    /// Index of the camera pose.
+    pub view: i32,
+    /// The hidden course of events.
+    pub branch: i32,
+    /// Step of it.
+    pub timestamp: i32,
+    /// Number of the drive in this run.
+    pub drive: i32,
+    /// Frames of this drive before this one.
+    pub frame_in_drive: i32,
+    /// Code of an [`Observability`].
+    pub observability: i32,
+    /// 1 on the last frame of a timestamp, when a decision on it is counted; else 0.
+    pub last_of_timestamp: u32,
+}
+
+impl DatasetView {
+    /// Not from a data set.
+    pub const UNKNOWN: Self = Self {
+        known: 0,
+        view: -1,
+        branch: -1,
+        timestamp: -1,
+        drive: -1,
+        frame_in_drive: -1,
+        observability: -1,
+        last_of_timestamp: 0,
+    };
+
+    fn check(&self) -> Result<(), Invalid> {
+        at_most("dataset_view.known", self.known.into(), 1)?;
+        at_most("dataset_view.last_of_timestamp", self.last_of_timestamp.into(), 1)?;
+        Observability::try_from(self.observability)?;
+        for (field, value) in [
+            ("dataset_view.view", self.view),
+            ("dataset_view.branch", self.branch),
+            ("dataset_view.timestamp", self.timestamp),
+            ("dataset_view.drive", self.drive),
+            ("dataset_view.frame_in_drive", self.frame_in_drive),
+        ] {
+            in_range(field, value.into(), -1, i32::MAX.into())?;
+        }
+        Ok(())
+    }
+}
+
+/// Describes a camera frame: RGB, 8 bit, rows from the top (height x width x 3 bytes).
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, ZeroCopySend)]
+#[type_name("carff.FrameMeta.v1")]
+pub struct FrameMeta {
+    /// Header, at step 0.
+    pub header: Header,
+    /// Pixels in a row.
+    pub width_px: u32,
+    /// Rows.
+    pub height_px: u32,
+    /// Intrinsics for this width and height.
+    pub intrinsics: Intrinsics,
+    /// Row-major 4x4: camera space (OpenGL axes) to world space (metres).
+    pub world_from_camera: [f64; 16],
+    /// Where it comes from, for reports.
+    pub dataset_view: DatasetView,
+}
+
+impl FrameMeta {
+    fn check(&self) -> Result<(), Invalid> {
+        self.header.validate()?;
+        picture_size(self.width_px, self.height_px)?;
+        self.intrinsics.check()?;
+        finite_f64("world_from_camera", &self.world_from_camera)?;
+        self.dataset_view.check()
+    }
+}
+
+message!(FrameMeta);
+
+impl PictureMeta for FrameMeta {
+    fn picture_bytes(&self) -> usize {
+        self.width_px as usize * self.height_px as usize * 3
+    }
+}
+
+/// Describes a rendered view: RGB, 8 bit, rows from the top (height x width x 3 bytes).
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, ZeroCopySend)]
+#[type_name("carff.ViewMeta.v1")]
+pub struct ViewMeta {
+    /// Header, at the step of the hypothesis.
+    pub header: Header,
+    /// Which sample or component it shows.
+    pub hypothesis: u32,
+    /// Code of a [`ViewKind`].
+    pub kind: u32,
+    /// The state that probing found in it; -1 for none of the known ones.
+    pub state: i32,
+    /// Pixels in a row.
+    pub width_px: u32,
+    /// Rows.
+    pub height_px: u32,
+    /// Probability of this hypothesis, 0..=1.
+    pub probability: f32,
+    /// The latent that it was rendered from.
+    pub latent: [f32; LATENT_DIM],
+    /// Intrinsics for this width and height.
+    pub intrinsics: Intrinsics,
+    /// Row-major 4x4: camera space (OpenGL axes) to world space (metres).
+    pub world_from_camera: [f64; 16],
+    /// Time that the rendering took, nanoseconds.
+    pub stage_latency_ns: u64,
+}
+
+impl ViewMeta {
+    fn check(&self) -> Result<(), Invalid> {
+        self.header.validate()?;
+        at_most("hypothesis", self.hypothesis.into(), MAX_SAMPLES as u64)?;
+        ViewKind::try_from(self.kind)?;
+        in_range("state", self.state.into(), -1, MAX_STATES as i64 - 1)?;
+        picture_size(self.width_px, self.height_px)?;
+        within("probability", [&self.probability], 0.0, 1.0)?;
+        finite("latent", &self.latent)?;
+        self.intrinsics.check()?;
+        finite_f64("world_from_camera", &self.world_from_camera)
+    }
+}
+
+message!(ViewMeta);
+
+impl PictureMeta for ViewMeta {
+    fn picture_bytes(&self) -> usize {
+        self.width_px as usize * self.height_px as usize * 3
+    }
+}
+
+fn picture_size(width_px: u32, height_px: u32) -> Result<(), Invalid> {
+    in_range("width_px", width_px.into(), 1, MAX_SIDE_PX.into())?;
+    in_range("height_px", height_px.into(), 1, MAX_SIDE_PX.into())?;
+    at_most("width_px * height_px * 3", u64::from(width_px) * u64::from(height_px) * 3, MAX_PICTURE_BYTES as u64)
+}

@@ -1,0 +1,282 @@
+//! Latents: the posterior, the forecast mixture with its samples, and the belief that probing makes of them.
+
+use crate::check::{at_most, distribution, equals, finite, in_range, probability, within};
+use crate::{
+    ForecastSource, Header, Invalid, LATENT_DIM, MAX_COMPONENTS, MAX_HORIZON, MAX_PLACES, MAX_SAMPLES, MAX_STATES,
+    message,
+};
+use iceoryx2::prelude::ZeroCopySend;
+
+/// Log-variances beyond this are an error of the sender: a standard deviation of e^-15 or e^15.
+const MAX_ABS_LOG_VARIANCE: f32 = 30.0;
+
+/// A diagonal Gaussian over the scene latent: q(z | I) = N(mean, diag exp(log-variance)).
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, ZeroCopySend)]
+#[type_name("carff.Gaussian.v1")]
+pub struct Gaussian {
+    /// Mean.
+    pub mean: [f32; LATENT_DIM],
+    /// Natural logarithm of the variance.
+    pub log_variance: [f32; LATENT_DIM],
+}
+
+impl Gaussian {
+    /// Mean 0, variance 1.
+    pub const fn standard() -> Self {
+        Self { mean: [0.0; LATENT_DIM], log_variance: [0.0; LATENT_DIM] }
+    }
+
+    fn check(&self) -> Result<(), Invalid> {
+        finite("gaussian.mean", &self.mean)?;
+        within("gaussian.log_variance", &self.log_variance, -MAX_ABS_LOG_VARIANCE, MAX_ABS_LOG_VARIANCE)
+    }
+}
+
+/// What the encoder sees in a frame.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, ZeroCopySend)]
+#[type_name("carff.Posterior.v1")]
+pub struct Posterior {
+    /// Header, at step 0.
+    pub header: Header,
+    /// The latent's distribution.
+    pub gaussian: Gaussian,
+    /// Time from the arrival of the frame to sending, nanoseconds.
+    pub stage_latency_ns: u64,
+}
+
+impl Posterior {
+    fn check(&self) -> Result<(), Invalid> {
+        self.header.validate()?;
+        self.gaussian.check()
+    }
+}
+
+message!(Posterior);
+
+/// A mixture over the latent at the next step, with latents drawn from it. Entries beyond the counts mean nothing.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, ZeroCopySend)]
+#[type_name("carff.Forecast.v1")]
+pub struct Forecast {
+    /// Header, at step 1 or more.
+    pub header: Header,
+    /// Code of a [`ForecastSource`].
+    pub source: u32,
+    /// Components in use, 1..=4.
+    pub component_count: u32,
+    /// Samples drawn, 1..=64.
+    pub sample_count: u32,
+    /// Steps that this frame is looked ahead, 1..=8.
+    pub horizon: u32,
+    /// The state that the previous step resolved to; -1 at step 1.
+    pub resolved_state: i32,
+    /// Probability of the path followed up to the input, 0..=1; 1 at step 1.
+    pub path_probability: f32,
+    /// Mixture weights.
+    pub weights: [f32; MAX_COMPONENTS],
+    /// Mixture components.
+    pub components: [Gaussian; MAX_COMPONENTS],
+    /// Drawn latents.
+    pub samples: [[f32; LATENT_DIM]; MAX_SAMPLES],
+    /// Which component each sample was drawn from.
+    pub sample_component: [u8; MAX_SAMPLES],
+    /// Time that the encoder took for this frame, nanoseconds.
+    pub encoder_ns: u64,
+    /// Time from the arrival of the input to sending, nanoseconds.
+    pub stage_latency_ns: u64,
+}
+
+impl Forecast {
+    /// A forecast with no components and no samples yet, to be filled in.
+    pub fn empty(header: Header, source: ForecastSource, horizon: u32) -> Self {
+        Self {
+            header,
+            source: source.code(),
+            component_count: 0,
+            sample_count: 0,
+            horizon,
+            resolved_state: -1,
+            path_probability: 1.0,
+            weights: [0.0; MAX_COMPONENTS],
+            components: [Gaussian::standard(); MAX_COMPONENTS],
+            samples: [[0.0; LATENT_DIM]; MAX_SAMPLES],
+            sample_component: [0; MAX_SAMPLES],
+            encoder_ns: 0,
+            stage_latency_ns: 0,
+        }
+    }
+
+    fn check(&self) -> Result<(), Invalid> {
+        self.header.validate()?;
+        ForecastSource::try_from(self.source)?;
+        in_range("horizon", self.horizon.into(), 1, MAX_HORIZON.into())?;
+        in_range("header.step", self.header.step.into(), 1, self.horizon.into())?;
+        in_range("component_count", self.component_count.into(), 1, MAX_COMPONENTS as i64)?;
+        in_range("sample_count", self.sample_count.into(), 1, MAX_SAMPLES as i64)?;
+        in_range("resolved_state", self.resolved_state.into(), -1, MAX_STATES as i64 - 1)?;
+        probability("path_probability", self.path_probability)?;
+        let (components, samples) = (self.component_count as usize, self.sample_count as usize);
+        distribution("weights", &self.weights[..components])?;
+        for component in &self.components[..components] {
+            component.check()?;
+        }
+        for sample in &self.samples[..samples] {
+            finite("samples", sample)?;
+        }
+        for &component in &self.sample_component[..samples] {
+            at_most("sample_component", component.into(), components as u64 - 1)?;
+        }
+        Ok(())
+    }
+
+    /// The samples in use.
+    pub fn samples(&self) -> &[[f32; LATENT_DIM]] {
+        &self.samples[..(self.sample_count as usize).min(MAX_SAMPLES)]
+    }
+}
+
+message!(Forecast);
+
+/// What probing found in one latent.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, ZeroCopySend)]
+#[type_name("carff.ProbeResult.v1")]
+pub struct ProbeResult {
+    /// Index of the state; -1 for none of the known ones.
+    pub state: i32,
+    /// How sure, 0..=1.
+    pub confidence: f32,
+    /// Probability that the scene of this latent holds the hazard, 0..=1.
+    pub hazard_likelihood: f32,
+    /// Density found at each place, 1/metre, at least 0.
+    pub densities: [f32; MAX_PLACES],
+}
+
+impl ProbeResult {
+    /// Nothing found.
+    pub const NONE: Self = Self { state: -1, confidence: 0.0, hazard_likelihood: 0.0, densities: [0.0; MAX_PLACES] };
+
+    fn check(&self, states: u32, places: u32) -> Result<(), Invalid> {
+        in_range("probe.state", self.state.into(), -1, i64::from(states) - 1)?;
+        probability("probe.confidence", self.confidence)?;
+        probability("probe.hazard_likelihood", self.hazard_likelihood)?;
+        within("probe.densities", &self.densities[..places as usize], 0.0, f32::MAX)
+    }
+}
+
+/// What the prober makes of a forecast. Entries beyond the counts mean nothing.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, ZeroCopySend)]
+#[type_name("carff.Belief.v1")]
+pub struct Belief {
+    /// Header, at the step of the forecast.
+    pub header: Header,
+    /// Steps that this frame is looked ahead, 1..=8.
+    pub horizon: u32,
+    /// States of the scenario, 1..=64.
+    pub state_count: u32,
+    /// Places probed, 1..=16.
+    pub place_count: u32,
+    /// Mixture components, 1..=4.
+    pub component_count: u32,
+    /// Samples, 1..=64.
+    pub sample_count: u32,
+    /// 1 when this is the frame's last step (also when the loop ended early), else 0.
+    pub is_final: u32,
+    /// Probability of each known state. What is missing to 1 is "none of the known states".
+    pub state_probability: [f32; MAX_STATES],
+    /// Probability that the hazard is there at this step, given the path followed, 0..=1.
+    pub hazard_probability: f32,
+    /// Probability of the path followed up to this step's input, 0..=1.
+    pub path_probability: f32,
+    /// Mixture weights.
+    pub component_weights: [f32; MAX_COMPONENTS],
+    /// Result for each component's mean.
+    pub components: [ProbeResult; MAX_COMPONENTS],
+    /// Result for each sample.
+    pub samples: [ProbeResult; MAX_SAMPLES],
+    /// Which component each sample was drawn from.
+    pub sample_component: [u8; MAX_SAMPLES],
+    /// The most probable state, fed back as the next step's input; -1 for none of the known ones.
+    pub resolved_state: i32,
+    /// Not used; 0.
+    pub reserved: u32,
+    /// That state's stored posterior.
+    pub resolved: Gaussian,
+    /// Time that the encoder took for this frame, nanoseconds.
+    pub encoder_ns: u64,
+    /// Time that the forecaster took for this step, nanoseconds.
+    pub forecaster_ns: u64,
+    /// Time from the arrival of the forecast to sending, nanoseconds.
+    pub stage_latency_ns: u64,
+}
+
+impl Belief {
+    /// A belief with no result yet, to be filled in.
+    pub fn empty(header: Header, horizon: u32) -> Self {
+        Self {
+            header,
+            horizon,
+            state_count: 0,
+            place_count: 0,
+            component_count: 0,
+            sample_count: 0,
+            is_final: u32::from(header.step == horizon),
+            state_probability: [0.0; MAX_STATES],
+            hazard_probability: 0.0,
+            path_probability: 1.0,
+            component_weights: [0.0; MAX_COMPONENTS],
+            components: [ProbeResult::NONE; MAX_COMPONENTS],
+            samples: [ProbeResult::NONE; MAX_SAMPLES],
+            sample_component: [0; MAX_SAMPLES],
+            resolved_state: -1,
+            reserved: 0,
+            resolved: Gaussian::standard(),
+            encoder_ns: 0,
+            forecaster_ns: 0,
+            stage_latency_ns: 0,
+        }
+    }
+
+    /// The results of the samples in use.
+    pub fn samples(&self) -> &[ProbeResult] {
+        &self.samples[..(self.sample_count as usize).min(MAX_SAMPLES)]
+    }
+
+    fn check(&self) -> Result<(), Invalid> {
+        self.header.validate()?;
+        in_range("horizon", self.horizon.into(), 1, MAX_HORIZON.into())?;
+        in_range("header.step", self.header.step.into(), 1, self.horizon.into())?;
+        in_range("state_count", self.state_count.into(), 1, MAX_STATES as i64)?;
+        in_range("place_count", self.place_count.into(), 1, MAX_PLACES as i64)?;
+        in_range("component_count", self.component_count.into(), 1, MAX_COMPONENTS as i64)?;
+        in_range("sample_count", self.sample_count.into(), 1, MAX_SAMPLES as i64)?;
+        at_most("is_final", self.is_final.into(), 1)?;
+        if self.header.step == self.horizon {
+            equals("is_final", self.is_final.into(), 1)?;
+        }
+        let states = &self.state_probability[..self.state_count as usize];
+        within("state_probability", states, 0.0, 1.0)?;
+        let sum: f32 = states.iter().sum();
+        within("sum of state_probability", [&sum], 0.0, 1.001)?;
+        probability("hazard_probability", self.hazard_probability)?;
+        probability("path_probability", self.path_probability)?;
+        let (components, samples) = (self.component_count as usize, self.sample_count as usize);
+        distribution("component_weights", &self.component_weights[..components])?;
+        for result in &self.components[..components] {
+            result.check(self.state_count, self.place_count)?;
+        }
+        for result in &self.samples[..samples] {
+            result.check(self.state_count, self.place_count)?;
+        }
+        for &component in &self.sample_component[..samples] {
+            at_most("sample_component", component.into(), components as u64 - 1)?;
+        }
+        in_range("resolved_state", self.resolved_state.into(), -1, i64::from(self.state_count) - 1)?;
+        self.resolved.check()
+    }
+}
+
+message!(Belief);
