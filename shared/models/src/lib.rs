@@ -1,1 +1,70 @@
 //! The learned models in tch, their weights and manifests.
+//!
+//! What lives here: the encoder (backbone and head), the pose-conditional decoder, the mixture density network, the
+//! belief's sampling, and how weights lie on disk. What never does: training loops, processes, topics.
+//!
+//! Tensors are `f32`, pictures `[N, 3, H, W]` in 0..=1 unless said otherwise.
+
+pub mod adam;
+pub mod backbone;
+pub mod borrow;
+pub mod decoder;
+pub mod encoder;
+pub mod mixture;
+pub mod weights;
+
+/// Number of dimensions of the scene latent (paper: z in R^8).
+pub const LATENT_DIM: usize = 8;
+
+/// A Gaussian over the scene latent with diagonal covariance: an encoder posterior q(z | I).
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
+pub struct LatentGaussian {
+    /// Mean.
+    pub mean: [f32; LATENT_DIM],
+    /// Natural logarithm of the variance, per dimension.
+    pub log_variance: [f32; LATENT_DIM],
+}
+
+impl LatentGaussian {
+    /// mean + exp(log variance / 2) * `unit`, for a draw `unit` from the standard normal distribution.
+    pub fn at(&self, unit: &[f32; LATENT_DIM]) -> [f32; LATENT_DIM] {
+        std::array::from_fn(|i| self.mean[i] + (0.5 * self.log_variance[i]).exp() * unit[i])
+    }
+}
+
+/// What goes wrong with models and their files.
+#[derive(Debug, thiserror::Error)]
+pub enum ModelError {
+    /// A file could not be read or written.
+    #[error("{path}: {source}")]
+    File {
+        /// Which file.
+        path: std::path::PathBuf,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// A file is not what it must be.
+    #[error("{path}: {what}")]
+    Format {
+        /// Which file.
+        path: std::path::PathBuf,
+        /// What is wrong, and what to do.
+        what: String,
+    },
+    /// Tensors that the model needs are missing, unknown or of another shape.
+    #[error("the weights do not fit the model: {0}")]
+    Mismatch(String),
+    /// A setting is out of its range.
+    #[error("`{key}` = {value}: {allowed}")]
+    Setting {
+        /// Which setting.
+        key: &'static str,
+        /// What it was.
+        value: String,
+        /// What is allowed.
+        allowed: &'static str,
+    },
+    /// libtorch refused an operation.
+    #[error("libtorch: {0}")]
+    Torch(#[from] tch::TchError),
+}

@@ -1,0 +1,160 @@
+//! EfficientNet-Lite0 (Tan and Le 2019, Lite variant: no squeeze-and-excite, ReLU6), up to stride 16, weights frozen.
+//!
+//! Frozen, so batch normalisation is folded into the convolutions when the weights are read.
+
+use super::{Backbone, resize};
+use crate::{ModelError, weights::Tensors};
+use tch::{Kind, Tensor, nn};
+
+/// Kernel, stride, expansion, input and output channels of each block up to the 112-channel stage.
+const BLOCKS: [(i64, i64, i64, i64, i64); 11] = [
+    (3, 1, 1, 32, 16),
+    (3, 2, 6, 16, 24),
+    (3, 1, 6, 24, 24),
+    (5, 2, 6, 24, 40),
+    (5, 1, 6, 40, 40),
+    (3, 2, 6, 40, 80),
+    (3, 1, 6, 80, 80),
+    (3, 1, 6, 80, 80),
+    (5, 1, 6, 80, 112),
+    (5, 1, 6, 112, 112),
+    (5, 1, 6, 112, 112),
+];
+
+const BATCH_NORM_EPSILON: f64 = 1e-3;
+
+/// The network, with batch normalisation folded.
+#[derive(Debug)]
+pub struct EfficientNetLite0 {
+    stem: Convolution,
+    blocks: Vec<Block>,
+    input_px: i64,
+}
+
+#[derive(Debug)]
+struct Block {
+    expand: Option<Convolution>,
+    depthwise: Convolution,
+    project: Convolution,
+    skip: bool,
+}
+
+#[derive(Debug)]
+struct Convolution {
+    weight: Tensor,
+    bias: Tensor,
+    stride: i64,
+    groups: i64,
+}
+
+impl EfficientNetLite0 {
+    /// Reads the weights in the names of the published state dict (`_conv_stem.weight`, `_blocks.0._bn1.weight`, ..);
+    /// with none, the weights are random (for tests and for filling from a checkpoint).
+    /// The folded weights are registered in `path`, not trainable.
+    pub fn new(path: &nn::Path, tensors: Option<&Tensors>, input_px: i64) -> Result<Self, ModelError> {
+        let read = |conv: &str, norm: &str, shape: [i64; 4], stride: i64, groups: i64| {
+            let target = path / conv.replace('.', "/");
+            folded(&target, tensors, conv, norm, shape, stride, groups)
+        };
+        let stem = read("_conv_stem", "_bn0", [32, 3, 3, 3], 2, 1)?;
+        let blocks = BLOCKS
+            .iter()
+            .enumerate()
+            .map(|(i, &(kernel, stride, expansion, input, output))| {
+                let inner = input * expansion;
+                let name = |part: &str| format!("_blocks.{i}.{part}");
+                Ok(Block {
+                    expand: (expansion > 1)
+                        .then(|| read(&name("_expand_conv"), &name("_bn0"), [inner, input, 1, 1], 1, 1))
+                        .transpose()?,
+                    depthwise: read(
+                        &name("_depthwise_conv"),
+                        &name("_bn1"),
+                        [inner, 1, kernel, kernel],
+                        stride,
+                        inner,
+                    )?,
+                    project: read(&name("_project_conv"), &name("_bn2"), [output, inner, 1, 1], 1, 1)?,
+                    skip: stride == 1 && input == output,
+                })
+            })
+            .collect::<Result<Vec<_>, ModelError>>()?;
+        Ok(Self { stem, blocks, input_px })
+    }
+}
+
+fn folded(
+    path: &nn::Path,
+    tensors: Option<&Tensors>,
+    conv: &str,
+    norm: &str,
+    shape: [i64; 4],
+    stride: i64,
+    groups: i64,
+) -> Result<Convolution, ModelError> {
+    let (weight, bias) = match tensors {
+        None => {
+            let fan_in = (shape[1] * shape[2] * shape[3]) as f64;
+            (
+                Tensor::randn(shape, (Kind::Float, path.device())) * (2.0 / fan_in).sqrt(),
+                Tensor::zeros([shape[0]], (Kind::Float, path.device())),
+            )
+        }
+        Some(tensors) => {
+            let take = |name: String, shape: &[i64]| crate::weights::take(tensors, &name, shape);
+            let channels = [shape[0]];
+            let gain = take(format!("{norm}.weight"), &channels)?;
+            let shift = take(format!("{norm}.bias"), &channels)?;
+            let mean = take(format!("{norm}.running_mean"), &channels)?;
+            let variance = take(format!("{norm}.running_var"), &channels)?;
+            let scale = gain / (variance + BATCH_NORM_EPSILON).sqrt();
+            (take(format!("{conv}.weight"), &shape)? * scale.view([-1, 1, 1, 1]), shift - mean * scale)
+        }
+    };
+    Ok(Convolution { weight: path.add("weight", weight, false), bias: path.add("bias", bias, false), stride, groups })
+}
+
+impl Convolution {
+    /// Convolution with TensorFlow's "same" padding: the odd pixel goes to the right and the bottom.
+    fn forward(&self, x: &Tensor) -> Tensor {
+        let kernel = self.weight.size()[2];
+        let side = x.size()[2];
+        let pad = (((side + self.stride - 1) / self.stride - 1) * self.stride + kernel - side).max(0);
+        let (before, after) = (pad / 2, pad - pad / 2);
+        let s = [self.stride, self.stride];
+        if before == after {
+            x.conv2d(&self.weight, Some(&self.bias), s, [before, before], [1, 1], self.groups)
+        } else {
+            x.zero_pad2d(before, after, before, after).conv2d(
+                &self.weight,
+                Some(&self.bias),
+                s,
+                [0, 0],
+                [1, 1],
+                self.groups,
+            )
+        }
+    }
+}
+
+impl Backbone for EfficientNetLite0 {
+    fn features(&self, pictures: &Tensor) -> Tensor {
+        // The published model's input is (byte - 127) / 128.
+        let x = resize(pictures, self.input_px) * (255.0 / 128.0) - 127.0 / 128.0;
+        let mut x = self.stem.forward(&x).clamp(0.0, 6.0);
+        for block in &self.blocks {
+            let inner = block.expand.as_ref().map_or_else(|| x.shallow_clone(), |e| e.forward(&x).clamp(0.0, 6.0));
+            let out = block.project.forward(&block.depthwise.forward(&inner).clamp(0.0, 6.0));
+            x = if block.skip { out + x } else { out };
+        }
+        x
+    }
+
+    fn channels(&self) -> i64 {
+        112
+    }
+
+    fn grid(&self) -> i64 {
+        self.input_px / 16
+    }
+}

@@ -1,0 +1,305 @@
+//! Vision transformer (Dosovitskiy et al. 2021) of any size, with standard safetensors weights.
+
+use super::{Backbone, resize};
+use crate::{ModelError, weights::Tensors};
+use serde::{Deserialize, Serialize};
+use tch::{Kind, Tensor, nn, nn::Module};
+
+/// Size of a vision transformer. The default is ViT-L/16, the paper's.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct VitConfig {
+    /// Patch side, pixels.
+    pub patch_px: i64,
+    /// Token width.
+    pub width: i64,
+    /// Number of blocks.
+    pub depth: i64,
+    /// Attention heads; must divide the width.
+    pub heads: i64,
+}
+
+impl Default for VitConfig {
+    fn default() -> Self {
+        Self { patch_px: 16, width: 1024, depth: 24, heads: 16 }
+    }
+}
+
+/// The network without its classifier.
+#[derive(Debug)]
+pub struct VisionTransformer {
+    patch: nn::Conv2D,
+    class_token: Tensor,
+    positions: Tensor,
+    blocks: Vec<Block>,
+    norm: nn::LayerNorm,
+    width: i64,
+    input_px: i64,
+    grid: i64,
+}
+
+#[derive(Debug)]
+struct Block {
+    norm1: nn::LayerNorm,
+    qkv: nn::Linear,
+    projection: nn::Linear,
+    norm2: nn::LayerNorm,
+    fc1: nn::Linear,
+    fc2: nn::Linear,
+    heads: i64,
+}
+
+impl VisionTransformer {
+    /// Builds the network in `path`; weights in the timm names (`blocks.0.attn.qkv.weight`) or the Hugging Face ones
+    /// (`vit.encoder.layer.0.attention.attention.query.weight`). A classifier in the file is ignored.
+    pub fn new(
+        path: &nn::Path,
+        config: &VitConfig,
+        tensors: Option<&Tensors>,
+        input_px: i64,
+    ) -> Result<Self, ModelError> {
+        let wrong = |key, value: i64, allowed| Err(ModelError::Setting { key, value: value.to_string(), allowed });
+        if config.heads < 1 || config.width % config.heads.max(1) != 0 {
+            return wrong("backbone.vit.heads", config.heads, "a divisor of `width`, at least 1");
+        }
+        if config.patch_px < 1 || input_px % config.patch_px.max(1) != 0 {
+            return wrong("backbone.vit.patch_px", config.patch_px, "a divisor of `input_px`, at least 1");
+        }
+        if !(1..=64).contains(&config.depth) {
+            return wrong("backbone.vit.depth", config.depth, "1 to 64");
+        }
+        let width = config.width;
+        let grid = input_px / config.patch_px;
+        let conv = nn::ConvConfig { stride: config.patch_px, ..Default::default() };
+        let norm_config = nn::LayerNormConfig { eps: 1e-6, ..Default::default() };
+        let small = nn::Init::Randn { mean: 0.0, stdev: 0.02 };
+        let blocks = (0..config.depth)
+            .map(|i| {
+                let p = path / "blocks" / i;
+                Block {
+                    norm1: nn::layer_norm(&p / "norm1", vec![width], norm_config),
+                    qkv: nn::linear(&p / "attn" / "qkv", width, 3 * width, nn::LinearConfig::default()),
+                    projection: nn::linear(&p / "attn" / "proj", width, width, nn::LinearConfig::default()),
+                    norm2: nn::layer_norm(&p / "norm2", vec![width], norm_config),
+                    fc1: nn::linear(&p / "mlp" / "fc1", width, 4 * width, nn::LinearConfig::default()),
+                    fc2: nn::linear(&p / "mlp" / "fc2", 4 * width, width, nn::LinearConfig::default()),
+                    heads: config.heads,
+                }
+            })
+            .collect();
+        let net = Self {
+            patch: nn::conv2d(path / "patch_embed" / "proj", 3, width, config.patch_px, conv),
+            class_token: path.var("cls_token", &[1, 1, width], small),
+            positions: path.var("pos_embed", &[1, grid * grid + 1, width], small),
+            blocks,
+            norm: nn::layer_norm(path / "norm", vec![width], norm_config),
+            width,
+            input_px,
+            grid,
+        };
+        if let Some(tensors) = tensors {
+            net.fill(&timm_names(tensors, config.depth))?;
+        }
+        Ok(net)
+    }
+
+    fn fill(&self, tensors: &Tensors) -> Result<(), ModelError> {
+        let mut faults = Vec::new();
+        tch::no_grad(|| {
+            let mut copy = |name: &str, variable: &Tensor| match tensors.get(name) {
+                Some(t) if t.size() == variable.size() => variable.shallow_clone().copy_(t),
+                Some(t) => {
+                    faults.push(format!("`{name}` is {:?}, the model wants {:?}", t.size(), variable.size()));
+                }
+                None => faults.push(format!("`{name}` is missing")),
+            };
+            copy("cls_token", &self.class_token);
+            copy("pos_embed", &self.positions);
+            copy("patch_embed.proj.weight", &self.patch.ws);
+            if let Some(bias) = &self.patch.bs {
+                copy("patch_embed.proj.bias", bias);
+            }
+            let mut norm = |name: &str, layer: &nn::LayerNorm| {
+                if let (Some(w), Some(b)) = (&layer.ws, &layer.bs) {
+                    copy(&format!("{name}.weight"), w);
+                    copy(&format!("{name}.bias"), b);
+                }
+            };
+            norm("norm", &self.norm);
+            for (i, block) in self.blocks.iter().enumerate() {
+                norm(&format!("blocks.{i}.norm1"), &block.norm1);
+                norm(&format!("blocks.{i}.norm2"), &block.norm2);
+            }
+            for (i, block) in self.blocks.iter().enumerate() {
+                for (name, layer) in [
+                    ("attn.qkv", &block.qkv),
+                    ("attn.proj", &block.projection),
+                    ("mlp.fc1", &block.fc1),
+                    ("mlp.fc2", &block.fc2),
+                ] {
+                    copy(&format!("blocks.{i}.{name}.weight"), &layer.ws);
+                    if let Some(bias) = &layer.bs {
+                        copy(&format!("blocks.{i}.{name}.bias"), bias);
+                    }
+                }
+            }
+        });
+        if faults.is_empty() {
+            return Ok(());
+        }
+        faults.truncate(8);
+        Err(ModelError::Mismatch(faults.join("; ")))
+    }
+}
+
+/// Hugging Face names to timm names; queries, keys and values are put together.
+fn timm_names(tensors: &Tensors, depth: i64) -> Tensors {
+    let root = if tensors.keys().any(|k| k.starts_with("vit.embeddings.")) { "vit." } else { "" };
+    if !tensors.contains_key(&format!("{root}embeddings.cls_token")) {
+        return tensors.iter().map(|(k, t)| (k.clone(), t.shallow_clone())).collect();
+    }
+    let mut renamed = Tensors::new();
+    let mut rename = |to: String, from: String| {
+        if let Some(t) = tensors.get(&format!("{root}{from}")) {
+            renamed.insert(to, t.shallow_clone());
+        }
+    };
+    rename("cls_token".into(), "embeddings.cls_token".into());
+    rename("pos_embed".into(), "embeddings.position_embeddings".into());
+    for part in ["weight", "bias"] {
+        rename(format!("patch_embed.proj.{part}"), format!("embeddings.patch_embeddings.projection.{part}"));
+        rename(format!("norm.{part}"), format!("layernorm.{part}"));
+        for i in 0..depth {
+            let from = format!("encoder.layer.{i}");
+            rename(format!("blocks.{i}.norm1.{part}"), format!("{from}.layernorm_before.{part}"));
+            rename(format!("blocks.{i}.norm2.{part}"), format!("{from}.layernorm_after.{part}"));
+            rename(format!("blocks.{i}.attn.proj.{part}"), format!("{from}.attention.output.dense.{part}"));
+            rename(format!("blocks.{i}.mlp.fc1.{part}"), format!("{from}.intermediate.dense.{part}"));
+            rename(format!("blocks.{i}.mlp.fc2.{part}"), format!("{from}.output.dense.{part}"));
+        }
+    }
+    for part in ["weight", "bias"] {
+        for i in 0..depth {
+            let parts: Vec<&Tensor> = ["query", "key", "value"]
+                .iter()
+                .filter_map(|q| tensors.get(&format!("{root}encoder.layer.{i}.attention.attention.{q}.{part}")))
+                .collect();
+            if parts.len() == 3 {
+                renamed.insert(format!("blocks.{i}.attn.qkv.{part}"), Tensor::cat(&parts, 0));
+            }
+        }
+    }
+    renamed
+}
+
+impl Block {
+    fn forward(&self, x: &Tensor) -> Tensor {
+        let size = x.size();
+        let (n, tokens, width) = (size[0], size[1], size[2]);
+        let qkv = self
+            .qkv
+            .forward(&self.norm1.forward(x))
+            .view([n, tokens, 3, self.heads, width / self.heads])
+            .permute([2, 0, 3, 1, 4]);
+        let attended = Tensor::scaled_dot_product_attention::<Tensor>(
+            &qkv.get(0),
+            &qkv.get(1),
+            &qkv.get(2),
+            None,
+            0.0,
+            false,
+            None,
+            false,
+        );
+        let x = x + self.projection.forward(&attended.transpose(1, 2).reshape([n, tokens, width]));
+        let hidden = self.fc1.forward(&self.norm2.forward(&x)).gelu("none");
+        &x + self.fc2.forward(&hidden)
+    }
+}
+
+impl Backbone for VisionTransformer {
+    fn features(&self, pictures: &Tensor) -> Tensor {
+        // timm's vision transformers take (x - 0.5) / 0.5.
+        let x = resize(pictures, self.input_px) * 2.0 - 1.0;
+        let n = x.size()[0];
+        let tokens = self.patch.forward(&x).flatten(2, 3).transpose(1, 2);
+        let class = self.class_token.expand([n, 1, self.width], false);
+        let x = Tensor::cat(&[class, tokens], 1) + &self.positions;
+        let x = self.blocks.iter().fold(x, |x, block| block.forward(&x));
+        let x = self.norm.forward(&x).to_kind(Kind::Float);
+        x.narrow(1, 1, self.grid * self.grid).transpose(1, 2).reshape([n, self.width, self.grid, self.grid])
+    }
+
+    fn channels(&self) -> i64 {
+        self.width
+    }
+
+    fn grid(&self) -> i64 {
+        self.grid
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use tch::{Device, nn::VarStore};
+
+    fn tiny() -> VitConfig {
+        VitConfig { patch_px: 16, width: 12, depth: 2, heads: 3 }
+    }
+
+    /// Weights in Hugging Face names and the same ones in timm names give the same features.
+    #[test]
+    fn both_name_forms_are_read() {
+        let store = VarStore::new(Device::Cpu);
+        let net = VisionTransformer::new(&store.root(), &tiny(), None, 64).unwrap();
+        let timm: Tensors = store.variables().into_iter().collect();
+        let mut hugging = Tensors::new();
+        for (name, t) in &timm {
+            let renamed = name
+                .replace("blocks.", "vit.encoder.layer.")
+                .replace(".norm1.", ".layernorm_before.")
+                .replace(".norm2.", ".layernorm_after.")
+                .replace(".attn.proj.", ".attention.output.dense.")
+                .replace(".mlp.fc1.", ".intermediate.dense.")
+                .replace(".mlp.fc2.", ".output.dense.");
+            if let Some(base) = renamed.find(".attn.qkv.").map(|at| renamed[..at].to_owned()) {
+                let part = name.rsplit('.').next().unwrap();
+                for (q, chunk) in ["query", "key", "value"].iter().zip(t.chunk(3, 0)) {
+                    hugging.insert(format!("{base}.attention.attention.{q}.{part}"), chunk);
+                }
+                continue;
+            }
+            let renamed = match name.as_str() {
+                "cls_token" => "vit.embeddings.cls_token".into(),
+                "pos_embed" => "vit.embeddings.position_embeddings".into(),
+                "norm.weight" | "norm.bias" => format!("vit.{}", name.replace("norm", "layernorm")),
+                n if n.starts_with("patch_embed") => {
+                    n.replace("patch_embed.proj", "vit.embeddings.patch_embeddings.projection")
+                }
+                _ => renamed,
+            };
+            hugging.insert(renamed, t.shallow_clone());
+        }
+        let picture = Tensor::rand([1, 3, 64, 64], (Kind::Float, Device::Cpu));
+        let expected = net.features(&picture);
+        assert_eq!(expected.size(), [1, 12, 4, 4]);
+        for names in [&timm, &hugging] {
+            let other = VarStore::new(Device::Cpu);
+            let read = VisionTransformer::new(&other.root(), &tiny(), Some(names), 64).unwrap();
+            assert!(read.features(&picture).allclose(&expected, 1e-5, 1e-6, false));
+        }
+    }
+
+    /// A missing tensor is named.
+    #[test]
+    fn a_missing_tensor_is_named() {
+        let store = VarStore::new(Device::Cpu);
+        let _net = VisionTransformer::new(&store.root(), &tiny(), None, 64).unwrap();
+        let mut tensors: Tensors = store.variables().into_iter().collect();
+        tensors.remove("blocks.1.mlp.fc2.weight");
+        let other = VarStore::new(Device::Cpu);
+        let error = VisionTransformer::new(&other.root(), &tiny(), Some(&tensors), 64).unwrap_err();
+        assert!(error.to_string().contains("`blocks.1.mlp.fc2.weight` is missing"), "{error}");
+    }
+}

@@ -1,0 +1,77 @@
+//! The pose-conditional VAE's decoder: from a scene latent and a pose's number to that pose's picture (section 3.2).
+
+use crate::LATENT_DIM;
+use serde::{Deserialize, Serialize};
+use tch::{Tensor, nn, nn::Module};
+
+/// Shape of the decoder.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct DecoderConfig {
+    /// Width of the hidden layer that joins latent and pose.
+    pub hidden: i64,
+    /// Channels at 8x8; halved at most once on the way up.
+    pub channels: i64,
+}
+
+impl Default for DecoderConfig {
+    fn default() -> Self {
+        Self { hidden: 256, channels: 64 }
+    }
+}
+
+/// Side of the decoder's pictures, pixels.
+pub const PICTURE_PX: i64 = 128;
+
+/// The decoder.
+#[derive(Debug)]
+pub struct Decoder {
+    join: nn::Linear,
+    spread: nn::Linear,
+    up16: nn::Conv2D,
+    up32: nn::Conv2D,
+    up64: nn::Conv2D,
+    out: nn::Conv2D,
+    channels: i64,
+    poses: i64,
+}
+
+impl Decoder {
+    /// Builds a decoder for `poses` fixed camera poses (0: no pose is given to it).
+    pub fn new(path: &nn::Path, config: &DecoderConfig, poses: i64) -> Self {
+        let same = nn::ConvConfig { padding: 1, ..Default::default() };
+        let c = config.channels;
+        let linear = nn::LinearConfig::default();
+        Self {
+            join: nn::linear(path / "join", LATENT_DIM as i64 + poses, config.hidden, linear),
+            spread: nn::linear(path / "spread", config.hidden, c * 64, linear),
+            up16: nn::conv2d(path / "up16", c, c, 3, same),
+            up32: nn::conv2d(path / "up32", c, c * 3 / 4, 3, same),
+            up64: nn::conv2d(path / "up64", c * 3 / 4, c * 3 / 8, 3, same),
+            // 12 = 3 colours of 2x2 pixels: the last doubling is a shuffle.
+            out: nn::conv2d(path / "out", c * 3 / 8, 12, 3, same),
+            channels: c,
+            poses,
+        }
+    }
+
+    /// Latents `[N, 8]` and pose numbers `[N]` (int64) to `[N, 3, 128, 128]`: a picture in 0..=1, or the residual
+    /// over the pose's mean picture, whichever it was trained for.
+    pub fn forward(&self, latents: &Tensor, poses: &Tensor) -> Tensor {
+        let input = if self.poses > 0 {
+            Tensor::cat(&[latents.shallow_clone(), poses.one_hot(self.poses).to_kind(latents.kind())], 1)
+        } else {
+            latents.shallow_clone()
+        };
+        let x = self.join.forward(&input).relu();
+        let x = self.spread.forward(&x).relu().view([-1, self.channels, 8, 8]);
+        let double = |x: &Tensor| {
+            let side = x.size()[2] * 2;
+            x.upsample_nearest2d([side, side], None, None)
+        };
+        let x = self.up16.forward(&double(&x)).relu();
+        let x = self.up32.forward(&double(&x)).relu();
+        let x = self.up64.forward(&double(&x)).relu();
+        self.out.forward(&x).pixel_shuffle(2)
+    }
+}

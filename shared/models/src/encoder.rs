@@ -1,0 +1,151 @@
+//! The pose-conditional VAE's encoder: from one picture to a Gaussian over the scene latent (paper section 3.2).
+
+use crate::{
+    LATENT_DIM, LatentGaussian, ModelError,
+    backbone::{self, Backbone, BackboneConfig},
+};
+use serde::{Deserialize, Serialize};
+use std::path::Path;
+use tch::{Kind, Tensor, nn, nn::Module};
+
+/// Shape of the encoder.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct EncoderConfig {
+    /// The image backbone.
+    pub backbone: BackboneConfig,
+    /// Channels of the optional convolutional stem before the backbone; 0 leaves it out. A stem makes training run
+    /// the backbone in every step, since its features cannot be kept.
+    pub stem_channels: i64,
+    /// Channels after the head's 1x1 convolution.
+    pub reduce_channels: i64,
+    /// Channels after the head's strided 3x3 convolution.
+    pub pool_channels: i64,
+    /// Width of the head's hidden layer.
+    pub hidden: i64,
+}
+
+impl Default for EncoderConfig {
+    fn default() -> Self {
+        Self {
+            backbone: BackboneConfig::default(),
+            stem_channels: 0,
+            reduce_channels: 128,
+            pool_channels: 64,
+            hidden: 256,
+        }
+    }
+}
+
+/// Log-variances are kept inside this range, so that no posterior is a point or the whole space.
+pub const LOG_VARIANCE_RANGE: (f64, f64) = (-8.0, 4.0);
+
+/// Backbone and head.
+pub struct Encoder {
+    stem: Option<(nn::Conv2D, nn::Conv2D)>,
+    backbone: Box<dyn Backbone>,
+    head: Head,
+}
+
+#[derive(Debug)]
+struct Head {
+    reduce: nn::Conv2D,
+    pool: nn::Conv2D,
+    hidden: nn::Linear,
+    mean: nn::Linear,
+    log_variance: nn::Linear,
+}
+
+impl Encoder {
+    /// Builds the encoder: backbone variables in `backbone_path`, all that learns besides in `head_path`.
+    pub fn new(
+        config: &EncoderConfig,
+        backbone_path: &nn::Path,
+        head_path: &nn::Path,
+        pretrained: Option<&Path>,
+    ) -> Result<Self, ModelError> {
+        let backbone = backbone::build(&config.backbone, backbone_path, pretrained)?;
+        let same = nn::ConvConfig { padding: 1, ..Default::default() };
+        let stem = (config.stem_channels > 0).then(|| {
+            let p = head_path / "stem";
+            let last = nn::ConvConfig { ws_init: nn::Init::Const(0.0), ..same };
+            (
+                nn::conv2d(&p / "first", 3, config.stem_channels, 3, same),
+                nn::conv2d(&p / "last", config.stem_channels, 3, 3, last),
+            )
+        });
+        let strided = nn::ConvConfig { stride: 2, padding: 1, ..Default::default() };
+        let p = head_path / "head";
+        let side = (backbone.grid() + 1) / 2;
+        let linear = nn::LinearConfig::default();
+        let head = Head {
+            reduce: nn::conv2d(
+                &p / "reduce",
+                backbone.channels(),
+                config.reduce_channels,
+                1,
+                nn::ConvConfig::default(),
+            ),
+            pool: nn::conv2d(&p / "pool", config.reduce_channels, config.pool_channels, 3, strided),
+            hidden: nn::linear(&p / "hidden", config.pool_channels * side * side, config.hidden, linear),
+            mean: nn::linear(&p / "mean", config.hidden, LATENT_DIM as i64, linear),
+            log_variance: nn::linear(&p / "log_variance", config.hidden, LATENT_DIM as i64, linear),
+        };
+        Ok(Self { stem, backbone, head })
+    }
+
+    /// `[N, 3, H, W]` in 0..=1 to backbone features `[N, C, h, w]`.
+    pub fn features(&self, pictures: &Tensor) -> Tensor {
+        match &self.stem {
+            None => self.backbone.features(pictures),
+            Some((first, last)) => self.backbone.features(&(pictures + last.forward(&first.forward(pictures).relu()))),
+        }
+    }
+
+    /// Backbone features to posterior mean and log-variance, each `[N, 8]`.
+    /// With `dropout` above zero, hidden units are dropped with that probability (training only).
+    pub fn posterior(&self, features: &Tensor, dropout: f64) -> (Tensor, Tensor) {
+        let x = self.head.reduce.forward(features).relu();
+        let x = self.head.pool.forward(&x).relu().flatten(1, -1);
+        let x = if dropout > 0.0 { x.dropout(dropout, true) } else { x };
+        let x = self.head.hidden.forward(&x).relu();
+        let log_variance = self.head.log_variance.forward(&x).clamp(LOG_VARIANCE_RANGE.0, LOG_VARIANCE_RANGE.1);
+        (self.head.mean.forward(&x), log_variance)
+    }
+
+    /// The posteriors of pictures `[N, 3, H, W]`.
+    pub fn encode(&self, pictures: &Tensor) -> Vec<LatentGaussian> {
+        tch::no_grad(|| {
+            let (mean, log_variance) = self.posterior(&self.features(pictures), 0.0);
+            gaussians(&mean, &log_variance)
+        })
+    }
+
+    /// The posterior of one picture, `[H, W, 3]` bytes.
+    pub fn encode_bytes(&self, picture: &Tensor) -> Option<LatentGaussian> {
+        self.encode(&pictures_from_bytes(&picture.unsqueeze(0))).into_iter().next()
+    }
+}
+
+/// `[N, H, W, 3]` bytes to `[N, 3, H, W]` in 0..=1.
+pub fn pictures_from_bytes(bytes: &Tensor) -> Tensor {
+    bytes.permute([0, 3, 1, 2]).to_kind(Kind::Float) * (1.0 / 255.0)
+}
+
+/// Two `[N, 8]` tensors to Gaussians.
+pub fn gaussians(mean: &Tensor, log_variance: &Tensor) -> Vec<LatentGaussian> {
+    let rows = |t: &Tensor| {
+        let mut flat = vec![0.0_f32; t.numel()];
+        let t = t.to_device(tch::Device::Cpu).contiguous();
+        t.copy_data(&mut flat, t.numel());
+        flat
+    };
+    rows(mean)
+        .chunks_exact(LATENT_DIM)
+        .zip(rows(log_variance).chunks_exact(LATENT_DIM))
+        .map(|(m, v)| LatentGaussian {
+            mean: std::array::from_fn(|i| m[i]),
+            log_variance: std::array::from_fn(|i| v[i]),
+        })
+        .collect()
+}
