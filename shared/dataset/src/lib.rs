@@ -1,1 +1,36 @@
 //! Posed image sets: reading, writing, checking, splitting.
+//!
+//! A set is a folder with `transforms.json` (the form of instant-ngp and nerfstudio, plus a few keys that say which
+//! course of events and which time step a picture shows) and its PNG pictures. No model and no rendering lives here.
+//!
+//! ```no_run
+//! use carff_dataset::{Dataset, Equivalence, PoseSplit};
+//! # fn main() -> Result<(), carff_dataset::DatasetError> {
+//! let dataset = Dataset::open("data/approaching-intersection".as_ref())?;
+//! let images = dataset.load_all_images()?;
+//! let split = PoseSplit::for_dataset(&dataset, 7);
+//! let equivalence = Equivalence::from_dataset(&dataset, &images);
+//! # Ok(())
+//! # }
+//! ```
+
+mod dataset;
+mod equivalence;
+mod error;
+mod image;
+mod report;
+pub mod sensor;
+mod split;
+mod transforms;
+mod writer;
+
+pub use dataset::{
+    Candidate, Dataset, Frame, MAX_FRAMES, MAX_IMAGE_SIDE_PX, MAX_TRANSFORMS_BYTES, NamedBox, Observability,
+    ScenarioInfo, StateInfo,
+};
+pub use equivalence::{Equivalence, MAX_DIFFERENT_PIXELS, PIXEL_TOLERANCE, looks_same};
+pub use error::DatasetError;
+pub use image::Image;
+pub use report::{DatasetReport, HiddenPair, SheetOptions, contact_sheet};
+pub use split::{PoseRole, PoseSplit};
+pub use writer::{DatasetWriter, FrameRecord};

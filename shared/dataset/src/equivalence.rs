@@ -1,0 +1,124 @@
+//! Which states look the same from a view, and how accurate a guess from a picture can be at best.
+
+use rayon::prelude::*;
+
+use crate::dataset::Dataset;
+use crate::image::Image;
+
+/// Two states look the same from a view when at most this many pixels differ by more than [`PIXEL_TOLERANCE`].
+pub const MAX_DIFFERENT_PIXELS: usize = 8;
+/// Largest difference in any channel, of 255, that does not count.
+pub const PIXEL_TOLERANCE: u8 = 12;
+
+/// Visual equivalence of states, per view.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Equivalence {
+    states: usize,
+    /// views x states x states.
+    same: Vec<bool>,
+}
+
+/// Whether two pictures are the same to the eye: same size, and at most [`MAX_DIFFERENT_PIXELS`] pixels differ by
+/// more than [`PIXEL_TOLERANCE`] in any channel.
+pub fn looks_same(a: &Image, b: &Image) -> bool {
+    (a.width_px, a.height_px) == (b.width_px, b.height_px)
+        && different_pixels(a, b).take(MAX_DIFFERENT_PIXELS + 1).count() <= MAX_DIFFERENT_PIXELS
+}
+
+fn different_pixels<'a>(a: &'a Image, b: &'a Image) -> impl Iterator<Item = usize> + 'a {
+    a.rgb.chunks_exact(3).zip(b.rgb.chunks_exact(3)).enumerate().filter_map(|(i, (a, b))| {
+        let differs = a.iter().zip(b).any(|(a, b)| a.abs_diff(*b) > PIXEL_TOLERANCE);
+        differs.then_some(i)
+    })
+}
+
+impl Equivalence {
+    /// Compares all pairs of states in each view. `images` are those of [`Dataset::load_all_images`]. A state with no
+    /// picture in a view is the same only as itself.
+    pub fn from_dataset(dataset: &Dataset, images: &[Image]) -> Self {
+        let (views, states) = (dataset.view_count(), dataset.state_count());
+        let mut index = vec![None; views * states];
+        for (i, frame) in dataset.frames().iter().enumerate().take(images.len()) {
+            if let (Some(view), Some(state)) = (frame.view, frame.state) {
+                index[view * states + state] = Some(i);
+            }
+        }
+        let same = (0..views)
+            .into_par_iter()
+            .flat_map_iter(|view| {
+                let of_view = &index[view * states..(view + 1) * states];
+                let mut same = vec![false; states * states];
+                for a in 0..states {
+                    same[a * states + a] = true;
+                    for b in 0..a {
+                        let equal = match (of_view[a], of_view[b]) {
+                            (Some(a), Some(b)) => looks_same(&images[a], &images[b]),
+                            _ => false,
+                        };
+                        same[a * states + b] = equal;
+                        same[b * states + a] = equal;
+                    }
+                }
+                same
+            })
+            .collect();
+        Self { states, same }
+    }
+
+    /// Whether states `a` and `b` look the same from `view`. Out of range, only equal indices do.
+    pub fn same(&self, view: usize, a: usize, b: usize) -> bool {
+        if a >= self.states || b >= self.states {
+            return a == b;
+        }
+        self.same.get((view * self.states + a) * self.states + b).copied().unwrap_or(a == b)
+    }
+
+    /// How many states look like `state` from `view`, itself counted: at least 1.
+    pub fn class_size(&self, view: usize, state: usize) -> usize {
+        (0..self.states).filter(|&other| self.same(view, state, other)).count().max(1)
+    }
+
+    /// The best mean accuracy of naming the state from a picture, over the given (view, state) pairs: the mean of
+    /// 1 / class size. `None` when there are no pairs.
+    pub fn ceiling(&self, pairs: impl IntoIterator<Item = (usize, usize)>) -> Option<f64> {
+        let (mut sum, mut count) = (0.0, 0_usize);
+        for (view, state) in pairs {
+            sum += 1.0 / self.class_size(view, state) as f64;
+            count += 1;
+        }
+        (count > 0).then(|| sum / count as f64)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Eight pixels may differ, nine may not; a difference of 12 does not count, one of 13 does.
+    #[test]
+    fn the_limits_are_exact() {
+        let a = Image::filled(8, 8, [100; 3]);
+        let with = |pixels: usize, difference: u8| {
+            let mut b = a.clone();
+            for i in 0..pixels {
+                b.rgb[i * 3 + i % 3] += difference;
+            }
+            b
+        };
+        assert!(looks_same(&a, &with(8, 13)));
+        assert!(!looks_same(&a, &with(9, 13)));
+        assert!(looks_same(&a, &with(64, 12)));
+        assert!(!looks_same(&a, &Image::filled(8, 9, [100; 3])));
+    }
+
+    /// One view, three states of which two look the same: class sizes 2, 2, 1, ceiling (1/2 + 1/2 + 1) / 3.
+    #[test]
+    fn ceiling_of_a_known_case() {
+        let e = Equivalence { states: 3, same: vec![true, true, false, true, true, false, false, false, true] };
+        assert_eq!([0, 1, 2].map(|s| e.class_size(0, s)), [2, 2, 1]);
+        let ceiling = e.ceiling((0..3).map(|s| (0, s))).unwrap();
+        assert!((ceiling - 2.0 / 3.0).abs() < 1e-12);
+        assert_eq!(e.ceiling([]), None);
+        assert!(e.same(0, 0, 1) && !e.same(0, 0, 2) && e.same(9, 5, 5) && !e.same(9, 0, 1));
+    }
+}

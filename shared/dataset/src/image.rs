@@ -1,0 +1,209 @@
+//! Pictures in memory and as PNG files.
+
+use std::fs::File;
+use std::io::{BufReader, BufWriter};
+use std::path::Path;
+
+use image::codecs::png::{PngDecoder, PngEncoder};
+use image::{ColorType, ExtendedColorType, ImageDecoder, ImageEncoder, Limits};
+
+use crate::dataset::MAX_IMAGE_SIDE_PX;
+use crate::error::DatasetError;
+
+/// An 8-bit RGB picture, row-major from the top left.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Image {
+    /// Width, pixels.
+    pub width_px: u32,
+    /// Height, pixels.
+    pub height_px: u32,
+    /// Height x width x 3 values, HWC, 0..=255.
+    pub rgb: Vec<u8>,
+}
+
+impl Image {
+    /// A picture of one colour.
+    pub fn filled(width_px: u32, height_px: u32, colour: [u8; 3]) -> Self {
+        Self { width_px, height_px, rgb: colour.repeat(width_px as usize * height_px as usize) }
+    }
+
+    /// The colour at column `x_px` and row `y_px`; `None` outside the picture.
+    pub fn pixel(&self, x_px: u32, y_px: u32) -> Option<[u8; 3]> {
+        if x_px >= self.width_px || y_px >= self.height_px {
+            return None;
+        }
+        let at = (y_px as usize * self.width_px as usize + x_px as usize) * 3;
+        self.rgb.get(at..at + 3).map(|p| [p[0], p[1], p[2]])
+    }
+
+    /// Copies `other` into this picture with its top left corner at (`x_px`, `y_px`); what falls outside is cut off.
+    pub fn paste(&mut self, other: &Image, x_px: u32, y_px: u32) {
+        if x_px >= self.width_px {
+            return;
+        }
+        let columns = other.width_px.min(self.width_px - x_px) as usize * 3;
+        let rows = other.height_px.min(self.height_px.saturating_sub(y_px));
+        for row in 0..rows as usize {
+            let from = row * other.width_px as usize * 3;
+            let to = ((y_px as usize + row) * self.width_px as usize + x_px as usize) * 3;
+            self.rgb[to..to + columns].copy_from_slice(&other.rgb[from..from + columns]);
+        }
+    }
+
+    /// Peak signal-to-noise ratio against a picture of the same size, decibels (peak 255); infinite when equal,
+    /// `None` when the sizes differ.
+    pub fn psnr_db(&self, other: &Image) -> Option<f64> {
+        if (self.width_px, self.height_px) != (other.width_px, other.height_px) {
+            return None;
+        }
+        let sum: f64 =
+            self.rgb.iter().zip(&other.rgb).map(|(&a, &b)| (f64::from(a) - f64::from(b)).powi(2)).sum::<f64>();
+        Some(10.0 * (255.0_f64 * 255.0 * self.rgb.len() as f64 / sum).log10())
+    }
+
+    /// Reads a PNG picture. Eight bits per channel are required. Grey becomes RGB with equal channels; an alpha
+    /// channel is dropped when every pixel is opaque and refused otherwise, since nothing says what lies behind it.
+    pub fn load_png(path: &Path) -> Result<Self, DatasetError> {
+        let problem = |problem: String| DatasetError::Image { path: path.to_owned(), problem };
+        let file = File::open(path).map_err(|source| DatasetError::Io { path: path.to_owned(), source })?;
+        let mut limits = Limits::default();
+        limits.max_image_width = Some(MAX_IMAGE_SIDE_PX);
+        limits.max_image_height = Some(MAX_IMAGE_SIDE_PX);
+        let decoder = PngDecoder::with_limits(BufReader::new(file), limits)
+            .map_err(|error| problem(format!("not a readable PNG picture: {error}")))?;
+        let (width_px, height_px) = decoder.dimensions();
+        if width_px > MAX_IMAGE_SIDE_PX || height_px > MAX_IMAGE_SIDE_PX {
+            return Err(problem(format!("{width_px}x{height_px} pixels; at most {MAX_IMAGE_SIDE_PX} a side")));
+        }
+        let color = decoder.color_type();
+        let channels = match color {
+            ColorType::Rgb8 => 3,
+            ColorType::Rgba8 => 4,
+            ColorType::L8 => 1,
+            ColorType::La8 => 2,
+            other => return Err(problem(format!("pixel type {other:?}; RGB with 8 bits per channel is needed"))),
+        };
+        let mut bytes = vec![0; decoder.total_bytes() as usize];
+        decoder.read_image(&mut bytes).map_err(|error| problem(format!("not a readable PNG picture: {error}")))?;
+        let opaque_part = if channels % 2 == 0 {
+            if let Some(at) = bytes.chunks_exact(channels).position(|pixel| pixel[channels - 1] != 255) {
+                let (x, y) = (at % width_px as usize, at / width_px as usize);
+                return Err(problem(format!(
+                    "pixel ({x}, {y}) is transparent; only opaque pictures are accepted, so compose it over its \
+                     background first"
+                )));
+            }
+            channels - 1
+        } else {
+            channels
+        };
+        let rgb = if channels == 3 {
+            bytes
+        } else {
+            bytes
+                .chunks_exact(channels)
+                .flat_map(|pixel| if opaque_part == 1 { [pixel[0]; 3] } else { [pixel[0], pixel[1], pixel[2]] })
+                .collect()
+        };
+        Ok(Self { width_px, height_px, rgb })
+    }
+
+    /// Writes the picture as an 8-bit RGB PNG file.
+    pub fn save_png(&self, path: &Path) -> Result<(), DatasetError> {
+        write_png(path, &self.rgb, self.width_px, self.height_px, ExtendedColorType::Rgb8)
+    }
+}
+
+/// Reads width and height from a PNG file's header, pixels.
+pub(crate) fn png_dimensions(path: &Path) -> Result<(u32, u32), DatasetError> {
+    let file = File::open(path).map_err(|source| DatasetError::Io { path: path.to_owned(), source })?;
+    let decoder = PngDecoder::new(BufReader::new(file)).map_err(|error| DatasetError::Image {
+        path: path.to_owned(),
+        problem: format!("not a readable PNG picture: {error}"),
+    })?;
+    Ok(decoder.dimensions())
+}
+
+/// Writes bytes of the given type as a PNG file.
+pub(crate) fn write_png(
+    path: &Path,
+    bytes: &[u8],
+    width_px: u32,
+    height_px: u32,
+    color: ExtendedColorType,
+) -> Result<(), DatasetError> {
+    let expected = (u64::from(width_px) * u64::from(height_px) * u64::from(color.bits_per_pixel())).div_ceil(8);
+    if bytes.len() as u64 != expected || width_px == 0 || height_px == 0 {
+        return Err(DatasetError::Image {
+            path: path.to_owned(),
+            problem: format!("{} bytes do not make a picture of {width_px}x{height_px} pixels", bytes.len()),
+        });
+    }
+    let file = File::create(path).map_err(|source| DatasetError::Io { path: path.to_owned(), source })?;
+    PngEncoder::new(BufWriter::new(file))
+        .write_image(bytes, width_px, height_px, color)
+        .map_err(|error| DatasetError::Image { path: path.to_owned(), problem: format!("cannot be written: {error}") })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn gradient() -> Image {
+        let rgb = (0..5 * 4 * 3).map(|v| (v * 4) as u8).collect();
+        Image { width_px: 5, height_px: 4, rgb }
+    }
+
+    /// What is written is read back, byte for byte.
+    #[test]
+    fn png_round_trip() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a.png");
+        gradient().save_png(&path).unwrap();
+        assert_eq!(Image::load_png(&path).unwrap(), gradient());
+    }
+
+    /// Opaque alpha is dropped, any transparency is refused and located, grey is spread, 16 bits are refused.
+    #[test]
+    fn other_pixel_types() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a.png");
+        let mut rgba: Vec<u8> = gradient().rgb.chunks(3).flat_map(|p| [p[0], p[1], p[2], 255]).collect();
+        write_png(&path, &rgba, 5, 4, ExtendedColorType::Rgba8).unwrap();
+        assert_eq!(Image::load_png(&path).unwrap(), gradient());
+        rgba[7 * 4 + 3] = 254;
+        write_png(&path, &rgba, 5, 4, ExtendedColorType::Rgba8).unwrap();
+        let message = Image::load_png(&path).unwrap_err().to_string();
+        assert!(message.contains("a.png: pixel (2, 1) is transparent"), "{message}");
+        write_png(&path, &[9; 20], 5, 4, ExtendedColorType::L8).unwrap();
+        assert_eq!(Image::load_png(&path).unwrap(), Image::filled(5, 4, [9; 3]));
+        write_png(&path, &[9; 40], 5, 4, ExtendedColorType::L16).unwrap();
+        let message = Image::load_png(&path).unwrap_err().to_string();
+        assert!(message.contains("L16") && message.contains("8 bits per channel"), "{message}");
+    }
+
+    /// A file that is no PNG, a cut-off file and a missing file are errors that name the file.
+    #[test]
+    fn broken_files_are_named() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("broken.png");
+        std::fs::write(&path, b"not a picture").unwrap();
+        assert!(Image::load_png(&path).unwrap_err().to_string().contains("broken.png: not a readable PNG"));
+        gradient().save_png(&path).unwrap();
+        let bytes = std::fs::read(&path).unwrap();
+        std::fs::write(&path, &bytes[..bytes.len() / 2]).unwrap();
+        assert!(Image::load_png(&path).unwrap_err().to_string().contains("broken.png: not a readable PNG"));
+        let missing = dir.path().join("missing.png");
+        assert!(Image::load_png(&missing).unwrap_err().to_string().contains("missing.png"));
+    }
+
+    /// One channel off by 1 in every pixel of a black picture is 10 log10(255^2 * 3) decibels.
+    #[test]
+    fn psnr_of_a_known_error() {
+        let black = Image::filled(4, 4, [0; 3]);
+        let off = Image::filled(4, 4, [1, 0, 0]);
+        let expected = 10.0 * (255.0_f64 * 255.0 * 3.0).log10();
+        assert!((black.psnr_db(&off).unwrap() - expected).abs() < 1e-9);
+        assert_eq!(black.psnr_db(&Image::filled(4, 5, [0; 3])), None);
+    }
+}

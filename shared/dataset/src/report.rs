@@ -1,0 +1,344 @@
+//! Statistics of a set, for people: what it holds, how hard it is, and whether hidden states leak.
+
+use std::collections::BTreeMap;
+use std::fmt;
+
+use crate::dataset::{Dataset, Observability, ScenarioInfo};
+use crate::equivalence::Equivalence;
+use crate::image::Image;
+
+/// A mean difference above this, of 255, between pictures that should look the same is a leak: nobody can see it,
+/// but a network can.
+const LEAK_LIMIT: f64 = 0.1;
+
+/// Pictures of one view at one timestamp in two branches, in neither of which the actor's place can be seen.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct HiddenPair {
+    /// Camera pose.
+    pub view: usize,
+    /// Step.
+    pub timestamp: usize,
+    /// The two branches.
+    pub branches: [usize; 2],
+    /// Mean absolute difference over pixels and channels, 0..=255.
+    pub mean_difference: f64,
+    /// Largest absolute difference, 0..=255.
+    pub max_difference: u8,
+}
+
+/// What `carff dataset check` prints.
+#[derive(Clone, Debug)]
+pub struct DatasetReport {
+    /// Where the set lies.
+    pub dir: String,
+    /// Number of pictures.
+    pub frames: usize,
+    /// Number of camera poses.
+    pub views: usize,
+    /// Pictures of each size (width, height), pixels.
+    pub image_sizes: BTreeMap<(u32, u32), usize>,
+    /// Poses of each kind.
+    pub view_kinds: BTreeMap<String, usize>,
+    /// The scenario.
+    pub scenario: Option<ScenarioInfo>,
+    /// Pictures per (branch, timestamp), by observability: full, partial, none, unknown.
+    pub counts: BTreeMap<(usize, usize), [usize; 4]>,
+    /// Mean over pictures of the PSNR of the mean picture of their pose, decibels; pictures that equal it are left
+    /// out. It is what a model scores that knows the pose and nothing else.
+    pub pose_mean_psnr_db: Option<f64>,
+    /// The same for the bird's-eye view alone.
+    pub bev_pose_mean_psnr_db: Option<f64>,
+    /// Best possible accuracy of naming the state: over all pictures, and by observability.
+    pub ceiling: Option<f64>,
+    /// See `ceiling`; full, partial, none.
+    pub ceiling_by_observability: [Option<f64>; 3],
+    /// Every pair of pictures that should look the same because the actor's place is hidden.
+    pub hidden_pairs: Vec<HiddenPair>,
+    /// What looks odd.
+    pub warnings: Vec<String>,
+}
+
+impl DatasetReport {
+    /// Measures a set. `images` are those of [`Dataset::load_all_images`].
+    pub fn of(dataset: &Dataset, images: &[Image]) -> Self {
+        let mut image_sizes = BTreeMap::new();
+        for image in images {
+            *image_sizes.entry((image.width_px, image.height_px)).or_insert(0) += 1;
+        }
+        let mut kind_of_view = BTreeMap::new();
+        let mut counts: BTreeMap<(usize, usize), [usize; 4]> = BTreeMap::new();
+        for frame in dataset.frames() {
+            if let (Some(view), Some(kind)) = (frame.view, &frame.view_kind) {
+                kind_of_view.insert(view, kind.clone());
+            }
+            if let (Some(branch), Some(timestamp)) = (frame.branch, frame.timestamp) {
+                counts.entry((branch, timestamp)).or_default()[column(frame.observability)] += 1;
+            }
+        }
+        let mut view_kinds = BTreeMap::new();
+        for kind in kind_of_view.into_values() {
+            *view_kinds.entry(kind).or_insert(0) += 1;
+        }
+        let bev_view = dataset.scenario().and_then(|s| s.bev_view);
+        let equivalence = Equivalence::from_dataset(dataset, images);
+        let pairs_where = |wanted: Option<Observability>| {
+            dataset
+                .frames()
+                .iter()
+                .filter(move |f| wanted.is_none() || f.observability == wanted)
+                .filter_map(|f| f.view.zip(f.state))
+        };
+        let hidden_pairs = hidden_pairs(dataset, images);
+        let mut warnings = dataset.warnings().to_vec();
+        for pair in hidden_pairs.iter().filter(|p| p.mean_difference > LEAK_LIMIT) {
+            warnings.push(format!(
+                "view {} at timestamp {}: the actor is hidden, yet branches {} and {} differ by a mean of {:.3} of 255; \
+                 a network can learn to see that",
+                pair.view, pair.timestamp, pair.branches[0], pair.branches[1], pair.mean_difference
+            ));
+        }
+        Self {
+            dir: dataset.dir().display().to_string(),
+            frames: dataset.frames().len(),
+            views: dataset.view_count(),
+            image_sizes,
+            view_kinds,
+            scenario: dataset.scenario().cloned(),
+            counts,
+            pose_mean_psnr_db: pose_mean_psnr(dataset, images, None),
+            bev_pose_mean_psnr_db: bev_view.and_then(|view| pose_mean_psnr(dataset, images, Some(view))),
+            ceiling: equivalence.ceiling(pairs_where(None)),
+            ceiling_by_observability: Observability::ALL.map(|o| equivalence.ceiling(pairs_where(Some(o)))),
+            hidden_pairs,
+            warnings,
+        }
+    }
+}
+
+fn column(observability: Option<Observability>) -> usize {
+    match observability {
+        Some(Observability::Full) => 0,
+        Some(Observability::Partial) => 1,
+        Some(Observability::None) => 2,
+        None => 3,
+    }
+}
+
+fn pose_mean_psnr(dataset: &Dataset, images: &[Image], only: Option<usize>) -> Option<f64> {
+    let mut by_view: BTreeMap<usize, Vec<&Image>> = BTreeMap::new();
+    for (frame, image) in dataset.frames().iter().zip(images) {
+        if let Some(view) = frame.view.filter(|v| only.is_none_or(|only| only == *v)) {
+            by_view.entry(view).or_default().push(image);
+        }
+    }
+    let (mut sum, mut count) = (0.0, 0_usize);
+    for of_view in by_view.values().filter(|v| v.len() > 1) {
+        let size = of_view[0].rgb.len();
+        if of_view.iter().any(|image| image.rgb.len() != size) {
+            continue;
+        }
+        let mut mean = vec![0.0_f64; size];
+        for image in of_view {
+            mean.iter_mut().zip(&image.rgb).for_each(|(m, v)| *m += f64::from(*v) / of_view.len() as f64);
+        }
+        for image in of_view {
+            let error: f64 = mean.iter().zip(&image.rgb).map(|(m, v)| (m - f64::from(*v)).powi(2)).sum::<f64>();
+            if error > 0.0 {
+                sum += 10.0 * (255.0_f64.powi(2) * size as f64 / error).log10();
+                count += 1;
+            }
+        }
+    }
+    (count > 0).then(|| sum / count as f64)
+}
+
+fn hidden_pairs(dataset: &Dataset, images: &[Image]) -> Vec<HiddenPair> {
+    let mut hidden: BTreeMap<(usize, usize), Vec<(usize, usize)>> = BTreeMap::new();
+    for (i, frame) in dataset.frames().iter().enumerate().take(images.len()) {
+        if let (Some(view), Some(branch), Some(timestamp), Some(Observability::None)) =
+            (frame.view, frame.branch, frame.timestamp, frame.observability)
+        {
+            hidden.entry((view, timestamp)).or_default().push((branch, i));
+        }
+    }
+    let is_hazard = |branch: usize| dataset.scenario().is_some_and(|s| s.is_hazard(branch));
+    let mut pairs = Vec::new();
+    for ((view, timestamp), branches) in hidden {
+        for (n, &(branch_a, a)) in branches.iter().enumerate() {
+            for &(branch_b, b) in &branches[n + 1..] {
+                if is_hazard(branch_a) == is_hazard(branch_b) || images[a].rgb.len() != images[b].rgb.len() {
+                    continue;
+                }
+                let differences = images[a].rgb.iter().zip(&images[b].rgb).map(|(a, b)| a.abs_diff(*b));
+                let sum: u64 = differences.clone().map(u64::from).sum();
+                pairs.push(HiddenPair {
+                    view,
+                    timestamp,
+                    branches: [branch_a, branch_b],
+                    mean_difference: sum as f64 / images[a].rgb.len().max(1) as f64,
+                    max_difference: differences.max().unwrap_or(0),
+                });
+            }
+        }
+    }
+    pairs
+}
+
+impl fmt::Display for DatasetReport {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let decibels = |v: Option<f64>| v.map_or_else(|| "-".to_owned(), |v| format!("{v:.2} dB"));
+        let percent = |v: Option<f64>| v.map_or_else(|| "-".to_owned(), |v| format!("{:.1} %", v * 100.0));
+        writeln!(f, "Data set    {}", self.dir)?;
+        let sizes: Vec<String> = self.image_sizes.iter().map(|((w, h), n)| format!("{n} of {w}x{h} px")).collect();
+        writeln!(f, "Pictures    {} ({})", self.frames, sizes.join(", "))?;
+        let kinds: Vec<String> = self.view_kinds.iter().map(|(kind, n)| format!("{n} {kind}")).collect();
+        let kinds = if kinds.is_empty() { String::new() } else { format!(" ({})", kinds.join(", ")) };
+        writeln!(f, "Poses       {}{kinds}", self.views)?;
+        let Some(scenario) = &self.scenario else {
+            writeln!(f, "Scenario    none: a plain set, one state")?;
+            return self.fmt_warnings(f);
+        };
+        writeln!(
+            f,
+            "Scenario    {}: {} branches x {} timestamps, bird's-eye view {}",
+            scenario.name,
+            scenario.branches.len(),
+            scenario.timestamps,
+            scenario.bev_view.map_or_else(|| "not named".to_owned(), |v| v.to_string())
+        )?;
+        let [low, high] = scenario.bounds;
+        writeln!(f, "Bounds      {low:?} to {high:?} m")?;
+        let hazards: Vec<&str> =
+            scenario.hazard_branches.iter().filter_map(|&b| scenario.branches.get(b)).map(String::as_str).collect();
+        writeln!(
+            f,
+            "Actions     {} in {}, else {}",
+            scenario.hazard_action,
+            if hazards.is_empty() { "no branch".to_owned() } else { hazards.join(", ") },
+            scenario.clear_action
+        )?;
+        let width = scenario.branches.iter().map(|b| b.chars().count()).max().unwrap_or(0).max(6);
+        writeln!(f, "\n{:width$}  {:>4} {:>6} {:>8} {:>6} {:>8}", "branch", "t", "full", "partial", "none", "unknown")?;
+        for (&(branch, timestamp), row) in &self.counts {
+            let name = scenario.branches.get(branch).map_or("?", String::as_str);
+            writeln!(f, "{name:width$}  {timestamp:>4} {:>6} {:>8} {:>6} {:>8}", row[0], row[1], row[2], row[3])?;
+        }
+        writeln!(f, "\nMean picture of each pose: {}", decibels(self.pose_mean_psnr_db))?;
+        writeln!(f, "  in the bird's-eye view:  {}", decibels(self.bev_pose_mean_psnr_db))?;
+        writeln!(f, "Best possible state accuracy: {}", percent(self.ceiling))?;
+        for (o, ceiling) in Observability::ALL.into_iter().zip(self.ceiling_by_observability) {
+            writeln!(f, "  {:<8} {:>8}", o.name(), percent(ceiling))?;
+        }
+        let pairs = self.hidden_pairs.len();
+        if pairs == 0 {
+            writeln!(f, "Hidden pairs: none")?;
+        } else {
+            let mean = self.hidden_pairs.iter().map(|p| p.mean_difference).sum::<f64>() / pairs as f64;
+            let worst = self.hidden_pairs.iter().map(|p| p.mean_difference).fold(0.0, f64::max);
+            let max = self.hidden_pairs.iter().map(|p| p.max_difference).max().unwrap_or(0);
+            writeln!(
+                f,
+                "Hidden pairs: {pairs}, with and without the actor differ by a mean of {mean:.4} of 255 (worst pair \
+                 {worst:.4}, worst value {max})"
+            )?;
+        }
+        self.fmt_warnings(f)
+    }
+}
+
+impl DatasetReport {
+    fn fmt_warnings(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        for warning in &self.warnings {
+            writeln!(f, "warning: {warning}")?;
+        }
+        Ok(())
+    }
+}
+
+/// How a contact sheet is laid out.
+#[derive(Clone, Copy, Debug)]
+pub struct SheetOptions {
+    /// Views, one a column.
+    pub columns: usize,
+    /// States, one a row.
+    pub max_rows: usize,
+    /// Space between pictures, pixels.
+    pub gap_px: u32,
+}
+
+impl Default for SheetOptions {
+    fn default() -> Self {
+        Self { columns: 12, max_rows: 16, gap_px: 2 }
+    }
+}
+
+/// Border colours of a contact sheet: green `full`, yellow `partial`, red `none`, grey unknown.
+const LEGEND: [[u8; 3]; 4] = [[40, 160, 60], [230, 190, 30], [205, 50, 45], [128, 128, 128]];
+const BORDER_PX: u32 = 2;
+
+/// One picture of the whole set: a row per state, a column per view, the views spread over kinds of cameras (the
+/// bird's-eye view first). Each picture's border tells its observability: green full, yellow partial, red none, grey
+/// unknown. A set without views is shown in the order of its frames.
+pub fn contact_sheet(dataset: &Dataset, images: &[Image], options: SheetOptions) -> Image {
+    let columns = options.columns.max(1);
+    let rows: Vec<Vec<usize>> = if dataset.view_count() == 0 {
+        let all: Vec<usize> = (0..images.len()).collect();
+        all.chunks(columns).take(options.max_rows.max(1)).map(<[usize]>::to_vec).collect()
+    } else {
+        let views = spread_views(dataset, columns);
+        (0..dataset.state_count().min(options.max_rows.max(1)))
+            .map(|state| views.iter().filter_map(|&v| dataset.frame_index(state, v)).collect())
+            .collect()
+    };
+    let cell_w = images.iter().map(|i| i.width_px).max().unwrap_or(1) + 2 * BORDER_PX;
+    let cell_h = images.iter().map(|i| i.height_px).max().unwrap_or(1) + 2 * BORDER_PX;
+    let columns = rows.iter().map(Vec::len).max().unwrap_or(1).max(1) as u32;
+    let gap = options.gap_px;
+    let mut sheet = Image::filled(
+        columns * cell_w + (columns - 1) * gap,
+        (rows.len().max(1) as u32) * cell_h + (rows.len().max(1) as u32 - 1) * gap,
+        [255; 3],
+    );
+    for (row, frames) in rows.iter().enumerate() {
+        for (at, &frame) in frames.iter().enumerate() {
+            let Some(image) = images.get(frame) else { continue };
+            let colour = LEGEND[column(dataset.frames()[frame].observability)];
+            let (x, y) = (at as u32 * (cell_w + gap), row as u32 * (cell_h + gap));
+            let border = Image::filled(image.width_px + 2 * BORDER_PX, image.height_px + 2 * BORDER_PX, colour);
+            sheet.paste(&border, x, y);
+            sheet.paste(image, x + BORDER_PX, y + BORDER_PX);
+        }
+    }
+    sheet
+}
+
+/// Views that show what the set holds: the bird's-eye one, then each kind's in turn, evenly spaced within the kind.
+fn spread_views(dataset: &Dataset, count: usize) -> Vec<usize> {
+    let bev = dataset.scenario().and_then(|s| s.bev_view);
+    let mut kinds: Vec<(Option<&str>, Vec<usize>)> = Vec::new();
+    let mut seen = vec![false; dataset.view_count()];
+    for frame in dataset.frames() {
+        let Some(view) = frame.view.filter(|v| Some(*v) != bev) else { continue };
+        if std::mem::replace(&mut seen[view], true) {
+            continue;
+        }
+        let kind = frame.view_kind.as_deref();
+        match kinds.iter_mut().find(|(k, _)| *k == kind) {
+            Some((_, views)) => views.push(view),
+            None => kinds.push((kind, vec![view])),
+        }
+    }
+    let wanted = count.saturating_sub(bev.iter().count());
+    let mut take = vec![0; kinds.len()];
+    let mut taken = 0;
+    while taken < wanted && kinds.iter().zip(&take).any(|((_, views), &n)| n < views.len()) {
+        for ((_, views), n) in kinds.iter().zip(&mut take) {
+            if taken < wanted && *n < views.len() {
+                *n += 1;
+                taken += 1;
+            }
+        }
+    }
+    let spread = kinds.iter().zip(take).flat_map(|((_, views), n)| (0..n).map(move |i| views[i * views.len() / n]));
+    bev.into_iter().chain(spread).take(count).collect()
+}

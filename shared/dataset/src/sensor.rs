@@ -1,0 +1,208 @@
+//! The noise of a small camera: read noise, exposure and white balance that vary from frame to frame.
+//!
+//! One function serves the camera stage and training alike, so that a model meets in use what it was trained on.
+//! All draws come from the counter-based stream of a key: the same key gives the same bytes.
+
+use carff_random::Key;
+use rand::Rng;
+use rand_distr::StandardNormal;
+use serde::{Deserialize, Serialize};
+
+/// How noisy the sensor is. All zero: the picture passes unchanged.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct SensorNoise {
+    /// Standard deviation of the read noise, per pixel and channel, in units of 1/255. 0 to 64.
+    pub sigma: f32,
+    /// Standard deviation of the exposure's relative error, one draw a frame. 0 to 0.5.
+    pub gain_sigma: f32,
+    /// Standard deviation of each channel's relative gain error (white balance), one draw a frame. 0 to 0.5.
+    pub channel_gain_sigma: f32,
+    /// Standard deviation of each channel's offset, one draw a frame, in units of 1/255. 0 to 64.
+    pub channel_offset_sigma: f32,
+}
+
+impl Default for SensorNoise {
+    fn default() -> Self {
+        Self { sigma: 2.0, gain_sigma: 0.02, channel_gain_sigma: 0.01, channel_offset_sigma: 1.0 }
+    }
+}
+
+/// Why noise cannot be applied.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum SensorError {
+    /// A setting out of range.
+    #[error("sensor noise: `{key}` is {value}; allowed are 0 to {limit}")]
+    OutOfRange {
+        /// Which setting.
+        key: &'static str,
+        /// Its value.
+        value: f32,
+        /// The largest allowed value.
+        limit: f32,
+    },
+    /// Source and destination have different lengths, or a length that is not made of RGB pixels.
+    #[error("sensor noise: {source_len} bytes into {destination_len}; both must be the same multiple of 3")]
+    Lengths {
+        /// Bytes in the source.
+        source_len: usize,
+        /// Bytes in the destination.
+        destination_len: usize,
+    },
+}
+
+/// Names this use of the run's seed, so that no other draw of the same run shares the stream.
+const STREAM: u64 = 0x7365_6e73_6f72_6e7a;
+
+impl SensorNoise {
+    /// No noise at all.
+    pub const OFF: Self = Self { sigma: 0.0, gain_sigma: 0.0, channel_gain_sigma: 0.0, channel_offset_sigma: 0.0 };
+
+    /// Checks that each setting is finite and in range.
+    pub fn validate(&self) -> Result<(), SensorError> {
+        for (key, value, limit) in [
+            ("sigma", self.sigma, 64.0),
+            ("gain_sigma", self.gain_sigma, 0.5),
+            ("channel_gain_sigma", self.channel_gain_sigma, 0.5),
+            ("channel_offset_sigma", self.channel_offset_sigma, 64.0),
+        ] {
+            if !(0.0..=limit).contains(&value) {
+                return Err(SensorError::OutOfRange { key, value, limit });
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Writes `source` (RGB, 8 bit) with noise into `destination`, each byte once and in order, so that the destination
+/// can be a loaned sample in shared memory. Nothing is allocated. The same key gives the same noise.
+pub fn apply_noise_into(
+    source: &[u8],
+    destination: &mut [u8],
+    noise: &SensorNoise,
+    key: Key,
+) -> Result<(), SensorError> {
+    noise.validate()?;
+    if source.len() != destination.len() || !source.len().is_multiple_of(3) {
+        return Err(SensorError::Lengths { source_len: source.len(), destination_len: destination.len() });
+    }
+    if *noise == SensorNoise::OFF {
+        destination.copy_from_slice(source);
+        return Ok(());
+    }
+    transform(source.iter().copied(), destination, noise, key);
+    Ok(())
+}
+
+/// [`apply_noise_into`], in place.
+pub fn apply_noise(rgb: &mut [u8], noise: &SensorNoise, key: Key) -> Result<(), SensorError> {
+    noise.validate()?;
+    if !rgb.len().is_multiple_of(3) {
+        return Err(SensorError::Lengths { source_len: rgb.len(), destination_len: rgb.len() });
+    }
+    if *noise == SensorNoise::OFF {
+        return Ok(());
+    }
+    let mut pixels = Noise::new(noise, key);
+    for pixel in rgb.chunks_exact_mut(3) {
+        for (channel, value) in pixel.iter_mut().enumerate() {
+            *value = pixels.next(channel, *value);
+        }
+    }
+    Ok(())
+}
+
+fn transform(source: impl Iterator<Item = u8>, destination: &mut [u8], noise: &SensorNoise, key: Key) {
+    let mut pixels = Noise::new(noise, key);
+    for (i, (to, from)) in destination.iter_mut().zip(source).enumerate() {
+        *to = pixels.next(i % 3, from);
+    }
+}
+
+/// The draws of one frame.
+struct Noise<R> {
+    rng: R,
+    sigma: f32,
+    gain: [f32; 3],
+    offset: [f32; 3],
+}
+
+impl Noise<()> {
+    #[allow(clippy::new_ret_no_self)]
+    fn new(noise: &SensorNoise, key: Key) -> Noise<impl Rng> {
+        let mut rng = carff_random::stream(Key { seed: key.seed ^ STREAM, ..key });
+        let mut normal = |sigma: f32| sigma * rng.sample::<f32, _>(StandardNormal);
+        let exposure = 1.0 + normal(noise.gain_sigma);
+        let gain = [0; 3].map(|_| exposure * (1.0 + normal(noise.channel_gain_sigma)));
+        let offset = [0; 3].map(|_| normal(noise.channel_offset_sigma));
+        Noise { rng, sigma: noise.sigma, gain, offset }
+    }
+}
+
+impl<R: Rng> Noise<R> {
+    fn next(&mut self, channel: usize, value: u8) -> u8 {
+        let read = if self.sigma > 0.0 { self.sigma * self.rng.sample::<f32, _>(StandardNormal) } else { 0.0 };
+        // The cast saturates at 0 and 255.
+        (f32::from(value) * self.gain[channel] + self.offset[channel] + read).round() as u8
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const KEY: Key = Key { seed: 5, frame: 17, step: 0, sample: 0 };
+
+    /// The same key gives the same bytes, in place or not; another key gives others.
+    #[test]
+    fn noise_is_named_by_its_key() {
+        let source = vec![128_u8; 64 * 64 * 3];
+        let mut a = vec![0; source.len()];
+        apply_noise_into(&source, &mut a, &SensorNoise::default(), KEY).unwrap();
+        let mut b = source.clone();
+        apply_noise(&mut b, &SensorNoise::default(), KEY).unwrap();
+        assert_eq!(a, b);
+        apply_noise_into(&source, &mut b, &SensorNoise::default(), Key { frame: 18, ..KEY }).unwrap();
+        assert_ne!(a, b);
+    }
+
+    /// Read noise of sigma 4 on mid grey has mean 0 and variance 16 + 1/12 (rounding), within 5 standard errors.
+    #[test]
+    fn read_noise_has_its_variance() {
+        let n = 128 * 128 * 3;
+        let mut rgb = vec![128_u8; n];
+        apply_noise(&mut rgb, &SensorNoise { sigma: 4.0, ..SensorNoise::OFF }, KEY).unwrap();
+        let n = n as f64;
+        let mean = rgb.iter().map(|&v| f64::from(v) - 128.0).sum::<f64>() / n;
+        let variance = rgb.iter().map(|&v| (f64::from(v) - 128.0 - mean).powi(2)).sum::<f64>() / n;
+        let expected = 16.0 + 1.0 / 12.0;
+        assert!(mean.abs() < 5.0 * (expected / n).sqrt(), "{mean}");
+        assert!((variance - expected).abs() < 5.0 * expected * (2.0 / n).sqrt(), "{variance}");
+    }
+
+    /// Gain and offset are one draw a frame: with no read noise, equal pixels stay equal within a channel.
+    #[test]
+    fn colour_changes_are_global() {
+        let mut rgb = vec![100_u8; 30];
+        let noise = SensorNoise { sigma: 0.0, gain_sigma: 0.2, channel_gain_sigma: 0.2, channel_offset_sigma: 10.0 };
+        apply_noise(&mut rgb, &noise, KEY).unwrap();
+        assert!(rgb.chunks(3).all(|p| p == &rgb[..3]));
+        assert_ne!(rgb[..3], [100; 3]);
+    }
+
+    /// No noise is a copy, black and white do not wrap around, and bad settings or lengths are refused.
+    #[test]
+    fn limits() {
+        let source = [0_u8, 255, 7];
+        let mut to = [1; 3];
+        apply_noise_into(&source, &mut to, &SensorNoise::OFF, KEY).unwrap();
+        assert_eq!(source, to);
+        let mut white = vec![255_u8; 300];
+        apply_noise(&mut white, &SensorNoise { sigma: 8.0, ..SensorNoise::OFF }, KEY).unwrap();
+        assert!(white.iter().all(|&v| v > 200));
+        let error = apply_noise(&mut white, &SensorNoise { sigma: f32::NAN, ..SensorNoise::OFF }, KEY).unwrap_err();
+        assert_eq!(error.to_string(), "sensor noise: `sigma` is NaN; allowed are 0 to 64");
+        assert!(apply_noise_into(&source, &mut [0; 2], &SensorNoise::OFF, KEY).is_err());
+        assert!(apply_noise(&mut [0; 4], &SensorNoise::OFF, KEY).is_err());
+    }
+}
