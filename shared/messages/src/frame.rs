@@ -9,7 +9,7 @@ use iceoryx2::prelude::ZeroCopySend;
 
 /// An ideal pinhole camera's intrinsics, pixels.
 #[repr(C)]
-#[derive(Clone, Copy, Debug, PartialEq, ZeroCopySend)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, ZeroCopySend)]
 #[type_name("carff.Intrinsics.v1")]
 pub struct Intrinsics {
     /// Focal length along x.
@@ -41,7 +41,7 @@ impl Intrinsics {
 
 /// Where in a data set a frame comes from: the truth, for reports alone. No stage of the decision path reads it.
 #[repr(C)]
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ZeroCopySend)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ZeroCopySend)]
 #[type_name("carff.DatasetView.v1")]
 pub struct DatasetView {
     /// 1 when the rest is known, else 0.
@@ -94,7 +94,7 @@ impl DatasetView {
 
 /// Describes a camera frame: RGB, 8 bit, rows from the top (height x width x 3 bytes).
 #[repr(C)]
-#[derive(Clone, Copy, Debug, PartialEq, ZeroCopySend)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, ZeroCopySend)]
 #[type_name("carff.FrameMeta.v1")]
 pub struct FrameMeta {
     /// Header, at step 0.
@@ -131,7 +131,7 @@ impl PictureMeta for FrameMeta {
 
 /// Describes a rendered view: RGB, 8 bit, rows from the top (height x width x 3 bytes).
 #[repr(C)]
-#[derive(Clone, Copy, Debug, PartialEq, ZeroCopySend)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, ZeroCopySend)]
 #[type_name("carff.ViewMeta.v1")]
 pub struct ViewMeta {
     /// Header, at the step of the hypothesis.

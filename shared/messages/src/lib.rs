@@ -51,7 +51,7 @@ pub const MAX_PICTURE_BYTES: usize = 1 << 24;
 
 /// What every message carries: enough to follow one frame through every stage.
 #[repr(C)]
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ZeroCopySend)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ZeroCopySend)]
 #[type_name("carff.Header.v1")]
 pub struct Header {
     /// [`SCHEMA_VERSION`] of the sender. Set on send.
@@ -110,8 +110,9 @@ pub trait Message: Copy {
     fn validate(&self) -> Result<(), Invalid>;
 }
 
-/// A message that describes a picture in the slice that it comes with.
-pub trait PictureMeta: Message {
+/// A message that describes a picture in the slice that it comes with. Its default is not valid: a loan holds it until
+/// the real one is written.
+pub trait PictureMeta: Message + Default {
     /// How many bytes the slice must have. Meaningful once [`Message::validate`] has passed.
     fn picture_bytes(&self) -> usize;
 }

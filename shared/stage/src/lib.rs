@@ -1,1 +1,39 @@
-//! What every stage process does the same way: start, log, report health, stop.
+//! What every stage process does the same way: arguments, log, health, waiting, stopping, exit code.
+//! What a stage computes lives in its own crate.
+//!
+//! A stage's `main` reads from top to bottom: open topics, say that it is ready, then receive, compute, publish.
+//!
+//! ```no_run
+//! use carff_messages::{Gaussian, Posterior, Stage};
+//! use carff_stage::StageContext;
+//! use carff_transport::{monotonic_now_ns, topics};
+//!
+//! fn main() -> std::process::ExitCode {
+//!     carff_stage::main(Stage::Encoder, run)
+//! }
+//!
+//! fn run(stage: &mut StageContext) -> anyhow::Result<()> {
+//!     let mut frames = stage.picture_input(&topics::FRAME)?;
+//!     let mut posteriors = stage.output(&topics::POSTERIOR)?;
+//!     stage.ready();
+//!     while stage.wait(&[&frames])? {
+//!         let Some(frame) = frames.newest()? else { continue };
+//!         let started_ns = monotonic_now_ns();
+//!         let gaussian = Gaussian::standard(); // computed from frame.meta() and frame.bytes(), read in place
+//!         let header = frame.meta().header;
+//!         let stage_latency_ns = stage.worked(&header, started_ns);
+//!         posteriors.send(Posterior { header, gaussian, stage_latency_ns })?;
+//!     }
+//!     Ok(())
+//! }
+//! ```
+//!
+//! Exit codes: 0 when it has done its work or was asked to stop, 1 after an error (one sentence on standard error),
+//! 2 for wrong arguments.
+
+mod args;
+mod context;
+mod health;
+
+pub use args::StageArgs;
+pub use context::{StageContext, main};

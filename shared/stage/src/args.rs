@@ -1,0 +1,87 @@
+//! The arguments that all stages take.
+
+use clap::Parser;
+use std::ffi::OsString;
+use std::path::{Path, PathBuf};
+
+/// One stage of a CARFF graph. `carff launch` starts them all; by hand, give each the same run name and id.
+#[derive(Clone, Debug, PartialEq, Eq, Parser)]
+#[command(version)]
+pub struct StageArgs {
+    /// The graph file.
+    #[arg(long)]
+    pub graph: PathBuf,
+    /// Run name, in place of the graph file's.
+    #[arg(long)]
+    pub run: Option<String>,
+    /// Run id: the same for all stages of a run.
+    #[arg(long, default_value_t = 0)]
+    pub run_id: u64,
+    /// Data set folder, in place of the graph file's.
+    #[arg(long)]
+    pub dataset: Option<PathBuf>,
+    /// Checkpoint folder, in place of the graph file's.
+    #[arg(long)]
+    pub checkpoint: Option<PathBuf>,
+    /// Camera: how many drives, in place of the graph file's.
+    #[arg(long)]
+    pub drives: Option<u32>,
+    /// Camera: stop after so many frames.
+    #[arg(long)]
+    pub frames: Option<u64>,
+    /// End when this process, the parent, ends.
+    #[arg(long)]
+    pub parent_pid: Option<u32>,
+}
+
+impl StageArgs {
+    /// The arguments of a stage of this run.
+    pub fn new(graph: &Path, run: &str, run_id: u64) -> Self {
+        Self {
+            graph: graph.to_owned(),
+            run: Some(run.to_owned()),
+            run_id,
+            dataset: None,
+            checkpoint: None,
+            drives: None,
+            frames: None,
+            parent_pid: None,
+        }
+    }
+
+    /// The command line that is read back as these arguments, without the program's name.
+    pub fn to_command_line(&self) -> Vec<OsString> {
+        let mut line: Vec<OsString> = vec!["--graph".into(), self.graph.clone().into()];
+        let mut add = |name: &str, value: Option<OsString>| {
+            if let Some(value) = value {
+                line.extend([OsString::from(name), value]);
+            }
+        };
+        add("--run", self.run.as_ref().map(Into::into));
+        add("--run-id", Some(self.run_id.to_string().into()));
+        add("--dataset", self.dataset.as_ref().map(Into::into));
+        add("--checkpoint", self.checkpoint.as_ref().map(Into::into));
+        add("--drives", self.drives.map(|n| n.to_string().into()));
+        add("--frames", self.frames.map(|n| n.to_string().into()));
+        add("--parent-pid", self.parent_pid.map(|n| n.to_string().into()));
+        line
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// What the launcher writes is what the stage reads.
+    #[test]
+    fn command_line_round_trips() {
+        let mut args = StageArgs::new("a b/graph.toml".as_ref(), "run-1", u64::MAX);
+        for _ in 0..2 {
+            let line = std::iter::once("stage".into()).chain(args.to_command_line());
+            assert_eq!(StageArgs::try_parse_from(line).unwrap(), args);
+            args.dataset = Some("data".into());
+            args.checkpoint = Some("checkpoint".into());
+            (args.drives, args.frames, args.parent_pid) = (Some(2), Some(30), Some(1));
+        }
+    }
+}

@@ -1,0 +1,232 @@
+//! A stage's surroundings: configuration, topics, waiting, and what it says of itself.
+
+use crate::StageArgs;
+use crate::health::{Heartbeat, Vitals};
+use anyhow::Context;
+use carff_config::{GraphConfig, LogLevel};
+use carff_messages::{Header, Health, HealthState, Message, PictureMeta, Stage};
+use carff_transport::{
+    Input, Node, PicturePublisher, PictureReceiver, PictureTopic, Publisher, Receiver, Run, Stop, Topic, Waiter, Woken,
+    monotonic_now_ns, topics,
+};
+use clap::Parser;
+use iceoryx2::prelude::ZeroCopySend;
+use rustix::process::{Signal, getppid, set_parent_process_death_signal};
+use std::fmt::Debug;
+use std::path::PathBuf;
+use std::process::ExitCode;
+use std::sync::Arc;
+use std::time::Duration;
+
+/// Runs a stage: everything around `run`, which opens topics, calls [`StageContext::ready`] and loops.
+pub fn main(stage: Stage, run: impl FnOnce(&mut StageContext) -> anyhow::Result<()>) -> ExitCode {
+    let args = StageArgs::parse();
+    match start(stage, args).and_then(|mut context| context.finish(run)) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("ERROR {stage}: {error:#}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+fn start(stage: Stage, args: StageArgs) -> anyhow::Result<StageContext> {
+    die_with_parent(args.parent_pid)?;
+    let graph = GraphConfig::load(&args.graph)?;
+    init_log(level(&graph, stage));
+    StageContext::new(stage, args, graph)
+}
+
+/// What a stage works with.
+#[derive(Debug)]
+pub struct StageContext {
+    /// Its own configuration is one field of this.
+    pub graph: GraphConfig,
+    /// The arguments.
+    pub args: StageArgs,
+    /// Folder of the data set.
+    pub dataset: PathBuf,
+    /// Folder of the trained models.
+    pub checkpoint: PathBuf,
+    /// Threads that it may use.
+    pub threads: usize,
+    stage: Stage,
+    deadline_ns: u64,
+    waiter: Waiter,
+    vitals: Arc<Vitals>,
+    begun: bool,
+    // Dropped in this order: the last heartbeat goes out before the node closes.
+    heartbeat: Option<Heartbeat>,
+    node: Node,
+}
+
+impl StageContext {
+    /// Joins the run and starts the heartbeat. [`main`] does this; tests call it in their own process.
+    pub fn new(stage: Stage, args: StageArgs, graph: GraphConfig) -> anyhow::Result<Self> {
+        let stop = Stop::on_signals().context("cannot handle signals")?;
+        let run = Run::new(args.run.as_deref().unwrap_or(&graph.run.name), args.run_id)?;
+        let node = Node::open(&run, stage.name())?;
+        let vitals = Arc::new(Vitals::new());
+        let publisher: Publisher<Health> = node.publisher(&topics::health(stage))?;
+        let counters = node.counters().clone();
+        let heartbeat = Heartbeat::start(stage, graph.run.seed, publisher, vitals.clone(), counters)
+            .context("cannot start the heartbeat")?;
+        let threads = match stage {
+            Stage::Encoder => graph.threads.encoder,
+            Stage::Forecaster => graph.threads.forecaster,
+            Stage::Prober => graph.threads.prober,
+            Stage::Renderer => graph.threads.renderer,
+            Stage::Camera | Stage::Controller => 1,
+        };
+        let deadline_ms = match stage {
+            Stage::Encoder => graph.encoder.deadline_ms,
+            Stage::Forecaster => graph.forecaster.deadline_ms,
+            Stage::Prober => graph.prober.deadline_ms,
+            Stage::Renderer => graph.renderer.deadline_ms,
+            Stage::Camera => (1000.0 / graph.run.frame_rate_hz) as u64,
+            Stage::Controller => graph.controller.deadline_ms,
+        };
+        Ok(Self {
+            dataset: graph.resolve(args.dataset.as_ref().unwrap_or(&graph.run.dataset)),
+            checkpoint: graph.resolve(args.checkpoint.as_ref().unwrap_or(&graph.run.checkpoint)),
+            threads: threads as usize,
+            stage,
+            deadline_ns: deadline_ms.max(1) * 1_000_000,
+            waiter: if graph.run.busy_polling { Waiter::busy_polling(stop) } else { Waiter::new(stop) },
+            vitals,
+            begun: false,
+            heartbeat: Some(heartbeat),
+            node,
+            graph,
+            args,
+        })
+    }
+
+    /// The run's seed.
+    pub fn seed(&self) -> u64 {
+        self.graph.run.seed
+    }
+
+    /// Opens a topic to receive from. Do this before [`StageContext::ready`].
+    pub fn input<M>(&self, topic: &Topic<M>) -> anyhow::Result<Receiver<M>>
+    where
+        M: Message + ZeroCopySend + Debug + 'static,
+    {
+        Ok(self.node.receiver(topic)?)
+    }
+
+    /// Opens a topic to send on.
+    pub fn output<M>(&self, topic: &Topic<M>) -> anyhow::Result<Publisher<M>>
+    where
+        M: Message + ZeroCopySend + Debug + 'static,
+    {
+        Ok(self.node.publisher(topic)?)
+    }
+
+    /// Opens a topic of pictures to receive from.
+    pub fn picture_input<M>(&self, topic: &PictureTopic<M>) -> anyhow::Result<PictureReceiver<M>>
+    where
+        M: PictureMeta + ZeroCopySend + Debug + 'static,
+    {
+        Ok(self.node.picture_receiver(topic)?)
+    }
+
+    /// Opens a topic of pictures of at most `max_bytes` each to send on.
+    pub fn picture_output<M>(&self, topic: &PictureTopic<M>, max_bytes: usize) -> anyhow::Result<PicturePublisher<M>>
+    where
+        M: PictureMeta + ZeroCopySend + Debug + 'static,
+    {
+        Ok(self.node.picture_publisher(topic, max_bytes)?)
+    }
+
+    /// Says that all topics are open and all models loaded. The launcher waits for it.
+    pub fn ready(&mut self) {
+        self.vitals.set_state(HealthState::Ok);
+        self.vitals.progress();
+        tracing::info!(threads = self.threads, "ready");
+    }
+
+    /// Sleeps until an input has a message; false when the stage shall end.
+    /// When an input that had begun goes quiet for longer than its topic's deadline, the stage's health says so.
+    pub fn wait(&mut self, inputs: &[&dyn Input]) -> anyhow::Result<bool> {
+        let patience = inputs.iter().map(|i| i.deadline()).min().unwrap_or(Duration::from_secs(1));
+        loop {
+            match self.wait_until(inputs, monotonic_now_ns() + patience.as_nanos() as u64)? {
+                Woken::Input => return Ok(true),
+                Woken::Stopped => return Ok(false),
+                Woken::Timeout if self.begun => self.vitals.set_state(HealthState::Stale),
+                Woken::Timeout => {}
+            }
+        }
+    }
+
+    /// Sleeps until an input has a message, a time on the monotonic clock (nanoseconds), or a stop.
+    pub fn wait_until(&mut self, inputs: &[&dyn Input], deadline_ns: u64) -> anyhow::Result<Woken> {
+        self.vitals.progress();
+        Ok(self.waiter.wait_until(inputs, deadline_ns)?)
+    }
+
+    /// Whether the stage shall end: for loops that compute for long without waiting.
+    pub fn is_stopped(&self) -> bool {
+        self.waiter.stop().is_stopped()
+    }
+
+    /// Notes that the work on a frame, begun at `started_ns`, is done. Returns the time it took, nanoseconds.
+    pub fn worked(&mut self, header: &Header, started_ns: u64) -> u64 {
+        let latency_ns = monotonic_now_ns().saturating_sub(started_ns);
+        self.begun = true;
+        self.vitals.worked(header, latency_ns);
+        self.vitals.set_state(if latency_ns > self.deadline_ns { HealthState::Slow } else { HealthState::Ok });
+        tracing::trace!(frame = header.frame_id, step = header.step, latency_us = latency_ns / 1000, "worked");
+        latency_ns
+    }
+
+    /// Counts and logs an error after which the stage goes on.
+    pub fn error(&mut self, error: &anyhow::Error) {
+        self.vitals.count_error();
+        tracing::error!("{error:#}");
+    }
+
+    fn finish(&mut self, run: impl FnOnce(&mut Self) -> anyhow::Result<()>) -> anyhow::Result<()> {
+        let result = run(self);
+        self.vitals.set_state(if result.is_ok() { HealthState::Done } else { HealthState::Faulty });
+        drop(self.heartbeat.take());
+        tracing::debug!(stage = %self.stage, ok = result.is_ok(), "ends");
+        result
+    }
+}
+
+/// Asks the system to end this process with its parent, so that a killed launcher leaves no stage behind.
+fn die_with_parent(parent_pid: Option<u32>) -> anyhow::Result<()> {
+    let Some(expected) = parent_pid else { return Ok(()) };
+    set_parent_process_death_signal(Some(Signal::TERM)).context("cannot watch the parent process")?;
+    // It may have died before the line above took effect.
+    let parent = getppid().map_or(0, |pid| pid.as_raw_nonzero().get() as u32);
+    anyhow::ensure!(parent == expected, "the launcher (process {expected}) has ended");
+    Ok(())
+}
+
+fn level(graph: &GraphConfig, stage: Stage) -> LogLevel {
+    let log = &graph.log;
+    match stage {
+        Stage::Camera => log.camera,
+        Stage::Encoder => log.encoder,
+        Stage::Forecaster => log.forecaster,
+        Stage::Prober => log.prober,
+        Stage::Renderer => log.renderer,
+        Stage::Controller => log.controller,
+    }
+}
+
+/// One line for each event on standard error, `LEVEL message fields`; the launcher puts time and stage in front.
+fn init_log(level: LogLevel) {
+    let level = level.name().parse().unwrap_or(tracing::Level::INFO);
+    // It fails only when a log is set up already, which then stays.
+    let _ = tracing_subscriber::fmt()
+        .with_max_level(level)
+        .with_writer(std::io::stderr)
+        .with_ansi(false)
+        .with_target(false)
+        .without_time()
+        .try_init();
+}

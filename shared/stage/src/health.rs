@@ -1,0 +1,121 @@
+//! The heartbeat: a thread of its own, so that it goes on while the stage loads or computes.
+
+use carff_messages::{Header, Health, HealthState, Stage};
+use carff_transport::{Counters, Publisher, Stop, Waiter, monotonic_now_ns};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU32, AtomicU64, Ordering};
+use std::thread::JoinHandle;
+
+/// Time between two heartbeats.
+const PERIOD_NS: u64 = 100_000_000;
+
+/// What the stage's loop writes and the heartbeat reads.
+#[derive(Debug)]
+pub(crate) struct Vitals {
+    state: AtomicU32,
+    frame_id: AtomicU64,
+    errors: AtomicU64,
+    last_latency_ns: AtomicU64,
+    max_latency_ns: AtomicU64,
+    last_progress_ns: AtomicU64,
+}
+
+impl Vitals {
+    pub(crate) fn new() -> Self {
+        Self {
+            state: AtomicU32::new(HealthState::Starting.code()),
+            frame_id: AtomicU64::new(0),
+            errors: AtomicU64::new(0),
+            last_latency_ns: AtomicU64::new(0),
+            max_latency_ns: AtomicU64::new(0),
+            last_progress_ns: AtomicU64::new(monotonic_now_ns()),
+        }
+    }
+
+    pub(crate) fn set_state(&self, state: HealthState) {
+        self.state.store(state.code(), Ordering::Relaxed);
+    }
+
+    pub(crate) fn progress(&self) {
+        self.last_progress_ns.store(monotonic_now_ns(), Ordering::Relaxed);
+    }
+
+    pub(crate) fn count_error(&self) {
+        self.errors.fetch_add(1, Ordering::Relaxed);
+    }
+
+    pub(crate) fn worked(&self, header: &Header, latency_ns: u64) {
+        self.frame_id.store(header.frame_id, Ordering::Relaxed);
+        self.last_latency_ns.store(latency_ns, Ordering::Relaxed);
+        self.max_latency_ns.fetch_max(latency_ns, Ordering::Relaxed);
+    }
+}
+
+/// A running heartbeat.
+#[derive(Debug)]
+pub(crate) struct Heartbeat {
+    beat: Stop,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Heartbeat {
+    pub(crate) fn start(
+        stage: Stage,
+        seed: u64,
+        mut publisher: Publisher<Health>,
+        vitals: Arc<Vitals>,
+        counters: Arc<Counters>,
+    ) -> std::io::Result<Self> {
+        let beat = Stop::new()?;
+        let waiter = Waiter::new(beat.clone());
+        let thread = std::thread::Builder::new().name("heartbeat".to_owned()).spawn(move || {
+            loop {
+                let stopping = waiter.stop().is_stopped();
+                if let Err(error) = publisher.send(snapshot(stage, seed, &vitals, &counters)) {
+                    tracing::warn!(%error, "no heartbeat");
+                }
+                // After a stop one last heartbeat has gone out, with the final state.
+                if stopping || waiter.wait_until(&[], monotonic_now_ns() + PERIOD_NS).is_err() {
+                    return;
+                }
+            }
+        })?;
+        Ok(Self { beat, thread: Some(thread) })
+    }
+}
+
+impl Drop for Heartbeat {
+    fn drop(&mut self) {
+        self.beat.stop();
+        if let Some(thread) = self.thread.take() {
+            // A panic in there has been printed by then, and the stage is ending anyway.
+            let _ = thread.join();
+        }
+    }
+}
+
+fn snapshot(stage: Stage, seed: u64, vitals: &Vitals, counters: &Counters) -> Health {
+    Health {
+        header: Header::of_frame(vitals.frame_id.load(Ordering::Relaxed), 0, seed),
+        stage: stage.code(),
+        state: vitals.state.load(Ordering::Relaxed),
+        pid: std::process::id(),
+        reserved: 0,
+        received: counters.received(),
+        published: counters.published(),
+        skipped: counters.skipped(),
+        invalid: counters.invalid(),
+        errors: vitals.errors.load(Ordering::Relaxed),
+        last_latency_ns: vitals.last_latency_ns.load(Ordering::Relaxed),
+        max_latency_ns: vitals.max_latency_ns.load(Ordering::Relaxed),
+        last_progress_ns: vitals.last_progress_ns.load(Ordering::Relaxed),
+        rss_bytes: resident_bytes().unwrap_or(0),
+    }
+}
+
+/// This process's resident memory, bytes.
+fn resident_bytes() -> Option<u64> {
+    let text = std::fs::read_to_string("/proc/self/statm").ok()?;
+    let pages: u64 = text.split_whitespace().nth(1)?.parse().ok()?;
+    Some(pages * rustix::param::page_size() as u64)
+}

@@ -1,0 +1,206 @@
+//! Receiving: in place, validated, newest first or one by one.
+
+use crate::wait::Input;
+use crate::{Counters, ReceiveError, Run, Service, descriptors};
+use carff_messages::{Invalid, Message, PictureMeta};
+use iceoryx2::port::listener::Listener;
+use iceoryx2::prelude::ZeroCopySend;
+use std::fmt::Debug;
+use std::ops::Deref;
+use std::os::fd::BorrowedFd;
+use std::sync::Arc;
+use std::time::Duration;
+
+/// What both kinds of receiver share.
+#[derive(Debug)]
+struct Source {
+    topic: &'static str,
+    deadline: Duration,
+    run_id: u64,
+    listener: Listener<Service>,
+    counters: Arc<Counters>,
+}
+
+impl Source {
+    fn failed(&self, error: &dyn std::error::Error) -> ReceiveError {
+        ReceiveError { topic: self.topic.to_owned(), cause: error.to_string() }
+    }
+
+    /// Counts, and says whether the message may be used. `origin` names the sender.
+    fn accepts(&self, message: &impl Message, extra: Result<(), Invalid>, origin: &dyn Debug) -> bool {
+        let found = message.header().run_id;
+        let same_run = if found == self.run_id {
+            Ok(())
+        } else {
+            Err(Invalid::Mismatch { field: "header.run_id", found, expected: self.run_id })
+        };
+        match message.validate().and(same_run).and(extra) {
+            Ok(()) => {
+                self.counters.count_received();
+                true
+            }
+            Err(error) => {
+                self.counters.count_invalid();
+                tracing::warn!(topic = self.topic, ?origin, %error, "dropped an invalid message");
+                false
+            }
+        }
+    }
+
+    fn clear(&self) -> Result<(), ReceiveError> {
+        self.listener.try_wait(|_| ()).map(|_| ()).map_err(|e| self.failed(&e))
+    }
+}
+
+/// Receives messages of a fixed size.
+#[derive(Debug)]
+pub struct Receiver<M: Message + ZeroCopySend + Debug + 'static> {
+    source: Source,
+    port: iceoryx2::port::subscriber::Subscriber<Service, M, ()>,
+}
+
+/// A message in the sender's memory. It keeps its place there until it is dropped.
+#[derive(Debug)]
+pub struct Sample<M: Message + ZeroCopySend + Debug + 'static>(iceoryx2::sample::Sample<Service, M, ()>);
+
+impl<M: Message + ZeroCopySend + Debug + 'static> Deref for Sample<M> {
+    type Target = M;
+    fn deref(&self) -> &M {
+        self.0.payload()
+    }
+}
+
+impl<M: Message + ZeroCopySend + Debug + 'static> Receiver<M> {
+    pub(crate) fn new(
+        (topic, deadline): (&'static str, Duration),
+        run: &Run,
+        port: iceoryx2::port::subscriber::Subscriber<Service, M, ()>,
+        listener: Listener<Service>,
+        counters: Arc<Counters>,
+    ) -> Self {
+        Self { source: Source { topic, deadline, run_id: run.id(), listener, counters }, port }
+    }
+
+    /// The oldest valid message that waits, if any.
+    pub fn next(&mut self) -> Result<Option<Sample<M>>, ReceiveError> {
+        while let Some(sample) = self.port.receive().map_err(|e| self.source.failed(&e))? {
+            if self.source.accepts(sample.payload(), Ok(()), &sample.origin()) {
+                return Ok(Some(Sample(sample)));
+            }
+        }
+        Ok(None)
+    }
+
+    /// The newest valid message that waits, if any. Older ones are counted as skipped.
+    pub fn newest(&mut self) -> Result<Option<Sample<M>>, ReceiveError> {
+        let mut newest = None;
+        while let Some(sample) = self.next()? {
+            if newest.replace(sample).is_some() {
+                self.source.counters.count_skipped();
+            }
+        }
+        Ok(newest)
+    }
+}
+
+impl<M: Message + ZeroCopySend + Debug + 'static> Input for Receiver<M> {
+    fn topic(&self) -> &'static str {
+        self.source.topic
+    }
+    fn deadline(&self) -> Duration {
+        self.source.deadline
+    }
+    fn has_waiting(&self) -> Result<bool, ReceiveError> {
+        self.port.has_samples().map_err(|e| self.source.failed(&e))
+    }
+    fn clear_wake_ups(&self) -> Result<(), ReceiveError> {
+        self.source.clear()
+    }
+    fn descriptor(&self) -> BorrowedFd<'_> {
+        descriptors::of_listener(&self.source.listener)
+    }
+}
+
+/// Receives pictures.
+#[derive(Debug)]
+pub struct PictureReceiver<M: PictureMeta + ZeroCopySend + Debug + 'static> {
+    source: Source,
+    port: iceoryx2::port::subscriber::Subscriber<Service, [u8], M>,
+}
+
+/// A picture in the sender's memory. It keeps its place there until it is dropped.
+#[derive(Debug)]
+pub struct Picture<M: PictureMeta + ZeroCopySend + Debug + 'static>(iceoryx2::sample::Sample<Service, [u8], M>);
+
+impl<M: PictureMeta + ZeroCopySend + Debug + 'static> Picture<M> {
+    /// What describes it.
+    pub fn meta(&self) -> &M {
+        self.0.user_header()
+    }
+
+    /// Its bytes, as many as the description says: RGB, 8 bit, rows from the top.
+    pub fn bytes(&self) -> &[u8] {
+        self.0.payload()
+    }
+}
+
+impl<M: PictureMeta + ZeroCopySend + Debug + 'static> PictureReceiver<M> {
+    pub(crate) fn new(
+        (topic, deadline): (&'static str, Duration),
+        run: &Run,
+        port: iceoryx2::port::subscriber::Subscriber<Service, [u8], M>,
+        listener: Listener<Service>,
+        counters: Arc<Counters>,
+    ) -> Self {
+        Self { source: Source { topic, deadline, run_id: run.id(), listener, counters }, port }
+    }
+
+    /// The oldest valid picture that waits, if any.
+    pub fn next(&mut self) -> Result<Option<Picture<M>>, ReceiveError> {
+        while let Some(sample) = self.port.receive().map_err(|e| self.source.failed(&e))? {
+            let meta = sample.user_header();
+            // The size that it claims is only meaningful, and only looked at, once the description is valid.
+            let size = meta.validate().and_then(|()| {
+                let (found, expected) = (sample.payload().len(), meta.picture_bytes());
+                if found == expected {
+                    Ok(())
+                } else {
+                    Err(Invalid::Mismatch { field: "picture bytes", found: found as u64, expected: expected as u64 })
+                }
+            });
+            if self.source.accepts(meta, size, &sample.origin()) {
+                return Ok(Some(Picture(sample)));
+            }
+        }
+        Ok(None)
+    }
+
+    /// The newest valid picture that waits, if any. Older ones are counted as skipped.
+    pub fn newest(&mut self) -> Result<Option<Picture<M>>, ReceiveError> {
+        let mut newest = None;
+        while let Some(picture) = self.next()? {
+            if newest.replace(picture).is_some() {
+                self.source.counters.count_skipped();
+            }
+        }
+        Ok(newest)
+    }
+}
+
+impl<M: PictureMeta + ZeroCopySend + Debug + 'static> Input for PictureReceiver<M> {
+    fn topic(&self) -> &'static str {
+        self.source.topic
+    }
+    fn deadline(&self) -> Duration {
+        self.source.deadline
+    }
+    fn has_waiting(&self) -> Result<bool, ReceiveError> {
+        self.port.has_samples().map_err(|e| self.source.failed(&e))
+    }
+    fn clear_wake_ups(&self) -> Result<(), ReceiveError> {
+        self.source.clear()
+    }
+    fn descriptor(&self) -> BorrowedFd<'_> {
+        descriptors::of_listener(&self.source.listener)
+    }
+}

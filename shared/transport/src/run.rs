@@ -1,0 +1,144 @@
+//! Namespaces: each run has its own folder and its own prefix in shared memory, so that runs never see each other.
+
+use crate::space::SHARED_MEMORY_DIR;
+use crate::{CleanupError, RunNameError, Service};
+use iceoryx2::prelude::{CallbackProgression, Config, FileName, NodeState, Path as IoxPath, SemanticString};
+use std::path::{Path, PathBuf};
+
+/// Longest run name: with it, the paths of the wake-up sockets stay below the system's limit of 107 bytes.
+const MAX_NAME_BYTES: usize = 24;
+
+/// One run of a graph: its name, which names its files, and its id, which is in every header.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Run {
+    name: String,
+    id: u64,
+}
+
+impl Run {
+    /// A run's name and id. All processes of a run must be given the same.
+    pub fn new(name: &str, id: u64) -> Result<Self, RunNameError> {
+        let fits = (1..=MAX_NAME_BYTES).contains(&name.len())
+            && name.bytes().all(|b| b.is_ascii_alphanumeric() || b == b'-' || b == b'_');
+        if fits { Ok(Self { name: name.to_owned(), id }) } else { Err(RunNameError { name: name.to_owned() }) }
+    }
+
+    /// The name.
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+
+    /// The id.
+    pub fn id(&self) -> u64 {
+        self.id
+    }
+
+    /// The folder of the run's small files. It exists while the run does.
+    pub fn folder(&self) -> PathBuf {
+        runtime_dir().join(&self.name)
+    }
+
+    /// What the names of the run's files in shared memory begin with.
+    pub fn shared_memory_prefix(&self) -> String {
+        format!("carff{:08x}_", fnv1a(self.folder().as_os_str().as_encoded_bytes()) as u32)
+    }
+
+    /// The run's files in shared memory, now.
+    pub fn shared_memory_files(&self) -> std::io::Result<Vec<PathBuf>> {
+        let prefix = self.shared_memory_prefix();
+        let mut files = Vec::new();
+        for entry in std::fs::read_dir(SHARED_MEMORY_DIR)? {
+            let entry = entry?;
+            if entry.file_name().to_string_lossy().starts_with(&prefix) {
+                files.push(entry.path());
+            }
+        }
+        Ok(files)
+    }
+
+    pub(crate) fn config(&self) -> Result<Config, String> {
+        let mut config = Config::default();
+        config.global.prefix =
+            FileName::new(self.shared_memory_prefix().as_bytes()).map_err(|e| format!("prefix: {e:?}"))?;
+        let folder = self.folder();
+        let folder = IoxPath::new(folder.as_os_str().as_encoded_bytes()).map_err(|e| format!("folder: {e:?}"))?;
+        config.global.set_root_path(&folder);
+        Ok(config)
+    }
+}
+
+/// The folder that holds the folders of all this user's runs.
+pub fn runtime_dir() -> PathBuf {
+    Path::new("/tmp").join(format!("carff-{}", rustix::process::getuid().as_raw()))
+}
+
+/// A run's id from its name and the time of its start.
+pub fn run_id_of(name: &str, start_ns: u64) -> u64 {
+    let mut bytes = name.as_bytes().to_vec();
+    bytes.extend_from_slice(&start_ns.to_le_bytes());
+    fnv1a(&bytes)
+}
+
+/// Removes what dead processes of a living run left behind. Returns how many were cleaned up.
+/// Wait for dead children first: a zombie still counts as alive.
+pub fn cleanup_dead(run: &Run) -> Result<u32, CleanupError> {
+    crate::node::quiet();
+    let failed = |cause: String| CleanupError::List { run: run.name.clone(), cause };
+    let config = run.config().map_err(failed)?;
+    let mut cleaned = 0;
+    iceoryx2::node::Node::<Service>::list(&config, |node| {
+        if let NodeState::Dead(dead) = node
+            && dead.try_remove_stale_resources().is_ok()
+        {
+            cleaned += 1;
+        }
+        CallbackProgression::Continue
+    })
+    .map_err(|e| failed(e.to_string()))?;
+    Ok(cleaned)
+}
+
+/// Removes all files of a run. Only for whoever knows that no process of the run lives any more.
+pub fn remove_run_leftovers(run: &Run) -> Result<(), CleanupError> {
+    let gone = |path: &Path, result: std::io::Result<()>| match result {
+        Err(source) if source.kind() != std::io::ErrorKind::NotFound => {
+            Err(CleanupError::Remove { path: path.to_owned(), source })
+        }
+        _ => Ok(()),
+    };
+    let files =
+        run.shared_memory_files().map_err(|source| CleanupError::Remove { path: SHARED_MEMORY_DIR.into(), source })?;
+    for file in files {
+        gone(&file, std::fs::remove_file(&file))?;
+    }
+    gone(&run.folder(), std::fs::remove_dir_all(run.folder()))
+}
+
+/// The FNV-1a hash: stable over builds and machines.
+fn fnv1a(bytes: &[u8]) -> u64 {
+    bytes.iter().fold(0xcbf2_9ce4_8422_2325, |hash, &b| (hash ^ u64::from(b)).wrapping_mul(0x0000_0100_0000_01b3))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Names that would leave the run's folder or break path limits are refused.
+    #[test]
+    fn names_are_plain_and_short() {
+        for name in ["", "a/b", "..", "a b", "ü", &"x".repeat(25)] {
+            assert!(Run::new(name, 0).is_err(), "{name}");
+        }
+        assert!(Run::new(&"x".repeat(24), 0).is_ok());
+    }
+
+    /// Two runs differ in folder and prefix; no prefix begins another.
+    #[test]
+    fn runs_are_apart() {
+        let (a, b) = (Run::new("run", 0).unwrap(), Run::new("run2", 0).unwrap());
+        assert_ne!(a.folder(), b.folder());
+        assert_ne!(a.shared_memory_prefix(), b.shared_memory_prefix());
+        assert_eq!(a.shared_memory_prefix().len(), b.shared_memory_prefix().len());
+        assert_ne!(run_id_of("run", 1), run_id_of("run", 2));
+    }
+}

@@ -1,0 +1,45 @@
+//! Looks whether shared memory has room, since memory promised beyond it ends in SIGBUS.
+
+use crate::OpenError;
+use std::path::Path;
+
+/// Where the system keeps shared memory.
+pub(crate) const SHARED_MEMORY_DIR: &str = "/dev/shm";
+
+/// What the rest of a topic (connections, wake-ups) takes, generously.
+pub(crate) const MANAGEMENT_BYTES: u64 = 1 << 20;
+
+/// Checks that `folder` (usually `/dev/shm`) can be written and has `needed_bytes` free for `what`.
+pub fn check_space(folder: &Path, what: &str, needed_bytes: u64) -> Result<(), OpenError> {
+    let not_writable =
+        |source: rustix::io::Errno| OpenError::NotWritable { path: folder.to_owned(), source: source.into() };
+    rustix::fs::access(folder, rustix::fs::Access::WRITE_OK).map_err(not_writable)?;
+    let stat = rustix::fs::statvfs(folder).map_err(not_writable)?;
+    let free_bytes = stat.f_bavail.saturating_mul(stat.f_frsize);
+    if free_bytes < needed_bytes {
+        return Err(OpenError::SharedMemoryFull {
+            path: folder.to_owned(),
+            what: what.to_owned(),
+            needed_bytes,
+            free_bytes,
+        });
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Too little room and a missing folder are clear errors that say what to do; enough room is none.
+    #[test]
+    fn says_what_is_wrong() {
+        let folder = tempfile::tempdir().unwrap();
+        assert!(check_space(folder.path(), "topic `x`", 1).is_ok());
+        let full = check_space(folder.path(), "topic `x`", u64::MAX).unwrap_err();
+        assert!(matches!(full, OpenError::SharedMemoryFull { needed_bytes: u64::MAX, .. }));
+        assert!(full.to_string().contains("--shm-size"), "{full}");
+        let missing = check_space(&folder.path().join("none"), "topic `x`", 1).unwrap_err();
+        assert!(matches!(missing, OpenError::NotWritable { .. }));
+    }
+}
