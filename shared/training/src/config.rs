@@ -1,0 +1,213 @@
+//! The training file: what `carff train` reads.
+
+use crate::TrainingError;
+use carff_dataset::sensor::SensorNoise;
+use carff_models::{decoder::DecoderConfig, encoder::EncoderConfig, mixture::MixtureConfig};
+use serde::{Deserialize, Serialize};
+use std::path::{Path, PathBuf};
+
+/// One training, from pictures to a checkpoint.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TrainingConfig {
+    /// The data set's folder, relative to the working directory; `--dataset` wins.
+    pub dataset: PathBuf,
+    /// The scenario file to render the data set from when its folder is missing.
+    #[serde(default)]
+    pub scenario: Option<PathBuf>,
+    /// Where the finished checkpoint goes; `--out` wins.
+    pub out: PathBuf,
+    /// Seed of everything random.
+    pub seed: u64,
+    /// Seed of the split of the poses into unseen (10 %), calibration (10 %) and the rest.
+    pub split_seed: u64,
+    /// Threads that training uses.
+    #[serde(default = "two")]
+    pub threads: i32,
+    /// Weights of the frozen backbone (safetensors); none: random.
+    #[serde(default)]
+    pub pretrained_backbone: Option<PathBuf>,
+    /// The encoder's shape.
+    #[serde(default)]
+    pub encoder: EncoderConfig,
+    /// The decoder's shape.
+    #[serde(default)]
+    pub decoder: DecoderConfig,
+    /// The mixture density network's shape.
+    #[serde(default)]
+    pub mixture: MixtureConfig,
+    /// What the pictures go through before the encoder sees them in training.
+    #[serde(default)]
+    pub augmentation: Augmentation,
+    /// The pose-conditional VAE's training.
+    #[serde(default)]
+    pub vae: VaeTraining,
+    /// The mixture density network's training.
+    #[serde(default)]
+    pub mdn: MdnTraining,
+}
+
+fn two() -> i32 {
+    2
+}
+
+/// What the pictures go through before the encoder sees them in training. The decoder's target is always the clean one.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Augmentation {
+    /// Altered copies of each picture, besides one with sensor noise alone. With a frozen backbone their features are
+    /// computed once and kept.
+    pub copies: usize,
+    /// Sensor noise and colour errors, on every copy.
+    pub sensor: SensorNoise,
+    /// Largest shift, as a share of the picture's side.
+    pub shift: f64,
+    /// Largest relative change of scale.
+    pub zoom: f64,
+    /// Largest rotation about the optical axis, degrees.
+    pub rotation_deg: f64,
+}
+
+impl Default for Augmentation {
+    fn default() -> Self {
+        Self {
+            copies: 8,
+            sensor: SensorNoise { sigma: 2.0, gain_sigma: 0.04, channel_gain_sigma: 0.02, channel_offset_sigma: 2.0 },
+            shift: 0.06,
+            zoom: 0.08,
+            rotation_deg: 3.0,
+        }
+    }
+}
+
+/// Training of the pose-conditional VAE (paper section 3.2, with the terms that keep its latent alive).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct VaeTraining {
+    /// Passes over the training pictures.
+    pub epochs: usize,
+    /// Pictures a step.
+    pub batch: usize,
+    /// Learning rate at the start; it falls to 2 % of it along a cosine.
+    pub learning_rate: f64,
+    /// Decoupled weight decay.
+    pub weight_decay: f64,
+    /// Dropout before the head's hidden layer.
+    pub dropout: f64,
+    /// Weight of the KL term when it is fully on (per dimension sum, against the weighted squared error).
+    pub kl_weight: f64,
+    /// Share of the training before the KL term sets in.
+    pub kl_delay: f64,
+    /// Share of the training in which it rises linearly to its full weight.
+    pub kl_ramp: f64,
+    /// Weight of the squared error of the reconstruction.
+    pub reconstruction_weight: f64,
+    /// Whether the decoder learns the residual over the pose's mean picture (`true`) or the picture itself, as in the
+    /// paper.
+    pub residual: bool,
+    /// Weight of pixels that differ from the pose's mean picture by more than 12 of 255; others weigh 1.
+    pub foreground_weight: f64,
+    /// Weight of the contrastive term between views of one state; 0 leaves it out.
+    pub contrastive_weight: f64,
+    /// Temperature of the contrastive term.
+    pub contrastive_temperature: f64,
+    /// Weight of the state term: cross-entropy of a linear read-out of the sampled latent against the states that look
+    /// the same in that view; 0 leaves it out.
+    pub state_weight: f64,
+}
+
+impl Default for VaeTraining {
+    fn default() -> Self {
+        Self {
+            epochs: 120,
+            batch: 32,
+            learning_rate: 1e-3,
+            weight_decay: 0.01,
+            dropout: 0.2,
+            kl_weight: 0.01,
+            kl_delay: 0.1,
+            kl_ramp: 0.3,
+            reconstruction_weight: 20.0,
+            residual: true,
+            foreground_weight: 10.0,
+            contrastive_weight: 0.0,
+            contrastive_temperature: 0.2,
+            state_weight: 1.0,
+        }
+    }
+}
+
+/// Training of the mixture density network (paper section 3.4).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct MdnTraining {
+    /// Optimiser steps.
+    pub steps: usize,
+    /// Pairs of a view and a neighbouring view of the next step, a step.
+    pub batch: usize,
+    /// Learning rate at the start; it falls to 2 % of it along a cosine.
+    pub learning_rate: f64,
+    /// Standard deviation of the noise on the input mean, in units of the input posterior's own deviation.
+    pub input_noise: f64,
+    /// Neighbouring views are drawn from those that show at least this much of the actor's place (visible fraction,
+    /// 0..=1). 0: any view, a hidden one too, whose posterior does not say what there is to forecast.
+    pub target_visible_fraction: f32,
+}
+
+impl Default for MdnTraining {
+    fn default() -> Self {
+        Self { steps: 4000, batch: 256, learning_rate: 1e-3, input_noise: 0.5, target_visible_fraction: 0.5 }
+    }
+}
+
+impl TrainingConfig {
+    /// Reads a training file; the error shows file, line and key.
+    pub fn load(path: &Path) -> Result<Self, TrainingError> {
+        let text = std::fs::read_to_string(path).map_err(|source| TrainingError::File { path: path.into(), source })?;
+        let config: Self =
+            toml::from_str(&text).map_err(|e| TrainingError::Format { path: path.into(), what: e.to_string() })?;
+        config.validate().map_err(|what| TrainingError::Format { path: path.into(), what })?;
+        Ok(config)
+    }
+
+    fn validate(&self) -> Result<(), String> {
+        let counts = [
+            ("vae.epochs", self.vae.epochs, 1, 10_000),
+            ("vae.batch", self.vae.batch, 2, 4096),
+            ("mdn.steps", self.mdn.steps, 1, 1_000_000),
+            ("mdn.batch", self.mdn.batch, 2, 65_536),
+            ("augmentation.copies", self.augmentation.copies, 0, 64),
+            ("threads", self.threads.max(0) as usize, 1, 256),
+        ];
+        for (key, value, low, high) in counts {
+            if !(low..=high).contains(&value) {
+                return Err(format!("`{key}` = {value}: {low} to {high} are allowed"));
+            }
+        }
+        let numbers = [
+            ("vae.learning_rate", self.vae.learning_rate, 1.0),
+            ("vae.weight_decay", self.vae.weight_decay, 1.0),
+            ("vae.dropout", self.vae.dropout, 0.95),
+            ("vae.kl_weight", self.vae.kl_weight, 1e3),
+            ("vae.kl_delay", self.vae.kl_delay, 1.0),
+            ("vae.kl_ramp", self.vae.kl_ramp, 1.0),
+            ("vae.reconstruction_weight", self.vae.reconstruction_weight, 1e6),
+            ("vae.foreground_weight", self.vae.foreground_weight, 1e4),
+            ("vae.contrastive_weight", self.vae.contrastive_weight, 1e3),
+            ("vae.contrastive_temperature", self.vae.contrastive_temperature, 10.0),
+            ("vae.state_weight", self.vae.state_weight, 1e3),
+            ("mdn.learning_rate", self.mdn.learning_rate, 1.0),
+            ("mdn.input_noise", self.mdn.input_noise, 10.0),
+            ("mdn.target_visible_fraction", f64::from(self.mdn.target_visible_fraction), 1.0),
+            ("augmentation.shift", self.augmentation.shift, 0.5),
+            ("augmentation.zoom", self.augmentation.zoom, 0.5),
+            ("augmentation.rotation_deg", self.augmentation.rotation_deg, 45.0),
+        ];
+        for (key, value, high) in numbers {
+            if !(0.0..=high).contains(&value) {
+                return Err(format!("`{key}` = {value}: 0 to {high} are allowed"));
+            }
+        }
+        self.augmentation.sensor.validate().map_err(|e| format!("[augmentation.sensor] {e}"))
+    }
+}

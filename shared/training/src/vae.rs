@@ -1,0 +1,421 @@
+//! The training loop of the pose-conditional VAE (paper section 3.2).
+//!
+//! The plain recipe (KL and squared error alone) ends in a dead latent that PSNR does not show. What keeps it alive
+//! here: the decoder learns the residual over the pose's mean picture, pixels that change weigh more, and a linear
+//! read-out of the sampled latent must name the state, up to the states that look the same in that view. The last
+//! term asks a view that hides the actor for an even answer, so its posterior lies between the states.
+
+use crate::{
+    TrainingError,
+    accuracy::{Centroids, state_accuracy},
+    config::TrainingConfig,
+    pictures::Pictures,
+    run::{Progress, Run, SaveClock, cosine, damaged, part, prefixed},
+};
+use carff_dataset::PoseRole;
+use carff_models::{
+    LATENT_DIM, LatentGaussian, ModelError,
+    adam::Adam,
+    decoder::Decoder,
+    encoder::{Encoder, gaussians},
+    weights::{self, Tensors},
+};
+use carff_random::Key;
+use rand::seq::SliceRandom;
+use serde_json::json;
+use std::path::Path;
+use tch::{Device, Kind, Tensor, nn, nn::Module, nn::VarStore};
+
+/// Encoder, decoder and the read-out that only training uses.
+pub struct Vae {
+    /// The encoder.
+    pub encoder: Encoder,
+    /// The decoder.
+    pub decoder: Decoder,
+    read_out: nn::Linear,
+    backbone: VarStore,
+    head: VarStore,
+    decoder_store: VarStore,
+    read_out_store: VarStore,
+    frozen: bool,
+}
+
+impl Vae {
+    /// Fresh weights from the global generator (seed it first); the backbone's from `pretrained`.
+    pub fn new(
+        config: &TrainingConfig,
+        poses: usize,
+        states: usize,
+        pretrained: Option<&Path>,
+    ) -> Result<Self, ModelError> {
+        let [mut backbone, head, decoder_store, read_out_store] = [(); 4].map(|()| VarStore::new(Device::Cpu));
+        let encoder =
+            Encoder::new(&config.encoder, &(backbone.root() / "backbone"), &(head.root() / "encoder"), pretrained)?;
+        let decoder = Decoder::new(&(decoder_store.root() / "decoder"), &config.decoder, poses as i64);
+        let read_out = nn::linear(
+            read_out_store.root() / "read_out",
+            LATENT_DIM as i64,
+            states as i64,
+            nn::LinearConfig::default(),
+        );
+        let frozen = config.encoder.backbone.frozen;
+        if frozen {
+            backbone.freeze();
+        }
+        Ok(Self { encoder, decoder, read_out, backbone, head, decoder_store, read_out_store, frozen })
+    }
+
+    /// Weights that a checkpoint keeps: (encoder head, decoder, backbone).
+    pub fn weights(&self) -> (Tensors, Tensors, Tensors) {
+        (weights::of_store(&self.head), weights::of_store(&self.decoder_store), weights::of_store(&self.backbone))
+    }
+
+    fn stores(&self) -> Vec<&VarStore> {
+        let mut stores = vec![&self.head, &self.decoder_store, &self.read_out_store];
+        if !self.frozen {
+            stores.push(&self.backbone);
+        }
+        stores
+    }
+
+    fn state(&self, adam: &Adam) -> Tensors {
+        let mut all: Tensors = prefixed("adam.", adam.state()).collect();
+        for store in self.stores() {
+            all.extend(prefixed("weights.", weights::of_store(store)));
+        }
+        all
+    }
+
+    fn restore(&self, adam: Option<&mut Adam>, state: &Tensors) -> bool {
+        let saved = part(state, "weights.");
+        for store in self.stores() {
+            let own: Tensors = weights::of_store(store)
+                .into_keys()
+                .filter_map(|k| saved.get(&k).map(|t| (k, t.shallow_clone())))
+                .collect();
+            if weights::fill_store(store, &own).is_err() {
+                return false;
+            }
+        }
+        adam.is_none_or(|adam| adam.restore(&part(state, "adam.")))
+    }
+
+    /// Puts the weights of a saved training back; `false` when they do not fit.
+    #[must_use]
+    pub fn restore_weights(&self, state: &Tensors) -> bool {
+        self.restore(None, state)
+    }
+}
+
+/// Backbone features of the pictures' altered copies, where they can be kept.
+pub struct Inputs<'a> {
+    config: &'a TrainingConfig,
+    pictures: &'a Pictures,
+    features: Option<Tensor>,
+}
+
+/// Pictures through the backbone at a time: large enough to keep two cores busy, small enough for the cache.
+const FEATURE_BATCH: usize = 30;
+
+impl<'a> Inputs<'a> {
+    /// Computes what can be kept: features `[copies + 1, N, C, h, w]` in half precision.
+    pub fn new(
+        config: &'a TrainingConfig,
+        pictures: &'a Pictures,
+        vae: &Vae,
+        run: &Run,
+    ) -> Result<Self, TrainingError> {
+        let keep = config.encoder.backbone.frozen && config.encoder.stem_channels == 0;
+        let mut this = Self { config, pictures, features: None };
+        if keep {
+            let all: Vec<usize> = (0..pictures.images.len()).collect();
+            let copies = config.augmentation.copies + 1;
+            let total = copies * all.len();
+            let mut rows = Vec::new();
+            for copy in 0..copies {
+                for (i, chunk) in all.chunks(FEATURE_BATCH).enumerate() {
+                    if run.stopped() {
+                        return Err(TrainingError::Stopped);
+                    }
+                    let inputs = pictures.inputs(chunk, copy, &config.augmentation, config.seed);
+                    rows.push(tch::no_grad(|| vae.encoder.features(&inputs)).to_kind(Kind::Half));
+                    let done = (copy * all.len() + (i + 1) * FEATURE_BATCH).min(total);
+                    (run.on_progress)(&Progress { stage: "features", done, total, line: String::new() });
+                }
+            }
+            this.features = Some(Tensor::cat(&rows, 0));
+        }
+        Ok(this)
+    }
+
+    /// Features of some pictures, each in its own copy.
+    fn features(&self, vae: &Vae, chosen: &[(usize, usize)]) -> Tensor {
+        if let Some(features) = &self.features {
+            let n = self.pictures.images.len();
+            let rows: Vec<i64> = chosen.iter().map(|&(i, copy)| (copy * n + i) as i64).collect();
+            return features.index_select(0, &Tensor::from_slice(&rows)).to_kind(Kind::Float);
+        }
+        let inputs: Vec<Tensor> = chosen
+            .iter()
+            .map(|&(i, copy)| self.pictures.inputs(&[i], copy, &self.config.augmentation, self.config.seed))
+            .collect();
+        vae.encoder.features(&Tensor::cat(&inputs, 0))
+    }
+
+    /// The posteriors of all pictures, in one copy.
+    pub fn posteriors(&self, vae: &Vae, copy: usize) -> Vec<LatentGaussian> {
+        let all: Vec<usize> = (0..self.pictures.images.len()).collect();
+        tch::no_grad(|| {
+            all.chunks(FEATURE_BATCH * 4)
+                .flat_map(|chunk| {
+                    let chosen: Vec<(usize, usize)> = chunk.iter().map(|&i| (i, copy)).collect();
+                    let (mean, log_variance) = vae.encoder.posterior(&self.features(vae, &chosen), 0.0);
+                    gaussians(&mean, &log_variance)
+                })
+                .collect()
+        })
+    }
+}
+
+/// Trains the VAE, or goes on where an earlier run stopped.
+pub fn train(
+    config: &TrainingConfig,
+    pictures: &Pictures,
+    vae: &Vae,
+    inputs: &Inputs,
+    run: &Run,
+) -> Result<(), TrainingError> {
+    let settings = &config.vae;
+    let mut adam = Adam::new(&vae.stores(), settings.weight_decay);
+    let mut first = 0;
+    if let Some((done, state)) = run.load("vae")? {
+        if !vae.restore(Some(&mut adam), &state) {
+            return Err(damaged(&run.state_path("vae")));
+        }
+        first = done;
+    }
+    let trained = pictures.trained();
+    let state_targets = state_targets(pictures);
+    let copies = config.augmentation.copies + 1;
+    let per_epoch = trained.len() / settings.batch.min(trained.len());
+    let mut clock = SaveClock::default();
+    for epoch in first..settings.epochs {
+        let mut rng =
+            carff_random::stream(Key { seed: config.seed, frame: epoch as u64, step: 0x7661_6500, sample: 0 });
+        let mut order = trained.clone();
+        order.shuffle(&mut rng);
+        let mut sums = [0.0_f64; 4];
+        for (b, batch) in order.chunks_exact(settings.batch.min(trained.len())).enumerate() {
+            let step = epoch * per_epoch + b;
+            let at = step as f64 / (settings.epochs * per_epoch) as f64;
+            let kl_weight =
+                settings.kl_weight * ((at - settings.kl_delay) / settings.kl_ramp.max(1e-9)).clamp(0.0, 1.0);
+            let chosen: Vec<(usize, usize)> =
+                batch.iter().map(|&i| (i, rand::Rng::random_range(&mut rng, 0..copies))).collect();
+            tch::manual_seed(config.seed as i64 ^ ((step as i64) << 20));
+            let losses = losses(config, pictures, vae, inputs, &chosen, &state_targets);
+            let mut loss = &losses.reconstruction * settings.reconstruction_weight + &losses.kl * kl_weight;
+            if let Some(term) = &losses.state {
+                loss = loss + term * settings.state_weight;
+            }
+            if let Some(term) = &losses.contrastive {
+                loss = loss + term * settings.contrastive_weight;
+            }
+            adam.step(&loss, settings.learning_rate * cosine(step, settings.epochs * per_epoch), 5.0);
+            let value = |t: &Tensor| t.double_value(&[]);
+            sums[0] += value(&loss);
+            sums[1] += value(&losses.reconstruction);
+            sums[2] += value(&losses.kl);
+            sums[3] += losses.state.as_ref().map_or(0.0, value);
+        }
+        let means = sums.map(|s| s / per_epoch as f64);
+        let posteriors = inputs.posteriors(vae, 0);
+        let report = evaluate(config, pictures, vae, &posteriors, epoch + 1 == settings.epochs || epoch % 10 == 9)?;
+        let mut record = json!({
+            "stage": "vae", "epoch": epoch + 1, "loss": means[0], "reconstruction": means[1], "kl": means[2],
+            "state": means[3],
+        });
+        if let (Some(to), Some(from)) = (record.as_object_mut(), report.as_object()) {
+            to.extend(from.clone());
+        }
+        run.metric(&record)?;
+        let figure = |role: &str, kind: &str| report[role][kind]["accuracy"].as_f64().unwrap_or(0.0) * 100.0;
+        (run.on_progress)(&Progress {
+            stage: "vae",
+            done: epoch + 1,
+            total: settings.epochs,
+            line: format!(
+                "loss {:.3}  kl {:.1}  state accuracy trained {:.1}/{:.1}/{:.1} % unseen {:.1}/{:.1} %{}",
+                means[0],
+                means[2],
+                figure("trained", "full"),
+                figure("trained", "partial"),
+                figure("trained", "none"),
+                figure("unseen", "full"),
+                figure("unseen", "partial"),
+                report["psnr_db"].as_f64().map_or(String::new(), |p| format!("  psnr {p:.2} dB")),
+            ),
+        });
+        let stopping = run.stopped();
+        if stopping || clock.is_due() || epoch + 1 == settings.epochs {
+            run.save("vae", epoch + 1, vae.state(&adam))?;
+        }
+        if stopping {
+            return Err(TrainingError::Stopped);
+        }
+    }
+    Ok(())
+}
+
+/// Per picture the distribution over the states that look the same in its view, `[N, S]`.
+fn state_targets(pictures: &Pictures) -> Tensor {
+    let states = pictures.scenario.state_count();
+    let mut rows = Vec::with_capacity(pictures.labels.len() * states);
+    for label in &pictures.labels {
+        let same: Vec<bool> =
+            (0..states).map(|s| s == label.state || pictures.equivalence.same(label.view, s, label.state)).collect();
+        let share = 1.0 / same.iter().filter(|&&s| s).count() as f32;
+        rows.extend(same.iter().map(|&s| if s { share } else { 0.0 }));
+    }
+    Tensor::from_slice(&rows).view([-1, states as i64])
+}
+
+struct Losses {
+    reconstruction: Tensor,
+    kl: Tensor,
+    state: Option<Tensor>,
+    contrastive: Option<Tensor>,
+}
+
+fn losses(
+    config: &TrainingConfig,
+    pictures: &Pictures,
+    vae: &Vae,
+    inputs: &Inputs,
+    chosen: &[(usize, usize)],
+    state_targets: &Tensor,
+) -> Losses {
+    let settings = &config.vae;
+    let only: Vec<usize> = chosen.iter().map(|&(i, _)| i).collect();
+    let features = inputs.features(vae, chosen);
+    let (mean, log_variance) = vae.encoder.posterior(&features, settings.dropout);
+    let latent = &mean + (&log_variance * 0.5).exp() * Tensor::randn_like(&mean);
+    let views: Vec<i64> = only.iter().map(|&i| pictures.labels[i].view as i64).collect();
+    let views = Tensor::from_slice(&views);
+    let targets = pictures.targets(&only);
+    let residual = &targets - pictures.pose_means.index_select(0, &views);
+    let changed = residual.abs().amax([1_i64].as_slice(), true).gt(12.0 / 255.0).to_kind(Kind::Float);
+    let weight = changed * (settings.foreground_weight - 1.0) + 1.0;
+    let wanted = if settings.residual { residual } else { targets };
+    let error = (vae.decoder.forward(&latent, &views) - wanted).square();
+    let reconstruction = (error * weight).mean(Kind::Float) * 10.0;
+    let kl = kl_divergence(&mean, &log_variance);
+    let state = (settings.state_weight > 0.0).then(|| {
+        let rows: Vec<i64> = only.iter().map(|&i| i as i64).collect();
+        let wanted = state_targets.index_select(0, &Tensor::from_slice(&rows));
+        let log = vae.read_out.forward(&latent).log_softmax(-1, Kind::Float);
+        -(wanted * log).sum_dim_intlist([-1_i64].as_slice(), false, Kind::Float).mean(Kind::Float)
+    });
+    let contrastive = (settings.contrastive_weight > 0.0).then(|| {
+        let states: Vec<i64> = only.iter().map(|&i| pictures.labels[i].state as i64).collect();
+        contrastive(&mean, &Tensor::from_slice(&states), settings.contrastive_temperature)
+    });
+    Losses { reconstruction, kl, state, contrastive }
+}
+
+/// Mean over the batch of KL(N(mean, exp(log variance)) || N(0, 1)), summed over dimensions. Inputs `[N, 8]`.
+pub fn kl_divergence(mean: &Tensor, log_variance: &Tensor) -> Tensor {
+    ((mean.square() + log_variance.exp() - log_variance - 1.0) * 0.5)
+        .sum_dim_intlist([-1_i64].as_slice(), false, Kind::Float)
+        .mean(Kind::Float)
+}
+
+/// Supervised contrastive loss (Khosla et al. 2020) of normalised means `[N, 8]` with state numbers `[N]`.
+pub fn contrastive(mean: &Tensor, states: &Tensor, temperature: f64) -> Tensor {
+    let n = mean.size()[0];
+    let unit = mean / (mean.square().sum_dim_intlist([-1_i64].as_slice(), true, Kind::Float) + 1e-8).sqrt();
+    let eye = Tensor::eye(n, (Kind::Float, mean.device()));
+    let others = eye.ones_like() - eye;
+    let positive = states.unsqueeze(0).eq_tensor(&states.unsqueeze(1)).to_kind(Kind::Float) * &others;
+    let logits: Tensor = unit.matmul(&unit.transpose(0, 1)) / temperature - (others.ones_like() - &others) * 1e9;
+    let log = logits.log_softmax(-1, Kind::Float);
+    let count = positive.sum_dim_intlist([-1_i64].as_slice(), false, Kind::Float);
+    let sum = (log * positive).sum_dim_intlist([-1_i64].as_slice(), false, Kind::Float);
+    -(sum / count.clamp_min(1.0)).mean(Kind::Float)
+}
+
+/// State accuracy by observability, for trained, calibration and unseen poses; with `picture_quality` also the PSNR of
+/// reconstructions on the trained poses, its gain over the pose's mean picture, and the PSNR where pixels change.
+pub fn evaluate(
+    config: &TrainingConfig,
+    pictures: &Pictures,
+    vae: &Vae,
+    posteriors: &[LatentGaussian],
+    picture_quality: bool,
+) -> Result<serde_json::Value, TrainingError> {
+    let centroids = Centroids::fit(pictures, posteriors)
+        .ok_or_else(|| TrainingError::Unfit("some state has no view that shows the actor's place fully".into()))?;
+    let accuracy = |roles: &[PoseRole]| {
+        let table = state_accuracy(pictures, posteriors, &centroids, &pictures.with_roles(roles));
+        let share = |s: crate::accuracy::Share| json!({"accuracy": s.accuracy(), "raw": s.raw(), "trials": s.trials});
+        json!({"full": share(table.full), "partial": share(table.partial), "none": share(table.none)})
+    };
+    let mut report = json!({
+        "trained": accuracy(&[PoseRole::Rest]),
+        "calibration": accuracy(&[PoseRole::Calibration]),
+        "unseen": accuracy(&[PoseRole::Unseen]),
+    });
+    if picture_quality {
+        let [mut error, mut mean_error, mut changed_error, mut changed_count, mut count] = [0.0_f64; 5];
+        tch::no_grad(|| {
+            for chunk in pictures.trained().chunks(60) {
+                let latents: Vec<f32> = chunk.iter().flat_map(|&i| posteriors[i].mean).collect();
+                let views: Vec<i64> = chunk.iter().map(|&i| pictures.labels[i].view as i64).collect();
+                let views = Tensor::from_slice(&views);
+                let means = pictures.pose_means.index_select(0, &views);
+                let out = vae.decoder.forward(&Tensor::from_slice(&latents).view([-1, LATENT_DIM as i64]), &views);
+                let out = if config.vae.residual { out + &means } else { out }.clamp(0.0, 1.0);
+                let targets = pictures.targets(chunk);
+                let residual = &targets - &means;
+                let changed = residual.abs().amax([1_i64].as_slice(), true).gt(12.0 / 255.0).to_kind(Kind::Float);
+                let squares = (&out - &targets).square();
+                error += squares.sum(Kind::Double).double_value(&[]);
+                mean_error += residual.square().sum(Kind::Double).double_value(&[]);
+                changed_error += (squares * &changed).sum(Kind::Double).double_value(&[]);
+                changed_count += changed.sum(Kind::Double).double_value(&[]) * 3.0;
+                count += targets.numel() as f64;
+            }
+        });
+        let psnr = |sum: f64, n: f64| carff_metrics::psnr_of_mse(sum / n.max(1.0));
+        report["psnr_db"] = json!(psnr(error, count));
+        report["mean_picture_psnr_db"] = json!(psnr(mean_error, count));
+        report["changed_pixels_psnr_db"] = json!(psnr(changed_error, changed_count));
+    }
+    Ok(report)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The divergence is the closed form: zero for the standard normal, and 8 * (0.5 m^2) for a mean of m.
+    #[test]
+    fn kl_is_the_closed_form() {
+        let zero = Tensor::zeros([2, 8], (Kind::Float, Device::Cpu));
+        assert!(kl_divergence(&zero, &zero).double_value(&[]).abs() < 1e-6);
+        assert!((kl_divergence(&(&zero + 0.5), &zero).double_value(&[]) - 1.0).abs() < 1e-5);
+    }
+
+    /// Views of one state closer together, states further apart: a smaller loss.
+    #[test]
+    fn contrastive_prefers_clusters() {
+        let states = Tensor::from_slice(&[0_i64, 0, 1, 1]);
+        let of = |rows: [[f32; 2]; 4]| {
+            let flat: Vec<f32> = rows.iter().flat_map(|r| [r[0], r[1], 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]).collect();
+            contrastive(&Tensor::from_slice(&flat).view([4, 8]), &states, 0.2).double_value(&[])
+        };
+        let clustered = of([[1.0, 0.0], [1.0, 0.1], [-1.0, 0.0], [-1.0, 0.1]]);
+        let mixed = of([[1.0, 0.0], [-1.0, 0.1], [-1.0, 0.0], [1.0, 0.1]]);
+        assert!(clustered < 0.1 && mixed > 1.0, "{clustered} {mixed}");
+    }
+}
