@@ -1,0 +1,175 @@
+//! Sending and receiving within one process.
+
+mod common;
+
+use carff_messages::Message;
+use carff_transport::{Node, OpenError, Run, SendError, Stop, Waiter, Woken, monotonic_now_ns, topics};
+use common::{TestRun, frame, in_seconds, posterior};
+
+/// Newest wins: of three messages the last is received, and the two before it are counted as skipped.
+#[test]
+fn newest_wins_and_skips_are_counted() {
+    let run = TestRun::new();
+    let node = Node::open(&run.0, "test").unwrap();
+    let mut input = node.receiver(&topics::POSTERIOR).unwrap();
+    let mut output = node.publisher(&topics::POSTERIOR).unwrap();
+    for frame_id in 0..3 {
+        output.send(posterior(frame_id)).unwrap();
+    }
+    let newest = input.newest().unwrap().unwrap();
+    assert_eq!((newest.header.frame_id, newest.header.sequence, newest.header.run_id), (2, 2, 77));
+    assert!(newest.header.publish_time_ns > 0);
+    assert!(input.newest().unwrap().is_none());
+    let counters = node.counters();
+    assert_eq!((counters.published(), counters.received(), counters.skipped()), (3, 3, 2));
+}
+
+/// A slow reader loses the oldest, the sender never fails, and what is left comes in order.
+#[test]
+fn overflow_loses_the_oldest_and_never_stops_the_sender() {
+    let run = TestRun::new();
+    let node = Node::open(&run.0, "test").unwrap();
+    let mut input = node.receiver(&topics::POSTERIOR).unwrap();
+    let mut output = node.publisher(&topics::POSTERIOR).unwrap();
+    let sent = 100;
+    for frame_id in 0..sent {
+        output.send(posterior(frame_id)).unwrap();
+    }
+    let mut got = Vec::new();
+    while let Some(sample) = input.next().unwrap() {
+        got.push(sample.header.frame_id);
+    }
+    let buffer = topics::POSTERIOR.limits.buffer as u64;
+    assert_eq!(got, (sent - buffer..sent).collect::<Vec<_>>());
+}
+
+/// Messages with a NaN, of another schema or of another run are dropped and counted; the valid one after them arrives.
+#[test]
+fn invalid_messages_are_dropped_and_counted() {
+    let run = TestRun::new();
+    let node = Node::open(&run.0, "test").unwrap();
+    let mut input = node.receiver(&topics::POSTERIOR).unwrap();
+    let mut output = node.publisher(&topics::POSTERIOR).unwrap();
+
+    let mut bad = posterior(1);
+    bad.gaussian.mean[4] = f32::NAN;
+    assert!(matches!(output.send(bad), Err(SendError::Invalid { .. })), "the sender refuses it too");
+    bad.header_mut().run_id = 77;
+    output.send_unchecked(bad).unwrap();
+    let mut other_schema = posterior(2);
+    (other_schema.header.run_id, other_schema.header.schema_version) = (77, 999);
+    output.send_unchecked(other_schema).unwrap();
+    let mut other_run = posterior(3);
+    other_run.header.run_id = 78;
+    output.send_unchecked(other_run).unwrap();
+    output.send(posterior(4)).unwrap();
+
+    assert_eq!(input.next().unwrap().unwrap().header.frame_id, 4);
+    assert!(input.next().unwrap().is_none());
+    assert_eq!((node.counters().invalid(), node.counters().received()), (3, 1));
+}
+
+/// A picture whose size is not what its description says is refused by the sender and dropped by the receiver.
+#[test]
+fn pictures_must_have_the_size_they_claim() {
+    let run = TestRun::new();
+    let node = Node::open(&run.0, "test").unwrap();
+    let mut input = node.picture_receiver(&topics::FRAME).unwrap();
+    let mut output = node.picture_publisher(&topics::FRAME, 8 * 4 * 3).unwrap();
+    assert!(matches!(output.loan(8 * 4 * 3 + 1), Err(SendError::Size { .. })));
+
+    let loan = output.loan(8 * 3 * 3).unwrap();
+    assert!(matches!(output.send(loan, frame(0, 8, 4)), Err(SendError::Size { .. })));
+    let mut meta = frame(1, 8, 4);
+    meta.header.run_id = 77;
+    let loan = output.loan(8 * 3 * 3).unwrap();
+    output.send_unchecked(loan, meta).unwrap();
+
+    let mut loan = output.loan(8 * 4 * 3).unwrap();
+    loan.bytes_mut()[95] = 200;
+    output.send(loan, frame(2, 8, 4)).unwrap();
+    let picture = input.newest().unwrap().unwrap();
+    assert_eq!((picture.meta().header.frame_id, picture.bytes().len(), picture.bytes()[95]), (2, 96, 200));
+    assert_eq!(node.counters().invalid(), 1);
+}
+
+/// A wait ends by input, by time and by stop; input that came before the wait counts too.
+#[test]
+fn waits_end_for_three_reasons() {
+    let run = TestRun::new();
+    let node = Node::open(&run.0, "test").unwrap();
+    let mut posteriors = node.receiver(&topics::POSTERIOR).unwrap();
+    let beliefs = node.receiver(&topics::BELIEF).unwrap();
+    let mut output = node.publisher(&topics::POSTERIOR).unwrap();
+    let waiter = Waiter::new(Stop::new().unwrap());
+
+    assert_eq!(waiter.wait_until(&[&posteriors, &beliefs], monotonic_now_ns() + 1_000_000).unwrap(), Woken::Timeout);
+    output.send(posterior(0)).unwrap();
+    for _ in 0..2 {
+        // Still there until it is received.
+        assert_eq!(waiter.wait_until(&[&posteriors, &beliefs], in_seconds(30)).unwrap(), Woken::Input);
+    }
+    assert!(posteriors.newest().unwrap().is_some());
+
+    let stop = waiter.stop().clone();
+    let stopper = std::thread::spawn(move || stop.stop());
+    assert_eq!(waiter.wait_until(&[&posteriors, &beliefs], in_seconds(30)).unwrap(), Woken::Stopped);
+    stopper.join().unwrap();
+}
+
+/// Two runs with the same topics at once do not see each other's messages.
+#[test]
+fn runs_do_not_see_each_other() {
+    let (run_a, run_b) = (TestRun::new(), TestRun::new());
+    let (node_a, node_b) = (Node::open(&run_a.0, "a").unwrap(), Node::open(&run_b.0, "b").unwrap());
+    let mut input_b = node_b.receiver(&topics::POSTERIOR).unwrap();
+    let mut input_a = node_a.receiver(&topics::POSTERIOR).unwrap();
+    let mut output_a = node_a.publisher(&topics::POSTERIOR).unwrap();
+    output_a.send(posterior(5)).unwrap();
+    assert!(input_b.newest().unwrap().is_none());
+    assert_eq!(input_a.newest().unwrap().unwrap().header.frame_id, 5);
+}
+
+/// One more subscriber than the table allows gets an error that names the topic and the limit.
+#[test]
+fn limits_of_the_table_hold() {
+    let run = TestRun::new();
+    let node = Node::open(&run.0, "test").unwrap();
+    let max = topics::FRAME.limits.max_subscribers;
+    let held: Vec<_> = (0..max).map(|_| node.picture_receiver(&topics::FRAME).unwrap()).collect();
+    let error = node.picture_receiver(&topics::FRAME).unwrap_err();
+    assert!(matches!(&error, OpenError::TooMany { .. }), "{error}");
+    assert!(error.to_string().contains("camera/frame") && error.to_string().contains(&max.to_string()), "{error}");
+    drop(held);
+    node.picture_receiver(&topics::FRAME).unwrap();
+}
+
+/// A segment that shared memory has no room for is refused with an error before it is made.
+#[test]
+fn an_oversized_segment_is_refused_before_it_is_made() {
+    let run = TestRun::new();
+    let node = Node::open(&run.0, "test").unwrap();
+    let error = node.picture_publisher(&topics::FRAME, 1 << 50).unwrap_err();
+    assert!(matches!(&error, OpenError::SharedMemoryFull { .. }), "{error}");
+    assert!(error.to_string().contains("camera/frame"), "{error}");
+}
+
+/// A node that closes leaves nothing of its topics in shared memory, and nothing at all after the final sweep.
+#[test]
+fn a_clean_stop_leaves_nothing() {
+    let run = TestRun::new();
+    {
+        let node = Node::open(&run.0, "test").unwrap();
+        let _input = node.receiver(&topics::POSTERIOR).unwrap();
+        let mut output = node.publisher(&topics::POSTERIOR).unwrap();
+        output.send(posterior(0)).unwrap();
+        assert!(!run.0.shared_memory_files().unwrap().is_empty());
+    }
+    let left = run.0.shared_memory_files().unwrap();
+    assert!(left.iter().all(|f| f.to_string_lossy().contains("global_mgmt")), "{left:?}");
+    carff_transport::remove_run_leftovers(&run.0).unwrap();
+    assert!(run.0.shared_memory_files().unwrap().is_empty());
+    assert!(!run.0.folder().exists());
+    // Sweeping what is not there is no error.
+    carff_transport::remove_run_leftovers(&Run::new("never-existed", 0).unwrap()).unwrap();
+}

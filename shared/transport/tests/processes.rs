@@ -1,0 +1,161 @@
+//! Sending and receiving between processes, and what is left of those that are killed.
+
+mod common;
+
+use carff_transport::{Node, Stop, Waiter, Woken, cleanup_dead, topics};
+use common::{Role, TestRun, frame, in_seconds, posterior};
+use std::io::{BufRead, BufReader, Write};
+
+const SIDE: u32 = 32;
+const BYTES: usize = (SIDE * SIDE * 3) as usize;
+
+/// What the other process of a test does. Without a role it does nothing: then it is the test program's own run.
+#[test]
+fn role() {
+    let Some((role, run)) = common::role() else { return };
+    let stop = Stop::on_signals().unwrap();
+    let waiter = Waiter::new(stop.clone());
+    let node = Node::open(&run, &role).unwrap();
+    match role.as_str() {
+        // Sends a picture for each line on standard input.
+        "camera" => {
+            let mut output = node.picture_publisher(&topics::FRAME, BYTES).unwrap();
+            println!("ready");
+            for (i, _) in std::io::stdin().lines().enumerate() {
+                let mut loan = output.loan(BYTES).unwrap();
+                loan.bytes_mut().fill(i as u8 + 1);
+                output.send(loan, frame(i as u64, SIDE, SIDE)).unwrap();
+            }
+        }
+        // Holds memory in mid-loan until it is killed.
+        "loaner" => {
+            let output = node.picture_publisher(&topics::FRAME, BYTES).unwrap();
+            let _loan = output.loan(BYTES).unwrap();
+            println!("ready");
+            waiter.wait_until(&[], in_seconds(60)).unwrap();
+        }
+        // Receives until it is stopped by a signal; then ends cleanly.
+        "reader" => {
+            let mut input = node.receiver(&topics::POSTERIOR).unwrap();
+            println!("ready");
+            while waiter.wait_until(&[&input], in_seconds(60)).unwrap() == Woken::Input {
+                if let Some(sample) = input.newest().unwrap() {
+                    println!("frame {}", sample.header.frame_id);
+                }
+            }
+            println!("stopped {}", stop.is_stopped());
+        }
+        other => panic!("unknown role {other}"),
+    }
+}
+
+/// The lines that a role prints, without the test harness's own.
+fn lines(child: &mut Role) -> impl Iterator<Item = String> + use<> {
+    let stdout = child.0.stdout.take().unwrap();
+    BufReader::new(stdout).lines().map_while(Result::ok)
+}
+
+fn wait_for(lines: &mut impl Iterator<Item = String>, wanted: &str) {
+    assert!(lines.any(|line| line.ends_with(wanted)), "the other process ended without `{wanted}`");
+}
+
+/// Zero copy: the address that the receiver reads lies in a mapping of the publisher's data segment, which the other
+/// process created in shared memory, and a second picture at the same address space is read in place too.
+#[test]
+fn pictures_are_read_in_the_publishers_segment() {
+    let run = TestRun::new();
+    let node = Node::open(&run.0, "test").unwrap();
+    let mut input = node.picture_receiver(&topics::FRAME).unwrap();
+    let waiter = Waiter::new(Stop::new().unwrap());
+    let mut camera = Role::start("camera", &run.0);
+    let mut output = lines(&mut camera);
+    wait_for(&mut output, "ready");
+    for i in 0..3_u8 {
+        writeln!(camera.0.stdin.as_mut().unwrap(), "next").unwrap();
+        assert_eq!(waiter.wait_until(&[&input], in_seconds(30)).unwrap(), Woken::Input);
+        let picture = input.newest().unwrap().unwrap();
+        assert!(picture.bytes().iter().all(|&b| b == i + 1));
+        let (first, last) = (picture.bytes().as_ptr() as usize, &raw const picture.bytes()[BYTES - 1] as usize);
+        let mapping = mapping_of(first).expect("the address is in a mapping of a file");
+        assert!(mapping.range.contains(&last), "the whole picture lies in it");
+        assert!(mapping.file.contains(&run.0.shared_memory_prefix()), "{}", mapping.file);
+        assert!(mapping.file.contains(".data"), "it is a data segment: {}", mapping.file);
+    }
+    drop(camera.0.stdin.take());
+    assert!(camera.0.wait().unwrap().success());
+}
+
+struct Mapping {
+    range: std::ops::Range<usize>,
+    file: String,
+}
+
+/// The file mapping of this process that holds an address.
+fn mapping_of(address: usize) -> Option<Mapping> {
+    std::fs::read_to_string("/proc/self/maps").unwrap().lines().find_map(|line| {
+        let mut fields = line.split_whitespace();
+        let (start, end) = fields.next()?.split_once('-')?;
+        let range = usize::from_str_radix(start, 16).ok()?..usize::from_str_radix(end, 16).ok()?;
+        let file = fields.nth(4)?.to_owned();
+        range.contains(&address).then_some(Mapping { range, file })
+    })
+}
+
+/// A publisher killed in mid-loan does not hold up its successor: after the clean-up a new one sends and is heard.
+#[test]
+fn a_publisher_killed_in_mid_loan_is_replaced() {
+    let run = TestRun::new();
+    let node = Node::open(&run.0, "test").unwrap();
+    let mut input = node.picture_receiver(&topics::FRAME).unwrap();
+    let waiter = Waiter::new(Stop::new().unwrap());
+    for _ in 0..3 {
+        let mut loaner = Role::start("loaner", &run.0);
+        wait_for(&mut lines(&mut loaner), "ready");
+        loaner.kill();
+        assert_eq!(cleanup_dead(&run.0).unwrap(), 1);
+    }
+    let mut camera = Role::start("camera", &run.0);
+    wait_for(&mut lines(&mut camera), "ready");
+    writeln!(camera.0.stdin.as_mut().unwrap(), "next").unwrap();
+    assert_eq!(waiter.wait_until(&[&input], in_seconds(30)).unwrap(), Woken::Input);
+    assert_eq!(input.newest().unwrap().unwrap().bytes()[0], 1);
+}
+
+/// A stopped (SIGSTOP) or killed subscriber does not keep the publisher from sending, and a signal ends a wait cleanly.
+#[test]
+fn no_subscriber_delays_a_publisher_and_signals_end_waits() {
+    let run = TestRun::new();
+    let node = Node::open(&run.0, "test").unwrap();
+    let mut output = node.publisher(&topics::POSTERIOR).unwrap();
+    let mut readers: Vec<_> = (0..3).map(|_| Role::start("reader", &run.0)).collect();
+    let mut printed: Vec<_> = readers.iter_mut().map(lines).collect();
+    for lines in &mut printed {
+        wait_for(lines, "ready");
+    }
+    readers[0].signal(rustix::process::Signal::STOP);
+    readers[1].kill();
+    for frame_id in 0..2000 {
+        output.send(posterior(frame_id)).unwrap();
+    }
+    wait_for(&mut printed[2], "frame 1999");
+    readers[2].signal(rustix::process::Signal::TERM);
+    wait_for(&mut printed[2], "stopped true");
+    assert!(readers[2].0.wait().unwrap().success());
+    readers[0].signal(rustix::process::Signal::CONT);
+    wait_for(&mut printed[0], "frame 1999");
+}
+
+/// Killing everything leaves files; whoever knows that all are dead removes them all.
+#[test]
+fn leftovers_of_killed_processes_can_be_removed() {
+    let run = TestRun::new();
+    let mut roles = [Role::start("loaner", &run.0), Role::start("reader", &run.0)];
+    for child in &mut roles {
+        wait_for(&mut lines(child), "ready");
+    }
+    roles.iter_mut().for_each(Role::kill);
+    assert!(!run.0.shared_memory_files().unwrap().is_empty());
+    carff_transport::remove_run_leftovers(&run.0).unwrap();
+    assert!(run.0.shared_memory_files().unwrap().is_empty());
+    assert!(!run.0.folder().exists());
+}
