@@ -49,6 +49,8 @@ pub struct Encoder {
 
 #[derive(Debug)]
 struct Head {
+    center: Tensor,
+    scale: Tensor,
     reduce: nn::Conv2D,
     pool: nn::Conv2D,
     hidden: nn::Linear,
@@ -79,6 +81,8 @@ impl Encoder {
         let side = (backbone.grid() + 1) / 2;
         let linear = nn::LinearConfig::default();
         let head = Head {
+            center: p.zeros_no_train("center", &[1, backbone.channels(), 1, 1]),
+            scale: p.ones_no_train("scale", &[1, backbone.channels(), 1, 1]),
             reduce: nn::conv2d(
                 &p / "reduce",
                 backbone.channels(),
@@ -105,12 +109,24 @@ impl Encoder {
     /// Backbone features to posterior mean and log-variance, each `[N, 8]`.
     /// With `dropout` above zero, hidden units are dropped with that probability (training only).
     pub fn posterior(&self, features: &Tensor, dropout: f64) -> (Tensor, Tensor) {
-        let x = self.head.reduce.forward(features).relu();
+        let x = (features - &self.head.center) * &self.head.scale;
+        let x = self.head.reduce.forward(&x).relu();
         let x = self.head.pool.forward(&x).relu().flatten(1, -1);
         let x = if dropout > 0.0 { x.dropout(dropout, true) } else { x };
         let x = self.head.hidden.forward(&x).relu();
         let log_variance = self.head.log_variance.forward(&x).clamp(LOG_VARIANCE_RANGE.0, LOG_VARIANCE_RANGE.1);
         (self.head.mean.forward(&x), log_variance)
+    }
+
+    /// Makes the head bring features to zero mean and unit deviation per channel, as measured on `features`.
+    pub fn standardise(&mut self, features: &Tensor) {
+        tch::no_grad(|| {
+            let axes = [0_i64, 2, 3];
+            let mean = features.mean_dim(axes.as_slice(), true, Kind::Float);
+            let deviation = (features - &mean).square().mean_dim(axes.as_slice(), true, Kind::Float).sqrt();
+            self.head.center.copy_(&mean);
+            self.head.scale.copy_(&(deviation + 1e-3).reciprocal());
+        });
     }
 
     /// The posteriors of pictures `[N, 3, H, W]`.

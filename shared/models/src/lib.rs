@@ -6,6 +6,7 @@
 //! Tensors are `f32`, pictures `[N, 3, H, W]` in 0..=1 unless said otherwise.
 
 pub mod adam;
+pub mod allocator;
 pub mod backbone;
 pub mod borrow;
 pub mod decoder;

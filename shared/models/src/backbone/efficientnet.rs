@@ -53,7 +53,7 @@ impl EfficientNetLite0 {
     /// The folded weights are registered in `path`, not trainable.
     pub fn new(path: &nn::Path, tensors: Option<&Tensors>, input_px: i64) -> Result<Self, ModelError> {
         let read = |conv: &str, norm: &str, shape: [i64; 4], stride: i64, groups: i64| {
-            let target = path / conv.replace('.', "/");
+            let target = conv.split('.').fold(path.clone(), |p, part| p / part);
             folded(&target, tensors, conv, norm, shape, stride, groups)
         };
         let stem = read("_conv_stem", "_bn0", [32, 3, 3, 3], 2, 1)?;

@@ -1,0 +1,388 @@
+//! A trained scenario on disk: manifest and weights.
+//!
+//! A checkpoint is a folder: `manifest.json` says what was trained, on what, how and how well; the weights lie beside
+//! it as safetensors. Nothing in it is code. What does not fit is an error that names the key.
+
+use carff_dataset::ScenarioInfo;
+use carff_field::{Field, FieldConfig};
+use carff_models::{
+    LatentGaussian, ModelError,
+    decoder::{Decoder, DecoderConfig},
+    encoder::{Encoder, EncoderConfig},
+    mixture::{MixtureConfig, MixtureNet},
+    weights::{self, Tensors},
+};
+use carff_probing::{Calibration, Place, Prober, ProbingError};
+use serde::{Deserialize, Serialize};
+use std::path::{Path, PathBuf};
+use tch::{Device, Kind, Tensor, nn::VarStore};
+
+/// The format that this program writes and reads.
+pub const FORMAT_VERSION: u32 = 1;
+/// A manifest is larger than this only by mistake.
+const MAX_MANIFEST_BYTES: u64 = 16 << 20;
+
+/// Why a checkpoint cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum CheckpointError {
+    /// A file could not be read or written.
+    #[error("checkpoint {path}: {source}; train it with `carff train`, or name another with --checkpoint")]
+    File {
+        /// Which file.
+        path: PathBuf,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// The manifest is not one.
+    #[error("checkpoint {path}: {what}")]
+    Manifest {
+        /// Which file.
+        path: PathBuf,
+        /// What is wrong.
+        what: String,
+    },
+    /// The checkpoint was trained on another scenario than the data set shows.
+    #[error("checkpoint {path} is of another scenario: `{key}` is {trained} there, and {given} in the data set")]
+    Scenario {
+        /// Which manifest.
+        path: PathBuf,
+        /// The key that differs.
+        key: &'static str,
+        /// What the checkpoint says.
+        trained: String,
+        /// What the data set says.
+        given: String,
+    },
+    /// A part is not there yet: training has not come so far.
+    #[error("checkpoint {path} has no {part}: run `carff train --stage {stage}`")]
+    Missing {
+        /// Which checkpoint.
+        path: PathBuf,
+        /// What is missing.
+        part: &'static str,
+        /// The training stage that makes it.
+        stage: &'static str,
+    },
+    /// Weights do not fit.
+    #[error("checkpoint {path}: {source}")]
+    Model {
+        /// Which checkpoint.
+        path: PathBuf,
+        /// What is wrong.
+        source: ModelError,
+    },
+    /// The field's weights do not fit.
+    #[error("checkpoint {path}: {source}")]
+    Field {
+        /// Which checkpoint.
+        path: PathBuf,
+        /// What is wrong.
+        source: carff_field::FieldError,
+    },
+    /// The probing section is wrong.
+    #[error("checkpoint {path}: {source}")]
+    Probing {
+        /// Which checkpoint.
+        path: PathBuf,
+        /// What is wrong.
+        source: ProbingError,
+    },
+}
+
+/// What a scenario is known by.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ScenarioIdentity {
+    /// Its name.
+    pub name: String,
+    /// Names of the branches.
+    pub branches: Vec<String>,
+    /// Steps per branch.
+    pub timestamps: usize,
+    /// Branches in which the hazard action is right.
+    pub hazard_branches: Vec<usize>,
+    /// Number of fixed camera poses.
+    pub poses: usize,
+}
+
+impl ScenarioIdentity {
+    /// The identity of a data set's scenario.
+    pub fn of(scenario: &ScenarioInfo, poses: usize) -> Self {
+        Self {
+            name: scenario.name.clone(),
+            branches: scenario.branches.clone(),
+            timestamps: scenario.timestamps,
+            hazard_branches: scenario.hazard_branches.clone(),
+            poses,
+        }
+    }
+
+    /// Number of states.
+    pub fn state_count(&self) -> usize {
+        self.branches.len() * self.timestamps
+    }
+
+    /// Per state whether the right action there is the hazard one.
+    pub fn hazard_states(&self) -> Vec<bool> {
+        (0..self.state_count()).map(|s| self.hazard_branches.contains(&(s / self.timestamps.max(1)))).collect()
+    }
+}
+
+/// Which poses training saw.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SplitRecord {
+    /// Seed of the split.
+    pub seed: u64,
+    /// Poses never trained on.
+    pub unseen: Vec<usize>,
+    /// Poses trained on, and used for thresholds and choices.
+    pub calibration: Vec<usize>,
+}
+
+/// What was trained, on what, how and how well.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Manifest {
+    /// Version of this format.
+    pub format_version: u32,
+    /// The scenario.
+    pub scenario: ScenarioIdentity,
+    /// Seed of the training.
+    pub seed: u64,
+    /// Which poses training saw.
+    pub split: SplitRecord,
+    /// Shape of the encoder.
+    pub encoder: EncoderConfig,
+    /// Shape of the decoder.
+    pub decoder: DecoderConfig,
+    /// Shape of the mixture density network.
+    pub mixture: MixtureConfig,
+    /// Structure of the field, once it is trained.
+    pub field: Option<FieldConfig>,
+    /// Per known state the posterior that stands for it: what a resolved state feeds back.
+    pub states: Vec<LatentGaussian>,
+    /// Places to probe.
+    pub places: Vec<Place>,
+    /// How the places look when taken and when free, once the field is trained.
+    pub probing: Option<Calibration>,
+    /// Threshold of the calibrated rule, chosen on the calibration poses.
+    pub hazard_threshold: Option<f64>,
+    /// The training file, as used.
+    pub training: serde_json::Value,
+    /// Figures by training stage.
+    pub metrics: serde_json::Value,
+}
+
+/// Names of the files in a checkpoint.
+pub mod files {
+    /// The manifest.
+    pub const MANIFEST: &str = "manifest.json";
+    /// The frozen backbone.
+    pub const BACKBONE: &str = "backbone.safetensors";
+    /// The encoder's head.
+    pub const ENCODER: &str = "encoder.safetensors";
+    /// The decoder.
+    pub const DECODER: &str = "decoder.safetensors";
+    /// The mixture density network.
+    pub const MIXTURE: &str = "mixture.safetensors";
+    /// The field.
+    pub const FIELD: &str = "field.safetensors";
+}
+
+impl Manifest {
+    /// Reads the manifest of a checkpoint and checks that its parts agree.
+    pub fn load(dir: &Path) -> Result<Self, CheckpointError> {
+        let path = dir.join(files::MANIFEST);
+        let file = |source| CheckpointError::File { path: path.clone(), source };
+        let wrong = |what: String| CheckpointError::Manifest { path: path.clone(), what };
+        let size = std::fs::metadata(&path).map_err(file)?.len();
+        if size > MAX_MANIFEST_BYTES {
+            return Err(wrong(format!("{size} bytes; at most {MAX_MANIFEST_BYTES} are allowed")));
+        }
+        let text = std::fs::read_to_string(&path).map_err(file)?;
+        // The version first: a manifest of another format may differ in every other key.
+        let value: serde_json::Value = serde_json::from_str(&text).map_err(|e| wrong(e.to_string()))?;
+        match value.get("format_version").and_then(serde_json::Value::as_u64) {
+            Some(v) if v == u64::from(FORMAT_VERSION) => {}
+            found => {
+                let found = found.map_or("missing".to_owned(), |v| v.to_string());
+                return Err(wrong(format!(
+                    "`format_version` is {found}, this program reads {FORMAT_VERSION}; train the checkpoint again"
+                )));
+            }
+        }
+        let manifest: Self = serde_json::from_str(&text).map_err(|e| wrong(e.to_string()))?;
+        manifest.check().map_err(wrong)?;
+        Ok(manifest)
+    }
+
+    fn check(&self) -> Result<(), String> {
+        let states = self.scenario.state_count();
+        if !(1..=64).contains(&states) {
+            return Err(format!("`scenario` has {states} states; 1 to 64 are allowed"));
+        }
+        if let Some(b) = self.scenario.hazard_branches.iter().find(|b| **b >= self.scenario.branches.len()) {
+            return Err(format!(
+                "`scenario.hazard_branches` names branch {b}, there are {}",
+                self.scenario.branches.len()
+            ));
+        }
+        if self.states.len() != states {
+            return Err(format!("`states` has {} entries, the scenario {states}", self.states.len()));
+        }
+        let finite = |g: &LatentGaussian| g.mean.iter().chain(&g.log_variance).all(|v| v.is_finite());
+        if !self.states.iter().all(finite) {
+            return Err("`states` has a number that is not finite".into());
+        }
+        if self.places.len() > 16 {
+            return Err(format!("`places` has {} entries; at most 16 are allowed", self.places.len()));
+        }
+        if self.hazard_threshold.is_some_and(|t| !(0.0..=1.0).contains(&t)) {
+            return Err("`hazard_threshold` must lie in 0..=1".into());
+        }
+        Ok(())
+    }
+
+    /// Writes the manifest, whole or not at all.
+    pub fn save(&self, dir: &Path) -> Result<(), CheckpointError> {
+        let path = dir.join(files::MANIFEST);
+        let file = |source| CheckpointError::File { path: path.clone(), source };
+        let text = serde_json::to_string_pretty(self)
+            .map_err(|e| CheckpointError::Manifest { path: path.clone(), what: e.to_string() })?;
+        let partial = path.with_extension("partial");
+        std::fs::create_dir_all(dir).map_err(file)?;
+        std::fs::write(&partial, text + "\n").map_err(file)?;
+        std::fs::rename(&partial, &path).map_err(file)
+    }
+
+    /// Checks that a data set shows the scenario that was trained; the error names the key that differs.
+    pub fn check_scenario(&self, dir: &Path, given: &ScenarioIdentity) -> Result<(), CheckpointError> {
+        let trained = &self.scenario;
+        let show = |key, a: &dyn std::fmt::Debug, b: &dyn std::fmt::Debug| CheckpointError::Scenario {
+            path: dir.join(files::MANIFEST),
+            key,
+            trained: format!("{a:?}"),
+            given: format!("{b:?}"),
+        };
+        if trained.name != given.name {
+            return Err(show("scenario.name", &trained.name, &given.name));
+        }
+        if trained.branches != given.branches {
+            return Err(show("scenario.branches", &trained.branches, &given.branches));
+        }
+        if trained.timestamps != given.timestamps {
+            return Err(show("scenario.timestamps", &trained.timestamps, &given.timestamps));
+        }
+        if trained.hazard_branches != given.hazard_branches {
+            return Err(show("scenario.hazard_branches", &trained.hazard_branches, &given.hazard_branches));
+        }
+        if trained.poses != given.poses {
+            return Err(show("scenario.poses", &trained.poses, &given.poses));
+        }
+        Ok(())
+    }
+}
+
+fn model(dir: &Path) -> impl Fn(ModelError) -> CheckpointError + '_ {
+    move |source| CheckpointError::Model { path: dir.into(), source }
+}
+
+/// Reads the encoder.
+pub fn load_encoder(dir: &Path, manifest: &Manifest) -> Result<Encoder, CheckpointError> {
+    let wrong = model(dir);
+    let backbone = VarStore::new(Device::Cpu);
+    let head = VarStore::new(Device::Cpu);
+    let frozen = manifest.encoder.backbone.frozen;
+    let file = dir.join(files::BACKBONE);
+    let pretrained = (frozen && file.is_file()).then_some(file.as_path());
+    let encoder =
+        Encoder::new(&manifest.encoder, &(backbone.root() / "backbone"), &(head.root() / "encoder"), pretrained)
+            .map_err(&wrong)?;
+    let mut tensors = weights::read(&dir.join(files::ENCODER)).map_err(&wrong)?;
+    if pretrained.is_none() {
+        // A backbone that learned lies in the encoder's own file.
+        let own: Tensors =
+            weights::of_store(&backbone).into_keys().filter_map(|k| tensors.remove(&k).map(|t| (k, t))).collect();
+        weights::fill_store(&backbone, &own).map_err(&wrong)?;
+    }
+    weights::fill_store(&head, &tensors).map_err(&wrong)?;
+    Ok(encoder)
+}
+
+/// Reads the decoder.
+pub fn load_decoder(dir: &Path, manifest: &Manifest) -> Result<Decoder, CheckpointError> {
+    let wrong = model(dir);
+    let store = VarStore::new(Device::Cpu);
+    let decoder = Decoder::new(&(store.root() / "decoder"), &manifest.decoder, manifest.scenario.poses as i64);
+    let tensors = weights::read(&dir.join(files::DECODER)).map_err(&wrong)?;
+    weights::fill_store(&store, &tensors).map_err(&wrong)?;
+    Ok(decoder)
+}
+
+/// Reads the mixture density network.
+pub fn load_mixture(dir: &Path, manifest: &Manifest) -> Result<MixtureNet, CheckpointError> {
+    let path = dir.join(files::MIXTURE);
+    if !path.is_file() {
+        return Err(CheckpointError::Missing { path: dir.into(), part: "mixture density network", stage: "mdn" });
+    }
+    let wrong = model(dir);
+    let store = VarStore::new(Device::Cpu);
+    let net = MixtureNet::new(&(store.root() / "mixture"), &manifest.mixture).map_err(&wrong)?;
+    weights::fill_store(&store, &weights::read(&path).map_err(&wrong)?).map_err(&wrong)?;
+    Ok(net)
+}
+
+/// Reads the field.
+pub fn load_field(dir: &Path, manifest: &Manifest) -> Result<Field, CheckpointError> {
+    let path = dir.join(files::FIELD);
+    let missing = || CheckpointError::Missing { path: dir.into(), part: "field", stage: "nerf" };
+    let config = manifest.field.clone().ok_or_else(missing)?;
+    if !path.is_file() {
+        return Err(missing());
+    }
+    let tensors = weights::read(&path).map_err(model(dir))?;
+    let rows = tensors.into_iter().map(|(name, t)| {
+        let shape: Vec<usize> = t.size().iter().map(|&s| s as usize).collect();
+        let mut values = vec![0.0_f32; t.numel()];
+        let count = values.len();
+        t.to_kind(Kind::Float).contiguous().copy_data(&mut values, count);
+        (name, shape, values)
+    });
+    Field::from_tensors(config, rows).map_err(|source| CheckpointError::Field { path: dir.into(), source })
+}
+
+/// Writes the field, in half precision.
+pub fn save_field(dir: &Path, field: &Field) -> Result<(), CheckpointError> {
+    let tensors: Tensors = field
+        .tensors()
+        .into_iter()
+        .map(|t| {
+            let shape: Vec<i64> = t.shape.iter().map(|&s| s as i64).collect();
+            (t.name.into_owned(), Tensor::from_slice(&t.data).view(shape.as_slice()))
+        })
+        .collect();
+    save_weights(dir, files::FIELD, &tensors)
+}
+
+/// Writes the weights of one part, in half precision.
+pub fn save_weights(dir: &Path, file: &str, tensors: &Tensors) -> Result<(), CheckpointError> {
+    std::fs::create_dir_all(dir).map_err(|source| CheckpointError::File { path: dir.into(), source })?;
+    weights::write(&dir.join(file), tensors, Kind::Half).map_err(model(dir))
+}
+
+/// The prober of a checkpoint, and its calibration.
+pub fn load_probing(dir: &Path, manifest: &Manifest) -> Result<(Prober, Calibration), CheckpointError> {
+    let missing = || CheckpointError::Missing { path: dir.into(), part: "probe calibration", stage: "nerf" };
+    let calibration = manifest.probing.clone().ok_or_else(missing)?;
+    let prober = Prober::new(manifest.places.clone(), manifest.scenario.hazard_states())
+        .map_err(|source| CheckpointError::Probing { path: dir.into(), source })?;
+    if calibration.fits(&prober) {
+        Ok((prober, calibration))
+    } else {
+        Err(CheckpointError::Manifest {
+            path: dir.join(files::MANIFEST),
+            what: "`probing.places` and `places` differ in number".into(),
+        })
+    }
+}
