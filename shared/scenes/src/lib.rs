@@ -1,1 +1,31 @@
 //! Scenarios as data, and the ray tracer that takes their pictures.
+//!
+//! A scenario is a TOML file: what stands where, who drives where in which branch, and which cameras look. Nothing
+//! here knows of models, data-set readers or processes.
+//!
+//! ```no_run
+//! use carff_scenes::{RenderOptions, Scenario};
+//! # fn main() -> Result<(), carff_scenes::ScenarioError> {
+//! let scenario = Scenario::load("configs/scenarios/approaching-intersection.toml".as_ref())?;
+//! let camera = scenario.cameras()[0].camera;
+//! let rendering = scenario.render(0, 2, &camera, &RenderOptions::default())?;
+//! rendering.image.save_png("view.png".as_ref())?;
+//! # Ok(())
+//! # }
+//! ```
+
+mod cameras;
+pub mod config;
+mod error;
+mod materials;
+mod scenario;
+mod scenery;
+mod shapes;
+mod tracer;
+
+pub use cameras::ScenarioCamera;
+pub use error::ScenarioError;
+pub use scenario::{
+    ActorView, Detail, Extras, FULL_FRACTION, FULL_PIXELS, NONE_FRACTION, NONE_MEAN_DIFFERENCE, RenderOptions,
+    Rendering, Scenario,
+};

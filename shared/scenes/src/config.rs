@@ -1,0 +1,592 @@
+//! The scenario file: what stands where, who drives where, and which cameras look. All lengths are metres, all angles
+//! degrees, +Z is up, and the ground is z = 0. Unknown keys and values out of range are errors.
+
+use serde::de::Error as _;
+use serde::{Deserialize, Deserializer};
+use toml::Spanned;
+
+/// A whole scenario file.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ScenarioConfig {
+    /// Name of the scenario, as it appears in data sets and checkpoints.
+    pub name: String,
+    /// Lower and upper corner of the box that matters, metres.
+    #[serde(deserialize_with = "box3")]
+    pub bounds_m: [[f64; 3]; 2],
+    /// Steps of each course of events, 1 to 64.
+    #[serde(deserialize_with = "count")]
+    pub timestamps: usize,
+    /// Names of the courses of events.
+    pub branches: Vec<String>,
+    /// Names of the branches in which the hazard action is right.
+    #[serde(default)]
+    pub hazard_branches: Vec<Spanned<String>>,
+    /// Index of the camera pose that looks straight down.
+    pub bev_view: Option<Spanned<usize>>,
+    /// What the actions are called.
+    #[serde(default)]
+    pub actions: ActionsConfig,
+    /// Size and field of view of all pictures.
+    #[serde(default)]
+    pub picture: PictureConfig,
+    /// The sun.
+    #[serde(default)]
+    pub sun: SunConfig,
+    /// Colour of the open ground, `#rrggbb`.
+    #[serde(default = "default_ground", deserialize_with = "colour")]
+    pub ground_colour: [f32; 3],
+    /// Asphalt strips on the ground.
+    #[serde(default)]
+    pub road: Vec<RoadConfig>,
+    /// Paint on the roads.
+    #[serde(default)]
+    pub marking: Vec<MarkingConfig>,
+    /// Raised slabs: pavements, verges, islands.
+    #[serde(default)]
+    pub slab: Vec<SlabConfig>,
+    /// Buildings.
+    #[serde(default)]
+    pub building: Vec<BuildingConfig>,
+    /// Trees.
+    #[serde(default)]
+    pub tree: Vec<TreeConfig>,
+    /// Street furniture.
+    #[serde(default)]
+    pub prop: Vec<PropConfig>,
+    /// Everything that drives or is parked.
+    #[serde(default)]
+    pub vehicle: Vec<VehicleConfig>,
+    /// Cameras on a dome that look inwards. Views are numbered in the order orbit, overhead, dash, street.
+    #[serde(default)]
+    pub orbit: Vec<OrbitConfig>,
+    /// Cameras high above that look down.
+    #[serde(default)]
+    pub overhead: Vec<OverheadConfig>,
+    /// Cameras above a vehicle's roof, at each of its places.
+    #[serde(default)]
+    pub dash: Vec<DashConfig>,
+    /// Cameras spread over a region that look at another region.
+    #[serde(default)]
+    pub street: Vec<StreetConfig>,
+}
+
+/// Names of the actions.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct ActionsConfig {
+    /// What to do in a hazard branch.
+    pub hazard: String,
+    /// What to do in the others.
+    pub clear: String,
+}
+
+impl Default for ActionsConfig {
+    fn default() -> Self {
+        Self { hazard: "halt".to_owned(), clear: "advance".to_owned() }
+    }
+}
+
+/// Size and field of view of all pictures.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct PictureConfig {
+    /// Width, pixels, 8 to 4096.
+    #[serde(deserialize_with = "side")]
+    pub width_px: u32,
+    /// Height, pixels, 8 to 4096.
+    #[serde(deserialize_with = "side")]
+    pub height_px: u32,
+    /// Horizontal field of view, degrees, 5 to 150.
+    #[serde(deserialize_with = "field_of_view")]
+    pub fov_deg: f64,
+}
+
+impl Default for PictureConfig {
+    fn default() -> Self {
+        Self { width_px: 128, height_px: 128, fov_deg: 60.0 }
+    }
+}
+
+/// The sun.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct SunConfig {
+    /// Direction to the sun, from +X towards +Y.
+    #[serde(deserialize_with = "finite")]
+    pub azimuth_deg: f64,
+    /// Height above the horizon, 5 to 90.
+    #[serde(deserialize_with = "elevation")]
+    pub elevation_deg: f64,
+    /// Apparent radius: larger makes softer shadows. 0 to 10 (the real one is 0.27).
+    #[serde(deserialize_with = "softness")]
+    pub radius_deg: f64,
+}
+
+impl Default for SunConfig {
+    fn default() -> Self {
+        Self { azimuth_deg: 50.0, elevation_deg: 50.0, radius_deg: 1.5 }
+    }
+}
+
+/// A straight strip of asphalt.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RoadConfig {
+    /// Start of its centre line (x, y).
+    #[serde(deserialize_with = "point2")]
+    pub from: [f64; 2],
+    /// End of its centre line (x, y).
+    #[serde(deserialize_with = "point2")]
+    pub to: [f64; 2],
+    /// Its width.
+    #[serde(deserialize_with = "positive")]
+    pub width_m: f64,
+}
+
+/// A straight strip of paint: solid, dashed, or a zebra crossing (wide, with short dashes).
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct MarkingConfig {
+    /// Start of its centre line (x, y).
+    #[serde(deserialize_with = "point2")]
+    pub from: [f64; 2],
+    /// End of its centre line (x, y).
+    #[serde(deserialize_with = "point2")]
+    pub to: [f64; 2],
+    /// Its width.
+    #[serde(deserialize_with = "positive")]
+    pub width_m: f64,
+    /// Length of a dash; 0 for a solid line.
+    #[serde(default, deserialize_with = "not_negative")]
+    pub dash_m: f64,
+    /// Length of the gaps.
+    #[serde(default, deserialize_with = "not_negative")]
+    pub gap_m: f64,
+    /// Its colour, `#rrggbb`.
+    #[serde(default = "default_marking", deserialize_with = "colour")]
+    pub colour: [f32; 3],
+}
+
+/// What a slab is covered with.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum SlabSurface {
+    /// Concrete slabs.
+    Pavement,
+    /// Grass.
+    Grass,
+}
+
+/// A raised slab, along the axes.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SlabConfig {
+    /// Lower corner (x, y).
+    #[serde(deserialize_with = "point2")]
+    pub min: [f64; 2],
+    /// Upper corner (x, y).
+    #[serde(deserialize_with = "point2")]
+    pub max: [f64; 2],
+    /// Its height.
+    #[serde(deserialize_with = "positive")]
+    pub height_m: f64,
+    /// `pavement` or `grass`.
+    pub surface: SlabSurface,
+}
+
+/// What walls are made of.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Walls {
+    /// Courses of brick.
+    Brick,
+    /// Smooth plaster.
+    Plaster,
+}
+
+/// The form of a roof.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Roof {
+    /// Flat, with a parapet.
+    Flat,
+    /// Two slopes; the ridge runs along X.
+    Gable,
+}
+
+/// Which wall a door is in.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Side {
+    /// The +X wall.
+    East,
+    /// The +Y wall.
+    North,
+    /// The -X wall.
+    West,
+    /// The -Y wall.
+    South,
+}
+
+/// A building, along the axes.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct BuildingConfig {
+    /// Its name, as it appears among the static boxes.
+    pub name: String,
+    /// Lower corner (x, y).
+    #[serde(deserialize_with = "point2")]
+    pub min: [f64; 2],
+    /// Upper corner (x, y).
+    #[serde(deserialize_with = "point2")]
+    pub max: [f64; 2],
+    /// Height of the walls.
+    #[serde(deserialize_with = "positive")]
+    pub height_m: f64,
+    /// Rows of windows, 1 to 64.
+    #[serde(default = "one", deserialize_with = "count")]
+    pub storeys: usize,
+    /// `brick` or `plaster`.
+    pub walls: Walls,
+    /// Colour of the walls, `#rrggbb`.
+    #[serde(deserialize_with = "colour")]
+    pub colour: [f32; 3],
+    /// Colour of frames and edges, `#rrggbb`.
+    #[serde(default = "default_trim", deserialize_with = "colour")]
+    pub trim: [f32; 3],
+    /// `flat` or `gable`.
+    #[serde(default = "flat")]
+    pub roof: Roof,
+    /// Wall with the door: `east`, `north`, `west` or `south`.
+    #[serde(default = "north")]
+    pub door: Side,
+}
+
+/// Kinds of trees.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum TreeKind {
+    /// A trunk under a crown.
+    Round,
+    /// Cones on a trunk.
+    Conifer,
+    /// Leaves down to the ground.
+    Bush,
+}
+
+/// A tree.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TreeConfig {
+    /// Where it stands (x, y).
+    #[serde(deserialize_with = "point2")]
+    pub at: [f64; 2],
+    /// Its height.
+    #[serde(deserialize_with = "positive")]
+    pub height_m: f64,
+    /// `round`, `conifer` or `bush`.
+    pub kind: TreeKind,
+}
+
+/// Kinds of street furniture.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum PropKind {
+    /// A lamp post, 5 m; its arm points along its yaw.
+    Lamp,
+    /// A bench.
+    Bench,
+    /// A litter bin.
+    Bin,
+    /// A fire hydrant.
+    Hydrant,
+    /// A traffic cone.
+    Cone,
+    /// A stop sign; it faces along its yaw.
+    Stop,
+}
+
+/// A piece of street furniture.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PropConfig {
+    /// `lamp`, `bench`, `bin`, `hydrant`, `cone` or `stop`.
+    pub kind: PropKind,
+    /// Where it stands (x, y).
+    #[serde(deserialize_with = "point2")]
+    pub at: [f64; 2],
+    /// Turn about +Z.
+    #[serde(default, deserialize_with = "finite")]
+    pub yaw_deg: f64,
+}
+
+/// Kinds of vehicles.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum VehicleKind {
+    /// An open bed behind a cabin.
+    Pickup,
+    /// A hatchback.
+    Car,
+    /// A van.
+    Van,
+    /// A plain box, for tests and abstract scenes.
+    Block,
+}
+
+/// A vehicle and its courses.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct VehicleConfig {
+    /// Its name, as it appears among the boxes.
+    pub name: String,
+    /// Its part: `ego`, `actor`, or any other word.
+    pub role: String,
+    /// `pickup`, `car`, `van` or `block`.
+    pub kind: VehicleKind,
+    /// Colour of the body, `#rrggbb`.
+    #[serde(deserialize_with = "colour")]
+    pub colour: [f32; 3],
+    /// Length, width, height.
+    #[serde(deserialize_with = "size3")]
+    pub size_m: [f64; 3],
+    /// Whether its presence or motion is what the forecast is about. At most one vehicle is.
+    #[serde(default)]
+    pub dynamic: bool,
+    /// Where it is. In a branch that no course names, it is absent.
+    pub course: Vec<CourseConfig>,
+}
+
+/// Where a vehicle is in some branches.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CourseConfig {
+    /// Names of the branches.
+    pub branches: Vec<Spanned<String>>,
+    /// One [x, y, yaw in degrees] per timestamp.
+    pub poses: Spanned<Vec<[f64; 3]>>,
+}
+
+/// Cameras on a dome, spread by the golden angle.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct OrbitConfig {
+    /// Kind of these views, as it appears in data sets.
+    pub view_kind: String,
+    /// How many, 1 to 10000.
+    #[serde(deserialize_with = "many")]
+    pub count: usize,
+    /// What they look at.
+    #[serde(deserialize_with = "point3")]
+    pub center: [f64; 3],
+    /// Distance from it, lowest and highest.
+    #[serde(deserialize_with = "range")]
+    pub radius_m: [f64; 2],
+    /// Angle above the horizon, lowest and highest.
+    #[serde(deserialize_with = "range")]
+    pub elevation_deg: [f64; 2],
+}
+
+/// Cameras high above that look down. The first looks straight down from the middle; the picture's up is +Y.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct OverheadConfig {
+    /// Kind of these views, as it appears in data sets.
+    pub view_kind: String,
+    /// How many, 1 to 10000.
+    #[serde(deserialize_with = "many")]
+    pub count: usize,
+    /// Point on the ground below the first (x, y).
+    #[serde(deserialize_with = "point2")]
+    pub center: [f64; 2],
+    /// Height of the first.
+    #[serde(deserialize_with = "positive")]
+    pub height_m: f64,
+    /// How far the others stand aside, at most.
+    #[serde(deserialize_with = "not_negative")]
+    pub spread_m: f64,
+}
+
+/// Cameras above a vehicle's roof.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct DashConfig {
+    /// Kind of these views, as it appears in data sets.
+    pub view_kind: String,
+    /// Name of the vehicle.
+    pub vehicle: Spanned<String>,
+    /// How many at each of its places, 1 to 10000.
+    #[serde(deserialize_with = "many")]
+    pub count_per_place: usize,
+    /// Ahead of the vehicle's middle, lowest and highest.
+    #[serde(deserialize_with = "range")]
+    pub forward_m: [f64; 2],
+    /// Above the ground, lowest and highest.
+    #[serde(deserialize_with = "range")]
+    pub height_m: [f64; 2],
+    /// Left of straight ahead, lowest and highest.
+    #[serde(deserialize_with = "range")]
+    pub left_deg: [f64; 2],
+    /// Below the horizon, lowest and highest.
+    #[serde(deserialize_with = "range")]
+    pub down_deg: [f64; 2],
+}
+
+/// Cameras spread over a region that look at another region.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct StreetConfig {
+    /// Kind of these views, as it appears in data sets.
+    pub view_kind: String,
+    /// How many, 1 to 10000.
+    #[serde(deserialize_with = "many")]
+    pub count: usize,
+    /// Where they stand: lower and upper corner.
+    #[serde(deserialize_with = "box3")]
+    pub region: [[f64; 3]; 2],
+    /// Where they look: lower and upper corner.
+    #[serde(deserialize_with = "box3")]
+    pub look_at: [[f64; 3]; 2],
+}
+
+fn default_ground() -> [f32; 3] {
+    parse_colour("#5d8a3c").unwrap_or([0.1; 3])
+}
+
+fn default_marking() -> [f32; 3] {
+    parse_colour("#e4e4de").unwrap_or([0.8; 3])
+}
+
+fn default_trim() -> [f32; 3] {
+    parse_colour("#d8d2c4").unwrap_or([0.7; 3])
+}
+
+fn one() -> usize {
+    1
+}
+
+fn flat() -> Roof {
+    Roof::Flat
+}
+
+fn north() -> Side {
+    Side::North
+}
+
+/// `#rrggbb` in sRGB to linear RGB.
+fn parse_colour(text: &str) -> Option<[f32; 3]> {
+    let digits = text.strip_prefix('#').filter(|d| d.len() == 6 && d.is_ascii())?;
+    let mut rgb = [0.0; 3];
+    for (i, value) in rgb.iter_mut().enumerate() {
+        let byte = u8::from_str_radix(&digits[2 * i..2 * i + 2], 16).ok()?;
+        let c = f32::from(byte) / 255.0;
+        *value = if c <= 0.04045 { c / 12.92 } else { ((c + 0.055) / 1.055).powf(2.4) };
+    }
+    Some(rgb)
+}
+
+fn colour<'de, D: Deserializer<'de>>(d: D) -> Result<[f32; 3], D::Error> {
+    let text = String::deserialize(d)?;
+    parse_colour(&text).ok_or_else(|| D::Error::custom(format!("`{text}` is not a colour; write `#rrggbb`")))
+}
+
+fn in_range<'de, D: Deserializer<'de>>(d: D, low: f64, high: f64, what: &str) -> Result<f64, D::Error> {
+    let value = f64::deserialize(d)?;
+    if (low..=high).contains(&value) {
+        Ok(value)
+    } else {
+        Err(D::Error::custom(format!("{value} is out of range; {what} from {low} to {high} is allowed")))
+    }
+}
+
+fn finite<'de, D: Deserializer<'de>>(d: D) -> Result<f64, D::Error> {
+    in_range(d, -1e6, 1e6, "a number")
+}
+
+fn positive<'de, D: Deserializer<'de>>(d: D) -> Result<f64, D::Error> {
+    in_range(d, 1e-3, 1e4, "a length")
+}
+
+fn not_negative<'de, D: Deserializer<'de>>(d: D) -> Result<f64, D::Error> {
+    in_range(d, 0.0, 1e4, "a length")
+}
+
+fn field_of_view<'de, D: Deserializer<'de>>(d: D) -> Result<f64, D::Error> {
+    in_range(d, 5.0, 150.0, "an angle")
+}
+
+fn elevation<'de, D: Deserializer<'de>>(d: D) -> Result<f64, D::Error> {
+    in_range(d, 5.0, 90.0, "an angle")
+}
+
+fn softness<'de, D: Deserializer<'de>>(d: D) -> Result<f64, D::Error> {
+    in_range(d, 0.0, 10.0, "an angle")
+}
+
+fn whole<'de, D: Deserializer<'de>>(d: D, low: i64, high: i64) -> Result<i64, D::Error> {
+    let value = i64::deserialize(d)?;
+    if (low..=high).contains(&value) {
+        Ok(value)
+    } else {
+        Err(D::Error::custom(format!("{value} is out of range; a whole number from {low} to {high} is allowed")))
+    }
+}
+
+fn count<'de, D: Deserializer<'de>>(d: D) -> Result<usize, D::Error> {
+    whole(d, 1, 64).map(|v| v as usize)
+}
+
+fn many<'de, D: Deserializer<'de>>(d: D) -> Result<usize, D::Error> {
+    whole(d, 1, 10_000).map(|v| v as usize)
+}
+
+fn side<'de, D: Deserializer<'de>>(d: D) -> Result<u32, D::Error> {
+    whole(d, 8, 4096).map(|v| v as u32)
+}
+
+fn vector<'de, D: Deserializer<'de>, const N: usize>(d: D) -> Result<[f64; N], D::Error>
+where
+    [f64; N]: Deserialize<'de>,
+{
+    let value = <[f64; N]>::deserialize(d)?;
+    if value.iter().all(|v| v.abs() <= 1e5) {
+        Ok(value)
+    } else {
+        Err(D::Error::custom("a coordinate is out of range; -100000 to 100000 is allowed"))
+    }
+}
+
+fn point2<'de, D: Deserializer<'de>>(d: D) -> Result<[f64; 2], D::Error> {
+    vector(d)
+}
+
+fn point3<'de, D: Deserializer<'de>>(d: D) -> Result<[f64; 3], D::Error> {
+    vector(d)
+}
+
+fn size3<'de, D: Deserializer<'de>>(d: D) -> Result<[f64; 3], D::Error> {
+    let size = vector(d)?;
+    if size.iter().all(|v| (0.1..=100.0).contains(v)) {
+        Ok(size)
+    } else {
+        Err(D::Error::custom("a size is out of range; 0.1 to 100 is allowed"))
+    }
+}
+
+fn range<'de, D: Deserializer<'de>>(d: D) -> Result<[f64; 2], D::Error> {
+    let value: [f64; 2] = vector(d)?;
+    if value[0] <= value[1] { Ok(value) } else { Err(D::Error::custom("the lowest value must come first")) }
+}
+
+fn box3<'de, D: Deserializer<'de>>(d: D) -> Result<[[f64; 3]; 2], D::Error> {
+    let value = <[[f64; 3]; 2]>::deserialize(d)?;
+    if !value.iter().flatten().all(|v| v.abs() <= 1e5) {
+        return Err(D::Error::custom("a coordinate is out of range; -100000 to 100000 is allowed"));
+    }
+    if (0..3).all(|i| value[0][i] <= value[1][i]) {
+        Ok(value)
+    } else {
+        Err(D::Error::custom("the first corner must not be above the second along any axis"))
+    }
+}

@@ -1,0 +1,59 @@
+//! What can be wrong with a scenario, and where.
+
+use std::path::PathBuf;
+
+use carff_dataset::DatasetError;
+
+/// Why a scenario cannot be loaded or rendered.
+#[derive(Debug, thiserror::Error)]
+pub enum ScenarioError {
+    /// The file cannot be read.
+    #[error("{}: {source}", path.display())]
+    Io {
+        /// The scenario file.
+        path: PathBuf,
+        /// The system's reason.
+        source: std::io::Error,
+    },
+    /// A key that is unknown, missing, of the wrong type or out of range. Names line and column and shows the line.
+    #[error("{}: {}", path.display(), .source.to_string().trim_end())]
+    Toml {
+        /// The scenario file.
+        path: PathBuf,
+        /// Line, column, key and what is allowed.
+        source: Box<toml::de::Error>,
+    },
+    /// Values that are well-formed each but do not fit together.
+    #[error("{}:{line}: key `{key}`: {problem}", path.display())]
+    Key {
+        /// The scenario file.
+        path: PathBuf,
+        /// Line, from 1.
+        line: usize,
+        /// The key.
+        key: String,
+        /// What is wrong and what is allowed.
+        problem: String,
+    },
+    /// A branch or timestamp that the scenario does not have.
+    #[error("there is no branch {branch} at timestamp {timestamp}; the scenario has {branches} x {timestamps}")]
+    NoSuchState {
+        /// Branch asked for.
+        branch: usize,
+        /// Timestamp asked for.
+        timestamp: usize,
+        /// Branches there are.
+        branches: usize,
+        /// Timestamps there are.
+        timestamps: usize,
+    },
+    /// A camera that cannot take pictures.
+    #[error("the camera is not usable: {0}")]
+    Camera(#[from] carff_geometry::CameraError),
+    /// The set cannot be written.
+    #[error(transparent)]
+    Dataset(#[from] DatasetError),
+    /// The caller stopped the rendering.
+    #[error("rendering was stopped; run it again to finish the set")]
+    Stopped,
+}

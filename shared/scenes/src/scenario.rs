@@ -1,0 +1,640 @@
+//! A loaded scenario: checked, with its solids and cameras made, ready to be rendered.
+
+use std::collections::HashMap;
+use std::ops::ControlFlow;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+
+use carff_dataset::{Candidate, DatasetWriter, FrameRecord, Image, Observability, ScenarioInfo, StateInfo, looks_same};
+use carff_geometry::PinholeCamera;
+use rayon::prelude::*;
+use toml::Spanned;
+
+use crate::cameras::{Obstacles, ScenarioCamera, cameras};
+use crate::config::ScenarioConfig;
+use crate::error::ScenarioError;
+use crate::scenery::{Body, Pose, Scenery, scenery, vehicle_bodies, vehicle_box};
+use crate::tracer::{Scene, Setting, ray};
+
+/// A view is `full` from this visible fraction on.
+pub const FULL_FRACTION: f64 = 0.75;
+/// A view is `full` from this many visible pixels on (of a picture of 128 x 128; fewer or more in proportion).
+pub const FULL_PIXELS: u32 = 12;
+/// A view is `none` up to this visible fraction.
+pub const NONE_FRACTION: f64 = 0.02;
+/// A `none` view's pictures with and without the actor differ by at most this mean, of 255.
+pub const NONE_MEAN_DIFFERENCE: f64 = 0.02;
+/// The unbounded picture, in which hidden pixels are counted, reaches this many widths beyond each edge.
+const BEYOND: i64 = 3;
+
+/// What to work out besides the picture.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Detail {
+    /// Picture, depth and object ids.
+    Picture,
+    /// Also how much of the actor is seen; costs one more picture where it is hidden.
+    Observability,
+}
+
+/// How to render one view.
+#[derive(Clone, Copy, Debug)]
+pub struct RenderOptions {
+    /// What to work out.
+    pub detail: Detail,
+}
+
+impl Default for RenderOptions {
+    fn default() -> Self {
+        Self { detail: Detail::Observability }
+    }
+}
+
+/// How much of the actor a view shows.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ActorView {
+    /// Visible pixels over the pixels that it would cover in an unbounded picture with nothing in between, 0..=1.
+    pub visible_fraction: f32,
+    /// Visible pixels; where the actor is absent, those its place would have.
+    pub actor_px: u32,
+    /// The class that follows from them.
+    pub observability: Observability,
+}
+
+/// One rendered view.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Rendering {
+    /// The picture.
+    pub image: Image,
+    /// Distance along the ray through each pixel's centre, metres, row-major; infinite for the sky.
+    pub depth_m: Vec<f32>,
+    /// What the ray through each pixel's centre meets first: 0 sky, 1 ground, then objects as in
+    /// [`Scenario::object_name`].
+    pub object_id: Vec<u16>,
+    /// How much of the actor it shows; `None` when not asked for or when the scenario has no dynamic vehicle.
+    pub actor: Option<ActorView>,
+}
+
+/// What to write besides pictures.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Extras {
+    /// Pictures only.
+    #[default]
+    None,
+    /// Also `depth/` (16-bit PNG, millimetres along the ray, 0 for the sky and beyond 65.535 m) and `masks/` (8-bit
+    /// PNG, 255 where the pixel's centre shows the actor), named by `depth_file_path` and `mask_file_path`.
+    DepthAndMasks,
+}
+
+/// Where each vehicle stands; absent ones are `None`.
+type Placement = Vec<Option<Pose>>;
+type PlacementKey = Vec<Option<[u64; 3]>>;
+
+fn key_of(placement: &Placement) -> PlacementKey {
+    placement.iter().map(|p| p.map(|p| p.map(f64::to_bits))).collect()
+}
+
+/// A scenario, ready to be rendered.
+pub struct Scenario {
+    path: PathBuf,
+    config: ScenarioConfig,
+    scenery: Scenery,
+    setting: Setting,
+    cameras: Vec<ScenarioCamera>,
+    info: ScenarioInfo,
+    /// By branch, then timestamp.
+    placements: Vec<Vec<Placement>>,
+    dynamic: Option<usize>,
+    scenes: HashMap<PlacementKey, Scene>,
+}
+
+impl std::fmt::Debug for Scenario {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Scenario").field("path", &self.path).field("name", &self.config.name).finish_non_exhaustive()
+    }
+}
+
+/// Turns places in the text into line numbers.
+struct Source<'a> {
+    path: &'a Path,
+    text: &'a str,
+}
+
+impl Source<'_> {
+    fn error(&self, offset: usize, key: &str, problem: impl Into<String>) -> ScenarioError {
+        let line = self.text.bytes().take(offset).filter(|b| *b == b'\n').count() + 1;
+        ScenarioError::Key { path: self.path.to_owned(), line, key: key.to_owned(), problem: problem.into() }
+    }
+
+    fn error_at<T>(&self, value: &Spanned<T>, key: &str, problem: impl Into<String>) -> ScenarioError {
+        self.error(value.span().start, key, problem)
+    }
+
+    /// For keys whose place is not kept: the first line that sets it.
+    fn error_in(&self, key: &str, problem: impl Into<String>) -> ScenarioError {
+        let is_key = |line: &str| {
+            line.trim_start()
+                .trim_start_matches('[')
+                .strip_prefix(key)
+                .is_some_and(|rest| rest.trim_start().starts_with('=') || rest.starts_with(']'))
+        };
+        let offset: usize = self.text.split_inclusive('\n').take_while(|l| !is_key(l)).map(str::len).sum();
+        self.error(if offset == self.text.len() { 0 } else { offset }, key, problem)
+    }
+}
+
+impl Scenario {
+    /// Reads and checks a scenario file, and makes its solids and cameras.
+    pub fn load(path: &Path) -> Result<Self, ScenarioError> {
+        let text =
+            std::fs::read_to_string(path).map_err(|source| ScenarioError::Io { path: path.to_owned(), source })?;
+        Self::parse(path, &text)
+    }
+
+    /// As [`Scenario::load`], from text; `path` is only named in errors.
+    pub fn parse(path: &Path, text: &str) -> Result<Self, ScenarioError> {
+        let config: ScenarioConfig = toml::from_str(text)
+            .map_err(|source| ScenarioError::Toml { path: path.to_owned(), source: Box::new(source) })?;
+        let source = Source { path, text };
+        let (placements, dynamic, hazard_branches) = check(&source, &config)?;
+
+        let scenery = scenery(&config);
+        let mut scenes = HashMap::new();
+        let mut still_and_moving: Vec<Body> = Vec::new();
+        let mut build = |placement: &Placement| {
+            scenes.entry(key_of(placement)).or_insert_with(|| {
+                let vehicles = vehicles(&config, &scenery, placement);
+                still_and_moving.extend(vehicles.iter().cloned());
+                Scene::new(scenery.bodies.iter().cloned().chain(vehicles).collect())
+            });
+        };
+        for (branch, steps) in placements.iter().enumerate() {
+            for (timestamp, placement) in steps.iter().enumerate() {
+                build(placement);
+                for other in counterparts(&placements, dynamic, branch, timestamp) {
+                    build(&other);
+                }
+            }
+        }
+        let obstacles = Obstacles::new(
+            scenery.bodies.iter().map(|b| b.solid.aabb()),
+            still_and_moving.iter().map(|b| b.solid.aabb()),
+        );
+        let places = |name: &str| -> Vec<[f64; 3]> {
+            let Some(index) = config.vehicle.iter().position(|v| v.name == name) else { return Vec::new() };
+            let mut seen: Vec<Pose> = Vec::new();
+            for pose in (0..config.timestamps).flat_map(|t| placements.iter().filter_map(move |b| b[t][index])) {
+                if !seen.contains(&pose) {
+                    seen.push(pose);
+                }
+            }
+            seen
+        };
+        let cameras = cameras(&config, &obstacles, places).map_err(|key| {
+            source.error_in(key, "too few places for these cameras stand clear of everything; widen their ranges")
+        })?;
+        if let Some(view) = config.bev_view.as_ref().filter(|v| *v.get_ref() >= cameras.len()) {
+            return Err(source.error_at(
+                view,
+                "bev_view",
+                format!("is {}, but there are {} cameras", view.get_ref(), cameras.len()),
+            ));
+        }
+        let info = info(&config, &scenery, &placements, hazard_branches);
+        let setting = Setting::new(&config);
+        Ok(Self { path: path.to_owned(), config, scenery, setting, cameras, info, placements, dynamic, scenes })
+    }
+
+    /// The file that it was read from.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Branches, states, boxes and actions, as they are written into data sets.
+    pub fn info(&self) -> &ScenarioInfo {
+        &self.info
+    }
+
+    /// The fixed camera poses, in the order of their view index.
+    pub fn cameras(&self) -> &[ScenarioCamera] {
+        &self.cameras
+    }
+
+    /// Object index of a vehicle by name, as it appears in [`Rendering::object_id`].
+    pub fn object_of_vehicle(&self, name: &str) -> Option<u16> {
+        let index = self.config.vehicle.iter().position(|v| v.name == name)?;
+        Some(self.scenery.next_object + index as u16)
+    }
+
+    /// What an object index stands for: `sky`, `ground`, a vehicle's name, or `static`.
+    pub fn object_name(&self, object: u16) -> &str {
+        match object {
+            0 => "sky",
+            1 => "ground",
+            _ => object
+                .checked_sub(self.scenery.next_object)
+                .and_then(|i| self.config.vehicle.get(i as usize))
+                .map_or("static", |v| v.name.as_str()),
+        }
+    }
+
+    /// Takes one picture from any camera.
+    pub fn render(
+        &self,
+        branch: usize,
+        timestamp: usize,
+        camera: &PinholeCamera,
+        options: &RenderOptions,
+    ) -> Result<Rendering, ScenarioError> {
+        camera.validate()?;
+        let mut shots = Shots { scenario: self, camera, taken: HashMap::new() };
+        self.render_with(&mut shots, branch, timestamp, options.detail)
+    }
+
+    fn render_with(
+        &self,
+        shots: &mut Shots,
+        branch: usize,
+        timestamp: usize,
+        detail: Detail,
+    ) -> Result<Rendering, ScenarioError> {
+        let placement =
+            self.placements.get(branch).and_then(|b| b.get(timestamp)).ok_or_else(|| ScenarioError::NoSuchState {
+                branch,
+                timestamp,
+                branches: self.info.branches.len(),
+                timestamps: self.info.timestamps,
+            })?;
+        let actor = match (detail, self.dynamic) {
+            (Detail::Observability, Some(dynamic)) => Some(self.actor_view(shots, branch, timestamp, dynamic)),
+            _ => None,
+        };
+        let shot = shots.take(placement);
+        Ok(Rendering {
+            image: shot.image.clone(),
+            depth_m: shot.depth_m.clone(),
+            object_id: shot.object_id.clone(),
+            actor,
+        })
+    }
+
+    /// One ray per pixel centre against the actor alone in an unbounded picture, and against everything.
+    fn actor_view(&self, shots: &mut Shots, branch: usize, timestamp: usize, dynamic: usize) -> ActorView {
+        let camera = shots.camera;
+        let placement = &self.placements[branch][timestamp];
+        let others = counterparts(&self.placements, self.dynamic, branch, timestamp);
+        let vehicle = &self.config.vehicle[dynamic];
+        let object = self.scenery.next_object + dynamic as u16;
+        let (mut visible, mut would_be) = (0_u32, 0_u32);
+        let poses: Vec<Pose> = match placement[dynamic] {
+            Some(pose) => vec![pose],
+            None => others.iter().filter_map(|o| o[dynamic]).collect(),
+        };
+        for pose in poses {
+            let alone = Scene::new(vehicle_bodies(vehicle, pose, object));
+            let shot = shots.take(placement);
+            let corners = alone.bodies().iter().flat_map(|b| {
+                let aabb = b.solid.aabb();
+                (0..8).map(move |i| {
+                    let pick =
+                        |axis: usize| f64::from(if i >> axis & 1 == 0 { aabb.mins[axis] } else { aabb.maxs[axis] });
+                    [pick(0), pick(1), pick(2)]
+                })
+            });
+            let (w, h) = (i64::from(camera.width_px), i64::from(camera.height_px));
+            let (low, high) = reach(camera, corners);
+            for y in low[1].max(-BEYOND * h)..high[1].min((BEYOND + 1) * h) {
+                for x in low[0].max(-BEYOND * w)..high[0].min((BEYOND + 1) * w) {
+                    let (origin, direction) = ray(camera, x as f64 + 0.5, y as f64 + 0.5);
+                    let (t, hit) = alone.probe(origin, direction);
+                    if hit != object {
+                        continue;
+                    }
+                    would_be += 1;
+                    if (0..w).contains(&x) && (0..h).contains(&y) {
+                        // In the branch with the actor the first hit is the actor itself, at this very distance.
+                        let at = (y * w + x) as usize;
+                        visible += u32::from(shot.object_id[at] == object || t < shot.depth_m[at]);
+                    }
+                }
+            }
+        }
+        let fraction = if would_be == 0 { 0.0 } else { f64::from(visible) / f64::from(would_be) };
+        let scale = f64::from(camera.width_px) * f64::from(camera.height_px) / (128.0 * 128.0);
+        let observability = if fraction >= FULL_FRACTION && f64::from(visible) >= f64::from(FULL_PIXELS) * scale {
+            Observability::Full
+        } else if fraction <= NONE_FRACTION {
+            let own = shots.take(placement).image.clone();
+            let hidden = others.iter().all(|other| {
+                let image = &shots.take(other).image;
+                looks_same(&own, image) && mean_difference(&own, image) <= NONE_MEAN_DIFFERENCE
+            });
+            if hidden { Observability::None } else { Observability::Partial }
+        } else {
+            Observability::Partial
+        };
+        ActorView { visible_fraction: fraction as f32, actor_px: visible, observability }
+    }
+
+    /// Renders every camera in every state into a posed data set, in parallel. `progress` is told how many pictures
+    /// of how many are done, from any thread, and may stop the work. `transforms.json` is written last, so a stopped
+    /// run is not mistaken for a set and can be run again.
+    pub fn render_dataset(
+        &self,
+        out_dir: &Path,
+        extras: Extras,
+        progress: impl Fn(usize, usize) -> ControlFlow<()> + Sync,
+    ) -> Result<(), ScenarioError> {
+        let writer = DatasetWriter::create(out_dir)?;
+        let total = self.cameras.len() * self.info.state_count();
+        let (done, stopped) = (AtomicUsize::new(0), AtomicBool::new(false));
+        let of_view = |(view, camera): (usize, &ScenarioCamera)| -> Result<Vec<FrameRecord>, ScenarioError> {
+            let mut shots = Shots { scenario: self, camera: &camera.camera, taken: HashMap::new() };
+            let mut records = Vec::new();
+            for timestamp in 0..self.info.timestamps {
+                shots.taken.clear();
+                for branch in 0..self.info.branches.len() {
+                    if stopped.load(Ordering::Relaxed) {
+                        return Err(ScenarioError::Stopped);
+                    }
+                    let rendering = self.render_with(&mut shots, branch, timestamp, Detail::Observability)?;
+                    records.push(self.write_frame(&writer, branch, timestamp, view, camera, &rendering, extras)?);
+                    if progress(done.fetch_add(1, Ordering::Relaxed) + 1, total).is_break() {
+                        stopped.store(true, Ordering::Relaxed);
+                    }
+                }
+            }
+            Ok(records)
+        };
+        let by_view: Vec<_> = self.cameras.par_iter().enumerate().map(of_view).collect();
+        let mut records = Vec::with_capacity(total);
+        for of_view in by_view {
+            records.extend(of_view?);
+        }
+        if stopped.load(Ordering::Relaxed) {
+            return Err(ScenarioError::Stopped);
+        }
+        records.sort_by_key(|r| (r.branch_and_timestamp, r.view));
+        writer.finish(&records, Some(&self.info))?;
+        Ok(())
+    }
+
+    #[allow(clippy::too_many_arguments)]
+    fn write_frame(
+        &self,
+        writer: &DatasetWriter,
+        branch: usize,
+        timestamp: usize,
+        view: usize,
+        camera: &ScenarioCamera,
+        rendering: &Rendering,
+        extras: Extras,
+    ) -> Result<FrameRecord, ScenarioError> {
+        let name = format!("b{branch}_t{timestamp}_v{view:03}.png");
+        let mut record = FrameRecord::new(format!("images/{name}"), camera.camera);
+        writer.write_image(&record.file_path, &rendering.image)?;
+        record.branch_and_timestamp = Some((branch, timestamp));
+        record.view = Some(view);
+        record.view_kind = Some(camera.view_kind.clone());
+        if let Some(actor) = rendering.actor {
+            record.observability = Some(actor.observability);
+            record.visible_fraction = Some(actor.visible_fraction);
+            record.actor_px = Some(actor.actor_px);
+        }
+        if extras == Extras::DepthAndMasks {
+            let (w, h) = (rendering.image.width_px, rendering.image.height_px);
+            let depth = format!("depth/{name}");
+            writer.write_depth(&depth, &rendering.depth_m, w, h)?;
+            record.depth_file_path = Some(depth);
+            let object = self.dynamic.map(|d| self.scenery.next_object + d as u16);
+            let mask: Vec<bool> = rendering.object_id.iter().map(|id| Some(*id) == object).collect();
+            let path = format!("masks/{name}");
+            writer.write_mask(&path, &mask, w, h)?;
+            record.mask_file_path = Some(path);
+        }
+        Ok(record)
+    }
+}
+
+/// What a camera sees of one placement.
+struct Shot {
+    image: Image,
+    depth_m: Vec<f32>,
+    object_id: Vec<u16>,
+}
+
+/// The pictures that one camera has taken, by placement: states that are alike share one.
+struct Shots<'a> {
+    scenario: &'a Scenario,
+    camera: &'a PinholeCamera,
+    taken: HashMap<PlacementKey, Shot>,
+}
+
+impl Shots<'_> {
+    fn take(&mut self, placement: &Placement) -> &Shot {
+        let key = key_of(placement);
+        let scenario = self.scenario;
+        self.taken.entry(key).or_insert_with_key(|key| {
+            let snap = |scene: &Scene| {
+                let (image, depth_m, object_id) = scene.picture(&scenario.setting, self.camera);
+                Shot { image, depth_m, object_id }
+            };
+            match scenario.scenes.get(key) {
+                Some(scene) => snap(scene),
+                None => {
+                    let vehicles = vehicles(&scenario.config, &scenario.scenery, placement);
+                    snap(&Scene::new(scenario.scenery.bodies.iter().cloned().chain(vehicles).collect()))
+                }
+            }
+        })
+    }
+}
+
+fn mean_difference(a: &Image, b: &Image) -> f64 {
+    let sum: u64 = a.rgb.iter().zip(&b.rgb).map(|(a, b)| u64::from(a.abs_diff(*b))).sum();
+    sum as f64 / a.rgb.len().max(1) as f64
+}
+
+/// Pixels that points can fall into: lowest, and one past the highest. All that is allowed when a point is behind.
+fn reach(camera: &PinholeCamera, points: impl Iterator<Item = [f64; 3]>) -> ([i64; 2], [i64; 2]) {
+    let (mut low, mut high) = ([f64::INFINITY; 2], [f64::NEG_INFINITY; 2]);
+    let (mut behind, mut ahead) = (false, false);
+    for point in points {
+        match camera.project(point) {
+            Some((pixel, depth)) if depth > 0.05 => {
+                ahead = true;
+                for i in 0..2 {
+                    low[i] = low[i].min(pixel[i]);
+                    high[i] = high[i].max(pixel[i]);
+                }
+            }
+            _ => behind = true,
+        }
+    }
+    match (ahead, behind) {
+        (false, _) => ([0; 2], [0; 2]),
+        (true, true) => ([i64::MIN / 4; 2], [i64::MAX / 4; 2]),
+        (true, false) => (low.map(|v| v.floor() as i64 - 1), high.map(|v| v.ceil() as i64 + 1)),
+    }
+}
+
+fn vehicles(config: &ScenarioConfig, scenery: &Scenery, placement: &Placement) -> Vec<Body> {
+    let placed = config.vehicle.iter().zip(placement).enumerate();
+    placed
+        .filter_map(|(i, (vehicle, pose))| {
+            pose.map(|pose| vehicle_bodies(vehicle, pose, scenery.next_object + i as u16))
+        })
+        .flatten()
+        .collect()
+}
+
+/// The same placement with the actor gone, where it is there; with the actor at each place that it has at this
+/// timestamp in other branches, where it is not.
+fn counterparts(
+    placements: &[Vec<Placement>],
+    dynamic: Option<usize>,
+    branch: usize,
+    timestamp: usize,
+) -> Vec<Placement> {
+    let Some(dynamic) = dynamic else { return Vec::new() };
+    let own = &placements[branch][timestamp];
+    if own[dynamic].is_some() {
+        let mut without = own.clone();
+        without[dynamic] = None;
+        return vec![without];
+    }
+    let mut poses: Vec<Pose> = Vec::new();
+    for pose in placements.iter().filter_map(|b| b[timestamp][dynamic]) {
+        if !poses.contains(&pose) {
+            poses.push(pose);
+        }
+    }
+    poses
+        .into_iter()
+        .map(|pose| {
+            let mut with = own.clone();
+            with[dynamic] = Some(pose);
+            with
+        })
+        .collect()
+}
+
+type Checked = (Vec<Vec<Placement>>, Option<usize>, Vec<usize>);
+
+/// Cross-references: names, lengths of courses, at most one dynamic vehicle.
+fn check(source: &Source, config: &ScenarioConfig) -> Result<Checked, ScenarioError> {
+    if config.branches.is_empty() || config.branches.len() > 64 {
+        return Err(source.error_in("branches", format!("{} names; from 1 to 64 are allowed", config.branches.len())));
+    }
+    if (0..3).any(|i| config.bounds_m[0][i] >= config.bounds_m[1][i]) {
+        return Err(source.error_in("bounds_m", "the first corner must be below the second along every axis"));
+    }
+    for (i, name) in config.branches.iter().enumerate() {
+        if config.branches[..i].contains(name) {
+            return Err(source.error_in("branches", format!("`{name}` is named twice")));
+        }
+    }
+    let known = || config.branches.iter().map(|b| format!("`{b}`")).collect::<Vec<_>>().join(", ");
+    let branch_index = |name: &Spanned<String>, key: &str| {
+        config.branches.iter().position(|b| b == name.get_ref()).ok_or_else(|| {
+            source.error_at(name, key, format!("there is no branch `{}`; there are {}", name.get_ref(), known()))
+        })
+    };
+    let hazard_branches =
+        config.hazard_branches.iter().map(|b| branch_index(b, "hazard_branches")).collect::<Result<Vec<_>, _>>()?;
+    for (key, boxes) in [
+        ("slab", config.slab.iter().map(|b| (b.min, b.max)).collect::<Vec<_>>()),
+        ("building", config.building.iter().map(|b| (b.min, b.max)).collect()),
+    ] {
+        if let Some((min, max)) = boxes.iter().find(|(min, max)| min[0] >= max[0] || min[1] >= max[1]) {
+            return Err(source.error_in(key, format!("`min` {min:?} must be below `max` {max:?} along both axes")));
+        }
+    }
+    let mut placements = vec![vec![vec![None; config.vehicle.len()]; config.timestamps]; config.branches.len()];
+    let mut dynamic = None;
+    for (v, vehicle) in config.vehicle.iter().enumerate() {
+        if config.vehicle[..v].iter().any(|other| other.name == vehicle.name) {
+            return Err(source.error_in("vehicle", format!("`{}` is named twice", vehicle.name)));
+        }
+        if vehicle.dynamic && dynamic.replace(v).is_some() {
+            return Err(source.error_in("dynamic", "more than one vehicle is dynamic; at most one may be"));
+        }
+        for course in &vehicle.course {
+            let poses = course.poses.get_ref();
+            if poses.len() != config.timestamps {
+                return Err(source.error_at(
+                    &course.poses,
+                    "poses",
+                    format!("{} poses; one for each of the {} timestamps is needed", poses.len(), config.timestamps),
+                ));
+            }
+            if poses.iter().flatten().any(|value| value.is_nan() || value.abs() > 1e5) {
+                return Err(source.error_at(&course.poses, "poses", "a value is out of range; [x, y, yaw in degrees]"));
+            }
+            for name in &course.branches {
+                let branch = branch_index(name, "branches")?;
+                for (timestamp, pose) in poses.iter().enumerate() {
+                    let slot: &mut Option<Pose> = &mut placements[branch][timestamp][v];
+                    if slot.replace([pose[0], pose[1], pose[2].to_radians()]).is_some() {
+                        return Err(source.error_at(
+                            name,
+                            "branches",
+                            format!("`{}` has two courses in branch `{}`", vehicle.name, name.get_ref()),
+                        ));
+                    }
+                }
+            }
+        }
+    }
+    for group in &config.dash {
+        if !config.vehicle.iter().any(|v| v.name == *group.vehicle.get_ref()) {
+            return Err(source.error_at(
+                &group.vehicle,
+                "vehicle",
+                format!("there is no vehicle `{}`", group.vehicle.get_ref()),
+            ));
+        }
+    }
+    Ok((placements, dynamic, hazard_branches))
+}
+
+fn info(
+    config: &ScenarioConfig,
+    scenery: &Scenery,
+    placements: &[Vec<Placement>],
+    hazard_branches: Vec<usize>,
+) -> ScenarioInfo {
+    let mut states = Vec::new();
+    let mut candidates: Vec<Candidate> = Vec::new();
+    for (branch, steps) in placements.iter().enumerate() {
+        for (timestamp, placement) in steps.iter().enumerate() {
+            let mut boxes = Vec::new();
+            for (vehicle, pose) in config.vehicle.iter().zip(placement) {
+                let Some(pose) = pose else { continue };
+                let named_box = vehicle_box(vehicle, *pose);
+                if vehicle.dynamic {
+                    let candidate =
+                        Candidate { branch: None, timestamp: Some(timestamp), named_box: named_box.clone() };
+                    if !candidates.contains(&candidate) {
+                        candidates.push(candidate);
+                    }
+                }
+                boxes.push(named_box);
+            }
+            states.push(StateInfo { branch, timestamp, boxes });
+        }
+    }
+    candidates.sort_by_key(|c| c.timestamp);
+    ScenarioInfo {
+        name: config.name.clone(),
+        bounds: config.bounds_m,
+        branches: config.branches.clone(),
+        timestamps: config.timestamps,
+        bev_view: config.bev_view.as_ref().map(|v| *v.get_ref()),
+        states,
+        candidates,
+        static_boxes: scenery.boxes.clone(),
+        hazard_branches,
+        hazard_action: config.actions.hazard.clone(),
+        clear_action: config.actions.clear.clone(),
+    }
+}

@@ -1,0 +1,265 @@
+//! Solids and where rays enter them.
+//!
+//! The tree that finds which solids a ray may meet is parry's `Bvh`: it is kept up, builds by binned surface area
+//! heuristic, and casts rays best first with a user's own leaf test. Its general shape casts (convex solids and
+//! cylinders by GJK iterations) are slower and less exact than closed formulas, so the leaf tests are ours.
+
+use parry3d::bounding_volume::Aabb;
+pub(crate) use parry3d::math::Vector as Vec3;
+
+/// The form of a solid, in its own axes, centred at the origin.
+#[derive(Clone, Debug)]
+pub(crate) enum Form {
+    /// A cuboid, by half extents.
+    Cuboid(Vec3),
+    /// A cuboid cut by planes: each keeps what satisfies `normal . p <= offset`.
+    Cut { half: Vec3, planes: Vec<(Vec3, f32)> },
+    /// A closed cylinder about axis 0, 1 or 2.
+    Cylinder { axis: usize, radius: f32, half_length: f32 },
+    /// A closed cone about Z, with radius `base` at the bottom and none at the top.
+    Cone { base: f32, half_height: f32 },
+    /// An ellipsoid, by radii.
+    Ellipsoid(Vec3),
+}
+
+/// A form, placed and turned about the vertical axis.
+#[derive(Clone, Debug)]
+pub(crate) struct Solid {
+    pub form: Form,
+    pub center: Vec3,
+    sin: f32,
+    cos: f32,
+}
+
+/// Where a ray enters a solid.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Entry {
+    pub t: f32,
+    /// Outward normal in the solid's own axes.
+    pub normal: Vec3,
+}
+
+impl Solid {
+    pub fn new(form: Form, center: Vec3, yaw: f32) -> Self {
+        let (sin, cos) = yaw.sin_cos();
+        Self { form, center, sin, cos }
+    }
+
+    /// The same solid, turned about the world's origin by `yaw` and then moved.
+    pub fn placed(mut self, origin: Vec3, yaw: f32) -> Self {
+        let (s, c) = yaw.sin_cos();
+        let p = self.center;
+        self.center = origin + Vec3::new(c * p.x - s * p.y, s * p.x + c * p.y, p.z);
+        (self.sin, self.cos) = (self.sin * c + self.cos * s, self.cos * c - self.sin * s);
+        self
+    }
+
+    pub fn to_local(&self, v: Vec3) -> Vec3 {
+        Vec3::new(self.cos * v.x + self.sin * v.y, -self.sin * v.x + self.cos * v.y, v.z)
+    }
+
+    pub fn to_world(&self, v: Vec3) -> Vec3 {
+        Vec3::new(self.cos * v.x - self.sin * v.y, self.sin * v.x + self.cos * v.y, v.z)
+    }
+
+    fn half(&self) -> Vec3 {
+        match &self.form {
+            Form::Cuboid(half) | Form::Cut { half, .. } => *half,
+            Form::Cylinder { axis, radius, half_length } => {
+                let mut half = Vec3::splat(*radius);
+                half[*axis] = *half_length;
+                half
+            }
+            Form::Cone { base, half_height } => Vec3::new(*base, *base, *half_height),
+            Form::Ellipsoid(radii) => *radii,
+        }
+    }
+
+    pub fn aabb(&self) -> Aabb {
+        let h = self.half();
+        let x = (self.cos * h.x).abs() + (self.sin * h.y).abs();
+        let y = (self.sin * h.x).abs() + (self.cos * h.y).abs();
+        let half = Vec3::new(x, y, h.z);
+        Aabb::new(self.center - half, self.center + half)
+    }
+
+    /// Where the ray enters, at 0 < t < `limit`; `None` when it misses or starts inside.
+    pub fn enter(&self, origin: Vec3, direction: Vec3, limit: f32) -> Option<Entry> {
+        let o = self.to_local(origin - self.center);
+        let d = self.to_local(direction);
+        match &self.form {
+            Form::Cuboid(half) => cuboid(o, d, *half, &[], limit),
+            Form::Cut { half, planes } => cuboid(o, d, *half, planes, limit),
+            Form::Cylinder { axis, radius, half_length } => cylinder(o, d, *axis, *radius, *half_length, limit),
+            Form::Cone { base, half_height } => cone(o, d, *base, *half_height, limit),
+            Form::Ellipsoid(radii) => ellipsoid(o, d, *radii, limit),
+        }
+    }
+}
+
+fn cuboid(o: Vec3, d: Vec3, half: Vec3, planes: &[(Vec3, f32)], limit: f32) -> Option<Entry> {
+    let (mut near, mut far) = (0.0_f32, limit);
+    let mut normal = None;
+    for axis in 0..3 {
+        let inverse = 1.0 / d[axis];
+        let (a, b) = ((-half[axis] - o[axis]) * inverse, (half[axis] - o[axis]) * inverse);
+        let (enter, leave) = if a < b { (a, b) } else { (b, a) };
+        if enter > near {
+            near = enter;
+            normal = Some(axis);
+        }
+        far = far.min(leave);
+        if near >= far {
+            return None;
+        }
+    }
+    let mut entry = normal.map(|axis| {
+        let mut n = Vec3::ZERO;
+        n[axis] = -d[axis].signum();
+        n
+    });
+    for (plane, offset) in planes {
+        let along = plane.dot(d);
+        let distance = offset - plane.dot(o);
+        if along < 0.0 {
+            let t = distance / along;
+            if t > near {
+                near = t;
+                entry = Some(*plane);
+            }
+        } else if along > 0.0 {
+            far = far.min(distance / along);
+        } else if distance < 0.0 {
+            return None;
+        }
+        if near >= far {
+            return None;
+        }
+    }
+    entry.map(|normal| Entry { t: near, normal })
+}
+
+fn cylinder(o: Vec3, d: Vec3, axis: usize, radius: f32, half_length: f32, limit: f32) -> Option<Entry> {
+    let (u, v) = ((axis + 1) % 3, (axis + 2) % 3);
+    let a = d[u] * d[u] + d[v] * d[v];
+    let b = o[u] * d[u] + o[v] * d[v];
+    let c = o[u] * o[u] + o[v] * o[v] - radius * radius;
+    let discriminant = b * b - a * c;
+    if discriminant <= 0.0 {
+        return None;
+    }
+    let side = (-b - discriminant.sqrt()) / a;
+    let leave = (-b + discriminant.sqrt()) / a;
+    let inverse = 1.0 / d[axis];
+    let (p, q) = ((-half_length - o[axis]) * inverse, (half_length - o[axis]) * inverse);
+    let (cap, cap_leave) = if p < q { (p, q) } else { (q, p) };
+    let t = side.max(cap);
+    if t <= 0.0 || t >= limit || t >= leave.min(cap_leave) {
+        return None;
+    }
+    let mut normal = Vec3::ZERO;
+    if cap > side {
+        normal[axis] = -d[axis].signum();
+    } else {
+        normal[u] = (o[u] + t * d[u]) / radius;
+        normal[v] = (o[v] + t * d[v]) / radius;
+    }
+    Some(Entry { t, normal })
+}
+
+fn cone(o: Vec3, d: Vec3, base: f32, half_height: f32, limit: f32) -> Option<Entry> {
+    // With s = z distance below the apex: x^2 + y^2 = (k s)^2.
+    let k = base / (2.0 * half_height);
+    let s0 = half_height - o.z;
+    let a = d.x * d.x + d.y * d.y - k * k * d.z * d.z;
+    let b = o.x * d.x + o.y * d.y + k * k * s0 * d.z;
+    let c = o.x * o.x + o.y * o.y - k * k * s0 * s0;
+    let mut best: Option<Entry> = None;
+    let mut offer = |t: f32, normal: Vec3| {
+        if t > 0.0 && t < limit && best.is_none_or(|e| t < e.t) {
+            best = Some(Entry { t, normal });
+        }
+    };
+    let discriminant = b * b - a * c;
+    if discriminant > 0.0 && a.abs() > 1e-9 {
+        let root = discriminant.sqrt();
+        for t in [(-b - root) / a, (-b + root) / a] {
+            let p = o + d * t;
+            if p.z.abs() <= half_height {
+                let radial = Vec3::new(p.x, p.y, 0.0).normalize_or_zero();
+                offer(t, (radial + Vec3::new(0.0, 0.0, k)).normalize_or_zero());
+            }
+        }
+    }
+    let t = (-half_height - o.z) / d.z;
+    let p = o + d * t;
+    if p.x * p.x + p.y * p.y <= base * base {
+        offer(t, Vec3::new(0.0, 0.0, -1.0));
+    }
+    best.filter(|e| e.normal.dot(d) < 0.0)
+}
+
+fn ellipsoid(o: Vec3, d: Vec3, radii: Vec3, limit: f32) -> Option<Entry> {
+    let (p, q) = (o / radii, d / radii);
+    let a = q.dot(q);
+    let b = p.dot(q);
+    let c = p.dot(p) - 1.0;
+    let discriminant = b * b - a * c;
+    if discriminant <= 0.0 {
+        return None;
+    }
+    let t = (-b - discriminant.sqrt()) / a;
+    (t > 0.0 && t < limit).then(|| Entry { t, normal: ((p + q * t) / radii).normalize_or_zero() })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn along_x(solid: &Solid, y: f32, z: f32) -> Option<Entry> {
+        solid.enter(Vec3::new(-10.0, y, z), Vec3::new(1.0, 1e-8, 1e-8), f32::MAX)
+    }
+
+    /// Each form is entered where its formula says, with the outward normal there.
+    #[test]
+    fn entries_of_known_solids() {
+        let up = 0.5;
+        for (form, t, normal) in [
+            (Form::Cuboid(Vec3::new(2.0, 1.0, 1.0)), 8.0, Vec3::new(-1.0, 0.0, 0.0)),
+            (Form::Cylinder { axis: 2, radius: 2.0, half_length: 1.0 }, 8.0, Vec3::new(-1.0, 0.0, 0.0)),
+            (Form::Cylinder { axis: 0, radius: 2.0, half_length: 1.0 }, 9.0, Vec3::new(-1.0, 0.0, 0.0)),
+            (Form::Ellipsoid(Vec3::new(3.0, 1.0, 1.0)), 10.0 - 3.0 * 0.75_f32.sqrt(), Vec3::ZERO),
+            (Form::Cone { base: 2.0, half_height: 1.0 }, 9.5, Vec3::new(-1.0, 0.0, 1.0).normalize()),
+        ] {
+            let entry = along_x(&Solid::new(form.clone(), Vec3::ZERO, 0.0), 0.0, up).unwrap();
+            assert!((entry.t - t).abs() < 1e-4, "{form:?}: {}", entry.t);
+            if normal != Vec3::ZERO {
+                assert!((entry.normal - normal).length() < 1e-4, "{form:?}: {}", entry.normal);
+            }
+            assert!(along_x(&Solid::new(form, Vec3::ZERO, 0.0), 0.0, 2.5).is_none());
+        }
+    }
+
+    /// A cuboid with a cut corner is entered at the cutting plane, and a cut plane does not enlarge it.
+    #[test]
+    fn cut_cuboid() {
+        let diagonal = Vec3::new(-1.0, 0.0, 1.0).normalize();
+        let form = Form::Cut { half: Vec3::ONE, planes: vec![(diagonal, 0.5_f32.sqrt())] };
+        let solid = Solid::new(form, Vec3::ZERO, 0.0);
+        let entry = along_x(&solid, 0.0, 0.5).unwrap();
+        assert!((entry.t - 9.5).abs() < 1e-4);
+        assert!((entry.normal - diagonal).length() < 1e-6);
+        assert!((along_x(&solid, 0.0, -0.5).unwrap().t - 9.0).abs() < 1e-5);
+    }
+
+    /// Turning and moving a solid moves its entry and its bounding box alike.
+    #[test]
+    fn placing_turns_and_moves() {
+        let solid = Solid::new(Form::Cuboid(Vec3::new(2.0, 1.0, 0.5)), Vec3::new(3.0, 0.0, 0.0), 0.0)
+            .placed(Vec3::new(0.0, 1.0, 0.0), std::f32::consts::FRAC_PI_2);
+        let aabb = solid.aabb();
+        assert!((aabb.mins - Vec3::new(-1.0, 2.0, -0.5)).length() < 1e-5);
+        assert!((aabb.maxs - Vec3::new(1.0, 6.0, 0.5)).length() < 1e-5);
+        assert!((along_x(&solid, 4.0, 0.0).unwrap().t - 9.0).abs() < 1e-5);
+    }
+}
