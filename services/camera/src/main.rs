@@ -1,2 +1,61 @@
-//! The camera stage.
-fn main() {}
+//! The camera stage: takes pictures from a [`source::Source`] at a fixed rate and publishes them.
+//! What a picture means lives in the encoder.
+
+use anyhow::Context;
+use carff_camera::{DriveSource, FolderSource, Source};
+use carff_config::CameraSource;
+use carff_messages::{Header, Stage};
+use carff_stage::StageContext;
+use carff_transport::{Woken, monotonic_now_ns, topics};
+
+fn main() -> std::process::ExitCode {
+    carff_stage::main(Stage::Camera, run)
+}
+
+fn run(stage: &mut StageContext) -> anyhow::Result<()> {
+    let mut source = open_source(stage)?;
+    let mut frames = stage.picture_output(&topics::FRAME, source.max_picture_bytes())?;
+    let period_ns = (1e9 / stage.graph.run.frame_rate_hz) as u64;
+    let limit = stage.args.frames.unwrap_or(u64::MAX);
+    stage.ready();
+
+    let mut next_ns = monotonic_now_ns();
+    let mut frame_id = 0;
+    while frame_id < limit && stage.wait_until(&[], next_ns)? != Woken::Stopped {
+        let Some(mut meta) = source.advance() else { break };
+        let capture_time_ns = monotonic_now_ns();
+        meta.header = Header::of_frame(frame_id, capture_time_ns, stage.seed());
+        let mut loan = frames.loan(meta.width_px as usize * meta.height_px as usize * 3)?;
+        source.write(frame_id, loan.bytes_mut())?;
+        frames.send(loan, meta)?;
+        stage.worked(&meta.header, capture_time_ns);
+        frame_id += 1;
+        // A late frame delays those after it; it is never made up for by a burst.
+        next_ns = (next_ns + period_ns).max(monotonic_now_ns());
+    }
+    // The last frames are still being worked on, and a view of them may still be wanted.
+    stage.wait_until(&[], monotonic_now_ns() + stage.graph.camera.linger_ms * 1_000_000)?;
+    tracing::info!(frames = frame_id, "done");
+    Ok(())
+}
+
+fn open_source(stage: &mut StageContext) -> anyhow::Result<Box<dyn Source>> {
+    match stage.graph.camera.source {
+        CameraSource::Drives => {
+            let drives = stage.args.drives.unwrap_or(stage.graph.camera.drives);
+            Ok(Box::new(DriveSource::open(&stage.dataset, &stage.checkpoint, &stage.graph, drives)?))
+        }
+        CameraSource::Folder => {
+            let folder = match &stage.graph.camera.folder {
+                Some(folder) => stage.graph.resolve(folder),
+                None => stage.dataset.join("images"),
+            };
+            let (source, unreadable) = FolderSource::open(&folder, &stage.graph)
+                .with_context(|| format!("no pictures from {}", folder.display()))?;
+            for error in &unreadable {
+                stage.error(error);
+            }
+            Ok(Box::new(source))
+        }
+    }
+}

@@ -1,2 +1,72 @@
-//! The controller stage.
-fn main() {}
+//! The controller stage: an action for each belief, and one at each tick. It never goes quiet.
+
+use anyhow::Context;
+use carff_config::CheckpointPlanning;
+use carff_controller::{Controller, Settings};
+use carff_messages::Stage;
+use carff_planning::Rule;
+use carff_stage::StageContext;
+use carff_transport::{Woken, monotonic_now_ns, topics};
+
+fn main() -> std::process::ExitCode {
+    carff_stage::main(Stage::Controller, run)
+}
+
+fn run(stage: &mut StageContext) -> anyhow::Result<()> {
+    let mut beliefs = stage.input(&topics::BELIEF)?;
+    let mut actions = stage.output(&topics::ACTION)?;
+    let settings = settings(stage)?;
+    let mut controller = Controller::new(settings);
+    stage.ready();
+
+    let mut invalid = 0;
+    let mut tick_ns = monotonic_now_ns();
+    loop {
+        if stage.wait_until(&[&beliefs], tick_ns)? == Woken::Stopped {
+            return Ok(());
+        }
+        while let Some(belief) = beliefs.next()? {
+            let started_ns = monotonic_now_ns();
+            if let Some(action) = controller.on_belief(&belief, started_ns) {
+                actions.send(action)?;
+                stage.worked(&action.header, started_ns);
+                tracing::debug!(frame = action.based_on_frame, action = action.action, "decided");
+            }
+        }
+        if stage.invalid_count() > invalid {
+            invalid = stage.invalid_count();
+            controller.on_invalid();
+        }
+        // Ticks keep their rate whatever arrives.
+        if monotonic_now_ns() >= tick_ns {
+            actions.send(controller.on_tick(monotonic_now_ns()))?;
+            tick_ns = (tick_ns + settings.period_ns).max(monotonic_now_ns());
+        }
+    }
+}
+
+fn settings(stage: &StageContext) -> anyhow::Result<Settings> {
+    let config = &stage.graph.controller;
+    let rule =
+        match config.rule {
+            carff_config::Rule::Underconfident => Rule::Underconfident,
+            carff_config::Rule::Overconfident => Rule::Overconfident,
+            carff_config::Rule::Paper => Rule::Paper,
+            carff_config::Rule::Calibrated => Rule::Calibrated {
+                threshold: match config.threshold {
+                    Some(threshold) => threshold,
+                    None => CheckpointPlanning::load(&stage.checkpoint)
+                        .context(
+                            "no threshold for the calibrated rule: set `controller.threshold`, or give a checkpoint",
+                        )?
+                        .hazard_threshold,
+                },
+            },
+        };
+    Ok(Settings {
+        rule,
+        deadline_ns: config.deadline_ms * 1_000_000,
+        period_ns: (1e9 / config.rate_hz) as u64,
+        seed: stage.seed(),
+    })
+}

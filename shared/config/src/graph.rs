@@ -172,6 +172,37 @@ pub enum CameraSource {
     Folder,
 }
 
+/// Which poses drives are taken from.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum PoseChoice {
+    /// Poses that were trained on and chose no threshold.
+    #[default]
+    Trained,
+    /// Poses that were never trained on.
+    Unseen,
+}
+
+/// The noise of the camera's sensor. All zero: pictures pass unchanged.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct NoiseConfig {
+    /// Read noise of each pixel and channel, standard deviation in units of 1/255, 0 to 64. Default 2.
+    pub sigma: f32,
+    /// Relative error of a frame's exposure, standard deviation, 0 to 0.5. Default 0.02.
+    pub gain_sigma: f32,
+    /// Relative error of each channel's gain, standard deviation, 0 to 0.5. Default 0.01.
+    pub channel_gain_sigma: f32,
+    /// Offset of each channel, standard deviation in units of 1/255, 0 to 64. Default 1.
+    pub channel_offset_sigma: f32,
+}
+
+impl Default for NoiseConfig {
+    fn default() -> Self {
+        Self { sigma: 2.0, gain_sigma: 0.02, channel_gain_sigma: 0.01, channel_offset_sigma: 1.0 }
+    }
+}
+
 /// The camera stage.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -184,10 +215,12 @@ pub struct CameraConfig {
     pub drives: u32,
     /// Frames that each timestamp of a drive is shown for, 1 to 1000. Default 6.
     pub frames_per_timestamp: u32,
-    /// Sensor noise of each pixel, standard deviation in units of 0..=255, 0 to 64. Default 1.5.
-    pub noise_sigma: f32,
-    /// Largest relative change of a whole frame's brightness, 0 to 0.5. Default 0.02.
-    pub noise_gain: f32,
+    /// The sensor's noise, drawn anew for each frame.
+    pub noise: NoiseConfig,
+    /// Which poses drives are taken from: `trained` (the paper's setting) or `unseen`. Default `trained`.
+    pub poses: PoseChoice,
+    /// Seed of the split into trained and unseen poses, in place of the checkpoint's. Default: none.
+    pub split_seed: Option<u64>,
     /// Begin again at the end, for ever. Default false.
     pub repeat: bool,
     /// Time to stay after the last frame, so that it can be worked on, milliseconds, 0 to 60000. Default 500.
@@ -201,8 +234,9 @@ impl Default for CameraConfig {
             folder: None,
             drives: 60,
             frames_per_timestamp: 6,
-            noise_sigma: 1.5,
-            noise_gain: 0.02,
+            noise: NoiseConfig::default(),
+            poses: PoseChoice::Trained,
+            split_seed: None,
             repeat: false,
             linger_ms: 500,
         }
@@ -318,9 +352,10 @@ pub struct ControllerConfig {
     pub rule: Rule,
     /// Actions a second besides those that a belief brings at once, 1 to 1000. Default 20.
     pub rate_hz: f64,
-    /// Oldest capture time that an action may rest on; beyond it, halt. Milliseconds, 1 to 60000. Default 150.
+    /// A belief older than this (since capture) is not acted on, and after this time without a new one the car halts.
+    /// Milliseconds, 1 to 60000. Default 150.
     pub deadline_ms: u64,
-    /// Halt above this hazard probability, 0 to 1, in place of the checkpoint's calibrated threshold. Default: none.
+    /// Halt from this hazard probability on, 0 to 1, in place of the checkpoint's calibrated threshold. Default: none.
     pub threshold: Option<f64>,
 }
 
@@ -494,8 +529,10 @@ impl GraphConfig {
         let camera = &self.camera;
         within(source, "camera.drives", camera.drives, 1..=100_000)?;
         within(source, "camera.frames_per_timestamp", camera.frames_per_timestamp, 1..=1000)?;
-        within(source, "camera.noise_sigma", camera.noise_sigma, 0.0..=64.0)?;
-        within(source, "camera.noise_gain", camera.noise_gain, 0.0..=0.5)?;
+        within(source, "camera.noise.sigma", camera.noise.sigma, 0.0..=64.0)?;
+        within(source, "camera.noise.gain_sigma", camera.noise.gain_sigma, 0.0..=0.5)?;
+        within(source, "camera.noise.channel_gain_sigma", camera.noise.channel_gain_sigma, 0.0..=0.5)?;
+        within(source, "camera.noise.channel_offset_sigma", camera.noise.channel_offset_sigma, 0.0..=64.0)?;
         within(source, "camera.linger_ms", camera.linger_ms, 0..=60_000)?;
         within(source, "encoder.deadline_ms", self.encoder.deadline_ms, 1..=60_000)?;
         within(source, "forecaster.deadline_ms", self.forecaster.deadline_ms, 1..=60_000)?;

@@ -22,12 +22,14 @@
 //! A relative path in a graph file is looked for in the current directory; where it is not there, it is taken from
 //! the root of the project: the first folder above the graph file that holds a `configs` folder.
 
+mod checkpoint;
 mod error;
 mod graph;
 
+pub use checkpoint::{CheckpointPlanning, CheckpointPlanningError};
 pub use error::ConfigError;
 pub use graph::{
     CameraConfig, CameraSource, ControllerConfig, EncoderConfig, ForecasterConfig, GraphConfig, LauncherConfig,
-    LogConfig, LogLevel, ProberConfig, RendererConfig, RestartConfig, RestartPolicy, Rule, RunConfig, Sampling,
-    ThreadsConfig, ViewChoice,
+    LogConfig, LogLevel, NoiseConfig, PoseChoice, ProberConfig, RendererConfig, RestartConfig, RestartPolicy, Rule,
+    RunConfig, Sampling, ThreadsConfig, ViewChoice,
 };

@@ -15,6 +15,7 @@
 //! ```
 
 mod dataset;
+pub mod drives;
 mod equivalence;
 mod error;
 mod image;

@@ -86,6 +86,20 @@ codes! {
 }
 
 codes! {
+    /// The decision rule in force.
+    RuleCode: u32, "rule" {
+        /// Always halt.
+        Underconfident = 0 "underconfident",
+        /// Always advance.
+        Overconfident = 1 "overconfident",
+        /// Halt when samples disagree or show the actor.
+        Paper = 2 "paper",
+        /// Halt when the hazard probability reaches a calibrated threshold.
+        Calibrated = 3 "calibrated",
+    }
+}
+
+codes! {
     /// What a forecast was made from.
     ForecastSource: u32, "source" {
         /// The posterior of a camera picture.

@@ -21,7 +21,7 @@ mod health;
 mod latent;
 
 pub use check::Invalid;
-pub use codes::{ActionCode, ForecastSource, HealthState, Observability, Reason, Stage, ViewKind};
+pub use codes::{ActionCode, ForecastSource, HealthState, Observability, Reason, RuleCode, Stage, ViewKind};
 pub use decision::Action;
 pub use frame::{DatasetView, FrameMeta, Intrinsics, ViewMeta};
 pub use health::Health;

@@ -181,6 +181,11 @@ impl StageContext {
         latency_ns
     }
 
+    /// Inputs dropped so far because they were not valid.
+    pub fn invalid_count(&self) -> u64 {
+        self.node.counters().invalid()
+    }
+
     /// Counts and logs an error after which the stage goes on.
     pub fn error(&mut self, error: &anyhow::Error) {
         self.vitals.count_error();

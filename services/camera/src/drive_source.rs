@@ -1,0 +1,140 @@
+//! Replays the views of a data set as drives.
+
+use crate::source::{Source, sensor_noise};
+use anyhow::Context;
+use carff_config::{CheckpointPlanning, GraphConfig, PoseChoice};
+use carff_dataset::drives::{Drive, plan_drives};
+use carff_dataset::sensor::{SensorNoise, apply_noise_into};
+use carff_dataset::{Dataset, Image, PoseRole, PoseSplit};
+use carff_geometry::PinholeCamera;
+use carff_messages::{DatasetView, FrameMeta, Header, Intrinsics, Observability};
+use carff_random::Key;
+use std::collections::HashMap;
+use std::path::Path;
+
+/// Drives, with all their pictures in memory.
+#[derive(Debug)]
+pub struct DriveSource {
+    dataset: Dataset,
+    drives: Vec<Drive>,
+    images: HashMap<usize, Image>,
+    noise: SensorNoise,
+    seed: u64,
+    frames_per_timestamp: usize,
+    repeat: bool,
+    /// Frames shown so far, in all repetitions.
+    shown: usize,
+    current: usize,
+}
+
+impl DriveSource {
+    /// Plans the drives and loads their pictures.
+    pub fn open(dataset: &Path, checkpoint: &Path, graph: &GraphConfig, count: u32) -> anyhow::Result<Self> {
+        let dataset = Dataset::open(dataset)?;
+        let split_seed = match graph.camera.split_seed {
+            Some(seed) => seed,
+            None => {
+                CheckpointPlanning::load(checkpoint)
+                    .context("which poses were trained on? Set `camera.split_seed`, or give a checkpoint that says it")?
+                    .split_seed
+            }
+        };
+        let role = match graph.camera.poses {
+            PoseChoice::Trained => PoseRole::Rest,
+            PoseChoice::Unseen => PoseRole::Unseen,
+        };
+        let views = PoseSplit::for_dataset(&dataset, split_seed).views(role);
+        let drives = plan_drives(&dataset, &views, count as usize, graph.run.seed)?;
+        let mut images = HashMap::new();
+        for &frame in drives.iter().flat_map(|d| &d.frames) {
+            if let std::collections::hash_map::Entry::Vacant(entry) = images.entry(frame) {
+                entry.insert(dataset.load_image(frame)?);
+            }
+        }
+        tracing::info!(drives = drives.len(), poses = views.len(), pictures = images.len(), "planned");
+        Ok(Self {
+            dataset,
+            drives,
+            images,
+            noise: sensor_noise(&graph.camera.noise),
+            seed: graph.run.seed,
+            frames_per_timestamp: graph.camera.frames_per_timestamp as usize,
+            repeat: graph.camera.repeat,
+            shown: 0,
+            current: 0,
+        })
+    }
+
+    /// The drives, in order.
+    pub fn drives(&self) -> &[Drive] {
+        &self.drives
+    }
+}
+
+impl Source for DriveSource {
+    fn max_picture_bytes(&self) -> usize {
+        self.images.values().map(|i| i.rgb.len()).max().unwrap_or(0)
+    }
+
+    fn advance(&mut self) -> Option<FrameMeta> {
+        let frames_of = |drive: &Drive| drive.frames.len() * self.frames_per_timestamp;
+        let total: usize = self.drives.iter().map(frames_of).sum();
+        if total == 0 || (self.shown >= total && !self.repeat) {
+            return None;
+        }
+        let mut frame_in_drive = self.shown % total;
+        let mut drive = 0;
+        while frame_in_drive >= frames_of(&self.drives[drive]) {
+            frame_in_drive -= frames_of(&self.drives[drive]);
+            drive += 1;
+        }
+        self.shown += 1;
+        let planned = &self.drives[drive];
+        let timestamp = frame_in_drive / self.frames_per_timestamp;
+        self.current = planned.frames[timestamp];
+        let frame = &self.dataset.frames()[self.current];
+        let observability = match frame.observability {
+            None => Observability::Unknown,
+            Some(carff_dataset::Observability::None) => Observability::None,
+            Some(carff_dataset::Observability::Partial) => Observability::Partial,
+            Some(carff_dataset::Observability::Full) => Observability::Full,
+        };
+        let dataset_view = DatasetView {
+            known: 1,
+            view: planned.view as i32,
+            branch: planned.branch as i32,
+            timestamp: timestamp as i32,
+            drive: drive as i32,
+            frame_in_drive: frame_in_drive as i32,
+            observability: observability.code(),
+            last_of_timestamp: u32::from((frame_in_drive + 1).is_multiple_of(self.frames_per_timestamp)),
+        };
+        Some(meta(&frame.camera, dataset_view))
+    }
+
+    fn write(&mut self, frame_id: u64, picture: &mut [u8]) -> anyhow::Result<()> {
+        let image = self.images.get(&self.current).context("no frame has been advanced to")?;
+        let key = Key { seed: self.seed, frame: frame_id, step: 0, sample: 0 };
+        Ok(apply_noise_into(&image.rgb, picture, &self.noise, key)?)
+    }
+}
+
+pub(crate) fn meta(camera: &PinholeCamera, dataset_view: DatasetView) -> FrameMeta {
+    let mut world_from_camera = [0.0; 16];
+    for (to, from) in world_from_camera.iter_mut().zip(camera.world_from_camera.iter().flatten()) {
+        *to = *from;
+    }
+    FrameMeta {
+        header: Header::default(),
+        width_px: camera.width_px,
+        height_px: camera.height_px,
+        intrinsics: Intrinsics {
+            fl_x_px: camera.fl_x_px,
+            fl_y_px: camera.fl_y_px,
+            cx_px: camera.cx_px,
+            cy_px: camera.cy_px,
+        },
+        world_from_camera,
+        dataset_view,
+    }
+}

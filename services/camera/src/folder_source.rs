@@ -1,0 +1,158 @@
+//! Shows the pictures of a folder, in the order of their names.
+
+use crate::drive_source::meta;
+use crate::source::{Source, sensor_noise};
+use anyhow::{Context, anyhow, ensure};
+use carff_config::GraphConfig;
+use carff_dataset::Image;
+use carff_dataset::sensor::{SensorNoise, apply_noise_into};
+use carff_geometry::PinholeCamera;
+use carff_messages::{DatasetView, FrameMeta};
+use carff_random::Key;
+use std::path::{Path, PathBuf};
+
+/// Horizontal field of view that is assumed, as plain pictures do not say it, degrees.
+const FIELD_OF_VIEW_DEG: f64 = 60.0;
+
+/// The pictures of a folder, in memory.
+#[derive(Debug)]
+pub struct FolderSource {
+    images: Vec<Image>,
+    noise: SensorNoise,
+    seed: u64,
+    repeat: bool,
+    frames_per_picture: usize,
+    shown: usize,
+    current: usize,
+}
+
+impl FolderSource {
+    /// Loads all PNG pictures of a folder. One that cannot be read, or has another size than the first, is left out,
+    /// with an error that names it; a folder with none that can be used is an error.
+    pub fn open(folder: &Path, graph: &GraphConfig) -> anyhow::Result<(Self, Vec<anyhow::Error>)> {
+        let entries = std::fs::read_dir(folder).with_context(|| format!("cannot read folder {}", folder.display()))?;
+        let mut paths: Vec<PathBuf> = entries.filter_map(|e| Some(e.ok()?.path())).collect();
+        paths.retain(|p| p.extension().is_some_and(|e| e.eq_ignore_ascii_case("png")));
+        paths.sort();
+        let mut images: Vec<Image> = Vec::new();
+        let mut errors = Vec::new();
+        for path in &paths {
+            match Image::load_png(path) {
+                Ok(image) => match images.first() {
+                    Some(first) if (first.width_px, first.height_px) != (image.width_px, image.height_px) => {
+                        errors.push(anyhow!(
+                            "{}: {}x{} pixels, but the first picture has {}x{}: left out; scale it",
+                            path.display(),
+                            image.width_px,
+                            image.height_px,
+                            first.width_px,
+                            first.height_px
+                        ));
+                    }
+                    _ => images.push(image),
+                },
+                Err(error) => errors.push(anyhow::Error::new(error).context("left out")),
+            }
+        }
+        ensure!(
+            !images.is_empty(),
+            "{} holds no PNG picture that can be read ({} tried{})",
+            folder.display(),
+            paths.len(),
+            errors.first().map(|e| format!("; the first: {e:#}")).unwrap_or_default()
+        );
+        let source = Self {
+            images,
+            noise: sensor_noise(&graph.camera.noise),
+            seed: graph.run.seed,
+            repeat: graph.camera.repeat,
+            frames_per_picture: graph.camera.frames_per_timestamp as usize,
+            shown: 0,
+            current: 0,
+        };
+        Ok((source, errors))
+    }
+}
+
+impl Source for FolderSource {
+    fn max_picture_bytes(&self) -> usize {
+        self.images[0].rgb.len()
+    }
+
+    fn advance(&mut self) -> Option<FrameMeta> {
+        let total = self.images.len() * self.frames_per_picture;
+        if self.shown >= total && !self.repeat {
+            return None;
+        }
+        self.current = self.shown % total / self.frames_per_picture;
+        self.shown += 1;
+        let image = &self.images[self.current];
+        let camera = PinholeCamera::look_at(
+            [0.0; 3],
+            [0.0, 1.0, 0.0],
+            [0.0, 0.0, 1.0],
+            image.width_px,
+            image.height_px,
+            FIELD_OF_VIEW_DEG,
+        );
+        Some(meta(&camera, DatasetView::UNKNOWN))
+    }
+
+    fn write(&mut self, frame_id: u64, picture: &mut [u8]) -> anyhow::Result<()> {
+        let key = Key { seed: self.seed, frame: frame_id, step: 0, sample: 0 };
+        Ok(apply_noise_into(&self.images[self.current].rgb, picture, &self.noise, key)?)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn graph() -> GraphConfig {
+        let text = "[run]\nname = \"t\"\ndataset = \"d\"\ncheckpoint = \"c\"\n[camera]\nframes_per_timestamp = 2";
+        GraphConfig::parse(text, "test.toml".as_ref()).unwrap()
+    }
+
+    /// Broken and wrong-sized pictures are left out, each with an error that names the file; the rest are shown in
+    /// order, each as often as asked.
+    #[test]
+    fn bad_pictures_are_named_and_left_out() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = |name: &str| folder.path().join(name);
+        Image::filled(4, 2, [10, 10, 10]).save_png(&path("a.png")).unwrap();
+        std::fs::write(path("b.png"), b"not a picture").unwrap();
+        Image::filled(3, 2, [0, 0, 0]).save_png(&path("c.png")).unwrap();
+        Image::filled(4, 2, [90, 90, 90]).save_png(&path("d.png")).unwrap();
+        std::fs::write(path("notes.txt"), b"no picture").unwrap();
+
+        let mut graph = graph();
+        let off = SensorNoise::OFF;
+        graph.camera.noise.sigma = off.sigma;
+        graph.camera.noise.gain_sigma = off.gain_sigma;
+        graph.camera.noise.channel_gain_sigma = off.channel_gain_sigma;
+        graph.camera.noise.channel_offset_sigma = off.channel_offset_sigma;
+        let (mut source, errors) = FolderSource::open(folder.path(), &graph).unwrap();
+        let errors: Vec<String> = errors.iter().map(|e| format!("{e:#}")).collect();
+        assert_eq!(errors.len(), 2, "{errors:?}");
+        assert!(errors[0].contains("b.png") && errors[1].contains("c.png"), "{errors:?}");
+
+        let mut greys = Vec::new();
+        let mut picture = vec![0; source.max_picture_bytes()];
+        while let Some(meta) = source.advance() {
+            assert_eq!((meta.width_px, meta.height_px), (4, 2));
+            source.write(greys.len() as u64, &mut picture).unwrap();
+            greys.push(picture[0]);
+        }
+        assert_eq!(greys, [10, 10, 90, 90]);
+    }
+
+    /// A folder without a usable picture, and a missing one, are errors that name it.
+    #[test]
+    fn nothing_to_show_is_an_error() {
+        let folder = tempfile::tempdir().unwrap();
+        let error = FolderSource::open(folder.path(), &graph()).unwrap_err();
+        assert!(error.to_string().contains("no PNG picture"), "{error:#}");
+        let missing = folder.path().join("missing");
+        assert!(FolderSource::open(&missing, &graph()).unwrap_err().to_string().contains("missing"));
+    }
+}

@@ -1,0 +1,9 @@
+//! Where the camera's pictures come from. No topic is opened here.
+
+mod drive_source;
+mod folder_source;
+pub mod source;
+
+pub use drive_source::DriveSource;
+pub use folder_source::FolderSource;
+pub use source::Source;

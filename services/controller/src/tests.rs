@@ -1,0 +1,154 @@
+use super::*;
+
+const MS: u64 = 1_000_000;
+const HORIZON: u32 = 2;
+
+fn controller(rule: Rule) -> Controller {
+    Controller::new(Settings { rule, deadline_ns: 150 * MS, period_ns: 50 * MS, seed: 1 })
+}
+
+fn calibrated() -> Controller {
+    controller(Rule::Calibrated { threshold: 0.3 })
+}
+
+/// A belief of ten samples, of which `hazardous` show the hazard, for a frame captured at `frame_id` x 100 ms.
+fn belief(frame_id: u64, step: u32, hazard_probability: f32, hazardous: usize) -> Belief {
+    let header = Header::of_frame(frame_id, frame_id * 100 * MS, 1).at_step(step);
+    let mut belief = Belief::empty(header, HORIZON);
+    belief.state_count = 6;
+    belief.place_count = 1;
+    belief.component_count = 1;
+    belief.component_weights[0] = 1.0;
+    belief.sample_count = 10;
+    belief.hazard_probability = hazard_probability;
+    for (i, sample) in belief.samples.iter_mut().enumerate().take(10) {
+        let likelihood = if i < hazardous { 1.0 } else { 0.0 };
+        *sample = ProbeResult { state: 1, confidence: 1.0, hazard_likelihood: likelihood, ..ProbeResult::NONE };
+    }
+    belief
+}
+
+fn told(action: &Action) -> (ActionCode, Reason) {
+    (action.code().unwrap(), action.reason().unwrap())
+}
+
+/// Before anything arrives, each tick says halt, and says why.
+#[test]
+fn quiet_from_the_start_is_halt() {
+    let mut controller = calibrated();
+    for tick in 0..10 {
+        let action = controller.on_tick(tick * 50 * MS);
+        action.validate().unwrap();
+        assert_eq!(told(&action), (ActionCode::Halt, Reason::NoBeliefYet));
+        assert_eq!(action.based_on_frame, u64::MAX);
+    }
+}
+
+/// Nothing is decided before the last step; then at once, on the largest hazard of all steps, by the path's share.
+#[test]
+fn decides_on_all_steps_of_a_frame() {
+    let mut controller = calibrated();
+    assert!(controller.on_belief(&belief(3, 1, 0.05, 0), 310 * MS).is_none());
+    let mut last = belief(3, 2, 0.9, 0);
+    last.path_probability = 0.2;
+    let action = controller.on_belief(&last, 330 * MS).unwrap();
+    action.validate().unwrap();
+    assert_eq!(told(&action), (ActionCode::Advance, Reason::Belief), "0.9 x 0.2 is below 0.3");
+    assert!((action.hazard_probability - 0.18).abs() < 1e-6);
+    assert_eq!((action.based_on_frame, action.latency_ns, action.is_decision), (3, 30 * MS, 1));
+
+    assert!(controller.on_belief(&belief(4, 1, 0.4, 4), 410 * MS).is_none());
+    let action = controller.on_belief(&belief(4, 2, 0.0, 0), 420 * MS).unwrap();
+    assert_eq!(told(&action), (ActionCode::Halt, Reason::Belief), "the first step alone is enough");
+}
+
+/// A final belief is acted on once; older frames and repeated ones are ignored.
+#[test]
+fn each_frame_is_decided_once_and_in_order() {
+    let mut controller = calibrated();
+    assert!(controller.on_belief(&belief(5, 1, 0.0, 0), 510 * MS).is_none());
+    assert!(controller.on_belief(&belief(5, 2, 0.0, 0), 520 * MS).is_some());
+    assert!(controller.on_belief(&belief(5, 2, 0.9, 9), 530 * MS).is_none(), "the same again");
+    assert!(controller.on_belief(&belief(4, 1, 0.9, 9), 530 * MS).is_none());
+    assert!(controller.on_belief(&belief(4, 2, 0.9, 9), 530 * MS).is_none(), "an older frame");
+    assert_eq!(told(&controller.on_tick(540 * MS)), (ActionCode::Advance, Reason::Belief));
+}
+
+/// A newer frame's first step abandons the older frame, whose last step then decides nothing.
+#[test]
+fn newest_frame_wins() {
+    let mut controller = calibrated();
+    assert!(controller.on_belief(&belief(1, 1, 0.0, 0), 110 * MS).is_none());
+    assert!(controller.on_belief(&belief(2, 1, 0.9, 9), 210 * MS).is_none());
+    assert!(controller.on_belief(&belief(1, 2, 0.0, 0), 215 * MS).is_none());
+    let action = controller.on_belief(&belief(2, 2, 0.0, 0), 220 * MS).unwrap();
+    assert_eq!((told(&action), action.based_on_frame), ((ActionCode::Halt, Reason::Belief), 2));
+}
+
+/// A decision stands until the deadline, then the car halts, and the next fresh belief lets it go on.
+#[test]
+fn halts_when_beliefs_stop_and_recovers() {
+    let mut controller = calibrated();
+    controller.on_belief(&belief(1, 1, 0.0, 0), 110 * MS);
+    assert!(controller.on_belief(&belief(1, 2, 0.0, 0), 120 * MS).is_some());
+    let held = controller.on_tick(270 * MS);
+    assert_eq!((told(&held), held.is_decision), ((ActionCode::Advance, Reason::Belief), 0));
+    assert_eq!(told(&controller.on_tick(271 * MS)), (ActionCode::Halt, Reason::StaleBelief));
+    controller.on_belief(&belief(9, 1, 0.0, 0), 910 * MS);
+    assert!(controller.on_belief(&belief(9, 2, 0.0, 0), 920 * MS).is_some());
+    assert_eq!(told(&controller.on_tick(921 * MS)), (ActionCode::Advance, Reason::Belief));
+}
+
+/// A belief that comes too late, or without its first step, is answered with halt and its reason, also at ticks.
+#[test]
+fn late_and_incomplete_beliefs_halt() {
+    let mut controller = calibrated();
+    controller.on_belief(&belief(1, 1, 0.0, 0), 260 * MS);
+    let late = controller.on_belief(&belief(1, 2, 0.0, 0), 260 * MS).unwrap();
+    assert_eq!(told(&late), (ActionCode::Halt, Reason::StaleBelief));
+    let incomplete = controller.on_belief(&belief(3, 2, 0.0, 0), 310 * MS).unwrap();
+    incomplete.validate().unwrap();
+    assert_eq!(told(&incomplete), (ActionCode::Halt, Reason::IncompleteBelief));
+    assert_eq!(told(&controller.on_tick(311 * MS)), (ActionCode::Halt, Reason::IncompleteBelief));
+}
+
+/// An invalid belief is never acted on: a standing decision stays until its deadline, then the car halts and says why.
+#[test]
+fn invalid_beliefs_are_never_acted_on() {
+    let mut controller = calibrated();
+    controller.on_belief(&belief(1, 1, 0.0, 0), 110 * MS);
+    controller.on_belief(&belief(1, 2, 0.0, 0), 120 * MS);
+    let mut bad = belief(2, 2, f32::NAN, 0);
+    assert!(controller.on_belief(&bad, 210 * MS).is_none());
+    bad.hazard_probability = 0.0;
+    bad.header.step = 40;
+    assert!(controller.on_belief(&bad, 215 * MS).is_none());
+    assert_eq!(told(&controller.on_tick(220 * MS)), (ActionCode::Advance, Reason::Belief));
+    assert_eq!(told(&controller.on_tick(300 * MS)), (ActionCode::Halt, Reason::InvalidBelief));
+}
+
+/// An early end of the look-ahead (nothing resolved at step 1) is decided on as it is.
+#[test]
+fn an_early_end_is_decided_on() {
+    let mut controller = calibrated();
+    let mut early = belief(1, 1, 0.8, 8);
+    early.is_final = 1;
+    let action = controller.on_belief(&early, 110 * MS).unwrap();
+    assert_eq!(told(&action), (ActionCode::Halt, Reason::Belief));
+}
+
+/// The other rules reach the action too: the paper's halts on one sample in ten, the two extremes never change.
+#[test]
+fn every_rule_is_wired() {
+    let run = |rule: Rule, hazardous: usize| {
+        let mut controller = controller(rule);
+        controller.on_belief(&belief(1, 1, hazardous as f32 / 10.0, hazardous), 110 * MS);
+        let action = controller.on_belief(&belief(1, 2, 0.0, 0), 120 * MS).unwrap();
+        assert_eq!(action.rule, rule_code(rule).code());
+        action.code().unwrap()
+    };
+    assert_eq!(run(Rule::Paper, 1), ActionCode::Halt);
+    assert_eq!(run(Rule::Paper, 0), ActionCode::Advance);
+    assert_eq!(run(Rule::Underconfident, 0), ActionCode::Halt);
+    assert_eq!(run(Rule::Overconfident, 10), ActionCode::Advance);
+}

@@ -1,0 +1,98 @@
+//! The part of a checkpoint that stages without models need: how poses were split, and the calibrated threshold.
+
+use serde::{Deserialize, Serialize};
+use std::path::{Path, PathBuf};
+
+/// The file's name in a checkpoint folder.
+const FILE: &str = "planning.json";
+/// The file's format.
+const FORMAT_VERSION: u32 = 1;
+
+/// `planning.json` of a checkpoint.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CheckpointPlanning {
+    /// Format of this file; 1.
+    pub format_version: u32,
+    /// Seed by which the poses were split into unseen, calibration and rest.
+    pub split_seed: u64,
+    /// Hazard probability from which on the calibrated rule halts, 0 to 1; chosen on the calibration poses.
+    pub hazard_threshold: f64,
+}
+
+/// Why it cannot be had.
+#[derive(Debug, thiserror::Error)]
+pub enum CheckpointPlanningError {
+    /// The file cannot be read or written.
+    #[error("{path}: {source}; is this the folder of a checkpoint that `carff train` made?")]
+    Io {
+        /// Which file.
+        path: PathBuf,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// The file is not what it should be.
+    #[error("{path}: {problem}; make the checkpoint again with `carff train`")]
+    Format {
+        /// Which file.
+        path: PathBuf,
+        /// What is wrong.
+        problem: String,
+    },
+}
+
+impl CheckpointPlanning {
+    /// With this format's version.
+    pub fn new(split_seed: u64, hazard_threshold: f64) -> Self {
+        Self { format_version: FORMAT_VERSION, split_seed, hazard_threshold }
+    }
+
+    /// Reads and checks the file of a checkpoint folder.
+    pub fn load(checkpoint: &Path) -> Result<Self, CheckpointPlanningError> {
+        let path = checkpoint.join(FILE);
+        let format = |problem: String| CheckpointPlanningError::Format { path: path.clone(), problem };
+        let text = std::fs::read_to_string(&path)
+            .map_err(|source| CheckpointPlanningError::Io { path: path.clone(), source })?;
+        let planning: Self = serde_json::from_str(&text).map_err(|e| format(e.to_string()))?;
+        if planning.format_version != FORMAT_VERSION {
+            let found = planning.format_version;
+            return Err(format(format!("`format_version` is {found}, this program reads {FORMAT_VERSION}")));
+        }
+        if !(0.0..=1.0).contains(&planning.hazard_threshold) {
+            return Err(format(format!("`hazard_threshold` is {}; allowed: 0 to 1", planning.hazard_threshold)));
+        }
+        Ok(planning)
+    }
+
+    /// Writes the file into a checkpoint folder.
+    pub fn save(&self, checkpoint: &Path) -> Result<(), CheckpointPlanningError> {
+        let path = checkpoint.join(FILE);
+        let text = serde_json::to_string_pretty(self)
+            .map_err(|e| CheckpointPlanningError::Format { path: path.clone(), problem: e.to_string() })?;
+        std::fs::write(&path, text + "\n").map_err(|source| CheckpointPlanningError::Io { path, source })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// What is saved is what is loaded; a missing file, another version and a bad threshold name the file and the key.
+    #[test]
+    fn round_trip_and_errors() {
+        let folder = tempfile::tempdir().unwrap();
+        let missing = CheckpointPlanning::load(folder.path()).unwrap_err().to_string();
+        assert!(missing.contains(FILE) && missing.contains("carff train"), "{missing}");
+        let planning = CheckpointPlanning::new(7, 0.25);
+        planning.save(folder.path()).unwrap();
+        assert_eq!(CheckpointPlanning::load(folder.path()).unwrap(), planning);
+        for (wrong, key) in [
+            (CheckpointPlanning { format_version: 2, ..planning }, "format_version"),
+            (CheckpointPlanning { hazard_threshold: 1.5, ..planning }, "hazard_threshold"),
+        ] {
+            wrong.save(folder.path()).unwrap();
+            let error = CheckpointPlanning::load(folder.path()).unwrap_err().to_string();
+            assert!(error.contains(key), "{error}");
+        }
+    }
+}

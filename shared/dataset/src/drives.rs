@@ -1,0 +1,234 @@
+//! Drives through a set: a hidden course of events, seen from one pose, timestamp by timestamp.
+//!
+//! A trial of the planner is an input view with one right answer (section 4.3 of the paper). Hazard: the actor's
+//! branch, and the actor is not visible. Clear: the other branch, and its place is fully visible. The last timestamp
+//! is no input, as nothing comes after it.
+
+use crate::{Dataset, Observability};
+use carff_random::Key;
+use rand::Rng;
+use rand::seq::SliceRandom;
+
+/// Names this use of the run's seed, so that no other draw of the same run shares the stream.
+const STREAM: u64 = 0x6472_6976_6573_2031;
+
+/// What the right action is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum DriveKind {
+    /// To halt: the actor comes, and cannot be seen.
+    Hazard,
+    /// To advance: nobody comes, and that can be seen.
+    Clear,
+}
+
+impl DriveKind {
+    /// The name that reports use.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Hazard => "hazard",
+            Self::Clear => "clear",
+        }
+    }
+}
+
+/// An input view with one right answer.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct EligibleInput {
+    /// Camera pose.
+    pub view: usize,
+    /// Course of events.
+    pub branch: usize,
+    /// Step of it, at most the last but one.
+    pub timestamp: usize,
+    /// The right answer.
+    pub kind: DriveKind,
+}
+
+/// One drive: all timestamps of a branch, seen from one pose.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Drive {
+    /// Camera pose.
+    pub view: usize,
+    /// Hidden course of events.
+    pub branch: usize,
+    /// The timestamp whose decision is counted.
+    pub eligible_timestamp: usize,
+    /// The right answer there.
+    pub kind: DriveKind,
+    /// Index in [`Dataset::frames`] of each timestamp's frame.
+    pub frames: Vec<usize>,
+}
+
+/// Why no drives can be planned.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum DrivesError {
+    /// The set has no scenario.
+    #[error(
+        "this data set has no `scenario`: there is nothing to drive through; give one that has, or a folder source"
+    )]
+    NoScenario,
+    /// No pose allows a trial of this kind.
+    #[error(
+        "none of the {views} poses allows a {} drive: the scenario needs `hazard_branches`, and frames an \
+         `observability` of `none` (hazard) and `full` (clear) before the last timestamp",
+        kind.name()
+    )]
+    NoneEligible {
+        /// Which kind.
+        kind: DriveKind,
+        /// How many poses were looked at.
+        views: usize,
+    },
+}
+
+/// All input views with one right answer among some poses, in the order of poses, branches and timestamps.
+pub fn eligible_inputs(dataset: &Dataset, views: &[usize]) -> Result<Vec<EligibleInput>, DrivesError> {
+    let scenario = dataset.scenario().ok_or(DrivesError::NoScenario)?;
+    let mut inputs = Vec::new();
+    for frame in dataset.frames() {
+        let (Some(view), Some(branch), Some(timestamp)) = (frame.view, frame.branch, frame.timestamp) else { continue };
+        if !views.contains(&view) || timestamp + 2 > scenario.timestamps {
+            continue;
+        }
+        let kind = match (scenario.is_hazard(branch), frame.observability) {
+            (true, Some(Observability::None)) => DriveKind::Hazard,
+            (false, Some(Observability::Full)) => DriveKind::Clear,
+            _ => continue,
+        };
+        inputs.push(EligibleInput { view, branch, timestamp, kind });
+    }
+    inputs.sort_by_key(|i| (i.view, i.branch, i.timestamp));
+    Ok(inputs)
+}
+
+/// Plans drives: hazard and clear ones in turn, their poses drawn by seed out of `views` without replacement while
+/// they last. The same arguments give the same drives.
+pub fn plan_drives(dataset: &Dataset, views: &[usize], count: usize, seed: u64) -> Result<Vec<Drive>, DrivesError> {
+    let scenario = dataset.scenario().ok_or(DrivesError::NoScenario)?;
+    let inputs = eligible_inputs(dataset, views)?;
+    let mut rng = carff_random::stream(Key { seed, frame: STREAM, step: 0, sample: 0 });
+    let mut deck = |kind: DriveKind| -> Result<Vec<Drive>, DrivesError> {
+        let wanted = count.div_ceil(2);
+        // One entry for each pose, with all its inputs of this kind.
+        let mut poses: Vec<(usize, Vec<EligibleInput>)> = Vec::new();
+        for input in inputs.iter().filter(|i| i.kind == kind) {
+            match poses.last_mut() {
+                Some((view, list)) if *view == input.view => list.push(*input),
+                _ => poses.push((input.view, vec![*input])),
+            }
+        }
+        let mut drives = Vec::with_capacity(wanted);
+        while drives.len() < wanted {
+            let before = drives.len();
+            poses.shuffle(&mut rng);
+            for (view, list) in poses.iter().take(wanted - before) {
+                let input = list[rng.random_range(0..list.len())];
+                let frames: Option<Vec<usize>> = (0..scenario.timestamps)
+                    .map(|t| dataset.frame_index(scenario.state(input.branch, t)?, *view))
+                    .collect();
+                // A pose that lacks a timestamp cannot be driven.
+                if let Some(frames) = frames {
+                    let (branch, eligible_timestamp) = (input.branch, input.timestamp);
+                    drives.push(Drive { view: *view, branch, eligible_timestamp, kind, frames });
+                }
+            }
+            if drives.len() == before {
+                return Err(DrivesError::NoneEligible { kind, views: views.len() });
+            }
+        }
+        Ok(drives)
+    };
+    let (hazard, clear) = (deck(DriveKind::Hazard)?, deck(DriveKind::Clear)?);
+    Ok(hazard.into_iter().zip(clear).flat_map(|(h, c)| [h, c]).take(count).collect())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{DatasetWriter, FrameRecord, Image, ScenarioInfo};
+    use carff_geometry::PinholeCamera;
+
+    /// Two branches (0 holds the hazard) x three timestamps x six poses: pose 0 to 2 see nothing of the actor,
+    /// pose 3 and 4 see its place fully, pose 5 in part.
+    fn dataset(folder: &std::path::Path) -> Dataset {
+        let writer = DatasetWriter::create(folder).unwrap();
+        let camera = PinholeCamera::look_at([0.0, 0.0, 5.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], 4, 4, 60.0);
+        let mut records = Vec::new();
+        for (branch, timestamp, view) in (0..2).flat_map(|b| (0..3).flat_map(move |t| (0..6).map(move |v| (b, t, v)))) {
+            let path = format!("images/b{branch}_t{timestamp}_v{view}.png");
+            let picture = Image::filled(4, 4, [branch as u8, timestamp as u8, view as u8]);
+            writer.write_image(&path, &picture).unwrap();
+            let mut record = FrameRecord::new(path, camera);
+            record.branch_and_timestamp = Some((branch, timestamp));
+            record.view = Some(view);
+            record.observability = Some(match view {
+                0..3 => Observability::None,
+                3..5 => Observability::Full,
+                _ => Observability::Partial,
+            });
+            records.push(record);
+        }
+        let scenario = ScenarioInfo {
+            name: "test".into(),
+            bounds: [[-1.0; 3], [1.0; 3]],
+            branches: vec!["hazard".into(), "clear".into()],
+            timestamps: 3,
+            bev_view: None,
+            states: Vec::new(),
+            candidates: Vec::new(),
+            static_boxes: Vec::new(),
+            hazard_branches: vec![0],
+            hazard_action: "halt".into(),
+            clear_action: "advance".into(),
+        };
+        writer.finish(&records, Some(&scenario)).unwrap();
+        Dataset::open(folder).unwrap()
+    }
+
+    /// Every eligible input is one that the definition names, and all of them are there.
+    #[test]
+    fn inputs_have_one_right_answer() {
+        let folder = tempfile::tempdir().unwrap();
+        let dataset = dataset(folder.path());
+        let inputs = eligible_inputs(&dataset, &[0, 1, 2, 3, 4, 5]).unwrap();
+        // Three blind poses x two timestamps, and two seeing ones x two timestamps.
+        assert_eq!(inputs.iter().filter(|i| i.kind == DriveKind::Hazard).count(), 6);
+        assert_eq!(inputs.iter().filter(|i| i.kind == DriveKind::Clear).count(), 4);
+        assert!(inputs.iter().all(|i| i.timestamp < 2 && (i.branch == 0) == (i.view < 3) && i.view < 5));
+    }
+
+    /// Half the drives are hazard ones, poses repeat only when all were used, and the same seed plans the same.
+    #[test]
+    fn drives_alternate_and_do_not_repeat_early() {
+        let folder = tempfile::tempdir().unwrap();
+        let dataset = dataset(folder.path());
+        let views = [0, 1, 2, 3, 4, 5];
+        let drives = plan_drives(&dataset, &views, 10, 1).unwrap();
+        assert_eq!(drives.len(), 10);
+        for (i, drive) in drives.iter().enumerate() {
+            assert_eq!(drive.kind, if i % 2 == 0 { DriveKind::Hazard } else { DriveKind::Clear });
+            assert_eq!(drive.frames.len(), 3);
+            for (timestamp, &frame) in drive.frames.iter().enumerate() {
+                let frame = &dataset.frames()[frame];
+                assert_eq!(
+                    (frame.view, frame.branch, frame.timestamp),
+                    (Some(drive.view), Some(drive.branch), Some(timestamp))
+                );
+            }
+        }
+        let mut first: Vec<usize> = drives.iter().step_by(2).take(3).map(|d| d.view).collect();
+        first.sort_unstable();
+        assert_eq!(first, [0, 1, 2]);
+        assert_eq!(drives, plan_drives(&dataset, &views, 10, 1).unwrap());
+        assert!((2..9).any(|seed| plan_drives(&dataset, &views, 10, seed).unwrap() != drives));
+    }
+
+    /// Poses that allow only one kind are an error that says which kind is missing.
+    #[test]
+    fn a_missing_kind_is_an_error() {
+        let folder = tempfile::tempdir().unwrap();
+        let dataset = dataset(folder.path());
+        let error = plan_drives(&dataset, &[0, 1], 4, 1).unwrap_err();
+        assert_eq!(error, DrivesError::NoneEligible { kind: DriveKind::Clear, views: 2 });
+    }
+}
