@@ -1,1 +1,27 @@
 //! The latent-conditioned radiance field: native kernels, rendering, training.
+//!
+//! A multi-resolution hash grid and small networks (Müller et al. 2022) conditioned on an 8-d scene latent (CARFF,
+//! section 3.2), in plain Rust on the processor: no tensor library. Kernels are one generic body each, compiled for
+//! every instruction set and chosen at run time.
+
+#![deny(unsafe_code)]
+
+mod config;
+mod dispatch;
+mod field;
+mod kernels;
+mod layout;
+mod march;
+mod math;
+mod render;
+mod sampler;
+mod space;
+mod train;
+
+pub use config::{FieldConfig, FieldError, LATENT_DIM, RenderOptions, TrainerConfig};
+pub use dispatch::InstructionSet;
+pub use field::{Field, NamedTensor};
+pub use render::RenderBuffer;
+pub use sampler::{RAYS_PER_GROUP, RaySampler, TrainingView, changed_pixels};
+pub use space::{Contraction, OccupancyGrid};
+pub use train::{FieldTrainer, RayBatch, StepReport, TrainerState};

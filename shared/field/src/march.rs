@@ -1,0 +1,212 @@
+//! Rays through the occupancy grid: where the samples of a chunk of rays lie, what they weigh, and which of them count.
+
+use carff_geometry::Ray;
+
+use crate::config::FieldConfig;
+use crate::field::{Field, Folded, Scratch, grow, raw_row};
+use crate::kernels::{LANES, activate_density, stride};
+use crate::math::exp;
+use crate::space::{Contraction, OccupancyGrid};
+
+/// Samples of a ray that are evaluated before its transmittance is looked at again.
+const WAVE: usize = 8;
+/// Marks a lane that fills up a block.
+pub(crate) const NO_RAY: u32 = u32::MAX;
+
+/// Step sizes and limits of rays.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Marcher {
+    contraction: Contraction,
+    pub step_m: f32,
+    cone: f32,
+    near: f32,
+    far: f32,
+}
+
+/// What ends a ray.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct RayLimits {
+    pub max_samples: usize,
+    pub min_transmittance: f32,
+    pub step_scale: f32,
+    pub use_occupancy: bool,
+}
+
+impl Marcher {
+    pub fn new(config: &FieldConfig, contraction: Contraction) -> Self {
+        Self {
+            contraction,
+            step_m: 2.0 * contraction.longest_half_m() / config.samples_across,
+            cone: config.cone_angle,
+            near: config.near_m,
+            far: config.far_m,
+        }
+    }
+
+    #[inline(always)]
+    fn step_at(&self, t: f32, u: [f32; 3], scale: f32) -> f32 {
+        let stretch = u[0].abs().max(u[1].abs()).max(u[2].abs()).max(1.0);
+        self.step_m.max(self.cone * t) * stretch * scale
+    }
+
+    /// Emits up to `most` samples (cube point, distance, length) from `t` on; false when the ray is past its end.
+    #[inline(always)]
+    fn advance(
+        &self,
+        grid: &OccupancyGrid,
+        ray: &Ray,
+        t: &mut f32,
+        most: usize,
+        limits: &RayLimits,
+        mut emit: impl FnMut([f32; 3], f32, f32),
+    ) -> bool {
+        let r = grid.resolution();
+        let rf = r as f32;
+        let mut left = most;
+        let inverse_half = self.contraction.inverse_half();
+        while left > 0 {
+            if !(*t < self.far) {
+                return false;
+            }
+            let p = [0, 1, 2].map(|i| ray.origin[i] + *t * ray.direction[i]);
+            let u = self.contraction.normalized(p);
+            let dt = self.step_at(*t, u, limits.step_scale);
+            let q = Contraction::contract_normalized(u);
+            if limits.use_occupancy {
+                let at = q.map(|v| v * rf);
+                let cell = at.map(|v| (v as usize).min(r - 1));
+                let rc = r / 4;
+                let coarse = ((cell[2] / 4) * rc + cell[1] / 4) * rc + cell[0] / 4;
+                let coarse_empty = !grid.coarse_cell(coarse);
+                if coarse_empty || !grid.cell((cell[2] * r + cell[1]) * r + cell[0]) {
+                    // To the far wall of the empty cell, in whole steps, so that the jitter of the start is kept.
+                    let cells = if coarse_empty { rf * 0.25 } else { rf };
+                    let mut distance = f32::INFINITY;
+                    for i in 0..3 {
+                        let speed = ray.direction[i] * inverse_half[i];
+                        if speed.abs() > 1e-9 {
+                            let here = (q[i] * cells).floor();
+                            let wall = if speed > 0.0 { here + 1.0 } else { here };
+                            distance = distance.min((Contraction::uncontract_axis(wall / cells) - u[i]) / speed);
+                        }
+                    }
+                    *t += (distance / dt).ceil().max(1.0) * dt;
+                    continue;
+                }
+            }
+            emit(q, *t, dt);
+            *t += dt;
+            left -= 1;
+        }
+        true
+    }
+}
+
+/// State of one ray.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct RayState {
+    t: f32,
+    pub transmittance: f32,
+    samples: usize,
+    alive: bool,
+}
+
+/// Samples of a chunk of rays, in waves; each wave fills whole blocks.
+#[derive(Debug, Default)]
+pub(crate) struct Samples {
+    /// In the unit cube.
+    pub points: Vec<[f32; 3]>,
+    pub distance_m: Vec<f32>,
+    pub length_m: Vec<f32>,
+    pub ray: Vec<u32>,
+    pub density: Vec<f32>,
+    /// Share of the light that reaches the camera from this sample.
+    pub weight: Vec<f32>,
+    /// Transmittance behind it.
+    pub behind: Vec<f32>,
+    /// Features, one block for each 16 samples.
+    pub features: Vec<f32>,
+    /// Outputs of the density network, blocks like `features`.
+    pub geometry: Vec<f32>,
+    pub rays: Vec<RayState>,
+}
+
+impl Samples {
+    /// Marches all rays (one latent) until each is opaque or at its end. `jitter` gives the start in steps, 0..1.
+    pub fn march(
+        &mut self,
+        field: &Field,
+        folded: &Folded,
+        rays: &[Ray],
+        limits: &RayLimits,
+        scratch: &mut Scratch,
+        jitter: impl Fn(usize) -> f32,
+    ) {
+        let (sf, sg) = (stride(field.layout.features), stride(field.layout.geometry));
+        let m = &field.marcher;
+        self.points.clear();
+        self.distance_m.clear();
+        self.length_m.clear();
+        self.ray.clear();
+        self.density.clear();
+        self.weight.clear();
+        self.behind.clear();
+        self.rays.clear();
+        self.rays.extend(rays.iter().enumerate().map(|(i, _)| {
+            let t = m.near + jitter(i) * m.step_m * limits.step_scale;
+            RayState { t, transmittance: 1.0, samples: 0, alive: true }
+        }));
+        let mut any_alive = true;
+        while any_alive {
+            let start = self.points.len();
+            for (i, (ray, state)) in rays.iter().zip(&mut self.rays).enumerate().filter(|(_, (_, s))| s.alive) {
+                let most = WAVE.min(limits.max_samples - state.samples);
+                let before = self.points.len();
+                state.alive = m.advance(&field.occupancy, ray, &mut state.t, most, limits, |q, t, dt| {
+                    self.points.push(q);
+                    self.distance_m.push(t);
+                    self.length_m.push(dt);
+                    self.ray.push(i as u32);
+                });
+                state.samples += self.points.len() - before;
+                state.alive &= state.samples < limits.max_samples;
+            }
+            let count = self.points.len();
+            if count == start {
+                break;
+            }
+            let end = count.next_multiple_of(LANES);
+            self.points.resize(end, [0.5; 3]);
+            self.distance_m.resize(end, 0.0);
+            self.length_m.resize(end, 0.0);
+            self.ray.resize(end, NO_RAY);
+            self.density.resize(end, 0.0);
+            self.weight.resize(end, 0.0);
+            self.behind.resize(end, 0.0);
+            let blocks = start / LANES..end / LANES;
+            grow(&mut self.features, blocks.end * sf);
+            grow(&mut self.geometry, blocks.end * sg);
+            let features = &mut self.features[blocks.start * sf..blocks.end * sf];
+            let geometry = &mut self.geometry[blocks.start * sg..blocks.end * sg];
+            field.encode(&self.points[start..end], features);
+            field.density_network(folded, features, &mut scratch.hidden_a, &mut scratch.hidden_b, geometry);
+            for (density, block) in
+                self.density[start..end].as_chunks_mut::<LANES>().0.iter_mut().zip(geometry.chunks_exact(sg))
+            {
+                activate_density(raw_row(block), field.config.density_offset, density);
+            }
+            for i in start..count {
+                let state = &mut self.rays[self.ray[i] as usize];
+                let passes = exp(-self.density[i] * self.length_m[i]);
+                self.weight[i] = state.transmittance * (1.0 - passes);
+                state.transmittance *= passes;
+                self.behind[i] = state.transmittance;
+            }
+            any_alive = false;
+            for state in &mut self.rays {
+                state.alive &= state.transmittance >= limits.min_transmittance;
+                any_alive |= state.alive;
+            }
+        }
+    }
+}

@@ -1,0 +1,113 @@
+//! Batches of rays drawn from posed pictures of several states, with more of the pixels that change among states.
+
+use carff_geometry::PinholeCamera;
+
+use crate::config::LATENT_DIM;
+use crate::math::hash;
+use crate::train::RayBatch;
+
+/// Rays of one batch that come from one picture and share its latent.
+pub const RAYS_PER_GROUP: usize = 32;
+
+/// One posed picture.
+#[derive(Clone, Debug)]
+pub struct TrainingView {
+    /// Where it was taken from.
+    pub camera: PinholeCamera,
+    /// RGB, row by row, 8 bit, width x height x 3.
+    pub rgb: Vec<u8>,
+    /// Pixels (y * width + x) that change among states; see [`changed_pixels`]. May be empty.
+    pub changed: Vec<u32>,
+}
+
+/// Pixels that differ by more than `threshold` (0..=255) in any channel between any two of the pictures (RGB of equal
+/// size, one for each state of one view).
+pub fn changed_pixels(pictures: &[&[u8]], threshold: u8) -> Vec<u32> {
+    let pixels = pictures.iter().map(|p| p.len() / 3).min().unwrap_or(0);
+    (0..pixels)
+        .filter(|i| {
+            (0..3).any(|c| {
+                let values = pictures.iter().map(|p| p[i * 3 + c]);
+                let (low, high) = values.fold((u8::MAX, 0), |(l, h), v| (l.min(v), h.max(v)));
+                high.saturating_sub(low) > threshold
+            })
+        })
+        .map(|i| i as u32)
+        .collect()
+}
+
+/// Draws batches: groups of rays, each group from one picture. Draw number n depends on the seed and n alone.
+#[derive(Clone, Debug)]
+pub struct RaySampler {
+    views: Vec<TrainingView>,
+    changed_share: f32,
+    seed: u64,
+    drawn: u64,
+}
+
+impl RaySampler {
+    /// A sampler over `views`; `changed_share` (0..=1) of each group's rays go through changed pixels where there are
+    /// any. Views whose picture does not fit their camera are left out.
+    pub fn new(views: Vec<TrainingView>, changed_share: f32, seed: u64) -> Self {
+        let mut views = views;
+        views.retain(|v| {
+            let pixels = v.camera.width_px as usize * v.camera.height_px as usize;
+            pixels > 0 && v.rgb.len() == pixels * 3 && v.changed.iter().all(|p| (*p as usize) < pixels)
+        });
+        Self { views, changed_share: changed_share.clamp(0.0, 1.0), seed, drawn: 0 }
+    }
+
+    /// The pictures in use.
+    pub fn views(&self) -> &[TrainingView] {
+        &self.views
+    }
+
+    /// Batches drawn so far; set it to go on after a resumed training.
+    pub fn set_drawn(&mut self, drawn: u64) {
+        self.drawn = drawn;
+    }
+
+    /// Batches drawn so far.
+    pub fn drawn(&self) -> u64 {
+        self.drawn
+    }
+
+    /// Fills `batch` with `rays` rays (rounded up to whole groups). `latent_of(view index, draw)` gives the latent of a
+    /// group; `draw` is a number of its own for each group, to seed noise with.
+    pub fn next_batch(
+        &mut self,
+        rays: usize,
+        batch: &mut RayBatch,
+        mut latent_of: impl FnMut(usize, u64) -> [f32; LATENT_DIM],
+    ) {
+        batch.rays.clear();
+        batch.target_rgb.clear();
+        batch.latent_index.clear();
+        batch.latents.clear();
+        if self.views.is_empty() {
+            return;
+        }
+        let from_changed = (RAYS_PER_GROUP as f32 * self.changed_share).round() as usize;
+        for group in 0..rays.div_ceil(RAYS_PER_GROUP) {
+            let draw = hash(self.seed, self.drawn, group as u64);
+            let at = (hash(draw, 0, 0) % self.views.len() as u64) as usize;
+            let view = &self.views[at];
+            let (width, height) = (u64::from(view.camera.width_px), u64::from(view.camera.height_px));
+            batch.latents.push(latent_of(at, draw));
+            for i in 0..RAYS_PER_GROUP {
+                let r = hash(draw, 1, i as u64);
+                let pixel = if i < from_changed && !view.changed.is_empty() {
+                    u64::from(view.changed[(r % view.changed.len() as u64) as usize])
+                } else {
+                    r % (width * height)
+                };
+                let (x, y) = (pixel % width, pixel / width);
+                batch.rays.push(view.camera.ray(x as f64 + 0.5, y as f64 + 0.5));
+                let rgb = &view.rgb[pixel as usize * 3..][..3];
+                batch.target_rgb.push([0, 1, 2].map(|c| f32::from(rgb[c]) / 255.0));
+                batch.latent_index.push(group as u32);
+            }
+        }
+        self.drawn += 1;
+    }
+}
