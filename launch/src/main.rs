@@ -1,2 +1,37 @@
-//! The carff command.
-fn main() {}
+//! The `carff` command.
+
+use carff::dataset::DatasetCommand;
+use carff::launch::LaunchArgs;
+use clap::{Parser, Subcommand};
+use std::process::ExitCode;
+
+/// CARFF: from a camera image to a driving decision, in separate processes.
+#[derive(Debug, Parser)]
+#[command(version)]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    /// Start a graph, show its decisions, and end with a report.
+    Launch(LaunchArgs),
+    /// Render and check data sets.
+    #[command(subcommand)]
+    Dataset(DatasetCommand),
+}
+
+fn main() -> ExitCode {
+    let result = match Cli::parse().command {
+        Command::Launch(args) => carff::launch::run(&args, |_| Ok(serde_json::Map::new())),
+        Command::Dataset(command) => carff::dataset::run(command).map(|()| ExitCode::SUCCESS),
+    };
+    match result {
+        Ok(code) => code,
+        Err(error) => {
+            eprintln!("error: {error:#}");
+            ExitCode::FAILURE
+        }
+    }
+}

@@ -20,7 +20,11 @@ use std::time::Duration;
 
 /// Runs a stage: everything around `run`, which opens topics, calls [`StageContext::ready`] and loops.
 pub fn main(stage: Stage, run: impl FnOnce(&mut StageContext) -> anyhow::Result<()>) -> ExitCode {
-    let args = StageArgs::parse();
+    run_with(stage, StageArgs::parse(), run)
+}
+
+/// The same, with given arguments.
+pub fn run_with(stage: Stage, args: StageArgs, run: impl FnOnce(&mut StageContext) -> anyhow::Result<()>) -> ExitCode {
     match start(stage, args).and_then(|mut context| context.finish(run)) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {

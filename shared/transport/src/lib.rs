@@ -45,7 +45,7 @@ pub use error::{CleanupError, OpenError, ReceiveError, RunNameError, SendError, 
 pub use node::Node;
 pub use publisher::{PictureLoan, PicturePublisher, Publisher};
 pub use receiver::{Picture, PictureReceiver, Receiver, Sample};
-pub use run::{Run, cleanup_dead, remove_run_leftovers, run_id_of, runtime_dir};
+pub use run::{Run, cleanup_dead, living_processes, remove_run_leftovers, run_id_of, runtime_dir};
 pub use space::check_space;
 pub use topics::{Limits, PictureTopic, Topic};
 pub use wait::{Input, Stop, Waiter, Woken};

@@ -2,6 +2,7 @@
 
 use crate::space::SHARED_MEMORY_DIR;
 use crate::{CleanupError, RunNameError, Service};
+use iceoryx2::node::NodeView;
 use iceoryx2::prelude::{CallbackProgression, Config, FileName, NodeState, Path as IoxPath, SemanticString};
 use std::path::{Path, PathBuf};
 
@@ -96,6 +97,24 @@ pub fn cleanup_dead(run: &Run) -> Result<u32, CleanupError> {
     })
     .map_err(|e| failed(e.to_string()))?;
     Ok(cleaned)
+}
+
+/// The processes of a run that live now.
+pub fn living_processes(run: &Run) -> Result<Vec<u32>, CleanupError> {
+    crate::node::quiet();
+    let failed = |cause: String| CleanupError::List { run: run.name.clone(), cause };
+    let config = run.config().map_err(failed)?;
+    let mut living = Vec::new();
+    iceoryx2::node::Node::<Service>::list(&config, |node| {
+        if let NodeState::Alive(node) = node
+            && let Some(details) = node.details()
+        {
+            living.push(details.process_id().value() as u32);
+        }
+        CallbackProgression::Continue
+    })
+    .map_err(|e| failed(e.to_string()))?;
+    Ok(living)
 }
 
 /// Removes all files of a run. Only for whoever knows that no process of the run lives any more.

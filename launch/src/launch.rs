@@ -1,0 +1,475 @@
+//! `carff launch`: starts a graph, watches it, shows its decisions, ends it, and reports.
+
+use crate::dataset::DatasetCommand;
+use crate::lock::RunLock;
+use crate::monitor::{FrameRecord, Monitor};
+use crate::process::StageProcess;
+use crate::report::{self, RunOutcome};
+use crate::run_record::RunRecord;
+use crate::supervise::{RestartBudget, Verdict};
+use crate::terminal::Terminal;
+use anyhow::{Context, bail, ensure};
+use carff_config::{GraphConfig, RestartPolicy};
+use carff_messages::{ActionCode, HealthState, Stage};
+use carff_stage::StageArgs;
+use carff_transport::{
+    Node, Run, Stop, Waiter, Woken, check_space, living_processes, monotonic_now_ns, remove_run_leftovers, run_id_of,
+    runtime_dir, topics,
+};
+use serde_json::{Map, Value};
+use std::path::{Path, PathBuf};
+use std::process::{ExitCode, ExitStatus};
+use std::sync::Arc;
+use std::time::{Duration, SystemTime};
+
+/// Stages in the order of their start: those that listen before those that speak, the camera last.
+const START_ORDER: [Stage; 6] =
+    [Stage::Controller, Stage::Renderer, Stage::Prober, Stage::Forecaster, Stage::Encoder, Stage::Camera];
+/// How often children are looked at.
+const WATCH_NS: u64 = 50_000_000;
+/// How long processes of an earlier, killed launch may take to end.
+const ORPHAN_PATIENCE_NS: u64 = 2_000_000_000;
+/// Exit code after Ctrl-C, as shells have it: 128 and the signal's number.
+const INTERRUPTED: u8 = 130;
+/// Bytes of a frame that are reckoned with when shared memory is checked, before the pictures are known.
+const FRAME_BYTES: usize = 1 << 20;
+
+/// Start a graph.
+#[derive(Clone, Debug, clap::Args)]
+pub struct LaunchArgs {
+    /// The graph file, as in configs/graphs.
+    pub graph: PathBuf,
+    /// Data set folder, in place of the graph file's.
+    #[arg(long)]
+    pub dataset: Option<PathBuf>,
+    /// Checkpoint folder, in place of the graph file's.
+    #[arg(long)]
+    pub checkpoint: Option<PathBuf>,
+    /// Stop after so many frames.
+    #[arg(long)]
+    pub frames: Option<u64>,
+    /// How many drives, in place of the graph file's.
+    #[arg(long)]
+    pub drives: Option<u32>,
+    /// Write the report here, as JSON.
+    #[arg(long)]
+    pub report: Option<PathBuf>,
+    /// Run name, in place of the graph file's: two runs side by side need two names.
+    #[arg(long)]
+    pub run: Option<String>,
+    /// Folder of the stages' programs, in place of this program's own.
+    #[arg(long, hide = true)]
+    pub stages: Option<PathBuf>,
+}
+
+/// Launches, and ends when the camera has done its work (exit code 0), on Ctrl-C (130), or with an error when a stage
+/// is lost. `tables` adds to the report of a finished run.
+pub fn run(
+    args: &LaunchArgs,
+    tables: impl FnOnce(&RunOutcome) -> anyhow::Result<Map<String, Value>>,
+) -> anyhow::Result<ExitCode> {
+    let graph = GraphConfig::load(&args.graph)?;
+    let terminal = Arc::new(Terminal::new());
+    for warning in graph.warnings() {
+        terminal.log(&format!("warning: {}: {warning}", args.graph.display()));
+    }
+    let name = args.run.clone().unwrap_or_else(|| graph.run.name.clone());
+    let run = Run::new(&name, run_id_of(&name, monotonic_now_ns()))?;
+    let record = RunRecord {
+        pid: std::process::id(),
+        run_id: run.id(),
+        graph: args.graph.display().to_string(),
+        started_unix_s: SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default().as_secs(),
+    };
+    let _lock = RunLock::take(&runtime_dir(), &name, &record)?;
+    sweep(&run)?;
+
+    let dataset = graph.resolve(args.dataset.as_ref().unwrap_or(&graph.run.dataset));
+    let checkpoint = graph.resolve(args.checkpoint.as_ref().unwrap_or(&graph.run.checkpoint));
+    provide_dataset(&graph, args, &dataset)?;
+    // From here on Ctrl-C is an orderly end; until here it may simply end the process, as no stage runs yet.
+    let stop = Stop::on_signals().context("cannot handle signals")?;
+    let view_bytes = (graph.renderer.width_px * graph.renderer.height_px * 3) as usize;
+    check_space(Path::new("/dev/shm"), "the graph", topics::graph_bytes(FRAME_BYTES, view_bytes))?;
+
+    let mut stage_args = StageArgs::new(&args.graph, &name, run.id());
+    stage_args.dataset = Some(dataset.clone());
+    stage_args.checkpoint = Some(checkpoint.clone());
+    (stage_args.drives, stage_args.frames) = (args.drives, args.frames);
+    stage_args.parent_pid = Some(std::process::id());
+    let folder = match &args.stages {
+        Some(folder) => folder.clone(),
+        None => std::env::current_exe()?.parent().context("this program has no folder")?.to_owned(),
+    };
+
+    let result = {
+        let node = Node::open(&run, "launcher")?;
+        let mut launcher = Launcher {
+            monitor: Monitor::open(&node)?,
+            waiter: Waiter::new(stop),
+            node: &node,
+            graph: &graph,
+            stages: Vec::new(),
+            stage_args,
+            folder,
+            drives: args.drives.unwrap_or(graph.camera.drives),
+            terminal: terminal.clone(),
+        };
+        let result = launcher.drive();
+        terminal.status(String::new());
+        launcher.shut_down();
+        result.map(|ended| {
+            let outcome = RunOutcome {
+                run: name,
+                graph: args.graph.display().to_string(),
+                seed: graph.run.seed,
+                dataset,
+                checkpoint,
+                restarts: launcher.stages.iter().map(|s| (s.stage, s.budget.restarts())).collect(),
+                records: std::mem::take(&mut launcher.monitor.records),
+                invalid: node.counters().invalid(),
+            };
+            (ended, outcome)
+        })
+    };
+    // All stages are dead and reaped, and the lock is held: whatever is left is nobody's.
+    remove_run_leftovers(&run)?;
+    let (ended, outcome) = result?;
+    if ended == Ended::Interrupted {
+        terminal.log("interrupted: all stages have ended");
+        return Ok(ExitCode::from(INTERRUPTED));
+    }
+    let report = report::json(&outcome, tables(&outcome)?);
+    terminal.line(&summary(&report));
+    if let Some(path) = &args.report {
+        write_report(path, &report)?;
+        terminal.line(&format!("report: {}", path.display()));
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+/// How a run ended that did not fail.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Ended {
+    /// The camera has shown everything.
+    Done,
+    /// Somebody asked for it.
+    Interrupted,
+}
+
+/// A stage under watch.
+#[derive(Debug)]
+struct Watched {
+    stage: Stage,
+    process: Option<StageProcess>,
+    budget: RestartBudget,
+    /// Whether any of its processes has ever been ready.
+    was_ready: bool,
+    started_ns: u64,
+    restart_at_ns: Option<u64>,
+}
+
+struct Launcher<'a> {
+    monitor: Monitor,
+    waiter: Waiter,
+    node: &'a Node,
+    graph: &'a GraphConfig,
+    stages: Vec<Watched>,
+    stage_args: StageArgs,
+    folder: PathBuf,
+    drives: u32,
+    terminal: Arc<Terminal>,
+}
+
+impl Launcher<'_> {
+    /// Starts everything and watches it to its end.
+    fn drive(&mut self) -> anyhow::Result<Ended> {
+        let (camera, listeners) = START_ORDER.split_last().context("there are stages")?;
+        for &stage in listeners {
+            self.start(stage)?;
+        }
+        if self.until_ready(listeners)? == Ended::Interrupted {
+            return Ok(Ended::Interrupted);
+        }
+        self.start(*camera)?;
+        loop {
+            if self.step()? == Woken::Stopped {
+                return Ok(Ended::Interrupted);
+            }
+            if self.watch()? {
+                self.collect()?;
+                return Ok(Ended::Done);
+            }
+            self.show_status();
+        }
+    }
+
+    fn start(&mut self, stage: Stage) -> anyhow::Result<()> {
+        let process = StageProcess::start(stage, &self.folder, &self.stage_args, &self.terminal)?;
+        let started_ns = monotonic_now_ns();
+        match self.stages.iter_mut().find(|w| w.stage == stage) {
+            Some(watched) => {
+                watched.process = Some(process);
+                (watched.started_ns, watched.restart_at_ns) = (started_ns, None);
+            }
+            None => self.stages.push(Watched {
+                stage,
+                process: Some(process),
+                budget: RestartBudget::new(self.policy(stage)),
+                was_ready: false,
+                started_ns,
+                restart_at_ns: None,
+            }),
+        }
+        Ok(())
+    }
+
+    fn policy(&self, stage: Stage) -> RestartPolicy {
+        let restart = &self.graph.launcher.restart;
+        match stage {
+            Stage::Camera => restart.camera,
+            Stage::Encoder => restart.encoder,
+            Stage::Forecaster => restart.forecaster,
+            Stage::Prober => restart.prober,
+            Stage::Renderer => restart.renderer,
+            Stage::Controller => restart.controller,
+        }
+    }
+
+    fn until_ready(&mut self, stages: &[Stage]) -> anyhow::Result<Ended> {
+        loop {
+            if self.step()? == Woken::Stopped {
+                return Ok(Ended::Interrupted);
+            }
+            self.watch()?;
+            let waiting: Vec<&str> = self
+                .stages
+                .iter()
+                .filter(|w| stages.contains(&w.stage) && !w.was_ready)
+                .map(|w| w.stage.name())
+                .collect();
+            if waiting.is_empty() {
+                return Ok(Ended::Done);
+            }
+            self.terminal.status(format!("starting: {}", waiting.join(", ")));
+        }
+    }
+
+    /// Sleeps until something arrives, at most until children should be looked at, and takes it in.
+    fn step(&mut self) -> anyhow::Result<Woken> {
+        let woken = self.waiter.wait_until(&self.monitor.inputs(), monotonic_now_ns() + WATCH_NS)?;
+        self.collect()?;
+        Ok(woken)
+    }
+
+    fn collect(&mut self) -> anyhow::Result<()> {
+        let (terminal, graph, drives) = (&self.terminal, self.graph, self.drives);
+        Ok(self.monitor.drain(|frame| terminal.line(&decision_line(frame, graph, drives, terminal)))?)
+    }
+
+    /// Looks at the children: notes who is ready, restarts who died, by policy. True when the camera is done.
+    fn watch(&mut self) -> anyhow::Result<bool> {
+        let now_ns = monotonic_now_ns();
+        let mut restart = Vec::new();
+        for watched in &mut self.stages {
+            if watched.restart_at_ns.is_some_and(|at| now_ns >= at) {
+                restart.push(watched.stage);
+                continue;
+            }
+            let Some(process) = &mut watched.process else { continue };
+            let health = self.monitor.records.stages.get(&watched.stage).and_then(|s| s.last);
+            if health.is_some_and(|h| h.pid == process.pid() && h.state != HealthState::Starting.code()) {
+                watched.was_ready = true;
+            }
+            let stage = watched.stage;
+            let Some(status) = process.ended()? else {
+                let limit_ms = self.graph.launcher.start_timeout_ms;
+                let late = now_ns.saturating_sub(watched.started_ns) > limit_ms * 1_000_000;
+                ensure!(
+                    watched.was_ready || !late,
+                    "stage `{stage}` was not ready within {limit_ms} ms: see its log, or raise \
+                     `launcher.start_timeout_ms`"
+                );
+                continue;
+            };
+            let cause = process.last_error().unwrap_or_else(|| how(status));
+            watched.process = None;
+            if stage == Stage::Camera && status.success() {
+                return Ok(true);
+            }
+            if !watched.was_ready {
+                bail!("stage `{stage}` did not start: {cause}");
+            }
+            match watched.budget.died(now_ns) {
+                Verdict::RestartAt(at_ns) => {
+                    watched.restart_at_ns = Some(at_ns);
+                    self.terminal.log(&format!(
+                        "[launcher] stage {stage} died ({cause}): restart {} in {} ms",
+                        watched.budget.restarts(),
+                        (at_ns - now_ns) / 1_000_000
+                    ));
+                }
+                Verdict::Lost => match watched.budget.restarts() {
+                    0 => bail!("stage `{stage}` is lost: {cause}"),
+                    n => bail!("stage `{stage}` is lost after {n} restarts: {cause}"),
+                },
+            }
+            // The dead one has been waited for: its ports can be freed for its successor.
+            self.node.cleanup_dead();
+        }
+        for stage in restart {
+            self.start(stage)?;
+        }
+        Ok(false)
+    }
+
+    fn show_status(&self) {
+        let records = &self.monitor.records;
+        let restarts: u32 = self.stages.iter().map(|s| s.budget.restarts()).sum();
+        let stages: Vec<String> = self
+            .stages
+            .iter()
+            .map(|w| {
+                let summary = records.stages.get(&w.stage);
+                let state = match (&w.process, summary) {
+                    (None, _) => HealthState::Restarting,
+                    (_, Some(summary)) => summary.state(),
+                    _ => HealthState::Starting,
+                };
+                format!("{} {state}", w.stage)
+            })
+            .collect();
+        self.terminal.status(format!(
+            "frames {} skipped {} restarts {restarts} | {}",
+            records.frames.len(),
+            records.skipped(),
+            stages.join(", ")
+        ));
+    }
+
+    /// Ends the stages, the camera first, each within the time limit; kills what does not end.
+    fn shut_down(&mut self) {
+        let limit = Duration::from_millis(self.graph.launcher.stop_timeout_ms);
+        let deadline_ns = monotonic_now_ns() + limit.as_nanos() as u64;
+        // In the order of the data's way: who speaks before who listens.
+        self.stages.reverse();
+        for process in self.stages.iter().filter_map(|w| w.process.as_ref()) {
+            process.terminate();
+        }
+        for watched in &mut self.stages {
+            let Some(mut process) = watched.process.take() else { continue };
+            while matches!(process.ended(), Ok(None)) {
+                if monotonic_now_ns() >= deadline_ns {
+                    self.terminal.log(&format!("[launcher] stage {} did not end in time: killed", watched.stage));
+                    process.kill();
+                    break;
+                }
+                std::thread::sleep(Duration::from_millis(5));
+            }
+        }
+        // Their last heartbeats hold the final counts. A failure here has nothing left to stop.
+        if let Err(error) = self.collect() {
+            self.terminal.log(&format!("[launcher] {error:#}"));
+        }
+    }
+}
+
+/// Makes sure that no process of an earlier launch lives, and removes what it left.
+fn sweep(run: &Run) -> anyhow::Result<()> {
+    let patience_ns = monotonic_now_ns() + ORPHAN_PATIENCE_NS;
+    if run.folder().is_dir() {
+        // The stages of a killed launcher end by themselves; it takes them a moment.
+        loop {
+            let living = living_processes(run)?;
+            if living.is_empty() {
+                break;
+            }
+            ensure!(
+                monotonic_now_ns() < patience_ns,
+                "processes {living:?} of an earlier launch of run `{}` still live: stop them, or give this one another \
+                 name with --run",
+                run.name()
+            );
+            std::thread::sleep(Duration::from_millis(20));
+        }
+    }
+    Ok(remove_run_leftovers(run)?)
+}
+
+/// Renders the data set when it is missing and the graph says from which scenario.
+fn provide_dataset(graph: &GraphConfig, args: &LaunchArgs, dataset: &Path) -> anyhow::Result<()> {
+    let complete = std::fs::read_dir(dataset)
+        .is_ok_and(|entries| entries.flatten().any(|e| e.file_name().to_string_lossy().starts_with("transforms")));
+    if complete || graph.camera.source == carff_config::CameraSource::Folder {
+        return Ok(());
+    }
+    ensure!(
+        args.dataset.is_none() || !dataset.exists(),
+        "{} holds no data set (no transforms.json)",
+        dataset.display()
+    );
+    match graph.scenario_path() {
+        Some(scenario) if args.dataset.is_none() => {
+            eprintln!("{} is missing: rendering it from {}", dataset.display(), scenario.display());
+            crate::dataset::run(DatasetCommand::Render { scenario, out: dataset.to_owned(), depth: false })
+        }
+        _ => bail!(
+            "data set {} is missing: give --dataset, or name its scenario in the graph file (`run.scenario`)",
+            dataset.display()
+        ),
+    }
+}
+
+fn how(status: ExitStatus) -> String {
+    use std::os::unix::process::ExitStatusExt;
+    match (status.code(), status.signal()) {
+        (Some(code), _) => format!("exit code {code}"),
+        (None, Some(signal)) => format!("killed by signal {signal}"),
+        (None, None) => "unknown end".to_owned(),
+    }
+}
+
+fn decision_line(frame: &FrameRecord, graph: &GraphConfig, drives: u32, terminal: &Terminal) -> String {
+    let action = match frame.action {
+        Some(ActionCode::Advance) => terminal.alarm("advance", false),
+        _ => terminal.alarm("HALT   ", true),
+    };
+    let place = if frame.drive >= 0 {
+        format!(
+            "drive {:>3}/{drives}  t{} frame {:>2}/{}  view {:>3}  {:<8}",
+            frame.drive + 1,
+            frame.timestamp,
+            frame.frame_in_drive % graph.camera.frames_per_timestamp as i32 + 1,
+            graph.camera.frames_per_timestamp,
+            frame.view,
+            frame.observability
+        )
+    } else {
+        format!("frame {:>6}", frame.frame_id)
+    };
+    format!("{place}  hazard {:.2}  {action}  {:>6.1} ms", frame.hazard_probability, frame.latency_ns as f64 / 1e6)
+}
+
+fn summary(report: &Value) -> String {
+    let latency = &report["latency_ms"]["camera_to_action"];
+    let ms = |key: &str| latency[key].as_f64().map_or("-".to_owned(), |v| format!("{v:.1}"));
+    format!(
+        "{} frames, {} decisions, {} actions, {} skipped, {} restarts; camera to action: p50 {} ms, p99 {} ms, max {} ms",
+        report["frames"],
+        report["decisions"],
+        report["actions"],
+        report["skipped"],
+        report["restarts"],
+        ms("p50"),
+        ms("p99"),
+        ms("max")
+    )
+}
+
+fn write_report(path: &Path, report: &Value) -> anyhow::Result<()> {
+    let context = || format!("cannot write the report {}", path.display());
+    if let Some(folder) = path.parent().filter(|f| !f.as_os_str().is_empty()) {
+        std::fs::create_dir_all(folder).with_context(context)?;
+    }
+    std::fs::write(path, serde_json::to_string_pretty(report)? + "\n").with_context(context)
+}

@@ -1,0 +1,12 @@
+//! The `carff` command's parts: starting a graph, watching it, recording what it does, and data sets.
+//! What the stages compute lives in the stages.
+
+pub mod dataset;
+pub mod launch;
+pub mod lock;
+pub mod monitor;
+mod process;
+pub mod report;
+pub mod run_record;
+pub mod supervise;
+pub mod terminal;

@@ -1,0 +1,241 @@
+//! Listens to all topics of a run and writes down what happened, frame by frame.
+
+use carff_messages::{
+    Action, ActionCode, Belief, FrameMeta, Gaussian, Health, HealthState, Observability, Posterior, Reason, Stage,
+    ViewMeta,
+};
+use carff_transport::{Input, Node, OpenError, PictureReceiver, ReceiveError, Receiver, topics};
+use std::collections::BTreeMap;
+
+/// Everything known about one camera frame. What is from the data set is -1 or `Unknown` where there is none.
+#[derive(Clone, Debug)]
+pub struct FrameRecord {
+    /// Frame number in the run.
+    pub frame_id: u64,
+    /// Camera pose.
+    pub view: i32,
+    /// Hidden course of events.
+    pub branch: i32,
+    /// Step of it.
+    pub timestamp: i32,
+    /// Drive number.
+    pub drive: i32,
+    /// Frames of the drive before this one.
+    pub frame_in_drive: i32,
+    /// Whether it is the last frame of its timestamp, whose decision counts.
+    pub last_of_timestamp: bool,
+    /// How much of the actor or its place it shows.
+    pub observability: Observability,
+    /// When it was taken: monotonic clock, nanoseconds.
+    pub capture_time_ns: u64,
+    /// What the encoder saw.
+    pub posterior: Option<Gaussian>,
+    /// The beliefs of its steps, in the order of their arrival.
+    pub beliefs: Vec<Belief>,
+    /// The decision that rests on it.
+    pub action: Option<ActionCode>,
+    /// Why (the decision's reason); also set when a belief on it was refused.
+    pub reason: Option<Reason>,
+    /// Hazard probability that the decision rests on.
+    pub hazard_probability: f32,
+    /// How sure the rule was.
+    pub confidence: f32,
+    /// Time from capture to the publication of the decision, nanoseconds; 0 without a decision.
+    pub latency_ns: u64,
+}
+
+/// What a stage has said of itself, summed over its restarts.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct StageSummary {
+    /// Latest heartbeat.
+    pub last: Option<Health>,
+    /// Messages skipped because a newer one was there.
+    pub skipped: u64,
+    /// Invalid messages dropped.
+    pub invalid: u64,
+    /// Errors.
+    pub errors: u64,
+    /// Largest resident memory, bytes.
+    pub max_rss_bytes: u64,
+    /// Counts of processes before the latest.
+    earlier: [u64; 3],
+}
+
+impl StageSummary {
+    fn take(&mut self, health: &Health) {
+        if self.last.is_some_and(|last| last.pid != health.pid) {
+            self.earlier = [self.skipped, self.invalid, self.errors];
+        }
+        self.skipped = self.earlier[0] + health.skipped;
+        self.invalid = self.earlier[1] + health.invalid;
+        self.errors = self.earlier[2] + health.errors;
+        self.max_rss_bytes = self.max_rss_bytes.max(health.rss_bytes);
+        self.last = Some(*health);
+    }
+
+    /// Its state, as last heard.
+    pub fn state(&self) -> HealthState {
+        self.last.and_then(|h| h.state().ok()).unwrap_or(HealthState::Starting)
+    }
+}
+
+/// All that was recorded of a run.
+#[derive(Clone, Debug, Default)]
+pub struct Records {
+    /// By frame number.
+    pub frames: BTreeMap<u64, FrameRecord>,
+    /// Actions published, decisions and ticks alike.
+    pub actions: u64,
+    /// Safe actions by reason.
+    pub safe_actions: BTreeMap<&'static str, u64>,
+    /// Time that each forecast step took, nanoseconds.
+    pub forecaster_ns: Vec<u64>,
+    /// Time that each probing step took, nanoseconds.
+    pub prober_ns: Vec<u64>,
+    /// Time that each frame's encoding took, nanoseconds.
+    pub encoder_ns: Vec<u64>,
+    /// Time that each view took, nanoseconds.
+    pub renderer_ns: Vec<u64>,
+    /// What the stages said of themselves.
+    pub stages: BTreeMap<Stage, StageSummary>,
+}
+
+impl Records {
+    /// The frames in order.
+    pub fn frames(&self) -> Vec<FrameRecord> {
+        self.frames.values().cloned().collect()
+    }
+
+    /// Frames that a stage of the decision path passed over.
+    pub fn skipped(&self) -> u64 {
+        [Stage::Encoder, Stage::Forecaster, Stage::Prober, Stage::Controller]
+            .iter()
+            .filter_map(|stage| self.stages.get(stage))
+            .map(|s| s.skipped)
+            .sum()
+    }
+
+    fn take_frame(&mut self, meta: &FrameMeta) {
+        let view = &meta.dataset_view;
+        let record = FrameRecord {
+            frame_id: meta.header.frame_id,
+            view: view.view,
+            branch: view.branch,
+            timestamp: view.timestamp,
+            drive: view.drive,
+            frame_in_drive: view.frame_in_drive,
+            last_of_timestamp: view.last_of_timestamp == 1,
+            observability: Observability::try_from(view.observability).unwrap_or(Observability::Unknown),
+            capture_time_ns: meta.header.capture_time_ns,
+            posterior: None,
+            beliefs: Vec::new(),
+            action: None,
+            reason: None,
+            hazard_probability: 0.0,
+            confidence: 0.0,
+            latency_ns: 0,
+        };
+        self.frames.insert(record.frame_id, record);
+    }
+
+    fn take_posterior(&mut self, posterior: &Posterior) {
+        self.encoder_ns.push(posterior.stage_latency_ns);
+        if let Some(frame) = self.frames.get_mut(&posterior.header.frame_id) {
+            frame.posterior = Some(posterior.gaussian);
+        }
+    }
+
+    fn take_belief(&mut self, belief: &Belief) {
+        self.forecaster_ns.push(belief.forecaster_ns);
+        self.prober_ns.push(belief.stage_latency_ns);
+        if let Some(frame) = self.frames.get_mut(&belief.header.frame_id) {
+            frame.beliefs.push(*belief);
+        }
+    }
+
+    /// Returns the frame that was decided on, if the action is a decision.
+    fn take_action(&mut self, action: &Action) -> Option<u64> {
+        self.actions += 1;
+        let reason = action.reason().ok()?;
+        if reason != Reason::Belief {
+            *self.safe_actions.entry(reason.name()).or_default() += 1;
+        }
+        if action.is_decision == 0 {
+            return None;
+        }
+        let frame = self.frames.get_mut(&action.based_on_frame)?;
+        frame.action = action.code().ok();
+        frame.reason = Some(reason);
+        frame.hazard_probability = action.hazard_probability;
+        frame.confidence = action.confidence;
+        frame.latency_ns = action.header.publish_time_ns.saturating_sub(action.header.capture_time_ns);
+        Some(frame.frame_id)
+    }
+}
+
+/// Subscribed to all topics of a run.
+#[derive(Debug)]
+pub struct Monitor {
+    frames: PictureReceiver<FrameMeta>,
+    posteriors: Receiver<Posterior>,
+    beliefs: Receiver<Belief>,
+    actions: Receiver<Action>,
+    views: PictureReceiver<ViewMeta>,
+    healths: Vec<Receiver<Health>>,
+    /// What was recorded.
+    pub records: Records,
+}
+
+impl Monitor {
+    /// Subscribes.
+    pub fn open(node: &Node) -> Result<Self, OpenError> {
+        let healths = Stage::ALL.iter().map(|&stage| node.receiver(&topics::health(stage)));
+        Ok(Self {
+            frames: node.picture_receiver(&topics::FRAME)?,
+            posteriors: node.receiver(&topics::POSTERIOR)?,
+            beliefs: node.receiver(&topics::BELIEF)?,
+            actions: node.receiver(&topics::ACTION)?,
+            views: node.picture_receiver(&topics::VIEW)?,
+            healths: healths.collect::<Result<_, _>>()?,
+            records: Records::default(),
+        })
+    }
+
+    /// What to wait for.
+    pub fn inputs(&self) -> Vec<&dyn Input> {
+        let mut inputs: Vec<&dyn Input> =
+            vec![&self.frames, &self.posteriors, &self.beliefs, &self.actions, &self.views];
+        inputs.extend(self.healths.iter().map(|h| h as &dyn Input));
+        inputs
+    }
+
+    /// Takes in all that waits. Calls `decided` for each frame that was decided on.
+    pub fn drain(&mut self, mut decided: impl FnMut(&FrameRecord)) -> Result<(), ReceiveError> {
+        // In the order of the data's way, so that what refers to a frame finds it.
+        while let Some(frame) = self.frames.next()? {
+            self.records.take_frame(frame.meta());
+        }
+        while let Some(posterior) = self.posteriors.next()? {
+            self.records.take_posterior(&posterior);
+        }
+        while let Some(belief) = self.beliefs.next()? {
+            self.records.take_belief(&belief);
+        }
+        while let Some(action) = self.actions.next()? {
+            if let Some(frame) = self.records.take_action(&action).and_then(|id| self.records.frames.get(&id)) {
+                decided(frame);
+            }
+        }
+        while let Some(view) = self.views.next()? {
+            self.records.renderer_ns.push(view.meta().stage_latency_ns);
+        }
+        for receiver in &mut self.healths {
+            while let Some(health) = receiver.next()? {
+                if let Ok(stage) = health.stage() {
+                    self.records.stages.entry(stage).or_default().take(&health);
+                }
+            }
+        }
+        Ok(())
+    }
+}

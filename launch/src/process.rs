@@ -1,0 +1,136 @@
+//! One child process of the launcher.
+
+use crate::terminal::Terminal;
+use anyhow::Context;
+use carff_messages::Stage;
+use carff_stage::StageArgs;
+use rustix::process::{Pid, Signal, kill_process};
+use std::io::{BufRead, BufReader, Read};
+use std::os::unix::process::CommandExt;
+use std::path::Path;
+use std::process::{Child, Command, ExitStatus, Stdio};
+use std::sync::{Arc, Mutex};
+use std::thread::JoinHandle;
+
+/// Longest line that is relayed; a longer one is cut.
+const MAX_LINE_BYTES: u64 = 4096;
+
+/// A stage's process, with its log relayed.
+#[derive(Debug)]
+pub(crate) struct StageProcess {
+    child: Child,
+    relay: Option<JoinHandle<()>>,
+    /// The last line that said what went wrong.
+    last_error: Arc<Mutex<Option<String>>>,
+}
+
+impl StageProcess {
+    /// Starts it. Call this from the main thread: the child ends with the thread that started it.
+    pub(crate) fn start(
+        stage: Stage,
+        folder: &Path,
+        args: &StageArgs,
+        terminal: &Arc<Terminal>,
+    ) -> anyhow::Result<Self> {
+        let program = folder.join(format!("carff-{stage}"));
+        let mut child = Command::new(&program)
+            .args(args.to_command_line())
+            .stdin(Stdio::null())
+            .stdout(Stdio::null())
+            .stderr(Stdio::piped())
+            // Ctrl-C goes to the launcher alone, which then ends the stages in order.
+            .process_group(0)
+            .spawn()
+            .with_context(|| format!("cannot start {}; build it with `cargo build --release`", program.display()))?;
+        let last_error = Arc::new(Mutex::new(None));
+        let stderr = child.stderr.take().context("the child's standard error is missing")?;
+        let (terminal, noted) = (terminal.clone(), last_error.clone());
+        let relay = std::thread::Builder::new().name(format!("log-{stage}")).spawn(move || {
+            relay_lines(BufReader::new(stderr), |line| {
+                let is_error = line.trim_start().starts_with("ERROR") || line.contains("panicked at");
+                if is_error && let Ok(mut noted) = noted.lock() {
+                    let own = format!("ERROR {stage}: ");
+                    *noted = Some(line.trim().strip_prefix(&own).unwrap_or(line.trim()).to_owned());
+                }
+                terminal.log(&format!("[{stage}] {}", line.trim_end()));
+            });
+        })?;
+        Ok(Self { child, relay: Some(relay), last_error })
+    }
+
+    pub(crate) fn pid(&self) -> u32 {
+        self.child.id()
+    }
+
+    /// Whether it has ended, and how. Reaps it, so that it is no zombie whose locks still count.
+    pub(crate) fn ended(&mut self) -> anyhow::Result<Option<ExitStatus>> {
+        let status = self.child.try_wait().context("cannot watch a stage")?;
+        if status.is_some()
+            && let Some(relay) = self.relay.take()
+        {
+            // Its last words come before what is said about its end.
+            let _ = relay.join();
+        }
+        Ok(status)
+    }
+
+    /// The last error that it logged.
+    pub(crate) fn last_error(&self) -> Option<String> {
+        self.last_error.lock().ok()?.clone()
+    }
+
+    /// Asks it to end.
+    pub(crate) fn terminate(&self) {
+        if let Some(pid) = Pid::from_raw(self.child.id() as i32) {
+            // It fails when the process has ended already, which is what is wanted.
+            let _ = kill_process(pid, Signal::TERM);
+            // One that is stopped cannot hear it otherwise.
+            let _ = kill_process(pid, Signal::CONT);
+        }
+    }
+
+    /// Ends it at once.
+    pub(crate) fn kill(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+impl Drop for StageProcess {
+    fn drop(&mut self) {
+        if matches!(self.child.try_wait(), Ok(None)) {
+            self.kill();
+        }
+        if let Some(relay) = self.relay.take() {
+            let _ = relay.join();
+        }
+    }
+}
+
+/// Calls `each` for each line, of any encoding, cut at a limit, until the end.
+fn relay_lines(mut input: impl BufRead, mut each: impl FnMut(&str)) {
+    let mut line = Vec::new();
+    loop {
+        line.clear();
+        match (&mut input).take(MAX_LINE_BYTES).read_until(b'\n', &mut line) {
+            Ok(0) | Err(_) => return,
+            Ok(_) => each(&String::from_utf8_lossy(&line)),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Lines arrive one by one; long ones in pieces, broken encodings as replacement characters.
+    #[test]
+    fn lines_are_relayed_whatever_they_are() {
+        let mut text = b"one\ntwo \xff\n".to_vec();
+        text.extend(std::iter::repeat_n(b'x', MAX_LINE_BYTES as usize + 5));
+        let mut lines = Vec::new();
+        relay_lines(text.as_slice(), |line| lines.push(line.trim_end().to_owned()));
+        assert_eq!(lines.len(), 4);
+        assert_eq!((lines[0].as_str(), lines[1].as_str(), lines[3].as_str()), ("one", "two \u{fffd}", "xxxxx"));
+    }
+}

@@ -1,0 +1,76 @@
+//! Lines and one status line on the terminal; plain lines alone where it is none.
+
+use std::io::{IsTerminal, Write};
+use std::sync::Mutex;
+
+/// The terminal. Lines may come from several threads.
+#[derive(Debug)]
+pub struct Terminal {
+    live: bool,
+    colour: bool,
+    status: Mutex<String>,
+}
+
+impl Terminal {
+    /// Looks at what the process has. `NO_COLOR` turns colours off.
+    pub fn new() -> Self {
+        let live = std::io::stdout().is_terminal() && std::io::stderr().is_terminal();
+        let colour = live && std::env::var_os("NO_COLOR").is_none_or(|v| v.is_empty());
+        Self { live, colour, status: Mutex::default() }
+    }
+
+    /// A line on standard output.
+    pub fn line(&self, text: &str) {
+        let status = self.lock();
+        self.clear();
+        // A closed pipe (`| head`) must not end the run in the middle.
+        let _ = writeln!(std::io::stdout(), "{text}");
+        self.draw(&status);
+    }
+
+    /// A line on standard error.
+    pub fn log(&self, text: &str) {
+        let status = self.lock();
+        self.clear();
+        let _ = writeln!(std::io::stderr(), "{text}");
+        self.draw(&status);
+    }
+
+    /// Sets the status line; empty removes it.
+    pub fn status(&self, text: String) {
+        let mut status = self.lock();
+        *status = text;
+        self.clear();
+        self.draw(&status);
+    }
+
+    /// `text` in red or green where colours are shown.
+    pub fn alarm(&self, text: &str, red: bool) -> String {
+        if self.colour { format!("\x1b[{}m{text}\x1b[0m", if red { 31 } else { 32 }) } else { text.to_owned() }
+    }
+
+    fn lock(&self) -> std::sync::MutexGuard<'_, String> {
+        self.status.lock().unwrap_or_else(std::sync::PoisonError::into_inner)
+    }
+
+    fn clear(&self) {
+        if self.live {
+            let _ = write!(std::io::stderr(), "\r\x1b[K");
+        }
+    }
+
+    fn draw(&self, status: &str) {
+        if self.live && !status.is_empty() {
+            // No wider than the narrowest usual terminal, since a wrapped line cannot be taken back.
+            let text: String = status.chars().take(118).collect();
+            let _ = write!(std::io::stderr(), "{text}");
+            let _ = std::io::stderr().flush();
+        }
+    }
+}
+
+impl Default for Terminal {
+    fn default() -> Self {
+        Self::new()
+    }
+}

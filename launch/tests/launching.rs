@@ -1,0 +1,373 @@
+//! Whole graphs of real processes, with stages that compute next to nothing: what the launcher does when all goes well,
+//! when a stage dies, and when it is interrupted or killed.
+
+use carff_messages::{
+    Action, ActionCode, Belief, DatasetView, Forecast, ForecastSource, FrameMeta, Gaussian, Header, Intrinsics,
+    Posterior, Reason, RuleCode, Stage,
+};
+use carff_stage::{StageArgs, StageContext};
+use carff_transport::{Run, Woken, living_processes, monotonic_now_ns, topics};
+use clap::Parser;
+use rustix::process::{Pid, Signal, kill_process};
+use serde_json::Value;
+use std::io::{BufRead, BufReader};
+use std::os::unix::fs::PermissionsExt;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, ExitCode, Output, Stdio};
+use std::sync::atomic::{AtomicU32, Ordering};
+use std::time::Duration;
+
+const HORIZON: u32 = 2;
+const SIDE: u32 = 16;
+
+/// Plays a stage when the launcher of a test starts this program as one; does nothing otherwise.
+#[test]
+fn fake_stage() {
+    let (Ok(role), Ok(args)) = (std::env::var("CARFF_FAKE"), std::env::var("CARFF_ARGS")) else { return };
+    let args = StageArgs::try_parse_from(std::iter::once("stage").chain(args.split_whitespace())).unwrap();
+    let (stage, fault) = role.split_once(':').unwrap();
+    let fault = fault.to_owned();
+    let code = match stage {
+        "camera" => carff_stage::run_with(Stage::Camera, args, camera),
+        "encoder" => carff_stage::run_with(Stage::Encoder, args, |stage| encoder(stage, &fault)),
+        "forecaster" => carff_stage::run_with(Stage::Forecaster, args, forecaster),
+        "prober" => carff_stage::run_with(Stage::Prober, args, prober),
+        "renderer" => carff_stage::run_with(Stage::Renderer, args, idle),
+        "controller" => carff_stage::run_with(Stage::Controller, args, controller),
+        other => panic!("unknown stage {other}"),
+    };
+    std::process::exit(i32::from(code != ExitCode::SUCCESS));
+}
+
+fn camera(stage: &mut StageContext) -> anyhow::Result<()> {
+    let mut frames = stage.picture_output(&topics::FRAME, (SIDE * SIDE * 3) as usize)?;
+    stage.ready();
+    for frame_id in 0..stage.args.frames.unwrap_or(u64::MAX) {
+        if stage.wait_until(&[], monotonic_now_ns() + 20_000_000)? == Woken::Stopped {
+            return Ok(());
+        }
+        let meta = FrameMeta {
+            header: Header::of_frame(frame_id, monotonic_now_ns(), 1),
+            width_px: SIDE,
+            height_px: SIDE,
+            intrinsics: Intrinsics { fl_x_px: 8.0, fl_y_px: 8.0, cx_px: 8.0, cy_px: 8.0 },
+            world_from_camera: [0.0; 16],
+            dataset_view: DatasetView::UNKNOWN,
+        };
+        let mut loan = frames.loan((SIDE * SIDE * 3) as usize)?;
+        loan.bytes_mut().fill(frame_id as u8);
+        frames.send(loan, meta)?;
+    }
+    stage.wait_until(&[], monotonic_now_ns() + 300_000_000)?;
+    Ok(())
+}
+
+/// Faults: `none`; `start` fails before it is ready; `once` dies in mid-run, its first life only; `always`.
+fn encoder(stage: &mut StageContext, fault: &str) -> anyhow::Result<()> {
+    anyhow::ensure!(fault != "start", "the weights are not where they should be");
+    let mut frames = stage.picture_input(&topics::FRAME)?;
+    let mut posteriors = stage.output(&topics::POSTERIOR)?;
+    let mark = stage.args.graph.with_extension("died");
+    stage.ready();
+    let mut count = 0;
+    while stage.wait(&[&frames])? {
+        let Some(frame) = frames.newest()? else { continue };
+        count += 1;
+        if fault == "always" && count == 2 || fault == "once" && count == 5 && !mark.exists() {
+            std::fs::write(&mark, "")?;
+            std::process::abort();
+        }
+        let mut gaussian = Gaussian::standard();
+        gaussian.mean[0] = f32::from(frame.bytes()[0]);
+        let header = frame.meta().header;
+        let stage_latency_ns = stage.worked(&header, monotonic_now_ns());
+        posteriors.send(Posterior { header, gaussian, stage_latency_ns })?;
+    }
+    Ok(())
+}
+
+fn forecaster(stage: &mut StageContext) -> anyhow::Result<()> {
+    let mut posteriors = stage.input(&topics::POSTERIOR)?;
+    let mut beliefs = stage.input(&topics::BELIEF)?;
+    let mut forecasts = stage.output(&topics::FORECAST)?;
+    stage.ready();
+    while stage.wait(&[&posteriors, &beliefs])? {
+        let observed = posteriors.newest()?.map(|p| (p.header.at_step(1), ForecastSource::Observed));
+        let probed = beliefs.newest()?.filter(|b| b.is_final == 0);
+        let probed = probed.map(|b| (b.header.at_step(b.header.step + 1), ForecastSource::Probed));
+        for (header, source) in [observed, probed].into_iter().flatten() {
+            let mut forecast = Forecast::empty(header, source, HORIZON);
+            (forecast.component_count, forecast.sample_count, forecast.weights[0]) = (1, 1, 1.0);
+            forecasts.send(forecast)?;
+        }
+    }
+    Ok(())
+}
+
+fn prober(stage: &mut StageContext) -> anyhow::Result<()> {
+    let mut forecasts = stage.input(&topics::FORECAST)?;
+    let mut beliefs = stage.output(&topics::BELIEF)?;
+    stage.ready();
+    while stage.wait(&[&forecasts])? {
+        while let Some(forecast) = forecasts.next()? {
+            let mut belief = Belief::empty(forecast.header, HORIZON);
+            (belief.state_count, belief.place_count, belief.component_count, belief.sample_count) = (1, 1, 1, 1);
+            belief.component_weights[0] = 1.0;
+            beliefs.send(belief)?;
+        }
+    }
+    Ok(())
+}
+
+fn controller(stage: &mut StageContext) -> anyhow::Result<()> {
+    let mut beliefs = stage.input(&topics::BELIEF)?;
+    let mut actions = stage.output(&topics::ACTION)?;
+    stage.ready();
+    while stage.wait(&[&beliefs])? {
+        while let Some(belief) = beliefs.next()? {
+            if belief.is_final == 0 {
+                continue;
+            }
+            actions.send(Action {
+                header: belief.header,
+                action: ActionCode::Advance.code(),
+                reason: Reason::Belief.code(),
+                rule: RuleCode::Calibrated.code(),
+                sample_count: 1,
+                confidence: 1.0,
+                hazard_probability: 0.25,
+                is_decision: 1,
+                reserved: 0,
+                valid_until_ns: monotonic_now_ns(),
+                based_on_frame: belief.header.frame_id,
+                latency_ns: 1,
+            })?;
+        }
+    }
+    Ok(())
+}
+
+fn idle(stage: &mut StageContext) -> anyhow::Result<()> {
+    stage.ready();
+    while stage.wait_until(&[], u64::MAX)? != Woken::Stopped {}
+    Ok(())
+}
+
+/// A graph of its own, in a folder of its own.
+struct Graph {
+    folder: tempfile::TempDir,
+    name: String,
+}
+
+impl Graph {
+    fn new(fault: &str) -> Self {
+        static NEXT: AtomicU32 = AtomicU32::new(0);
+        let name = format!("l{}-{}", std::process::id(), NEXT.fetch_add(1, Ordering::Relaxed));
+        let folder = tempfile::tempdir().unwrap();
+        let test = std::env::current_exe().unwrap();
+        for stage in Stage::ALL {
+            let path = folder.path().join(format!("carff-{stage}"));
+            let fault = if *stage == Stage::Encoder { fault } else { "none" };
+            let script = format!(
+                "#!/bin/sh\nCARFF_FAKE={stage}:{fault} CARFF_ARGS=\"$*\" exec {} --exact fake_stage --nocapture\n",
+                test.display()
+            );
+            std::fs::write(&path, script).unwrap();
+            std::fs::set_permissions(&path, std::fs::Permissions::from_mode(0o755)).unwrap();
+        }
+        let text = format!(
+            "[run]\nname = \"{name}\"\ndataset = \"none\"\ncheckpoint = \"none\"\n[camera]\nsource = \"folder\"\n\
+             [launcher.restart]\nencoder = {{ on-failure = {{ backoff_ms = 10, max_restarts = 2 }} }}\n"
+        );
+        std::fs::write(folder.path().join("graph.toml"), text).unwrap();
+        Self { folder, name }
+    }
+
+    fn path(&self, name: &str) -> PathBuf {
+        self.folder.path().join(name)
+    }
+
+    fn command(&self, frames: u64) -> Command {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_carff"));
+        command
+            .arg("launch")
+            .arg(self.path("graph.toml"))
+            .args(["--frames", &frames.to_string(), "--stages"])
+            .arg(self.folder.path())
+            .arg("--report")
+            .arg(self.path("report.json"))
+            .stdin(Stdio::null())
+            .stdout(Stdio::piped())
+            .stderr(Stdio::piped());
+        command
+    }
+
+    fn run(&self) -> Run {
+        Run::new(&self.name, 0).unwrap()
+    }
+
+    fn assert_nothing_left(&self) {
+        assert_eq!(self.run().shared_memory_files().unwrap(), Vec::<PathBuf>::new());
+        assert!(!self.run().folder().exists());
+        assert!(living_processes(&self.run()).unwrap().is_empty());
+    }
+
+    fn report(&self) -> Value {
+        serde_json::from_str(&std::fs::read_to_string(self.path("report.json")).unwrap()).unwrap()
+    }
+}
+
+impl Drop for Graph {
+    fn drop(&mut self) {
+        let _ = carff_transport::remove_run_leftovers(&self.run());
+    }
+}
+
+fn text(output: &Output) -> String {
+    format!("{}\n{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr))
+}
+
+/// A launcher that has shown its first decision.
+fn deciding(graph: &Graph) -> Child {
+    let mut child = graph.command(100_000).spawn().unwrap();
+    let stdout = child.stdout.take().unwrap();
+    let mut lines = BufReader::new(stdout).lines().map_while(Result::ok);
+    assert!(lines.any(|line| line.contains("hazard 0.25")), "no decision was shown");
+    // Keep reading, so that the launcher never writes into a closed pipe.
+    std::thread::spawn(move || lines.for_each(drop));
+    child
+}
+
+fn signal(child: &Child, signal: Signal) {
+    kill_process(Pid::from_raw(child.id() as i32).unwrap(), signal).unwrap();
+}
+
+/// Whether it comes true before a watchdog barks.
+fn eventually(mut condition: impl FnMut() -> bool) -> bool {
+    let deadline_ns = monotonic_now_ns() + 30_000_000_000;
+    while monotonic_now_ns() < deadline_ns {
+        if condition() {
+            return true;
+        }
+        std::thread::sleep(Duration::from_millis(10));
+    }
+    false
+}
+
+/// A run to its end: each frame is recorded, decisions are shown and reported, nothing is left, exit code 0.
+#[test]
+fn a_run_ends_with_a_report_and_leaves_nothing() {
+    let graph = Graph::new("none");
+    let output = graph.command(20).output().unwrap();
+    assert!(output.status.success(), "{}", text(&output));
+    let report = graph.report();
+    assert_eq!(report["frames"], 20, "{}", text(&output));
+    assert_eq!(report["restarts"], 0);
+    let decisions = report["decisions"].as_u64().unwrap();
+    assert!((1..=20).contains(&decisions), "{report}");
+    assert!(report["latency_ms"]["camera_to_action"]["p99"].as_f64().unwrap() > 0.0);
+    assert!(report["memory_mb"]["encoder"].as_f64().unwrap() > 0.0, "{report}");
+    assert_eq!(text(&output).matches("hazard 0.25").count() as u64, decisions);
+    graph.assert_nothing_left();
+}
+
+/// A stage that dies in mid-run is started again, the run goes on to its end, and the report counts it.
+#[test]
+fn a_dead_stage_is_started_again() {
+    let graph = Graph::new("once");
+    let output = graph.command(100).output().unwrap();
+    assert!(output.status.success(), "{}", text(&output));
+    let report = graph.report();
+    assert_eq!(report["restarts_by_stage"]["encoder"], 1, "{}", text(&output));
+    assert_eq!(report["frames"], 100);
+    assert!(report["decisions"].as_u64().unwrap() > 5, "decisions went on after the restart: {report}");
+    assert!(text(&output).contains("stage encoder died (killed by signal 6)"), "{}", text(&output));
+    graph.assert_nothing_left();
+}
+
+/// A stage that keeps dying is lost: one clear sentence, exit code 1, nothing left.
+#[test]
+fn a_lost_stage_ends_the_run() {
+    let graph = Graph::new("always");
+    let output = graph.command(100_000).output().unwrap();
+    assert_eq!(output.status.code(), Some(1), "{}", text(&output));
+    assert!(text(&output).contains("error: stage `encoder` is lost after 2 restarts:"), "{}", text(&output));
+    graph.assert_nothing_left();
+}
+
+/// A stage that cannot start ends the launch with the stage's own sentence, without restarts.
+#[test]
+fn a_stage_that_cannot_start_says_why() {
+    let graph = Graph::new("start");
+    let output = graph.command(10).output().unwrap();
+    assert_eq!(output.status.code(), Some(1));
+    let wanted = "error: stage `encoder` did not start: the weights are not where they should be";
+    assert!(text(&output).contains(wanted), "{}", text(&output));
+    graph.assert_nothing_left();
+}
+
+/// Ctrl-C ends all processes and leaves nothing behind.
+#[test]
+fn an_interrupt_ends_everything() {
+    let graph = Graph::new("none");
+    let mut child = deciding(&graph);
+    assert!(!living_processes(&graph.run()).unwrap().is_empty());
+    signal(&child, Signal::INT);
+    assert_eq!(child.wait().unwrap().code(), Some(130));
+    graph.assert_nothing_left();
+}
+
+/// A second launch of the same run is refused with a sentence that names the first; under another name it runs.
+#[test]
+fn a_second_launch_of_a_run_is_refused() {
+    let graph = Graph::new("none");
+    let mut first = deciding(&graph);
+    let second = graph.command(10).output().unwrap();
+    assert_eq!(second.status.code(), Some(1));
+    let wanted = format!("run `{}` is already running (process {}", graph.name, first.id());
+    assert!(text(&second).contains(&wanted), "{}", text(&second));
+
+    let other = Graph { folder: tempfile::tempdir().unwrap(), name: format!("{}x", graph.name) };
+    let beside = graph.command(10).args(["--run", &other.name]).output().unwrap();
+    assert!(beside.status.success(), "{}", text(&beside));
+    other.assert_nothing_left();
+    signal(&first, Signal::TERM);
+    first.wait().unwrap();
+    graph.assert_nothing_left();
+}
+
+/// When the launcher itself is killed, its stages end by themselves, and the next launch of that run works.
+#[test]
+fn a_killed_launcher_leaves_no_stage_and_no_obstacle() {
+    let graph = Graph::new("none");
+    let mut child = deciding(&graph);
+    child.kill().unwrap();
+    child.wait().unwrap();
+    assert!(eventually(|| living_processes(&graph.run()).unwrap().is_empty()), "stages outlive their launcher");
+    let output = graph.command(10).output().unwrap();
+    assert!(output.status.success(), "{}", text(&output));
+    graph.assert_nothing_left();
+}
+
+/// Missing and wrong graph files are one clear sentence each.
+#[test]
+fn wrong_graph_files_are_named() {
+    let graph = Graph::new("none");
+    let launch = |path: &Path| {
+        let output = Command::new(env!("CARGO_BIN_EXE_carff")).arg("launch").arg(path).output().unwrap();
+        assert_eq!(output.status.code(), Some(1));
+        text(&output)
+    };
+    let missing = launch(&graph.path("none.toml"));
+    assert!(missing.contains("cannot read the graph file") && missing.contains("none.toml"), "{missing}");
+    std::fs::write(graph.path("wrong.toml"), "[run]\nname = \"x\"\nhorizn = 2\n").unwrap();
+    let wrong = launch(&graph.path("wrong.toml"));
+    assert!(wrong.contains("wrong.toml:3: `run.horizn`: unknown field `horizn`, expected one of"), "{wrong}");
+    std::fs::write(
+        graph.path("bare.toml"),
+        format!("[run]\nname = \"{}\"\ndataset = \"nowhere\"\ncheckpoint = \"nowhere\"\n", graph.name),
+    )
+    .unwrap();
+    let bare = launch(&graph.path("bare.toml"));
+    assert!(bare.contains("is missing: give --dataset"), "{bare}");
+}
