@@ -1,2 +1,30 @@
-//! The encoder stage.
-fn main() {}
+//! The encoder stage: camera frames in, posteriors out.
+
+use carff_encoder::{encode, load};
+use carff_messages::{Posterior, Stage};
+use carff_stage::StageContext;
+use carff_transport::{monotonic_now_ns, topics};
+
+fn main() -> std::process::ExitCode {
+    carff_stage::main(Stage::Encoder, run)
+}
+
+fn run(stage: &mut StageContext) -> anyhow::Result<()> {
+    let mut frames = stage.picture_input(&topics::FRAME)?;
+    let mut posteriors = stage.output(&topics::POSTERIOR)?;
+    let encoder = load(&stage.checkpoint, stage.threads)?;
+    stage.ready();
+    while stage.wait(&[&frames])? {
+        let started_ns = monotonic_now_ns();
+        let Some(frame) = frames.newest()? else { continue };
+        let meta = frame.meta();
+        match encode(&encoder, frame.bytes(), meta.height_px as usize, meta.width_px as usize) {
+            Ok(gaussian) => {
+                let stage_latency_ns = stage.worked(&meta.header, started_ns);
+                posteriors.send(Posterior { header: meta.header, gaussian, stage_latency_ns })?;
+            }
+            Err(error) => stage.error(&error),
+        }
+    }
+    Ok(())
+}

@@ -1,2 +1,47 @@
-//! The forecaster stage.
-fn main() {}
+//! The forecaster stage: posteriors and fed-back beliefs in, forecasts out.
+
+use carff_forecaster::Forecaster;
+use carff_messages::Stage;
+use carff_models::mixture::Sampling;
+use carff_stage::StageContext;
+use carff_transport::{monotonic_now_ns, topics};
+
+fn main() -> std::process::ExitCode {
+    carff_stage::main(Stage::Forecaster, run)
+}
+
+fn run(stage: &mut StageContext) -> anyhow::Result<()> {
+    let mut posteriors = stage.input(&topics::POSTERIOR)?;
+    let mut beliefs = stage.input(&topics::BELIEF)?;
+    let mut forecasts = stage.output(&topics::FORECAST)?;
+    let settings = &stage.graph.run;
+    let sampling = match settings.sampling {
+        carff_config::Sampling::Stratified => Sampling::Stratified,
+        carff_config::Sampling::Independent => Sampling::Independent,
+    };
+    let forecaster =
+        Forecaster::load(&stage.checkpoint, stage.threads, settings.samples as usize, sampling, settings.horizon)?;
+    let mut newest_frame = 0;
+    stage.ready();
+    while stage.wait(&[&posteriors, &beliefs])? {
+        let started_ns = monotonic_now_ns();
+        if let Some(posterior) = posteriors.newest()? {
+            newest_frame = posterior.header.frame_id;
+            let mut forecast = forecaster.from_observation(&posterior);
+            forecast.stage_latency_ns = stage.worked(&forecast.header, started_ns);
+            forecasts.send(forecast)?;
+        }
+        while let Some(belief) = beliefs.next()? {
+            // A belief on a frame that a newer one has overtaken is not looked ahead from.
+            let started_ns = monotonic_now_ns();
+            if belief.header.frame_id < newest_frame {
+                continue;
+            }
+            if let Some(mut forecast) = forecaster.from_feedback(&belief) {
+                forecast.stage_latency_ns = stage.worked(&forecast.header, started_ns);
+                forecasts.send(forecast)?;
+            }
+        }
+    }
+    Ok(())
+}

@@ -1,2 +1,67 @@
-//! The renderer stage.
-fn main() {}
+//! The renderer stage: forecasts and beliefs in, pictures of the hypotheses out. It gives way to the decision path.
+
+use anyhow::Context;
+use carff_field::RenderBuffer;
+use carff_messages::Stage;
+use carff_renderer::{camera, hypotheses, load, meta, render};
+use carff_stage::StageContext;
+use carff_transport::{Woken, monotonic_now_ns, topics};
+
+fn main() -> std::process::ExitCode {
+    carff_stage::main(Stage::Renderer, run)
+}
+
+fn run(stage: &mut StageContext) -> anyhow::Result<()> {
+    let settings = stage.graph.renderer.clone();
+    rustix::process::nice(settings.nice as i32).context("cannot lower the renderer's priority")?;
+    let bytes = settings.width_px as usize * settings.height_px as usize * 3;
+    let mut forecasts = stage.input(&topics::FORECAST)?;
+    let mut beliefs = stage.input(&topics::BELIEF)?;
+    let mut views = stage.picture_output(&topics::VIEW, bytes)?;
+    let field = load(&stage.checkpoint)?;
+    let mut buffer = RenderBuffer::new();
+    let period_ns = (1e9 / settings.max_rate_hz) as u64;
+    let mut next_ns = 0;
+    stage.ready();
+    loop {
+        // One view, then a rest: the rate stays below its limit, and only the newest belief is looked at.
+        while monotonic_now_ns() < next_ns {
+            if stage.wait_until(&[], next_ns)? == Woken::Stopped {
+                return Ok(());
+            }
+        }
+        if !stage.wait(&[&beliefs])? {
+            return Ok(());
+        }
+        let mut pair = None;
+        while let Some(forecast) = forecasts.next()? {
+            pair = Some(*forecast);
+        }
+        let Some(belief) = beliefs.newest()? else { continue };
+        let belief = *belief;
+        let Some(forecast) =
+            pair.filter(|f| f.header.frame_id == belief.header.frame_id && f.header.step == belief.header.step)
+        else {
+            continue;
+        };
+        for hypothesis in hypotheses(&forecast, &belief, settings.hypotheses as usize) {
+            for &choice in &settings.views {
+                if stage.is_stopped() {
+                    return Ok(());
+                }
+                let started_ns = monotonic_now_ns();
+                let camera = camera(&field, choice, settings.width_px, settings.height_px);
+                let mut loan = views.loan(bytes)?;
+                match render(&field, &camera, &hypothesis.latent, stage.threads, &mut buffer, loan.bytes_mut()) {
+                    Ok(()) => {
+                        let mut meta = meta(&forecast, &hypothesis, choice, &camera);
+                        meta.stage_latency_ns = stage.worked(&meta.header, started_ns);
+                        views.send(loan, meta)?;
+                    }
+                    Err(error) => stage.error(&error),
+                }
+                next_ns = next_ns.max(started_ns) + period_ns;
+            }
+        }
+    }
+}

@@ -166,8 +166,6 @@ pub struct Manifest {
     pub places: Vec<Place>,
     /// How the places look when taken and when free, once the field is trained.
     pub probing: Option<Calibration>,
-    /// Threshold of the calibrated rule, chosen on the calibration poses.
-    pub hazard_threshold: Option<f64>,
     /// The training file, as used.
     pub training: serde_json::Value,
     /// Figures by training stage.
@@ -237,9 +235,6 @@ impl Manifest {
         }
         if self.places.len() > 16 {
             return Err(format!("`places` has {} entries; at most 16 are allowed", self.places.len()));
-        }
-        if self.hazard_threshold.is_some_and(|t| !(0.0..=1.0).contains(&t)) {
-            return Err("`hazard_threshold` must lie in 0..=1".into());
         }
         Ok(())
     }

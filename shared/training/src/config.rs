@@ -88,6 +88,8 @@ pub struct VaeTraining {
     pub epochs: usize,
     /// Pictures a step.
     pub batch: usize,
+    /// How many of them the decoder reconstructs: it costs twelve times as much as the head.
+    pub decoder_batch: usize,
     /// Learning rate at the start; it falls to 2 % of it along a cosine.
     pub learning_rate: f64,
     /// Decoupled weight decay.
@@ -119,15 +121,16 @@ pub struct VaeTraining {
 impl Default for VaeTraining {
     fn default() -> Self {
         Self {
-            epochs: 120,
+            epochs: 150,
             batch: 32,
+            decoder_batch: 8,
             learning_rate: 1e-3,
             weight_decay: 0.01,
-            dropout: 0.2,
+            dropout: 0.1,
             kl_weight: 0.01,
             kl_delay: 0.1,
             kl_ramp: 0.3,
-            reconstruction_weight: 20.0,
+            reconstruction_weight: 1.0,
             residual: true,
             foreground_weight: 10.0,
             contrastive_weight: 0.0,
@@ -174,6 +177,7 @@ impl TrainingConfig {
         let counts = [
             ("vae.epochs", self.vae.epochs, 1, 10_000),
             ("vae.batch", self.vae.batch, 2, 4096),
+            ("vae.decoder_batch", self.vae.decoder_batch, 1, self.vae.batch),
             ("mdn.steps", self.mdn.steps, 1, 1_000_000),
             ("mdn.batch", self.mdn.batch, 2, 65_536),
             ("augmentation.copies", self.augmentation.copies, 0, 64),

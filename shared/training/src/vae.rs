@@ -122,7 +122,7 @@ impl<'a> Inputs<'a> {
     pub fn new(
         config: &'a TrainingConfig,
         pictures: &'a Pictures,
-        vae: &Vae,
+        vae: &mut Vae,
         run: &Run,
     ) -> Result<Self, TrainingError> {
         let keep = config.encoder.backbone.frozen && config.encoder.stem_channels == 0;
@@ -304,14 +304,15 @@ fn losses(
     let features = inputs.features(vae, chosen);
     let (mean, log_variance) = vae.encoder.posterior(&features, settings.dropout);
     let latent = &mean + (&log_variance * 0.5).exp() * Tensor::randn_like(&mean);
-    let views: Vec<i64> = only.iter().map(|&i| pictures.labels[i].view as i64).collect();
+    let decoded = &only[..settings.decoder_batch.min(only.len())];
+    let views: Vec<i64> = decoded.iter().map(|&i| pictures.labels[i].view as i64).collect();
     let views = Tensor::from_slice(&views);
-    let targets = pictures.targets(&only);
+    let targets = pictures.targets(decoded);
     let residual = &targets - pictures.pose_means.index_select(0, &views);
     let changed = residual.abs().amax([1_i64].as_slice(), true).gt(12.0 / 255.0).to_kind(Kind::Float);
     let weight = changed * (settings.foreground_weight - 1.0) + 1.0;
     let wanted = if settings.residual { residual } else { targets };
-    let error = (vae.decoder.forward(&latent, &views) - wanted).square();
+    let error = (vae.decoder.forward(&latent.narrow(0, 0, decoded.len() as i64), &views) - wanted).square();
     let reconstruction = (error * weight).mean(Kind::Float) * 10.0;
     let kl = kl_divergence(&mean, &log_variance);
     let state = (settings.state_weight > 0.0).then(|| {

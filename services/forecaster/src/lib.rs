@@ -1,0 +1,78 @@
+//! The forecaster stage's arithmetic: from a posterior, observed or fed back, to a mixture and its draws.
+
+use carff_checkpoint::Manifest;
+use carff_messages::{Belief, Forecast, ForecastSource, Gaussian, Header, Posterior};
+use carff_models::{
+    LatentGaussian,
+    mixture::{MixtureNet, Sampling},
+};
+use std::path::Path;
+
+/// The forecaster's model and settings.
+#[derive(Debug)]
+pub struct Forecaster {
+    net: MixtureNet,
+    samples: usize,
+    sampling: Sampling,
+    horizon: u32,
+}
+
+impl Forecaster {
+    /// Loads the mixture density network and runs it once.
+    pub fn load(
+        checkpoint: &Path,
+        threads: usize,
+        samples: usize,
+        sampling: Sampling,
+        horizon: u32,
+    ) -> anyhow::Result<Self> {
+        carff_models::allocator::keep_large_blocks();
+        tch::set_num_threads(threads as i32);
+        let manifest = Manifest::load(checkpoint)?;
+        let net = carff_checkpoint::load_mixture(checkpoint, &manifest)?;
+        for _ in 0..3 {
+            net.forecast(&LatentGaussian { mean: [0.0; 8], log_variance: [0.0; 8] });
+        }
+        Ok(Self { net, samples, sampling, horizon })
+    }
+
+    /// The forecast of an observed posterior: step 1.
+    pub fn from_observation(&self, posterior: &Posterior) -> Forecast {
+        let mut forecast = Forecast::empty(posterior.header.at_step(1), ForecastSource::Observed, self.horizon);
+        forecast.encoder_ns = posterior.stage_latency_ns;
+        self.fill(&mut forecast, &posterior.gaussian);
+        forecast
+    }
+
+    /// The forecast of a probed belief's resolved state: the next step. `None` when the belief was the frame's last.
+    pub fn from_feedback(&self, belief: &Belief) -> Option<Forecast> {
+        if belief.is_final == 1 || belief.header.step >= self.horizon {
+            return None;
+        }
+        let state = usize::try_from(belief.resolved_state).ok()?;
+        let header: Header = belief.header.at_step(belief.header.step + 1);
+        let mut forecast = Forecast::empty(header, ForecastSource::Probed, self.horizon);
+        forecast.encoder_ns = belief.encoder_ns;
+        forecast.resolved_state = belief.resolved_state;
+        forecast.path_probability = (belief.path_probability * belief.state_probability[state]).clamp(0.0, 1.0);
+        self.fill(&mut forecast, &belief.resolved);
+        Some(forecast)
+    }
+
+    fn fill(&self, forecast: &mut Forecast, input: &Gaussian) {
+        let input = LatentGaussian { mean: input.mean, log_variance: input.log_variance };
+        let mixture = self.net.forecast(&input);
+        let Header { seed, frame_id, step, .. } = forecast.header;
+        let draws = mixture.draw(self.samples, self.sampling, seed, frame_id, step);
+        forecast.component_count = mixture.components.len() as u32;
+        forecast.sample_count = draws.len() as u32;
+        for (i, (weight, component)) in mixture.weights.iter().zip(&mixture.components).enumerate() {
+            forecast.weights[i] = *weight;
+            forecast.components[i] = Gaussian { mean: component.mean, log_variance: component.log_variance };
+        }
+        for (i, draw) in draws.iter().enumerate() {
+            forecast.samples[i] = draw.latent;
+            forecast.sample_component[i] = draw.component as u8;
+        }
+    }
+}

@@ -1,0 +1,128 @@
+//! The renderer stage's arithmetic: which hypotheses to show, from where, and their pictures.
+
+use anyhow::Context;
+use carff_checkpoint::Manifest;
+use carff_config::ViewChoice;
+use carff_field::{Field, RenderBuffer, RenderOptions};
+use carff_geometry::PinholeCamera;
+use carff_messages::{Belief, Forecast, Intrinsics, LATENT_DIM, ViewKind, ViewMeta};
+use std::path::Path;
+
+/// Loads the field.
+pub fn load(checkpoint: &Path) -> anyhow::Result<Field> {
+    Ok(carff_checkpoint::load_field(checkpoint, &Manifest::load(checkpoint)?)?)
+}
+
+/// One hypothesis to render.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Hypothesis {
+    /// Its index: a mixture component's, or the number of components plus a sample's.
+    pub index: u32,
+    /// The latent.
+    pub latent: [f32; LATENT_DIM],
+    /// The state that probing found in it; -1 for none of the known ones.
+    pub state: i32,
+    /// Its probability, 0..=1.
+    pub probability: f32,
+}
+
+/// The hypotheses of a forecast and its belief, the most probable first, at most `count`: the component means, then
+/// the samples.
+pub fn hypotheses(forecast: &Forecast, belief: &Belief, count: usize) -> Vec<Hypothesis> {
+    let components = forecast.component_count as usize;
+    let mut all: Vec<Hypothesis> = (0..components)
+        .map(|i| Hypothesis {
+            index: i as u32,
+            latent: forecast.components[i].mean,
+            state: belief.components[i].state,
+            probability: forecast.weights[i].clamp(0.0, 1.0),
+        })
+        .collect();
+    all.sort_by(|a, b| b.probability.total_cmp(&a.probability));
+    let samples = forecast.samples();
+    let share = 1.0 / samples.len().max(1) as f32;
+    all.extend(samples.iter().zip(belief.samples()).enumerate().map(|(i, (latent, probe))| Hypothesis {
+        index: (components + i) as u32,
+        latent: *latent,
+        state: probe.state,
+        probability: share,
+    }));
+    all.truncate(count);
+    all
+}
+
+/// A camera over the region that matters: straight down with the picture's up = +Y, or from a corner.
+pub fn camera(field: &Field, choice: ViewChoice, width_px: u32, height_px: u32) -> PinholeCamera {
+    let [low, high] = field.config().bounds_m.map(|corner| corner.map(f64::from));
+    let centre = [0, 1, 2].map(|i| (low[i] + high[i]) / 2.0);
+    let extent = (high[0] - low[0]).max(high[1] - low[1]);
+    let fov_deg = 60.0_f64;
+    let distance = extent / 2.0 / (fov_deg / 2.0).to_radians().tan();
+    match choice {
+        ViewChoice::BirdsEye => PinholeCamera::look_at(
+            [centre[0], centre[1], low[2] + distance],
+            [centre[0], centre[1], low[2]],
+            [0.0, 1.0, 0.0],
+            width_px,
+            height_px,
+            fov_deg,
+        ),
+        ViewChoice::Free => PinholeCamera::look_at(
+            [high[0], low[1], low[2] + distance * 0.5],
+            [centre[0], centre[1], low[2] + 1.0],
+            [0.0, 0.0, 1.0],
+            width_px,
+            height_px,
+            fov_deg,
+        ),
+    }
+}
+
+/// Renders into 8-bit RGB, rows from the top.
+pub fn render(
+    field: &Field,
+    camera: &PinholeCamera,
+    latent: &[f32; LATENT_DIM],
+    threads: usize,
+    buffer: &mut RenderBuffer,
+    rgb: &mut [u8],
+) -> anyhow::Result<()> {
+    let options = RenderOptions { threads, ..RenderOptions::default() };
+    field.render(camera, latent, &options, buffer);
+    let wanted = buffer.rgb.len();
+    (rgb.len() == wanted).then_some(()).with_context(|| format!("{} bytes for a view of {wanted}", rgb.len()))?;
+    for (to, from) in rgb.iter_mut().zip(&buffer.rgb) {
+        *to = (from.clamp(0.0, 1.0) * 255.0 + 0.5) as u8;
+    }
+    Ok(())
+}
+
+/// Describes a rendered view.
+pub fn meta(forecast: &Forecast, hypothesis: &Hypothesis, choice: ViewChoice, camera: &PinholeCamera) -> ViewMeta {
+    let mut world_from_camera = [0.0; 16];
+    for (to, from) in world_from_camera.iter_mut().zip(camera.world_from_camera.iter().flatten()) {
+        *to = *from;
+    }
+    ViewMeta {
+        header: forecast.header,
+        hypothesis: hypothesis.index,
+        kind: match choice {
+            ViewChoice::BirdsEye => ViewKind::BirdsEye,
+            ViewChoice::Free => ViewKind::Free,
+        }
+        .code(),
+        state: hypothesis.state,
+        width_px: camera.width_px,
+        height_px: camera.height_px,
+        probability: hypothesis.probability,
+        latent: hypothesis.latent,
+        intrinsics: Intrinsics {
+            fl_x_px: camera.fl_x_px,
+            fl_y_px: camera.fl_y_px,
+            cx_px: camera.cx_px,
+            cy_px: camera.cy_px,
+        },
+        world_from_camera,
+        stage_latency_ns: 0,
+    }
+}
