@@ -97,6 +97,13 @@ fn save_png(path: &Path, rgb: &[f32], width: u32, height: u32) -> Result<()> {
     Ok(())
 }
 
+/// Processor seconds that this program has used, all threads together (Linux; 0 elsewhere).
+fn cpu_seconds() -> f64 {
+    let Ok(stat) = std::fs::read_to_string("/proc/self/stat") else { return 0.0 };
+    let ticks: f64 = stat.split(' ').skip(13).take(2).filter_map(|v| v.parse::<f64>().ok()).sum();
+    ticks / 100.0
+}
+
 struct Score {
     matching: f64,
     unmatching: f64,
@@ -210,33 +217,35 @@ fn main() -> Result<()> {
     trainer.set_state_latents(&clouds);
     let mut sampler = RaySampler::new(views.clone(), changed_share, 1);
     let mut batch = RayBatch::default();
-    let (mut spent, mut next, mut total_rays, mut psnr_mean) = (0.0, every, 0_usize, 0.0);
-    while spent < seconds && trainer.step_count() < 10_000_000 {
-        let t = Instant::now();
+    let (mut cpu, mut spent, mut next, mut total_rays, mut psnr_mean) = (0.0, 0.0, every, 0_usize, 0.0);
+    while cpu < seconds * 2.0 && trainer.step_count() < 10_000_000 {
+        let (t, c) = (Instant::now(), cpu_seconds());
         sampler.next_batch(rays, &mut batch, |v, draw| jittered(set.pictures[v].state, draw));
         let report = trainer.step(&batch);
         spent += t.elapsed().as_secs_f64();
+        cpu += cpu_seconds() - c;
         total_rays += report.rays;
         psnr_mean += 0.02 * (report.psnr - psnr_mean);
-        if trainer.step_count() % 100 == 1 {
+        if trainer.step_count() % 250 == 1 {
             println!(
-                "  {spent:.1} s: step {} {} rays {} samples {} kept, loss {:.5}",
+                "  {cpu:.1} cpu s: step {} {} rays {} samples {} kept, scale {:.2}, loss {:.5}",
                 trainer.step_count(),
                 report.rays,
                 report.samples,
                 report.kept_samples,
+                trainer.step_scale(),
                 report.loss
             );
         }
-        if spent >= next || spent >= seconds {
+        if cpu >= next * 2.0 || cpu >= seconds * 2.0 {
             next += every;
             let t = Instant::now();
             let s = evaluate(&set, &views, trainer.field(), &codes, None)?;
             println!(
-                "{spent:5.0} s step {:6} {:6.2} M rays ({:.0}/s) samples/ray {:.1} kept {:.1} occupied {:.3} lr {:.3} train {psnr_mean:.2} | bev {:.2} unmatching {:.2} changed {:.2} others {:.2} dB (evaluated in {:.1} s)",
+                "{spent:5.0} s, {cpu:5.0} cpu s: step {:6} {:6.2} M rays ({:.0}/cpu s) samples/ray {:.1} kept {:.1} occupied {:.3} lr {:.3} train {psnr_mean:.2} | bev {:.2} unmatching {:.2} changed {:.2} others {:.2} dB (evaluated in {:.1} s)",
                 trainer.step_count(),
                 total_rays as f64 / 1e6,
-                total_rays as f64 / spent,
+                total_rays as f64 / cpu,
                 report.samples as f64 / report.rays as f64,
                 report.kept_samples as f64 / report.rays as f64,
                 trainer.field().occupancy().occupied_share(),

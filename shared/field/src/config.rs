@@ -240,10 +240,14 @@ pub struct TrainerConfig {
     pub opacity_entropy: f32,
     /// Steps between two refreshes of the occupancy grid.
     pub occupancy_interval: u64,
-    /// Up to this step all of space counts as occupied and the step is `warmup_step_scale` times as long.
+    /// Up to this step all of space counts as occupied.
     pub occupancy_warmup_steps: u64,
-    /// See `occupancy_warmup_steps`.
-    pub warmup_step_scale: f32,
+    /// While rays have more samples than this on average, steps along them are stretched (up to `most_step_scale`
+    /// times): thin fog needs no fine steps, and by the time that surfaces stand out the occupancy grid keeps rays
+    /// short.
+    pub target_samples_per_ray: f32,
+    /// See `target_samples_per_ray`; also the stretch to start with. 1 switches stretching off.
+    pub most_step_scale: f32,
     /// Cells looked at in each refresh, half of them among the occupied ones.
     pub occupancy_cells: usize,
     /// Kept share of a cell's density at each look.
@@ -272,15 +276,16 @@ impl Default for TrainerConfig {
             weight_decay: 1e-6,
             huber_delta: 0.1,
             max_samples_per_ray: 192,
-            samples_per_step: 1 << 16,
+            samples_per_step: 1 << 15,
             min_transmittance: 1e-3,
             roulette_weight: 1e-3,
             min_keep: 0.1,
             jitter: true,
             opacity_entropy: 0.0,
             occupancy_interval: 16,
-            occupancy_warmup_steps: 128,
-            warmup_step_scale: 7.0,
+            occupancy_warmup_steps: 256,
+            target_samples_per_ray: 24.0,
+            most_step_scale: 12.0,
             occupancy_cells: 1 << 15,
             occupancy_decay: 0.9,
             occupancy_threshold: 0.05,

@@ -181,41 +181,71 @@ pub(crate) fn dense_backward_weights<const FMA: bool>(
     }
 }
 
-/// The eight corners of a point's cell: entry numbers and blend weights.
+/// For 16 points at once: entry numbers and blend weights of the eight corners of each one's cell, `[corner][lane]`.
+/// `points` is shorter than 16 only at the end; the rest of the lanes stand at the cube's corner.
 #[inline(always)]
-fn corners(level: &Level, q: [f32; 3]) -> ([usize; 8], [f32; 8]) {
+fn corners(level: &Level, points: &[[f32; LANES]; 3], index: &mut [[u32; LANES]; 8], weight: &mut [[f32; LANES]; 8]) {
+    const PY: u32 = 2_654_435_761;
+    const PZ: u32 = 805_459_861;
     let n = level.resolution;
-    let scaled = q.map(|v| v.clamp(0.0, 1.0) * n as f32);
-    let cell = scaled.map(|v| (v as u32).min(n - 1));
-    let f = [0, 1, 2].map(|i| scaled[i] - cell[i] as f32);
-    let mut index = [0_usize; 8];
+    let scale = n as f32;
+    let mut low = [[0_u32; LANES]; 3];
+    let mut part = [[0.0_f32; LANES]; 3];
+    for a in 0..3 {
+        for l in 0..LANES {
+            let scaled = points[a][l] * scale;
+            // Below 2^23: adding it leaves the whole part in the low bits. (Rounding by truncation of a value >= 0.)
+            let cell = scaled.floor().min(scale - 1.0);
+            low[a][l] = (cell + 8_388_608.0).to_bits() & 0x007f_ffff;
+            part[a][l] = scaled - cell;
+        }
+    }
+    let first = level.first as u32;
     if level.dense {
         let side = n + 1;
-        let base = (cell[2] * side + cell[1]) * side + cell[0];
-        let (sy, sz) = (side, side * side);
-        for (c, at) in index.iter_mut().enumerate() {
-            let c = c as u32;
-            *at = (base + (c & 1) + ((c >> 1) & 1) * sy + (c >> 2) * sz) as usize + level.first;
+        for l in 0..LANES {
+            low[0][l] = (low[2][l] * side + low[1][l]) * side + low[0][l] + first;
+        }
+        for c in 0..8_u32 {
+            let offset = (c & 1) + ((c >> 1) & 1) * side + (c >> 2) * side * side;
+            for l in 0..LANES {
+                index[c as usize][l] = low[0][l] + offset;
+            }
         }
     } else {
-        const PY: u32 = 2_654_435_761;
-        const PZ: u32 = 805_459_861;
         let mask = level.entries as u32 - 1;
-        let x = [cell[0], cell[0] + 1];
-        let y = [cell[1].wrapping_mul(PY), (cell[1] + 1).wrapping_mul(PY)];
-        let z = [cell[2].wrapping_mul(PZ), (cell[2] + 1).wrapping_mul(PZ)];
-        for (c, at) in index.iter_mut().enumerate() {
-            *at = ((x[c & 1] ^ y[(c >> 1) & 1] ^ z[c >> 2]) & mask) as usize + level.first;
+        for l in 0..LANES {
+            low[1][l] = low[1][l].wrapping_mul(PY);
+            low[2][l] = low[2][l].wrapping_mul(PZ);
+        }
+        for c in 0..8_u32 {
+            let (dx, dy, dz) = (c & 1, ((c >> 1) & 1).wrapping_mul(PY), (c >> 2).wrapping_mul(PZ));
+            for l in 0..LANES {
+                let hash = (low[0][l] + dx) ^ low[1][l].wrapping_add(dy) ^ low[2][l].wrapping_add(dz);
+                index[c as usize][l] = (hash & mask) + first;
+            }
         }
     }
-    let wx = [1.0 - f[0], f[0]];
-    let wy = [1.0 - f[1], f[1]];
-    let wz = [1.0 - f[2], f[2]];
-    let mut weight = [0.0_f32; 8];
-    for (c, w) in weight.iter_mut().enumerate() {
-        *w = wx[c & 1] * (wy[(c >> 1) & 1] * wz[c >> 2]);
+    for c in 0..8 {
+        for l in 0..LANES {
+            let x = if c & 1 == 1 { part[0][l] } else { 1.0 - part[0][l] };
+            let y = if c & 2 == 2 { part[1][l] } else { 1.0 - part[1][l] };
+            let z = if c & 4 == 4 { part[2][l] } else { 1.0 - part[2][l] };
+            weight[c][l] = x * (y * z);
+        }
     }
-    (index, weight)
+}
+
+/// Points lane by lane, brought into the cube (NaN goes to its corner).
+#[inline(always)]
+fn lanes_of(points: &[[f32; 3]]) -> [[f32; LANES]; 3] {
+    let mut lanes = [[0.0; LANES]; 3];
+    for (l, q) in points.iter().enumerate().take(LANES) {
+        for a in 0..3 {
+            lanes[a][l] = q[a].max(0.0).min(1.0);
+        }
+    }
+    lanes
 }
 
 /// Features of up to 16 points into one block (rows = levels x F); lanes past the last point are zeroed.
@@ -227,16 +257,19 @@ pub(crate) fn encode<const FMA: bool, const F: usize>(
     block: &mut [f32],
 ) {
     let table = table.as_chunks::<F>().0;
+    let count = points.len().min(LANES);
+    let points = lanes_of(points);
+    let mut index = [[0_u32; LANES]; 8];
+    let mut weight = [[0.0_f32; LANES]; 8];
     for (level, rows) in levels.iter().zip(block.chunks_exact_mut(F * LANES)) {
-        for l in 0..LANES {
+        corners(level, &points, &mut index, &mut weight);
+        rows.fill(0.0);
+        for l in 0..count {
             let mut sum = [0.0_f32; F];
-            if let Some(q) = points.get(l) {
-                let (index, weight) = corners(level, *q);
-                for c in 0..8 {
-                    let entry = &table[index[c]];
-                    for f in 0..F {
-                        sum[f] = fma::<FMA>(entry[f], weight[c], sum[f]);
-                    }
+            for c in 0..8 {
+                let entry = &table[index[c][l] as usize];
+                for f in 0..F {
+                    sum[f] = fma::<FMA>(entry[f], weight[c][l], sum[f]);
                 }
             }
             for f in 0..F {
@@ -255,17 +288,21 @@ pub(crate) fn scatter<const FMA: bool, const F: usize>(
     block: &[f32],
 ) {
     let gradient = gradient.as_chunks_mut::<F>().0;
+    let count = points.len().min(LANES);
+    let points = lanes_of(points);
+    let mut index = [[0_u32; LANES]; 8];
+    let mut weight = [[0.0_f32; LANES]; 8];
     for (level, rows) in levels.iter().zip(block.chunks_exact(F * LANES)) {
-        for (l, q) in points.iter().enumerate() {
+        corners(level, &points, &mut index, &mut weight);
+        for l in 0..count {
             let mut d = [0.0_f32; F];
             for f in 0..F {
                 d[f] = rows[f * LANES + l];
             }
-            let (index, weight) = corners(level, *q);
             for c in 0..8 {
-                let entry = &mut gradient[index[c]];
+                let entry = &mut gradient[index[c][l] as usize];
                 for f in 0..F {
-                    entry[f] = fma::<FMA>(d[f], weight[c], entry[f]);
+                    entry[f] = fma::<FMA>(d[f], weight[c][l], entry[f]);
                 }
             }
         }

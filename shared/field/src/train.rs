@@ -141,6 +141,7 @@ pub struct FieldTrainer {
     step: u64,
     state_latents: Vec<Vec<[f32; LATENT_DIM]>>,
     cell_density: Vec<f32>,
+    step_scale: f32,
     table_moments: [Vec<f32>; 2],
     network_moments: [Vec<f32>; 2],
     shards: Vec<Shard>,
@@ -168,7 +169,8 @@ impl FieldTrainer {
             (config.learning_rate_networks, "learning_rate_networks"),
             (config.huber_delta, "huber_delta"),
             (config.min_keep, "min_keep"),
-            (config.warmup_step_scale, "warmup_step_scale"),
+            (config.target_samples_per_ray, "target_samples_per_ray"),
+            (config.most_step_scale, "most_step_scale"),
             (config.final_factor, "final_factor"),
         ];
         for (value, key) in rates {
@@ -196,6 +198,7 @@ impl FieldTrainer {
             shards,
             pool,
             field,
+            step_scale: config.most_step_scale.max(1.0),
             config,
             step: 0,
             state_latents: Vec::new(),
@@ -221,6 +224,11 @@ impl FieldTrainer {
         self.field
     }
 
+    /// How much steps along rays are stretched just now; 1 once the occupancy grid keeps rays short.
+    pub fn step_scale(&self) -> f32 {
+        self.step_scale
+    }
+
     /// Steps done.
     pub fn step_count(&self) -> u64 {
         self.step
@@ -241,6 +249,11 @@ impl FieldTrainer {
         self.refresh_occupancy();
         let report = self.accumulate(batch);
         self.update();
+        if report.rays > 0 {
+            let excess = report.samples as f32 / report.rays as f32 / self.config.target_samples_per_ray;
+            self.step_scale =
+                (self.step_scale * excess.clamp(0.5, 2.0).powf(0.1)).clamp(1.0, self.config.most_step_scale.max(1.0));
+        }
         self.step += 1;
         report
     }
@@ -250,7 +263,7 @@ impl FieldTrainer {
         RayLimits {
             max_samples: self.config.max_samples_per_ray,
             min_transmittance: self.config.min_transmittance,
-            step_scale: if warm { 1.0 } else { self.config.warmup_step_scale },
+            step_scale: self.step_scale,
             use_occupancy: warm,
         }
     }
@@ -466,6 +479,7 @@ impl FieldTrainer {
             shape: vec![r, r, r],
             data: (&self.cell_density).into(),
         });
+        tensors.push(NamedTensor { name: "step_scale".into(), shape: vec![1], data: vec![self.step_scale].into() });
         TrainerState { step: self.step, tensors }
     }
 
@@ -503,6 +517,7 @@ impl FieldTrainer {
                 Some(("second", "grid.table")) => trainer.table_moments[1] = data,
                 Some(("first", rest)) => set_network_tensor(layout, &mut trainer.network_moments[0], rest, &data),
                 Some(("second", rest)) => set_network_tensor(layout, &mut trainer.network_moments[1], rest, &data),
+                _ if name == "step_scale" => trainer.step_scale = data[0],
                 _ => trainer.cell_density = data,
             }
         }
