@@ -43,8 +43,8 @@ pub struct DatasetReport {
     pub scenario: Option<ScenarioInfo>,
     /// Pictures per (branch, timestamp), by observability: full, partial, none, unknown.
     pub counts: BTreeMap<(usize, usize), [usize; 4]>,
-    /// Mean over pictures of the PSNR of the mean picture of their pose, decibels; pictures that equal it are left
-    /// out. It is what a model scores that knows the pose and nothing else.
+    /// PSNR of the mean picture of each pose against the pictures, errors pooled over all of them, decibels. It is
+    /// what a model scores that knows the pose and nothing else. `None` when no pose has two different pictures.
     pub pose_mean_psnr_db: Option<f64>,
     /// The same for the bird's-eye view alone.
     pub bev_pose_mean_psnr_db: Option<f64>,
@@ -142,14 +142,11 @@ fn pose_mean_psnr(dataset: &Dataset, images: &[Image], only: Option<usize>) -> O
             mean.iter_mut().zip(&image.rgb).for_each(|(m, v)| *m += f64::from(*v) / of_view.len() as f64);
         }
         for image in of_view {
-            let error: f64 = mean.iter().zip(&image.rgb).map(|(m, v)| (m - f64::from(*v)).powi(2)).sum::<f64>();
-            if error > 0.0 {
-                sum += 10.0 * (255.0_f64.powi(2) * size as f64 / error).log10();
-                count += 1;
-            }
+            sum += mean.iter().zip(&image.rgb).map(|(m, v)| (m - f64::from(*v)).powi(2)).sum::<f64>();
+            count += size;
         }
     }
-    (count > 0).then(|| sum / count as f64)
+    (sum > 0.0).then(|| 10.0 * (255.0_f64.powi(2) * count as f64 / sum).log10())
 }
 
 fn hidden_pairs(dataset: &Dataset, images: &[Image]) -> Vec<HiddenPair> {

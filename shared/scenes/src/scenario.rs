@@ -258,7 +258,7 @@ impl Scenario {
         detail: Detail,
     ) -> Result<Rendering, ScenarioError> {
         let placement =
-            self.placements.get(branch).and_then(|b| b.get(timestamp)).ok_or_else(|| ScenarioError::NoSuchState {
+            self.placements.get(branch).and_then(|b| b.get(timestamp)).ok_or(ScenarioError::NoSuchState {
                 branch,
                 timestamp,
                 branches: self.info.branches.len(),
@@ -438,13 +438,11 @@ impl Shots<'_> {
                 let (image, depth_m, object_id) = scene.picture(&scenario.setting, self.camera);
                 Shot { image, depth_m, object_id }
             };
-            match scenario.scenes.get(key) {
-                Some(scene) => snap(scene),
-                None => {
-                    let vehicles = vehicles(&scenario.config, &scenario.scenery, placement);
-                    snap(&Scene::new(scenario.scenery.bodies.iter().cloned().chain(vehicles).collect()))
-                }
+            if let Some(scene) = scenario.scenes.get(key) {
+                return snap(scene);
             }
+            let vehicles = vehicles(&scenario.config, &scenario.scenery, placement);
+            snap(&Scene::new(scenario.scenery.bodies.iter().cloned().chain(vehicles).collect()))
         })
     }
 }

@@ -85,7 +85,7 @@ impl Scenery {
 }
 
 fn block(min: [f64; 2], max: [f64; 2], low: f64, high: f64) -> (Vec3, Vec3) {
-    let center = vec3((min[0] + max[0]) / 2.0, (min[1] + max[1]) / 2.0, f64::midpoint(low, high));
+    let center = vec3(f64::midpoint(min[0], max[0]), f64::midpoint(min[1], max[1]), f64::midpoint(low, high));
     (center, vec3((max[0] - min[0]) / 2.0, (max[1] - min[1]) / 2.0, (high - low) / 2.0))
 }
 
@@ -309,7 +309,7 @@ pub(crate) fn vehicle_bodies(vehicle: &VehicleConfig, pose: Pose, object: u16) -
     };
     // A panel of the body from x0 to x1 and z0 to z1, over the given share of the width.
     let mut panel = |x0: f32, x1: f32, z0: f32, z1: f32, y0: f32, y1: f32, edge: f32, lights_z: f32| {
-        let center = Vec3::new((x0 + x1) / 2.0, (y0 + y1) / 2.0, (z0 + z1) / 2.0);
+        let center = Vec3::new(f32::midpoint(x0, x1), f32::midpoint(y0, y1), f32::midpoint(z0, z1));
         let half = Vec3::new((x1 - x0) / 2.0, (y1 - y0) / 2.0, (z1 - z0) / 2.0);
         add(chamfered(half, edge), center, paint(center, lights_z));
     };

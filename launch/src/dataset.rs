@@ -1,0 +1,136 @@
+//! `carff dataset`: renders scenarios into data sets, and checks data sets.
+
+use std::ops::ControlFlow;
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, bail};
+use carff_dataset::{Dataset, DatasetReport, SheetOptions, contact_sheet};
+use carff_scenes::{Extras, Scenario};
+use indicatif::{ProgressBar, ProgressStyle};
+
+/// What to do with data sets.
+#[derive(Debug, clap::Subcommand)]
+pub enum DatasetCommand {
+    /// Render a scenario into a posed data set.
+    Render {
+        /// A scenario file, or the name of one in configs/scenarios.
+        scenario: PathBuf,
+        /// Folder to write; it must be new, empty, or a set that this command wrote.
+        #[arg(long)]
+        out: PathBuf,
+        /// Also write depth (16-bit PNG, millimetres) and actor masks.
+        #[arg(long)]
+        depth: bool,
+    },
+    /// Check a data set and print its statistics.
+    Check {
+        /// Folder of the set.
+        dir: PathBuf,
+        /// Where to write a picture of the whole set: a row per state, a column per view.
+        #[arg(long)]
+        contact_sheet: Option<PathBuf>,
+        /// Columns of the contact sheet.
+        #[arg(long, default_value_t = 12, value_parser = clap::value_parser!(u16).range(1..=64))]
+        columns: u16,
+    },
+}
+
+/// Runs one of the commands.
+pub fn run(command: DatasetCommand) -> anyhow::Result<()> {
+    match command {
+        DatasetCommand::Render { scenario, out, depth } => {
+            render(&scenario, &out, if depth { Extras::DepthAndMasks } else { Extras::None })
+        }
+        DatasetCommand::Check { dir, contact_sheet, columns } => {
+            check(&dir, contact_sheet.as_deref(), usize::from(columns))
+        }
+    }
+}
+
+/// A path as it is, or else the scenario of that name in configs/scenarios.
+fn find_scenario(scenario: &Path) -> anyhow::Result<PathBuf> {
+    if scenario.is_file() {
+        return Ok(scenario.to_owned());
+    }
+    let named = Path::new("configs/scenarios").join(scenario).with_extension("toml");
+    if named.is_file() {
+        return Ok(named);
+    }
+    bail!("no scenario {}: there is no such file, nor {}", scenario.display(), named.display());
+}
+
+fn render(scenario: &Path, out: &Path, extras: Extras) -> anyhow::Result<()> {
+    let path = find_scenario(scenario)?;
+    let scenario = Scenario::load(&path)?;
+    let bar = ProgressBar::new((scenario.cameras().len() * scenario.info().state_count()) as u64);
+    bar.set_style(ProgressStyle::with_template("{msg} [{bar:40}] {pos}/{len} pictures, {eta} left")?);
+    bar.set_message(scenario.info().name.clone());
+    let rendered = scenario.render_dataset(out, extras, |_, _| {
+        bar.inc(1);
+        ControlFlow::Continue(())
+    });
+    bar.finish_and_clear();
+    rendered.with_context(|| format!("cannot render {} into {}", path.display(), out.display()))?;
+    println!("{} pictures in {}", bar.position(), out.display());
+    Ok(())
+}
+
+fn check(dir: &Path, sheet: Option<&Path>, columns: usize) -> anyhow::Result<()> {
+    let dataset = Dataset::open(dir)?;
+    let images = dataset.load_all_images()?;
+    print!("{}", DatasetReport::of(&dataset, &images));
+    if let Some(path) = sheet {
+        contact_sheet(&dataset, &images, SheetOptions { columns, ..SheetOptions::default() }).save_png(path)?;
+        println!("Contact sheet: {}", path.display());
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SMALL: &str = r##"
+name = "small"
+bounds_m = [[-2.0, -2.0, 0.0], [2.0, 2.0, 2.0]]
+timestamps = 1
+branches = ["only"]
+picture = { width_px = 16, height_px = 16, fov_deg = 60.0 }
+
+[[overhead]]
+view_kind = "bev"
+count = 2
+center = [0.0, 0.0]
+height_m = 5.0
+spread_m = 1.0
+"##;
+
+    /// A rendered set passes its own check and may be rendered again; a folder of somebody else's is left alone.
+    #[test]
+    fn render_then_check() {
+        let dir = tempfile::tempdir().unwrap();
+        let scenario = dir.path().join("small.toml");
+        std::fs::write(&scenario, SMALL).unwrap();
+        let out = dir.path().join("set");
+        let command = || DatasetCommand::Render { scenario: scenario.clone(), out: out.clone(), depth: true };
+        run(command()).unwrap();
+        run(command()).unwrap();
+        let sheet = dir.path().join("sheet.png");
+        run(DatasetCommand::Check { dir: out.clone(), contact_sheet: Some(sheet.clone()), columns: 4 }).unwrap();
+        assert!(sheet.is_file());
+
+        let foreign = dir.path().join("foreign");
+        std::fs::create_dir(&foreign).unwrap();
+        std::fs::write(foreign.join("thesis.txt"), "irreplaceable").unwrap();
+        let error = run(DatasetCommand::Render { scenario, out: foreign.clone(), depth: false }).unwrap_err();
+        assert!(format!("{error:#}").contains("not a set that this program wrote"), "{error:#}");
+        assert_eq!(std::fs::read_to_string(foreign.join("thesis.txt")).unwrap(), "irreplaceable");
+    }
+
+    /// A scenario that is neither a file nor a name is an error that names both places.
+    #[test]
+    fn unknown_scenario() {
+        let error = find_scenario(Path::new("nowhere-at-all")).unwrap_err().to_string();
+        assert!(error.contains("nowhere-at-all") && error.contains("nowhere-at-all.toml"), "{error}");
+    }
+}

@@ -1,0 +1,334 @@
+//! Contracts of scenarios and their pictures: determinism, true geometry, what is hidden, and what mistakes are told.
+
+#![allow(clippy::unwrap_used)] // The helpers below are parts of tests.
+
+use std::ops::ControlFlow;
+use std::path::Path;
+
+use carff_dataset::{Dataset, Observability};
+use carff_geometry::PinholeCamera;
+use carff_scenes::{Detail, Extras, RenderOptions, Scenario, ScenarioError};
+
+/// A block may stand behind a wall that hides half of it from the camera at -Y. Nothing else. The sun stands opposite
+/// the camera, so shadows fall towards it.
+const SMALL: &str = r##"
+name = "small"
+bounds_m = [[-3.0, -3.0, 0.0], [3.0, 3.0, 2.0]]
+timestamps = 2
+branches = ["with", "without"]
+hazard_branches = ["with"]
+bev_view = 0
+
+[picture]
+width_px = 96
+height_px = 80
+fov_deg = 60.0
+
+[sun]
+azimuth_deg = 90.0
+elevation_deg = 80.0
+
+[[road]]
+from = [-20.0, 0.0]
+to = [20.0, 0.0]
+width_m = 6.0
+
+[[marking]]
+from = [-20.0, 0.0]
+to = [20.0, 0.0]
+width_m = 0.3
+dash_m = 1.0
+gap_m = 1.0
+
+[[building]]
+name = "wall"
+min = [-8.0, -4.0]
+max = [0.0, -3.6]
+height_m = 6.0
+walls = "plaster"
+colour = "#a0a0a0"
+
+[[vehicle]]
+name = "block"
+role = "actor"
+kind = "block"
+colour = "#ff0000"
+size_m = [2.0, 1.0, 1.0]
+dynamic = true
+
+[[vehicle.course]]
+branches = ["with"]
+poses = [[0.0, 0.0, 0.0], [-3.0, 0.0, 0.0]]
+
+[[overhead]]
+view_kind = "bev"
+count = 3
+center = [0.0, 0.0]
+height_m = 12.0
+spread_m = 2.0
+"##;
+
+fn small() -> Scenario {
+    Scenario::parse("small.toml".as_ref(), SMALL).unwrap()
+}
+
+/// Far away on -Y, through a long lens, so that the wall's edge at x = 0 is seen nearly in parallel projection.
+fn front() -> PinholeCamera {
+    PinholeCamera::look_at([0.0, -60.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 1.0], 256, 128, 8.0)
+}
+
+fn in_pool<T: Send>(threads: usize, work: impl FnOnce() -> T + Send) -> T {
+    rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap().install(work)
+}
+
+/// The same bytes with one thread and with three, and when asked twice.
+#[test]
+fn same_bytes_whatever_the_threads() {
+    let scenario = small();
+    let camera = scenario.cameras()[1].camera;
+    let render = || scenario.render(0, 0, &camera, &RenderOptions::default()).unwrap();
+    let one = in_pool(1, render);
+    let three = in_pool(3, render);
+    assert_eq!(one, three);
+    assert_eq!(one, render());
+}
+
+/// Depth is the distance along the ray: on the ground seen from straight above it is height / cosine, on the block's
+/// top it is less by the block's height.
+#[test]
+fn depth_agrees_with_the_planes() {
+    let scenario = small();
+    let camera = scenario.cameras()[0].camera;
+    let rendering = scenario.render(0, 0, &camera, &RenderOptions { detail: Detail::Picture }).unwrap();
+    let block = scenario.object_of_vehicle("block").unwrap();
+    let (mut ground, mut top) = (0, 0);
+    for y in 0..80_usize {
+        for x in 0..96_usize {
+            let cosine = -f64::from(camera.ray(x as f64 + 0.5, y as f64 + 0.5).direction[2]);
+            let depth = f64::from(rendering.depth_m[y * 96 + x]);
+            let object = rendering.object_id[y * 96 + x];
+            if object == 1 {
+                assert!((depth - 12.0 / cosine).abs() < 1e-3, "({x}, {y}): {depth}");
+                ground += 1;
+            } else if object == block && (depth - 11.0 / cosine).abs() < 1e-3 {
+                top += 1;
+            }
+        }
+    }
+    // 2 m x 1 m at 11 m through a focal length of 83.1 px: 15.1 x 7.6 px.
+    assert!(ground > 5000 && (98..=128).contains(&top), "{ground} {top}");
+    assert!(rendering.actor.is_none());
+}
+
+/// A block of which a wall hides the left half is half visible, in both branches alike: where it is absent, its place
+/// counts. From above it is wholly visible.
+#[test]
+fn half_hidden_is_one_half() {
+    let scenario = small();
+    let options = RenderOptions::default();
+    let with = scenario.render(0, 0, &front(), &options).unwrap().actor.unwrap();
+    let without = scenario.render(1, 0, &front(), &options).unwrap().actor.unwrap();
+    assert_eq!(with, without);
+    assert!((with.visible_fraction - 0.5).abs() < 0.03, "{with:?}");
+    assert_eq!(with.observability, Observability::Partial);
+    let above = scenario.render(1, 0, &scenario.cameras()[0].camera, &options).unwrap().actor.unwrap();
+    assert_eq!((above.visible_fraction, above.observability), (1.0, Observability::Full));
+}
+
+/// What lies outside the picture counts as not visible: a camera that cuts the block's place in two sees half of it.
+#[test]
+fn outside_the_picture_is_not_visible() {
+    let scenario = small();
+    // From +Y, where no wall stands; turned aside by half its field of view, so that x = 0 is the picture's edge.
+    let turn = 10.0_f64.to_radians();
+    let camera =
+        PinholeCamera::look_at([0.0, 40.0, 0.5], [40.0 * turn.tan(), 0.0, 0.5], [0.0, 0.0, 1.0], 256, 128, 20.0);
+    let actor = scenario.render(0, 0, &camera, &RenderOptions::default()).unwrap().actor.unwrap();
+    assert!((actor.visible_fraction - 0.5).abs() < 0.05, "{actor:?}");
+}
+
+/// Behind the wall the actor leaves no trace: the pictures with and without it are the same bytes, and the view is
+/// `none`. It is there, though: from the other side they differ.
+#[test]
+fn hidden_pairs_are_equal() {
+    let scenario = small();
+    let options = RenderOptions::default();
+    let with = scenario.render(0, 1, &front(), &options).unwrap();
+    let without = scenario.render(1, 1, &front(), &options).unwrap();
+    assert_eq!(with.image, without.image);
+    assert_eq!(with.actor.unwrap().observability, Observability::None);
+    assert_eq!(with.actor, without.actor);
+    let behind = PinholeCamera::look_at([-3.0, 9.0, 2.0], [-3.0, 0.0, 0.5], [0.0, 0.0, 1.0], 96, 80, 60.0);
+    let with = scenario.render(0, 1, &behind, &options).unwrap();
+    let without = scenario.render(1, 1, &behind, &options).unwrap();
+    assert_ne!(with.image, without.image);
+}
+
+/// A hidden actor whose shadow is seen is not `none`: its shadow gives it away. With a low sun behind it, the shadow
+/// reaches past the end of the wall.
+#[test]
+fn a_visible_shadow_is_partial() {
+    let low_sun = SMALL
+        .replace("azimuth_deg = 90.0", "azimuth_deg = 165.0")
+        .replace("elevation_deg = 80.0", "elevation_deg = 12.0");
+    let scenario = Scenario::parse("small.toml".as_ref(), &low_sun).unwrap();
+    let camera = PinholeCamera::look_at([0.0, -20.0, 2.5], [0.0, 0.0, 0.5], [0.0, 0.0, 1.0], 96, 80, 40.0);
+    let with = scenario.render(0, 1, &camera, &RenderOptions::default()).unwrap();
+    let without = scenario.render(1, 1, &camera, &RenderOptions::default()).unwrap();
+    assert_eq!(with.actor.unwrap().actor_px, 0);
+    assert_ne!(with.image, without.image);
+    assert_eq!(with.actor.unwrap().observability, Observability::Partial);
+    assert_eq!(without.actor.unwrap().observability, Observability::Partial);
+}
+
+/// Things look like what they are: the block is red, the marking brighter than the asphalt, the sky blue.
+#[test]
+fn colours_are_plausible() {
+    let scenario = small();
+    let rendering = scenario.render(0, 0, &scenario.cameras()[0].camera, &RenderOptions::default()).unwrap();
+    let [r, g, b] = rendering.image.pixel(48, 40).unwrap();
+    assert!(r > 120 && g < 80 && b < 80, "{r} {g} {b}");
+    let brightest = (0..96).map(|x| rendering.image.pixel(x, 40).unwrap()[1]).max().unwrap();
+    let asphalt = rendering.image.pixel(60, 48).unwrap()[1];
+    assert!(brightest > asphalt + 60, "{brightest} {asphalt}");
+    let up = PinholeCamera::look_at([0.0, 0.0, 2.0], [1.0, 0.0, 2.6], [0.0, 0.0, 1.0], 16, 16, 30.0);
+    let sky = scenario.render(1, 0, &up, &RenderOptions::default()).unwrap();
+    assert!(sky.object_id.iter().all(|id| *id == 0) && sky.depth_m.iter().all(|d| d.is_infinite()));
+    let [r, _, b] = sky.image.pixel(8, 8).unwrap();
+    assert!(b > r + 20);
+}
+
+/// A rendered set is read back with the scenario's states, candidates and cameras; depth and masks lie beside the
+/// pictures and agree with them. A run that is stopped leaves no set.
+#[test]
+fn rendered_sets_are_read() {
+    let scenario = small();
+    let dir = tempfile::tempdir().unwrap();
+    let out = dir.path().join("set");
+    let stopped = scenario.render_dataset(&out, Extras::None, |done, total| {
+        assert!(done <= total && total == 12);
+        ControlFlow::Break(())
+    });
+    assert!(matches!(stopped, Err(ScenarioError::Stopped)));
+    assert!(Dataset::open(&out).is_err());
+
+    scenario.render_dataset(&out, Extras::DepthAndMasks, |_, _| ControlFlow::Continue(())).unwrap();
+    let dataset = Dataset::open(&out).unwrap();
+    assert_eq!(dataset.scenario(), Some(scenario.info()));
+    assert_eq!((dataset.frames().len(), dataset.view_count()), (12, 3));
+    let info = scenario.info();
+    assert_eq!(info.states[0].boxes[0].oriented_box.center, [0.0, 0.0, 0.5]);
+    assert!(info.states[2].boxes.is_empty());
+    assert_eq!(info.candidates.iter().map(|c| c.timestamp).collect::<Vec<_>>(), [Some(0), Some(1)]);
+    assert_eq!(info.static_boxes[0].name, "wall");
+    let frame = &dataset.frames()[4];
+    assert_eq!((frame.branch, frame.timestamp, frame.view), (Some(0), Some(1), Some(1)));
+    let rendering = scenario.render(0, 1, &scenario.cameras()[1].camera, &RenderOptions::default()).unwrap();
+    assert_eq!(dataset.load_image(4).unwrap(), rendering.image);
+    assert_eq!(frame.actor_px, Some(rendering.actor.unwrap().actor_px));
+    let text = std::fs::read_to_string(out.join("transforms.json")).unwrap();
+    assert!(text.contains("\"depth_file_path\":\"depth/b0_t1_v001.png\"") && text.contains("\"role\":\"actor\""));
+    let mask = carff_dataset::Image::load_png(&out.join("masks/b0_t1_v001.png")).unwrap();
+    let block = scenario.object_of_vehicle("block").unwrap();
+    let expected = rendering.object_id.iter().filter(|id| **id == block).count();
+    assert!(expected > 0 && mask.rgb.chunks(3).filter(|p| p[0] == 255).count() == expected);
+    assert_eq!(scenario.object_name(block), "block");
+}
+
+/// Cameras and states that do not exist are errors.
+#[test]
+fn bad_requests() {
+    let scenario = small();
+    let mut camera = scenario.cameras()[0].camera;
+    let error = scenario.render(2, 0, &camera, &RenderOptions::default()).unwrap_err().to_string();
+    assert_eq!(error, "there is no branch 2 at timestamp 0; the scenario has 2 x 2");
+    camera.fl_x_px = f64::NAN;
+    let error = scenario.render(0, 0, &camera, &RenderOptions::default()).unwrap_err().to_string();
+    assert_eq!(error, "the camera is not usable: `fl_x` must be finite");
+}
+
+/// Each mistake in a scenario file is told with file, line and key.
+#[test]
+fn golden_errors() {
+    for (from, to, expected) in [
+        (
+            "timestamps = 2",
+            "timestamp = 2",
+            &["small.toml: TOML parse error at line 4, column 1", "unknown field `timestamp`", "`timestamps`"][..],
+        ),
+        ("timestamps = 2", "timestamps = 0", &["line 4", "0 is out of range; a whole number from 1 to 64 is allowed"]),
+        (
+            "width_m = 6.0",
+            "width_m = -6.0",
+            &["line 21", "width_m = -6.0", "-6 is out of range; a length from 0.001 to 10000 is allowed"],
+        ),
+        ("width_m = 6.0", "width_m = nan", &["line 21", "out of range"]),
+        ("\"#ff0000\"", "\"red\"", &["line 42", "`red` is not a colour; write `#rrggbb`"]),
+        ("kind = \"block\"", "kind = \"tank\"", &["line 41", "unknown variant `tank`", "`pickup`"]),
+        ("from = [-20.0, 0.0]", "from = [-20.0]", &["line 19", "invalid length 1"]),
+        (
+            "\nbranches = [\"with\"]\n",
+            "\nbranches = [\"whit\"]\n",
+            &["small.toml:47: key `branches`: there is no branch `whit`; there are `with`, `without`"],
+        ),
+        (
+            "hazard_branches = [\"with\"]",
+            "hazard_branches = [\"none\"]",
+            &["small.toml:6: key `hazard_branches`: there is no branch `none`; there are `with`, `without`"],
+        ),
+        (
+            ", [-3.0, 0.0, 0.0]]",
+            "]",
+            &["small.toml:48: key `poses`: 1 poses; one for each of the 2 timestamps is needed"],
+        ),
+        ("bev_view = 0", "bev_view = 3", &["small.toml:7: key `bev_view`: is 3, but there are 3 cameras"]),
+        (
+            "min = [-8.0, -4.0]",
+            "min = [8.0, -4.0]",
+            &["small.toml:30: key `building`: `min` [8.0, -4.0] must be below `max` [0.0, -3.6] along both axes"],
+        ),
+        (
+            "branches = [\"with\", \"without\"]",
+            "branches = [\"with\", \"with\"]",
+            &["small.toml:5: key `branches`: `with` is named twice"],
+        ),
+    ] {
+        assert!(SMALL.contains(from), "{from}");
+        let error = Scenario::parse("small.toml".as_ref(), &SMALL.replacen(from, to, 1)).unwrap_err().to_string();
+        for part in expected {
+            assert!(error.contains(part), "{to}: expected `{part}` in\n{error}");
+        }
+    }
+    let error = Scenario::load("nowhere.toml".as_ref()).unwrap_err().to_string();
+    assert!(error.starts_with("nowhere.toml: "), "{error}");
+}
+
+/// The shipped scenario loads and is what the paper's data set is: two branches, three timestamps, a hundred poses,
+/// one bird's-eye view straight down at 50 that sees every place of actor and ego. No camera stands inside a box.
+#[test]
+fn the_shipped_scenario() {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs/scenarios/approaching-intersection.toml");
+    let scenario = Scenario::load(&path).unwrap();
+    let info = scenario.info();
+    assert_eq!((info.branches.len(), info.timestamps, info.bev_view), (2, 3, Some(50)));
+    assert_eq!(info.hazard_branches, [0]);
+    assert_eq!(info.candidates.len(), 3);
+    assert_eq!(scenario.cameras().len(), 100);
+    let bev = scenario.cameras()[50].camera;
+    assert!((bev.ray(64.0, 64.0).direction[2] + 1.0).abs() < 1e-6);
+    for state in &info.states {
+        for named in &state.boxes {
+            let corners = named.oriented_box.lattice([2, 2, 2], 1.0);
+            for corner in corners {
+                let ([x, y], _) = bev.project(corner).unwrap();
+                assert!((0.0..=128.0).contains(&x) && (0.0..=128.0).contains(&y), "{} {x} {y}", named.name);
+            }
+            for camera in scenario.cameras() {
+                assert!(!named.oriented_box.contains(camera.camera.position_m()));
+            }
+        }
+    }
+    for camera in scenario.cameras() {
+        assert!(info.static_boxes.iter().all(|b| !b.oriented_box.contains(camera.camera.position_m())));
+    }
+}
