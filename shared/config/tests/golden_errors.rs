@@ -1,0 +1,97 @@
+//! What a wrong graph file is answered with, word by word: file, line, key, and what is allowed.
+
+use carff_config::{ConfigError, GraphConfig, RestartPolicy, ViewChoice};
+use std::path::Path;
+
+const HEAD: &str = "[run]\nname = \"x\"\ndataset = \"d\"\ncheckpoint = \"c\"\n";
+
+fn error(text: &str) -> String {
+    GraphConfig::parse(text, Path::new("graph.toml")).unwrap_err().to_string()
+}
+
+/// Each wrong file has exactly this message.
+#[test]
+fn wrong_files_have_golden_messages() {
+    let cases = [
+        (
+            format!("{HEAD}horizn = 2\n"),
+            "graph.toml:5: `run.horizn`: unknown field `horizn`, expected one of `name`, `seed`, `dataset`, `scenario`, \
+             `checkpoint`, `horizon`, `samples`, `sampling`, `frame_rate_hz`, `busy_polling`",
+        ),
+        (format!("{HEAD}horizon = 9\n"), "graph.toml:5: `run.horizon` is 9; allowed: 1 to 8"),
+        (
+            format!("{HEAD}horizon = \"two\"\n"),
+            "graph.toml:5: `run.horizon`: invalid type: string \"two\", expected u32",
+        ),
+        (
+            format!("{HEAD}sampling = \"random\"\n"),
+            "graph.toml:5: `run.sampling`: unknown variant `random`, expected `stratified` or `independent`",
+        ),
+        (
+            format!("{HEAD}\n[controller]\n\nrule = \"calibrated\"\nthreshold = 1.5\n"),
+            "graph.toml:9: `controller.threshold` is 1.5; allowed: 0 to 1",
+        ),
+        (format!("{HEAD}[camera.noise]\nsigma = nan\n"), "graph.toml:6: `camera.noise.sigma` is NaN; allowed: 0 to 64"),
+        (
+            format!("{HEAD}[launcher.restart]\nprober = {{ on-failure = {{ backoff_ms = 1, max_restarts = 0 }} }}\n"),
+            "graph.toml:6: `launcher.restart.prober.on-failure.max_restarts` is 0; allowed: 1 to 1000",
+        ),
+        (
+            "[run]\nname = \"two words\"\ndataset = \"d\"\ncheckpoint = \"c\"\n".to_owned(),
+            "graph.toml:2: `run.name` is \"two words\"; allowed: 1 to 24 characters out of a-z, A-Z, 0-9, `-` and `_`",
+        ),
+        ("[run]\nname = \"x\"\ncheckpoint = \"c\"\n".to_owned(), "graph.toml:1: `run`: missing field `dataset`"),
+        (
+            format!("{HEAD}[cameras]\n"),
+            "graph.toml:5: `cameras`: unknown field `cameras`, expected one of `run`, \
+             `threads`, `log`, `camera`, `encoder`, `forecaster`, `prober`, `renderer`, `controller`, `launcher`",
+        ),
+        (
+            format!("{HEAD}[renderer]\nviews = []\n"),
+            "graph.toml:6: `renderer.views` is []; allowed: `birds-eye`, `free`, or both",
+        ),
+    ];
+    for (text, expected) in cases {
+        assert_eq!(error(&text), expected, "for\n{text}");
+    }
+}
+
+/// What is no TOML at all names the line too.
+#[test]
+fn broken_toml_names_the_line() {
+    let message = error("[run]\nname = \"x\ndataset = 3\n");
+    assert!(message.starts_with("graph.toml:2: "), "{message}");
+}
+
+/// A missing file is named, with the system's reason.
+#[test]
+fn a_missing_file_is_named() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("none.toml");
+    let error = GraphConfig::load(&path).unwrap_err();
+    assert!(matches!(error, ConfigError::Read { .. }));
+    assert!(error.to_string().contains("none.toml"), "{error}");
+}
+
+/// The shipped graph loads without a warning, and says what its comments say.
+#[test]
+fn the_shipped_graph_is_valid() {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs/graphs/approaching-intersection.toml");
+    let graph = GraphConfig::load(&path).unwrap();
+    assert_eq!(graph.warnings(), Vec::<String>::new());
+    assert_eq!((graph.run.samples, graph.run.horizon, graph.camera.drives), (10, 2, 60));
+    assert_eq!(graph.renderer.views, [ViewChoice::BirdsEye, ViewChoice::Free]);
+    assert_eq!(graph.launcher.restart.camera, RestartPolicy::Never);
+    assert!(graph.scenario_path().unwrap().is_file());
+    // Paths fall back to the project's root, wherever the program runs.
+    assert!(graph.resolve(Path::new("configs/graphs")).is_dir());
+}
+
+/// Odd but allowed settings are warned of.
+#[test]
+fn odd_settings_are_warned_of() {
+    let text = format!("{HEAD}[threads]\ntotal = 2\nencoder = 2\n[controller]\ndeadline_ms = 90\n");
+    let warnings = GraphConfig::parse(&text, Path::new("graph.toml")).unwrap().warnings();
+    assert_eq!(warnings.len(), 2, "{warnings:?}");
+    assert!(warnings[0].contains("threads") && warnings[1].contains("controller.deadline_ms"), "{warnings:?}");
+}
