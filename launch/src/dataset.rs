@@ -90,7 +90,7 @@ fn check(dir: &Path, sheet: Option<&Path>, columns: usize) -> anyhow::Result<()>
 mod tests {
     use super::*;
 
-    const SMALL: &str = r##"
+    const SMALL: &str = r#"
 name = "small"
 bounds_m = [[-2.0, -2.0, 0.0], [2.0, 2.0, 2.0]]
 timestamps = 1
@@ -103,7 +103,7 @@ count = 2
 center = [0.0, 0.0]
 height_m = 5.0
 spread_m = 1.0
-"##;
+"#;
 
     /// A rendered set passes its own check and may be rendered again; a folder of somebody else's is left alone.
     #[test]
