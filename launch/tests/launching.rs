@@ -1,6 +1,8 @@
 //! Whole graphs of real processes, with stages that compute next to nothing: what the launcher does when all goes well,
 //! when a stage dies, and when it is interrupted or killed.
 
+#![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
+
 use carff_messages::{
     Action, ActionCode, Belief, DatasetView, Forecast, ForecastSource, FrameMeta, Gaussian, Header, Intrinsics,
     Posterior, Reason, RuleCode, Stage,

@@ -500,7 +500,7 @@ impl GraphConfig {
     }
 
     fn check(&self, source: &Source<'_>) -> Result<(), ConfigError> {
-        fn within<T: PartialOrd + Display>(
+        fn within<T: PartialOrd + Display + Copy>(
             source: &Source<'_>,
             key: &str,
             value: T,

@@ -1,5 +1,7 @@
 //! What a wrong graph file is answered with, word by word: file, line, key, and what is allowed.
 
+#![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
+
 use carff_config::{ConfigError, GraphConfig, RestartPolicy, ViewChoice};
 use std::path::Path;
 

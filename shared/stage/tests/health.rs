@@ -1,5 +1,7 @@
 //! What a stage says of itself.
 
+#![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
+
 use carff_config::GraphConfig;
 use carff_messages::{Gaussian, Header, HealthState, Posterior, Stage};
 use carff_stage::{StageArgs, StageContext, run_with};

@@ -114,7 +114,7 @@ impl Node {
         M: Message + ZeroCopySend + Debug + 'static,
     {
         let (name, limits) = (topic.name, topic.limits);
-        self.check_segment(name, limits, size_of::<M>())?;
+        check_segment(name, limits, size_of::<M>())?;
         let service = retry(name, || {
             limited!(self.inner.service_builder(&service_name(name)?).publish_subscribe::<M>(), limits)
         })?;
@@ -159,7 +159,7 @@ impl Node {
         M: PictureMeta + ZeroCopySend + Debug + 'static,
     {
         let (name, limits) = (topic.name, topic.limits);
-        self.check_segment(name, limits, size_of::<M>() + max_bytes)?;
+        check_segment(name, limits, size_of::<M>() + max_bytes)?;
         let service = retry(name, || {
             limited!(
                 self.inner.service_builder(&service_name(name)?).publish_subscribe::<[u8]>().user_header::<M>(),
@@ -176,11 +176,6 @@ impl Node {
             .map_err(|e| port_error(name, "publishers", limits.max_publishers, &e))?;
         let notifier = self.notifier(name, limits)?;
         Ok(PicturePublisher::new(name, &self.run, publisher, notifier, self.counters.clone(), max_bytes))
-    }
-
-    fn check_segment(&self, topic: &str, limits: Limits, message_bytes: usize) -> Result<(), OpenError> {
-        let needed = (limits.preallocated() * (message_bytes + 64)) as u64 + MANAGEMENT_BYTES;
-        check_space(Path::new(SHARED_MEMORY_DIR), &format!("topic `{topic}`"), needed)
     }
 
     fn event(&self, topic: &str, limits: Limits) -> Result<EventFactory<Service>, OpenError> {
@@ -206,6 +201,11 @@ impl Node {
         let factory = self.event(topic, limits)?;
         factory.notifier_builder().create().map_err(|e| port_error(topic, "notifiers", limits.max_publishers, &e))
     }
+}
+
+fn check_segment(topic: &str, limits: Limits, message_bytes: usize) -> Result<(), OpenError> {
+    let needed = (limits.preallocated() * (message_bytes + 64)) as u64 + MANAGEMENT_BYTES;
+    check_space(Path::new(SHARED_MEMORY_DIR), &format!("topic `{topic}`"), needed)
 }
 
 fn service_name(topic: &str) -> Result<ServiceName, String> {

@@ -26,8 +26,8 @@ impl Source {
         ReceiveError { topic: self.topic.to_owned(), cause: error.to_string() }
     }
 
-    /// Counts, and says whether the message may be used. `origin` names the sender.
-    fn accepts(&self, message: &impl Message, extra: Result<(), Invalid>, origin: &dyn Debug) -> bool {
+    /// Counts, and says whether the message may be used. `publisher` is the sender's unique id.
+    fn accepts(&self, message: &impl Message, extra: Result<(), Invalid>, publisher: u128) -> bool {
         let found = message.header().run_id;
         let same_run = if found == self.run_id {
             Ok(())
@@ -41,7 +41,7 @@ impl Source {
             }
             Err(error) => {
                 self.counters.count_invalid();
-                tracing::warn!(topic = self.topic, ?origin, %error, "dropped an invalid message");
+                tracing::warn!(topic = self.topic, publisher = format_args!("{publisher:x}"), %error, "dropped an invalid message");
                 false
             }
         }
@@ -82,9 +82,10 @@ impl<M: Message + ZeroCopySend + Debug + 'static> Receiver<M> {
     }
 
     /// The oldest valid message that waits, if any.
+    #[allow(clippy::should_implement_trait, reason = "an iterator would borrow the receiver for a whole loop")]
     pub fn next(&mut self) -> Result<Option<Sample<M>>, ReceiveError> {
         while let Some(sample) = self.port.receive().map_err(|e| self.source.failed(&e))? {
-            if self.source.accepts(sample.payload(), Ok(()), &sample.origin()) {
+            if self.source.accepts(sample.payload(), Ok(()), sample.origin().value()) {
                 return Ok(Some(Sample(sample)));
             }
         }
@@ -156,6 +157,7 @@ impl<M: PictureMeta + ZeroCopySend + Debug + 'static> PictureReceiver<M> {
     }
 
     /// The oldest valid picture that waits, if any.
+    #[allow(clippy::should_implement_trait, reason = "an iterator would borrow the receiver for a whole loop")]
     pub fn next(&mut self) -> Result<Option<Picture<M>>, ReceiveError> {
         while let Some(sample) = self.port.receive().map_err(|e| self.source.failed(&e))? {
             let meta = sample.user_header();
@@ -168,7 +170,7 @@ impl<M: PictureMeta + ZeroCopySend + Debug + 'static> PictureReceiver<M> {
                     Err(Invalid::Mismatch { field: "picture bytes", found: found as u64, expected: expected as u64 })
                 }
             });
-            if self.source.accepts(meta, size, &sample.origin()) {
+            if self.source.accepts(meta, size, sample.origin().value()) {
                 return Ok(Some(Picture(sample)));
             }
         }

@@ -1,5 +1,7 @@
 //! Sending and receiving within one process.
 
+#![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
+
 mod common;
 
 use carff_messages::Message;
