@@ -1,6 +1,6 @@
 //! The training file: what `carff train` reads.
 
-use crate::TrainingError;
+use crate::{TrainingError, field::FieldTraining};
 use carff_dataset::sensor::SensorNoise;
 use carff_models::{decoder::DecoderConfig, encoder::EncoderConfig, mixture::MixtureConfig};
 use serde::{Deserialize, Serialize};
@@ -42,9 +42,38 @@ pub struct TrainingConfig {
     /// The pose-conditional VAE's training.
     #[serde(default)]
     pub vae: VaeTraining,
+    /// The field's structure. Its bounds and the scale of its latents come from the data.
+    #[serde(default)]
+    pub field: carff_field::FieldConfig,
+    /// The field's training.
+    #[serde(default)]
+    pub nerf: FieldTraining,
     /// The mixture density network's training.
     #[serde(default)]
     pub mdn: MdnTraining,
+    /// How the calibrated rule's threshold is chosen.
+    #[serde(default)]
+    pub calibration: CalibrationConfig,
+}
+
+/// How the calibrated rule's threshold is chosen, on the calibration poses alone.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct CalibrationConfig {
+    /// Times that each picture is taken, with fresh sensor noise.
+    pub repeats: usize,
+    /// Sensor noise.
+    pub sensor: SensorNoise,
+    /// Samples a step.
+    pub samples: usize,
+    /// Steps looked ahead.
+    pub horizon: u32,
+}
+
+impl Default for CalibrationConfig {
+    fn default() -> Self {
+        Self { repeats: 5, sensor: SensorNoise::default(), samples: 10, horizon: 2 }
+    }
 }
 
 fn two() -> i32 {
@@ -122,8 +151,8 @@ impl Default for VaeTraining {
     fn default() -> Self {
         Self {
             epochs: 150,
-            batch: 32,
-            decoder_batch: 8,
+            batch: 30,
+            decoder_batch: 4,
             learning_rate: 1e-3,
             weight_decay: 0.01,
             dropout: 0.1,
@@ -178,6 +207,10 @@ impl TrainingConfig {
             ("vae.epochs", self.vae.epochs, 1, 10_000),
             ("vae.batch", self.vae.batch, 2, 4096),
             ("vae.decoder_batch", self.vae.decoder_batch, 1, self.vae.batch),
+            ("nerf.rays", self.nerf.rays, 32, 1 << 20),
+            ("calibration.repeats", self.calibration.repeats, 1, 1000),
+            ("calibration.samples", self.calibration.samples, 1, 64),
+            ("calibration.horizon", self.calibration.horizon as usize, 1, 8),
             ("mdn.steps", self.mdn.steps, 1, 1_000_000),
             ("mdn.batch", self.mdn.batch, 2, 65_536),
             ("augmentation.copies", self.augmentation.copies, 0, 64),
@@ -200,6 +233,10 @@ impl TrainingConfig {
             ("vae.contrastive_weight", self.vae.contrastive_weight, 1e3),
             ("vae.contrastive_temperature", self.vae.contrastive_temperature, 10.0),
             ("vae.state_weight", self.vae.state_weight, 1e3),
+            ("nerf.changed_share", f64::from(self.nerf.changed_share), 1.0),
+            ("nerf.visible_fraction", f64::from(self.nerf.visible_fraction), 1.0),
+            ("nerf.resampled_share", self.nerf.resampled_share, 1.0),
+            ("nerf.resampled_ramp", self.nerf.resampled_ramp, 1.0),
             ("mdn.learning_rate", self.mdn.learning_rate, 1.0),
             ("mdn.input_noise", self.mdn.input_noise, 10.0),
             ("mdn.target_visible_fraction", f64::from(self.mdn.target_visible_fraction), 1.0),
@@ -212,6 +249,8 @@ impl TrainingConfig {
                 return Err(format!("`{key}` = {value}: 0 to {high} are allowed"));
             }
         }
+        self.field.validate().map_err(|e| format!("[field] {e}"))?;
+        self.calibration.sensor.validate().map_err(|e| format!("[calibration.sensor] {e}"))?;
         self.augmentation.sensor.validate().map_err(|e| format!("[augmentation.sensor] {e}"))
     }
 }

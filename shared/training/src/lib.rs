@@ -5,8 +5,10 @@
 
 pub mod accuracy;
 pub mod config;
+pub mod field;
 pub mod mixture;
 pub mod pictures;
+pub mod pipeline;
 pub mod run;
 pub mod vae;
 
@@ -19,6 +21,15 @@ pub enum TrainingError {
     /// A model or a weights file cannot be used.
     #[error(transparent)]
     Model(#[from] carff_models::ModelError),
+    /// The field cannot be made or trained so.
+    #[error(transparent)]
+    Field(#[from] carff_field::FieldError),
+    /// A checkpoint cannot be read or written.
+    #[error(transparent)]
+    Checkpoint(#[from] carff_checkpoint::CheckpointError),
+    /// The scenario cannot be probed.
+    #[error(transparent)]
+    Probing(#[from] carff_probing::ProbingError),
     /// libtorch refused an operation.
     #[error("libtorch: {0}")]
     Torch(#[from] tch::TchError),

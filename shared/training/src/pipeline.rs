@@ -1,0 +1,347 @@
+//! From pictures to a checkpoint: VAE, field, mixture density network, calibration, figures.
+
+use crate::{
+    TrainingError,
+    config::TrainingConfig,
+    field::{self, Clouds},
+    mixture::{self, Mdn},
+    pictures::Pictures,
+    run::{Progress, Run, damaged},
+    vae::{self, Inputs, Vae},
+};
+use carff_checkpoint::{FORMAT_VERSION, Manifest, ScenarioIdentity, SplitRecord, files, save_field, save_weights};
+use carff_config::CheckpointPlanning;
+use carff_dataset::{Observability, PoseRole, drives::eligible_inputs};
+use carff_evaluation::{Input, Models, birds_eye, planning_table, sample_accuracy, trials};
+use carff_field::Field;
+use carff_models::{LATENT_DIM, LatentGaussian, mixture::Sampling};
+use carff_planning::{CalibrationTrial, Rule, choose_threshold};
+use carff_probing::{Calibration, Place, Prober};
+use carff_random::Key;
+use serde_json::{Value, json};
+use std::path::Path;
+
+/// Which models to train.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Stage {
+    /// All three, in order.
+    All,
+    /// The pose-conditional VAE.
+    Vae,
+    /// The field.
+    Nerf,
+    /// The mixture density network.
+    Mdn,
+}
+
+/// Trains what `stage` says and writes what is ready to the checkpoint folder `out`. Finished stages are read from
+/// their saved states; a stage that is asked for by name needs those before it.
+pub fn train(
+    config: &TrainingConfig,
+    dataset: &Path,
+    out: &Path,
+    stage: Stage,
+    run: &Run,
+) -> Result<Value, TrainingError> {
+    carff_models::allocator::keep_large_blocks();
+    tch::set_num_threads(config.threads);
+    tch::manual_seed(config.seed as i64);
+    let pictures = Pictures::open(dataset, config.split_seed)?;
+    let states = pictures.scenario.state_count();
+    let pretrained = config.pretrained_backbone.as_deref();
+    let mut vae = Vae::new(config, pictures.dataset.view_count(), states, pretrained)?;
+    let inputs = Inputs::new(config, &pictures, &mut vae, run)?;
+    if matches!(stage, Stage::All | Stage::Vae) {
+        vae::train(config, &pictures, &vae, &inputs, run)?;
+    } else {
+        finished(run, "vae", config.vae.epochs, |state| vae.restore_weights(state))?;
+    }
+    let posteriors: Vec<Vec<LatentGaussian>> =
+        (0..=config.augmentation.copies).map(|copy| inputs.posteriors(&vae, copy)).collect();
+    let mut metrics = json!({"vae": vae::evaluate(config, &pictures, &vae, &posteriors[0], true)?});
+    let clouds = Clouds::new(&pictures, &posteriors[0], config.nerf.visible_fraction)?;
+    let mut manifest = Manifest {
+        format_version: FORMAT_VERSION,
+        scenario: ScenarioIdentity::of(&pictures.scenario, pictures.dataset.view_count()),
+        seed: config.seed,
+        split: SplitRecord {
+            seed: config.split_seed,
+            unseen: pictures.split.views(PoseRole::Unseen),
+            calibration: pictures.split.views(PoseRole::Calibration),
+        },
+        encoder: config.encoder.clone(),
+        decoder: config.decoder.clone(),
+        mixture: config.mixture.clone(),
+        field: None,
+        states: clouds.states(),
+        places: places(&pictures),
+        probing: None,
+        training: serde_json::to_value(config).unwrap_or(Value::Null),
+        metrics: Value::Null,
+    };
+    write_vae(config, &vae, out)?;
+
+    // The mixture density network before the field: it is quick, and needs the posteriors alone.
+    let mdn = Mdn::new(config)?;
+    let mdn_ready = if matches!(stage, Stage::All | Stage::Mdn) {
+        mixture::train(config, &pictures, &posteriors, &mdn, run)?;
+        true
+    } else {
+        finished(run, "mdn", config.mdn.steps, |state| mdn.restore_weights(state)).is_ok()
+    };
+    if mdn_ready {
+        save_weights(out, files::MIXTURE, &mdn.weights())?;
+    }
+
+    let field = if matches!(stage, Stage::All | Stage::Nerf) {
+        Some(field::train(config, &pictures, &clouds, run)?)
+    } else {
+        run.load("nerf")?.and_then(|(_, state)| field::saved_field(config, &state))
+    };
+    if let Some(mut field) = field {
+        // What ships is what is judged.
+        field.round_to_f16();
+        save_field(out, &field)?;
+        manifest.field = Some(field.config().clone());
+        let (prober, calibration) = calibrate_probing(&manifest, &field, &clouds, config.seed)?;
+        metrics["probing"] = json!({"separations": calibration.separations(), "places": prober.places().len()});
+        if let Some(view) = birds_eye(&field, &manifest.states, &pictures.dataset, config.threads.max(1) as usize)? {
+            write_birds_eye(run, &view)?;
+            metrics["birds_eye"] = serde_json::to_value(&view).unwrap_or(Value::Null);
+        }
+        manifest.probing = Some(calibration);
+    }
+    manifest.metrics = metrics;
+    manifest.save(out)?;
+    if manifest.probing.is_some() && mdn_ready {
+        let mut models = Models::load(out)?;
+        calibrate_threshold(config, &pictures, &mut models, out, run)?;
+        let figures = figures(config, &pictures, &mut models, out)?;
+        if let (Some(to), Some(from)) = (manifest.metrics.as_object_mut(), figures.as_object()) {
+            to.extend(from.clone());
+        }
+        manifest.save(out)?;
+    }
+    run.metric(&json!({"stage": "done", "metrics": manifest.metrics}))?;
+    Ok(manifest.metrics)
+}
+
+fn finished(
+    run: &Run,
+    stage: &str,
+    total: usize,
+    restore: impl FnOnce(&carff_models::weights::Tensors) -> bool,
+) -> Result<(), TrainingError> {
+    match run.load(stage)? {
+        Some((done, state)) if done >= total => {
+            if restore(&state) {
+                Ok(())
+            } else {
+                Err(damaged(&run.state_path(stage)))
+            }
+        }
+        Some((done, _)) => {
+            Err(TrainingError::Unfit(format!("stage {stage} stopped at {done} of {total}: finish it first")))
+        }
+        None => Err(TrainingError::Unfit(format!("stage {stage} is not trained yet: run it first"))),
+    }
+}
+
+fn write_vae(config: &TrainingConfig, vae: &Vae, out: &Path) -> Result<(), TrainingError> {
+    let (mut encoder, decoder, backbone) = vae.weights();
+    match (&config.pretrained_backbone, config.encoder.backbone.frozen) {
+        (Some(file), true) => {
+            let target = out.join(files::BACKBONE);
+            std::fs::create_dir_all(out)
+                .and_then(|()| std::fs::copy(file, &target))
+                .map_err(|source| TrainingError::File { path: target, source })?;
+        }
+        _ => encoder.extend(backbone),
+    }
+    save_weights(out, files::ENCODER, &encoder)?;
+    Ok(save_weights(out, files::DECODER, &decoder)?)
+}
+
+/// Every distinct box of the states, and every candidate, with the states in which it is taken. Boxes that no state
+/// moves tell nothing and are left out.
+pub fn places(pictures: &Pictures) -> Vec<Place> {
+    let scenario = &pictures.scenario;
+    let mut places: Vec<Place> = Vec::new();
+    let all = scenario
+        .states
+        .iter()
+        .enumerate()
+        .flat_map(|(state, info)| info.boxes.iter().map(move |b| (Some(state), b)))
+        .chain(scenario.candidates.iter().map(|c| (None, &c.named_box)));
+    for (state, named) in all {
+        let b = named.oriented_box;
+        let near = |other: &Place| {
+            let o = other.oriented_box;
+            let distance: f64 = (0..3).map(|i| (o.center[i] - b.center[i]).powi(2)).sum();
+            other.name == named.name && distance.sqrt() < 0.25 && (o.yaw - b.yaw).abs() < 0.1
+        };
+        let at = places.iter().position(near).unwrap_or_else(|| {
+            places.push(Place {
+                name: named.name.clone(),
+                oriented_box: b,
+                occupied_in: vec![false; scenario.state_count()],
+            });
+            places.len() - 1
+        });
+        if let Some(state) = state {
+            places[at].occupied_in[state] = true;
+        }
+    }
+    places.retain(|p| p.occupied_in.contains(&true) && p.occupied_in.contains(&false));
+    places.truncate(16);
+    places
+}
+
+/// Latents of each known state that the prober is calibrated on.
+const CALIBRATION_LATENTS: usize = 64;
+
+fn calibrate_probing(
+    manifest: &Manifest,
+    field: &Field,
+    clouds: &Clouds,
+    seed: u64,
+) -> Result<(Prober, Calibration), TrainingError> {
+    let prober = Prober::new(manifest.places.clone(), manifest.scenario.hazard_states())?;
+    let places = prober.places().len();
+    let mut densities = vec![0.0; prober.points().len()];
+    let occupancies: Vec<Vec<f32>> = (0..prober.state_count())
+        .map(|state| {
+            let mut rng = carff_random::stream(Key { seed, frame: state as u64, step: 0x7072_6f62, sample: 0 });
+            let mut rows = Vec::with_capacity(CALIBRATION_LATENTS * places);
+            for _ in 0..CALIBRATION_LATENTS {
+                let latent: [f32; LATENT_DIM] = clouds.draw(state, 1.0, &mut rng);
+                field.density(prober.points(), &latent, &mut densities);
+                let mut row = vec![0.0; places];
+                prober.occupancies(&densities, &mut row);
+                rows.extend(row);
+            }
+            rows
+        })
+        .collect();
+    let calibration = Calibration::fit(&prober, &occupancies)?;
+    Ok((prober, calibration))
+}
+
+/// Chooses the calibrated rule's threshold on the calibration poses, and writes it beside the manifest.
+fn calibrate_threshold(
+    config: &TrainingConfig,
+    pictures: &Pictures,
+    models: &mut Models,
+    out: &Path,
+    run: &Run,
+) -> Result<(), TrainingError> {
+    let settings = &config.calibration;
+    let unfit = |e: &dyn std::fmt::Display| TrainingError::Unfit(e.to_string());
+    let inputs =
+        eligible_inputs(&pictures.dataset, &pictures.split.views(PoseRole::Calibration)).map_err(|e| unfit(&e))?;
+    let trials = trials(&models.encoder, &pictures.dataset, &inputs, settings.repeats, &settings.sensor, config.seed)?;
+    let mut found = Vec::with_capacity(trials.len());
+    for trial in &trials {
+        let plan = carff_belief::Plan {
+            samples: settings.samples,
+            sampling: Sampling::Stratified,
+            horizon: settings.horizon,
+            seed: trial.seed,
+            frame: trial.frame,
+        };
+        let steps = carff_belief::look_ahead(&models.mixture, &mut models.probe, &trial.posterior, plan);
+        let hazard =
+            carff_belief::hazard_probability(steps.iter().map(|s| (s.resolved.hazard_probability, s.path_probability)));
+        found.push(CalibrationTrial {
+            hazard_probability: f64::from(hazard),
+            halt_is_right: trial.kind == carff_dataset::drives::DriveKind::Hazard,
+        });
+    }
+    let threshold = choose_threshold(&found).ok_or_else(|| {
+        TrainingError::Unfit(
+            "the calibration poses allow no trial of one kind (hazard or clear): choose another `split_seed`".into(),
+        )
+    })?;
+    run.metric(&json!({"stage": "threshold", "threshold": threshold, "trials": found.len()}))?;
+    CheckpointPlanning::new(config.split_seed, threshold).save(out).map_err(|e| unfit(&e))
+}
+
+/// The figures that a checkpoint's manifest carries. The thresholds are chosen by now; nothing is chosen from these.
+fn figures(
+    config: &TrainingConfig,
+    pictures: &Pictures,
+    models: &mut Models,
+    out: &Path,
+) -> Result<Value, TrainingError> {
+    let unfit = |e: &dyn std::fmt::Display| TrainingError::Unfit(e.to_string());
+    let threshold = CheckpointPlanning::load(out).map_err(|e| unfit(&e))?.hazard_threshold;
+    let rules = [Rule::Underconfident, Rule::Overconfident, Rule::Paper, Rule::Calibrated { threshold }];
+    let mut planning = serde_json::Map::new();
+    for (name, role) in [("all_views", PoseRole::Rest), ("unseen_views", PoseRole::Unseen)] {
+        let views = pictures.split.views(role);
+        let inputs = eligible_inputs(&pictures.dataset, &views).map_err(|e| unfit(&e))?;
+        let trials =
+            trials(&models.encoder, &pictures.dataset, &inputs, 5, &config.calibration.sensor, config.seed + 1)?;
+        let (table, _) = planning_table(
+            &models.mixture,
+            &mut models.probe,
+            &trials,
+            &rules,
+            Sampling::Stratified,
+            config.calibration.horizon,
+        );
+        planning.insert(name.into(), serde_json::to_value(table).unwrap_or(Value::Null));
+    }
+    let mut samples = serde_json::Map::new();
+    for (name, role) in [("trained", PoseRole::Rest), ("unseen", PoseRole::Unseen)] {
+        let chosen = pictures.with_roles(&[role]);
+        let mut inputs = Vec::with_capacity(chosen.len());
+        for &i in &chosen {
+            let image = pictures.inputs(&[i], 0, &config.augmentation, config.seed + 1);
+            inputs.extend(models.encoder.encode(&image).into_iter().map(|posterior| Input {
+                state: pictures.labels[i].state,
+                view: pictures.labels[i].view,
+                observability: pictures.labels[i].observability,
+                posterior,
+                frame: i as u64,
+            }));
+        }
+        let table = sample_accuracy(
+            &models.mixture,
+            &mut models.probe,
+            &inputs,
+            Observability::Full,
+            pictures.scenario.timestamps,
+            &pictures.equivalence,
+            50,
+            config.seed + 1,
+        );
+        samples.insert(name.into(), json!({"full": table, "accuracy": table.accuracy()}));
+    }
+    Ok(json!({"planning": planning, "samples": samples}))
+}
+
+/// Rendered above true, one column a state.
+fn write_birds_eye(run: &Run, view: &carff_evaluation::BirdsEye) -> Result<(), TrainingError> {
+    let (Some(first), columns) = (view.pictures.first(), view.pictures.len()) else { return Ok(()) };
+    let (w, h) = (first.width_px as usize, first.height_px as usize);
+    let mut sheet = carff_dataset::Image {
+        width_px: (w * columns) as u32,
+        height_px: (h * 2) as u32,
+        rgb: vec![0; w * columns * h * 2 * 3],
+    };
+    for (row, images) in [&view.pictures, &view.truths].into_iter().enumerate() {
+        for (column, image) in images.iter().enumerate() {
+            for y in 0..h {
+                let to = ((row * h + y) * w * columns + column * w) * 3;
+                sheet.rgb[to..to + w * 3].copy_from_slice(&image.rgb[y * w * 3..(y + 1) * w * 3]);
+            }
+        }
+    }
+    Ok(sheet.save_png(&run.dir.join("birds_eye.png"))?)
+}
+
+/// A progress line for those who have no bar.
+pub fn plain_line(progress: &Progress) -> String {
+    format!("{} {}/{}  {}", progress.stage, progress.done, progress.total, progress.line)
+}
