@@ -278,7 +278,8 @@ impl Launcher<'_> {
             }
             let Some(process) = &mut watched.process else { continue };
             let health = self.monitor.records.stages.get(&watched.stage).and_then(|s| s.last);
-            if health.is_some_and(|h| h.pid == process.pid() && h.state != HealthState::Starting.code()) {
+            let ready = |state| !matches!(state, HealthState::Starting | HealthState::Faulty);
+            if health.is_some_and(|h| h.pid == process.pid() && h.state().is_ok_and(ready)) {
                 watched.was_ready = true;
             }
             let stage = watched.stage;
@@ -369,7 +370,7 @@ impl Launcher<'_> {
         }
         // Their last heartbeats hold the final counts. A failure here has nothing left to stop.
         if let Err(error) = self.collect() {
-            self.terminal.log(&format!("[launcher] {error:#}"));
+            self.terminal.log(&format!("[launcher] {}", carff_stage::describe(&error)));
         }
     }
 }

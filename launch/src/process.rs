@@ -49,8 +49,7 @@ impl StageProcess {
             relay_lines(BufReader::new(stderr), |line| {
                 let is_error = line.trim_start().starts_with("ERROR") || line.contains("panicked at");
                 if is_error && let Ok(mut noted) = noted.lock() {
-                    let own = format!("ERROR {stage}: ");
-                    *noted = Some(line.trim().strip_prefix(&own).unwrap_or(line.trim()).to_owned());
+                    *noted = Some(line.trim().trim_start_matches("ERROR").trim().to_owned());
                 }
                 terminal.log(&format!("[{stage}] {}", line.trim_end()));
             });

@@ -28,10 +28,21 @@ pub fn run_with(stage: Stage, args: StageArgs, run: impl FnOnce(&mut StageContex
     match start(stage, args).and_then(|mut context| context.finish(run)) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("ERROR {stage}: {error:#}");
+            eprintln!("ERROR {}", describe(&error));
             ExitCode::FAILURE
         }
     }
+}
+
+/// An error and its causes in one sentence; a cause that the sentence has told already is not told again.
+pub fn describe(error: &anyhow::Error) -> String {
+    let mut sentence = error.to_string();
+    for cause in error.chain().skip(1).map(ToString::to_string) {
+        if !sentence.contains(&cause) {
+            sentence = format!("{sentence}: {cause}");
+        }
+    }
+    sentence
 }
 
 fn start(stage: Stage, args: StageArgs) -> anyhow::Result<StageContext> {
@@ -193,7 +204,7 @@ impl StageContext {
     /// Counts and logs an error after which the stage goes on.
     pub fn error(&mut self, error: &anyhow::Error) {
         self.vitals.count_error();
-        tracing::error!("{error:#}");
+        tracing::error!("{}", describe(error));
     }
 
     fn finish(&mut self, run: impl FnOnce(&mut Self) -> anyhow::Result<()>) -> anyhow::Result<()> {
@@ -238,4 +249,17 @@ fn init_log(level: LogLevel) {
         .with_target(false)
         .without_time()
         .try_init();
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Causes that a message contains are not repeated; others are added.
+    #[test]
+    fn errors_do_not_repeat_themselves() {
+        let cause = std::io::Error::other("disk on fire");
+        let error = anyhow::Error::new(cause).context("cannot read x: disk on fire").context("no weights");
+        assert_eq!(describe(&error), "no weights: cannot read x: disk on fire");
+    }
 }

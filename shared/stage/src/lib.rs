@@ -36,4 +36,4 @@ mod context;
 mod health;
 
 pub use args::StageArgs;
-pub use context::{StageContext, main, run_with};
+pub use context::{StageContext, describe, main, run_with};
