@@ -1,0 +1,220 @@
+#!/usr/bin/env python3
+"""Checks dependencies and house rules without network, once the crates are fetched.
+
+Dependencies, as deny.toml says: licences, banned crates, duplicate versions, sources; and the direction of arrows
+between our own crates. House rules: no unfinished code, no paths of one machine, `unsafe` in named modules only.
+
+Usage: python3 .ci/check_dependencies.py      (from anywhere; exit code 1 and one line per finding)
+"""
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+try:
+    import tomllib
+except ImportError:  # Python before 3.11: pip brings a reader along.
+    from pip._vendor import tomli as tomllib
+
+ROOT = Path(__file__).resolve().parent.parent
+TARGET = "x86_64-unknown-linux-gnu"
+
+# The only modules with `unsafe`, and what for.
+UNSAFE_MODULES = {
+    "shared/field/src/dispatch.rs": "calls kernels compiled for an instruction set that was found at run time",
+    "shared/messages/src/tests.rs": "makes messages out of arbitrary bytes",
+    "shared/models/src/allocator.rs": "mallopt",
+    "shared/models/src/borrow.rs": "tensors that borrow shared memory",
+    "shared/transport/src/descriptors.rs": "file descriptors of iceoryx2's listeners",
+}
+
+UNFINISHED = re.compile(r"\b(?:todo|unimplemented)!|\bdbg!\(|\b(?:FIXME|TODO|XXX)\b")
+MACHINE_PATH = re.compile(r"(?<![\w.}$])/(?:home|root|work|Users|mnt|media|tmp)/")
+UNSAFE = re.compile(r"\bunsafe\s*(?:\{|fn\b|impl\b|extern\b|trait\b)")
+TEXT = {".rs", ".toml", ".py", ".md", ".json", ".sh", ".yml"}
+# How far above an `unsafe` block its SAFETY line may stand: macros put arguments in between.
+SAFETY_LINES = 4
+
+findings: list[str] = []
+
+
+def find(text: str) -> None:
+    findings.append(text)
+
+
+def run(*command: str) -> str:
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    if done.returncode != 0:
+        sys.exit(f"{' '.join(command)} failed:\n{done.stderr.strip()}")
+    return done.stdout
+
+
+def licence_allowed(expression: str, allowed: set[str]) -> bool:
+    """Whether an SPDX expression can be met by allowed licences alone. `/` is the old way to write OR."""
+    tokens = re.findall(r"[()]|[^\s()]+", expression.replace("/", " OR "))
+    place = 0
+
+    def one() -> bool:
+        nonlocal place
+        token = tokens[place]
+        place += 1
+        if token == "(":
+            result = either()
+            place += 1  # the closing one
+            return result
+        if tokens[place:place + 1] == ["WITH"]:
+            token = f"{token} WITH {tokens[place + 1]}"
+            place += 2
+        return token in allowed
+
+    def both() -> bool:
+        nonlocal place
+        result = one()
+        while tokens[place:place + 1] == ["AND"]:
+            place += 1
+            result &= one()
+        return result
+
+    def either() -> bool:
+        nonlocal place
+        result = both()
+        while tokens[place:place + 1] == ["OR"]:
+            place += 1
+            result |= both()
+        return result
+
+    try:
+        return either() and place == len(tokens)
+    except IndexError:
+        return False
+
+
+def version_matches(version: str, wanted: str) -> bool:
+    """Whether a version begins with what a `crate@version` entry says."""
+    return version == wanted or version.startswith((wanted + ".", wanted + "+"))
+
+
+def named(entry: object) -> tuple[str, str]:
+    """Crate and version (may be empty) of a deny.toml entry."""
+    text = entry["crate"] if isinstance(entry, dict) else str(entry)
+    name, _, version = text.partition("@")
+    return name, version
+
+
+def check_crates(metadata: dict, deny: dict) -> None:
+    ids = {node["id"]: node for node in metadata["resolve"]["nodes"]}
+    packages = {p["id"]: p for p in metadata["packages"] if p["id"] in ids}
+    ours = set(metadata["workspace_members"])
+
+    allowed = set(deny["licenses"]["allow"])
+    for package in packages.values():
+        label = f"{package['name']} {package['version']}"
+        if not licence_allowed(package["license"] or "", allowed):
+            find(f"{label}: licence `{package['license']}` is not among those that deny.toml allows")
+        if package["id"] not in ours and not (package["source"] or "").startswith("registry+"):
+            find(f"{label}: comes from {package['source'] or 'a path'}, not from a registry")
+
+    users: dict[str, set[str]] = {}
+    for node in ids.values():
+        for dependency in node["deps"]:
+            users.setdefault(packages[dependency["pkg"]]["name"], set()).add(packages[node["id"]]["name"])
+    present = {p["name"] for p in packages.values()}
+    for entry in deny["bans"]["deny"]:
+        name, version = named(entry)
+        found = [p for p in packages.values() if p["name"] == name and (not version or version_matches(p["version"], version))]
+        strangers = users.get(name, set()) - set(entry.get("wrappers", []))
+        if found and (strangers or not entry.get("wrappers")):
+            find(f"{name}: banned ({entry['reason']}), but used by {', '.join(sorted(strangers)) or 'the lock file'}")
+
+    versions: dict[str, list[str]] = {}
+    for package in packages.values():
+        versions.setdefault(package["name"], []).append(package["version"])
+    skips = [named(entry) for entry in deny["bans"]["skip"]]
+    for name, found in sorted(versions.items()):
+        left = [v for v in found if not any(n == name and version_matches(v, w) for n, w in skips)]
+        if len(found) > 1 and len(left) > 1:
+            find(f"{name}: versions {', '.join(sorted(found))} at once; allow one in deny.toml, with its reason")
+    for name, version in skips:
+        if not any(version_matches(v, version) for v in versions.get(name, [])) or len(versions[name]) < 2:
+            find(f"deny.toml: the line for {name}@{version} is no longer needed")
+    for entry in deny["bans"]["deny"] + deny["bans"]["skip"] + deny["advisories"]["ignore"]:
+        if not entry.get("reason"):
+            find(f"deny.toml: {entry} has no reason")
+    for node in ids.values():
+        if packages[node["id"]]["name"].startswith("iceoryx2") and "dev_permissions" in node["features"]:
+            find("iceoryx2 is built with dev_permissions: any user could write the shared memory")
+    print(f"crates: {len(packages)}, {len(ours)} of them ours")
+
+
+def check_arrows(metadata: dict) -> None:
+    """services and launch may use shared; shared uses shared; no service uses another; messages uses nothing of ours."""
+    room = {}
+    for package in metadata["packages"]:
+        if package["source"] is None:
+            room[package["name"]] = Path(package["manifest_path"]).parent.relative_to(ROOT).parts[0]
+    for package in metadata["packages"]:
+        if package["source"] is not None:
+            continue
+        name = package["name"]
+        for dependency in package["dependencies"]:
+            used = dependency["name"]
+            if used not in room:
+                continue
+            if room[used] != "shared" and room[name] != "tests":
+                find(f"{name} ({room[name]}/) depends on {used} ({room[used]}/): arrows point to shared/ alone")
+            if room[used] == "tests":
+                find(f"{name} depends on {used}: nothing depends on tests/")
+            if name == "carff-messages" and dependency["kind"] is None:
+                find(f"carff-messages depends on {used}: it may use nothing of ours")
+
+
+def check_sources() -> None:
+    files = [Path(f) for f in run("git", "ls-files", "--cached", "--others", "--exclude-standard").splitlines()]
+    count = 0
+    seen_unsafe = set()
+    for file in files:
+        if file.suffix not in TEXT and file.name not in {"Makefile", "run"} or not (ROOT / file).is_file():
+            continue
+        if (ROOT / file).resolve() == Path(__file__).resolve():
+            continue
+        count += 1
+        lines = (ROOT / file).read_text(encoding="utf-8").splitlines()
+        for number, line in enumerate(lines, 1):
+            here = f"{file}:{number}"
+            if MACHINE_PATH.search(line):
+                find(f"{here}: a path of one machine: {line.strip()}")
+            if file.suffix != ".rs":
+                continue
+            if UNFINISHED.search(line):
+                find(f"{here}: unfinished: {line.strip()}")
+            if UNSAFE.search(line) and not line.lstrip().startswith("//"):
+                seen_unsafe.add(str(file))
+                if str(file) not in UNSAFE_MODULES:
+                    find(f"{here}: `unsafe` outside of the modules that .ci/check_dependencies.py names")
+                above = lines[max(0, number - 1 - SAFETY_LINES):number - 1]
+                if "unsafe {" in line and not any("SAFETY:" in text for text in above):
+                    find(f"{here}: no SAFETY line above this `unsafe` block")
+    for file in sorted(set(UNSAFE_MODULES) - seen_unsafe):
+        find(f".ci/check_dependencies.py: {file} has no `unsafe` any more")
+    print(f"files: {count}")
+
+
+def main() -> None:
+    deny = tomllib.loads((ROOT / "deny.toml").read_text(encoding="utf-8"))
+    metadata = json.loads(
+        run("cargo", "metadata", "--locked", "--offline", "--format-version", "1", "--filter-platform", TARGET)
+    )
+    check_crates(metadata, deny)
+    check_arrows(metadata)
+    check_sources()
+    for text in findings:
+        print(f"error: {text}", file=sys.stderr)
+    if findings:
+        sys.exit(f"{len(findings)} findings")
+    print("dependencies and house rules: all well")
+
+
+if __name__ == "__main__":
+    main()
