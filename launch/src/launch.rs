@@ -32,7 +32,7 @@ const ORPHAN_PATIENCE_NS: u64 = 2_000_000_000;
 /// Exit code after Ctrl-C, as shells have it: 128 and the signal's number.
 const INTERRUPTED: u8 = 130;
 /// Bytes of a frame that are reckoned with when shared memory is checked, before the pictures are known.
-const FRAME_BYTES: usize = 1 << 20;
+const FRAME_BYTES: usize = 1 << 17;
 
 /// Start a graph.
 #[derive(Clone, Debug, clap::Args)]
@@ -257,6 +257,10 @@ impl Launcher<'_> {
 
     /// Sleeps until something arrives, at most until children should be looked at, and takes it in.
     fn step(&mut self) -> anyhow::Result<Woken> {
+        static DBG: std::sync::atomic::AtomicU64 = std::sync::atomic::AtomicU64::new(0);
+        let t0 = monotonic_now_ns();
+        let last = DBG.swap(t0, std::sync::atomic::Ordering::Relaxed);
+        if last != 0 && t0 - last > 100_000_000 { self.terminal.log(&format!("DBG gap {} ms, frames {}", (t0 - last) / 1_000_000, self.monitor.records.frames.len())); }
         let woken = self.waiter.wait_until(&self.monitor.inputs(), monotonic_now_ns() + WATCH_NS)?;
         self.collect()?;
         Ok(woken)
@@ -316,7 +320,9 @@ impl Launcher<'_> {
                 },
             }
             // The dead one has been waited for: its ports can be freed for its successor.
+            let t = monotonic_now_ns();
             self.node.cleanup_dead();
+            self.terminal.log(&format!("DBG cleanup {} ms", (monotonic_now_ns() - t) / 1_000_000));
         }
         for stage in restart {
             self.start(stage)?;
@@ -342,7 +348,7 @@ impl Launcher<'_> {
             .collect();
         self.terminal.status(format!(
             "frames {} skipped {} restarts {restarts} | {}",
-            records.frames.len(),
+            records.frame_count(),
             records.skipped(),
             stages.join(", ")
         ));

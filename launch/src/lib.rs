@@ -10,3 +10,4 @@ pub mod report;
 pub mod run_record;
 pub mod supervise;
 pub mod terminal;
+pub mod train;

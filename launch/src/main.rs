@@ -2,6 +2,7 @@
 
 use carff::dataset::DatasetCommand;
 use carff::launch::LaunchArgs;
+use carff::train::TrainArgs;
 use clap::{Parser, Subcommand};
 use std::process::ExitCode;
 
@@ -20,11 +21,14 @@ enum Command {
     /// Render and check data sets.
     #[command(subcommand)]
     Dataset(DatasetCommand),
+    /// Train a scenario's models; goes on where an earlier run stopped.
+    Train(TrainArgs),
 }
 
 fn main() -> ExitCode {
     let result = match Cli::parse().command {
         Command::Launch(args) => carff::launch::run(&args, |_| Ok(serde_json::Map::new())),
+        Command::Train(args) => carff::train::run(&args),
         Command::Dataset(command) => carff::dataset::run(command).map(|()| ExitCode::SUCCESS),
     };
     match result {

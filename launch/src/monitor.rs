@@ -106,6 +106,11 @@ impl Records {
         self.frames.values().cloned().collect()
     }
 
+    /// Frames that the camera took, whether or not the launcher was quick enough to write each down.
+    pub fn frame_count(&self) -> u64 {
+        self.frames.last_key_value().map_or(0, |(last, _)| last + 1)
+    }
+
     /// Frames that a stage of the decision path passed over.
     pub fn skipped(&self) -> u64 {
         [Stage::Encoder, Stage::Forecaster, Stage::Prober, Stage::Controller]

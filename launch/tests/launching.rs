@@ -281,7 +281,7 @@ fn a_dead_stage_is_started_again() {
     assert!(output.status.success(), "{}", text(&output));
     let report = graph.report();
     assert_eq!(report["restarts_by_stage"]["encoder"], 1, "{}", text(&output));
-    assert_eq!(report["frames"], 100);
+    assert_eq!(report["frames"], 100, "{report}\n{}", text(&output));
     assert!(report["decisions"].as_u64().unwrap() > 5, "decisions went on after the restart: {report}");
     assert!(text(&output).contains("stage encoder died (killed by signal 6)"), "{}", text(&output));
     graph.assert_nothing_left();

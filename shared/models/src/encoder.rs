@@ -93,8 +93,7 @@ impl Encoder {
             pool: nn::conv2d(&p / "pool", config.reduce_channels, config.pool_channels, 3, strided),
             hidden: nn::linear(&p / "hidden", config.pool_channels * side * side, config.hidden, linear),
             mean: nn::linear(&p / "mean", config.hidden, LATENT_DIM as i64, linear),
-            // Posteriors start narrow: wide ones drown the mean before it has learnt anything (a training from
-            // variance 1 was still at chance after 300 steps).
+            // Posteriors start narrow: wide ones drown the mean before it has learnt anything.
             log_variance: nn::linear(
                 &p / "log_variance",
                 config.hidden,

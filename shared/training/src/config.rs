@@ -100,11 +100,11 @@ pub struct Augmentation {
 impl Default for Augmentation {
     fn default() -> Self {
         Self {
-            copies: 8,
+            copies: 11,
             sensor: SensorNoise { sigma: 2.0, gain_sigma: 0.04, channel_gain_sigma: 0.02, channel_offset_sigma: 2.0 },
-            shift: 0.06,
-            zoom: 0.08,
-            rotation_deg: 3.0,
+            shift: 0.1,
+            zoom: 0.15,
+            rotation_deg: 5.0,
         }
     }
 }
@@ -150,16 +150,16 @@ pub struct VaeTraining {
 impl Default for VaeTraining {
     fn default() -> Self {
         Self {
-            epochs: 150,
+            epochs: 100,
             batch: 30,
-            decoder_batch: 4,
+            decoder_batch: 6,
             learning_rate: 1e-3,
-            weight_decay: 0.01,
-            dropout: 0.1,
+            weight_decay: 0.05,
+            dropout: 0.3,
             kl_weight: 0.01,
             kl_delay: 0.1,
             kl_ramp: 0.3,
-            reconstruction_weight: 1.0,
+            reconstruction_weight: 5.0,
             residual: true,
             foreground_weight: 10.0,
             contrastive_weight: 0.0,
@@ -188,7 +188,7 @@ pub struct MdnTraining {
 
 impl Default for MdnTraining {
     fn default() -> Self {
-        Self { steps: 4000, batch: 256, learning_rate: 1e-3, input_noise: 0.5, target_visible_fraction: 0.5 }
+        Self { steps: 4000, batch: 256, learning_rate: 1e-3, input_noise: 1.0, target_visible_fraction: 0.5 }
     }
 }
 

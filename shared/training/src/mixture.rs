@@ -1,7 +1,8 @@
 //! The training loop of the mixture density network (paper section 3.4).
 //!
 //! An input is the posterior of a view; its target is a real Gaussian draw from the posterior of a random neighbouring
-//! view of the next time step. After the last step the scene stays as it is.
+//! view of the next time step. Where several states look the same in the input's view, the step that follows any of
+//! them is the target equally often. After the last step the scene stays as it is.
 
 use crate::{
     TrainingError,
@@ -71,6 +72,7 @@ pub fn train(
             "no trained view of state {state} shows enough of the actor's place"
         )));
     }
+    let alike: Vec<Vec<usize>> = pictures.labels.iter().map(|l| pictures.alike(l.view, l.state)).collect();
     let mut clock = SaveClock::default();
     let mut sum = 0.0;
     for step in first..settings.steps {
@@ -83,7 +85,10 @@ pub fn train(
                 std::array::from_fn(|_| rng.sample::<f32, _>(StandardNormal) * settings.input_noise as f32);
             means.extend(input.at(&noise));
             log_variances.extend(input.log_variance);
-            let views = &neighbours[pictures.next_state(pictures.labels[i].state)];
+            // States that look the same in this view are equally likely: the input must not be learnt by heart.
+            let alike = &alike[i];
+            let state = alike[rng.random_range(0..alike.len())];
+            let views = &neighbours[pictures.next_state(state)];
             let next = &posteriors[rng.random_range(0..posteriors.len())][views[rng.random_range(0..views.len())]];
             let unit: [f32; LATENT_DIM] = std::array::from_fn(|_| rng.sample(StandardNormal));
             targets.extend(next.at(&unit));

@@ -101,6 +101,11 @@ impl Pictures {
         self.with_roles(&[PoseRole::Rest, PoseRole::Calibration])
     }
 
+    /// The states that look the same as `state` in a view, itself among them.
+    pub fn alike(&self, view: usize, state: usize) -> Vec<usize> {
+        (0..self.scenario.state_count()).filter(|&s| s == state || self.equivalence.same(view, s, state)).collect()
+    }
+
     /// The state that follows: the next timestamp of the branch; the last one follows itself.
     pub fn next_state(&self, state: usize) -> usize {
         if (state + 1).is_multiple_of(self.scenario.timestamps) { state } else { state + 1 }

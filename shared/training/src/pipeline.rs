@@ -345,3 +345,42 @@ fn write_birds_eye(run: &Run, view: &carff_evaluation::BirdsEye) -> Result<(), T
 pub fn plain_line(progress: &Progress) -> String {
     format!("{} {}/{}  {}", progress.stage, progress.done, progress.total, progress.line)
 }
+
+/// The figures of a finished training, for a person.
+pub fn summary(metrics: &Value) -> String {
+    let number = |path: &str| metrics.pointer(path).and_then(Value::as_f64);
+    let mut lines = Vec::new();
+    let mut line = |label: &str, values: &[(&str, Option<f64>, f64, &str)]| {
+        let parts: Vec<String> = values
+            .iter()
+            .filter_map(|(name, value, scale, unit)| value.map(|v| format!("{name} {:.1}{unit}", v * scale)))
+            .collect();
+        if !parts.is_empty() {
+            lines.push(format!("{label}: {}", parts.join(", ")));
+        }
+    };
+    line(
+        "state accuracy of latents, fully observable views",
+        &[
+            ("trained poses", number("/vae/trained/full/accuracy"), 100.0, " %"),
+            ("unseen poses", number("/vae/unseen/full/accuracy"), 100.0, " %"),
+        ],
+    );
+    line(
+        "state accuracy of probed samples, fully observable views",
+        &[
+            ("trained poses", number("/samples/trained/accuracy"), 100.0, " %"),
+            ("unseen poses", number("/samples/unseen/accuracy"), 100.0, " %"),
+        ],
+    );
+    line(
+        "bird's-eye PSNR",
+        &[
+            ("matching", number("/birds_eye/matching_db"), 1.0, " dB"),
+            ("un-matching", number("/birds_eye/unmatching_db"), 1.0, " dB"),
+            ("mean picture", number("/birds_eye/mean_picture_db"), 1.0, " dB"),
+            ("pixels that change", number("/birds_eye/changed_db"), 1.0, " dB"),
+        ],
+    );
+    lines.join("\n")
+}

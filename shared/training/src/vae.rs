@@ -271,8 +271,7 @@ pub fn train(
 }
 
 /// One pass over the pictures, in batches made of whole poses: all states of a pose stand in one batch, so that what
-/// tells states apart is not drowned by what tells poses apart. (Measured: batches of random pictures are still at
-/// chance after 500 steps.)
+/// tells states apart is not drowned by what tells poses apart.
 fn batches(pictures: &Pictures, trained: &[usize], size: usize, rng: &mut impl rand::Rng) -> Vec<Vec<usize>> {
     let mut by_view = vec![Vec::new(); pictures.dataset.view_count()];
     for &i in trained {
@@ -299,10 +298,9 @@ fn state_targets(pictures: &Pictures) -> Tensor {
     let states = pictures.scenario.state_count();
     let mut rows = Vec::with_capacity(pictures.labels.len() * states);
     for label in &pictures.labels {
-        let same: Vec<bool> =
-            (0..states).map(|s| s == label.state || pictures.equivalence.same(label.view, s, label.state)).collect();
-        let share = 1.0 / same.iter().filter(|&&s| s).count() as f32;
-        rows.extend(same.iter().map(|&s| if s { share } else { 0.0 }));
+        let alike = pictures.alike(label.view, label.state);
+        let share = 1.0 / alike.len() as f32;
+        rows.extend((0..states).map(|s| if alike.contains(&s) { share } else { 0.0 }));
     }
     Tensor::from_slice(&rows).view([-1, states as i64])
 }

@@ -1,0 +1,188 @@
+//! `carff train`: trains a scenario's models and writes the checkpoint.
+
+use anyhow::{Context, bail};
+use carff_scenes::{Extras, Scenario};
+use carff_training::{
+    TrainingError,
+    config::TrainingConfig,
+    pipeline::{self, Stage},
+    run::{Progress, Run},
+};
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use std::{
+    collections::BTreeMap,
+    io::IsTerminal,
+    ops::ControlFlow,
+    path::{Path, PathBuf},
+    process::ExitCode,
+    sync::{
+        Arc, Mutex,
+        atomic::{AtomicBool, Ordering},
+    },
+    time::{Duration, Instant},
+};
+
+/// What to train, and where it goes.
+#[derive(Debug, clap::Args)]
+pub struct TrainArgs {
+    /// The training file, for example configs/training/approaching-intersection.toml.
+    config: PathBuf,
+    /// Data set to train on, in place of the training file's.
+    #[arg(long)]
+    dataset: Option<PathBuf>,
+    /// Folder for the finished checkpoint, in place of the training file's.
+    #[arg(long)]
+    out: Option<PathBuf>,
+    /// Train one model alone; those before it must be there.
+    #[arg(long, value_enum)]
+    stage: Option<StageName>,
+    /// Folder for saved states, metrics and curves.
+    #[arg(long)]
+    run_dir: Option<PathBuf>,
+}
+
+/// The models, in the order of training.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+enum StageName {
+    /// The pose-conditional VAE.
+    Vae,
+    /// The latent-conditioned field.
+    Nerf,
+    /// The mixture density network.
+    Mdn,
+}
+
+/// Runs the command.
+pub fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
+    let config = TrainingConfig::load(&args.config)?;
+    let dataset = args.dataset.clone().unwrap_or_else(|| config.dataset.clone());
+    let out = args.out.clone().unwrap_or_else(|| config.out.clone());
+    if args.dataset.is_some() && args.out.is_none() {
+        bail!("--dataset without --out would overwrite {}: say where this checkpoint goes", config.out.display());
+    }
+    if !dataset.join("transforms.json").is_file() && args.dataset.is_none() {
+        render(&config, &dataset)?;
+    }
+    let name = out.file_name().map_or_else(|| "training".into(), |n| n.to_string_lossy().into_owned());
+    let dir = args.run_dir.clone().unwrap_or_else(|| Path::new("runs").join(name));
+    std::fs::create_dir_all(&dir).with_context(|| format!("cannot make {}", dir.display()))?;
+    refuse_another_configuration(&dir, &config, &dataset)?;
+
+    let stop = Arc::new(AtomicBool::new(false));
+    for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
+        // The second Ctrl-C ends the program at once.
+        signal_hook::flag::register_conditional_shutdown(signal, 130, Arc::clone(&stop))?;
+        signal_hook::flag::register(signal, Arc::clone(&stop))?;
+    }
+    let display = Display::default();
+    let report = |progress: &Progress| display.show(progress);
+    let run = Run { dir: dir.clone(), on_progress: &report, stop: &stop };
+    let stage = match args.stage {
+        None => Stage::All,
+        Some(StageName::Vae) => Stage::Vae,
+        Some(StageName::Nerf) => Stage::Nerf,
+        Some(StageName::Mdn) => Stage::Mdn,
+    };
+    let result = pipeline::train(&config, &dataset, &out, stage, &run);
+    display.finish();
+    match result {
+        Ok(metrics) => {
+            println!("{}", pipeline::summary(&metrics));
+            println!("checkpoint: {}", out.display());
+            println!("metrics and saved states: {}", dir.display());
+            Ok(ExitCode::SUCCESS)
+        }
+        Err(TrainingError::Stopped) => {
+            debug_assert!(stop.load(Ordering::Relaxed));
+            eprintln!("stopped; the same command goes on from the states saved in {}", dir.display());
+            Ok(ExitCode::from(130))
+        }
+        Err(error) => Err(error.into()),
+    }
+}
+
+fn render(config: &TrainingConfig, dataset: &Path) -> anyhow::Result<()> {
+    let Some(scenario) = &config.scenario else {
+        bail!("no data set in {}: name one with --dataset, or a `scenario` in the training file", dataset.display());
+    };
+    let scenario = Scenario::load(scenario)?;
+    let bar = ProgressBar::new((scenario.cameras().len() * scenario.info().state_count()) as u64);
+    bar.set_style(ProgressStyle::with_template("rendering [{bar:40}] {pos}/{len} pictures, {eta} left")?);
+    let rendered = scenario.render_dataset(dataset, Extras::None, |_, _| {
+        bar.inc(1);
+        ControlFlow::Continue(())
+    });
+    bar.finish_and_clear();
+    rendered.map(|_| ()).with_context(|| format!("cannot render {}", dataset.display()))
+}
+
+/// A run folder belongs to one configuration and one data set: going on with another would mix them.
+fn refuse_another_configuration(dir: &Path, config: &TrainingConfig, dataset: &Path) -> anyhow::Result<()> {
+    let path = dir.join("configuration.json");
+    let mut mine = serde_json::to_value(config)?;
+    mine["dataset"] = serde_json::to_value(dataset)?;
+    // These change how fast and where to, not what is learnt.
+    for key in ["threads", "out"] {
+        if let Some(map) = mine.as_object_mut() {
+            map.remove(key);
+        }
+    }
+    let text = serde_json::to_string_pretty(&mine)?;
+    match std::fs::read_to_string(&path) {
+        Ok(there) if there != text => bail!(
+            "{} holds states of another training configuration or data set; remove the folder, or name another with \
+             --run-dir",
+            dir.display()
+        ),
+        Ok(_) => Ok(()),
+        Err(_) => std::fs::write(&path, text).with_context(|| format!("cannot write {}", path.display())),
+    }
+}
+
+/// One bar a stage on a terminal; a line now and then elsewhere.
+#[derive(Default)]
+struct Display {
+    bars: Mutex<BTreeMap<String, (ProgressBar, Instant)>>,
+}
+
+/// Time between two lines where there is no terminal.
+const LINE_EVERY: Duration = Duration::from_secs(15);
+
+impl Display {
+    fn show(&self, progress: &Progress) {
+        let live = std::io::stderr().is_terminal();
+        let Ok(mut bars) = self.bars.lock() else { return };
+        let (bar, last) = bars.entry(progress.stage.to_owned()).or_insert_with(|| {
+            let bar = ProgressBar::new(progress.total as u64);
+            if !live {
+                bar.set_draw_target(ProgressDrawTarget::hidden());
+            }
+            if let Ok(style) =
+                ProgressStyle::with_template("{prefix:9} [{bar:24}] {pos}/{len} {elapsed} < {eta}  {wide_msg}")
+            {
+                bar.set_style(style);
+            }
+            bar.set_prefix(progress.stage.to_owned());
+            (bar, Instant::now())
+        });
+        bar.set_position(progress.done as u64);
+        bar.set_message(progress.line.clone());
+        if !live && (last.elapsed() >= LINE_EVERY || progress.done == progress.total) {
+            *last = Instant::now();
+            eprintln!("{}, {:.0} s left", pipeline::plain_line(progress), bar.eta().as_secs_f64());
+        }
+        if progress.done == progress.total {
+            bar.finish();
+        }
+    }
+
+    fn finish(&self) {
+        if let Ok(bars) = self.bars.lock() {
+            for (bar, _) in bars.values() {
+                if !bar.is_finished() {
+                    bar.abandon();
+                }
+            }
+        }
+    }
+}
