@@ -62,7 +62,9 @@ def licence_allowed(expression: str, allowed: set[str]) -> bool:
         place += 1
         if token == "(":
             result = either()
-            place += 1  # the closing one
+            if tokens[place] != ")":
+                raise IndexError
+            place += 1
             return result
         if tokens[place:place + 1] == ["WITH"]:
             token = f"{token} WITH {tokens[place + 1]}"

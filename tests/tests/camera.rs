@@ -1,0 +1,73 @@
+//! The camera as its own process, with pictures that cannot be used.
+
+#![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
+
+use carff_dataset::Image;
+use carff_messages::{Health, Stage};
+use carff_tests::{TestGraph, eventually, picture_set};
+use carff_transport::{Node, topics};
+use std::path::Path;
+
+/// Unreadable and wrong-sized pictures of a folder are named, counted as errors and never shown; the others are shown.
+#[test]
+fn a_folder_with_bad_pictures() {
+    let pictures = tempfile::tempdir().unwrap();
+    let path = |name: &str| pictures.path().join(name);
+    Image::filled(16, 8, [10, 10, 10]).save_png(&path("a.png")).unwrap();
+    std::fs::write(path("b.png"), "no picture").unwrap();
+    Image::filled(8, 8, [50, 50, 50]).save_png(&path("c.png")).unwrap();
+    Image::filled(16, 8, [90, 90, 90]).save_png(&path("d.png")).unwrap();
+    let rest = format!(
+        "frame_rate_hz = 5.0\n[camera]\nsource = \"folder\"\nfolder = \"{}\"\nframes_per_timestamp = 3\n\
+         [camera.noise]\nsigma = 0.0\ngain_sigma = 0.0\nchannel_gain_sigma = 0.0\nchannel_offset_sigma = 0.0\n",
+        pictures.path().display()
+    );
+    let graph = TestGraph::new(Path::new("none"), Path::new("none"), &rest);
+    let node = Node::open(graph.run(), "test").unwrap();
+    let mut frames = node.picture_receiver(&topics::FRAME).unwrap();
+    let mut healths = node.receiver(&topics::health(Stage::Camera)).unwrap();
+    let camera = graph.stage(Stage::Camera);
+    let mut shown = Vec::new();
+    let mut health: Option<Health> = None;
+    let done = eventually(|| {
+        while let Some(frame) = frames.next().unwrap() {
+            assert_eq!((frame.meta().width_px, frame.meta().height_px), (16, 8));
+            shown.push(frame.bytes()[0]);
+        }
+        while let Some(latest) = healths.next().unwrap() {
+            health = Some(*latest);
+        }
+        health.is_some_and(|h| h.published >= 6 && h.state == carff_messages::HealthState::Done.code())
+    });
+    let finished = camera.end();
+    assert!(done, "{}", finished.text);
+    finished.assert_success();
+    assert!(finished.text.contains("b.png") && finished.text.contains("c.png"), "{}", finished.text);
+    assert_eq!(health.unwrap().errors, 2, "{}", finished.text);
+    assert_eq!(shown, [10, 10, 10, 90, 90, 90]);
+}
+
+/// A data set whose pictures cannot be read, or have another size than it says, ends the camera with an error that names
+/// the picture: no drive is shown with a picture left out.
+#[test]
+fn drives_with_bad_pictures() {
+    let set = tempfile::tempdir().unwrap();
+    let spoil = |write: &dyn Fn(&Path)| {
+        picture_set(set.path());
+        std::fs::read_dir(set.path().join("images")).unwrap().for_each(|e| write(&e.unwrap().path()));
+    };
+    let camera = || {
+        let graph = TestGraph::new(set.path(), Path::new("none"), "[camera]\nsplit_seed = 1\ndrives = 4\nlinger_ms = 0\n");
+        let finished = graph.stage(Stage::Camera).end();
+        assert!(!finished.text.contains("panicked at"), "{}", finished.text);
+        finished
+    };
+    spoil(&|path| std::fs::write(path, "no picture").unwrap());
+    let unreadable = camera();
+    assert_eq!(unreadable.status.code(), Some(1), "{}", unreadable.text);
+    assert!(unreadable.text.contains("ERROR") && unreadable.text.contains(".png"), "{}", unreadable.text);
+    spoil(&|path| Image::filled(4, 4, [0; 3]).save_png(path).unwrap());
+    let wrong_sized = camera();
+    assert_eq!(wrong_sized.status.code(), Some(1), "{}", wrong_sized.text);
+    assert!(wrong_sized.text.contains("4x4") && wrong_sized.text.contains("8x8"), "{}", wrong_sized.text);
+}
