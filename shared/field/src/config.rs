@@ -121,7 +121,7 @@ impl FieldConfig {
             "2, 4 or 8",
         )?;
         check(
-            self.levels * self.features_per_level % 4 == 0,
+            (self.levels * self.features_per_level).is_multiple_of(4),
             "levels",
             self.levels,
             "levels * features_per_level a multiple of 4",
@@ -135,7 +135,7 @@ impl FieldConfig {
             "base_resolution..=65536",
         )?;
         check(
-            self.hidden_width % 4 == 0 && (8..=256).contains(&self.hidden_width),
+            self.hidden_width.is_multiple_of(4) && (8..=256).contains(&self.hidden_width),
             "hidden_width",
             self.hidden_width,
             "a multiple of 4 in 8..=256",
@@ -148,14 +148,14 @@ impl FieldConfig {
         )?;
         check((1..=4).contains(&self.direction_degree), "direction_degree", self.direction_degree, "1..=4")?;
         check(
-            self.background_width % 4 == 0 && (4..=256).contains(&self.background_width),
+            self.background_width.is_multiple_of(4) && (4..=256).contains(&self.background_width),
             "background_width",
             self.background_width,
             "a multiple of 4 in 4..=256",
         )?;
         check((-20.0..=20.0).contains(&self.density_offset), "density_offset", self.density_offset, "-20..=20")?;
         check(
-            self.occupancy_resolution % 8 == 0 && (8..=512).contains(&self.occupancy_resolution),
+            self.occupancy_resolution.is_multiple_of(8) && (8..=512).contains(&self.occupancy_resolution),
             "occupancy_resolution",
             self.occupancy_resolution,
             "a multiple of 8 in 8..=512",

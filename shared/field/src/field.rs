@@ -317,7 +317,7 @@ impl Field {
 
     /// Every number of the field by name, as a checkpoint holds it.
     ///
-    /// `grid.table` is `[entries of all levels, features per level]`. Layers are as in PyTorch's `Linear`: `weight` is
+    /// `grid.table` is `[entries of all levels, features per level]`. Layers are as in `torch.nn.Linear`: `weight` is
     /// `[outputs, inputs]`, y = W x + b, the latent's 8 inputs last. Inputs: `density.0` (grid features level by level,
     /// z), `color.0` (all outputs of `density.2`, raw density first; direction harmonics; z), `background.0` (direction
     /// harmonics, z). `occupancy.bytes` holds 8 cells a number (0..=255, exact in f16 and bf16), cell
@@ -396,7 +396,7 @@ pub(crate) fn write_direction(block: &mut [f32], first_row: usize, rows: usize, 
     }
 }
 
-/// Layers of a flat network buffer (weights, gradients or moments) as tensors in PyTorch's layout.
+/// Layers of a flat network buffer (weights, gradients or moments) as tensors in the layout of `torch.nn.Linear`.
 pub(crate) fn network_tensors(layout: &Layout, networks: &[f32], prefix: &str) -> Vec<NamedTensor<'static>> {
     let mut tensors = Vec::new();
     for (name, layer) in layout.named_layers() {

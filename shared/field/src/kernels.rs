@@ -4,6 +4,10 @@
 //! other, so that a block is read front to back. Blocks are `stride(rows)` apart: one row of padding keeps equal rows
 //! of neighbouring blocks out of the same cache set.
 
+// Loops over lanes by index: that is the form which vectorises, and all of a loop's arrays read alike.
+#![allow(clippy::needless_range_loop, clippy::too_many_arguments)]
+
+use crate::dispatch::prefetch;
 use crate::layout::Level;
 use crate::math::{exp, fma};
 
@@ -20,7 +24,7 @@ fn row(block: &[f32], r: usize) -> &[f32; LANES] {
     block[r * LANES..].first_chunk().expect("a block holds all its rows")
 }
 
-/// One fully connected layer over `blocks` blocks: y = W^T x + b, with ReLU if asked.
+/// One fully connected layer over `blocks` blocks: y = W^T x + b, `relu` clamps it from below at zero.
 /// `weights` is `[inputs][outputs]`; x blocks are `x_stride` apart, y blocks `y_stride`.
 #[inline(always)]
 pub(crate) fn dense_forward<const FMA: bool>(
@@ -242,7 +246,7 @@ fn lanes_of(points: &[[f32; 3]]) -> [[f32; LANES]; 3] {
     let mut lanes = [[0.0; LANES]; 3];
     for (l, q) in points.iter().enumerate().take(LANES) {
         for a in 0..3 {
-            lanes[a][l] = q[a].max(0.0).min(1.0);
+            lanes[a][l] = if q[a].is_nan() { 0.0 } else { q[a].clamp(0.0, 1.0) };
         }
     }
     lanes
@@ -263,17 +267,24 @@ pub(crate) fn encode<const FMA: bool, const F: usize>(
     let mut weight = [[0.0_f32; LANES]; 8];
     for (level, rows) in levels.iter().zip(block.chunks_exact_mut(F * LANES)) {
         corners(level, &points, &mut index, &mut weight);
-        rows.fill(0.0);
-        for l in 0..count {
-            let mut sum = [0.0_f32; F];
+        // All at once, so that the misses overlap: the gathers below would wait for them a few at a time.
+        for c in 0..8 {
+            for l in 0..count {
+                prefetch(&table[index[c][l] as usize]);
+            }
+        }
+        let mut sums = [[0.0_f32; F]; LANES];
+        for (l, sum) in sums.iter_mut().enumerate().take(count) {
             for c in 0..8 {
                 let entry = &table[index[c][l] as usize];
                 for f in 0..F {
                     sum[f] = fma::<FMA>(entry[f], weight[c][l], sum[f]);
                 }
             }
-            for f in 0..F {
-                rows[f * LANES + l] = sum[f];
+        }
+        for f in 0..F {
+            for l in 0..LANES {
+                rows[f * LANES + l] = sums[l][f];
             }
         }
     }
@@ -294,6 +305,11 @@ pub(crate) fn scatter<const FMA: bool, const F: usize>(
     let mut weight = [[0.0_f32; LANES]; 8];
     for (level, rows) in levels.iter().zip(block.chunks_exact(F * LANES)) {
         corners(level, &points, &mut index, &mut weight);
+        for c in 0..8 {
+            for l in 0..count {
+                prefetch(&gradient[index[c][l] as usize]);
+            }
+        }
         for l in 0..count {
             let mut d = [0.0_f32; F];
             for f in 0..F {

@@ -70,7 +70,7 @@ impl Layer {
         &mut networks[self.bias..self.bias + self.outputs]
     }
 
-    /// Biases with the latent's share added: W_z z + b.
+    /// Biases with the latent's share added: `W_z z + b`.
     pub fn fold(&self, networks: &[f32], latent: &[f32; LATENT_DIM], out: &mut Vec<f32>) {
         out.clear();
         out.extend_from_slice(self.biases(networks));

@@ -5,6 +5,8 @@
 //! every instruction set and chosen at run time.
 
 #![deny(unsafe_code)]
+// Bodies must be inlined into each instruction set's version of them, or they would be compiled for the wrong one.
+#![allow(clippy::inline_always)]
 
 mod config;
 mod dispatch;

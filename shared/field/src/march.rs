@@ -65,7 +65,7 @@ impl Marcher {
         let mut left = most;
         let inverse_half = self.contraction.inverse_half();
         while left > 0 {
-            if !(*t < self.far) {
+            if *t >= self.far || t.is_nan() {
                 return false;
             }
             let p = [0, 1, 2].map(|i| ray.origin[i] + *t * ray.direction[i]);

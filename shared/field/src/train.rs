@@ -14,6 +14,13 @@ use crate::math::{hash, sigmoid, spherical_harmonics, unit};
 
 /// Most rays that are worked on together; all of one latent.
 const CHUNK: usize = 32;
+/// Numbers that one task of the Adam step updates.
+const ADAM_PIECE: usize = 1 << 15;
+/// Occupancy cells that one task looks at.
+const CELLS_PIECE: usize = 512;
+
+/// One task of the Adam step: parameters, both moments, and each shard's gradient.
+type AdamPiece<'a> = (&'a mut [f32], &'a mut [f32], &'a mut [f32], Vec<&'a mut [f32]>);
 
 /// Rays with what they should see. All three lists have one entry for each ray.
 #[derive(Clone, Debug, Default)]
@@ -362,22 +369,21 @@ impl FieldTrainer {
         let mut gradients: Vec<&mut [f32]> = self.shards.iter_mut().map(|s| &mut s.network_gradient[..]).collect();
         dispatch::adam(set, network_step, false, &mut self.field.networks, first, second, &mut gradients);
 
-        const PIECE: usize = 1 << 15;
         let [first, second] = &mut self.table_moments;
-        let mut pieces: Vec<_> = self
+        let mut pieces: Vec<AdamPiece> = self
             .field
             .table
-            .chunks_mut(PIECE)
-            .zip(first.chunks_mut(PIECE))
-            .zip(second.chunks_mut(PIECE))
+            .chunks_mut(ADAM_PIECE)
+            .zip(first.chunks_mut(ADAM_PIECE))
+            .zip(second.chunks_mut(ADAM_PIECE))
             .map(|((p, m), v)| (p, m, v, Vec::with_capacity(self.shards.len())))
             .collect();
         for shard in &mut self.shards {
-            for (piece, gradient) in pieces.iter_mut().zip(shard.table_gradient.chunks_mut(PIECE)) {
+            for (piece, gradient) in pieces.iter_mut().zip(shard.table_gradient.chunks_mut(ADAM_PIECE)) {
                 piece.3.push(gradient);
             }
         }
-        let run = |(p, m, v, g): &mut (&mut [f32], &mut [f32], &mut [f32], Vec<&mut [f32]>)| {
+        let run = |(p, m, v, g): &mut AdamPiece| {
             dispatch::adam(set, table_step, true, p, m, v, g);
         };
         match &self.pool {
@@ -394,7 +400,7 @@ impl FieldTrainer {
             return;
         }
         let since = self.step - warmup;
-        if since % c.occupancy_interval.max(1) != 0 {
+        if !since.is_multiple_of(c.occupancy_interval.max(1)) {
             return;
         }
         let round = hash(c.seed, 0x0cc0, self.step);
@@ -426,7 +432,6 @@ impl FieldTrainer {
             .collect();
         let field = &self.field;
         let inverse = 1.0 / resolution as f32;
-        const PIECE: usize = 512;
         let look = |cells: &[u32]| -> Vec<f32> {
             let points: Vec<[f32; 3]> = cells
                 .iter()
@@ -446,8 +451,8 @@ impl FieldTrainer {
                 .collect()
         };
         let found: Vec<f32> = match &self.pool {
-            Some(pool) => pool.install(|| self.cells.par_chunks(PIECE).map(look).flatten().collect()),
-            None => self.cells.chunks(PIECE).flat_map(look).collect(),
+            Some(pool) => pool.install(|| self.cells.par_chunks(CELLS_PIECE).map(look).flatten().collect()),
+            None => self.cells.chunks(CELLS_PIECE).flat_map(look).collect(),
         };
         for (cell, density) in self.cells.iter().zip(found) {
             let kept = &mut self.cell_density[*cell as usize];

@@ -66,7 +66,6 @@ fn rough_field(seed: u64) -> Field {
             *v = 0.1 * normal(seed + 2, i as u64);
         }
     }
-    // What the padding holds must never matter.
     field
 }
 
@@ -87,7 +86,7 @@ fn exact_config() -> TrainerConfig {
 }
 
 fn loss_of(field: &Field, batch: &RayBatch) -> f64 {
-    FieldTrainer::new(field.clone(), exact_config()).unwrap().accumulate(batch).loss * 3.0 / 3.0
+    FieldTrainer::new(field.clone(), exact_config()).unwrap().accumulate(batch).loss
 }
 
 /// The loss's change along each parameter group's gradient is what the gradient says (central differences), for
@@ -98,7 +97,6 @@ fn gradients_agree_with_finite_differences() {
     let batch = random_batch(40, 3, 9);
     let mut trainer = FieldTrainer::new(field.clone(), exact_config()).unwrap();
     let report = trainer.accumulate(&batch);
-    // The gradient is that of the sum over channels / (3 rays): the same as of the mean loss.
     let mut table = vec![0.0_f32; field.table.len()];
     let mut networks = vec![0.0_f32; field.networks.len()];
     for shard in &trainer.shards {
@@ -148,8 +146,8 @@ fn gradients_agree_with_finite_differences() {
     for (l, g) in report.latent_gradient.iter().enumerate() {
         check(&format!("latent {l}"), squared(g), &|step| {
             let mut moved = batch.clone();
-            for k in 0..LATENT_DIM {
-                moved.latents[l][k] += (step * f64::from(g[k])) as f32;
+            for (z, g) in moved.latents[l].iter_mut().zip(g) {
+                *z += (step * f64::from(*g)) as f32;
             }
             loss_of(&field, &moved)
         });
