@@ -21,6 +21,12 @@ pub enum DatasetCommand {
         /// Also write depth (16-bit PNG, millimetres) and actor masks.
         #[arg(long)]
         depth: bool,
+        /// In place of the fixed cameras, so many drawn at random from the same ranges.
+        #[arg(long, value_parser = clap::value_parser!(u32).range(1..=10_000))]
+        free_poses: Option<u32>,
+        /// Seed of the free poses.
+        #[arg(long, default_value_t = 1)]
+        seed: u64,
     },
     /// Check a data set and print its statistics.
     Check {
@@ -38,8 +44,16 @@ pub enum DatasetCommand {
 /// Runs one of the commands.
 pub fn run(command: DatasetCommand) -> anyhow::Result<()> {
     match command {
-        DatasetCommand::Render { scenario, out, depth } => {
-            render(&scenario, &out, if depth { Extras::DepthAndMasks } else { Extras::None })
+        DatasetCommand::Render { scenario, out, depth, free_poses, seed } => {
+            let path = find_scenario(&scenario)?;
+            let mut scenario = Scenario::load(&path)?;
+            if let Some(count) = free_poses {
+                scenario = scenario.with_free_cameras(count as usize, seed)?;
+            }
+            let extras = if depth { Extras::DepthAndMasks } else { Extras::None };
+            let pictures = render(&scenario, &out, extras)?;
+            println!("{pictures} pictures in {}", out.display());
+            Ok(())
         }
         DatasetCommand::Check { dir, contact_sheet, columns } => {
             check(&dir, contact_sheet.as_deref(), usize::from(columns))
@@ -59,9 +73,8 @@ fn find_scenario(scenario: &Path) -> anyhow::Result<PathBuf> {
     bail!("no scenario {}: there is no such file, nor {}", scenario.display(), named.display());
 }
 
-fn render(scenario: &Path, out: &Path, extras: Extras) -> anyhow::Result<()> {
-    let path = find_scenario(scenario)?;
-    let scenario = Scenario::load(&path)?;
+/// Renders a set, with a progress bar. Returns the number of pictures.
+pub fn render(scenario: &Scenario, out: &Path, extras: Extras) -> anyhow::Result<u64> {
     let bar = ProgressBar::new((scenario.cameras().len() * scenario.info().state_count()) as u64);
     bar.set_style(ProgressStyle::with_template("{msg} [{bar:40}] {pos}/{len} pictures, {eta} left")?);
     bar.set_message(scenario.info().name.clone());
@@ -70,9 +83,8 @@ fn render(scenario: &Path, out: &Path, extras: Extras) -> anyhow::Result<()> {
         ControlFlow::Continue(())
     });
     bar.finish_and_clear();
-    rendered.with_context(|| format!("cannot render {} into {}", path.display(), out.display()))?;
-    println!("{} pictures in {}", bar.position(), out.display());
-    Ok(())
+    rendered.with_context(|| format!("cannot render {} into {}", scenario.path().display(), out.display()))?;
+    Ok(bar.position())
 }
 
 fn check(dir: &Path, sheet: Option<&Path>, columns: usize) -> anyhow::Result<()> {
@@ -105,6 +117,11 @@ height_m = 5.0
 spread_m = 1.0
 "#;
 
+    fn render_command(scenario: &Path, out: &Path) -> DatasetCommand {
+        let (scenario, out) = (scenario.to_owned(), out.to_owned());
+        DatasetCommand::Render { scenario, out, depth: true, free_poses: None, seed: 1 }
+    }
+
     /// A rendered set passes its own check and may be rendered again; a folder of somebody else's is left alone.
     #[test]
     fn render_then_check() {
@@ -112,7 +129,7 @@ spread_m = 1.0
         let scenario = dir.path().join("small.toml");
         std::fs::write(&scenario, SMALL).unwrap();
         let out = dir.path().join("set");
-        let command = || DatasetCommand::Render { scenario: scenario.clone(), out: out.clone(), depth: true };
+        let command = || render_command(&scenario, &out);
         run(command()).unwrap();
         run(command()).unwrap();
         let sheet = dir.path().join("sheet.png");
@@ -122,7 +139,7 @@ spread_m = 1.0
         let foreign = dir.path().join("foreign");
         std::fs::create_dir(&foreign).unwrap();
         std::fs::write(foreign.join("thesis.txt"), "irreplaceable").unwrap();
-        let error = run(DatasetCommand::Render { scenario, out: foreign.clone(), depth: false }).unwrap_err();
+        let error = run(render_command(&scenario, &foreign)).unwrap_err();
         assert!(format!("{error:#}").contains("not a set that this program wrote"), "{error:#}");
         assert_eq!(std::fs::read_to_string(foreign.join("thesis.txt")).unwrap(), "irreplaceable");
     }

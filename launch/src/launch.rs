@@ -1,8 +1,8 @@
 //! `carff launch`: starts a graph, watches it, shows its decisions, ends it, and reports.
 
-use crate::dataset::DatasetCommand;
 use crate::lock::RunLock;
 use crate::monitor::{FrameRecord, Monitor};
+use crate::planning::{self, Planning};
 use crate::process::StageProcess;
 use crate::report::{self, RunOutcome};
 use crate::run_record::RunRecord;
@@ -11,12 +11,13 @@ use crate::terminal::Terminal;
 use anyhow::{Context, bail, ensure};
 use carff_config::{GraphConfig, RestartPolicy};
 use carff_messages::{ActionCode, HealthState, Stage};
+use carff_scenes::{Extras, Scenario};
 use carff_stage::StageArgs;
 use carff_transport::{
     Node, Run, Stop, Waiter, Woken, check_space, living_processes, monotonic_now_ns, remove_run_leftovers, run_id_of,
     runtime_dir, topics,
 };
-use serde_json::{Map, Value};
+use serde_json::Value;
 use std::path::{Path, PathBuf};
 use std::process::{ExitCode, ExitStatus};
 use std::sync::Arc;
@@ -63,11 +64,8 @@ pub struct LaunchArgs {
 }
 
 /// Launches, and ends when the camera has done its work (exit code 0), on Ctrl-C (130), or with an error when a stage
-/// is lost. `tables` adds to the report of a finished run.
-pub fn run(
-    args: &LaunchArgs,
-    tables: impl FnOnce(&RunOutcome) -> anyhow::Result<Map<String, Value>>,
-) -> anyhow::Result<ExitCode> {
+/// is lost.
+pub fn run(args: &LaunchArgs) -> anyhow::Result<ExitCode> {
     let graph = GraphConfig::load(&args.graph)?;
     let terminal = Arc::new(Terminal::new());
     for warning in graph.warnings() {
@@ -139,11 +137,22 @@ pub fn run(
         terminal.log("interrupted: all stages have ended");
         return Ok(ExitCode::from(INTERRUPTED));
     }
-    let report = report::json(&outcome, tables(&outcome)?);
-    terminal.line(&summary(&report));
+    terminal.status("computing the planning table over all views".to_owned());
+    let planning = planning::evaluate(&outcome)?;
+    terminal.status(String::new());
+    let report = report::json(&outcome, planning.as_ref().map(Planning::tables).unwrap_or_default());
+    let text = format!("{}\n{}", summary(&report), planning::text(&report));
+    terminal.line(&text);
     if let Some(path) = &args.report {
-        write_report(path, &report)?;
-        terminal.line(&format!("report: {}", path.display()));
+        write(path, &(serde_json::to_string_pretty(&report)? + "\n"))?;
+        let page = path.with_extension("txt");
+        write(&page, &text)?;
+        terminal.line(&format!("report: {}\nJSON: {}", page.display(), path.display()));
+        if let Some(planning) = &planning {
+            let strip = path.with_extension("png");
+            planning.write_filmstrip(&strip)?;
+            terminal.line(&format!("filmstrip: {}", strip.display()));
+        }
     }
     Ok(ExitCode::SUCCESS)
 }
@@ -257,10 +266,6 @@ impl Launcher<'_> {
 
     /// Sleeps until something arrives, at most until children should be looked at, and takes it in.
     fn step(&mut self) -> anyhow::Result<Woken> {
-        static DBG: std::sync::atomic::AtomicU64 = std::sync::atomic::AtomicU64::new(0);
-        let t0 = monotonic_now_ns();
-        let last = DBG.swap(t0, std::sync::atomic::Ordering::Relaxed);
-        if last != 0 && t0 - last > 100_000_000 { self.terminal.log(&format!("DBG gap {} ms, frames {}", (t0 - last) / 1_000_000, self.monitor.records.frames.len())); }
         let woken = self.waiter.wait_until(&self.monitor.inputs(), monotonic_now_ns() + WATCH_NS)?;
         self.collect()?;
         Ok(woken)
@@ -320,9 +325,7 @@ impl Launcher<'_> {
                 },
             }
             // The dead one has been waited for: its ports can be freed for its successor.
-            let t = monotonic_now_ns();
             self.node.cleanup_dead();
-            self.terminal.log(&format!("DBG cleanup {} ms", (monotonic_now_ns() - t) / 1_000_000));
         }
         for stage in restart {
             self.start(stage)?;
@@ -418,7 +421,7 @@ fn provide_dataset(graph: &GraphConfig, args: &LaunchArgs, dataset: &Path) -> an
     match graph.scenario_path() {
         Some(scenario) if args.dataset.is_none() => {
             eprintln!("{} is missing: rendering it from {}", dataset.display(), scenario.display());
-            crate::dataset::run(DatasetCommand::Render { scenario, out: dataset.to_owned(), depth: false })
+            crate::dataset::render(&Scenario::load(&scenario)?, dataset, Extras::None).map(drop)
         }
         _ => bail!(
             "data set {} is missing: give --dataset, or name its scenario in the graph file (`run.scenario`)",
@@ -473,10 +476,10 @@ fn summary(report: &Value) -> String {
     )
 }
 
-fn write_report(path: &Path, report: &Value) -> anyhow::Result<()> {
-    let context = || format!("cannot write the report {}", path.display());
+fn write(path: &Path, text: &str) -> anyhow::Result<()> {
+    let context = || format!("cannot write {}", path.display());
     if let Some(folder) = path.parent().filter(|f| !f.as_os_str().is_empty()) {
         std::fs::create_dir_all(folder).with_context(context)?;
     }
-    std::fs::write(path, serde_json::to_string_pretty(report)? + "\n").with_context(context)
+    std::fs::write(path, text).with_context(context)
 }

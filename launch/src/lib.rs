@@ -5,6 +5,7 @@ pub mod dataset;
 pub mod launch;
 pub mod lock;
 pub mod monitor;
+pub mod planning;
 mod process;
 pub mod report;
 pub mod run_record;

@@ -27,7 +27,7 @@ enum Command {
 
 fn main() -> ExitCode {
     let result = match Cli::parse().command {
-        Command::Launch(args) => carff::launch::run(&args, |_| Ok(serde_json::Map::new())),
+        Command::Launch(args) => carff::launch::run(&args),
         Command::Train(args) => carff::train::run(&args),
         Command::Dataset(command) => carff::dataset::run(command).map(|()| ExitCode::SUCCESS),
     };

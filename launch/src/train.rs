@@ -1,10 +1,11 @@
 //! `carff train`: trains a scenario's models and writes the checkpoint.
 
+use crate::dataset::render;
 use anyhow::{Context, bail};
 use carff_scenes::{Extras, Scenario};
 use carff_training::{
     TrainingError,
-    config::TrainingConfig,
+    config::{FreePoses, TrainingConfig},
     pipeline::{self, Stage},
     run::{Progress, Run},
 };
@@ -12,7 +13,6 @@ use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use std::{
     collections::BTreeMap,
     io::IsTerminal,
-    ops::ControlFlow,
     path::{Path, PathBuf},
     process::ExitCode,
     sync::{
@@ -61,8 +61,9 @@ pub fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
         bail!("--dataset without --out would overwrite {}: say where this checkpoint goes", config.out.display());
     }
     if !dataset.join("transforms.json").is_file() && args.dataset.is_none() {
-        render(&config, &dataset)?;
+        render(&scenario(&config)?, &dataset, Extras::None)?;
     }
+    let free = free_poses(&config, args)?;
     let name = out.file_name().map_or_else(|| "training".into(), |n| n.to_string_lossy().into_owned());
     let dir = args.run_dir.clone().unwrap_or_else(|| Path::new("runs").join(name));
     std::fs::create_dir_all(&dir).with_context(|| format!("cannot make {}", dir.display()))?;
@@ -83,7 +84,7 @@ pub fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
         Some(StageName::Nerf) => Stage::Nerf,
         Some(StageName::Mdn) => Stage::Mdn,
     };
-    let result = pipeline::train(&config, &dataset, &out, stage, &run);
+    let result = pipeline::train(&config, &dataset, free.as_deref(), &out, stage, &run);
     display.finish();
     match result {
         Ok(metrics) => {
@@ -101,19 +102,29 @@ pub fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
     }
 }
 
-fn render(config: &TrainingConfig, dataset: &Path) -> anyhow::Result<()> {
-    let Some(scenario) = &config.scenario else {
-        bail!("no data set in {}: name one with --dataset, or a `scenario` in the training file", dataset.display());
-    };
-    let scenario = Scenario::load(scenario)?;
-    let bar = ProgressBar::new((scenario.cameras().len() * scenario.info().state_count()) as u64);
-    bar.set_style(ProgressStyle::with_template("rendering [{bar:40}] {pos}/{len} pictures, {eta} left")?);
-    let rendered = scenario.render_dataset(dataset, Extras::None, |_, _| {
-        bar.inc(1);
-        ControlFlow::Continue(())
-    });
-    bar.finish_and_clear();
-    rendered.map(|_| ()).with_context(|| format!("cannot render {}", dataset.display()))
+fn scenario(config: &TrainingConfig) -> anyhow::Result<Scenario> {
+    match &config.scenario {
+        Some(path) => Ok(Scenario::load(path)?),
+        None => bail!(
+            "no data set in {}: name one with --dataset, or a `scenario` in the training file",
+            config.dataset.display()
+        ),
+    }
+}
+
+/// The set of freely drawn poses, rendered when it is missing; none for a data set that the scenario did not make.
+fn free_poses(config: &TrainingConfig, args: &TrainArgs) -> anyhow::Result<Option<PathBuf>> {
+    let FreePoses { count, seed } = config.free_poses;
+    if count == 0 || args.dataset.is_some() || config.scenario.is_none() {
+        return Ok(None);
+    }
+    let mut name = config.dataset.file_name().unwrap_or_default().to_owned();
+    name.push(format!("-free-{count}-{seed}"));
+    let dir = config.dataset.with_file_name(name);
+    if !dir.join("transforms.json").is_file() {
+        render(&scenario(config)?.with_free_cameras(count, seed)?, &dir, Extras::None)?;
+    }
+    Ok(Some(dir))
 }
 
 /// A run folder belongs to one configuration and one data set: going on with another would mix them.

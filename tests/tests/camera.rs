@@ -57,7 +57,8 @@ fn drives_with_bad_pictures() {
         std::fs::read_dir(set.path().join("images")).unwrap().for_each(|e| write(&e.unwrap().path()));
     };
     let camera = || {
-        let graph = TestGraph::new(set.path(), Path::new("none"), "[camera]\nsplit_seed = 1\ndrives = 4\nlinger_ms = 0\n");
+        let graph =
+            TestGraph::new(set.path(), Path::new("none"), "[camera]\nsplit_seed = 1\ndrives = 4\nlinger_ms = 0\n");
         let finished = graph.stage(Stage::Camera).end();
         assert!(!finished.text.contains("panicked at"), "{}", finished.text);
         finished

@@ -14,7 +14,7 @@ use carff_probing::{Calibration, Prober, Reading, Resolved, resolve};
 use std::path::Path;
 
 /// Probes hypotheses for what stands in them.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub struct Probe {
     field: Field,
     prober: Prober,
@@ -72,6 +72,11 @@ impl Probe {
         &self.field
     }
 
+    /// The posteriors that stand for the known states.
+    pub fn states(&self) -> &[LatentGaussian] {
+        &self.states
+    }
+
     /// The posterior that stands for a known state.
     pub fn state_posterior(&self, state: usize) -> Option<&LatentGaussian> {
         self.states.get(state)
@@ -114,18 +119,29 @@ pub struct Plan {
 
 /// Looks ahead from one posterior: each step's resolved state feeds the next.
 pub fn look_ahead(net: &MixtureNet, probe: &mut Probe, posterior: &LatentGaussian, plan: Plan) -> Vec<Step> {
+    look_ahead_with(|posterior, _| net.forecast(posterior), probe, posterior, plan)
+}
+
+/// [`look_ahead`] with forecasts from elsewhere: `forecast` is given the input, and the known state that it stands for
+/// (`None` at the first step).
+pub fn look_ahead_with(
+    mut forecast: impl FnMut(&LatentGaussian, Option<usize>) -> Mixture,
+    probe: &mut Probe,
+    posterior: &LatentGaussian,
+    plan: Plan,
+) -> Vec<Step> {
     let mut steps = Vec::with_capacity(plan.horizon as usize);
-    let mut input = *posterior;
+    let mut input = (*posterior, None);
     let mut path_probability = 1.0;
     for k in 1..=plan.horizon {
-        let mixture = net.forecast(&input);
+        let mixture = forecast(&input.0, input.1);
         let draws = mixture.draw(plan.samples, plan.sampling, plan.seed, plan.frame, k);
         let step = probe.step(mixture, draws, path_probability);
         path_probability = next_path_probability(&step.resolved, path_probability);
-        let next = probe.state_posterior(step.resolved.state).copied();
+        let state = step.resolved.state;
         steps.push(step);
-        match next {
-            Some(next) => input = next,
+        match probe.state_posterior(state) {
+            Some(next) => input = (*next, Some(state)),
             None => break,
         }
     }

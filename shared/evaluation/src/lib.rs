@@ -8,7 +8,7 @@ mod planning;
 mod samples;
 
 pub use birds_eye::{BirdsEye, birds_eye};
-pub use planning::{Count, PlanningTable, SAMPLE_COUNTS, Trial, TrialOutcome, planning_table, trials};
+pub use planning::{Count, PlanningTable, SAMPLE_COUNTS, Trial, TrialOutcome, count, planning_table, trials};
 pub use samples::{Input, SampleAccuracy, sample_accuracy};
 
 use carff_belief::Probe;

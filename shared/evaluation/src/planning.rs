@@ -1,6 +1,6 @@
 //! The planning table (paper section 4.3): success of each decision rule over eligible input views.
 
-use carff_belief::{Plan, Probe, decision, hazard_probability, look_ahead};
+use carff_belief::{Plan, Probe, decision, hazard_probability, look_ahead_with};
 use carff_dataset::{
     Dataset, DatasetError,
     drives::{DriveKind, EligibleInput},
@@ -13,6 +13,7 @@ use carff_models::{
 };
 use carff_planning::Rule;
 use carff_random::Key;
+use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use tch::Tensor;
@@ -106,37 +107,55 @@ pub struct TrialOutcome {
     pub kind: DriveKind,
 }
 
-/// Runs every trial with every rule and number of samples. Outcomes are those of n = 10.
+/// Runs every trial with every rule and number of samples, on all threads of rayon's pool. Outcomes, in the order of
+/// the trials, are those of n = 10.
 pub fn planning_table(
     net: &MixtureNet,
-    probe: &mut Probe,
+    probe: &Probe,
     trials: &[Trial],
     rules: &[Rule],
     sampling: Sampling,
     horizon: u32,
 ) -> (PlanningTable, Vec<TrialOutcome>) {
+    let posteriors: Vec<LatentGaussian> = trials.iter().map(|t| t.posterior).collect();
+    let first = if posteriors.is_empty() { Vec::new() } else { net.forecast_all(&posteriors) };
+    let later = net.forecast_all(probe.states());
+    let results: Vec<(Vec<(usize, usize, bool)>, TrialOutcome)> = trials
+        .par_iter()
+        .zip(&first)
+        .map_init(
+            || probe.clone(),
+            |probe, (trial, mixture)| {
+                let mut actions = Vec::with_capacity(SAMPLE_COUNTS.len() * rules.len());
+                let mut outcome = TrialOutcome { hazard_probability: 0.0, kind: trial.kind };
+                for (column, samples) in SAMPLE_COUNTS.into_iter().enumerate() {
+                    let plan = Plan { samples, sampling, horizon, seed: trial.seed, frame: trial.frame };
+                    let forecast =
+                        |_: &LatentGaussian, state: Option<usize>| state.map_or(mixture, |s| &later[s]).clone();
+                    let steps = look_ahead_with(forecast, probe, &trial.posterior, plan);
+                    actions.extend(rules.iter().enumerate().map(|(r, rule)| (r, column, decision(*rule, &steps).halt)));
+                    if samples == 10 {
+                        let hazard = steps.iter().map(|s| (s.resolved.hazard_probability, s.path_probability));
+                        outcome.hazard_probability = hazard_probability(hazard);
+                    }
+                }
+                (actions, outcome)
+            },
+        )
+        .collect();
     let mut table = PlanningTable::new();
-    let mut outcomes = Vec::with_capacity(trials.len());
-    for trial in trials {
-        for samples in SAMPLE_COUNTS {
-            let plan = Plan { samples, sampling, horizon, seed: trial.seed, frame: trial.frame };
-            let steps = look_ahead(net, probe, &trial.posterior, plan);
-            for rule in rules {
-                let right = decision(*rule, &steps).halt == (trial.kind == DriveKind::Hazard);
-                table
-                    .entry(rule.name().to_owned())
-                    .or_default()
-                    .entry(samples.to_string())
-                    .or_default()
-                    .entry(trial.kind.name().to_owned())
-                    .or_default()
-                    .add(right);
-            }
-            if samples == 10 {
-                let hazard = steps.iter().map(|s| (s.resolved.hazard_probability, s.path_probability));
-                outcomes.push(TrialOutcome { hazard_probability: hazard_probability(hazard), kind: trial.kind });
-            }
+    for (actions, outcome) in &results {
+        for &(rule, column, halted) in actions {
+            let right = halted == (outcome.kind == DriveKind::Hazard);
+            count(&mut table, rules[rule].name(), SAMPLE_COUNTS[column], outcome.kind, right);
         }
     }
-    (table, outcomes)
+    (table, results.into_iter().map(|(_, outcome)| outcome).collect())
+}
+
+/// Counts one trial of a rule.
+pub fn count(table: &mut PlanningTable, rule: &str, samples: usize, kind: DriveKind, right: bool) {
+    let by_samples = table.entry(rule.to_owned()).or_default();
+    let by_kind = by_samples.entry(samples.to_string()).or_default();
+    by_kind.entry(kind.name().to_owned()).or_default().add(right);
 }

@@ -1,7 +1,10 @@
-//! Where a scenario's fixed cameras stand: evenly spread sequences, no random numbers, and never inside anything.
+//! Where a scenario's cameras stand, never inside anything: the fixed ones by evenly spread sequences, free ones at
+//! random in the same ranges.
 
 use carff_geometry::PinholeCamera;
+use carff_random::Key;
 use parry3d::bounding_volume::Aabb;
+use rand::Rng;
 
 use crate::config::{DashConfig, OrbitConfig, OverheadConfig, ScenarioConfig, StreetConfig};
 use crate::shapes::Vec3;
@@ -87,11 +90,14 @@ fn look(config: &ScenarioConfig, kind: &str, eye: [f64; 3], target: [f64; 3], up
     ScenarioCamera { view_kind: kind.to_owned(), camera }
 }
 
+/// A camera, and where it stands.
+type Candidate = ([f64; 3], ScenarioCamera);
+
 /// Takes `count` candidates that stand clear, in the order of their index.
 fn take_clear(
     count: usize,
     obstacles: &Obstacles,
-    candidate: impl Fn(usize) -> ([f64; 3], ScenarioCamera),
+    candidate: impl Fn(usize) -> Candidate,
 ) -> Option<Vec<ScenarioCamera>> {
     let found: Vec<_> = (0..count * MAX_TRIES)
         .map(candidate)
@@ -104,38 +110,39 @@ fn take_clear(
 
 fn orbit(config: &ScenarioConfig, group: &OrbitConfig, obstacles: &Obstacles) -> Option<Vec<ScenarioCamera>> {
     let golden_angle = std::f64::consts::PI * (3.0 - 5.0_f64.sqrt());
-    take_clear(group.count, obstacles, |i| {
-        let azimuth = i as f64 * golden_angle;
-        let [r, e] = spread::<2>(i);
-        let radius = mix(group.radius_m, r);
-        let elevation = mix(group.elevation_deg, e).to_radians();
-        let c = group.center;
-        let eye = [
-            c[0] + radius * elevation.cos() * azimuth.cos(),
-            c[1] + radius * elevation.cos() * azimuth.sin(),
-            c[2] + radius * elevation.sin(),
-        ];
-        (eye, look(config, &group.view_kind, eye, c, [0.0, 0.0, 1.0]))
-    })
+    take_clear(group.count, obstacles, |i| orbit_at(config, group, i as f64 * golden_angle, spread(i)))
+}
+
+fn orbit_at(config: &ScenarioConfig, group: &OrbitConfig, azimuth: f64, [r, e]: [f64; 2]) -> Candidate {
+    let radius = mix(group.radius_m, r);
+    let elevation = mix(group.elevation_deg, e).to_radians();
+    let c = group.center;
+    let eye = [
+        c[0] + radius * elevation.cos() * azimuth.cos(),
+        c[1] + radius * elevation.cos() * azimuth.sin(),
+        c[2] + radius * elevation.sin(),
+    ];
+    (eye, look(config, &group.view_kind, eye, c, [0.0, 0.0, 1.0]))
 }
 
 fn overhead(config: &ScenarioConfig, group: &OverheadConfig) -> Vec<ScenarioCamera> {
     let [x, y] = group.center;
     (0..group.count)
-        .map(|i| {
-            if i == 0 {
-                return look(config, &group.view_kind, [x, y, group.height_m], [x, y, 0.0], [0.0, 1.0, 0.0]);
-            }
-            let [a, b, c] = spread::<3>(i);
-            let eye = [
-                x + group.spread_m * (2.0 * a - 1.0),
-                y + group.spread_m * (2.0 * b - 1.0),
-                group.height_m * mix([0.8, 1.0], c),
-            ];
-            let turn = i as f64 * 1.1;
-            look(config, &group.view_kind, eye, [x, y, 0.0], [turn.sin(), turn.cos(), 0.0])
+        .map(|i| match i {
+            0 => look(config, &group.view_kind, [x, y, group.height_m], [x, y, 0.0], [0.0, 1.0, 0.0]),
+            _ => overhead_at(config, group, i as f64 * 1.1, spread(i)).1,
         })
         .collect()
+}
+
+fn overhead_at(config: &ScenarioConfig, group: &OverheadConfig, turn: f64, [a, b, c]: [f64; 3]) -> Candidate {
+    let [x, y] = group.center;
+    let eye = [
+        x + group.spread_m * (2.0 * a - 1.0),
+        y + group.spread_m * (2.0 * b - 1.0),
+        group.height_m * mix([0.8, 1.0], c),
+    ];
+    (eye, look(config, &group.view_kind, eye, [x, y, 0.0], [turn.sin(), turn.cos(), 0.0]))
 }
 
 fn dash(
@@ -145,25 +152,107 @@ fn dash(
     obstacles: &Obstacles,
 ) -> Option<Vec<ScenarioCamera>> {
     take_clear(group.count_per_place, obstacles, |i| {
-        let [f, h, d] = spread::<3>(i);
-        let [x, y, yaw] = place;
         // Turned evenly from the lowest to the highest angle, whatever the count.
         let turn = ((i % group.count_per_place) as f64 + 0.5) / group.count_per_place as f64;
-        let heading = yaw + mix(group.left_deg, turn).to_radians();
-        let down = mix(group.down_deg, d).to_radians();
-        let forward = mix(group.forward_m, f);
-        let eye = [x + forward * yaw.cos(), y + forward * yaw.sin(), mix(group.height_m, h)];
-        let target = [eye[0] + down.cos() * heading.cos(), eye[1] + down.cos() * heading.sin(), eye[2] - down.sin()];
-        (eye, look(config, &group.view_kind, eye, target, [0.0, 0.0, 1.0]))
+        dash_at(config, group, place, turn, spread(i))
     })
 }
 
+fn dash_at(
+    config: &ScenarioConfig,
+    group: &DashConfig,
+    [x, y, yaw]: [f64; 3],
+    turn: f64,
+    [f, h, d]: [f64; 3],
+) -> Candidate {
+    let heading = yaw + mix(group.left_deg, turn).to_radians();
+    let down = mix(group.down_deg, d).to_radians();
+    let forward = mix(group.forward_m, f);
+    let eye = [x + forward * yaw.cos(), y + forward * yaw.sin(), mix(group.height_m, h)];
+    let target = [eye[0] + down.cos() * heading.cos(), eye[1] + down.cos() * heading.sin(), eye[2] - down.sin()];
+    (eye, look(config, &group.view_kind, eye, target, [0.0, 0.0, 1.0]))
+}
+
 fn street(config: &ScenarioConfig, group: &StreetConfig, obstacles: &Obstacles) -> Option<Vec<ScenarioCamera>> {
-    take_clear(group.count, obstacles, |i| {
-        let eye = within(&group.region, spread::<3>(i));
-        let target = within(&group.look_at, spread::<3>(i + 7));
-        (eye, look(config, &group.view_kind, eye, target, [0.0, 0.0, 1.0]))
-    })
+    take_clear(group.count, obstacles, |i| street_at(config, group, spread(i), spread(i + 7)))
+}
+
+fn street_at(config: &ScenarioConfig, group: &StreetConfig, eye: [f64; 3], target: [f64; 3]) -> Candidate {
+    let (eye, target) = (within(&group.region, eye), within(&group.look_at, target));
+    (eye, look(config, &group.view_kind, eye, target, [0.0, 0.0, 1.0]))
+}
+
+/// `count` cameras drawn at random from the ranges of the fixed ones, each group as often as its share of those; or
+/// the key of the group that found no room.
+pub(crate) fn free_cameras(
+    config: &ScenarioConfig,
+    obstacles: &Obstacles,
+    places: impl Fn(&str) -> Vec<[f64; 3]>,
+    count: usize,
+    seed: u64,
+) -> Result<Vec<ScenarioCamera>, &'static str> {
+    let dash: Vec<(&DashConfig, Vec<[f64; 3]>)> =
+        config.dash.iter().map(|group| (group, places(group.vehicle.get_ref()))).collect();
+    let groups: Vec<(usize, Group)> = (config.orbit.iter().map(|g| (g.count, Group::Orbit(g))))
+        .chain(config.overhead.iter().map(|g| (g.count, Group::Overhead(g))))
+        .chain(dash.iter().map(|(g, places)| (g.count_per_place * places.len(), Group::Dash(g, places))))
+        .chain(config.street.iter().map(|g| (g.count, Group::Street(g))))
+        .collect();
+    let total: usize = groups.iter().map(|(share, _)| share).sum();
+    if total == 0 {
+        return Err("orbit");
+    }
+    (0..count)
+        .map(|i| {
+            let mut rng = carff_random::stream(Key { seed, frame: i as u64, step: FREE_STREAM, sample: 0 });
+            let mut nth = rng.random_range(0..total);
+            let group = groups.iter().find(|(share, _)| {
+                let here = nth < *share;
+                nth = nth.saturating_sub(*share);
+                here
+            });
+            let (_, group) = group.ok_or("orbit")?;
+            (0..MAX_TRIES)
+                .map(|_| group.candidate(config, &mut rng))
+                .find(|(eye, _)| obstacles.clear(*eye))
+                .map(|(_, camera)| camera)
+                .ok_or(group.key())
+        })
+        .collect()
+}
+
+/// Names this use of a seed.
+const FREE_STREAM: u32 = 0x6672_6565;
+
+enum Group<'a> {
+    Orbit(&'a OrbitConfig),
+    Overhead(&'a OverheadConfig),
+    Dash(&'a DashConfig, &'a [[f64; 3]]),
+    Street(&'a StreetConfig),
+}
+
+impl Group<'_> {
+    fn key(&self) -> &'static str {
+        match self {
+            Self::Orbit(_) => "orbit",
+            Self::Overhead(_) => "overhead",
+            Self::Dash(..) => "dash",
+            Self::Street(_) => "street",
+        }
+    }
+
+    fn candidate(&self, config: &ScenarioConfig, rng: &mut impl Rng) -> Candidate {
+        let turn = rng.random::<f64>() * std::f64::consts::TAU;
+        match self {
+            Self::Orbit(group) => orbit_at(config, group, turn, rng.random()),
+            Self::Overhead(group) => overhead_at(config, group, turn, rng.random()),
+            Self::Dash(group, places) => {
+                let place = places[rng.random_range(0..places.len())];
+                dash_at(config, group, place, rng.random(), rng.random())
+            }
+            Self::Street(group) => street_at(config, group, rng.random(), rng.random()),
+        }
+    }
 }
 
 #[cfg(test)]

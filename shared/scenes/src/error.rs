@@ -50,6 +50,14 @@ pub enum ScenarioError {
     /// A camera that cannot take pictures.
     #[error("the camera is not usable: {0}")]
     Camera(#[from] carff_geometry::CameraError),
+    /// No place was found for a freely drawn camera.
+    #[error("{}: key `{key}`: no place in these ranges stands clear of everything; widen them", path.display())]
+    NoRoom {
+        /// The scenario file.
+        path: PathBuf,
+        /// The group of cameras.
+        key: &'static str,
+    },
     /// The set cannot be written.
     #[error(transparent)]
     Dataset(#[from] DatasetError),

@@ -10,7 +10,7 @@ use carff_geometry::PinholeCamera;
 use rayon::prelude::*;
 use toml::Spanned;
 
-use crate::cameras::{Obstacles, ScenarioCamera, cameras};
+use crate::cameras::{Obstacles, ScenarioCamera, cameras, free_cameras};
 use crate::config::ScenarioConfig;
 use crate::error::ScenarioError;
 use crate::scenery::{Body, Pose, Scenery, scenery, vehicle_bodies, vehicle_box};
@@ -87,6 +87,18 @@ pub enum Extras {
 
 /// Where each vehicle stands; absent ones are `None`.
 type Placement = Vec<Option<Pose>>;
+/// Where a vehicle stands in any state (x, y, yaw), each place once.
+fn places(config: &ScenarioConfig, placements: &[Vec<Placement>], name: &str) -> Vec<[f64; 3]> {
+    let Some(index) = config.vehicle.iter().position(|v| v.name == name) else { return Vec::new() };
+    let mut seen: Vec<Pose> = Vec::new();
+    for pose in (0..config.timestamps).flat_map(|t| placements.iter().filter_map(move |b| b[t][index])) {
+        if !seen.contains(&pose) {
+            seen.push(pose);
+        }
+    }
+    seen
+}
+
 type PlacementKey = Vec<Option<[u64; 3]>>;
 
 fn key_of(placement: &Placement) -> PlacementKey {
@@ -99,6 +111,7 @@ pub struct Scenario {
     config: ScenarioConfig,
     scenery: Scenery,
     setting: Setting,
+    obstacles: Obstacles,
     cameras: Vec<ScenarioCamera>,
     info: ScenarioInfo,
     /// By branch, then timestamp.
@@ -179,16 +192,7 @@ impl Scenario {
             scenery.bodies.iter().map(|b| b.solid.aabb()),
             still_and_moving.iter().map(|b| b.solid.aabb()),
         );
-        let places = |name: &str| -> Vec<[f64; 3]> {
-            let Some(index) = config.vehicle.iter().position(|v| v.name == name) else { return Vec::new() };
-            let mut seen: Vec<Pose> = Vec::new();
-            for pose in (0..config.timestamps).flat_map(|t| placements.iter().filter_map(move |b| b[t][index])) {
-                if !seen.contains(&pose) {
-                    seen.push(pose);
-                }
-            }
-            seen
-        };
+        let places = |name: &str| places(&config, &placements, name);
         let cameras = cameras(&config, &obstacles, places).map_err(|key| {
             source.error_in(key, "too few places for these cameras stand clear of everything; widen their ranges")
         })?;
@@ -201,7 +205,18 @@ impl Scenario {
         }
         let info = info(&config, &scenery, &placements, hazard_branches);
         let setting = Setting::new(&config);
-        Ok(Self { path: path.to_owned(), config, scenery, setting, cameras, info, placements, dynamic, scenes })
+        Ok(Self {
+            path: path.to_owned(),
+            config,
+            scenery,
+            setting,
+            obstacles,
+            cameras,
+            info,
+            placements,
+            dynamic,
+            scenes,
+        })
     }
 
     /// The file that it was read from.
@@ -217,6 +232,16 @@ impl Scenario {
     /// The fixed camera poses, in the order of their view index.
     pub fn cameras(&self) -> &[ScenarioCamera] {
         &self.cameras
+    }
+
+    /// The same scenario with `count` cameras drawn at random from the ranges of its fixed ones, and no bird's-eye view:
+    /// poses that none of the fixed ones is, for an encoder that must not know poses by heart.
+    pub fn with_free_cameras(mut self, count: usize, seed: u64) -> Result<Self, ScenarioError> {
+        let places = |name: &str| places(&self.config, &self.placements, name);
+        let cameras = free_cameras(&self.config, &self.obstacles, places, count, seed);
+        self.cameras = cameras.map_err(|key| ScenarioError::NoRoom { path: self.path.clone(), key })?;
+        self.info.bev_view = None;
+        Ok(self)
     }
 
     /// Object index of a vehicle by name, as it appears in [`Rendering::object_id`].

@@ -87,6 +87,7 @@ fn heartbeats_tell_state_and_counts() {
     assert!(stage.worked(&newest, slow_ns) >= 1_000_000_000);
     let counted = heartbeat(&mut health, |h| h.state() == Ok(HealthState::Slow));
     assert_eq!((counted.received, counted.skipped, counted.invalid, counted.header.frame_id), (3, 2, 1, 2));
+    assert_eq!(counted.published, 0, "heartbeats do not count as work");
     stage.worked(&newest, monotonic_now_ns());
     heartbeat(&mut health, |h| h.state() == Ok(HealthState::Ok) && h.max_latency_ns >= 1_000_000_000);
 }

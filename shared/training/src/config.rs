@@ -36,6 +36,9 @@ pub struct TrainingConfig {
     /// The mixture density network's shape.
     #[serde(default)]
     pub mixture: MixtureConfig,
+    /// Poses besides those of the data set.
+    #[serde(default)]
+    pub free_poses: FreePoses,
     /// What the pictures go through before the encoder sees them in training.
     #[serde(default)]
     pub augmentation: Augmentation,
@@ -74,6 +77,18 @@ impl Default for CalibrationConfig {
     fn default() -> Self {
         Self { repeats: 5, sensor: SensorNoise::default(), samples: 10, horizon: 2 }
     }
+}
+
+/// Poses besides those of the data set, drawn at random from the ranges of the scenario's cameras. Encoder and
+/// forecaster train on them too, so that they do not know poses by heart; decoder, field and all figures do not. They
+/// are only there for a data set that the scenario has made.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct FreePoses {
+    /// How many; 0 leaves them out.
+    pub count: usize,
+    /// Seed of the draw.
+    pub seed: u64,
 }
 
 fn two() -> i32 {
@@ -181,14 +196,11 @@ pub struct MdnTraining {
     pub learning_rate: f64,
     /// Standard deviation of the noise on the input mean, in units of the input posterior's own deviation.
     pub input_noise: f64,
-    /// Neighbouring views are drawn from those that show at least this much of the actor's place (visible fraction,
-    /// 0..=1). 0: any view, a hidden one too, whose posterior does not say what there is to forecast.
-    pub target_visible_fraction: f32,
 }
 
 impl Default for MdnTraining {
     fn default() -> Self {
-        Self { steps: 4000, batch: 256, learning_rate: 1e-3, input_noise: 1.0, target_visible_fraction: 0.5 }
+        Self { steps: 4000, batch: 256, learning_rate: 1e-3, input_noise: 1.0 }
     }
 }
 
@@ -213,6 +225,7 @@ impl TrainingConfig {
             ("calibration.horizon", self.calibration.horizon as usize, 1, 8),
             ("mdn.steps", self.mdn.steps, 1, 1_000_000),
             ("mdn.batch", self.mdn.batch, 2, 65_536),
+            ("free_poses.count", self.free_poses.count, 0, 10_000),
             ("augmentation.copies", self.augmentation.copies, 0, 64),
             ("threads", self.threads.max(0) as usize, 1, 256),
         ];
@@ -234,12 +247,10 @@ impl TrainingConfig {
             ("vae.contrastive_temperature", self.vae.contrastive_temperature, 10.0),
             ("vae.state_weight", self.vae.state_weight, 1e3),
             ("nerf.changed_share", f64::from(self.nerf.changed_share), 1.0),
-            ("nerf.visible_fraction", f64::from(self.nerf.visible_fraction), 1.0),
             ("nerf.resampled_share", self.nerf.resampled_share, 1.0),
             ("nerf.resampled_ramp", self.nerf.resampled_ramp, 1.0),
             ("mdn.learning_rate", self.mdn.learning_rate, 1.0),
             ("mdn.input_noise", self.mdn.input_noise, 10.0),
-            ("mdn.target_visible_fraction", f64::from(self.mdn.target_visible_fraction), 1.0),
             ("augmentation.shift", self.augmentation.shift, 0.5),
             ("augmentation.zoom", self.augmentation.zoom, 0.5),
             ("augmentation.rotation_deg", self.augmentation.rotation_deg, 45.0),

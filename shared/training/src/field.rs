@@ -6,7 +6,7 @@
 use crate::{
     TrainingError,
     config::TrainingConfig,
-    mixture::neighbours,
+    mixture::telling,
     pictures::Pictures,
     run::{Progress, Run, SaveClock, damaged, part, prefixed},
 };
@@ -28,9 +28,6 @@ pub struct FieldTraining {
     pub rays: usize,
     /// Share of the rays through pixels that change among the states, 0..=1.
     pub changed_share: f32,
-    /// Latents come from views that show at least this much of the actor's place (visible fraction, 0..=1): the
-    /// posterior of a view that hides it stands between the states.
-    pub visible_fraction: f32,
     /// Share of rays whose latent is a draw instead of a mean, at the end of the ramp, 0..=1.
     pub resampled_share: f64,
     /// Share of the training in which it rises from 0.
@@ -44,7 +41,6 @@ impl Default for FieldTraining {
         Self {
             rays: 4096,
             changed_share: 0.34,
-            visible_fraction: 0.5,
             resampled_share: 0.7,
             resampled_ramp: 0.3,
             trainer: carff_field::TrainerConfig::default(),
@@ -58,16 +54,10 @@ pub struct Clouds {
 }
 
 impl Clouds {
-    /// The posteriors of the trained views that show enough.
-    pub fn new(
-        pictures: &Pictures,
-        posteriors: &[LatentGaussian],
-        visible_fraction: f32,
-    ) -> Result<Self, TrainingError> {
-        let by_state: Vec<Vec<LatentGaussian>> = neighbours(pictures, visible_fraction)
-            .into_iter()
-            .map(|views| views.into_iter().map(|i| posteriors[i]).collect())
-            .collect();
+    /// The posteriors of the views that tell each state.
+    pub fn new(pictures: &Pictures, posteriors: &[LatentGaussian]) -> Result<Self, TrainingError> {
+        let by_state: Vec<Vec<LatentGaussian>> =
+            telling(pictures).into_iter().map(|views| views.into_iter().map(|i| posteriors[i]).collect()).collect();
         match by_state.iter().position(Vec::is_empty) {
             Some(state) => Err(TrainingError::Unfit(format!("no trained view of state {state} shows enough"))),
             None => Ok(Self { by_state }),

@@ -5,6 +5,7 @@
 
 pub mod accuracy;
 pub mod config;
+pub mod curves;
 pub mod field;
 pub mod mixture;
 pub mod pictures;
@@ -30,6 +31,9 @@ pub enum TrainingError {
     /// The scenario cannot be probed.
     #[error(transparent)]
     Probing(#[from] carff_probing::ProbingError),
+    /// The curves cannot be drawn.
+    #[error(transparent)]
+    Plot(#[from] carff_plots::PlotError),
     /// libtorch refused an operation.
     #[error("libtorch: {0}")]
     Torch(#[from] tch::TchError),

@@ -1,7 +1,7 @@
 //! The training loop of the mixture density network (paper section 3.4).
 //!
 //! An input is the posterior of a view; its target is a real Gaussian draw from the posterior of a random neighbouring
-//! view of the next time step. Where several states look the same in the input's view, the step that follows any of
+//! view of the next time step that tells its state. Where several states look the same in the input's view, the step that follows any of
 //! them is the target equally often. After the last step the scene stays as it is.
 
 use crate::{
@@ -65,9 +65,9 @@ pub fn train(
         }
         first = done;
     }
-    let trained = pictures.trained();
-    let neighbours = neighbours(pictures, settings.target_visible_fraction);
-    if let Some(state) = neighbours.iter().position(Vec::is_empty) {
+    let trained = pictures.trained_and_free();
+    let targets_of = telling(pictures);
+    if let Some(state) = targets_of.iter().position(Vec::is_empty) {
         return Err(TrainingError::Unfit(format!(
             "no trained view of state {state} shows enough of the actor's place"
         )));
@@ -88,7 +88,7 @@ pub fn train(
             // States that look the same in this view are equally likely: the input must not be learnt by heart.
             let alike = &alike[i];
             let state = alike[rng.random_range(0..alike.len())];
-            let views = &neighbours[pictures.next_state(state)];
+            let views = &targets_of[pictures.next_state(state)];
             let next = &posteriors[rng.random_range(0..posteriors.len())][views[rng.random_range(0..views.len())]];
             let unit: [f32; LATENT_DIM] = std::array::from_fn(|_| rng.sample(StandardNormal));
             targets.extend(next.at(&unit));
@@ -122,15 +122,21 @@ pub fn train(
     Ok(())
 }
 
-/// Per state the trained pictures that show enough of the actor's place.
-pub fn neighbours(pictures: &Pictures, visible_fraction: f32) -> Vec<Vec<usize>> {
+/// Per state the pictures of trained and free poses that tell it: those that look like no other state from their pose.
+/// The posterior of any other picture rightly stands between states. Where no picture tells a state, those count that
+/// show at least half of the actor's place.
+pub fn telling(pictures: &Pictures) -> Vec<Vec<usize>> {
     let mut by_state = vec![Vec::new(); pictures.scenario.state_count()];
-    for i in pictures.trained() {
-        if pictures.labels[i].visible_fraction >= visible_fraction {
-            by_state[pictures.labels[i].state].push(i);
+    let mut fallback = by_state.clone();
+    for i in pictures.trained_and_free() {
+        let label = pictures.labels[i];
+        if pictures.alike(label.view, label.state).len() == 1 {
+            by_state[label.state].push(i);
+        } else if label.visible_fraction >= 0.5 {
+            fallback[label.state].push(i);
         }
     }
-    by_state
+    by_state.into_iter().zip(fallback).map(|(telling, rest)| if telling.is_empty() { rest } else { telling }).collect()
 }
 
 /// Mean negative log-likelihood over given pairs, for tests and reports.

@@ -1,7 +1,7 @@
 //! The posed pictures of one scenario as tensors: what every training loop reads.
 
 use crate::{TrainingError, config::Augmentation};
-use carff_dataset::{Dataset, Equivalence, Image, Observability, PoseRole, PoseSplit, ScenarioInfo, sensor};
+use carff_dataset::{Dataset, Equivalence, Frame, Image, Observability, PoseRole, PoseSplit, ScenarioInfo, sensor};
 use carff_models::decoder::PICTURE_PX;
 use carff_random::Key;
 use rand::Rng;
@@ -19,24 +19,26 @@ pub struct Label {
     pub observability: Observability,
     /// Visible fraction, where known; else 1, 0.5 or 0 by observability.
     pub visible_fraction: f32,
-    /// Part of the pose in the split.
-    pub role: PoseRole,
+    /// Part of the pose in the split; none for a freely drawn pose.
+    pub role: Option<PoseRole>,
 }
 
-/// A scenario's pictures, labels, split and equivalences.
+/// A scenario's pictures, labels, split and equivalences: those of a data set, and behind them those of freely drawn
+/// poses, whose views are numbered on.
 pub struct Pictures {
     /// The data set.
     pub dataset: Dataset,
     /// Its scenario.
     pub scenario: ScenarioInfo,
-    /// All pictures, in the set's order.
+    /// All pictures, in the sets' order.
     pub images: Vec<Image>,
     /// What is known of each.
     pub labels: Vec<Label>,
     /// The split of the poses.
     pub split: PoseSplit,
-    /// Which states look the same in which view.
+    /// Which states look the same in which view of the data set.
     pub equivalence: Equivalence,
+    free_equivalence: Option<Equivalence>,
     /// Per pose the mean over all states, `[V, 3, 128, 128]`, 0..=1.
     pub pose_means: Tensor,
     index: Vec<Option<usize>>,
@@ -50,25 +52,7 @@ impl Pictures {
         let scenario = dataset.scenario().cloned().ok_or_else(|| unfit("transforms.json has no `scenario`"))?;
         let images = dataset.load_all_images()?;
         let split = PoseSplit::for_dataset(&dataset, split_seed);
-        let mut labels = Vec::with_capacity(images.len());
-        for (i, frame) in dataset.frames().iter().enumerate() {
-            let (Some(state), Some(view)) = (frame.state, frame.view) else {
-                return Err(unfit(&format!("frames[{i}] lacks `branch` and `timestamp`, or `view_id`")));
-            };
-            let observability = frame.observability.unwrap_or(Observability::Full);
-            let by_kind = match observability {
-                Observability::Full => 1.0,
-                Observability::Partial => 0.5,
-                Observability::None => 0.0,
-            };
-            labels.push(Label {
-                state,
-                view,
-                observability,
-                visible_fraction: frame.visible_fraction.unwrap_or(by_kind),
-                role: split.role(view),
-            });
-        }
+        let labels = labels(&dataset, 0, |view| Some(split.role(view))).map_err(|what| unfit(&what))?;
         let states = dataset.state_count();
         let mut index = vec![None; states * dataset.view_count()];
         for (i, label) in labels.iter().enumerate() {
@@ -82,10 +66,40 @@ impl Pictures {
                 Tensor::stack(&of_view, 0).mean_dim([0_i64].as_slice(), false, Kind::Float)
             })
             .collect();
-        Ok(Self { pose_means: Tensor::stack(&means, 0), dataset, scenario, images, labels, split, equivalence, index })
+        Ok(Self {
+            pose_means: Tensor::stack(&means, 0),
+            dataset,
+            scenario,
+            images,
+            labels,
+            split,
+            equivalence,
+            free_equivalence: None,
+            index,
+        })
     }
 
-    /// The picture of a state from a pose.
+    /// Adds the pictures of a set of freely drawn poses of the same scenario.
+    pub fn add_free(&mut self, dir: &Path) -> Result<(), TrainingError> {
+        let unfit = |what: &str| TrainingError::Unfit(format!("{}: {what}", dir.display()));
+        let free = Dataset::open(dir)?;
+        let same = free.scenario().is_some_and(|s| s.name == self.scenario.name && s.states == self.scenario.states);
+        if !same {
+            return Err(unfit("another scenario than the data set's: remove the folder, it is rendered again"));
+        }
+        let images = free.load_all_images()?;
+        self.labels.extend(labels(&free, self.dataset.view_count(), |_| None).map_err(|what| unfit(&what))?);
+        self.free_equivalence = Some(Equivalence::from_dataset(&free, &images));
+        self.images.extend(images);
+        Ok(())
+    }
+
+    /// Number of poses, the freely drawn ones among them.
+    pub fn view_count(&self) -> usize {
+        self.labels.iter().map(|l| l.view + 1).max().unwrap_or(0)
+    }
+
+    /// The picture of a state from a pose of the data set.
     pub fn at(&self, state: usize, view: usize) -> Option<usize> {
         let states = self.scenario.state_count();
         (state < states).then(|| self.index.get(view * states + state).copied().flatten()).flatten()
@@ -93,17 +107,27 @@ impl Pictures {
 
     /// The pictures whose pose has one of `roles`.
     pub fn with_roles(&self, roles: &[PoseRole]) -> Vec<usize> {
-        (0..self.labels.len()).filter(|&i| roles.contains(&self.labels[i].role)).collect()
+        (0..self.labels.len()).filter(|&i| self.labels[i].role.is_some_and(|role| roles.contains(&role))).collect()
     }
 
-    /// The pictures that training may use: all but those of unseen poses.
+    /// The data set's pictures that training may use: all but those of unseen poses.
     pub fn trained(&self) -> Vec<usize> {
         self.with_roles(&[PoseRole::Rest, PoseRole::Calibration])
     }
 
+    /// As [`Self::trained`], and those of freely drawn poses.
+    pub fn trained_and_free(&self) -> Vec<usize> {
+        (0..self.labels.len()).filter(|&i| self.labels[i].role != Some(PoseRole::Unseen)).collect()
+    }
+
     /// The states that look the same as `state` in a view, itself among them.
     pub fn alike(&self, view: usize, state: usize) -> Vec<usize> {
-        (0..self.scenario.state_count()).filter(|&s| s == state || self.equivalence.same(view, s, state)).collect()
+        let poses = self.dataset.view_count();
+        let same = |other| match &self.free_equivalence {
+            Some(free) if view >= poses => free.same(view - poses, other, state),
+            _ => self.equivalence.same(view, other, state),
+        };
+        (0..self.scenario.state_count()).filter(|&s| s == state || same(s)).collect()
     }
 
     /// The state that follows: the next timestamp of the branch; the last one follows itself.
@@ -147,6 +171,28 @@ impl Pictures {
         // Bilinear (0), edge pixels repeated (1).
         pictures.grid_sampler(&grid, 0, 1, false)
     }
+}
+
+/// What a set knows of its pictures, views numbered from `first_view`; or what a frame lacks.
+fn labels(
+    dataset: &Dataset,
+    first_view: usize,
+    role: impl Fn(usize) -> Option<PoseRole>,
+) -> Result<Vec<Label>, String> {
+    let label = |(i, frame): (usize, &Frame)| {
+        let (Some(state), Some(view)) = (frame.state, frame.view) else {
+            return Err(format!("frames[{i}] lacks `branch` and `timestamp`, or `view_id`"));
+        };
+        let observability = frame.observability.unwrap_or(Observability::Full);
+        let by_kind = match observability {
+            Observability::Full => 1.0,
+            Observability::Partial => 0.5,
+            Observability::None => 0.0,
+        };
+        let visible_fraction = frame.visible_fraction.unwrap_or(by_kind);
+        Ok(Label { state, view: first_view + view, observability, visible_fraction, role: role(view) })
+    };
+    dataset.frames().iter().enumerate().map(label).collect()
 }
 
 /// One picture as a decoder target `[3, 128, 128]`, 0..=1.

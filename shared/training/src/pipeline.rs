@@ -34,11 +34,13 @@ pub enum Stage {
     Mdn,
 }
 
-/// Trains what `stage` says and writes what is ready to the checkpoint folder `out`. Finished stages are read from
+/// Trains what `stage` says on a data set, and on the set `free` of freely drawn poses beside it, and writes what is
+/// ready to the checkpoint folder `out`. Finished stages are read from
 /// their saved states; a stage that is asked for by name needs those before it.
 pub fn train(
     config: &TrainingConfig,
     dataset: &Path,
+    free: Option<&Path>,
     out: &Path,
     stage: Stage,
     run: &Run,
@@ -46,7 +48,10 @@ pub fn train(
     carff_models::allocator::keep_large_blocks();
     tch::set_num_threads(config.threads);
     tch::manual_seed(config.seed as i64);
-    let pictures = Pictures::open(dataset, config.split_seed)?;
+    let mut pictures = Pictures::open(dataset, config.split_seed)?;
+    if let Some(free) = free {
+        pictures.add_free(free)?;
+    }
     let states = pictures.scenario.state_count();
     let pretrained = config.pretrained_backbone.as_deref();
     let mut vae = Vae::new(config, pictures.dataset.view_count(), states, pretrained)?;
@@ -59,7 +64,7 @@ pub fn train(
     let posteriors: Vec<Vec<LatentGaussian>> =
         (0..=config.augmentation.copies).map(|copy| inputs.posteriors(&vae, copy)).collect();
     let mut metrics = json!({"vae": vae::evaluate(config, &pictures, &vae, &posteriors[0], true)?});
-    let clouds = Clouds::new(&pictures, &posteriors[0], config.nerf.visible_fraction)?;
+    let clouds = Clouds::new(&pictures, &posteriors[0])?;
     let mut manifest = Manifest {
         format_version: FORMAT_VERSION,
         scenario: ScenarioIdentity::of(&pictures.scenario, pictures.dataset.view_count()),
@@ -284,7 +289,7 @@ fn figures(
             trials(&models.encoder, &pictures.dataset, &inputs, 5, &config.calibration.sensor, config.seed + 1)?;
         let (table, _) = planning_table(
             &models.mixture,
-            &mut models.probe,
+            &models.probe,
             &trials,
             &rules,
             Sampling::Stratified,

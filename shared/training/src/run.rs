@@ -1,6 +1,6 @@
 //! What every training loop does the same way: report, save, stop.
 
-use crate::TrainingError;
+use crate::{TrainingError, curves};
 use carff_models::weights::{self, Tensors};
 use serde_json::Value;
 use std::{
@@ -57,10 +57,11 @@ impl Run<'_> {
         self.dir.join(format!("{stage}.state.safetensors"))
     }
 
-    /// Saves a state, whole or not at all, in full precision.
+    /// Saves a state, whole or not at all, in full precision, and draws the curves up to it.
     pub fn save(&self, stage: &str, done: usize, mut state: Tensors) -> Result<(), TrainingError> {
         state.insert("run.done".into(), Tensor::from_slice(&[done as i64]));
-        Ok(weights::write(&self.state_path(stage), &state, Kind::Float)?)
+        weights::write(&self.state_path(stage), &state, Kind::Float)?;
+        curves::draw(&self.dir)
     }
 
     /// A saved state and the steps done, if there is one.

@@ -196,7 +196,7 @@ pub fn train(
         }
         first = done;
     }
-    let trained = pictures.trained();
+    let trained = pictures.trained_and_free();
     let state_targets = state_targets(pictures);
     let copies = config.augmentation.copies + 1;
     let per_epoch = trained.len().div_ceil(settings.batch).max(1);
@@ -215,7 +215,10 @@ pub fn train(
                 batch.iter().map(|&i| (i, rand::Rng::random_range(&mut rng, 0..copies))).collect();
             tch::manual_seed(config.seed as i64 ^ ((step as i64) << 20));
             let losses = losses(config, pictures, vae, inputs, &chosen, &state_targets);
-            let mut loss = &losses.reconstruction * settings.reconstruction_weight + &losses.kl * kl_weight;
+            let mut loss = &losses.kl * kl_weight;
+            if let Some(term) = &losses.reconstruction {
+                loss = loss + term * settings.reconstruction_weight;
+            }
             if let Some(term) = &losses.state {
                 loss = loss + term * settings.state_weight;
             }
@@ -225,7 +228,7 @@ pub fn train(
             adam.step(&loss, settings.learning_rate * cosine(step, settings.epochs * per_epoch), 5.0);
             let value = |t: &Tensor| t.double_value(&[]);
             sums[0] += value(&loss);
-            sums[1] += value(&losses.reconstruction);
+            sums[1] += losses.reconstruction.as_ref().map_or(0.0, value);
             sums[2] += value(&losses.kl);
             sums[3] += losses.state.as_ref().map_or(0.0, value);
         }
@@ -273,7 +276,7 @@ pub fn train(
 /// One pass over the pictures, in batches made of whole poses: all states of a pose stand in one batch, so that what
 /// tells states apart is not drowned by what tells poses apart.
 fn batches(pictures: &Pictures, trained: &[usize], size: usize, rng: &mut impl rand::Rng) -> Vec<Vec<usize>> {
-    let mut by_view = vec![Vec::new(); pictures.dataset.view_count()];
+    let mut by_view = vec![Vec::new(); pictures.view_count()];
     for &i in trained {
         by_view[pictures.labels[i].view].push(i);
     }
@@ -306,10 +309,31 @@ fn state_targets(pictures: &Pictures) -> Tensor {
 }
 
 struct Losses {
-    reconstruction: Tensor,
+    /// None when the batch has no picture of the data set's own.
+    reconstruction: Option<Tensor>,
     kl: Tensor,
     state: Option<Tensor>,
     contrastive: Option<Tensor>,
+}
+
+/// Weighted squared error of the decoder on some pictures of the data set, from a latent each.
+fn reconstruction(
+    config: &TrainingConfig,
+    pictures: &Pictures,
+    vae: &Vae,
+    latents: &Tensor,
+    decoded: &[usize],
+) -> Tensor {
+    let settings = &config.vae;
+    let views: Vec<i64> = decoded.iter().map(|&i| pictures.labels[i].view as i64).collect();
+    let views = Tensor::from_slice(&views);
+    let targets = pictures.targets(decoded);
+    let residual = &targets - pictures.pose_means.index_select(0, &views);
+    let changed = residual.abs().amax([1_i64].as_slice(), true).gt(12.0 / 255.0).to_kind(Kind::Float);
+    let weight = changed * (settings.foreground_weight - 1.0) + 1.0;
+    let wanted = if settings.residual { residual } else { targets };
+    let error = (vae.decoder.forward(latents, &views) - wanted).square();
+    (error * weight).mean(Kind::Float) * 10.0
 }
 
 fn losses(
@@ -325,16 +349,14 @@ fn losses(
     let features = inputs.features(vae, chosen);
     let (mean, log_variance) = vae.encoder.posterior(&features, settings.dropout);
     let latent = &mean + (&log_variance * 0.5).exp() * Tensor::randn_like(&mean);
-    let decoded = &only[..settings.decoder_batch.min(only.len())];
-    let views: Vec<i64> = decoded.iter().map(|&i| pictures.labels[i].view as i64).collect();
-    let views = Tensor::from_slice(&views);
-    let targets = pictures.targets(decoded);
-    let residual = &targets - pictures.pose_means.index_select(0, &views);
-    let changed = residual.abs().amax([1_i64].as_slice(), true).gt(12.0 / 255.0).to_kind(Kind::Float);
-    let weight = changed * (settings.foreground_weight - 1.0) + 1.0;
-    let wanted = if settings.residual { residual } else { targets };
-    let error = (vae.decoder.forward(&latent.narrow(0, 0, decoded.len() as i64), &views) - wanted).square();
-    let reconstruction = (error * weight).mean(Kind::Float) * 10.0;
+    // The decoder knows the data set's poses alone.
+    let known: Vec<usize> =
+        (0..only.len()).filter(|&row| pictures.labels[only[row]].role.is_some()).take(settings.decoder_batch).collect();
+    let reconstruction = (!known.is_empty()).then(|| {
+        let decoded: Vec<usize> = known.iter().map(|&row| only[row]).collect();
+        let rows: Vec<i64> = known.iter().map(|&row| row as i64).collect();
+        reconstruction(config, pictures, vae, &latent.index_select(0, &Tensor::from_slice(&rows)), &decoded)
+    });
     let kl = kl_divergence(&mean, &log_variance);
     let state = (settings.state_weight > 0.0).then(|| {
         let rows: Vec<i64> = only.iter().map(|&i| i as i64).collect();

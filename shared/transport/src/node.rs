@@ -1,5 +1,6 @@
 //! A process's membership in a run.
 
+use crate::run::CLEANUP_PATIENCE;
 use crate::space::{MANAGEMENT_BYTES, SHARED_MEMORY_DIR, check_space};
 use crate::topics::Limits;
 use crate::{
@@ -82,7 +83,7 @@ impl Node {
 
     /// Removes what dead processes of this run left behind. Returns how many were cleaned up.
     pub fn cleanup_dead(&self) -> u64 {
-        self.inner.try_cleanup_dead_nodes().cleanups
+        self.inner.blocking_cleanup_dead_nodes(CLEANUP_PATIENCE).cleanups
     }
 
     /// Opens a topic to receive from.

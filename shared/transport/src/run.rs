@@ -5,9 +5,13 @@ use crate::{CleanupError, RunNameError, Service};
 use iceoryx2::node::NodeView;
 use iceoryx2::prelude::{CallbackProgression, Config, FileName, NodeState, Path as IoxPath, SemanticString};
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 /// Longest run name: with it, the paths of the wake-up sockets stay below the system's limit of 107 bytes.
 const MAX_NAME_BYTES: usize = 24;
+
+/// How long to wait for another thread or process that is cleaning up too.
+pub(crate) const CLEANUP_PATIENCE: Duration = Duration::from_millis(500);
 
 /// One run of a graph: its name, which names its files, and its id, which is in every header.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -89,7 +93,7 @@ pub fn cleanup_dead(run: &Run) -> Result<u32, CleanupError> {
     let mut cleaned = 0;
     iceoryx2::node::Node::<Service>::list(&config, |node| {
         if let NodeState::Dead(dead) = node
-            && dead.try_remove_stale_resources().is_ok()
+            && dead.blocking_remove_stale_resources(CLEANUP_PATIENCE).is_ok()
         {
             cleaned += 1;
         }

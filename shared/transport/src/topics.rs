@@ -62,7 +62,7 @@ const MESSAGES: Limits =
     Limits { max_subscribers: 10, max_publishers: 2, max_nodes: 14, history: 0, buffer: 16, borrowed: 3, loaned: 2 };
 /// Pictures: fewer wait, as they are large and only the newest counts.
 const PICTURES: Limits =
-    Limits { max_subscribers: 8, max_publishers: 2, max_nodes: 12, history: 0, buffer: 4, borrowed: 2, loaned: 2 };
+    Limits { max_subscribers: 8, max_publishers: 2, max_nodes: 12, history: 0, buffer: 8, borrowed: 2, loaned: 2 };
 /// The latest of these tells a late reader how things stand.
 const STATUS: Limits = Limits { history: 1, ..MESSAGES };
 

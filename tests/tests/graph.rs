@@ -1,0 +1,189 @@
+//! Whole graphs: the shipped programs on the shipped checkpoint, launched as a user launches them.
+
+#![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
+
+use carff_dataset::Image;
+use carff_messages::Stage;
+use carff_tests::{Process, TestGraph, copy_checkpoint, eventually, project_root, scenario_set, shipped_checkpoint};
+use rustix::process::{Pid, Signal, kill_process};
+use serde_json::Value;
+
+/// Decisions shown so far: each is one line.
+fn decisions(text: &str) -> usize {
+    text.lines().filter(|line| line.contains("hazard ") && line.trim_end().ends_with(" ms")).count()
+}
+
+/// Settings under which the pace of the machine changes no decision: nothing is stale on a machine that is busy with
+/// something else.
+const PATIENT: &str = "[controller]\nrate_hz = 4.0\ndeadline_ms = 60000\n[launcher]\nstart_timeout_ms = 600000\n\
+                       stop_timeout_ms = 30000\n";
+
+/// The shipped graph file drives the shipped checkpoint: it ends with exit code 0, its report has every promised key,
+/// and neither a process nor a file in shared memory is left.
+#[test]
+fn the_shipped_graph_drives() {
+    let (set, checkpoint) = (scenario_set(), shipped_checkpoint());
+    let graph = TestGraph::new(&set, &checkpoint, "");
+    let shipped = project_root().join("configs/graphs/approaching-intersection.toml");
+    let (set, checkpoint) = (set.to_str().unwrap(), checkpoint.to_str().unwrap());
+    let args = ["--drives", "2", "--dataset", set, "--checkpoint", checkpoint, "--report", "report.json"];
+    let finished = Process::start(&mut graph.launch(&shipped, &args)).end();
+    finished.assert_success();
+    graph.assert_nothing_left();
+
+    let report = graph.report();
+    let number = |value: &Value, what: &str| {
+        value.as_f64().unwrap_or_else(|| panic!("{what} is {value}, not a number:\n{report:#}"))
+    };
+    // Two drives of three timestamps with six frames each.
+    assert!((1.0..=36.0).contains(&number(&report["frames"], "frames")), "{report:#}");
+    assert!(number(&report["actions"], "actions") > 0.0);
+    assert!(number(&report["skipped"], "skipped") >= 0.0);
+    assert!(number(&report["restarts"], "restarts") == 0.0, "{}", finished.text);
+    for part in ["camera_to_action", "encoder", "forecaster", "prober", "renderer"] {
+        for quantile in ["p50", "p99", "max"] {
+            assert!(report["latency_ms"][part].get(quantile).is_some(), "latency_ms.{part}.{quantile}:\n{report:#}");
+        }
+    }
+    for stage in Stage::ALL {
+        assert!(number(&report["memory_mb"][stage.name()], stage.name()) > 0.0);
+    }
+    for table in ["drives", "all_views", "unseen_views"] {
+        for rule in ["underconfident", "overconfident", "paper", "calibrated"] {
+            for samples in ["2", "10", "35"] {
+                for kind in ["hazard", "clear"] {
+                    let cell = &report["planning"][table][rule][samples][kind];
+                    let what = format!("planning.{table}.{rule}.{samples}.{kind}");
+                    let (success, trials) = (number(&cell["success"], &what), number(&cell["trials"], &what));
+                    assert!(success <= trials, "{what}: {cell}");
+                    // Whatever the models: these two rules look at nothing.
+                    match (rule, kind) {
+                        ("underconfident", "hazard") | ("overconfident", "clear") => {
+                            assert!(success == trials, "{what}")
+                        }
+                        ("underconfident", "clear") | ("overconfident", "hazard") => assert!(success == 0.0, "{what}"),
+                        _ => {}
+                    }
+                }
+            }
+        }
+    }
+    let trials = |kind: &str| number(&report["planning"]["all_views"]["calibrated"]["10"][kind]["trials"], kind);
+    assert!(trials("hazard") + trials("clear") >= 300.0, "{report:#}");
+}
+
+/// Ctrl-C ends all processes of a graph in full work, with the shell's exit code for it, and leaves nothing behind.
+#[test]
+fn an_interrupt_leaves_nothing() {
+    let graph = TestGraph::new(&scenario_set(), &shipped_checkpoint(), &format!("{PATIENT}[camera]\nrepeat = true\n"));
+    let mut launcher = Process::start(&mut graph.launch(&graph.file(), &[]));
+    launcher.wait_for("decision", |text| decisions(text) >= 3);
+    for stage in Stage::ALL {
+        assert!(graph.stage_pid(*stage).is_some(), "stage {stage} does not run");
+    }
+    assert!(!graph.run().shared_memory_files().unwrap().is_empty());
+    launcher.signal(Signal::INT);
+    let finished = launcher.end();
+    assert_eq!(finished.status.code(), Some(130), "{}", finished.text);
+    graph.assert_nothing_left();
+}
+
+/// Each stage but the camera may be killed outright: the launcher starts it again, and decisions go on.
+#[test]
+fn killed_stages_are_started_again() {
+    let graph = TestGraph::new(&scenario_set(), &shipped_checkpoint(), &format!("{PATIENT}[camera]\nrepeat = true\n"));
+    let mut launcher = Process::start(&mut graph.launch(&graph.file(), &[]));
+    launcher.wait_for("decision", |text| decisions(text) >= 1);
+    for stage in [Stage::Encoder, Stage::Forecaster, Stage::Prober, Stage::Renderer, Stage::Controller] {
+        let killed = graph.stage_pid(stage).unwrap();
+        kill_process(Pid::from_raw(killed as i32).unwrap(), Signal::KILL).unwrap();
+        let died = format!("stage {stage} died");
+        launcher.wait_for("word of its death", |text| text.contains(&died));
+        let lives = || graph.stage_pid(stage).is_some_and(|pid| pid != killed);
+        assert!(eventually(lives), "stage {stage} was not started again:\n{}", launcher.text());
+        // What was under way may still be decided on without the dead one; so many more cannot.
+        let before = decisions(&launcher.text());
+        launcher.wait_for("further decisions", |text| decisions(text) >= before + 10);
+    }
+    launcher.signal(Signal::INT);
+    let finished = launcher.end();
+    assert_eq!(finished.status.code(), Some(130), "{}", finished.text);
+    graph.assert_nothing_left();
+}
+
+/// The camera is not started again, as its drives would count twice: when it dies, the run ends with one sentence.
+#[test]
+fn a_lost_camera_ends_the_run() {
+    let graph = TestGraph::new(&scenario_set(), &shipped_checkpoint(), &format!("{PATIENT}[camera]\nrepeat = true\n"));
+    let mut launcher = Process::start(&mut graph.launch(&graph.file(), &[]));
+    launcher.wait_for("decision", |text| decisions(text) >= 1);
+    let camera = graph.stage_pid(Stage::Camera).unwrap();
+    kill_process(Pid::from_raw(camera as i32).unwrap(), Signal::KILL).unwrap();
+    launcher.end().assert_one_error(&["stage `camera` is lost", "signal 9"]);
+    graph.assert_nothing_left();
+}
+
+/// A folder in which one picture is broken and one has another size: both are reported as errors of the camera, and the
+/// graph decides on the others.
+#[test]
+fn bad_pictures_are_left_out() {
+    let pictures = tempfile::tempdir().unwrap();
+    let path = |name: &str| pictures.path().join(name);
+    for (name, grey) in [("a.png", 60), ("d.png", 120), ("e.png", 180)] {
+        Image::filled(128, 128, [grey; 3]).save_png(&path(name)).unwrap();
+    }
+    std::fs::write(path("b.png"), "no picture").unwrap();
+    Image::filled(64, 64, [90; 3]).save_png(&path("c.png")).unwrap();
+    let rest = format!(
+        "frame_rate_hz = 2.0\n{PATIENT}[camera]\nsource = \"folder\"\nfolder = \"{}\"\nframes_per_timestamp = 2\n\
+         linger_ms = 10000\n",
+        pictures.path().display()
+    );
+    let graph = TestGraph::new(pictures.path(), &shipped_checkpoint(), &rest);
+    let finished = graph.launch_to_end(&["--report", "report.json"]);
+    finished.assert_success();
+    let report = graph.report();
+    assert_eq!(report["errors_by_stage"]["camera"], 2, "{}", finished.text);
+    assert_eq!(report["frames"], 6, "{}", finished.text);
+    assert!(decisions(&finished.text) >= 1, "{}", finished.text);
+    assert!(finished.text.contains("b.png") && finished.text.contains("c.png"), "{}", finished.text);
+    graph.assert_nothing_left();
+}
+
+/// A checkpoint that was trained on another scenario than the data set shows is refused before anything is decided; the
+/// error names the key that differs and both values.
+#[test]
+fn a_checkpoint_of_another_scenario() {
+    let folder = tempfile::tempdir().unwrap();
+    let checkpoint = folder.path().join("other");
+    copy_checkpoint(&checkpoint, |manifest| manifest["scenario"]["name"] = "roundabout".into());
+    let graph = TestGraph::new(&scenario_set(), &checkpoint, PATIENT);
+    let finished = graph.launch_to_end(&[]);
+    finished.assert_one_error(&["another scenario", "scenario.name", "roundabout", "approaching-intersection"]);
+    assert_eq!(decisions(&finished.text), 0);
+    graph.assert_nothing_left();
+}
+
+/// Weights that are cut off, or of another shape than the manifest says, are refused with the file's name.
+#[test]
+fn a_checkpoint_with_damaged_weights() {
+    let folder = tempfile::tempdir().unwrap();
+    let set = scenario_set();
+    let cut = folder.path().join("cut");
+    copy_checkpoint(&cut, |_| ());
+    let field = cut.join("field.safetensors");
+    let bytes = std::fs::read(&field).unwrap();
+    std::fs::write(&field, &bytes[..bytes.len() / 2]).unwrap();
+    let graph = TestGraph::new(&set, &cut, PATIENT);
+    graph.launch_to_end(&[]).assert_one_error(&["did not start", "cut"]);
+    graph.assert_nothing_left();
+
+    let reshaped = folder.path().join("reshaped");
+    copy_checkpoint(&reshaped, |manifest| {
+        let hidden = manifest["encoder"]["hidden"].as_i64().unwrap();
+        manifest["encoder"]["hidden"] = (hidden + 1).into();
+    });
+    let graph = TestGraph::new(&set, &reshaped, PATIENT);
+    graph.launch_to_end(&[]).assert_one_error(&["did not start", "reshaped"]);
+    graph.assert_nothing_left();
+}
