@@ -1,0 +1,377 @@
+//! Line charts in a grid.
+
+use crate::PlotError;
+use crate::canvas::{Area, Canvas, FAINT_INK, Font, INK, OVERSAMPLING, PAPER, drawing};
+use carff_dataset::Image;
+use plotters::coord::Shift;
+use plotters::coord::ranged1d::{KeyPointHint, NoDefaultFormatting, Ranged, ValueFormatter};
+use plotters::prelude::{BitMapBackend, ChartBuilder, Circle, DrawingArea, PathElement, RGBColor, Rectangle};
+use plotters::style::Color;
+use std::ops::Range;
+use std::path::Path;
+
+/// One chart.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Panel {
+    /// Heading.
+    pub title: String,
+    /// What is along x, with its unit.
+    pub x_label: String,
+    /// What is along y, with its unit.
+    pub y_label: String,
+    /// Logarithmic y axis; points at or below zero are left out.
+    pub log_y: bool,
+    /// The lines.
+    pub series: Vec<Series>,
+}
+
+/// One line of a chart.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Series {
+    /// Name in the legend.
+    pub name: String,
+    /// Points `(x, y)` in the order of the line; it is broken where one is not finite.
+    pub points: Vec<(f64, f64)>,
+}
+
+const MARGIN: u32 = 20;
+const PANEL_WIDTH: u32 = 560;
+const PANEL_HEIGHT: u32 = 380;
+const TITLE: Font = Font::bold(24.0);
+const PANEL_TITLE: Font = Font::bold(15.0);
+const LEGEND: Font = Font::regular(12.5);
+const LABEL: Font = Font::regular(12.0);
+/// Space for the y axis' numbers and name, and for those of the x axis.
+const Y_LABELS: u32 = 74;
+const X_LABELS: u32 = 42;
+/// A legend's line, and the space around it.
+const SWATCH: u32 = 18;
+const LEGEND_GAP: u32 = 14;
+/// Lines with at most so many points show each of them.
+const FEW_POINTS: usize = 30;
+/// Values beyond this are no figures.
+const LARGEST: f64 = 1e100;
+/// Colours that colour-blind readers can tell apart (Okabe and Ito), the yellow left out: paper is too bright for it.
+const COLOURS: [RGBColor; 7] = [
+    RGBColor(0, 114, 178),
+    RGBColor(213, 94, 0),
+    RGBColor(0, 158, 115),
+    RGBColor(204, 121, 167),
+    RGBColor(86, 180, 233),
+    RGBColor(150, 110, 20),
+    RGBColor(70, 70, 70),
+];
+
+type Page<'a> = DrawingArea<BitMapBackend<'a>, Shift>;
+
+/// Draws charts into a PNG file, side by side as a grid. A panel without any point says so.
+pub fn curves(path: &Path, title: &str, panels: &[Panel]) -> Result<(), PlotError> {
+    Ok(draw(title, panels)?.save_png(path)?)
+}
+
+/// Panels side by side for so many panels.
+fn columns(panels: usize) -> u32 {
+    match panels {
+        0 | 1 => 1,
+        2..=4 => 2,
+        _ => 3,
+    }
+}
+
+fn draw(title: &str, panels: &[Panel]) -> Result<Image, PlotError> {
+    let columns = columns(panels.len());
+    let rows = (panels.len() as u32).div_ceil(columns);
+    let head = MARGIN + TITLE.line_px();
+    let mut canvas =
+        Canvas::new(columns * PANEL_WIDTH + 2 * MARGIN, head + rows.saturating_mul(PANEL_HEIGHT) + 2 * MARGIN)?;
+    for (i, panel) in panels.iter().enumerate() {
+        let (column, row) = (i as u32 % columns, i as u32 / columns);
+        let left = MARGIN + column * PANEL_WIDTH;
+        let top = head + MARGIN + row * PANEL_HEIGHT;
+        let pad = MARGIN / 2;
+        let inner = PANEL_WIDTH - 2 * pad;
+        canvas.text(&panel.title, left + pad, top, PANEL_TITLE, INK)?;
+        let under = top + PANEL_TITLE.line_px() + 2;
+        let legend = legend(&mut canvas, &panel.series, left + pad, under, inner)?;
+        let chart = [left + pad, under + legend, left + pad + inner, top + PANEL_HEIGHT - pad];
+        let area = canvas.drawing_area();
+        plot(&shrunk(&area, chart), panel)?;
+    }
+    canvas.text(title, MARGIN + MARGIN / 2, MARGIN, TITLE, INK)?;
+    Ok(canvas.finish())
+}
+
+/// The part of the page within left, top, right, bottom, pixels of the finished picture.
+fn shrunk<'a>(area: &Page<'a>, [left, top, right, bottom]: [u32; 4]) -> Page<'a> {
+    let [left, top, right, bottom] = [left, top, right, bottom].map(|v| v * OVERSAMPLING);
+    area.clone().shrink((left, top), (right - left, bottom - top))
+}
+
+/// Writes the names of the lines in their colours, in as many rows as they need; returns their height.
+fn legend(canvas: &mut Canvas, series: &[Series], left: u32, top: u32, width: u32) -> Result<u32, PlotError> {
+    let (mut x, mut y) = (left, top);
+    for (one, colour) in series.iter().zip(COLOURS.iter().cycle()) {
+        let text = LEGEND.width_px(&one.name)?;
+        if x > left && x + SWATCH + 5 + text > left + width {
+            (x, y) = (left, y + LEGEND.line_px());
+        }
+        let middle = y + LEGEND.line_px() / 2 - 1;
+        let swatch = Area { x, y: middle, width: SWATCH, height: 3 };
+        canvas.fill(swatch, *colour);
+        canvas.text(&one.name, x + SWATCH + 5, y, LEGEND, FAINT_INK)?;
+        x += SWATCH + 5 + text + LEGEND_GAP;
+    }
+    Ok(if series.is_empty() { 0 } else { y - top + LEGEND.line_px() })
+}
+
+/// Draws axes and lines.
+fn plot(area: &Page, panel: &Panel) -> Result<(), PlotError> {
+    let lines: Vec<Vec<Vec<(f64, f64)>>> = panel.series.iter().map(|s| pieces(&s.points, panel.log_y)).collect();
+    let all = || lines.iter().flatten().flatten();
+    let (Some(x), Some(y)) = (range(all().map(|p| p.0), 0.0), range(all().map(|p| p.1), 0.06)) else {
+        return empty(area);
+    };
+    let (x_ticks, y_ticks) =
+        (linear_ticks(&x, 6), if panel.log_y { logarithmic_ticks(&y) } else { linear_ticks(&y, 6) });
+    let scale = |px: u32| px * OVERSAMPLING;
+    let mut chart = ChartBuilder::on(area)
+        .margin_right(scale(14))
+        .margin_top(scale(8))
+        .x_label_area_size(scale(X_LABELS))
+        .y_label_area_size(scale(Y_LABELS))
+        .build_cartesian_2d(Axis { range: x, ticks: x_ticks }, Axis { range: y, ticks: y_ticks })
+        .map_err(drawing)?;
+    chart
+        .configure_mesh()
+        .x_desc(&panel.x_label)
+        .y_desc(&panel.y_label)
+        .axis_style(FAINT_INK.stroke_width(OVERSAMPLING))
+        .bold_line_style(RGBColor(226, 228, 232).stroke_width(OVERSAMPLING))
+        .light_line_style(PAPER)
+        .label_style(LABEL.style(FAINT_INK)?)
+        .axis_desc_style(LABEL.style(INK)?)
+        .draw()
+        .map_err(drawing)?;
+    for (pieces, colour) in lines.iter().zip(COLOURS.iter().cycle()) {
+        let dots = pieces.iter().map(Vec::len).sum::<usize>() <= FEW_POINTS;
+        for piece in pieces {
+            let line = PathElement::new(piece.clone(), colour.stroke_width(2 * OVERSAMPLING));
+            chart.draw_series(std::iter::once(line)).map_err(drawing)?;
+            if dots || piece.len() == 1 {
+                let dot = |p: &(f64, f64)| Circle::new(*p, 3 * OVERSAMPLING, colour.filled());
+                chart.draw_series(piece.iter().map(dot)).map_err(drawing)?;
+            }
+        }
+    }
+    Ok(())
+}
+
+fn empty(area: &Page) -> Result<(), PlotError> {
+    let (width, height) = area.dim_in_pixel();
+    let frame = Rectangle::new([(0, 0), (width as i32 - 1, height as i32 - 1)], RGBColor(226, 228, 232));
+    area.draw(&frame).map_err(drawing)?;
+    let text = "nothing recorded yet";
+    let left = (width as i32 - (LABEL.width_px(text)? * OVERSAMPLING) as i32) / 2;
+    area.draw_text(text, &LABEL.style(FAINT_INK)?, (left, height as i32 / 2)).map_err(drawing)
+}
+
+/// An axis with its numbers: where each stands, and how it is written.
+struct Axis {
+    range: Range<f64>,
+    ticks: Vec<(f64, String)>,
+}
+
+impl Ranged for Axis {
+    type FormatOption = NoDefaultFormatting;
+    type ValueType = f64;
+
+    fn map(&self, value: &f64, (first, last): (i32, i32)) -> i32 {
+        let share = (value - self.range.start) / (self.range.end - self.range.start);
+        first + (share * f64::from(last - first)).round() as i32
+    }
+
+    fn key_points<Hint: KeyPointHint>(&self, _: Hint) -> Vec<f64> {
+        self.ticks.iter().map(|t| t.0).collect()
+    }
+
+    fn range(&self) -> Range<f64> {
+        self.range.clone()
+    }
+}
+
+impl ValueFormatter<f64> for Axis {
+    fn format(value: &f64) -> String {
+        value.to_string()
+    }
+
+    fn format_ext(&self, value: &f64) -> String {
+        self.ticks.iter().find(|(v, _)| v == value).map(|(_, text)| text.clone()).unwrap_or_default()
+    }
+}
+
+/// The pieces of a line between points that cannot be shown; y as it is drawn, for a logarithmic axis its logarithm.
+fn pieces(points: &[(f64, f64)], log_y: bool) -> Vec<Vec<(f64, f64)>> {
+    let shown = |v: f64| v.is_finite() && v.abs() < LARGEST;
+    let points: Vec<(f64, f64)> = points.iter().map(|&(x, y)| (x, if log_y { y.log10() } else { y })).collect();
+    points.split(|&(x, y)| !(shown(x) && shown(y))).filter(|piece| !piece.is_empty()).map(<[_]>::to_vec).collect()
+}
+
+/// From the least to the largest value, with a share of that added at both ends; `None` for no values.
+fn range(values: impl Iterator<Item = f64>, padding: f64) -> Option<Range<f64>> {
+    let (low, high) = values.fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), v| (l.min(v), h.max(v)));
+    if low > high {
+        return None;
+    }
+    // A single value still needs an axis around it.
+    if high - low <= low.abs().max(high.abs()) * 1e-9 {
+        let around = (low.abs() * 0.1).max(0.5);
+        return Some(low - around..high + around);
+    }
+    let pad = (high - low) * padding;
+    Some(low - pad..high + pad)
+}
+
+/// Round numbers within a range, about `count`, and how they are written.
+fn linear_ticks(range: &Range<f64>, count: u32) -> Vec<(f64, String)> {
+    let rough = (range.end - range.start) / f64::from(count);
+    let power = 10_f64.powf(rough.log10().floor());
+    let step = [1.0, 2.0, 5.0, 10.0].map(|f| f * power).into_iter().find(|s| *s >= rough * 0.999).unwrap_or(rough);
+    let first = (range.start / step).ceil();
+    (0..=2 * count)
+        .map(|i| (first + f64::from(i)) * step)
+        .take_while(|v| *v <= range.end)
+        .map(|v| (v, written(v, step)))
+        .collect()
+}
+
+/// Round numbers for a range of decimal logarithms: as logarithm, and how the number is written.
+fn logarithmic_ticks(range: &Range<f64>) -> Vec<(f64, String)> {
+    let decades = range.end - range.start;
+    if decades < 1.2 {
+        let linear = linear_ticks(&(10_f64.powf(range.start)..10_f64.powf(range.end)), 6);
+        return linear.into_iter().filter(|(v, _)| *v > 0.0).map(|(v, text)| (v.log10(), text)).collect();
+    }
+    let factors: &[f64] = if decades < 3.0 { &[1.0, 2.0, 5.0] } else { &[1.0] };
+    let stride = (decades / 8.0).ceil().max(1.0);
+    let first = (range.start / stride).floor();
+    (0..12)
+        .map(|i| (first + f64::from(i)) * stride)
+        .flat_map(|exponent| factors.iter().map(move |f| (f, exponent)))
+        .map(|(f, exponent)| {
+            let unit = 10_f64.powf(exponent);
+            (f.log10() + exponent, written(f * unit, unit))
+        })
+        .filter(|(v, _)| (range.start..=range.end).contains(v))
+        .collect()
+}
+
+/// A number, exact to the digit of `unit`.
+fn written(value: f64, unit: f64) -> String {
+    let place = |v: f64| (v.abs().log10() + 1e-9).floor();
+    if value != 0.0 && !(1e-4..1e6).contains(&value.abs()) {
+        let digits = (place(value) - place(unit)).clamp(0.0, 9.0) as usize;
+        return format!("{value:.digits$e}");
+    }
+    let decimals = (-place(unit)).clamp(0.0, 9.0) as usize;
+    // No minus before a zero.
+    format!("{:.decimals$}", value + 0.0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn panel(points: Vec<(f64, f64)>, log_y: bool) -> Panel {
+        Panel {
+            title: "Loss".into(),
+            x_label: "epoch".into(),
+            y_label: "loss".into(),
+            log_y,
+            series: vec![Series { name: "all".into(), points }],
+        }
+    }
+
+    fn coloured(image: &Image, colour: RGBColor) -> Vec<(u32, u32)> {
+        let wanted = Some([colour.0, colour.1, colour.2]);
+        (0..image.height_px)
+            .flat_map(|y| (0..image.width_px).map(move |x| (x, y)))
+            .filter(|&(x, y)| image.pixel(x, y) == wanted)
+            .collect()
+    }
+
+    /// The file is a readable PNG, one column of panels wide for one panel, two for up to four, three for more.
+    #[test]
+    fn size_follows_the_number_of_panels() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("curves.png");
+        for (count, columns, rows) in [(0, 1, 0), (1, 1, 1), (2, 2, 1), (4, 2, 2), (9, 3, 3)] {
+            curves(&path, "Training", &vec![panel(vec![(0.0, 1.0), (1.0, 2.0)], false); count]).unwrap();
+            let image = Image::load_png(&path).unwrap();
+            assert_eq!(image.width_px, columns * PANEL_WIDTH + 2 * MARGIN);
+            assert_eq!(image.height_px, rows * PANEL_HEIGHT + 3 * MARGIN + TITLE.line_px());
+        }
+        let too_many = vec![panel(Vec::new(), false); 3 * 30];
+        assert!(matches!(curves(&path, "", &too_many), Err(PlotError::TooLarge { .. })));
+    }
+
+    /// No points, one point, points that are no numbers, not positive on a logarithmic axis, equal, or huge: all make
+    /// a picture.
+    #[test]
+    fn odd_points_are_drawn_or_left_out() {
+        let odd = [
+            vec![],
+            vec![(1.0, 2.0)],
+            vec![(f64::NAN, 1.0), (1.0, f64::NAN), (f64::INFINITY, f64::NEG_INFINITY)],
+            vec![(1.0, -1.0), (2.0, 0.0)],
+            vec![(3.0, 7.0); 5],
+            vec![(0.0, 0.0), (0.0, 0.0)],
+            vec![(-1e99, -1e99), (1e99, 1e99), (f64::MAX, f64::MIN)],
+            vec![(1e15, 1e-300), (1e15 + 1.0, 1e-299)],
+            vec![(0.0, 1.0), (1.0, 1.0 + 1e-15)],
+        ];
+        for points in odd {
+            for log_y in [false, true] {
+                assert!(draw("Odd", &[panel(points.clone(), log_y)]).is_ok(), "{points:?} {log_y}");
+            }
+        }
+        assert!(draw("", &[Panel::default()]).is_ok());
+        assert_eq!(pieces(&[(0.0, 1.0), (1.0, f64::NAN), (2.0, 3.0), (3.0, 4.0)], false).len(), 2);
+    }
+
+    /// A rising line is drawn rising: its points are where its values say, left to right and low to high.
+    #[test]
+    fn a_rising_line_rises() {
+        let image = draw("", &[panel((0..100).map(|i| (f64::from(i), f64::from(i))).collect(), false)]).unwrap();
+        // Below the legend, which is in the same colour.
+        let line: Vec<_> = coloured(&image, COLOURS[0]).into_iter().filter(|&(_, y)| y > 130).collect();
+        let (left, right) = (line.iter().min().unwrap(), line.iter().max().unwrap());
+        assert!(right.0 - left.0 > PANEL_WIDTH / 2 && left.1 - right.1 > PANEL_HEIGHT / 2, "{left:?} {right:?}");
+        let (a, b) = (f64::from(left.0), f64::from(left.1));
+        let slope = (b - f64::from(right.1)) / (f64::from(right.0) - a);
+        for &(x, y) in &line {
+            assert!((b - (f64::from(x) - a) * slope - f64::from(y)).abs() < 4.0, "({x}, {y}) is off the line");
+        }
+    }
+
+    /// Ticks lie in the range, in order, at least two of them, and their texts differ.
+    #[test]
+    fn ticks_are_round_and_differ() {
+        for (low, high) in [(0.0, 100.0), (-3.2, 17.9), (0.991, 0.9987), (1e-5, 3e-5), (12.0, 4e6), (27.3, 27.9)] {
+            let linear = linear_ticks(&(low..high), 6);
+            let mut all = vec![(linear, low..high)];
+            if low > 0.0 {
+                let logarithms = f64::log10(low)..f64::log10(high);
+                all.push((logarithmic_ticks(&logarithms), logarithms));
+            }
+            for (ticks, range) in all {
+                assert!((2..=14).contains(&ticks.len()), "{range:?}: {ticks:?}");
+                assert!(ticks.iter().all(|(v, _)| (range.start..=range.end).contains(v)), "{range:?}: {ticks:?}");
+                assert!(ticks.windows(2).all(|w| w[0].0 < w[1].0 && w[0].1 != w[1].1), "{range:?}: {ticks:?}");
+            }
+        }
+        assert_eq!(
+            linear_ticks(&(0.0..1.0), 5).iter().map(|t| t.1.as_str()).collect::<Vec<_>>(),
+            ["0.0", "0.2", "0.4", "0.6", "0.8", "1.0"]
+        );
+    }
+}

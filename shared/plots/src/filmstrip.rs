@@ -1,0 +1,288 @@
+//! Rows of captioned pictures, one row a drive.
+
+use crate::canvas::{Area, Canvas, FAINT_INK, Font, INK};
+use crate::{MAX_SIDE_PX, PlotError};
+use carff_dataset::Image;
+use plotters::style::RGBColor;
+use std::path::Path;
+
+/// One row: what it is about, and its pictures from left to right.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct StripRow {
+    /// Left of the pictures; the first line stands out.
+    pub caption: Vec<String>,
+    /// The pictures.
+    pub cells: Vec<StripCell>,
+}
+
+/// One picture with what is said below it.
+#[derive(Clone, Debug, PartialEq)]
+pub struct StripCell {
+    /// The picture; a small one is shown twice as large.
+    pub image: Image,
+    /// Below it; the first line stands out.
+    pub caption: Vec<String>,
+    /// Colour of a frame around it, RGB.
+    pub emphasis: Option<[u8; 3]>,
+}
+
+const MARGIN: u32 = 28;
+const TITLE: Font = Font::bold(26.0);
+const SUBTITLE: Font = Font::regular(14.0);
+const CAPTION_HEAD: Font = Font::bold(14.0);
+const CAPTION: Font = Font::regular(13.0);
+/// Width of the text left of the pictures.
+const CAPTION_WIDTH: u32 = 190;
+/// Pictures with no side as long as this are shown twice as large.
+const SMALL_SIDE: u32 = 160;
+/// Space between pictures, and between a picture and its frame's outer edge.
+const GAP: u32 = 18;
+const FRAME: u32 = 4;
+/// Between a picture and its caption.
+const CAPTION_GAP: u32 = 9;
+/// Above and below the line between rows.
+const ROW_GAP: u32 = 18;
+const RULE: RGBColor = RGBColor(224, 226, 230);
+
+/// Draws a filmstrip into a PNG file.
+pub fn filmstrip(path: &Path, title: &str, subtitle: &str, rows: &[StripRow]) -> Result<(), PlotError> {
+    Ok(draw(title, subtitle, rows)?.save_png(path)?)
+}
+
+fn draw(title: &str, subtitle: &str, rows: &[StripRow]) -> Result<Image, PlotError> {
+    check(rows)?;
+    let layout = Layout::new(title, subtitle, rows)?;
+    let mut canvas = Canvas::new(layout.width, layout.height)?;
+    for (area, colour) in &layout.fills {
+        canvas.fill(*area, *colour);
+    }
+    for line in &layout.lines {
+        canvas.text(&line.text, line.area.x, line.area.y, line.font, line.colour)?;
+    }
+    let mut sheet = canvas.finish();
+    for tile in &layout.tiles {
+        let image = &rows[tile.row].cells[tile.cell].image;
+        sheet.paste(&enlarged(image, scale(image)), tile.area.x, tile.area.y);
+    }
+    Ok(sheet)
+}
+
+fn check(rows: &[StripRow]) -> Result<(), PlotError> {
+    for (row, strip_row) in rows.iter().enumerate() {
+        for (cell, Image { width_px, height_px, rgb }) in strip_row.cells.iter().map(|c| &c.image).enumerate() {
+            let (width_px, height_px) = (*width_px, *height_px);
+            if width_px.max(height_px) > MAX_SIDE_PX {
+                return Err(PlotError::TooLarge { width_px, height_px });
+            }
+            if u64::from(width_px) * u64::from(height_px) * 3 != rgb.len() as u64 || rgb.is_empty() {
+                return Err(PlotError::Image { row, cell, bytes: rgb.len(), width_px, height_px });
+            }
+        }
+    }
+    Ok(())
+}
+
+fn scale(image: &Image) -> u32 {
+    if image.width_px.max(image.height_px) < SMALL_SIDE { 2 } else { 1 }
+}
+
+/// Each pixel as a square of `factor` pixels: nothing is shown that was not there.
+fn enlarged(image: &Image, factor: u32) -> Image {
+    let factor = factor as usize;
+    let mut rgb = Vec::with_capacity(image.rgb.len() * factor * factor);
+    for row in image.rgb.chunks_exact(image.width_px as usize * 3) {
+        let wide: Vec<u8> = row.chunks_exact(3).flat_map(|pixel| pixel.repeat(factor)).collect();
+        for _ in 0..factor {
+            rgb.extend_from_slice(&wide);
+        }
+    }
+    Image { width_px: image.width_px * factor as u32, height_px: image.height_px * factor as u32, rgb }
+}
+
+/// One line of text in its place.
+struct Line {
+    text: String,
+    area: Area,
+    font: Font,
+    colour: RGBColor,
+}
+
+/// One picture in its place.
+struct Tile {
+    row: usize,
+    cell: usize,
+    area: Area,
+}
+
+/// Where everything goes.
+struct Layout {
+    width: u32,
+    height: u32,
+    lines: Vec<Line>,
+    tiles: Vec<Tile>,
+    fills: Vec<(Area, RGBColor)>,
+}
+
+impl Layout {
+    fn new(title: &str, subtitle: &str, rows: &[StripRow]) -> Result<Self, PlotError> {
+        let cells = || rows.iter().flat_map(|r| &r.cells);
+        // All columns are as wide as the widest picture, so that rows can be compared.
+        let tile_width = cells().map(|c| c.image.width_px * scale(&c.image)).max().unwrap_or(0).max(SMALL_SIDE);
+        let columns = rows.iter().map(|r| r.cells.len()).max().unwrap_or(0) as u32;
+        let text_width = CAPTION_WIDTH + columns * (GAP + tile_width);
+        let mut layout = Self {
+            width: text_width + 2 * MARGIN,
+            height: MARGIN,
+            lines: Vec::new(),
+            tiles: Vec::new(),
+            fills: Vec::new(),
+        };
+        let heading = |text: &str, font, colour| [(text.to_owned(), font, colour)];
+        layout.height += layout.paragraph(&heading(title, TITLE, INK), MARGIN, layout.height, text_width)?;
+        layout.height +=
+            layout.paragraph(&heading(subtitle, SUBTITLE, FAINT_INK), MARGIN, layout.height, text_width)?;
+        for (index, row) in rows.iter().enumerate() {
+            let rule = Area { x: MARGIN, y: layout.height + ROW_GAP, width: text_width, height: 1 };
+            layout.fills.push((rule, RULE));
+            layout.height += 2 * ROW_GAP + 1;
+            layout.height += layout.row(index, row, tile_width)?;
+        }
+        layout.height += MARGIN;
+        Ok(layout)
+    }
+
+    /// Places a row below what is there; returns its height.
+    fn row(&mut self, index: usize, row: &StripRow, tile_width: u32) -> Result<u32, PlotError> {
+        let top = self.height;
+        let mut height = self.paragraph(&captioned(&row.caption), MARGIN, top, CAPTION_WIDTH)?;
+        for (at, cell) in row.cells.iter().enumerate() {
+            let x = MARGIN + CAPTION_WIDTH + GAP + at as u32 * (tile_width + GAP);
+            let factor = scale(&cell.image);
+            let area = Area { x, y: top, width: cell.image.width_px * factor, height: cell.image.height_px * factor };
+            if let Some([r, g, b]) = cell.emphasis {
+                let frame = Area {
+                    x: area.x - FRAME,
+                    y: area.y - FRAME,
+                    width: area.width + 2 * FRAME,
+                    height: area.height + 2 * FRAME,
+                };
+                self.fills.push((frame, RGBColor(r, g, b)));
+            }
+            self.tiles.push(Tile { row: index, cell: at, area });
+            let below = area.height + CAPTION_GAP;
+            let caption = self.paragraph(&captioned(&cell.caption), x, top + below, tile_width)?;
+            height = height.max(below + caption);
+        }
+        Ok(height)
+    }
+
+    /// Places lines, broken to a width, under each other; returns their height.
+    fn paragraph(&mut self, lines: &[(String, Font, RGBColor)], x: u32, y: u32, width: u32) -> Result<u32, PlotError> {
+        let mut height = 0;
+        for (text, font, colour) in lines {
+            for text in font.wrapped(text, width)? {
+                let area = Area { x, y: y + height, width: font.width_px(&text)?, height: font.line_px() };
+                self.lines.push(Line { text, area, font: *font, colour: *colour });
+                height += area.height;
+            }
+        }
+        Ok(height)
+    }
+}
+
+/// The first line of a caption stands out.
+fn captioned(lines: &[String]) -> Vec<(String, Font, RGBColor)> {
+    let styles = std::iter::once((CAPTION_HEAD, INK)).chain(std::iter::repeat((CAPTION, FAINT_INK)));
+    lines.iter().zip(styles).map(|(text, (font, colour))| (text.clone(), font, colour)).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn cell(width_px: u32, height_px: u32, caption: &str) -> StripCell {
+        let rgb = (0..width_px * height_px * 3).map(|i| (i * 7 % 251) as u8).collect();
+        StripCell {
+            image: Image { width_px, height_px, rgb },
+            caption: vec![caption.into(), "second line".into()],
+            emphasis: Some([200, 40, 30]),
+        }
+    }
+
+    fn odd_rows() -> Vec<StripRow> {
+        let long = "a caption that is much longer than the picture above it is wide, and so must be broken often";
+        vec![
+            StripRow { caption: vec![long.repeat(12)], cells: vec![cell(8, 200, long), cell(128, 128, long)] },
+            StripRow { caption: Vec::new(), cells: vec![cell(300, 20, "short")] },
+            StripRow { caption: vec!["no pictures".into()], cells: Vec::new() },
+            StripRow { caption: vec!["x".into()], cells: vec![cell(128, 128, ""), cell(1, 1, long), cell(9, 9, "W")] },
+        ]
+    }
+
+    fn apart(a: Area, b: Area) -> bool {
+        a.x + a.width <= b.x || b.x + b.width <= a.x || a.y + a.height <= b.y || b.y + b.height <= a.y
+    }
+
+    /// Whatever sizes and captions are given, no text lies over a picture, its frame or other text, no picture over
+    /// another, and all lie within the page.
+    #[test]
+    fn nothing_overlaps() {
+        let layout = Layout::new("Title", &"a long subtitle ".repeat(30), &odd_rows()).unwrap();
+        let texts = layout.lines.iter().map(|l| l.area);
+        let tiles = layout.tiles.iter().map(|t| t.area);
+        let all: Vec<Area> = texts.chain(tiles).collect();
+        assert!(layout.tiles.len() == 6 && layout.lines.len() > 20);
+        for (i, a) in all.iter().enumerate() {
+            assert!(a.x + a.width <= layout.width && a.y + a.height <= layout.height, "{a:?}");
+            for b in &all[i + 1..] {
+                assert!(apart(*a, *b), "{a:?} and {b:?}");
+            }
+        }
+        for (fill, _) in &layout.fills {
+            assert!(layout.lines.iter().all(|l| apart(*fill, l.area)), "{fill:?}");
+        }
+    }
+
+    /// The file is a PNG of the laid-out size in which every picture stands unchanged: small ones with each pixel
+    /// twice, large ones as they are, each within its frame.
+    #[test]
+    fn pictures_are_shown_unchanged() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("strip.png");
+        let rows = odd_rows();
+        filmstrip(&path, "Title", "subtitle", &rows).unwrap();
+        let sheet = Image::load_png(&path).unwrap();
+        let layout = Layout::new("Title", "subtitle", &rows).unwrap();
+        assert_eq!((sheet.width_px, sheet.height_px), (layout.width, layout.height));
+        for tile in &layout.tiles {
+            let image = &rows[tile.row].cells[tile.cell].image;
+            let factor = if image.width_px.max(image.height_px) < 160 { 2 } else { 1 };
+            assert_eq!((tile.area.width, tile.area.height), (image.width_px * factor, image.height_px * factor));
+            for y in 0..tile.area.height {
+                for x in 0..tile.area.width {
+                    let shown = sheet.pixel(tile.area.x + x, tile.area.y + y);
+                    assert_eq!(shown, image.pixel(x / factor, y / factor), "{x} {y}");
+                }
+            }
+            assert_eq!(sheet.pixel(tile.area.x - 1, tile.area.y - 1), Some([200, 40, 30]));
+        }
+    }
+
+    /// No rows at all is a page with its title; a picture whose bytes do not fit its size is named; too many rows are
+    /// refused before anything is drawn.
+    #[test]
+    fn odd_input() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("strip.png");
+        filmstrip(&path, "Nothing", "", &[]).unwrap();
+        assert!(Image::load_png(&path).is_ok());
+        let mut rows = odd_rows();
+        rows[3].cells[1].image.rgb.pop();
+        let message = filmstrip(&path, "", "", &rows).unwrap_err().to_string();
+        assert!(message.contains("row 3, image 1: 2 bytes do not make a picture of 1x1"), "{message}");
+        let many: Vec<StripRow> = (0..200).flat_map(|_| odd_rows()).collect();
+        assert!(matches!(filmstrip(&path, "", "", &many), Err(PlotError::TooLarge { .. })));
+        let nowhere = dir.path().join("missing").join("strip.png");
+        assert!(filmstrip(&nowhere, "", "", &[]).unwrap_err().to_string().contains("missing"));
+    }
+}
