@@ -23,6 +23,7 @@ mod train;
 pub use config::{FieldConfig, FieldError, LATENT_DIM, RenderOptions, TrainerConfig};
 pub use dispatch::InstructionSet;
 pub use field::{Field, NamedTensor};
+pub use march::{RayLimits, RaySamples};
 pub use render::RenderBuffer;
 pub use sampler::{RAYS_PER_GROUP, RaySampler, TrainingView, changed_pixels};
 pub use space::{Contraction, OccupancyGrid};

@@ -2,7 +2,7 @@
 
 use carff_geometry::Ray;
 
-use crate::config::FieldConfig;
+use crate::config::{FieldConfig, LATENT_DIM};
 use crate::field::{Field, Folded, Scratch, grow, raw_row};
 use crate::kernels::{LANES, activate_density, stride};
 use crate::math::exp;
@@ -10,6 +10,8 @@ use crate::space::{Contraction, OccupancyGrid};
 
 /// Samples of a ray that are evaluated before its transmittance is looked at again.
 const WAVE: usize = 8;
+/// Rays that are worked on together where their samples are listed.
+const CHUNK: usize = 64;
 /// Marks a lane that fills up a block.
 pub(crate) const NO_RAY: u32 = u32::MAX;
 
@@ -23,13 +25,32 @@ pub(crate) struct Marcher {
     far: f32,
 }
 
-/// What ends a ray.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct RayLimits {
+/// What ends a ray, and how finely it is sampled.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct RayLimits {
+    /// A ray ends after so many samples, at least 1.
     pub max_samples: usize,
+    /// A ray ends when less than this share of light passes.
     pub min_transmittance: f32,
+    /// Multiplies the steps, above zero.
     pub step_scale: f32,
+    /// Leave out cells in which there is no matter in any state.
     pub use_occupancy: bool,
+}
+
+/// Samples along rays, sorted by ray and along each ray. All lists but the last have one entry for each sample.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct RaySamples {
+    /// The sample's ray.
+    pub ray: Vec<u32>,
+    /// Its distance from the ray's origin, metres.
+    pub distance_m: Vec<f32>,
+    /// The length of ray that it stands for, metres.
+    pub length_m: Vec<f32>,
+    /// Share of the ray's light that comes from it, 0..=1.
+    pub weight: Vec<f32>,
+    /// For each ray, the share of light that passes all of its samples, 0..=1.
+    pub transmittance: Vec<f32>,
 }
 
 impl Marcher {
@@ -207,6 +228,33 @@ impl Samples {
                 state.alive &= state.transmittance >= limits.min_transmittance;
                 any_alive |= state.alive;
             }
+        }
+    }
+}
+
+impl Field {
+    /// The samples that rendering (or training without jitter) takes along rays under one latent: where they lie and
+    /// what they weigh. For measurements and parity tests; rendering itself keeps no such lists.
+    pub fn samples_along(&self, rays: &[Ray], latent: &[f32; LATENT_DIM], limits: &RayLimits, out: &mut RaySamples) {
+        let limits = RayLimits { max_samples: limits.max_samples.max(1), ..*limits };
+        let (mut samples, mut scratch, mut folded) = (Samples::default(), Scratch::default(), Folded::default());
+        for list in [&mut out.distance_m, &mut out.length_m, &mut out.weight, &mut out.transmittance] {
+            list.clear();
+        }
+        out.ray.clear();
+        self.fold(latent, &mut folded);
+        for (c, chunk) in rays.chunks(CHUNK).enumerate() {
+            samples.march(self, &folded, chunk, &limits, &mut scratch, |_| 0.5);
+            // Waves go round all rays: sorted by ray, each one's samples keep their order.
+            let mut order: Vec<usize> = (0..samples.ray.len()).filter(|i| samples.ray[*i] != NO_RAY).collect();
+            order.sort_by_key(|i| samples.ray[*i]);
+            for i in order {
+                out.ray.push((c * CHUNK) as u32 + samples.ray[i]);
+                out.distance_m.push(samples.distance_m[i]);
+                out.length_m.push(samples.length_m[i]);
+                out.weight.push(samples.weight[i]);
+            }
+            out.transmittance.extend(samples.rays.iter().map(|r| r.transmittance));
         }
     }
 }

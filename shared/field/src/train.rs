@@ -265,7 +265,8 @@ impl FieldTrainer {
         report
     }
 
-    fn limits(&self) -> RayLimits {
+    /// How the rays of the current step are sampled.
+    pub fn limits(&self) -> RayLimits {
         let warm = self.step >= self.config.occupancy_warmup_steps && !self.state_latents.is_empty();
         RayLimits {
             max_samples: self.config.max_samples_per_ray,
@@ -273,6 +274,27 @@ impl FieldTrainer {
             step_scale: self.step_scale,
             use_occupancy: warm,
         }
+    }
+
+    /// Loss and gradients of a batch, with no step taken. The gradients' names and shapes are those of
+    /// [`Field::tensors`], the occupancy left out.
+    pub fn gradients(&mut self, batch: &RayBatch) -> (StepReport, Vec<NamedTensor<'static>>) {
+        let report = self.accumulate(batch);
+        let mut table = vec![0.0_f32; self.field.table.len()];
+        let mut networks = vec![0.0_f32; self.field.networks.len()];
+        for shard in &mut self.shards {
+            for (sums, parts) in [(&mut table, &mut shard.table_gradient), (&mut networks, &mut shard.network_gradient)]
+            {
+                for (sum, part) in sums.iter_mut().zip(parts) {
+                    *sum += std::mem::take(part);
+                }
+            }
+        }
+        let f = self.field.config.features_per_level;
+        let shape = vec![table.len() / f, f];
+        let mut tensors = vec![NamedTensor { name: "grid.table".into(), shape, data: table.into() }];
+        tensors.extend(network_tensors(&self.field.layout, &networks, ""));
+        (report, tensors)
     }
 
     /// Forward and backward: fills the shards' gradients.
