@@ -1,12 +1,13 @@
 //! The planning tables of a run's report: each rule over its drives, and over every eligible view.
 
+use crate::filmstrip;
 use crate::monitor::FrameRecord;
 use crate::report::RunOutcome;
 use anyhow::Context;
-use carff_belief::{Plan, decision, look_ahead};
+use carff_belief::{Plan, Probe, Step, decision, look_ahead};
 use carff_config::{CheckpointPlanning, GraphConfig};
 use carff_dataset::{
-    Dataset, PoseRole, PoseSplit,
+    Dataset, PoseRole, PoseSplit, ScenarioInfo,
     drives::{DriveKind, EligibleInput, eligible_inputs},
     sensor::SensorNoise,
 };
@@ -26,91 +27,164 @@ const MOST_REPEATS: usize = 20;
 
 /// What planning made of a run.
 pub struct Planning {
+    setup: Setup,
+    decisive: Vec<(FrameRecord, DriveKind)>,
     tables: Map<String, Value>,
 }
 
 impl Planning {
-    /// What the report holds of it.
+    /// What the report holds of it: `planning` and `checkpoint_metrics`.
     pub fn tables(&self) -> Map<String, Value> {
         self.tables.clone()
     }
 
-    /// Pictures and hypotheses of some drives.
-    pub fn write_filmstrip(&self, _path: &Path) -> anyhow::Result<()> {
-        Ok(())
+    /// Draws some of the run's drives into a PNG file: what was seen, what came, and what was thought possible.
+    pub fn write_filmstrip(&self, path: &Path) -> anyhow::Result<()> {
+        filmstrip::write(path, &self.setup, &self.decisive)
     }
 }
 
 /// Computes the tables; none for a run without drives through a scenario.
 pub fn evaluate(outcome: &RunOutcome) -> anyhow::Result<Option<Planning>> {
-    let mut tables = Map::new();
     if outcome.records.frames.values().all(|f| f.drive < 0 || f.posterior.is_none()) {
         return Ok(None);
     }
     carff_models::allocator::keep_large_blocks();
-    let graph = GraphConfig::load(Path::new(&outcome.graph))?;
-    let dataset = Dataset::open(&outcome.dataset)?;
-    let timestamps = dataset.scenario().context("the data set has no scenario")?.timestamps;
-    let hazard_branches = dataset.scenario().map(|s| s.hazard_branches.clone()).unwrap_or_default();
-    let mut models = Models::load(&outcome.checkpoint)?;
-    let known = CheckpointPlanning::load(&outcome.checkpoint)?;
-    let threshold = graph.controller.threshold.unwrap_or(known.hazard_threshold);
-    let rules = [Rule::Underconfident, Rule::Overconfident, Rule::Paper, Rule::Calibrated { threshold }];
-    let sampling = match graph.run.sampling {
-        carff_config::Sampling::Stratified => Sampling::Stratified,
-        carff_config::Sampling::Independent => Sampling::Independent,
-    };
+    let setup = Setup::load(outcome)?;
+    let decisive = decisive_frames(outcome, setup.scenario.timestamps, &setup.scenario.hazard_branches);
+    let (drives, live) = drives_table(&setup, &decisive);
+    let mut planning = json!({ "drives": drives, "threshold": setup.threshold, "live": live });
+    let split = PoseSplit::for_dataset(&setup.dataset, setup.split_seed);
+    for (name, role) in [("all_views", PoseRole::Rest), ("unseen_views", PoseRole::Unseen)] {
+        let (table, views) = views_table(&setup, &split.views(role))?;
+        planning[name] = serde_json::to_value(table)?;
+        planning["views"][name] = views;
+    }
+    let mut tables = Map::new();
+    tables.insert("planning".into(), planning);
+    tables.insert("checkpoint_metrics".into(), setup.models.manifest.metrics.clone());
+    Ok(Some(Planning { setup, decisive, tables }))
+}
 
-    let decisive = decisive_frames(outcome, timestamps, &hazard_branches);
-    let mut drives = PlanningTable::new();
-    let (mut agreeing, mut compared) = (0, 0);
-    let live_rule = format!("{:?}", graph.controller.rule).to_lowercase();
-    for (frame, kind) in &decisive {
-        let Some(posterior) = frame.posterior else { continue };
-        let posterior = LatentGaussian { mean: posterior.mean, log_variance: posterior.log_variance };
-        for samples in SAMPLE_COUNTS {
-            let plan =
-                Plan { samples, sampling, horizon: graph.run.horizon, seed: outcome.seed, frame: frame.frame_id };
-            let steps = look_ahead(&models.mixture, &mut models.probe, &posterior, plan);
-            for rule in rules {
-                let mut halted = decision(rule, &steps).halt;
-                if rule.name() == live_rule && samples == graph.run.samples as usize {
-                    // What the graph did counts, not what it should have done.
-                    let live = frame.action != Some(ActionCode::Advance);
-                    compared += 1;
-                    agreeing += usize::from(live == halted);
-                    halted = live;
-                }
-                count(&mut drives, rule.name(), samples, *kind, halted == (*kind == DriveKind::Hazard));
-            }
+/// All that a run's decisions rested on.
+pub struct Setup {
+    /// Name of the run.
+    pub run: String,
+    /// The graph file.
+    pub graph: GraphConfig,
+    /// The data set.
+    pub dataset: Dataset,
+    /// Its scenario.
+    pub scenario: ScenarioInfo,
+    /// The trained models.
+    pub models: Models,
+    /// Threshold of the calibrated rule.
+    pub threshold: f64,
+    /// Seed of the split into trained and unseen poses.
+    split_seed: u64,
+    /// The run's seed.
+    seed: u64,
+}
+
+impl Setup {
+    fn load(outcome: &RunOutcome) -> anyhow::Result<Self> {
+        let graph = GraphConfig::load(Path::new(&outcome.graph))?;
+        let dataset = Dataset::open(&outcome.dataset)?;
+        let scenario = dataset.scenario().context("the data set has no scenario")?.clone();
+        let known = CheckpointPlanning::load(&outcome.checkpoint)?;
+        Ok(Self {
+            run: outcome.run.clone(),
+            dataset,
+            scenario,
+            models: Models::load(&outcome.checkpoint)?,
+            threshold: graph.controller.threshold.unwrap_or(known.hazard_threshold),
+            split_seed: graph.camera.split_seed.unwrap_or(known.split_seed),
+            seed: outcome.seed,
+            graph,
+        })
+    }
+
+    fn sampling(&self) -> Sampling {
+        match self.graph.run.sampling {
+            carff_config::Sampling::Stratified => Sampling::Stratified,
+            carff_config::Sampling::Independent => Sampling::Independent,
         }
     }
 
-    let split = PoseSplit::for_dataset(&dataset, graph.camera.split_seed.unwrap_or(known.split_seed));
-    let noise = SensorNoise {
-        sigma: graph.camera.noise.sigma,
-        gain_sigma: graph.camera.noise.gain_sigma,
-        channel_gain_sigma: graph.camera.noise.channel_gain_sigma,
-        channel_offset_sigma: graph.camera.noise.channel_offset_sigma,
-    };
-    let mut planning = json!({
-        "drives": drives,
-        "threshold": threshold,
-        "live": { "rule": live_rule, "samples": graph.run.samples, "compared": compared, "agrees_with_library": agreeing },
-    });
-    for (name, role) in [("all_views", PoseRole::Rest), ("unseen_views", PoseRole::Unseen)] {
-        let inputs = eligible_inputs(&dataset, &split.views(role))?;
-        let of = |kind| inputs.iter().filter(|i: &&EligibleInput| i.kind == kind).count();
-        let (hazards, clears) = (of(DriveKind::Hazard), of(DriveKind::Clear));
-        let repeats = TRIALS.div_ceil(hazards.min(clears).max(1)).min(MOST_REPEATS);
-        let trials = trials(&models.encoder, &dataset, &inputs, repeats, &noise, outcome.seed)?;
-        let (table, _) = planning_table(&models.mixture, &models.probe, &trials, &rules, sampling, graph.run.horizon);
-        planning[name] = serde_json::to_value(table)?;
-        planning["views"][name] = json!({"hazard": hazards, "clear": clears, "repeats": repeats});
+    fn rules(&self) -> [Rule; 4] {
+        let calibrated = Rule::Calibrated { threshold: self.threshold };
+        [Rule::Underconfident, Rule::Overconfident, Rule::Paper, calibrated]
     }
-    tables.insert("planning".into(), planning);
-    tables.insert("checkpoint_metrics".into(), models.manifest.metrics.clone());
-    Ok(Some(Planning { tables }))
+
+    /// Name of the rule that the controller had.
+    pub fn live_rule(&self) -> String {
+        format!("{:?}", self.graph.controller.rule).to_lowercase()
+    }
+
+    /// Looks ahead from what the encoder saw in a frame, with the random numbers of the run: with its number of samples
+    /// these are the run's own. `None` when no posterior was recorded.
+    pub fn look_ahead(&self, probe: &mut Probe, frame: &FrameRecord, samples: usize) -> Option<Vec<Step>> {
+        let posterior = frame.posterior?;
+        let posterior = LatentGaussian { mean: posterior.mean, log_variance: posterior.log_variance };
+        let horizon = self.graph.run.horizon;
+        let plan = Plan { samples, sampling: self.sampling(), horizon, seed: self.seed, frame: frame.frame_id };
+        Some(look_ahead(&self.models.mixture, probe, &posterior, plan))
+    }
+}
+
+/// Every rule over the drives of the run; and how often what the graph did is what the library says.
+fn drives_table(setup: &Setup, decisive: &[(FrameRecord, DriveKind)]) -> (PlanningTable, Value) {
+    let mut probe = setup.models.probe.clone();
+    let mut table = PlanningTable::new();
+    let (live_rule, live_samples) = (setup.live_rule(), setup.graph.run.samples as usize);
+    let (mut agreeing, mut compared) = (0, 0);
+    for (frame, kind) in decisive {
+        for samples in SAMPLE_COUNTS {
+            let Some(steps) = setup.look_ahead(&mut probe, frame, samples) else { continue };
+            for rule in setup.rules() {
+                let mut halted = decision(rule, &steps).halt;
+                if rule.name() == live_rule && samples == live_samples {
+                    // What the graph did counts, not what it should have done.
+                    compared += 1;
+                    agreeing += usize::from(halts(frame) == halted);
+                    halted = halts(frame);
+                }
+                count(&mut table, rule.name(), samples, *kind, halted == (*kind == DriveKind::Hazard));
+            }
+        }
+    }
+    let live = json!({
+        "rule": live_rule,
+        "samples": live_samples,
+        "compared": compared,
+        "agrees_with_library": agreeing,
+    });
+    (table, live)
+}
+
+/// Whether the graph halted at a frame: with anything but an advance it did.
+pub fn halts(frame: &FrameRecord) -> bool {
+    frame.action != Some(ActionCode::Advance)
+}
+
+/// Every rule over all eligible pictures of some poses; and how many those were.
+fn views_table(setup: &Setup, views: &[usize]) -> anyhow::Result<(PlanningTable, Value)> {
+    let of_camera = &setup.graph.camera.noise;
+    let noise = SensorNoise {
+        sigma: of_camera.sigma,
+        gain_sigma: of_camera.gain_sigma,
+        channel_gain_sigma: of_camera.channel_gain_sigma,
+        channel_offset_sigma: of_camera.channel_offset_sigma,
+    };
+    let inputs = eligible_inputs(&setup.dataset, views)?;
+    let of = |kind| inputs.iter().filter(|i: &&EligibleInput| i.kind == kind).count();
+    let (hazards, clears) = (of(DriveKind::Hazard), of(DriveKind::Clear));
+    let repeats = TRIALS.div_ceil(hazards.min(clears).max(1)).min(MOST_REPEATS);
+    let models = &setup.models;
+    let trials = trials(&models.encoder, &setup.dataset, &inputs, repeats, &noise, setup.seed)?;
+    let horizon = setup.graph.run.horizon;
+    let (table, _) = planning_table(&models.mixture, &models.probe, &trials, &setup.rules(), setup.sampling(), horizon);
+    Ok((table, json!({ "hazard": hazards, "clear": clears, "repeats": repeats })))
 }
 
 /// Per drive the frame whose decision counts: the last decided one of the first timestamp at which the drive is a
@@ -156,22 +230,12 @@ pub fn text(report: &Value) -> String {
         ("unseen_views", "every eligible view of poses never trained on"),
     ] {
         let _ = writeln!(out, "\n  {title}");
-        let _ = writeln!(out, "  {:<15} {:>3}  {:<28} {:<28}", "rule", "n", "hazard: halts", "clear: advances");
+        let _ = writeln!(out, "  {:<15} {:>3}  {:<32} {:<32}", "rule", "n", "hazard: halts", "clear: advances");
         for rule in ["underconfident", "overconfident", "paper", "calibrated"] {
             for samples in SAMPLE_COUNTS {
-                let cell = |kind: &str| {
-                    let c = &planning[name][rule][samples.to_string()][kind];
-                    match (c["success"].as_u64(), c["trials"].as_u64()) {
-                        (Some(s), Some(t)) if t > 0 => format!(
-                            "{s}/{t} = {:.1} % [{:.1}, {:.1}]",
-                            100.0 * s as f64 / t as f64,
-                            100.0 * c["interval"][0].as_f64().unwrap_or(0.0),
-                            100.0 * c["interval"][1].as_f64().unwrap_or(1.0)
-                        ),
-                        _ => "-".to_owned(),
-                    }
-                };
-                let _ = writeln!(out, "  {rule:<15} {samples:>3}  {:<28} {:<28}", cell("hazard"), cell("clear"));
+                let counts = &planning[name][rule][samples.to_string()];
+                let (hazard, clear) = (share(&counts["hazard"]), share(&counts["clear"]));
+                let _ = writeln!(out, "  {rule:<15} {samples:>3}  {hazard:<32} {clear}");
             }
         }
     }
@@ -180,4 +244,103 @@ pub fn text(report: &Value) -> String {
         let _ = writeln!(out, "\nModels, as measured when they were trained\n  {}", metrics.replace('\n', "\n  "));
     }
     out
+}
+
+/// One count of a table as text; a dash where nothing was tried.
+fn share(count: &Value) -> String {
+    match (count["success"].as_u64(), count["trials"].as_u64()) {
+        (Some(success), Some(trials)) if trials > 0 => format!(
+            "{success}/{trials} = {:.1} % [{:.1}, {:.1}]",
+            100.0 * success as f64 / trials as f64,
+            100.0 * count["interval"][0].as_f64().unwrap_or(0.0),
+            100.0 * count["interval"][1].as_f64().unwrap_or(1.0)
+        ),
+        _ => "-".to_owned(),
+    }
+}
+
+#[cfg(test)]
+pub(crate) mod tests {
+    use super::*;
+    use crate::monitor::Records;
+
+    /// A decided frame of the first timestamp of a drive, that shows nothing of the place that matters.
+    pub(crate) fn frame() -> FrameRecord {
+        FrameRecord {
+            frame_id: 0,
+            view: 0,
+            branch: 0,
+            timestamp: 0,
+            drive: 0,
+            frame_in_drive: 0,
+            last_of_timestamp: false,
+            observability: Observability::None,
+            capture_time_ns: 0,
+            posterior: None,
+            beliefs: Vec::new(),
+            action: Some(ActionCode::Halt),
+            reason: None,
+            hazard_probability: 0.5,
+            confidence: 0.5,
+            latency_ns: 1,
+        }
+    }
+
+    fn outcome(frames: impl IntoIterator<Item = FrameRecord>) -> RunOutcome {
+        let frames = frames.into_iter().enumerate().map(|(i, f)| (i as u64, FrameRecord { frame_id: i as u64, ..f }));
+        RunOutcome { records: Records { frames: frames.collect(), ..Records::default() }, ..RunOutcome::default() }
+    }
+
+    /// A run without drives, or of which no posterior was recorded, has no tables, and no model is looked for.
+    #[test]
+    fn nothing_is_computed_without_drives() {
+        let known = Some(carff_messages::Gaussian::standard());
+        let no_drive = FrameRecord { drive: -1, posterior: known, ..frame() };
+        for outcome in [outcome([]), outcome([no_drive]), outcome([frame()])] {
+            assert!(evaluate(&outcome).unwrap().is_none());
+        }
+        let driven = outcome([FrameRecord { posterior: known, ..frame() }]);
+        assert!(evaluate(&driven).is_err(), "without its graph file a run cannot be judged");
+    }
+
+    /// Of each drive the last decided frame of the first timestamp with one right answer counts: hidden in a hazard
+    /// branch, fully visible in another, never the last timestamp, never an undecided frame.
+    #[test]
+    fn decisive_frames_are_those_with_one_right_answer() {
+        let at = |drive, timestamp, branch, observability| FrameRecord {
+            branch,
+            timestamp,
+            drive,
+            observability,
+            ..frame()
+        };
+        let undecided = FrameRecord { action: None, ..at(0, 0, 0, Observability::None) };
+        let outcome = outcome([
+            at(0, 0, 0, Observability::None),
+            at(0, 0, 0, Observability::None),
+            undecided,
+            at(0, 1, 0, Observability::None),
+            at(1, 0, 1, Observability::None),
+            at(1, 1, 1, Observability::Full),
+            at(1, 2, 1, Observability::Full),
+            at(2, 0, 0, Observability::Full),
+            at(3, 2, 0, Observability::None),
+            at(-1, 0, 0, Observability::None),
+        ]);
+        let found: Vec<_> = decisive_frames(&outcome, 3, &[0]).iter().map(|(f, kind)| (f.frame_id, *kind)).collect();
+        assert_eq!(found, [(1, DriveKind::Hazard), (5, DriveKind::Clear)]);
+    }
+
+    /// The text holds each count with its interval, a dash where nothing was tried, and nothing for a run without
+    /// planning.
+    #[test]
+    fn tables_become_text() {
+        assert_eq!(text(&json!({ "frames": 3 })), "");
+        let count = json!({ "success": 29, "trials": 30, "interval": [0.833, 0.994] });
+        let report = json!({ "planning": { "drives": { "paper": { "10": { "hazard": count } } } } });
+        let text = text(&report);
+        let line = text.lines().find(|l| l.contains("29/30")).unwrap();
+        assert_eq!(line.split_whitespace().collect::<Vec<_>>()[..2], ["paper", "10"]);
+        assert!(line.contains("29/30 = 96.7 % [83.3, 99.4]") && line.trim_end().ends_with('-'), "{line}");
+    }
 }

@@ -32,7 +32,7 @@ const SUBTITLE: Font = Font::regular(14.0);
 const CAPTION_HEAD: Font = Font::bold(14.0);
 const CAPTION: Font = Font::regular(13.0);
 /// Width of the text left of the pictures.
-const CAPTION_WIDTH: u32 = 190;
+const CAPTION_WIDTH: u32 = 230;
 /// Pictures with no side as long as this are shown twice as large.
 const SMALL_SIDE: u32 = 160;
 /// Space between pictures, and between a picture and its frame's outer edge.
