@@ -3,6 +3,7 @@
 use carff::dataset::DatasetCommand;
 use carff::launch::LaunchArgs;
 use carff::train::TrainArgs;
+use carff_bench::BenchCommand;
 use clap::{Parser, Subcommand};
 use std::process::ExitCode;
 
@@ -23,12 +24,16 @@ enum Command {
     Dataset(DatasetCommand),
     /// Train a scenario's models; goes on where an earlier run stopped.
     Train(TrainArgs),
+    /// Measure the program's parts, and the whole loop, on this machine.
+    #[command(subcommand)]
+    Bench(BenchCommand),
 }
 
 fn main() -> ExitCode {
     let result = match Cli::parse().command {
         Command::Launch(args) => carff::launch::run(&args),
         Command::Train(args) => carff::train::run(&args),
+        Command::Bench(command) => carff_bench::run(command),
         Command::Dataset(command) => carff::dataset::run(command).map(|()| ExitCode::SUCCESS),
     };
     match result {

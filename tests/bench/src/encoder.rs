@@ -1,0 +1,109 @@
+//! Encoder and forecaster, one frame at a time, as their stages run them.
+
+use crate::OutputArgs;
+use crate::report::{Report, number, table};
+use crate::stats::{Contender, Times, in_turns, timed};
+use anyhow::Context;
+use carff_checkpoint::Manifest;
+use carff_models::{
+    LatentGaussian,
+    backbone::{BackboneConfig, BackboneKind},
+    borrow,
+    encoder::{Encoder, EncoderConfig},
+    mixture::Sampling,
+};
+use std::path::PathBuf;
+use tch::{Device, nn::VarStore};
+
+/// Side of the measured picture, pixels.
+const SIDE_PX: usize = 128;
+/// Latents drawn from a forecast.
+const SAMPLES: usize = 10;
+
+/// Encoder and forecaster, one frame at a time.
+#[derive(Clone, Debug, clap::Args)]
+pub struct EncoderArgs {
+    /// Checkpoint folder.
+    #[arg(long, default_value = "configs/checkpoints/approaching-intersection")]
+    checkpoint: PathBuf,
+    /// Leave out the vision transformer, which takes 1.3 GB and seconds a frame.
+    #[arg(long)]
+    no_vit: bool,
+    /// Fewer rounds.
+    #[arg(long)]
+    quick: bool,
+    #[command(flatten)]
+    pub(crate) output: OutputArgs,
+}
+
+pub(crate) fn run(args: &EncoderArgs) -> anyhow::Result<Report> {
+    carff_models::allocator::keep_large_blocks();
+    let manifest = Manifest::load(&args.checkpoint)?;
+    let encoder = carff_checkpoint::load_encoder(&args.checkpoint, &manifest)?;
+    let net = carff_checkpoint::load_mixture(&args.checkpoint, &manifest)?;
+    let rgb: Vec<u8> = (0..SIDE_PX * SIDE_PX * 3).map(|i| (i * 2_654_435_761 >> 13) as u8).collect();
+    let posterior = encode(&encoder, &rgb).context("the encoder gives no posterior")?;
+
+    let mut report = Report::default();
+    let mut rows = vec![["a frame (ms)", "p50", "p99", "max", "frames"].map(str::to_owned)];
+    let mut note = |name: &str, key: &str, seconds: &[f64]| {
+        let times = Times::new(seconds.iter().map(|s| s * 1e3).collect());
+        let [p50, p99, max] = [0.5, 0.99, 1.0].map(|q| times.quantile(q));
+        rows.push([name.to_owned(), number(p50), number(p99), number(max), times.len().to_string()]);
+        report.set(&format!("{key}p50_ms"), p50);
+        report.set(&format!("{key}p99_ms"), p99);
+    };
+
+    let with_threads = |threads: i32| -> Contender<'_> {
+        let (encoder, rgb) = (&encoder, &rgb);
+        let mut clock = timed(move || {
+            std::hint::black_box(encode(encoder, rgb));
+        });
+        // The change of threads is no part of the frame.
+        Box::new(move || {
+            tch::set_num_threads(threads);
+            clock()
+        })
+    };
+    let seconds = in_turns(if args.quick { 20 } else { 300 }, &mut [with_threads(1), with_threads(2)]);
+    let backbone = format!("{:?}", manifest.encoder.backbone.kind);
+    note(&format!("encoder, {backbone}, 1 thread"), "encoder.", &seconds[0]);
+    note(&format!("encoder, {backbone}, 2 threads"), "encoder.two_threads.", &seconds[1]);
+
+    tch::set_num_threads(1);
+    let forecast = timed(|| {
+        let mixture = net.forecast(&posterior);
+        std::hint::black_box(mixture.draw(SAMPLES, Sampling::Stratified, 1, 2, 1));
+    });
+    let seconds = in_turns(if args.quick { 200 } else { 3000 }, &mut [forecast]);
+    note(&format!("forecaster, n = {SAMPLES}, 1 thread"), "forecaster.", &seconds[0]);
+
+    if !args.no_vit {
+        let config = EncoderConfig {
+            backbone: BackboneConfig { kind: BackboneKind::Vit, ..BackboneConfig::default() },
+            ..EncoderConfig::default()
+        };
+        let store = VarStore::new(Device::Cpu);
+        let vit = Encoder::new(&config, &(store.root() / "backbone"), &(store.root() / "head"), None)?;
+        let with_threads = |threads: i32| -> Contender<'_> {
+            let (vit, rgb) = (&vit, &rgb);
+            let mut clock = timed(move || {
+                std::hint::black_box(encode(vit, rgb));
+            });
+            Box::new(move || {
+                tch::set_num_threads(threads);
+                clock()
+            })
+        };
+        let seconds = in_turns(if args.quick { 2 } else { 10 }, &mut [with_threads(1), with_threads(2)]);
+        note("encoder, ViT-L/16 of random weights, 1 thread", "encoder.vit_l16.", &seconds[0]);
+        note("encoder, ViT-L/16 of random weights, 2 threads", "encoder.vit_l16.two_threads.", &seconds[1]);
+    }
+    print!("{}", table(&rows));
+    Ok(report)
+}
+
+/// From bytes to posterior, as the encoder stage does it.
+fn encode(encoder: &Encoder, rgb: &[u8]) -> Option<LatentGaussian> {
+    borrow::with_picture(rgb, SIDE_PX, SIDE_PX, |picture| encoder.encode_bytes(picture)).flatten()
+}

@@ -1,0 +1,544 @@
+//! The field's kernels against the same model in tensor operations and against the machine's limits.
+
+use crate::OutputArgs;
+use crate::limits::{matrix_product, triad};
+use crate::report::{Report, number, table};
+use crate::stats::{Contender, Ratio, Times, in_turns, timed};
+use anyhow::Context;
+use carff_belief::Probe;
+use carff_checkpoint::Manifest;
+use carff_field::{
+    Field, FieldConfig, FieldTrainer, LATENT_DIM, RayBatch, RayLimits, RaySamples, RenderBuffer, RenderOptions,
+    TrainerConfig,
+};
+use carff_field_reference::{Precision, Rays, ReferenceField, Samples, huber_sum};
+use carff_geometry::{PinholeCamera, Ray};
+use carff_models::mixture::{Draw, Mixture};
+use carff_random::{Key, gaussians, uniform};
+use std::path::PathBuf;
+use std::time::Instant;
+use tch::{Kind, Tensor, nn::OptimizerConfig};
+
+/// Hypotheses whose probing is measured.
+const HYPOTHESES: usize = 10;
+/// Rays of a training step, and samples of each: 2^17 samples together.
+const TRAINING_RAYS: usize = 4096;
+const SAMPLES_PER_RAY: usize = 32;
+/// A learning rate that leaves the field as it is: each step is the same work.
+const STANDSTILL: f32 = 1e-12;
+/// Points and latents that the networks' rate is measured with: features stay in the second-level cache.
+const POINTS: usize = 2048;
+const LATENTS: usize = 32;
+
+/// The field's kernels against the same model in tensor operations and against the machine's limits.
+#[derive(Clone, Debug, clap::Args)]
+pub struct FieldArgs {
+    /// Checkpoint folder whose field is measured.
+    #[arg(long, default_value = "configs/checkpoints/approaching-intersection")]
+    checkpoint: PathBuf,
+    /// Threads. Default: all cores.
+    #[arg(long)]
+    threads: Option<usize>,
+    /// Side of the bird's-eye view, pixels.
+    #[arg(long, default_value_t = 128)]
+    side_px: u32,
+    /// Fewer rounds.
+    #[arg(long)]
+    quick: bool,
+    #[command(flatten)]
+    pub(crate) output: OutputArgs,
+}
+
+pub(crate) fn run(args: &FieldArgs) -> anyhow::Result<Report> {
+    carff_models::allocator::keep_large_blocks();
+    let cores = std::thread::available_parallelism().map_or(1, usize::from);
+    let threads = args.threads.unwrap_or(cores).max(1);
+    tch::set_num_threads(threads as i32);
+    let manifest = Manifest::load(&args.checkpoint)?;
+    let field = carff_checkpoint::load_field(&args.checkpoint, &manifest)?;
+    let mut probe = Probe::load(&args.checkpoint, &manifest)?;
+    let states: Vec<[f32; LATENT_DIM]> = manifest.states.iter().map(|s| s.mean).collect();
+    anyhow::ensure!(!states.is_empty(), "checkpoint {}: it knows no states", args.checkpoint.display());
+    println!(
+        "field of {}: {} numbers, {} instructions, {} threads\n",
+        args.checkpoint.display(),
+        field.parameter_count(),
+        field.instruction_set().name(),
+        threads
+    );
+    let bench = Bench {
+        threads,
+        side_px: args.side_px.clamp(16, 2048),
+        rounds: if args.quick { 3 } else { 15 },
+        precisions: precisions(&field),
+    };
+
+    let mut report = Report::default();
+    report.set_value("field.instruction_set", field.instruction_set().name().into());
+    report.set("field.threads", threads as f64);
+    bench.networks(&field, &mut report);
+    bench.rendering(&field, &states, &mut report);
+    bench.probes(&mut probe, &states, &mut report);
+    bench.training(&field, &states, &mut report)?;
+    Ok(report)
+}
+
+/// A camera straight above the bounds, the picture's up = +Y.
+fn birds_eye(config: &FieldConfig, side_px: u32) -> PinholeCamera {
+    let [low, high] = config.bounds_m.map(|corner| corner.map(f64::from));
+    let centre = [0, 1, 2].map(|i| (low[i] + high[i]) / 2.0);
+    let extent = (high[0] - low[0]).max(high[1] - low[1]);
+    let fov_deg = 60.0_f64;
+    let height = low[2] + extent / 2.0 / (fov_deg / 2.0).to_radians().tan();
+    let eye = [centre[0], centre[1], height];
+    PinholeCamera::look_at(eye, [centre[0], centre[1], low[2]], [0.0, 1.0, 0.0], side_px, side_px, fov_deg)
+}
+
+/// Multiplications and additions of the density network for one sample.
+fn density_operations(c: &FieldConfig) -> f64 {
+    let features = c.levels * c.features_per_level;
+    2.0 * (features * c.hidden_width + c.hidden_width * c.hidden_width + c.hidden_width * (1 + c.geometry_features))
+        as f64
+}
+
+struct Bench {
+    threads: usize,
+    side_px: u32,
+    rounds: usize,
+    precisions: Vec<Precision>,
+}
+
+impl Bench {
+    /// The density network's rate against the rate of matrix products.
+    fn networks(&self, field: &Field, report: &mut Report) {
+        let points: Vec<[f32; 3]> = (0..POINTS).map(|i| random_point(field.config(), i as u64)).collect();
+        let latents: Vec<[f32; LATENT_DIM]> = (0..LATENTS).map(|i| random_latent(i as u64)).collect();
+        let mut outs = vec![vec![0.0_f32; POINTS * LATENTS]; self.threads];
+        let operations = density_operations(field.config()) * (POINTS * LATENTS * self.threads) as f64;
+        let native = timed(move || {
+            std::thread::scope(|scope| {
+                for out in &mut outs {
+                    let (points, latents) = (&points, &latents);
+                    scope.spawn(move || field.density_by_latent(points, latents, out));
+                }
+            });
+        });
+        let width = field.config().hidden_width as i64;
+        let square = [1024, 1024, 1024];
+        let layer = [1 << 17, width, width];
+        let named = [
+            ("density network, native f32", (native, operations)),
+            ("matrix product 1024^3, f32", matrix_product(Kind::Float, square)),
+            ("matrix product 131072 x width x width, f32", matrix_product(Kind::Float, layer)),
+            ("matrix product 1024^3, bf16", matrix_product(Kind::BFloat16, square)),
+            ("matrix product 131072 x width x width, bf16", matrix_product(Kind::BFloat16, layer)),
+            ("memory bandwidth (GB/s)", triad(self.threads)),
+        ];
+        let (names, measured): (Vec<_>, Vec<_>) = named.into_iter().unzip();
+        let (mut contenders, amounts): (Vec<_>, Vec<_>) = measured.into_iter().unzip();
+        let seconds = in_turns(self.rounds, &mut contenders);
+        let rates: Vec<Times> =
+            seconds.iter().zip(&amounts).map(|(s, a)| Times::new(s.iter().map(|s| a / s / 1e9).collect())).collect();
+        let mut rows = vec![["rate", "median", "lowest", "highest"].map(str::to_owned)];
+        for (name, rate) in names.iter().zip(&rates) {
+            let [median, low, high] = [0.5, 0.0, 1.0].map(|q| number(rate.quantile(q)));
+            let unit = if name.contains("GB/s") { "" } else { " (GFLOP/s)" };
+            rows.push([format!("{name}{unit}"), median, low, high]);
+        }
+        print!("{}", table(&rows));
+        let native = rates[0].median();
+        let limit = rates[1].median().max(rates[2].median());
+        let share = native / limit;
+        println!("networks: {} of the measured limit of f32 matrix products\n", percent(share));
+        report.set("field.mlp_gflops", native);
+        report.set("field.mlp_share_of_limit", share);
+        report.set("field.limit.f32_gflops", limit);
+        report.set("field.limit.bf16_gflops", rates[3].median().max(rates[4].median()));
+        report.set("field.limit.bandwidth_gb_s", rates[5].median());
+    }
+
+    /// Bird's-eye views of every state.
+    fn rendering(&self, field: &Field, states: &[[f32; LATENT_DIM]], report: &mut Report) {
+        let camera = birds_eye(field.config(), self.side_px);
+        let rays: Vec<Ray> = (0..self.side_px * self.side_px)
+            .map(|i| camera.ray(f64::from(i % self.side_px) + 0.5, f64::from(i / self.side_px) + 0.5))
+            .collect();
+        let options = RenderOptions { threads: self.threads, ..RenderOptions::default() };
+        let limits = RayLimits {
+            max_samples: options.max_samples_per_ray,
+            min_transmittance: options.min_transmittance,
+            step_scale: 1.0,
+            use_occupancy: true,
+        };
+        let samples: Vec<RaySamples> = states
+            .iter()
+            .map(|z| {
+                let mut samples = RaySamples::default();
+                field.samples_along(&rays, z, &limits, &mut samples);
+                samples
+            })
+            .collect();
+        let count = samples.iter().map(|s| s.ray.len()).sum::<usize>() as f64 / states.len() as f64;
+        let kept = |s: &RaySamples| s.weight.iter().filter(|w| **w > options.min_weight).count();
+        let kept = samples.iter().map(kept).sum::<usize>() as f64 / states.len() as f64;
+
+        let tensor_rays = Rays::new(&rays, field.config().direction_degree);
+        let tensor_samples: Vec<Samples> = samples.iter().map(Samples::new).collect();
+        let latents: Vec<Tensor> = states.iter().map(|z| Tensor::from_slice(z)).collect();
+        let references: Vec<ReferenceField> = self.precisions.iter().map(|p| ReferenceField::new(field, *p)).collect();
+        let min_weight = f64::from(options.min_weight);
+        let frame = |reference: &ReferenceField, state: usize, chunk: i64| {
+            drop(std::hint::black_box(reference.render(
+                &tensor_rays,
+                &tensor_samples[state],
+                &latents[state],
+                min_weight,
+                chunk,
+            )));
+        };
+        let mut buffer = RenderBuffer::new();
+        let mut contenders =
+            vec![round_and_round(states.len(), |s| field.render(&camera, &states[s], &options, &mut buffer))];
+        let mut chunks = Vec::new();
+        for reference in &references {
+            let chunk = best(&[1 << 13, 1 << 12, 1 << 14, 1 << 16, 1 << 22], |chunk| frame(reference, 0, chunk));
+            chunks.push(chunk.min(count as i64));
+            contenders.push(round_and_round(states.len(), move |s| frame(reference, s, chunk)));
+        }
+        let seconds = in_turns(self.rounds, &mut contenders);
+        drop(contenders);
+        println!(
+            "bird's-eye view {0} x {0}: {1:.0} samples, {2:.0} of them with colour, a frame",
+            self.side_px, count, kept
+        );
+        let native = self.versus("render", count, &chunks, &seconds, report);
+        println!("(tensor operations are given where the samples lie: they need not march)\n");
+        report.set("field.render_fps", 1.0 / native);
+        report.set("field.render_samples", count);
+        report.set("field.render_colored_samples", kept);
+        self.breakdown(field, states, &camera, &samples, report);
+    }
+
+    /// Where rendering's time goes, on one thread: by leaving parts out.
+    fn breakdown(
+        &self,
+        field: &Field,
+        states: &[[f32; LATENT_DIM]],
+        camera: &PinholeCamera,
+        samples: &[RaySamples],
+        report: &mut Report,
+    ) {
+        let (z, samples) = (&states[0], &samples[0]);
+        let rays: Vec<Ray> = (0..self.side_px * self.side_px)
+            .map(|i| camera.ray(f64::from(i % self.side_px) + 0.5, f64::from(i / self.side_px) + 0.5))
+            .collect();
+        let points: Vec<[f32; 3]> = samples
+            .ray
+            .iter()
+            .zip(&samples.distance_m)
+            .map(|(ray, t)| {
+                let ray = &rays[*ray as usize];
+                std::array::from_fn(|i| ray.origin[i] + t * ray.direction[i])
+            })
+            .collect();
+        let latents: Vec<[f32; LATENT_DIM]> = vec![*z; 9];
+        let (mut one, mut nine) = (vec![0.0; points.len()], vec![0.0; points.len() * 9]);
+        let (mut buffer, mut without_color) = (RenderBuffer::new(), RenderBuffer::new());
+        let mut nothing = RenderBuffer::new();
+        let options = RenderOptions::default();
+        // No sample weighs more than 1.
+        let colorless = RenderOptions { min_weight: 2.0, ..options };
+        let up: Vec<Ray> = rays
+            .iter()
+            .map(|r| Ray { origin: [r.origin[0], r.origin[1], 1e6], direction: r.direction.map(|v| v * 1e-9) })
+            .collect();
+        let seconds = in_turns(
+            self.rounds,
+            &mut [
+                timed(|| field.render(camera, z, &options, &mut buffer)),
+                timed(|| field.render(camera, z, &colorless, &mut without_color)),
+                // In pieces, as rendering does it: features stay in the cache.
+                timed(|| {
+                    for (points, out) in points.chunks(512).zip(one.chunks_mut(512)) {
+                        field.density(points, z, out);
+                    }
+                }),
+                timed(|| {
+                    for (points, out) in points.chunks(512).zip(nine.chunks_mut(512 * 9)) {
+                        field.density_by_latent(points, &latents, out);
+                    }
+                }),
+                timed(|| {
+                    field.render_rays(&up, &[*z], &RenderOptions { max_samples_per_ray: 1, ..options }, &mut nothing)
+                }),
+            ],
+        );
+        let [all, colorless, density, ninefold, rays_alone] =
+            [0, 1, 2, 3, 4].map(|i| Times::new(seconds[i].clone()).median());
+        let network = (ninefold - density) / 8.0;
+        let parts = [
+            ("features", density - network),
+            ("density_network", network),
+            ("color_network", all - colorless),
+            ("rays_and_background", rays_alone),
+            ("marching_and_the_rest", colorless - density - rays_alone),
+        ];
+        let mut rows = vec![["where a frame's time goes (one thread)", "ms", "share"].map(str::to_owned)];
+        for (name, part) in parts {
+            rows.push([name.replace('_', " "), number(part * 1e3), percent(part / all)]);
+            report.set(&format!("field.render_parts_ms.{name}"), part * 1e3);
+        }
+        rows.push(["all".to_owned(), number(all * 1e3), percent(1.0)]);
+        report.set("field.render_one_thread_ms", all * 1e3);
+        println!("{}", table(&rows));
+    }
+
+    /// Probing ten hypotheses, as the prober does it (one thread), and their densities alone.
+    fn probes(&self, probe: &mut Probe, states: &[[f32; LATENT_DIM]], report: &mut Report) {
+        let draws: Vec<[f32; LATENT_DIM]> = (0..HYPOTHESES)
+            .map(|i| {
+                let noise = random_latent(i as u64);
+                std::array::from_fn(|k| states[i % states.len()][k] + 0.2 * noise[k])
+            })
+            .collect();
+        let (field, points) = (probe.field().clone(), probe.prober().points().to_vec());
+        let mut densities = vec![0.0; points.len() * draws.len()];
+        let mixture = Mixture { weights: Vec::new(), components: Vec::new() };
+        let drawn = || draws.iter().map(|z| Draw { latent: *z, component: 0 }).collect::<Vec<_>>();
+        let seconds = in_turns(
+            self.rounds * 20,
+            &mut [
+                timed(|| {
+                    std::hint::black_box(probe.step(mixture.clone(), drawn(), 1.0));
+                }),
+                timed(|| field.density_by_latent(&points, &draws, &mut densities)),
+            ],
+        );
+        let [step, alone] = [0, 1].map(|i| Times::new(seconds[i].clone()));
+        let mut rows = vec![["probing, one thread (ms)", "p50", "p99"].map(str::to_owned)];
+        for (name, times) in [
+            (format!("{HYPOTHESES} hypotheses at {} points, with readings", points.len()), &step),
+            ("densities alone, features shared".to_owned(), &alone),
+        ] {
+            rows.push([name, number(times.median() * 1e3), number(times.quantile(0.99) * 1e3)]);
+        }
+        println!("{}", table(&rows));
+        report.set("field.probe_ms", step.median() * 1e3);
+        report.set("field.probe_p99_ms", step.quantile(0.99) * 1e3);
+        report.set("field.probe_densities_ms", alone.median() * 1e3);
+        report.set("field.probe_points", points.len() as f64);
+    }
+
+    /// A training step of 2^17 samples, each with a colour and a gradient.
+    fn training(&self, field: &Field, states: &[[f32; LATENT_DIM]], report: &mut Report) -> anyhow::Result<()> {
+        let batch = training_batch(field.config(), states);
+        let config = TrainerConfig {
+            threads: self.threads,
+            gradient_shards: self.threads,
+            learning_rate_table: STANDSTILL,
+            learning_rate_networks: STANDSTILL,
+            max_samples_per_ray: SAMPLES_PER_RAY,
+            samples_per_step: usize::MAX,
+            min_transmittance: 0.0,
+            roulette_weight: 0.0,
+            jitter: false,
+            occupancy_warmup_steps: u64::MAX,
+            target_samples_per_ray: SAMPLES_PER_RAY as f32,
+            most_step_scale: 4.0,
+            ..TrainerConfig::default()
+        };
+        let mut trainer = FieldTrainer::new(field.clone(), config.clone())?;
+        let mut samples = RaySamples::default();
+        field.samples_along(&batch.rays, &batch.latents[0], &trainer.limits(), &mut samples);
+        let count = trainer.step(&batch).kept_samples;
+        anyhow::ensure!(count == samples.ray.len(), "{count} samples in place of {}", samples.ray.len());
+
+        let references: Vec<ReferenceField> = self.precisions.iter().map(|p| ReferenceField::new(field, *p)).collect();
+        let mut contenders: Vec<Contender<'_>> = vec![timed(|| {
+            std::hint::black_box(trainer.step(&batch));
+        })];
+        let mut chunks = Vec::new();
+        let degree = field.config().direction_degree;
+        for reference in &references {
+            let mut optimizer = tch::nn::Adam::default()
+                .build(reference.store(), f64::from(STANDSTILL))
+                .context("no optimizer from libtorch")?;
+            let mut step = move |pieces: &[Piece]| {
+                optimizer.zero_grad();
+                for piece in pieces {
+                    let pixels = reference.pixels(&piece.rays, &piece.samples, &piece.latents);
+                    let loss = huber_sum(&pixels, &piece.targets, f64::from(config.huber_delta));
+                    (loss / (3.0 * TRAINING_RAYS as f64)).backward();
+                }
+                optimizer.step();
+            };
+            let rays_at_once = best(&[512, TRAINING_RAYS as i64, 1024, 256, 128], |rays| {
+                step(&pieces(&batch, &samples, rays as usize, degree));
+            });
+            let pieces = pieces(&batch, &samples, rays_at_once as usize, degree);
+            chunks.push(rays_at_once * SAMPLES_PER_RAY as i64);
+            contenders.push(timed(move || step(&pieces)));
+        }
+        let seconds = in_turns(self.rounds.min(9), &mut contenders);
+        drop(contenders);
+        println!("training step of {count} samples, all with colour and gradient");
+        self.versus("train", count as f64, &chunks, &seconds, report);
+        Ok(())
+    }
+
+    /// Prints and notes native kernels against tensor operations; returns the native median, seconds.
+    fn versus(&self, what: &str, count: f64, chunks: &[i64], seconds: &[Vec<f64>], report: &mut Report) -> f64 {
+        let medians: Vec<f64> = seconds.iter().map(|s| Times::new(s.clone()).median()).collect();
+        let mut rows = vec![["by", "ms", "a second", "ns/sample"].map(str::to_owned)];
+        let mut row = |name: String, median: f64| {
+            rows.push([name, number(median * 1e3), number(1.0 / median), number(median * 1e9 / count)]);
+        };
+        row("native kernels".to_owned(), medians[0]);
+        report.set(&format!("field.{what}_ms"), medians[0] * 1e3);
+        for ((precision, chunk), median) in self.precisions.iter().zip(chunks).zip(&medians[1..]) {
+            let kind = precision_name(*precision);
+            row(format!("tensor operations, {kind}, {chunk} samples at a time"), *median);
+            report.set(&format!("field.{what}_tch_{kind}_ms"), median * 1e3);
+        }
+        let better = (1..medians.len()).min_by(|a, b| medians[*a].total_cmp(&medians[*b])).unwrap_or(0);
+        let ratio = Ratio::new(&seconds[better], &seconds[0]);
+        println!("{}native kernels are {ratio} as fast as tensor operations at their best", table(&rows));
+        report.set(&format!("field.{what}_vs_tch"), ratio.of_medians);
+        report.set(&format!("field.{what}_vs_tch_low"), ratio.low);
+        report.set(&format!("field.{what}_vs_tch_high"), ratio.high);
+        medians[0]
+    }
+}
+
+fn precision_name(precision: Precision) -> &'static str {
+    match precision {
+        Precision::F32 => "f32",
+        Precision::Bf16 => "bf16",
+    }
+}
+
+/// Precisions that are worth measuring: bf16 where the tensor library is not far slower with it than with f32.
+fn precisions(field: &Field) -> Vec<Precision> {
+    let points: Vec<f32> = (0..1 << 12).flat_map(|i| random_point(field.config(), i)).collect();
+    let (points, latent) = (Tensor::from_slice(&points).view([-1, 3]), Tensor::from_slice(&random_latent(0)));
+    let seconds = [Precision::F32, Precision::Bf16].map(|precision| {
+        let reference = ReferenceField::new(field, precision);
+        let mut least = f64::INFINITY;
+        for _ in 0..3 {
+            let start = Instant::now();
+            drop(std::hint::black_box(tch::no_grad(|| reference.density(&points, &latent))));
+            least = least.min(start.elapsed().as_secs_f64());
+        }
+        least
+    });
+    let slower = seconds[1] / seconds[0];
+    if slower > 1.5 {
+        println!("networks in bf16 are left out: tensor operations are {slower:.1} times slower with them here\n");
+        vec![Precision::F32]
+    } else {
+        vec![Precision::F32, Precision::Bf16]
+    }
+}
+
+/// Part of a training batch, as tensors.
+struct Piece {
+    rays: Rays,
+    samples: Samples,
+    latents: Tensor,
+    targets: Tensor,
+}
+
+/// A batch in pieces of `size` rays.
+fn pieces(batch: &RayBatch, samples: &RaySamples, size: usize, degree: usize) -> Vec<Piece> {
+    let flat = |rows: Vec<f32>, width: i64| Tensor::from_slice(&rows).view([-1, width]);
+    (0..batch.rays.len())
+        .step_by(size.max(1))
+        .map(|first| {
+            let range = first..(first + size).min(batch.rays.len());
+            let from = samples.ray.partition_point(|r| (*r as usize) < range.start);
+            let to = samples.ray.partition_point(|r| (*r as usize) < range.end);
+            let own = RaySamples {
+                ray: samples.ray[from..to].iter().map(|r| r - first as u32).collect(),
+                distance_m: samples.distance_m[from..to].to_vec(),
+                length_m: samples.length_m[from..to].to_vec(),
+                ..RaySamples::default()
+            };
+            let latents = batch.latent_index[range.clone()].iter().flat_map(|l| batch.latents[*l as usize]).collect();
+            let targets = batch.target_rgb[range.clone()].iter().flatten().copied().collect();
+            Piece {
+                rays: Rays::new(&batch.rays[range], degree),
+                samples: Samples::new(&own),
+                latents: flat(latents, LATENT_DIM as i64),
+                targets: flat(targets, 3),
+            }
+        })
+        .collect()
+}
+
+/// Rays from around the bounds into them, of any state. What they shall see is of no matter for speed.
+fn training_batch(config: &FieldConfig, states: &[[f32; LATENT_DIM]]) -> RayBatch {
+    let [low, high] = config.bounds_m;
+    let mut batch = RayBatch { latents: states.to_vec(), ..RayBatch::default() };
+    for i in 0..TRAINING_RAYS {
+        let at = |k: u32| uniform(Key { seed: 7, frame: i as u64, step: k, sample: 0 }) as f32;
+        let angle = std::f32::consts::TAU * at(0);
+        let radius = 0.5 * (high[0] - low[0]).max(high[1] - low[1]);
+        let origin = [
+            0.5 * (low[0] + high[0]) + radius * angle.cos(),
+            0.5 * (low[1] + high[1]) + radius * angle.sin(),
+            low[2] + 1.0 + 8.0 * at(1),
+        ];
+        let target = random_point(config, i as u64);
+        let d: [f32; 3] = std::array::from_fn(|k| target[k] - origin[k]);
+        let n = d.iter().map(|v| v * v).sum::<f32>().sqrt().max(1e-6);
+        batch.rays.push(Ray { origin, direction: d.map(|v| v / n) });
+        batch.target_rgb.push([at(2), at(3), at(4)]);
+        batch.latent_index.push((i % states.len()) as u32);
+    }
+    batch
+}
+
+fn random_point(config: &FieldConfig, i: u64) -> [f32; 3] {
+    let [low, high] = config.bounds_m;
+    std::array::from_fn(|k| {
+        let at = uniform(Key { seed: 3, frame: i, step: k as u32, sample: 0 }) as f32;
+        low[k] + (high[k] - low[k]) * at
+    })
+}
+
+fn random_latent(i: u64) -> [f32; LATENT_DIM] {
+    gaussians(Key { seed: 5, frame: i, step: 0, sample: 0 })
+}
+
+/// The setting that takes the least time, each tried twice; where a try takes long, no further one is made.
+fn best(settings: &[i64], mut action: impl FnMut(i64)) -> i64 {
+    const LONG_S: f64 = 4.0;
+    let mut least = (f64::INFINITY, settings[0]);
+    for &setting in settings {
+        for _ in 0..2 {
+            let start = Instant::now();
+            action(setting);
+            let seconds = start.elapsed().as_secs_f64();
+            if seconds < least.0 {
+                least = (seconds, setting);
+            }
+            if seconds > LONG_S {
+                return least.1;
+            }
+        }
+    }
+    least.1
+}
+
+/// Times an action on another one of `count` things at each turn.
+fn round_and_round<'a>(count: usize, mut action: impl FnMut(usize) + 'a) -> Contender<'a> {
+    let mut turn = 0;
+    timed(move || {
+        action(turn % count);
+        turn += 1;
+    })
+}
+
+fn percent(share: f64) -> String {
+    format!("{:.1} %", share * 100.0)
+}

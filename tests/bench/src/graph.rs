@@ -1,0 +1,395 @@
+//! A graph of all stages, started as the launcher starts it, and listened to message by message.
+
+use anyhow::{Context, bail, ensure};
+use carff_config::GraphConfig;
+use carff_messages::{Action, Belief, Forecast, FrameMeta, Health, HealthState, Posterior, Stage};
+use carff_stage::StageArgs;
+use carff_transport::{
+    Input, Node, PictureReceiver, Receiver, Run, Stop, Waiter, Woken, monotonic_now_ns, remove_run_leftovers,
+    run_id_of, topics,
+};
+use rustix::process::{Pid, Signal, kill_process};
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+
+/// Those that listen before those that speak, the camera last.
+const START_ORDER: [Stage; 6] =
+    [Stage::Controller, Stage::Renderer, Stage::Prober, Stage::Forecaster, Stage::Encoder, Stage::Camera];
+/// How often stages are looked at while they start.
+const WATCH_NS: u64 = 50_000_000;
+/// How long the last frames are waited for.
+const TAIL: Duration = Duration::from_millis(500);
+/// Clock ticks a second in the system's accounts of processor time: fixed on Linux.
+const TICKS_PER_S: f64 = 100.0;
+
+/// What to run.
+#[derive(Clone, Debug)]
+pub(crate) struct Plan<'a> {
+    /// The graph, with the settings to measure.
+    pub(crate) graph: GraphConfig,
+    pub(crate) dataset: &'a Path,
+    pub(crate) checkpoint: &'a Path,
+    /// Frames of this time at first do not count.
+    pub(crate) warm_up: Duration,
+    pub(crate) measured: Duration,
+}
+
+/// One frame's way; times on the monotonic clock, nanoseconds.
+#[derive(Clone, Debug, Default)]
+struct Frame {
+    captured_ns: u64,
+    published_ns: u64,
+    /// Begin and end of the encoder's work.
+    encoded_ns: Option<(u64, u64)>,
+    /// The same of each step's forecast and probing.
+    forecast_ns: BTreeMap<u32, (u64, u64)>,
+    probed_ns: BTreeMap<u32, (u64, u64)>,
+    decided_ns: Option<u64>,
+}
+
+impl Frame {
+    /// Time between the stages: from one's sending to the next one's begin, nanoseconds. `None` when a message was
+    /// not seen.
+    fn between_ns(&self) -> Option<u64> {
+        let (begin, mut end) = self.encoded_ns?;
+        let mut sum = begin.saturating_sub(self.published_ns);
+        for (step, forecast) in &self.forecast_ns {
+            let probed = self.probed_ns.get(step)?;
+            sum += forecast.0.saturating_sub(end) + probed.0.saturating_sub(forecast.1);
+            end = probed.1;
+        }
+        Some(sum + self.decided_ns?.saturating_sub(end))
+    }
+}
+
+/// What a stage used while it was measured.
+#[derive(Clone, Debug)]
+pub(crate) struct Use {
+    pub(crate) stage: Stage,
+    /// Cores in use on average.
+    pub(crate) cores: f64,
+    /// Resident memory at the end, bytes.
+    pub(crate) resident_bytes: f64,
+}
+
+/// What was measured.
+#[derive(Clone, Debug)]
+pub(crate) struct Measured {
+    /// Camera to action, milliseconds, frame by frame.
+    pub(crate) latency_ms: Vec<f64>,
+    /// Time between stages as a share of the time from camera to action, over all frames.
+    pub(crate) ipc_share: f64,
+    /// Frames taken, and those of them that no action rests on.
+    pub(crate) frames: usize,
+    pub(crate) missed: usize,
+    /// Frames a second that the camera reached.
+    pub(crate) rate_hz: f64,
+    /// Views that the renderer made.
+    pub(crate) views: u64,
+    pub(crate) uses: Vec<Use>,
+}
+
+impl Measured {
+    /// Whether every frame was decided on, at the rate that was asked for.
+    pub(crate) fn held(&self, wanted_hz: f64) -> bool {
+        self.missed == 0 && self.frames > 1 && self.rate_hz > 0.98 * wanted_hz
+    }
+}
+
+/// Runs a graph for its time and ends it.
+pub(crate) fn measure(plan: &Plan<'_>) -> anyhow::Result<Measured> {
+    let folder = tempfile::tempdir()?;
+    let name = format!("bench-{}", std::process::id());
+    let run = Run::new(&name, run_id_of(&name, monotonic_now_ns()))?;
+    remove_run_leftovers(&run)?;
+    let file = folder.path().join("graph.toml");
+    std::fs::write(&file, toml::to_string(&plan.graph)?)?;
+    let mut args = StageArgs::new(&file, &name, run.id());
+    args.dataset = Some(std::path::absolute(plan.dataset)?);
+    args.checkpoint = Some(std::path::absolute(plan.checkpoint)?);
+    args.parent_pid = Some(std::process::id());
+    let result = {
+        let node = Node::open(&run, "bench")?;
+        let mut listener = Listener::open(&node)?;
+        let mut stages = Stages { children: Vec::new(), logs: folder.path().to_owned() };
+        listen(plan, &args, &mut listener, &mut stages)
+    };
+    remove_run_leftovers(&run)?;
+    result
+}
+
+fn listen(plan: &Plan<'_>, args: &StageArgs, listener: &mut Listener, stages: &mut Stages) -> anyhow::Result<Measured> {
+    let waiter = Waiter::new(Stop::on_signals()?);
+    let take = |listener: &mut Listener, until_ns: u64| -> anyhow::Result<()> {
+        ensure!(waiter.wait_until(&listener.inputs(), until_ns)? != Woken::Stopped, "interrupted");
+        listener.drain()
+    };
+    let limit = Duration::from_millis(plan.graph.launcher.start_timeout_ms);
+    for batch in [&START_ORDER[..5], &START_ORDER[5..]] {
+        for &stage in batch {
+            stages.start(stage, args)?;
+        }
+        let begun = Instant::now();
+        while !batch.iter().all(|stage| listener.ready.contains_key(stage)) {
+            stages.check()?;
+            ensure!(begun.elapsed() < limit, "the stages were not ready within {} ms", limit.as_millis());
+            take(listener, monotonic_now_ns() + WATCH_NS)?;
+        }
+    }
+    let from_ns = monotonic_now_ns() + plan.warm_up.as_nanos() as u64;
+    while monotonic_now_ns() < from_ns {
+        take(listener, from_ns)?;
+    }
+    let (ticks_before, views_before) = (stages.ticks(), listener.views);
+    let to_ns = from_ns + plan.measured.as_nanos() as u64;
+    while monotonic_now_ns() < to_ns {
+        take(listener, to_ns)?;
+    }
+    let seconds = (monotonic_now_ns() - from_ns) as f64 / 1e9;
+    let (ticks, views) = (stages.ticks(), listener.views - views_before);
+    let uses = stages
+        .children
+        .iter()
+        .zip(ticks_before.iter().zip(&ticks))
+        .map(|((stage, child), (before, after))| Use {
+            stage: *stage,
+            cores: (after - before) / TICKS_PER_S / seconds,
+            resident_bytes: resident_bytes(child.id()),
+        })
+        .collect();
+    let tail_ns = monotonic_now_ns() + TAIL.as_nanos() as u64;
+    while monotonic_now_ns() < tail_ns {
+        take(listener, tail_ns)?;
+    }
+    stages.check()?;
+
+    let frames: Vec<&Frame> = listener.frames.values().filter(|f| (from_ns..to_ns).contains(&f.captured_ns)).collect();
+    // Frame numbers have no gaps: one that is not there was not even seen.
+    let (first, last) = (
+        listener.frames.iter().find(|(_, f)| f.captured_ns >= from_ns).map_or(0, |(id, _)| *id),
+        listener.frames.iter().rfind(|(_, f)| f.captured_ns < to_ns).map_or(0, |(id, _)| *id + 1),
+    );
+    let decided: Vec<(&Frame, u64)> = frames.iter().filter_map(|f| Some((*f, f.decided_ns?))).collect();
+    let (mut all_ns, mut between_ns) = (0, 0);
+    for (frame, decided_ns) in &decided {
+        if let Some(between) = frame.between_ns() {
+            all_ns += decided_ns - frame.captured_ns;
+            between_ns += between;
+        }
+    }
+    let span_ns = frames.last().map_or(0, |f| f.captured_ns) - frames.first().map_or(0, |f| f.captured_ns);
+    let count = last.saturating_sub(first) as usize;
+    Ok(Measured {
+        latency_ms: decided.iter().map(|(f, at)| (at - f.captured_ns) as f64 / 1e6).collect(),
+        ipc_share: between_ns as f64 / all_ns as f64,
+        missed: count - decided.len(),
+        frames: count,
+        rate_hz: count.saturating_sub(1) as f64 / (span_ns as f64 / 1e9),
+        views,
+        uses,
+    })
+}
+
+/// Hears all that a run says.
+struct Listener {
+    frames_in: PictureReceiver<FrameMeta>,
+    posteriors: Receiver<Posterior>,
+    forecasts: Receiver<Forecast>,
+    beliefs: Receiver<Belief>,
+    actions: Receiver<Action>,
+    views_in: PictureReceiver<carff_messages::ViewMeta>,
+    healths: Vec<Receiver<Health>>,
+    frames: BTreeMap<u64, Frame>,
+    views: u64,
+    ready: BTreeMap<Stage, u32>,
+}
+
+impl Listener {
+    fn open(node: &Node) -> anyhow::Result<Self> {
+        let healths = Stage::ALL.iter().map(|&stage| node.receiver(&topics::health(stage)));
+        Ok(Self {
+            frames_in: node.picture_receiver(&topics::FRAME)?,
+            posteriors: node.receiver(&topics::POSTERIOR)?,
+            forecasts: node.receiver(&topics::FORECAST)?,
+            beliefs: node.receiver(&topics::BELIEF)?,
+            actions: node.receiver(&topics::ACTION)?,
+            views_in: node.picture_receiver(&topics::VIEW)?,
+            healths: healths.collect::<Result<_, _>>()?,
+            frames: BTreeMap::new(),
+            views: 0,
+            ready: BTreeMap::new(),
+        })
+    }
+
+    fn inputs(&self) -> Vec<&dyn Input> {
+        let mut inputs: Vec<&dyn Input> =
+            vec![&self.frames_in, &self.posteriors, &self.forecasts, &self.beliefs, &self.actions, &self.views_in];
+        inputs.extend(self.healths.iter().map(|h| h as &dyn Input));
+        inputs
+    }
+
+    fn drain(&mut self) -> anyhow::Result<()> {
+        while let Some(picture) = self.frames_in.next()? {
+            let header = &picture.meta().header;
+            let frame = self.frames.entry(header.frame_id).or_default();
+            (frame.captured_ns, frame.published_ns) = (header.capture_time_ns, header.publish_time_ns);
+        }
+        let span = |published_ns: u64, latency_ns: u64| (published_ns.saturating_sub(latency_ns), published_ns);
+        while let Some(m) = self.posteriors.next()? {
+            if let Some(frame) = self.frames.get_mut(&m.header.frame_id) {
+                frame.encoded_ns = Some(span(m.header.publish_time_ns, m.stage_latency_ns));
+            }
+        }
+        while let Some(m) = self.forecasts.next()? {
+            if let Some(frame) = self.frames.get_mut(&m.header.frame_id) {
+                frame.forecast_ns.insert(m.header.step, span(m.header.publish_time_ns, m.stage_latency_ns));
+            }
+        }
+        while let Some(m) = self.beliefs.next()? {
+            if let Some(frame) = self.frames.get_mut(&m.header.frame_id) {
+                frame.probed_ns.insert(m.header.step, span(m.header.publish_time_ns, m.stage_latency_ns));
+            }
+        }
+        while let Some(m) = self.actions.next()? {
+            if m.is_decision == 1
+                && let Some(frame) = self.frames.get_mut(&m.based_on_frame)
+            {
+                frame.decided_ns = Some(m.header.publish_time_ns);
+            }
+        }
+        while self.views_in.next()?.is_some() {
+            self.views += 1;
+        }
+        for receiver in &mut self.healths {
+            while let Some(health) = receiver.next()? {
+                let ready = health.state().is_ok_and(|s| !matches!(s, HealthState::Starting | HealthState::Faulty));
+                if let (true, Ok(stage)) = (ready, health.stage()) {
+                    self.ready.insert(stage, health.pid);
+                }
+            }
+        }
+        Ok(())
+    }
+}
+
+/// The stages' processes. Dropping ends them.
+struct Stages {
+    children: Vec<(Stage, Child)>,
+    logs: PathBuf,
+}
+
+impl Stages {
+    fn start(&mut self, stage: Stage, args: &StageArgs) -> anyhow::Result<()> {
+        let folder = std::env::current_exe()?.parent().context("this program has no folder")?.to_owned();
+        let program = folder.join(format!("carff-{stage}"));
+        let log = std::fs::File::create(self.log(stage))?;
+        let child = Command::new(&program)
+            .args(args.to_command_line())
+            .stdin(Stdio::null())
+            .stdout(Stdio::null())
+            .stderr(log)
+            .spawn()
+            .with_context(|| format!("cannot start {}; build it with `cargo build --release`", program.display()))?;
+        self.children.push((stage, child));
+        Ok(())
+    }
+
+    fn log(&self, stage: Stage) -> PathBuf {
+        self.logs.join(format!("{stage}.log"))
+    }
+
+    /// An error when one has ended.
+    fn check(&mut self) -> anyhow::Result<()> {
+        for i in 0..self.children.len() {
+            let (stage, child) = &mut self.children[i];
+            if let Some(status) = child.try_wait()? {
+                let stage = *stage;
+                let log = std::fs::read_to_string(self.log(stage)).unwrap_or_default();
+                bail!("stage `{stage}` has ended ({status}): {}", log.lines().last().unwrap_or("it said nothing"));
+            }
+        }
+        Ok(())
+    }
+
+    /// Processor time of each so far, in ticks.
+    fn ticks(&self) -> Vec<f64> {
+        let of = |pid: u32| {
+            let stat = std::fs::read_to_string(format!("/proc/{pid}/stat")).ok()?;
+            // The name before may hold anything; behind its bracket user and system time are the 12th and 13th.
+            let (_, rest) = stat.rsplit_once(')')?;
+            Some(rest.split_whitespace().skip(11).take(2).filter_map(|v| v.parse::<f64>().ok()).sum())
+        };
+        self.children.iter().map(|(_, child)| of(child.id()).unwrap_or(0.0)).collect()
+    }
+}
+
+impl Drop for Stages {
+    fn drop(&mut self) {
+        // Who speaks before who listens.
+        for (_, child) in self.children.iter().rev() {
+            if let Some(pid) = Pid::from_raw(child.id() as i32) {
+                // It fails when the process has ended already, which is what is wanted.
+                let _ = kill_process(pid, Signal::TERM);
+            }
+        }
+        let begun = Instant::now();
+        for (_, child) in self.children.iter_mut().rev() {
+            while matches!(child.try_wait(), Ok(None)) {
+                if begun.elapsed() > Duration::from_secs(3) {
+                    let _ = child.kill();
+                    let _ = child.wait();
+                    break;
+                }
+                std::thread::sleep(Duration::from_millis(5));
+            }
+        }
+    }
+}
+
+fn resident_bytes(pid: u32) -> f64 {
+    let status = std::fs::read_to_string(format!("/proc/{pid}/status")).unwrap_or_default();
+    let kb = status.lines().find_map(|l| l.strip_prefix("VmRSS:")?.split_whitespace().next()?.parse::<f64>().ok());
+    kb.map_or(f64::NAN, |kb| kb * 1024.0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Time between stages is the sum of the gaps along the frame's way, over both steps; a frame with a message
+    /// missing has none.
+    #[test]
+    fn gaps_add_up() {
+        let mut frame = Frame {
+            captured_ns: 0,
+            published_ns: 10,
+            encoded_ns: Some((12, 50)),
+            forecast_ns: [(1, (53, 60)), (2, (85, 90))].into(),
+            probed_ns: [(1, (64, 80)), (2, (96, 100))].into(),
+            decided_ns: Some(107),
+        };
+        assert_eq!(frame.between_ns(), Some(2 + 3 + 4 + 5 + 6 + 7));
+        frame.probed_ns.remove(&1);
+        assert_eq!(frame.between_ns(), None);
+        assert_eq!(Frame::default().between_ns(), None);
+    }
+
+    /// A rate is held when no frame was missed and the camera was not late.
+    #[test]
+    fn a_held_rate_misses_nothing() {
+        let measured = |missed, rate_hz| Measured {
+            latency_ms: Vec::new(),
+            ipc_share: 0.0,
+            frames: 100,
+            missed,
+            rate_hz,
+            views: 0,
+            uses: Vec::new(),
+        };
+        assert!(measured(0, 19.9).held(20.0));
+        assert!(!measured(1, 20.0).held(20.0));
+        assert!(!measured(0, 19.0).held(20.0));
+    }
+}

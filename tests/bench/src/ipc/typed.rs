@@ -1,0 +1,82 @@
+//! Payloads by this program's typed topics: the camera's.
+
+use super::{Receiver, Sender, Size, Waiting};
+use anyhow::Context;
+use carff_messages::{DatasetView, FrameMeta, Header, Intrinsics};
+use carff_transport::{
+    Node, PicturePublisher, PictureReceiver, Run, Stop, Waiter, monotonic_now_ns, remove_run_leftovers, topics,
+};
+use std::path::Path;
+
+/// The run that both processes join, named after the folder that they share.
+fn run_of(folder: &Path) -> anyhow::Result<Run> {
+    let name = folder.file_name().unwrap_or_default().to_string_lossy();
+    let letters: String = name.chars().filter(char::is_ascii_alphanumeric).take(16).collect();
+    Ok(Run::new(&format!("bench-{letters}"), 1)?)
+}
+
+/// Removes what the run leaves behind; all its processes have ended.
+pub(crate) fn clean_up(folder: &Path) -> anyhow::Result<()> {
+    Ok(remove_run_leftovers(&run_of(folder)?)?)
+}
+
+pub(crate) struct TypedSender {
+    // Dropped before the node.
+    publisher: PicturePublisher<FrameMeta>,
+    _node: Node,
+    meta: FrameMeta,
+}
+
+impl TypedSender {
+    pub(crate) fn open(folder: &Path, size: Size) -> anyhow::Result<Self> {
+        let node = Node::open(&run_of(folder)?, "sender")?;
+        let publisher = node.picture_publisher(&topics::FRAME, size.bytes())?;
+        let meta = FrameMeta {
+            width_px: size.width_px,
+            height_px: size.height_px,
+            intrinsics: Intrinsics { fl_x_px: 1.0, fl_y_px: 1.0, ..Intrinsics::default() },
+            dataset_view: DatasetView::UNKNOWN,
+            ..FrameMeta::default()
+        };
+        Ok(Self { publisher, _node: node, meta })
+    }
+}
+
+impl Sender for TypedSender {
+    fn send(&mut self, payload: &[u8], _waiting: Waiting) -> anyhow::Result<()> {
+        let mut loan = self.publisher.loan(payload.len())?;
+        loan.bytes_mut().copy_from_slice(payload);
+        self.meta.header = Header::of_frame(0, monotonic_now_ns(), 1);
+        Ok(self.publisher.send(loan, self.meta)?)
+    }
+}
+
+pub(crate) struct TypedReceiver {
+    receiver: PictureReceiver<FrameMeta>,
+    _node: Node,
+    sleeping: Waiter,
+    busy: Waiter,
+}
+
+impl TypedReceiver {
+    pub(crate) fn open(folder: &Path) -> anyhow::Result<Self> {
+        let node = Node::open(&run_of(folder)?, "receiver")?;
+        let stop = Stop::new()?;
+        Ok(Self {
+            receiver: node.picture_receiver(&topics::FRAME)?,
+            _node: node,
+            sleeping: Waiter::new(stop.clone()),
+            busy: Waiter::busy_polling(stop),
+        })
+    }
+}
+
+impl Receiver for TypedReceiver {
+    fn receive(&mut self, waiting: Waiting, read: &mut dyn FnMut(&[u8])) -> anyhow::Result<()> {
+        let waiter = if waiting == Waiting::Busy { &self.busy } else { &self.sleeping };
+        waiter.wait(&[&self.receiver])?;
+        let picture = self.receiver.newest()?.context("a payload was not valid")?;
+        read(picture.bytes());
+        Ok(())
+    }
+}

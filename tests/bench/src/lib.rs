@@ -1,0 +1,75 @@
+//! Measures the program's parts, and the whole loop, on the machine at hand.
+//!
+//! Whatever is compared is measured in one run, in turns, and compared as a ratio of medians. Nothing here is part of
+//! the tests: times depend on the machine, and on what else it does. Each benchmark prints a table, and can write its
+//! figures as JSON with a description of the machine, and compare them with those of an earlier run.
+
+mod encoder;
+mod field;
+mod graph;
+mod graph_loop;
+mod ipc;
+mod limits;
+mod machine;
+mod report;
+mod stats;
+
+use report::Report;
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+/// What to measure.
+#[derive(Debug, clap::Subcommand)]
+pub enum BenchCommand {
+    /// The field's kernels against the same model in tensor operations and against the machine's limits.
+    Field(field::FieldArgs),
+    /// Encoder and forecaster, one frame at a time.
+    Encoder(encoder::EncoderArgs),
+    /// From one process to another: this program's topics, bare iceoryx2, Unix sockets.
+    Ipc(ipc::IpcArgs),
+    /// The other process of `ipc`.
+    #[command(hide = true)]
+    IpcPeer(ipc::PeerArgs),
+    /// Camera to action, with all stages alive.
+    Loop(graph_loop::LoopArgs),
+}
+
+/// Where figures go.
+#[derive(Clone, Debug, clap::Args)]
+pub struct OutputArgs {
+    /// Write the figures here, as JSON. Figures of other benchmarks that the file holds are kept.
+    #[arg(long)]
+    json: Option<PathBuf>,
+    /// Compare with the figures of an earlier run's JSON, as ratios.
+    #[arg(long)]
+    baseline: Option<PathBuf>,
+}
+
+/// Measures, prints, and writes what was asked for.
+pub fn run(command: BenchCommand) -> anyhow::Result<ExitCode> {
+    let (report, output) = match command {
+        BenchCommand::Field(args) => (field::run(&args)?, args.output),
+        BenchCommand::Encoder(args) => (encoder::run(&args)?, args.output),
+        BenchCommand::Ipc(args) => (ipc::run(&args)?, args.output),
+        BenchCommand::Loop(args) => (graph_loop::run(&args)?, args.output),
+        BenchCommand::IpcPeer(args) => {
+            ipc::peer(&args)?;
+            return Ok(ExitCode::SUCCESS);
+        }
+    };
+    finish(&report, &output)?;
+    Ok(ExitCode::SUCCESS)
+}
+
+fn finish(report: &Report, output: &OutputArgs) -> anyhow::Result<()> {
+    let machine = machine::describe();
+    println!("\nmachine: {}", machine::sentence(&machine));
+    if let Some(path) = &output.baseline {
+        print!("\n{}", report.compared_with(&report::read(path)?));
+    }
+    if let Some(path) = &output.json {
+        report.write(path, &machine)?;
+        println!("figures: {}", path.display());
+    }
+    Ok(())
+}

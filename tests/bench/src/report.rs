@@ -1,0 +1,187 @@
+//! Figures by key: as JSON, and compared with those of an earlier run.
+
+use anyhow::Context;
+use serde_json::{Map, Value, json};
+use std::fmt::Write;
+use std::path::Path;
+
+/// The figures of one benchmark. Keys are dotted paths below the benchmark's name or names.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Report {
+    figures: Map<String, Value>,
+}
+
+impl Report {
+    /// Notes a figure: `key` is a path like `field.render_fps`. What is not finite becomes null.
+    pub(crate) fn set(&mut self, key: &str, value: f64) {
+        // Six digits are more than any of them is good for.
+        let rounded = format!("{value:.6e}").parse().unwrap_or(value);
+        self.set_value(key, json!(rounded));
+    }
+
+    /// Notes anything else.
+    pub(crate) fn set_value(&mut self, key: &str, value: Value) {
+        let mut parts: Vec<&str> = key.split('.').collect();
+        let Some(last) = parts.pop() else { return };
+        let mut map = &mut self.figures;
+        for part in parts {
+            let entry = map.entry(part).or_insert_with(|| json!({}));
+            if !entry.is_object() {
+                *entry = json!({});
+            }
+            let Some(below) = entry.as_object_mut() else { return };
+            map = below;
+        }
+        map.insert(last.to_owned(), value);
+    }
+
+    /// Writes the figures and the machine. Another benchmark's figures in the file stay when they are of this machine.
+    pub(crate) fn write(&self, path: &Path, machine: &Value) -> anyhow::Result<()> {
+        let without_date = |machine: &Value| {
+            let mut machine = machine.clone();
+            if let Some(map) = machine.as_object_mut() {
+                map.remove("date");
+            }
+            machine
+        };
+        let mut all = Map::new();
+        if path.is_file()
+            && let Value::Object(old) = read(path)?
+        {
+            if old.get("machine").map(without_date) == Some(without_date(machine)) {
+                all = old;
+            } else {
+                println!("{} is of another machine: its figures are replaced", path.display());
+            }
+        }
+        all.insert("machine".to_owned(), machine.clone());
+        all.extend(self.figures.clone());
+        let context = || format!("cannot write {}", path.display());
+        if let Some(folder) = path.parent().filter(|f| !f.as_os_str().is_empty()) {
+            std::fs::create_dir_all(folder).with_context(context)?;
+        }
+        std::fs::write(path, serde_json::to_string_pretty(&all)? + "\n").with_context(context)
+    }
+
+    /// A table of all figures that both have, with their ratios, now over then.
+    pub(crate) fn compared_with(&self, baseline: &Value) -> String {
+        let mut rows = vec![["figure", "before", "now", "now / before"].map(str::to_owned)];
+        let (mut now, mut then) = (Vec::new(), Vec::new());
+        flatten("", &Value::Object(self.figures.clone()), &mut now);
+        flatten("", baseline, &mut then);
+        for (key, value) in &now {
+            if let Some((_, before)) = then.iter().find(|(k, _)| k == key) {
+                rows.push([key.clone(), number(*before), number(*value), format!("{:.3}", value / before)]);
+            }
+        }
+        if rows.len() == 1 {
+            return "the baseline has none of these figures\n".to_owned();
+        }
+        table(&rows)
+    }
+}
+
+/// Reads figures.
+pub(crate) fn read(path: &Path) -> anyhow::Result<Value> {
+    let text = std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
+    serde_json::from_str(&text).with_context(|| format!("{} holds no figures as `--json` writes them", path.display()))
+}
+
+/// All numbers below a value, by their paths.
+fn flatten(path: &str, value: &Value, out: &mut Vec<(String, f64)>) {
+    match value {
+        Value::Object(map) => {
+            for (key, value) in map {
+                let below = if path.is_empty() { key.clone() } else { format!("{path}.{key}") };
+                flatten(&below, value, out);
+            }
+        }
+        Value::Number(number) => out.extend(number.as_f64().map(|n| (path.to_owned(), n))),
+        _ => {}
+    }
+}
+
+/// A number with the digits that matter.
+pub(crate) fn number(value: f64) -> String {
+    match value.abs() {
+        a if !a.is_finite() => "-".to_owned(),
+        a if a >= 100.0 => format!("{value:.0}"),
+        a if a >= 10.0 => format!("{value:.1}"),
+        a if a >= 1.0 => format!("{value:.2}"),
+        _ => format!("{value:.3}"),
+    }
+}
+
+/// Columns side by side: the first to the left, the others to the right. The first row is the heading.
+pub(crate) fn table<const N: usize>(rows: &[[String; N]]) -> String {
+    let widths: [usize; N] =
+        std::array::from_fn(|c| rows.iter().map(|row| row[c].chars().count()).max().unwrap_or_default());
+    let mut text = String::new();
+    for (i, row) in rows.iter().enumerate() {
+        let mut line = String::new();
+        for (c, cell) in row.iter().enumerate() {
+            let width = widths[c];
+            // Writing to a string cannot fail.
+            let _ = if c == 0 { write!(line, "{cell:<width$}") } else { write!(line, "  {cell:>width$}") };
+        }
+        text.push_str(line.trim_end());
+        text.push('\n');
+        if i == 0 {
+            text.push_str(&"-".repeat(widths.iter().sum::<usize>() + 2 * (N - 1)));
+            text.push('\n');
+        }
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn report(fps: f64) -> Report {
+        let mut report = Report::default();
+        report.set("field.render_fps", fps);
+        report.set("field.limit.gflops", 200.0);
+        report.set_value("field.instruction_set", json!("avx2"));
+        report
+    }
+
+    /// Keys are nested, another benchmark's figures stay on the same machine whatever the date, and go on another.
+    #[test]
+    fn files_are_merged_by_machine() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("new/figures.json");
+        let machine = |name: &str, date: &str| json!({ "cpu": name, "date": date });
+        report(30.0).write(&path, &machine("a", "Monday")).unwrap();
+        let mut other = Report::default();
+        other.set("loop.p50_ms", f64::NAN);
+        other.write(&path, &machine("a", "Tuesday")).unwrap();
+        let value = read(&path).unwrap();
+        assert_eq!(value["field"]["render_fps"], json!(30.0));
+        assert_eq!(value["field"]["limit"]["gflops"], json!(200.0));
+        assert_eq!(value["loop"]["p50_ms"], Value::Null);
+        assert_eq!(value["machine"]["date"], json!("Tuesday"));
+        other.write(&path, &machine("b", "Tuesday")).unwrap();
+        assert_eq!(read(&path).unwrap().get("field"), None);
+        std::fs::write(&path, "{").unwrap();
+        assert!(read(&path).unwrap_err().to_string().contains("figures.json"));
+    }
+
+    /// Figures that both runs have are compared as now over then; the rest is left out.
+    #[test]
+    fn comparison_is_a_ratio() {
+        let baseline = json!({ "field": { "render_fps": 20.0, "gone": 1.0 }, "machine": { "cores": 2 } });
+        let text = report(30.0).compared_with(&baseline);
+        let row: Vec<&str> = text.lines().nth(2).unwrap().split_whitespace().collect();
+        assert_eq!(row, ["field.render_fps", "20.0", "30.0", "1.500"]);
+        assert_eq!(text.lines().count(), 3);
+        assert!(report(1.0).compared_with(&json!({})).contains("none"));
+    }
+
+    /// Columns line up.
+    #[test]
+    fn tables_line_up() {
+        let rows = [["a", "bb"], ["long", "1"]].map(|row| row.map(str::to_owned));
+        assert_eq!(table(&rows), "a     bb\n--------\nlong   1\n");
+    }
+}

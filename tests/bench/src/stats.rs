@@ -1,0 +1,134 @@
+//! Quantiles, ratios of medians, and measuring in turns.
+
+use std::time::Instant;
+
+/// Times of one thing, sorted.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub(crate) struct Times {
+    sorted: Vec<f64>,
+}
+
+impl Times {
+    pub(crate) fn new(mut times: Vec<f64>) -> Self {
+        times.retain(|t| t.is_finite());
+        times.sort_by(f64::total_cmp);
+        Self { sorted: times }
+    }
+
+    /// The smallest time that at least this share (0..=1) of all times does not exceed; NaN when there are none.
+    pub(crate) fn quantile(&self, share: f64) -> f64 {
+        let rank = (share * self.sorted.len() as f64).ceil() as usize;
+        self.sorted.get(rank.max(1) - 1).copied().unwrap_or(f64::NAN)
+    }
+
+    pub(crate) fn median(&self) -> f64 {
+        self.quantile(0.5)
+    }
+
+    pub(crate) fn len(&self) -> usize {
+        self.sorted.len()
+    }
+}
+
+/// How much longer `slow` takes than `fast`, measured in turns: the ratio of medians, and the quartiles of the ratios
+/// of turns.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Ratio {
+    pub(crate) of_medians: f64,
+    pub(crate) low: f64,
+    pub(crate) high: f64,
+}
+
+impl Ratio {
+    /// Both in the order of their turns.
+    pub(crate) fn new(slow: &[f64], fast: &[f64]) -> Self {
+        let turns = Times::new(slow.iter().zip(fast).map(|(s, f)| s / f).collect());
+        Self {
+            of_medians: Times::new(slow.to_vec()).median() / Times::new(fast.to_vec()).median(),
+            low: turns.quantile(0.25),
+            high: turns.quantile(0.75),
+        }
+    }
+}
+
+impl std::fmt::Display for Ratio {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{:.2}x ({:.2} to {:.2})", self.of_medians, self.low, self.high)
+    }
+}
+
+/// Something to be measured: returns the seconds that it took.
+pub(crate) type Contender<'a> = Box<dyn FnMut() -> f64 + 'a>;
+
+/// Wraps an action with a clock.
+pub(crate) fn timed<'a>(mut action: impl FnMut() + 'a) -> Contender<'a> {
+    Box::new(move || {
+        let start = Instant::now();
+        action();
+        start.elapsed().as_secs_f64()
+    })
+}
+
+/// Seconds after which a contender is asked no more: one that is far slower than the others needs few turns.
+const PATIENCE_S: f64 = 12.0;
+
+/// Measures all in turns, `rounds` times, after one turn that does not count; every second round goes backwards, so
+/// that none is always the one after another. A slow one takes part in the first rounds alone, at least in one.
+/// Returns the seconds of each, in the order of its turns.
+pub(crate) fn in_turns(rounds: usize, contenders: &mut [Contender<'_>]) -> Vec<Vec<f64>> {
+    let mut seconds = vec![Vec::with_capacity(rounds); contenders.len()];
+    let own_rounds: Vec<usize> =
+        contenders.iter_mut().map(|c| ((PATIENCE_S / c()) as usize).clamp(1, rounds.max(1))).collect();
+    for round in 0..rounds.max(1) {
+        for i in 0..contenders.len() {
+            let i = if round % 2 == 0 { i } else { contenders.len() - 1 - i };
+            if round < own_rounds[i] {
+                seconds[i].push(contenders[i]());
+            }
+        }
+    }
+    seconds
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Quantiles are times that occurred: of a thousand, p99 is the 990th, p99.9 the 999th, the last the maximum.
+    #[test]
+    fn quantiles_are_exact() {
+        let times = Times::new((1..=1000).rev().map(f64::from).collect());
+        assert_eq!([0.5, 0.99, 0.999, 1.0].map(|q| times.quantile(q)), [500.0, 990.0, 999.0, 1000.0]);
+        assert_eq!((times.median(), times.len()), (500.0, 1000));
+        assert_eq!(Times::new(vec![7.0]).quantile(0.999), 7.0);
+        assert!(Times::default().median().is_nan());
+        assert_eq!(Times::new(vec![f64::NAN, 1.0]).len(), 1);
+    }
+
+    /// The ratio is that of the medians, whatever the order; the spread is that of the turns.
+    #[test]
+    fn ratios_are_of_medians() {
+        let ratio = Ratio::new(&[8.0, 4.0, 100.0, 8.0, 8.0], &[2.0, 2.0, 2.0, 1.0, 4.0]);
+        assert_eq!((ratio.of_medians, ratio.low, ratio.high), (4.0, 2.0, 8.0));
+        assert_eq!(ratio.to_string(), "4.00x (2.00 to 8.00)");
+    }
+
+    /// Each is called once a round and once before, forwards and backwards in turn; a slow one less often.
+    #[test]
+    fn turns_alternate() {
+        let calls = std::cell::RefCell::new(String::new());
+        let contender = |name: char| -> Contender<'_> {
+            let calls = &calls;
+            Box::new(move || {
+                calls.borrow_mut().push(name);
+                calls.borrow().len() as f64
+            })
+        };
+        let seconds = in_turns(2, &mut [contender('a'), contender('b')]);
+        assert_eq!(*calls.borrow(), "ababba");
+        assert_eq!(seconds, [[3.0, 6.0], [4.0, 5.0]]);
+        let slow: Contender<'_> = Box::new(|| PATIENCE_S);
+        let quick: Contender<'_> = Box::new(|| 1e-3);
+        assert_eq!(in_turns(3, &mut [slow, quick]), [vec![PATIENCE_S], vec![1e-3; 3]]);
+    }
+}
