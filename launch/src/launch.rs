@@ -8,7 +8,7 @@ use crate::report::{self, RunOutcome};
 use crate::run_record::RunRecord;
 use crate::supervise::{RestartBudget, Verdict};
 use crate::terminal::Terminal;
-use anyhow::{Context, bail, ensure};
+use anyhow::{Context, anyhow, bail, ensure};
 use carff_config::{GraphConfig, RestartPolicy};
 use carff_messages::{ActionCode, HealthState, Stage};
 use carff_scenes::{Extras, Scenario};
@@ -104,7 +104,7 @@ pub fn run(args: &LaunchArgs) -> anyhow::Result<ExitCode> {
         let node = Node::open(&run, "launcher")?;
         let mut launcher = Launcher {
             monitor: Monitor::open(&node)?,
-            waiter: Waiter::new(stop),
+            waiter: Waiter::new(stop.clone()),
             node: &node,
             graph: &graph,
             stages: Vec::new(),
@@ -137,9 +137,8 @@ pub fn run(args: &LaunchArgs) -> anyhow::Result<ExitCode> {
         terminal.log("interrupted: all stages have ended");
         return Ok(ExitCode::from(INTERRUPTED));
     }
-    terminal.status("computing the planning table over all views".to_owned());
-    let planning = planning::evaluate(&outcome)?;
-    terminal.status(String::new());
+    let outcome = Arc::new(outcome);
+    let Some(planning) = evaluate(&outcome, &stop, &terminal)? else { return Ok(ExitCode::from(INTERRUPTED)) };
     let report = report::json(&outcome, planning.as_ref().map(Planning::tables).unwrap_or_default());
     let text = format!("{}\n{}", summary(&report), planning::text(&report));
     terminal.line(&text);
@@ -155,6 +154,24 @@ pub fn run(args: &LaunchArgs) -> anyhow::Result<ExitCode> {
         }
     }
     Ok(ExitCode::SUCCESS)
+}
+
+/// The planning tables (none for a run without drives), computed on a thread of their own, so that Ctrl-C still ends the
+/// program: then the answer is `None`.
+fn evaluate(outcome: &Arc<RunOutcome>, stop: &Stop, terminal: &Terminal) -> anyhow::Result<Option<Option<Planning>>> {
+    let theirs = Arc::clone(outcome);
+    let work = std::thread::spawn(move || planning::evaluate(&theirs));
+    let started_ns = monotonic_now_ns();
+    while !work.is_finished() {
+        if stop.is_stopped() {
+            return Ok(None);
+        }
+        let seconds = (monotonic_now_ns() - started_ns) / 1_000_000_000;
+        terminal.status(format!("planning table over every eligible view: {seconds} s"));
+        std::thread::sleep(Duration::from_millis(50));
+    }
+    terminal.status(String::new());
+    work.join().map_err(|_| anyhow!("the computation of the planning table broke off"))?.map(Some)
 }
 
 /// How a run ended that did not fail.

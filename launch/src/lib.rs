@@ -2,6 +2,7 @@
 //! What the stages compute lives in the stages.
 
 pub mod dataset;
+mod filmstrip;
 pub mod launch;
 pub mod lock;
 pub mod monitor;

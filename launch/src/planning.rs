@@ -20,10 +20,10 @@ use std::collections::BTreeMap;
 use std::fmt::Write;
 use std::path::Path;
 
-/// Least trials of each kind over the trained poses.
+/// Least trials of a table, where its pictures allow it.
 const TRIALS: usize = 300;
-/// Most times that one picture is taken.
-const MOST_REPEATS: usize = 20;
+/// Most times that one picture is taken: pictures that differ in sensor noise alone are no new cases.
+const MOST_REPEATS: usize = 5;
 
 /// What planning made of a run.
 pub struct Planning {
@@ -179,7 +179,7 @@ fn views_table(setup: &Setup, views: &[usize]) -> anyhow::Result<(PlanningTable,
     let inputs = eligible_inputs(&setup.dataset, views)?;
     let of = |kind| inputs.iter().filter(|i: &&EligibleInput| i.kind == kind).count();
     let (hazards, clears) = (of(DriveKind::Hazard), of(DriveKind::Clear));
-    let repeats = TRIALS.div_ceil(hazards.min(clears).max(1)).min(MOST_REPEATS);
+    let repeats = TRIALS.div_ceil(inputs.len().max(1)).min(MOST_REPEATS);
     let models = &setup.models;
     let trials = trials(&models.encoder, &setup.dataset, &inputs, repeats, &noise, setup.seed)?;
     let horizon = setup.graph.run.horizon;

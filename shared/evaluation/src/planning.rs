@@ -107,6 +107,9 @@ pub struct TrialOutcome {
     pub kind: DriveKind,
 }
 
+/// Index of a rule, index of a number of samples, and whether it halted.
+type Halt = (usize, usize, bool);
+
 /// Runs every trial with every rule and number of samples, on all threads of rayon's pool. Outcomes, in the order of
 /// the trials, are those of n = 10.
 pub fn planning_table(
@@ -120,7 +123,7 @@ pub fn planning_table(
     let posteriors: Vec<LatentGaussian> = trials.iter().map(|t| t.posterior).collect();
     let first = if posteriors.is_empty() { Vec::new() } else { net.forecast_all(&posteriors) };
     let later = net.forecast_all(probe.states());
-    let results: Vec<(Vec<(usize, usize, bool)>, TrialOutcome)> = trials
+    let results: Vec<(Vec<Halt>, TrialOutcome)> = trials
         .par_iter()
         .zip(&first)
         .map_init(

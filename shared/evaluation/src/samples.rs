@@ -1,7 +1,7 @@
 //! Do the probed samples name the state that comes next?
 
 use carff_belief::Probe;
-use carff_dataset::{Equivalence, Observability};
+use carff_dataset::Equivalence;
 use carff_models::{
     LatentGaussian,
     mixture::{MixtureNet, Sampling},
@@ -37,27 +37,24 @@ pub struct Input {
     pub state: usize,
     /// Pose.
     pub view: usize,
-    /// How much of the actor's place it shows.
-    pub observability: Observability,
     /// The posterior.
     pub posterior: LatentGaussian,
     /// Names the random draws.
     pub frame: u64,
 }
 
-/// Accuracy of `count` probed samples from each input of one observability whose state has a next one.
+/// Accuracy of `count` probed samples from each input whose state has a next one.
 pub fn sample_accuracy(
     net: &MixtureNet,
     probe: &mut Probe,
     inputs: &[Input],
-    observability: Observability,
     timestamps: usize,
     equivalence: &Equivalence,
     count: usize,
     seed: u64,
 ) -> SampleAccuracy {
     let mut table = SampleAccuracy::default();
-    for input in inputs.iter().filter(|i| i.observability == observability) {
+    for input in inputs {
         if (input.state + 1).is_multiple_of(timestamps) {
             continue;
         }

@@ -16,6 +16,10 @@ use crate::math::{hash, sigmoid, spherical_harmonics, unit};
 const CHUNK: usize = 32;
 /// Numbers that one task of the Adam step updates.
 const ADAM_PIECE: usize = 1 << 15;
+/// Random points of each cell that are looked at when training ends.
+const LAST_LOOKS: u64 = 24;
+/// A cell stays when a step inside the bounds through its densest point would hide this share of what is behind.
+const VISIBLE_OPACITY: f32 = 0.03;
 /// Occupancy cells that one task looks at.
 const CELLS_PIECE: usize = 512;
 
@@ -226,8 +230,28 @@ impl FieldTrainer {
         &self.field
     }
 
-    /// The field, and an end to training.
-    pub fn into_field(self) -> Field {
+    /// The field, and an end to training. Cells of the occupancy grid in which no state has anything that a picture
+    /// would show are given up: training keeps thin fog, which rendering need not walk through.
+    pub fn into_field(mut self) -> Field {
+        let cells: Vec<u32> =
+            (0..self.cell_density.len() as u32).filter(|cell| self.field.occupancy.cell(*cell as usize)).collect();
+        if self.step < self.config.occupancy_warmup_steps || self.state_latents.is_empty() {
+            return self.field;
+        }
+        let mut densest = vec![0.0_f32; cells.len()];
+        for look in 0..LAST_LOOKS {
+            let round = hash(self.config.seed, 0x1a57, look);
+            let latents = self.latents_for(round);
+            for (most, density) in densest.iter_mut().zip(self.densest(&cells, &latents, round)) {
+                *most = most.max(density);
+            }
+        }
+        let threshold = VISIBLE_OPACITY / self.field.marcher.step_m;
+        let mut kept = vec![false; self.cell_density.len()];
+        for (cell, density) in cells.iter().zip(densest) {
+            kept[*cell as usize] = density > threshold;
+        }
+        self.field.occupancy.set_from(|cell| kept[cell]);
         self.field
     }
 
@@ -446,13 +470,31 @@ impl FieldTrainer {
             self.cells.sort_unstable();
             self.cells.dedup();
         }
-        let latents: Vec<[f32; LATENT_DIM]> = self
-            .state_latents
+        let latents = self.latents_for(round);
+        let found = self.densest(&self.cells, &latents, round);
+        for (cell, density) in self.cells.iter().zip(found) {
+            let kept = &mut self.cell_density[*cell as usize];
+            *kept = (*kept * self.config.occupancy_decay).max(density);
+        }
+        let mean = self.cell_density.iter().map(|d| f64::from(d.min(1e3))).sum::<f64>() / cells as f64;
+        let threshold = (self.config.occupancy_threshold / self.field.marcher.step_m).min(mean as f32);
+        let densities = &self.cell_density;
+        self.field.occupancy.set_from(|i| densities[i] > threshold);
+    }
+
+    /// One latent of each state, another in each round.
+    fn latents_for(&self, round: u64) -> Vec<[f32; LATENT_DIM]> {
+        self.state_latents
             .iter()
             .enumerate()
             .map(|(s, of_state)| of_state[(hash(round, 3, s as u64) % of_state.len() as u64) as usize])
-            .collect();
+            .collect()
+    }
+
+    /// The largest density under any of the latents, at one random point of each cell.
+    fn densest(&self, cells: &[u32], latents: &[[f32; LATENT_DIM]], round: u64) -> Vec<f32> {
         let field = &self.field;
+        let resolution = field.occupancy.resolution();
         let inverse = 1.0 / resolution as f32;
         let look = |cells: &[u32]| -> Vec<f32> {
             let points: Vec<[f32; 3]> = cells
@@ -467,23 +509,15 @@ impl FieldTrainer {
                 })
                 .collect();
             let mut densities = vec![0.0; points.len() * latents.len()];
-            field.density_in_cube(&points, &latents, &mut densities);
+            field.density_in_cube(&points, latents, &mut densities);
             (0..points.len())
                 .map(|p| (0..latents.len()).map(|l| densities[l * points.len() + p]).fold(0.0, f32::max))
                 .collect()
         };
-        let found: Vec<f32> = match &self.pool {
-            Some(pool) => pool.install(|| self.cells.par_chunks(CELLS_PIECE).map(look).flatten().collect()),
-            None => self.cells.chunks(CELLS_PIECE).flat_map(look).collect(),
-        };
-        for (cell, density) in self.cells.iter().zip(found) {
-            let kept = &mut self.cell_density[*cell as usize];
-            *kept = (*kept * c.occupancy_decay).max(density);
+        match &self.pool {
+            Some(pool) => pool.install(|| cells.par_chunks(CELLS_PIECE).map(look).flatten().collect()),
+            None => cells.chunks(CELLS_PIECE).flat_map(look).collect(),
         }
-        let mean = self.cell_density.iter().map(|d| f64::from(d.min(1e3))).sum::<f64>() / cells as f64;
-        let threshold = (c.occupancy_threshold / self.field.marcher.step_m).min(mean as f32);
-        let densities = &self.cell_density;
-        self.field.occupancy.set_from(|i| densities[i] > threshold);
     }
 
     /// The optimiser's state; with the field's own tensors it is all that is needed to go on bit by bit.

@@ -23,6 +23,12 @@ impl Default for DecoderConfig {
 /// Side of the decoder's pictures, pixels.
 pub const PICTURE_PX: i64 = 128;
 
+/// Inputs of the first layer: the one-hot pose, and its product with the latent, so that each pose has its own map of
+/// the latent. With latent and pose side by side, the decoder stayed at the pose's mean picture.
+fn joined(poses: i64) -> i64 {
+    if poses > 0 { poses * (LATENT_DIM as i64 + 1) } else { LATENT_DIM as i64 }
+}
+
 /// The decoder.
 #[derive(Debug)]
 pub struct Decoder {
@@ -43,7 +49,7 @@ impl Decoder {
         let c = config.channels;
         let linear = nn::LinearConfig::default();
         Self {
-            join: nn::linear(path / "join", LATENT_DIM as i64 + poses, config.hidden, linear),
+            join: nn::linear(path / "join", joined(poses), config.hidden, linear),
             spread: nn::linear(path / "spread", config.hidden, c * 64, linear),
             up16: nn::conv2d(path / "up16", c, c, 3, same),
             up32: nn::conv2d(path / "up32", c, c * 3 / 4, 3, same),
@@ -59,7 +65,9 @@ impl Decoder {
     /// over the pose's mean picture, whichever it was trained for.
     pub fn forward(&self, latents: &Tensor, poses: &Tensor) -> Tensor {
         let input = if self.poses > 0 {
-            Tensor::cat(&[latents.shallow_clone(), poses.one_hot(self.poses).to_kind(latents.kind())], 1)
+            let one_hot = poses.one_hot(self.poses).to_kind(latents.kind());
+            let product = (one_hot.unsqueeze(2) * latents.unsqueeze(1)).flatten(1, -1);
+            Tensor::cat(&[product, one_hot], 1)
         } else {
             latents.shallow_clone()
         };

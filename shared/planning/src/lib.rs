@@ -120,7 +120,7 @@ pub fn choose_threshold(trials: &[CalibrationTrial]) -> Option<f64> {
         .windows(2)
         .map(|w| (score(w[1]), logit(w[1]) - logit(w[0]), w))
         .max_by(|a, b| a.0.total_cmp(&b.0).then(a.1.total_cmp(&b.1)))?;
-    let middle = (logit(best.2[0]) + logit(best.2[1])) / 2.0;
+    let middle = logit(best.2[0]).midpoint(logit(best.2[1]));
     Some(1.0 / (1.0 + (-middle).exp()))
 }
 

@@ -35,8 +35,8 @@ pub enum Stage {
 }
 
 /// Trains what `stage` says on a data set, and on the set `free` of freely drawn poses beside it, and writes what is
-/// ready to the checkpoint folder `out`. Finished stages are read from
-/// their saved states; a stage that is asked for by name needs those before it.
+/// ready to the checkpoint folder `out`. Finished stages are read from their saved states; a stage that is asked for by
+/// name needs those before it.
 pub fn train(
     config: &TrainingConfig,
     dataset: &Path,
@@ -55,14 +55,15 @@ pub fn train(
     let states = pictures.scenario.state_count();
     let pretrained = config.pretrained_backbone.as_deref();
     let mut vae = Vae::new(config, pictures.dataset.view_count(), states, pretrained)?;
-    let inputs = Inputs::new(config, &pictures, &mut vae, run)?;
-    if matches!(stage, Stage::All | Stage::Vae) {
-        vae::train(config, &pictures, &vae, &inputs, run)?;
-    } else {
-        finished(run, "vae", config.vae.epochs, |state| vae.restore_weights(state))?;
-    }
-    let posteriors: Vec<Vec<LatentGaussian>> =
-        (0..=config.augmentation.copies).map(|copy| inputs.posteriors(&vae, copy)).collect();
+    let posteriors = match finished(run, "vae", config.vae.epochs, |state| vae.restore_weights(state)) {
+        Ok(()) => posteriors_of(config, &pictures, &mut vae, run)?,
+        Err(error) if matches!(stage, Stage::Nerf | Stage::Mdn) => return Err(error),
+        Err(_) => {
+            let inputs = Inputs::new(config, &pictures, &mut vae, run)?;
+            vae::train(config, &pictures, &vae, &inputs, run)?;
+            inputs.all_posteriors(&vae, run)?
+        }
+    };
     let mut metrics = json!({"vae": vae::evaluate(config, &pictures, &vae, &posteriors[0], true)?});
     let clouds = Clouds::new(&pictures, &posteriors[0])?;
     let mut manifest = Manifest {
@@ -129,6 +130,19 @@ pub fn train(
     }
     run.metric(&json!({"stage": "done", "metrics": manifest.metrics}))?;
     Ok(manifest.metrics)
+}
+
+/// The posteriors that a finished VAE gave, from the run's folder; computed anew when they are not there.
+fn posteriors_of(
+    config: &TrainingConfig,
+    pictures: &Pictures,
+    vae: &mut Vae,
+    run: &Run,
+) -> Result<Vec<Vec<LatentGaussian>>, TrainingError> {
+    match run.load_posteriors(config.augmentation.copies + 1, pictures.images.len())? {
+        Some(posteriors) => Ok(posteriors),
+        None => Inputs::new(config, pictures, vae, run)?.all_posteriors(vae, run),
+    }
 }
 
 fn finished(
@@ -299,14 +313,13 @@ fn figures(
     }
     let mut samples = serde_json::Map::new();
     for (name, role) in [("trained", PoseRole::Rest), ("unseen", PoseRole::Unseen)] {
-        let chosen = pictures.with_roles(&[role]);
-        let mut inputs = Vec::with_capacity(chosen.len());
-        for &i in &chosen {
+        let full = |i: &usize| pictures.labels[*i].observability == Observability::Full;
+        let mut inputs = Vec::new();
+        for i in pictures.with_roles(&[role]).into_iter().filter(full) {
             let image = pictures.inputs(&[i], 0, &config.augmentation, config.seed + 1);
             inputs.extend(models.encoder.encode(&image).into_iter().map(|posterior| Input {
                 state: pictures.labels[i].state,
                 view: pictures.labels[i].view,
-                observability: pictures.labels[i].observability,
                 posterior,
                 frame: i as u64,
             }));
@@ -315,7 +328,6 @@ fn figures(
             &models.mixture,
             &mut models.probe,
             &inputs,
-            Observability::Full,
             pictures.scenario.timestamps,
             &pictures.equivalence,
             50,

@@ -1,7 +1,11 @@
 //! What every training loop does the same way: report, save, stop.
 
 use crate::{TrainingError, curves};
-use carff_models::weights::{self, Tensors};
+use carff_models::{
+    LATENT_DIM, LatentGaussian,
+    encoder::gaussians,
+    weights::{self, Tensors},
+};
 use serde_json::Value;
 use std::{
     fs::OpenOptions,
@@ -35,6 +39,9 @@ pub struct Run<'a> {
     pub stop: &'a AtomicBool,
 }
 
+/// File of the posteriors.
+const POSTERIORS: &str = "posteriors.safetensors";
+
 /// How long a training goes on before it saves its state.
 const SAVE_EVERY: Duration = Duration::from_secs(45);
 
@@ -62,6 +69,40 @@ impl Run<'_> {
         state.insert("run.done".into(), Tensor::from_slice(&[done as i64]));
         weights::write(&self.state_path(stage), &state, Kind::Float)?;
         curves::draw(&self.dir)
+    }
+
+    /// Keeps posteriors `[copy][picture]`, so that later stages need no picture to pass the backbone again.
+    pub fn save_posteriors(&self, posteriors: &[Vec<LatentGaussian>]) -> Result<(), TrainingError> {
+        let all = || posteriors.iter().flatten();
+        let shape = [posteriors.len() as i64, -1, LATENT_DIM as i64];
+        let rows = |values: Vec<f32>| Tensor::from_slice(&values).view(shape);
+        let tensors = Tensors::from([
+            ("mean".into(), rows(all().flat_map(|g| g.mean).collect())),
+            ("log_variance".into(), rows(all().flat_map(|g| g.log_variance).collect())),
+        ]);
+        Ok(weights::write(&self.dir.join(POSTERIORS), &tensors, Kind::Float)?)
+    }
+
+    /// Posteriors that were kept; `None` when there are none, or those of other pictures.
+    pub fn load_posteriors(
+        &self,
+        copies: usize,
+        pictures: usize,
+    ) -> Result<Option<Vec<Vec<LatentGaussian>>>, TrainingError> {
+        let path = self.dir.join(POSTERIORS);
+        if !path.is_file() {
+            return Ok(None);
+        }
+        let tensors = weights::read(&path)?;
+        let shape = [copies as i64, pictures as i64, LATENT_DIM as i64];
+        let (Some(mean), Some(log_variance)) = (tensors.get("mean"), tensors.get("log_variance")) else {
+            return Ok(None);
+        };
+        if mean.size() != shape || log_variance.size() != shape {
+            return Ok(None);
+        }
+        let flat = gaussians(&mean.flatten(0, 1), &log_variance.flatten(0, 1));
+        Ok(Some(flat.chunks(pictures.max(1)).map(<[_]>::to_vec).collect()))
     }
 
     /// A saved state and the steps done, if there is one.

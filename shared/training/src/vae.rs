@@ -164,8 +164,15 @@ impl<'a> Inputs<'a> {
         vae.encoder.features(&Tensor::cat(&inputs, 0))
     }
 
+    /// The posteriors of all pictures in all copies, `[copy][picture]`; kept in the run's folder.
+    pub fn all_posteriors(&self, vae: &Vae, run: &Run) -> Result<Vec<Vec<LatentGaussian>>, TrainingError> {
+        let all: Vec<_> = (0..=self.config.augmentation.copies).map(|copy| self.posteriors(vae, copy)).collect();
+        run.save_posteriors(&all)?;
+        Ok(all)
+    }
+
     /// The posteriors of all pictures, in one copy.
-    pub fn posteriors(&self, vae: &Vae, copy: usize) -> Vec<LatentGaussian> {
+    fn posteriors(&self, vae: &Vae, copy: usize) -> Vec<LatentGaussian> {
         let all: Vec<usize> = (0..self.pictures.images.len()).collect();
         tch::no_grad(|| {
             all.chunks(FEATURE_BATCH * 4)
@@ -217,13 +224,13 @@ pub fn train(
             let losses = losses(config, pictures, vae, inputs, &chosen, &state_targets);
             let mut loss = &losses.kl * kl_weight;
             if let Some(term) = &losses.reconstruction {
-                loss = loss + term * settings.reconstruction_weight;
+                loss = &loss + term * settings.reconstruction_weight;
             }
             if let Some(term) = &losses.state {
-                loss = loss + term * settings.state_weight;
+                loss = &loss + term * settings.state_weight;
             }
             if let Some(term) = &losses.contrastive {
-                loss = loss + term * settings.contrastive_weight;
+                loss = &loss + term * settings.contrastive_weight;
             }
             adam.step(&loss, settings.learning_rate * cosine(step, settings.epochs * per_epoch), 5.0);
             let value = |t: &Tensor| t.double_value(&[]);

@@ -1,4 +1,4 @@
-//! EfficientNet-Lite0 (Tan and Le 2019, Lite variant: no squeeze-and-excite, ReLU6), up to stride 16, weights frozen.
+//! EfficientNet-Lite0 (Tan and Le 2019, Lite variant: no squeeze-and-excite, `ReLU6`), up to stride 16, weights frozen.
 //!
 //! Frozen, so batch normalisation is folded into the convolutions when the weights are read.
 

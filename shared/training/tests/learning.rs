@@ -1,0 +1,202 @@
+//! Contracts of training: it learns what can be learnt, and an interrupted training ends where a straight one does.
+
+#![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
+
+use carff_evaluation::Models;
+use carff_scenes::{Extras, Scenario};
+use carff_training::{
+    TrainingError,
+    config::TrainingConfig,
+    pipeline::{self, Stage},
+    run::{Progress, Run},
+};
+use serde_json::Value;
+use std::ops::ControlFlow;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
+
+/// A block drives along a road, or does not; twelve cameras look down on it, eight stand behind a wall.
+const SCENARIO: &str = r##"
+name = "small"
+bounds_m = [[-4.0, -3.0, 0.0], [4.0, 3.0, 2.0]]
+timestamps = 2
+branches = ["with", "without"]
+hazard_branches = ["with"]
+bev_view = 0
+
+[picture]
+width_px = 64
+height_px = 64
+fov_deg = 50.0
+
+[sun]
+azimuth_deg = 90.0
+elevation_deg = 80.0
+
+[[road]]
+from = [-20.0, 0.0]
+to = [20.0, 0.0]
+width_m = 5.0
+
+[[building]]
+name = "wall"
+min = [-7.0, -3.6]
+max = [1.0, -3.2]
+height_m = 4.0
+walls = "plaster"
+colour = "#a0a0a0"
+
+[[vehicle]]
+name = "ego"
+role = "ego"
+kind = "block"
+colour = "#2030ff"
+size_m = [1.6, 1.0, 1.0]
+
+[[vehicle.course]]
+branches = ["with", "without"]
+poses = [[2.5, -2.0, 0.0], [2.5, 2.0, 0.0]]
+
+[[vehicle]]
+name = "block"
+role = "actor"
+kind = "block"
+colour = "#ff2000"
+size_m = [2.0, 1.2, 1.2]
+dynamic = true
+
+[[vehicle.course]]
+branches = ["with"]
+poses = [[-2.5, 1.0, 0.0], [-0.5, -1.0, 0.0]]
+
+[[overhead]]
+view_kind = "bev"
+count = 12
+center = [0.0, 0.0]
+height_m = 9.0
+spread_m = 2.0
+
+[[street]]
+view_kind = "street"
+count = 8
+region = [[-4.0, -6.5, 0.7], [-1.5, -5.0, 1.4]]
+look_at = [[-2.5, 0.0, 0.5], [-1.5, 1.0, 0.7]]
+"##;
+
+/// Nets so small that all three are trained in seconds.
+const TRAINING: &str = r#"
+dataset = "set"
+out = "out"
+seed = 3
+split_seed = 5
+threads = 1
+
+[encoder]
+backbone = { kind = "efficientnet-lite0", input_px = 96 }
+reduce_channels = 32
+pool_channels = 16
+hidden = 32
+
+[decoder]
+hidden = 32
+channels = 16
+
+[augmentation]
+copies = 1
+
+[vae]
+epochs = 24
+batch = 16
+learning_rate = 4e-3
+dropout = 0.0
+
+[mixture]
+components = 2
+hidden = 64
+
+[mdn]
+steps = 300
+batch = 64
+
+[field]
+levels = 6
+log2_table_size = 13
+max_resolution = 128
+hidden_width = 16
+samples_across = 64.0
+
+[nerf]
+rays = 1024
+
+[nerf.trainer]
+steps = 400
+occupancy_warmup_steps = 100
+threads = 1
+"#;
+
+struct Place {
+    folder: tempfile::TempDir,
+    config: TrainingConfig,
+}
+
+impl Place {
+    fn new() -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("training.toml");
+        std::fs::write(&file, TRAINING).unwrap();
+        let mut config = TrainingConfig::load(&file).unwrap();
+        let root = Path::new(env!("CARGO_MANIFEST_DIR")).ancestors().nth(2).unwrap();
+        config.pretrained_backbone = Some(root.join("configs/checkpoints/backbones/efficientnet-lite0.safetensors"));
+        let scenario = Scenario::parse(Path::new("small.toml"), SCENARIO).unwrap();
+        scenario.render_dataset(&folder.path().join("set"), Extras::None, |_, _| ControlFlow::Continue(())).unwrap();
+        Self { folder, config }
+    }
+
+    fn out(&self, name: &str) -> PathBuf {
+        self.folder.path().join(name)
+    }
+
+    /// Trains until `stop_at` (stage, steps done), or to the end.
+    fn train(&self, name: &str, stop_at: Option<(&str, usize)>) -> Result<Value, TrainingError> {
+        let stop = AtomicBool::new(false);
+        let on_progress = |progress: &Progress| {
+            if stop_at.is_some_and(|(stage, done)| progress.stage == stage && progress.done >= done) {
+                stop.store(true, Ordering::Relaxed);
+            }
+        };
+        let dir = self.out(&format!("{name}-run"));
+        std::fs::create_dir_all(&dir).unwrap();
+        let run = Run { dir, on_progress: &on_progress, stop: &stop };
+        pipeline::train(&self.config, &self.out("set"), None, &self.out(name), Stage::All, &run)
+    }
+}
+
+/// From pictures alone to a checkpoint that decides: latents name states, the field shows each state and not another,
+/// the forecast of a state shows its successor, and the calibrated rule halts for the block and else advances. And a
+/// training that is stopped in each of its three stages ends with the same bytes as one that is not.
+#[test]
+fn training_learns_and_resumes() {
+    let place = Place::new();
+    let metrics = place.train("straight", None).unwrap();
+    let figure =
+        |path: &str| metrics.pointer(path).and_then(Value::as_f64).unwrap_or_else(|| panic!("{path}: {metrics:#}"));
+    // Chance is 25 %.
+    assert!(figure("/vae/trained/full/accuracy") > 0.95, "{metrics:#}");
+    assert!(figure("/samples/trained/accuracy") > 0.8, "{metrics:#}");
+    assert!(figure("/birds_eye/matching_db") > figure("/birds_eye/unmatching_db") + 2.0, "{metrics:#}");
+    for kind in ["clear", "hazard"] {
+        let cell = |key: &str| figure(&format!("/planning/all_views/calibrated/10/{kind}/{key}"));
+        assert!(cell("trials") >= 20.0 && cell("success") >= 0.9 * cell("trials"), "{kind}: {metrics:#}");
+    }
+    let models = Models::load(&place.out("straight")).unwrap();
+    assert_eq!(models.probe.states().len(), 4);
+
+    for stop_at in [("vae", 5), ("mdn", 100), ("nerf", 150)] {
+        assert!(matches!(place.train("halting", Some(stop_at)), Err(TrainingError::Stopped)), "{stop_at:?}");
+    }
+    place.train("halting", None).unwrap();
+    for file in ["encoder", "decoder", "mixture", "field"] {
+        let read = |name: &str| std::fs::read(place.out(name).join(format!("{file}.safetensors"))).unwrap();
+        assert!(read("straight") == read("halting"), "{file} differs after interruptions");
+    }
+}
