@@ -138,7 +138,10 @@ pub fn run(args: &LaunchArgs) -> anyhow::Result<ExitCode> {
         return Ok(ExitCode::from(INTERRUPTED));
     }
     let outcome = Arc::new(outcome);
-    let Some(planning) = evaluate(&outcome, &stop, &terminal)? else { return Ok(ExitCode::from(INTERRUPTED)) };
+    let planning = evaluate(&outcome, &stop, &terminal)?;
+    if stop.is_stopped() {
+        return Ok(ExitCode::from(INTERRUPTED));
+    }
     let report = report::json(&outcome, planning.as_ref().map(Planning::tables).unwrap_or_default());
     let text = format!("{}\n{}", summary(&report), planning::text(&report));
     terminal.line(&text);
@@ -157,8 +160,8 @@ pub fn run(args: &LaunchArgs) -> anyhow::Result<ExitCode> {
 }
 
 /// The planning tables (none for a run without drives), computed on a thread of their own, so that Ctrl-C still ends the
-/// program: then the answer is `None`.
-fn evaluate(outcome: &Arc<RunOutcome>, stop: &Stop, terminal: &Terminal) -> anyhow::Result<Option<Option<Planning>>> {
+/// program: then there are none either.
+fn evaluate(outcome: &Arc<RunOutcome>, stop: &Stop, terminal: &Terminal) -> anyhow::Result<Option<Planning>> {
     let theirs = Arc::clone(outcome);
     let work = std::thread::spawn(move || planning::evaluate(&theirs));
     let started_ns = monotonic_now_ns();
@@ -171,7 +174,7 @@ fn evaluate(outcome: &Arc<RunOutcome>, stop: &Stop, terminal: &Terminal) -> anyh
         std::thread::sleep(Duration::from_millis(50));
     }
     terminal.status(String::new());
-    work.join().map_err(|_| anyhow!("the computation of the planning table broke off"))?.map(Some)
+    work.join().map_err(|_| anyhow!("the computation of the planning table broke off"))?
 }
 
 /// How a run ended that did not fail.

@@ -54,7 +54,9 @@ fn drives_with_bad_pictures() {
     let set = tempfile::tempdir().unwrap();
     let spoil = |write: &dyn Fn(&Path)| {
         picture_set(set.path());
-        std::fs::read_dir(set.path().join("images")).unwrap().for_each(|e| write(&e.unwrap().path()));
+        for entry in std::fs::read_dir(set.path().join("images")).unwrap() {
+            write(&entry.unwrap().path());
+        }
     };
     let camera = || {
         let graph =

@@ -59,7 +59,7 @@ fn the_shipped_graph_drives() {
                     // Whatever the models: these two rules look at nothing.
                     match (rule, kind) {
                         ("underconfident", "hazard") | ("overconfident", "clear") => {
-                            assert!(success == trials, "{what}")
+                            assert!(success == trials, "{what}");
                         }
                         ("underconfident", "clear") | ("overconfident", "hazard") => assert!(success == 0.0, "{what}"),
                         _ => {}

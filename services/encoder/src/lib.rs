@@ -13,7 +13,7 @@ pub fn load(checkpoint: &Path, threads: usize) -> anyhow::Result<Encoder> {
     let manifest = Manifest::load(checkpoint)?;
     let encoder = carff_checkpoint::load_encoder(checkpoint, &manifest)?;
     for _ in 0..3 {
-        encode(&encoder, &[128; 128 * 128 * 3], 128, 128)?;
+        encode(&encoder, &vec![128; 128 * 128 * 3], 128, 128)?;
     }
     Ok(encoder)
 }

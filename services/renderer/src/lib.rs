@@ -54,7 +54,7 @@ pub fn hypotheses(forecast: &Forecast, belief: &Belief, count: usize) -> Vec<Hyp
 /// A camera over the region that matters: straight down with the picture's up = +Y, or from a corner.
 pub fn camera(field: &Field, choice: ViewChoice, width_px: u32, height_px: u32) -> PinholeCamera {
     let [low, high] = field.config().bounds_m.map(|corner| corner.map(f64::from));
-    let centre = [0, 1, 2].map(|i| (low[i] + high[i]) / 2.0);
+    let centre = [0, 1, 2].map(|i| f64::midpoint(low[i], high[i]));
     let extent = (high[0] - low[0]).max(high[1] - low[1]);
     let fov_deg = 60.0_f64;
     let distance = extent / 2.0 / (fov_deg / 2.0).to_radians().tan();

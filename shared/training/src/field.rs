@@ -113,14 +113,10 @@ pub fn train(config: &TrainingConfig, pictures: &Pictures, clouds: &Clouds, run:
         threads: config.threads.max(1) as usize,
         ..settings.trainer.clone()
     };
-    let mut trainer = match run.load("nerf")? {
-        Some((done, state)) => {
-            resume(config, trainer_config.clone(), done, &state).ok_or_else(|| damaged(&run.state_path("nerf")))?
-        }
-        None => {
-            let field = Field::new(clouds.structure(&config.field, pictures), config.seed)?;
-            FieldTrainer::new(field, trainer_config.clone())?
-        }
+    let mut trainer = if let Some((done, state)) = run.load("nerf")? {
+        resume(config, trainer_config.clone(), done, &state).ok_or_else(|| damaged(&run.state_path("nerf")))?
+    } else {
+        FieldTrainer::new(Field::new(clouds.structure(&config.field, pictures), config.seed)?, trainer_config.clone())?
     };
     let states = pictures.scenario.state_count();
     trainer.set_state_latents(&state_latents(clouds, states, config.seed));
@@ -141,8 +137,8 @@ pub fn train(config: &TrainingConfig, pictures: &Pictures, clouds: &Clouds, run:
             clouds.draw(state_of[view], resampled, &mut rng)
         });
         let report = trainer.step(&batch);
-        loss += 0.02 * (f64::from(report.loss) - loss);
-        psnr += 0.02 * (f64::from(report.psnr) - psnr);
+        loss += 0.02 * (report.loss - loss);
+        psnr += 0.02 * (report.psnr - psnr);
         let done = trainer.step_count();
         if done.is_multiple_of(20) || done == total {
             let line = format!(

@@ -41,7 +41,7 @@ pub(crate) fn run(args: &EncoderArgs) -> anyhow::Result<Report> {
     let manifest = Manifest::load(&args.checkpoint)?;
     let encoder = carff_checkpoint::load_encoder(&args.checkpoint, &manifest)?;
     let net = carff_checkpoint::load_mixture(&args.checkpoint, &manifest)?;
-    let rgb: Vec<u8> = (0..SIDE_PX * SIDE_PX * 3).map(|i| (i * 2_654_435_761 >> 13) as u8).collect();
+    let rgb: Vec<u8> = (0..SIDE_PX * SIDE_PX * 3).map(|i| ((i * 2_654_435_761) >> 13) as u8).collect();
     let posterior = encode(&encoder, &rgb).context("the encoder gives no posterior")?;
 
     let mut report = Report::default();

@@ -86,7 +86,7 @@ pub(crate) fn run(args: &FieldArgs) -> anyhow::Result<Report> {
 /// A camera straight above the bounds, the picture's up = +Y.
 fn birds_eye(config: &FieldConfig, side_px: u32) -> PinholeCamera {
     let [low, high] = config.bounds_m.map(|corner| corner.map(f64::from));
-    let centre = [0, 1, 2].map(|i| (low[i] + high[i]) / 2.0);
+    let centre = [0, 1, 2].map(|i| f64::midpoint(low[i], high[i]));
     let extent = (high[0] - low[0]).max(high[1] - low[1]);
     let fov_deg = 60.0_f64;
     let height = low[2] + extent / 2.0 / (fov_deg / 2.0).to_radians().tan();
@@ -269,7 +269,7 @@ impl Bench {
                     }
                 }),
                 timed(|| {
-                    field.render_rays(&up, &[*z], &RenderOptions { max_samples_per_ray: 1, ..options }, &mut nothing)
+                    field.render_rays(&up, &[*z], &RenderOptions { max_samples_per_ray: 1, ..options }, &mut nothing);
                 }),
             ],
         );

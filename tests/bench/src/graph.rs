@@ -38,6 +38,7 @@ pub(crate) struct Plan<'a> {
 
 /// One frame's way; times on the monotonic clock, nanoseconds.
 #[derive(Clone, Debug, Default)]
+#[allow(clippy::struct_field_names, reason = "the postfix is the unit")]
 struct Frame {
     captured_ns: u64,
     published_ns: u64,

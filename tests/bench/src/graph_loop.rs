@@ -171,13 +171,11 @@ fn highest_rate<T>(mut held: impl FnMut(f64) -> anyhow::Result<Option<T>>) -> an
     let mut rate_hz = MAIN.rate_hz;
     let mut too_high = HIGHEST_HZ * 2.0;
     while rate_hz <= HIGHEST_HZ {
-        match held(rate_hz)? {
-            Some(result) => best = Some((rate_hz, result)),
-            None => {
-                too_high = rate_hz;
-                break;
-            }
-        }
+        let Some(result) = held(rate_hz)? else {
+            too_high = rate_hz;
+            break;
+        };
+        best = Some((rate_hz, result));
         rate_hz *= 2.0;
     }
     if too_high > HIGHEST_HZ {
