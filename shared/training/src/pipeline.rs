@@ -296,7 +296,12 @@ fn figures(
     let threshold = CheckpointPlanning::load(out).map_err(|e| unfit(&e))?.hazard_threshold;
     let rules = [Rule::Underconfident, Rule::Overconfident, Rule::Paper, Rule::Calibrated { threshold }];
     let mut planning = serde_json::Map::new();
-    for (name, role) in [("all_views", PoseRole::Rest), ("unseen_views", PoseRole::Unseen)] {
+    let tables = [
+        ("all_views", PoseRole::Rest),
+        ("calibration_views", PoseRole::Calibration),
+        ("unseen_views", PoseRole::Unseen),
+    ];
+    for (name, role) in tables {
         let views = pictures.split.views(role);
         let inputs = eligible_inputs(&pictures.dataset, &views).map_err(|e| unfit(&e))?;
         let trials =
