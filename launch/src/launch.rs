@@ -9,7 +9,9 @@ use crate::run_record::RunRecord;
 use crate::supervise::{RestartBudget, Verdict};
 use crate::terminal::Terminal;
 use anyhow::{Context, anyhow, bail, ensure};
-use carff_config::{GraphConfig, RestartPolicy};
+use carff_checkpoint::{Manifest, ScenarioIdentity};
+use carff_config::{CameraSource, GraphConfig, RestartPolicy};
+use carff_dataset::Dataset;
 use carff_messages::{ActionCode, HealthState, Stage};
 use carff_scenes::{Extras, Scenario};
 use carff_stage::StageArgs;
@@ -85,6 +87,7 @@ pub fn run(args: &LaunchArgs) -> anyhow::Result<ExitCode> {
     let dataset = graph.resolve(args.dataset.as_ref().unwrap_or(&graph.run.dataset));
     let checkpoint = graph.resolve(args.checkpoint.as_ref().unwrap_or(&graph.run.checkpoint));
     provide_dataset(&graph, args, &dataset)?;
+    refuse_another_scenario(&graph, &dataset, &checkpoint)?;
     // From here on Ctrl-C is an orderly end; until here it may simply end the process, as no stage runs yet.
     let stop = Stop::on_signals().context("cannot handle signals")?;
     let view_bytes = (graph.renderer.width_px * graph.renderer.height_px * 3) as usize;
@@ -430,7 +433,7 @@ fn sweep(run: &Run) -> anyhow::Result<()> {
 fn provide_dataset(graph: &GraphConfig, args: &LaunchArgs, dataset: &Path) -> anyhow::Result<()> {
     let complete = std::fs::read_dir(dataset)
         .is_ok_and(|entries| entries.flatten().any(|e| e.file_name().to_string_lossy().starts_with("transforms")));
-    if complete || graph.camera.source == carff_config::CameraSource::Folder {
+    if complete || graph.camera.source == CameraSource::Folder {
         return Ok(());
     }
     ensure!(
@@ -447,6 +450,22 @@ fn provide_dataset(graph: &GraphConfig, args: &LaunchArgs, dataset: &Path) -> an
             "data set {} is missing: give --dataset, or name its scenario in the graph file (`run.scenario`)",
             dataset.display()
         ),
+    }
+}
+
+/// A checkpoint knows one scenario: driven through another one it would be sure and wrong. A checkpoint that is not there
+/// is told of by the stage that misses it.
+fn refuse_another_scenario(graph: &GraphConfig, dataset: &Path, checkpoint: &Path) -> anyhow::Result<()> {
+    if graph.camera.source == CameraSource::Folder || !checkpoint.join(carff_checkpoint::files::MANIFEST).exists() {
+        return Ok(());
+    }
+    let manifest = Manifest::load(checkpoint)?;
+    let dataset = Dataset::open(dataset)?;
+    match dataset.scenario() {
+        Some(scenario) => {
+            Ok(manifest.check_scenario(checkpoint, &ScenarioIdentity::of(scenario, dataset.view_count()))?)
+        }
+        None => Ok(()),
     }
 }
 

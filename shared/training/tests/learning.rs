@@ -14,7 +14,7 @@ use serde_json::Value;
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 
 /// A block drives along a road, or does not; twelve cameras look down on it, eight stand behind a wall.
 const SCENARIO: &str = r##"
@@ -135,8 +135,12 @@ occupancy_warmup_steps = 100
 threads = 1
 "#;
 
-/// libtorch has one random generator a process: two trainings in one would draw from each other's.
-static ALONE: Mutex<()> = Mutex::new(());
+/// libtorch has one random generator a process: two trainings at once, or a training and a model that is made, would
+/// draw from each other's.
+fn alone() -> MutexGuard<'static, ()> {
+    static ALONE: Mutex<()> = Mutex::new(());
+    ALONE.lock().unwrap_or_else(PoisonError::into_inner)
+}
 
 struct Place {
     folder: tempfile::TempDir,
@@ -162,7 +166,7 @@ impl Place {
 
     /// Trains, alone in this process, until `stop_at` (stage, steps done), or to the end.
     fn train(&self, name: &str, stop_at: Option<(&str, usize)>) -> Result<Value, TrainingError> {
-        let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
+        let _alone = alone();
         let stop = AtomicBool::new(false);
         let on_progress = |progress: &Progress| {
             if stop_at.is_some_and(|(stage, done)| progress.stage == stage && progress.done >= done) {
@@ -192,6 +196,7 @@ fn training_learns() {
         let cell = |key: &str| figure(&format!("/planning/all_views/calibrated/10/{kind}/{key}"));
         assert!(cell("trials") >= 20.0 && cell("success") >= 0.9 * cell("trials"), "{kind}: {metrics:#}");
     }
+    let _alone = alone();
     assert_eq!(Models::load(&place.out("learnt")).unwrap().probe.states().len(), 4);
 }
 

@@ -123,11 +123,16 @@ pub(crate) struct Size {
 }
 
 impl Size {
-    /// As near to so many bytes as whole pixels allow.
+    /// As near to so many bytes as whole pixels allow; of sizes that are equally near, the one closest to a square.
     fn near(bytes: usize) -> Self {
         let pixels = bytes as f64 / 3.0;
-        let height = pixels.sqrt().floor().max(1.0);
-        Self { width_px: (pixels / height).round() as u32, height_px: height as u32 }
+        let square = pixels.sqrt().floor().max(1.0) as u32;
+        let of_height = |height_px: u32| Self { width_px: (pixels / f64::from(height_px)).round() as u32, height_px };
+        let off = |size: &Self| (size.bytes() as f64 / 3.0 - pixels).abs();
+        (square.div_ceil(2)..square)
+            .rev()
+            .map(of_height)
+            .fold(of_height(square), |best, size| if off(&size) < off(&best) { size } else { best })
     }
 
     fn bytes(self) -> usize {
