@@ -229,7 +229,14 @@ pub fn text(report: &Value) -> String {
         ("all_views", "every eligible view of the trained poses"),
         ("unseen_views", "every eligible view of poses never trained on"),
     ] {
-        let _ = writeln!(out, "\n  {title}");
+        let views = &planning["views"][name];
+        let times = match (views["hazard"].as_u64(), views["clear"].as_u64(), views["repeats"].as_u64()) {
+            (Some(hazard), Some(clear), Some(repeats)) => {
+                format!(" ({hazard} hazard and {clear} clear pictures, each {repeats} times with fresh sensor noise)")
+            }
+            _ => String::new(),
+        };
+        let _ = writeln!(out, "\n  {title}{times}");
         let _ = writeln!(out, "  {:<15} {:>3}  {:<32} {:<32}", "rule", "n", "hazard: halts", "clear: advances");
         for rule in ["underconfident", "overconfident", "paper", "calibrated"] {
             for samples in SAMPLE_COUNTS {

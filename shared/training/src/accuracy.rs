@@ -59,12 +59,15 @@ impl Centroids {
 }
 
 /// Right answers out of trials, for one kind of view.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Share {
     /// Right up to visual equivalence.
     pub right: usize,
     /// Right by name.
     pub right_by_name: usize,
+    /// Right names to be expected of someone who knows all that the pictures show, and guesses among what looks the
+    /// same.
+    pub best_by_name: f64,
     /// Views counted.
     pub trials: usize,
 }
@@ -80,16 +83,22 @@ impl Share {
         if self.trials == 0 { 0.0 } else { self.right_by_name as f64 / self.trials as f64 }
     }
 
-    /// Counts one answer.
-    pub fn count(&mut self, right: bool, by_name: bool) {
+    /// The best possible [`Self::raw`], 0..=1; 0 for no trials.
+    pub fn ceiling(&self) -> f64 {
+        if self.trials == 0 { 0.0 } else { self.best_by_name / self.trials as f64 }
+    }
+
+    /// Counts one answer, for a state that looks the same as `alike` states, itself among them.
+    pub fn count(&mut self, right: bool, by_name: bool, alike: usize) {
         self.trials += 1;
+        self.best_by_name += 1.0 / alike.max(1) as f64;
         self.right += usize::from(right);
         self.right_by_name += usize::from(by_name);
     }
 }
 
 /// State accuracy by how much the views show.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct ByObservability {
     /// The actor's place is fully visible.
     pub full: Share,
@@ -122,7 +131,8 @@ pub fn state_accuracy(
         let label = pictures.labels[i];
         let named = centroids.nearest(&posteriors[i].mean);
         let right = pictures.equivalence.same(label.view, named, label.state);
-        table.of(label.observability).count(right, named == label.state);
+        let alike = pictures.alike(label.view, label.state).len();
+        table.of(label.observability).count(right, named == label.state, alike);
     }
     table
 }

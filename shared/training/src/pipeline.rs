@@ -389,6 +389,15 @@ pub fn summary(metrics: &Value) -> String {
         ],
     );
     line(
+        "the same by name, where states that look the same count as wrong",
+        &[
+            ("trained poses", number("/vae/trained/full/raw"), 100.0, " %"),
+            ("of at most", number("/vae/trained/full/raw_ceiling"), 100.0, " %"),
+            ("unseen poses", number("/vae/unseen/full/raw"), 100.0, " %"),
+            ("of at most", number("/vae/unseen/full/raw_ceiling"), 100.0, " %"),
+        ],
+    );
+    line(
         "state accuracy of probed samples, fully observable views",
         &[
             ("trained poses", number("/samples/trained/accuracy"), 100.0, " %"),
@@ -400,8 +409,8 @@ pub fn summary(metrics: &Value) -> String {
         &[
             ("matching", number("/birds_eye/matching_db"), 1.0, " dB"),
             ("un-matching", number("/birds_eye/unmatching_db"), 1.0, " dB"),
-            ("mean picture", number("/birds_eye/mean_picture_db"), 1.0, " dB"),
-            ("pixels that change", number("/birds_eye/changed_db"), 1.0, " dB"),
+            ("mean picture of all states", number("/birds_eye/mean_picture_db"), 1.0, " dB"),
+            ("inside the vehicles' pixels", number("/birds_eye/changed_db"), 1.0, " dB"),
         ],
     );
     lines.join("\n")
