@@ -412,9 +412,7 @@ pub fn evaluate(
         .ok_or_else(|| TrainingError::Unfit("some state has no view that shows the actor's place fully".into()))?;
     let accuracy = |roles: &[PoseRole]| {
         let table = state_accuracy(pictures, posteriors, &centroids, &pictures.with_roles(roles));
-        let share = |s: crate::accuracy::Share| {
-            json!({"accuracy": s.accuracy(), "raw": s.raw(), "raw_ceiling": s.ceiling(), "trials": s.trials})
-        };
+        let share = |s: crate::accuracy::Share| json!({"accuracy": s.accuracy(), "raw": s.raw(), "raw_ceiling": s.ceiling(), "trials": s.trials});
         json!({"full": share(table.full), "partial": share(table.partial), "none": share(table.none)})
     };
     let mut report = json!({
