@@ -1,0 +1,53 @@
+//! What the shipped checkpoint makes of views that show nothing of the place where somebody may be.
+
+#![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
+
+use carff_belief::{Plan, hazard_probability, look_ahead};
+use carff_dataset::Observability;
+use carff_evaluation::Models;
+use carff_models::mixture::Sampling;
+use carff_scenes::{RenderOptions, Scenario};
+use std::path::Path;
+
+/// Somebody and nobody, at the first step.
+const BRANCHES: [usize; 2] = [0, 1];
+
+/// A view that hides the place gives an even belief, whether somebody is there or not: pictures of the two hold nothing
+/// that tells them apart, and training learnt no pose by heart.
+#[test]
+fn hidden_views_give_an_even_belief() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).ancestors().nth(2).unwrap();
+    let scenario = Scenario::load(&root.join("configs/scenarios/approaching-intersection.toml")).unwrap();
+    let mut models = Models::load(&root.join("configs/checkpoints/approaching-intersection")).unwrap();
+    let mut hazard = |view: usize, branch: usize, timestamp: usize| {
+        let camera = scenario.cameras()[view].camera;
+        let rendering = scenario.render(branch, timestamp, &camera, &RenderOptions::default()).unwrap();
+        let hidden = rendering.actor.is_some_and(|actor| actor.observability == Observability::None);
+        let image = rendering.image;
+        let sides = [i64::from(image.height_px), i64::from(image.width_px), 3];
+        let posterior = models.encoder.encode_bytes(&tch::Tensor::from_slice(&image.rgb).view(sides)).unwrap();
+        let plan = Plan {
+            samples: 10,
+            sampling: Sampling::Stratified,
+            horizon: 2,
+            seed: 1,
+            frame: (view * 2 + branch) as u64,
+        };
+        let steps = look_ahead(&models.mixture, &mut models.probe, &posterior, plan);
+        let steps = steps.iter().map(|s| (s.resolved.hazard_probability, s.path_probability));
+        (hidden, f64::from(hazard_probability(steps)))
+    };
+    let mut pairs = Vec::new();
+    // Every second ego view: enough to see, and quick to render.
+    for view in (0..scenario.cameras().len()).filter(|v| scenario.cameras()[*v].view_kind == "dash").step_by(2) {
+        let [with, without] = BRANCHES.map(|branch| hazard(view, branch, 0));
+        if with.0 && without.0 {
+            pairs.push((view, with.1, without.1));
+        }
+    }
+    assert!(pairs.len() >= 5, "too few hidden views: {pairs:?}");
+    let mean = pairs.iter().map(|(_, a, b)| (a + b) / 2.0).sum::<f64>() / pairs.len() as f64;
+    let difference = pairs.iter().map(|(_, a, b)| (a - b).abs()).sum::<f64>() / pairs.len() as f64;
+    assert!((0.35..0.65).contains(&mean), "mean hazard probability {mean}: {pairs:?}");
+    assert!(difference < 0.1, "with and without somebody differ by {difference}: {pairs:?}");
+}
