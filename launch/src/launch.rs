@@ -20,6 +20,7 @@ use carff_transport::{
     runtime_dir, topics,
 };
 use serde_json::Value;
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::process::{ExitCode, ExitStatus};
 use std::sync::Arc;
@@ -303,6 +304,16 @@ impl Launcher<'_> {
     fn watch(&mut self) -> anyhow::Result<bool> {
         let now_ns = monotonic_now_ns();
         let mut restart = Vec::new();
+        let mut ended = BTreeMap::new();
+        for watched in &mut self.stages {
+            if let Some(status) = watched.process.as_mut().map(StageProcess::ended).transpose()?.flatten() {
+                ended.insert(watched.stage, status);
+            }
+        }
+        // What the dead said last is heard before they are judged.
+        if !ended.is_empty() {
+            self.collect()?;
+        }
         for watched in &mut self.stages {
             if watched.restart_at_ns.is_some_and(|at| now_ns >= at) {
                 restart.push(watched.stage);
@@ -315,7 +326,7 @@ impl Launcher<'_> {
                 watched.was_ready = true;
             }
             let stage = watched.stage;
-            let Some(status) = process.ended()? else {
+            let Some(&status) = ended.get(&stage) else {
                 let limit_ms = self.graph.launcher.start_timeout_ms;
                 let late = now_ns.saturating_sub(watched.started_ns) > limit_ms * 1_000_000;
                 ensure!(

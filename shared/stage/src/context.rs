@@ -154,10 +154,13 @@ impl StageContext {
         Ok(self.node.picture_publisher(topic, max_bytes)?)
     }
 
-    /// Says that all topics are open and all models loaded. The launcher waits for it.
+    /// Says that all topics are open and all models loaded, before any work is done. The launcher waits for it.
     pub fn ready(&mut self) {
         self.vitals.set_state(HealthState::Ok);
         self.vitals.progress();
+        if let Some(heartbeat) = &self.heartbeat {
+            heartbeat.beat();
+        }
         tracing::info!(threads = self.threads, "ready");
     }
 

@@ -1,13 +1,18 @@
 //! The heartbeat: a thread of its own, so that it goes on while the stage loads or computes.
 
 use carff_messages::{Header, Health, HealthState, Stage};
-use carff_transport::{Counters, Publisher, Stop, Waiter, monotonic_now_ns};
+use carff_transport::{Counters, Publisher, monotonic_now_ns};
+use crossbeam::channel::{RecvTimeoutError, Sender, bounded, unbounded};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, AtomicU64, Ordering};
 use std::thread::JoinHandle;
+use std::time::Duration;
 
 /// Time between two heartbeats.
-const PERIOD_NS: u64 = 100_000_000;
+const PERIOD: Duration = Duration::from_millis(100);
+
+/// Longest wait for a heartbeat that was asked for: it only keeps a broken transport from hanging the stage.
+const PATIENCE: Duration = Duration::from_secs(1);
 
 /// What the stage's loop writes and the heartbeat reads.
 #[derive(Debug)]
@@ -51,10 +56,11 @@ impl Vitals {
     }
 }
 
-/// A running heartbeat.
+/// A running heartbeat. Its last beat, with the final state, goes out when it is dropped.
 #[derive(Debug)]
 pub(crate) struct Heartbeat {
-    beat: Stop,
+    /// Asks for a beat at once; the answer says that it has gone out.
+    ask: Option<Sender<Sender<()>>>,
     thread: Option<JoinHandle<()>>,
 }
 
@@ -66,12 +72,10 @@ impl Heartbeat {
         vitals: Arc<Vitals>,
         counters: Arc<Counters>,
     ) -> std::io::Result<Self> {
-        let beat = Stop::new()?;
-        let waiter = Waiter::new(beat.clone());
+        let (ask, asked) = unbounded::<Sender<()>>();
         let thread = std::thread::Builder::new().name("heartbeat".to_owned()).spawn(move || {
             let mut beats = 0;
-            loop {
-                let stopping = waiter.stop().is_stopped();
+            let mut beat = || {
                 let mut health = snapshot(stage, seed, &vitals, &counters);
                 // The node counts heartbeats too, which are no work.
                 health.published = health.published.saturating_sub(beats);
@@ -79,19 +83,37 @@ impl Heartbeat {
                     Ok(()) => beats += 1,
                     Err(error) => tracing::warn!(%error, "no heartbeat"),
                 }
-                // After a stop one last heartbeat has gone out, with the final state.
-                if stopping || waiter.wait_until(&[], monotonic_now_ns() + PERIOD_NS).is_err() {
-                    return;
+            };
+            loop {
+                beat();
+                match asked.recv_timeout(PERIOD) {
+                    Ok(answer) => {
+                        beat();
+                        // Who asked may have lost patience.
+                        let _ = answer.send(());
+                    }
+                    Err(RecvTimeoutError::Timeout) => {}
+                    Err(RecvTimeoutError::Disconnected) => return beat(),
                 }
             }
         })?;
-        Ok(Self { beat, thread: Some(thread) })
+        Ok(Self { ask: Some(ask), thread: Some(thread) })
+    }
+
+    /// Sends a heartbeat now, and returns when it is out: what the stage does next is done by a stage of known state.
+    pub(crate) fn beat(&self) {
+        let (answer, answered) = bounded(1);
+        if let Some(ask) = &self.ask
+            && ask.send(answer).is_ok()
+        {
+            let _ = answered.recv_timeout(PATIENCE);
+        }
     }
 }
 
 impl Drop for Heartbeat {
     fn drop(&mut self) {
-        self.beat.stop();
+        self.ask = None;
         if let Some(thread) = self.thread.take() {
             // A panic in there has been printed by then, and the stage is ending anyway.
             let _ = thread.join();

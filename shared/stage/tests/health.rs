@@ -57,6 +57,21 @@ fn heartbeat(
     panic!("no such heartbeat");
 }
 
+/// When `ready` returns, the heartbeat that says so is out: who dies in its first frame has been ready.
+#[test]
+fn ready_is_said_before_work_begins() {
+    let fixture = Fixture::new("ready");
+    let node = Node::open(&fixture.run, "test").unwrap();
+    let mut health = node.receiver(&topics::health(Stage::Camera)).unwrap();
+    let mut stage = fixture.context(Stage::Camera);
+    stage.ready();
+    let mut states = Vec::new();
+    while let Some(health) = health.next().unwrap() {
+        states.push(health.state().unwrap());
+    }
+    assert_eq!(states.last(), Some(&HealthState::Ok), "{states:?}");
+}
+
 /// From starting to ok, with counts of what was received, skipped and found invalid, while the stage's loop does nothing.
 #[test]
 fn heartbeats_tell_state_and_counts() {
