@@ -17,10 +17,10 @@ else ifneq ($(CARGO_TARGET_DIR),)
 export LD_LIBRARY_PATH := $(CURDIR)/.libtorch/lib$(if $(LD_LIBRARY_PATH),:$(LD_LIBRARY_PATH))
 endif
 
-.PHONY: help run build test lint fmt libtorch
+.PHONY: help run build test bench-peer lint fmt libtorch
 
 help: ## List the targets
-	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
 
 run: build ## Drive the shipped model through the intersection: decisions live, then report, JSON and filmstrip
 	$(TARGET)/release/carff launch $(GRAPH) --report $(REPORT)
@@ -30,6 +30,11 @@ build: libtorch ## Build all programs
 
 test: build ## Run all tests, whole graphs of processes among them
 	cargo test --release --locked --workspace
+
+bench-peer: ## Build the program by which `carff bench ipc` measures zenoh as well (300 crates more; nothing else needs it)
+	cargo build --release --locked --manifest-path tests/zenoh-peer/Cargo.toml --target-dir $(TARGET)/zenoh-peer
+	mkdir -p $(TARGET)/release
+	cp $(TARGET)/zenoh-peer/release/carff-zenoh-peer $(TARGET)/release/
 
 lint: libtorch ## Check format and lints
 	cargo fmt --all --check

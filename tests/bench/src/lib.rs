@@ -25,7 +25,7 @@ pub enum BenchCommand {
     Field(field::FieldArgs),
     /// Encoder and forecaster, one frame at a time.
     Encoder(encoder::EncoderArgs),
-    /// From one process to another: this program's topics, bare iceoryx2, Unix sockets.
+    /// From one process to another: this program's topics, bare iceoryx2, Unix sockets, zenoh.
     Ipc(ipc::IpcArgs),
     /// The other process of `ipc`.
     #[command(hide = true)]

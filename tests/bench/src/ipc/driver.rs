@@ -1,6 +1,6 @@
 //! The sending process: starts the other one, and tells it what to wait for.
 
-use super::{Sender, Size, Transport, Waiting};
+use super::{Pair, Sender, Size, Transport, Waiting, times_us};
 use anyhow::{Context, bail};
 use carff_transport::monotonic_now_ns;
 use rustix::event::{PollFd, PollFlags, poll};
@@ -38,34 +38,6 @@ impl Driver {
         Ok(Self { transport, folder: folder.to_owned(), sender: None, payload: Vec::new(), child, commands, answers })
     }
 
-    /// Both ends anew, for payloads of this size.
-    pub(crate) fn open(&mut self, size: Size) -> anyhow::Result<()> {
-        self.sender = None;
-        writeln!(self.commands, "open {} {}", size.width_px, size.height_px)?;
-        self.answer(&mut [0], Waiting::Sleeping)?;
-        self.sender = Some(self.transport.sender(&self.folder, size)?);
-        self.payload = (0..size.bytes()).map(|i| (i * 31) as u8).collect();
-        Ok(())
-    }
-
-    /// Sends so many payloads, each once the one before is acknowledged. Returns the times, microseconds.
-    pub(crate) fn run(&mut self, count: usize, waiting: Waiting, pause_us: u64) -> anyhow::Result<Vec<f64>> {
-        writeln!(self.commands, "run {count} {}", waiting.name())?;
-        self.answer(&mut [0], waiting)?;
-        for _ in 0..count {
-            if pause_us > 0 {
-                std::thread::sleep(Duration::from_micros(pause_us));
-            }
-            let sender = self.sender.as_mut().context("no sender is open")?;
-            self.payload[..size_of::<u64>()].copy_from_slice(&monotonic_now_ns().to_le_bytes());
-            sender.send(&self.payload, waiting)?;
-            self.answer(&mut [0], waiting)?;
-        }
-        let mut times = vec![0; count * size_of::<u64>()];
-        self.answer(&mut times, Waiting::Sleeping)?;
-        Ok(times.as_chunks().0.iter().map(|ns| u64::from_le_bytes(*ns) as f64 / 1e3).collect())
-    }
-
     /// Reads what the peer says, as many bytes as there is room for.
     fn answer(&mut self, bytes: &mut [u8], waiting: Waiting) -> anyhow::Result<()> {
         let mut filled = 0;
@@ -85,6 +57,42 @@ impl Driver {
             }
         }
         Ok(())
+    }
+}
+
+impl Pair for Driver {
+    fn name(&self) -> &'static str {
+        self.transport.name()
+    }
+
+    fn title(&self) -> &'static str {
+        self.transport.title()
+    }
+
+    fn open(&mut self, size: Size) -> anyhow::Result<()> {
+        self.sender = None;
+        writeln!(self.commands, "open {} {}", size.width_px, size.height_px)?;
+        self.answer(&mut [0], Waiting::Sleeping)?;
+        self.sender = Some(self.transport.sender(&self.folder, size)?);
+        self.payload = (0..size.bytes()).map(|i| (i * 31) as u8).collect();
+        Ok(())
+    }
+
+    fn run(&mut self, count: usize, waiting: Waiting, pause_us: u64) -> anyhow::Result<Vec<f64>> {
+        writeln!(self.commands, "run {count} {}", waiting.name())?;
+        self.answer(&mut [0], waiting)?;
+        for _ in 0..count {
+            if pause_us > 0 {
+                std::thread::sleep(Duration::from_micros(pause_us));
+            }
+            let sender = self.sender.as_mut().context("no sender is open")?;
+            self.payload[..size_of::<u64>()].copy_from_slice(&monotonic_now_ns().to_le_bytes());
+            sender.send(&self.payload, waiting)?;
+            self.answer(&mut [0], waiting)?;
+        }
+        let mut times = vec![0; count * size_of::<u64>()];
+        self.answer(&mut times, Waiting::Sleeping)?;
+        Ok(times_us(&times))
     }
 }
 

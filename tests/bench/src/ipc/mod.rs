@@ -1,14 +1,16 @@
-//! From one process to another: this program's topics, bare iceoryx2, Unix sockets.
+//! From one process to another: this program's topics, bare iceoryx2, Unix sockets, zenoh.
 //!
 //! A payload is written by one process and read by another. The time is from before the sender asks for memory to after
 //! the receiver has read the last byte, on the one monotonic clock. The receiver acknowledges by a pipe, the same for
-//! all, which is not part of the time; then the next payload goes out.
+//! all, which is not part of the time; then the next payload goes out. zenoh's two processes are those of a program of
+//! its own; while they work, this one sleeps.
 
 mod bare;
 mod driver;
 mod peer;
 mod typed;
 mod unix;
+mod zenoh;
 
 use crate::OutputArgs;
 use crate::report::{Report, number, table};
@@ -16,13 +18,14 @@ use crate::stats::{Ratio, Times};
 use driver::Driver;
 pub(crate) use peer::peer;
 use std::path::{Path, PathBuf};
+use zenoh::ZenohPair;
 
 /// Payloads, bytes: in powers of two, brought to whole pixels.
 const SIZES: [usize; 5] = [64, 1 << 10, 1 << 14, 1 << 18, 1 << 22];
 /// Turns that each transport takes at each size.
 const TURNS: usize = 10;
 
-/// From one process to another: this program's topics, bare iceoryx2, Unix sockets.
+/// From one process to another: this program's topics, bare iceoryx2, Unix sockets, zenoh.
 #[derive(Clone, Debug, clap::Args)]
 pub struct IpcArgs {
     /// Payloads for each transport, size and way of waiting; a tenth of them at 256 KiB and more.
@@ -34,6 +37,10 @@ pub struct IpcArgs {
     /// A tenth of the payloads.
     #[arg(long)]
     quick: bool,
+    /// The program with zenoh's two ends, which `make bench-peer` builds; when not given, `carff-zenoh-peer` beside
+    /// this program, and no zenoh if it is not there.
+    #[arg(long)]
+    zenoh: Option<PathBuf>,
     #[command(flatten)]
     pub(crate) output: OutputArgs,
 }
@@ -140,6 +147,21 @@ impl Size {
     }
 }
 
+/// Two processes and a way from one to the other.
+trait Pair {
+    /// In keys of figures.
+    fn name(&self) -> &'static str;
+
+    /// In tables.
+    fn title(&self) -> &'static str;
+
+    /// Opens both ends anew, for payloads of this size.
+    fn open(&mut self, size: Size) -> anyhow::Result<()>;
+
+    /// Sends so many payloads, each once the one before is acknowledged. Returns the times, microseconds.
+    fn run(&mut self, count: usize, waiting: Waiting, pause_us: u64) -> anyhow::Result<Vec<f64>>;
+}
+
 /// The sender's end.
 pub(crate) trait Sender {
     /// Writes the payload and sends it, waking a receiver that sleeps.
@@ -152,33 +174,45 @@ pub(crate) trait Receiver {
     fn receive(&mut self, waiting: Waiting, read: &mut dyn FnMut(&[u8])) -> anyhow::Result<()>;
 }
 
+/// What a receiver measured, in nanoseconds, eight bytes each, the lowest first: in microseconds.
+fn times_us(bytes: &[u8]) -> Vec<f64> {
+    bytes.as_chunks().0.iter().map(|ns| u64::from_le_bytes(*ns) as f64 / 1e3).collect()
+}
+
 pub(crate) fn run(args: &IpcArgs) -> anyhow::Result<Report> {
+    let zenoh = zenoh::program(args.zenoh.as_deref())?;
     let folder = tempfile::tempdir()?;
-    let mut drivers =
-        Transport::ALL.iter().map(|t| Driver::start(*t, folder.path())).collect::<anyhow::Result<Vec<_>>>()?;
+    let mut pairs: Vec<Box<dyn Pair>> = Vec::new();
+    for transport in Transport::ALL {
+        pairs.push(Box::new(Driver::start(transport, folder.path())?));
+    }
+    if let Some(program) = zenoh {
+        pairs.push(Box::new(ZenohPair::start(&program, folder.path())?));
+    }
+    let labels: Vec<_> = pairs.iter().map(|pair| (pair.name(), pair.title())).collect();
     let mut report = Report::default();
     let mut cells = Vec::new();
     for size in SIZES.map(Size::near) {
         let messages = args.messages / if args.quick { 10 } else { 1 } / if size.bytes() > 200_000 { 10 } else { 1 };
         let turn = (messages / TURNS).max(20);
-        for driver in &mut drivers {
-            driver.open(size)?;
+        for pair in &mut pairs {
+            pair.open(size)?;
             for waiting in Waiting::ALL {
-                driver.run(turn.min(200), waiting, args.pause_us)?;
+                pair.run(turn.min(200), waiting, args.pause_us)?;
             }
         }
         for waiting in Waiting::ALL {
-            let mut turns = vec![Vec::new(); drivers.len()];
+            let mut turns = vec![Vec::new(); pairs.len()];
             for round in 0..TURNS {
-                for i in 0..drivers.len() {
-                    let i = if round % 2 == 0 { i } else { drivers.len() - 1 - i };
-                    turns[i].push(drivers[i].run(turn, waiting, args.pause_us)?);
+                for i in 0..pairs.len() {
+                    let i = if round % 2 == 0 { i } else { pairs.len() - 1 - i };
+                    turns[i].push(pairs[i].run(turn, waiting, args.pause_us)?);
                 }
             }
             cells.push(Cell { size, waiting, turns });
         }
     }
-    drop(drivers);
+    drop(pairs);
     typed::clean_up(folder.path())?;
 
     for waiting in Waiting::ALL {
@@ -187,20 +221,20 @@ pub(crate) fn run(args: &IpcArgs) -> anyhow::Result<Report> {
                 .map(str::to_owned),
         ];
         for cell in cells.iter().filter(|c| c.waiting == waiting) {
-            for (i, transport) in Transport::ALL.into_iter().enumerate() {
+            for (i, (name, title)) in labels.iter().copied().enumerate() {
                 let times = cell.times(i);
                 let [p50, p99, p999, max] = [0.5, 0.99, 0.999, 1.0].map(|q| times.quantile(q));
                 let bytes = cell.size.bytes();
                 rows.push([
                     if i == 0 { format!("{bytes} bytes") } else { String::new() },
-                    transport.title().to_owned(),
+                    title.to_owned(),
                     number(p50),
                     number(p99),
                     number(p999),
                     number(max),
                     cell.ratio_to_bare(i).to_string(),
                 ]);
-                let key = format!("ipc.{}.{}.{}", waiting.name(), transport.name(), bytes);
+                let key = format!("ipc.{}.{}.{}", waiting.name(), name, bytes);
                 for (name, value) in [("p50_us", p50), ("p99_us", p99), ("p999_us", p999), ("max_us", max)] {
                     report.set(&format!("{key}.{name}"), value);
                 }
@@ -255,6 +289,13 @@ impl Cell {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// Times come as whole nanoseconds, eight bytes each, and are told in microseconds.
+    #[test]
+    fn times_are_in_microseconds() {
+        let bytes: Vec<u8> = [1_500_u64, 0, 1 << 40].iter().flat_map(|ns| ns.to_le_bytes()).collect();
+        assert_eq!(times_us(&bytes), [1.5, 0.0, 1_099_511_627.776]);
+    }
 
     /// Payloads are near to what was asked for, and no picture is wider or higher than topics allow.
     #[test]
