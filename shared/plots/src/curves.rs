@@ -19,8 +19,12 @@ pub struct Panel {
     pub x_label: String,
     /// What is along y, with its unit.
     pub y_label: String,
+    /// Logarithmic x axis; points at or below zero are left out.
+    pub log_x: bool,
     /// Logarithmic y axis; points at or below zero are left out.
     pub log_y: bool,
+    /// The y axis holds zero, so that heights can be compared. Without effect on a logarithmic one.
+    pub from_zero: bool,
     /// The lines.
     pub series: Vec<Series>,
 }
@@ -126,13 +130,16 @@ fn legend(canvas: &mut Canvas, series: &[Series], left: u32, top: u32, width: u3
 
 /// Draws axes and lines.
 fn plot(area: &Page, panel: &Panel) -> Result<(), PlotError> {
-    let lines: Vec<Vec<Vec<(f64, f64)>>> = panel.series.iter().map(|s| pieces(&s.points, panel.log_y)).collect();
+    let lines: Vec<Vec<Vec<(f64, f64)>>> = panel.series.iter().map(|s| pieces(&s.points, panel)).collect();
     let all = || lines.iter().flatten().flatten();
-    let (Some(x), Some(y)) = (range(all().map(|p| p.0), 0.0), range(all().map(|p| p.1), 0.06)) else {
+    let (Some(x), Some(mut y)) = (range(all().map(|p| p.0), 0.0), range(all().map(|p| p.1), 0.06)) else {
         return empty(area);
     };
-    let (x_ticks, y_ticks) =
-        (linear_ticks(&x, 6), if panel.log_y { logarithmic_ticks(&y) } else { linear_ticks(&y, 6) });
+    if panel.from_zero && !panel.log_y {
+        y = if all().all(|p| p.1 >= 0.0) { 0.0..y.end } else { y.start..y.end.max(0.0) };
+    }
+    let ticks = |range: &Range<f64>, log: bool| if log { logarithmic_ticks(range) } else { linear_ticks(range, 6) };
+    let (x_ticks, y_ticks) = (ticks(&x, panel.log_x), ticks(&y, panel.log_y));
     let scale = |px: u32| px * OVERSAMPLING;
     let mut chart = ChartBuilder::on(area)
         .margin_right(scale(14))
@@ -209,10 +216,11 @@ impl ValueFormatter<f64> for Axis {
     }
 }
 
-/// The pieces of a line between points that cannot be shown; y as it is drawn, for a logarithmic axis its logarithm.
-fn pieces(points: &[(f64, f64)], log_y: bool) -> Vec<Vec<(f64, f64)>> {
+/// The pieces of a line between points that cannot be shown; as it is drawn, for a logarithmic axis the logarithm.
+fn pieces(points: &[(f64, f64)], panel: &Panel) -> Vec<Vec<(f64, f64)>> {
     let shown = |v: f64| v.is_finite() && v.abs() < LARGEST;
-    let points: Vec<(f64, f64)> = points.iter().map(|&(x, y)| (x, if log_y { y.log10() } else { y })).collect();
+    let drawn = |v: f64, log: bool| if log { v.log10() } else { v };
+    let points: Vec<_> = points.iter().map(|&(x, y)| (drawn(x, panel.log_x), drawn(y, panel.log_y))).collect();
     points.split(|&(x, y)| !(shown(x) && shown(y))).filter(|piece| !piece.is_empty()).map(<[_]>::to_vec).collect()
 }
 
@@ -288,6 +296,7 @@ mod tests {
             y_label: "loss".into(),
             log_y,
             series: vec![Series { name: "all".into(), points }],
+            ..Panel::default()
         }
     }
 
@@ -330,12 +339,39 @@ mod tests {
             vec![(0.0, 1.0), (1.0, 1.0 + 1e-15)],
         ];
         for points in odd {
-            for log_y in [false, true] {
-                assert!(draw("Odd", &[panel(points.clone(), log_y)]).is_ok(), "{points:?} {log_y}");
+            for (log_x, log_y) in [(false, false), (false, true), (true, false), (true, true)] {
+                let panel = Panel { log_x, from_zero: log_x, ..panel(points.clone(), log_y) };
+                assert!(draw("Odd", &[panel]).is_ok(), "{points:?} {log_x} {log_y}");
             }
         }
         assert!(draw("", &[Panel::default()]).is_ok());
-        assert_eq!(pieces(&[(0.0, 1.0), (1.0, f64::NAN), (2.0, 3.0), (3.0, 4.0)], false).len(), 2);
+        let broken = [(0.0, 1.0), (1.0, f64::NAN), (2.0, 3.0), (3.0, 4.0)];
+        assert_eq!(pieces(&broken, &Panel::default()).len(), 2);
+        assert_eq!(pieces(&broken, &Panel { log_x: true, ..Panel::default() }).len(), 1);
+    }
+
+    /// Between the outermost points of a line that is a power of x, all lie on a straight line when both axes are
+    /// logarithmic; with an axis that holds zero, a line far above zero is drawn near the top.
+    #[test]
+    fn axes_are_as_asked_for() {
+        let power: Vec<(f64, f64)> =
+            (0..60).map(|i| f64::from(i) / 20.0).map(|e| (10_f64.powf(e), 100_f64.powf(e))).collect();
+        let both = Panel { log_x: true, ..panel(power, true) };
+        let line: Vec<_> =
+            coloured(&draw("", &[both]).unwrap(), COLOURS[0]).into_iter().filter(|&(_, y)| y > 130).collect();
+        let (left, right) = (line.iter().min().unwrap(), line.iter().max().unwrap());
+        let slope = (f64::from(left.1) - f64::from(right.1)) / f64::from(right.0 - left.0);
+        for &(x, y) in &line {
+            let wanted = f64::from(left.1) - f64::from(x - left.0) * slope;
+            assert!((wanted - f64::from(y)).abs() < 5.0, "({x}, {y}) is off the line");
+        }
+        let high = Panel { from_zero: true, ..panel(vec![(0.0, 9.0), (1.0, 10.0)], false) };
+        let lowest = |panel| {
+            let image = draw("", &[panel]).unwrap();
+            coloured(&image, COLOURS[0]).into_iter().map(|(_, y)| y).max().unwrap()
+        };
+        let without = Panel { from_zero: false, ..high.clone() };
+        assert!(lowest(high) + PANEL_HEIGHT / 2 < lowest(without));
     }
 
     /// A rising line is drawn rising: its points are where its values say, left to right and low to high.

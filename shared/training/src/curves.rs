@@ -129,6 +129,7 @@ fn panel(chart: &Chart, records: &[Value]) -> Panel {
         y_label: chart.y_label.into(),
         log_y: chart.log_y,
         series: series.filter(|s| !s.points.is_empty()).collect(),
+        ..Panel::default()
     }
 }
 

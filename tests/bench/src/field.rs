@@ -84,7 +84,7 @@ pub(crate) fn run(args: &FieldArgs) -> anyhow::Result<Report> {
 }
 
 /// A camera straight above the bounds, the picture's up = +Y.
-fn birds_eye(config: &FieldConfig, side_px: u32) -> PinholeCamera {
+pub(crate) fn birds_eye(config: &FieldConfig, side_px: u32) -> PinholeCamera {
     let [low, high] = config.bounds_m.map(|corner| corner.map(f64::from));
     let centre = [0, 1, 2].map(|i| f64::midpoint(low[i], high[i]));
     let extent = (high[0] - low[0]).max(high[1] - low[1]);

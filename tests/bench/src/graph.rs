@@ -1,5 +1,7 @@
 //! A graph of all stages, started as the launcher starts it, and listened to message by message.
 
+use crate::helper::cpu_seconds;
+use crate::probes::Probes;
 use anyhow::{Context, bail, ensure};
 use carff_config::GraphConfig;
 use carff_messages::{Action, Belief, Forecast, FrameMeta, Health, HealthState, Posterior, Stage};
@@ -21,8 +23,6 @@ const START_ORDER: [Stage; 6] =
 const WATCH_NS: u64 = 50_000_000;
 /// How long the last frames are waited for.
 const TAIL: Duration = Duration::from_millis(500);
-/// Clock ticks a second in the system's accounts of processor time: fixed on Linux.
-const TICKS_PER_S: f64 = 100.0;
 
 /// What to run.
 #[derive(Clone, Debug)]
@@ -34,6 +34,8 @@ pub(crate) struct Plan<'a> {
     /// Frames of this time at first do not count.
     pub(crate) warm_up: Duration,
     pub(crate) measured: Duration,
+    /// Further subscribers to frames, beliefs and actions, in a process of their own.
+    pub(crate) probes: usize,
 }
 
 /// One frame's way; times on the monotonic clock, nanoseconds.
@@ -90,6 +92,10 @@ pub(crate) struct Measured {
     /// Views that the renderer made.
     pub(crate) views: u64,
     pub(crate) uses: Vec<Use>,
+    /// Cores in use by the process of the probes.
+    pub(crate) probe_cores: f64,
+    /// Messages that the probes read, in all.
+    pub(crate) probed: u64,
 }
 
 impl Measured {
@@ -115,13 +121,19 @@ pub(crate) fn measure(plan: &Plan<'_>) -> anyhow::Result<Measured> {
         let node = Node::open(&run, "bench")?;
         let mut listener = Listener::open(&node)?;
         let mut stages = Stages { children: Vec::new(), logs: folder.path().to_owned() };
-        listen(plan, &args, &mut listener, &mut stages)
+        listen(plan, &args, &run, &mut listener, &mut stages)
     };
     remove_run_leftovers(&run)?;
     result
 }
 
-fn listen(plan: &Plan<'_>, args: &StageArgs, listener: &mut Listener, stages: &mut Stages) -> anyhow::Result<Measured> {
+fn listen(
+    plan: &Plan<'_>,
+    args: &StageArgs,
+    run: &Run,
+    listener: &mut Listener,
+    stages: &mut Stages,
+) -> anyhow::Result<Measured> {
     let waiter = Waiter::new(Stop::on_signals()?);
     let take = |listener: &mut Listener, until_ns: u64| -> anyhow::Result<()> {
         ensure!(waiter.wait_until(&listener.inputs(), until_ns)? != Woken::Stopped, "interrupted");
@@ -139,24 +151,27 @@ fn listen(plan: &Plan<'_>, args: &StageArgs, listener: &mut Listener, stages: &m
             take(listener, monotonic_now_ns() + WATCH_NS)?;
         }
     }
+    let probes = if plan.probes > 0 { Some(Probes::start(run, plan.probes)?) } else { None };
+    let probes_s = || probes.as_ref().map_or(0.0, Probes::cpu_seconds);
     let from_ns = monotonic_now_ns() + plan.warm_up.as_nanos() as u64;
     while monotonic_now_ns() < from_ns {
         take(listener, from_ns)?;
     }
-    let (ticks_before, views_before) = (stages.ticks(), listener.views);
+    let (used_before, probes_before, views_before) = (stages.cpu_seconds(), probes_s(), listener.views);
     let to_ns = from_ns + plan.measured.as_nanos() as u64;
     while monotonic_now_ns() < to_ns {
         take(listener, to_ns)?;
     }
     let seconds = (monotonic_now_ns() - from_ns) as f64 / 1e9;
-    let (ticks, views) = (stages.ticks(), listener.views - views_before);
+    let (used, views) = (stages.cpu_seconds(), listener.views - views_before);
+    let probe_cores = (probes_s() - probes_before) / seconds;
     let uses = stages
         .children
         .iter()
-        .zip(ticks_before.iter().zip(&ticks))
+        .zip(used_before.iter().zip(&used))
         .map(|((stage, child), (before, after))| Use {
             stage: *stage,
-            cores: (after - before) / TICKS_PER_S / seconds,
+            cores: (after - before) / seconds,
             resident_bytes: resident_bytes(child.id()),
         })
         .collect();
@@ -165,6 +180,7 @@ fn listen(plan: &Plan<'_>, args: &StageArgs, listener: &mut Listener, stages: &m
         take(listener, tail_ns)?;
     }
     stages.check()?;
+    let probed = probes.map_or(Ok(0), Probes::finish)?;
 
     let frames: Vec<&Frame> = listener.frames.values().filter(|f| (from_ns..to_ns).contains(&f.captured_ns)).collect();
     // Frame numbers have no gaps: one that is not there was not even seen.
@@ -190,6 +206,8 @@ fn listen(plan: &Plan<'_>, args: &StageArgs, listener: &mut Listener, stages: &m
         rate_hz: count.saturating_sub(1) as f64 / (span_ns as f64 / 1e9),
         views,
         uses,
+        probe_cores,
+        probed,
     })
 }
 
@@ -314,15 +332,9 @@ impl Stages {
         Ok(())
     }
 
-    /// Processor time of each so far, in ticks.
-    fn ticks(&self) -> Vec<f64> {
-        let of = |pid: u32| {
-            let stat = std::fs::read_to_string(format!("/proc/{pid}/stat")).ok()?;
-            // The name before may hold anything; behind its bracket user and system time are the 12th and 13th.
-            let (_, rest) = stat.rsplit_once(')')?;
-            Some(rest.split_whitespace().skip(11).take(2).filter_map(|v| v.parse::<f64>().ok()).sum())
-        };
-        self.children.iter().map(|(_, child)| of(child.id()).unwrap_or(0.0)).collect()
+    /// Processor time of each so far.
+    fn cpu_seconds(&self) -> Vec<f64> {
+        self.children.iter().map(|(_, child)| cpu_seconds(child.id())).collect()
     }
 }
 
@@ -388,6 +400,8 @@ mod tests {
             rate_hz,
             views: 0,
             uses: Vec::new(),
+            probe_cores: 0.0,
+            probed: 0,
         };
         assert!(measured(0, 19.9).held(20.0));
         assert!(!measured(1, 20.0).held(20.0));

@@ -67,6 +67,7 @@ impl Bench {
             checkpoint: &self.checkpoint,
             warm_up: self.warm_up,
             measured: Duration::from_secs_f64(seconds.clamp(0.5, 3600.0)),
+            probes: 0,
         })
     }
 }

@@ -8,10 +8,13 @@ mod encoder;
 mod field;
 mod graph;
 mod graph_loop;
+mod helper;
 mod ipc;
 mod limits;
 mod machine;
+mod probes;
 mod report;
+mod scale;
 mod stats;
 
 use report::Report;
@@ -32,6 +35,14 @@ pub enum BenchCommand {
     IpcPeer(ipc::PeerArgs),
     /// Camera to action, with all stages alive.
     Loop(graph_loop::LoopArgs),
+    /// How cost grows with samples, horizon, resolution, candidates, stages and probes.
+    Scale(scale::ScaleArgs),
+    /// A process of `scale`'s chain of stages.
+    #[command(hide = true)]
+    Relay(scale::RelayArgs),
+    /// The process of `scale`'s probes.
+    #[command(hide = true)]
+    Probes(probes::ProbesArgs),
 }
 
 /// Where figures go.
@@ -52,8 +63,17 @@ pub fn run(command: BenchCommand) -> anyhow::Result<ExitCode> {
         BenchCommand::Encoder(args) => (encoder::run(&args)?, args.output),
         BenchCommand::Ipc(args) => (ipc::run(&args)?, args.output),
         BenchCommand::Loop(args) => (graph_loop::run(&args)?, args.output),
+        BenchCommand::Scale(args) => (scale::run(&args)?, args.output),
         BenchCommand::IpcPeer(args) => {
             ipc::peer(&args)?;
+            return Ok(ExitCode::SUCCESS);
+        }
+        BenchCommand::Relay(args) => {
+            scale::relay(&args)?;
+            return Ok(ExitCode::SUCCESS);
+        }
+        BenchCommand::Probes(args) => {
+            probes::run(&args)?;
             return Ok(ExitCode::SUCCESS);
         }
     };

@@ -1,0 +1,112 @@
+//! Other processes of this program that take part in a measurement, and the processor time of any process.
+
+use anyhow::{Context, ensure};
+use rustix::process::{Pid, Signal, kill_process, set_parent_process_death_signal};
+use std::io::{Read, Write};
+use std::process::{Child, ChildStdout, Command, Stdio};
+use std::time::{Duration, Instant};
+
+/// What a helper writes once it is ready.
+const READY: &[u8] = b".";
+/// How long a helper may take to end.
+const PATIENCE: Duration = Duration::from_secs(3);
+/// Clock ticks a second in the system's accounts of processor time: fixed on Linux.
+const TICKS_PER_S: f64 = 100.0;
+
+/// A process of this program. Dropping ends it.
+pub(crate) struct Helper {
+    child: Child,
+    answers: ChildStdout,
+}
+
+impl Helper {
+    /// Starts `carff bench` with these arguments. It is not ready yet.
+    pub(crate) fn start(args: &[String]) -> anyhow::Result<Self> {
+        let program = std::env::current_exe().context("cannot find this program")?;
+        let mut child = Command::new(&program)
+            .arg("bench")
+            .args(args)
+            .stdin(Stdio::null())
+            .stdout(Stdio::piped())
+            .spawn()
+            .with_context(|| format!("cannot start {}", program.display()))?;
+        let answers = child.stdout.take().context("the process has no standard output")?;
+        Ok(Self { child, answers })
+    }
+
+    /// Waits until it says that it is ready.
+    pub(crate) fn wait_ready(&mut self) -> anyhow::Result<()> {
+        let mut byte = [0];
+        let read = self.answers.read(&mut byte)?;
+        ensure!(byte[..read] == *READY, "a process of the measurement ended before it was ready");
+        Ok(())
+    }
+
+    /// Processor time that its living threads have used: finer than [`cpu_seconds`], for work of microseconds.
+    pub(crate) fn cpu_seconds(&self) -> f64 {
+        let threads = std::fs::read_dir(format!("/proc/{}/task", self.child.id())).into_iter().flatten().flatten();
+        let nanoseconds = threads.filter_map(|thread| {
+            let stat = std::fs::read_to_string(thread.path().join("schedstat")).ok()?;
+            stat.split_whitespace().next()?.parse::<f64>().ok()
+        });
+        nanoseconds.sum::<f64>() / 1e9
+    }
+
+    /// Asks it to end; returns what it still had to say.
+    pub(crate) fn finish(mut self) -> anyhow::Result<String> {
+        self.ask_to_end();
+        let mut said = String::new();
+        self.answers.read_to_string(&mut said)?;
+        let status = self.child.wait()?;
+        ensure!(status.success(), "a process of the measurement failed: {status}");
+        Ok(said)
+    }
+
+    fn ask_to_end(&self) {
+        if let Some(pid) = Pid::from_raw(self.child.id() as i32) {
+            // It fails when the process has ended already, which is what is wanted.
+            let _ = kill_process(pid, Signal::TERM);
+        }
+    }
+}
+
+impl Drop for Helper {
+    fn drop(&mut self) {
+        if matches!(self.child.try_wait(), Ok(Some(_))) {
+            return;
+        }
+        self.ask_to_end();
+        let begun = Instant::now();
+        while matches!(self.child.try_wait(), Ok(None)) {
+            if begun.elapsed() > PATIENCE {
+                let _ = self.child.kill();
+                let _ = self.child.wait();
+                return;
+            }
+            std::thread::sleep(Duration::from_millis(5));
+        }
+    }
+}
+
+/// In the helper: ends it when its parent dies.
+pub(crate) fn end_with_parent() -> anyhow::Result<()> {
+    set_parent_process_death_signal(Some(Signal::KILL)).context("cannot watch the parent process")
+}
+
+/// In the helper: says that it is ready.
+pub(crate) fn say_ready() -> anyhow::Result<()> {
+    let mut out = std::io::stdout().lock();
+    out.write_all(READY)?;
+    Ok(out.flush()?)
+}
+
+/// Processor time that a process has used so far, user and system; 0 when there is none.
+pub(crate) fn cpu_seconds(pid: u32) -> f64 {
+    let of = || {
+        let stat = std::fs::read_to_string(format!("/proc/{pid}/stat")).ok()?;
+        // The name before may hold anything; behind its bracket user and system time are the 12th and 13th.
+        let (_, rest) = stat.rsplit_once(')')?;
+        Some(rest.split_whitespace().skip(11).take(2).filter_map(|v| v.parse::<f64>().ok()).sum::<f64>())
+    };
+    of().unwrap_or(0.0) / TICKS_PER_S
+}
