@@ -245,7 +245,7 @@ impl Axis {
                 x_label: self.x_label.to_owned(),
                 y_label: y_label.to_owned(),
                 log_x: log,
-                log_y: log,
+                log_y: self.law == Law::Power,
                 from_zero: true,
                 // What was measured is drawn over the fit.
                 series: fitted.into_iter().chain(measured).collect(),
