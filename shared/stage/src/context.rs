@@ -107,7 +107,7 @@ impl StageContext {
             threads: threads as usize,
             stage,
             deadline_ns: deadline_ms.max(1) * 1_000_000,
-            waiter: if graph.run.busy_polling { Waiter::busy_polling(stop) } else { Waiter::new(stop) },
+            waiter: Waiter::new(stop),
             vitals,
             begun: false,
             heartbeat: Some(heartbeat),
@@ -127,7 +127,8 @@ impl StageContext {
     where
         M: Message + ZeroCopySend + Debug + 'static,
     {
-        Ok(self.node.receiver(topic)?)
+        let receiver = self.node.receiver(topic)?;
+        Ok(if self.graph.run.busy_polling { receiver.polled() } else { receiver })
     }
 
     /// Opens a topic to send on.
@@ -143,7 +144,8 @@ impl StageContext {
     where
         M: PictureMeta + ZeroCopySend + Debug + 'static,
     {
-        Ok(self.node.picture_receiver(topic)?)
+        let receiver = self.node.picture_receiver(topic)?;
+        Ok(if self.graph.run.busy_polling { receiver.polled() } else { receiver })
     }
 
     /// Opens a topic of pictures of at most `max_bytes` each to send on.

@@ -121,6 +121,22 @@ impl<M: PictureMeta + ZeroCopySend + Debug + 'static> PicturePublisher<M> {
         Ok(PictureLoan { sample })
     }
 
+    /// [`PicturePublisher::send`] of a picture that lies elsewhere: its bytes are copied once, over memory that nobody
+    /// cleared first.
+    pub fn send_bytes(&mut self, bytes: &[u8], mut meta: M) -> Result<(), SendError> {
+        self.sender.stamp(meta.header_mut());
+        self.sender.validated(&meta)?;
+        let topic = || self.sender.topic.to_owned();
+        if bytes.len() > self.max_bytes {
+            return Err(SendError::Size { topic: topic(), found: bytes.len(), max: self.max_bytes });
+        }
+        if bytes.len() != meta.picture_bytes() {
+            return Err(SendError::Size { topic: topic(), found: bytes.len(), max: meta.picture_bytes() });
+        }
+        let sample = self.port.loan_slice_uninit(bytes.len()).map_err(|e| self.sender.failed(&e))?;
+        self.send_unchecked(PictureLoan { sample: sample.write_from_slice(bytes) }, meta)
+    }
+
     /// Stamps the header, validates, sends what was written, and wakes whoever waits.
     pub fn send(&mut self, loan: PictureLoan<M>, mut meta: M) -> Result<(), SendError> {
         self.sender.stamp(meta.header_mut());

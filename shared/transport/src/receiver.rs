@@ -17,7 +17,8 @@ struct Source {
     topic: &'static str,
     deadline: Duration,
     run_id: u64,
-    listener: Listener<Service>,
+    /// None when nobody is to be woken.
+    listener: Option<Listener<Service>>,
     counters: Arc<Counters>,
 }
 
@@ -48,7 +49,8 @@ impl Source {
     }
 
     fn clear(&self) -> Result<(), ReceiveError> {
-        self.listener.try_wait(|_| ()).map(|_| ()).map_err(|e| self.failed(&e))
+        let Some(listener) = &self.listener else { return Ok(()) };
+        listener.try_wait(|_| ()).map(|_| ()).map_err(|e| self.failed(&e))
     }
 }
 
@@ -78,7 +80,14 @@ impl<M: Message + ZeroCopySend + Debug + 'static> Receiver<M> {
         listener: Listener<Service>,
         counters: Arc<Counters>,
     ) -> Self {
-        Self { source: Source { topic, deadline, run_id: run.id(), listener, counters }, port }
+        Self { source: Source { topic, deadline, run_id: run.id(), listener: Some(listener), counters }, port }
+    }
+
+    /// Gives up being woken: senders save the system call, and whoever waits for this input spins on a core of its own.
+    #[must_use]
+    pub fn polled(mut self) -> Self {
+        self.source.listener = None;
+        self
     }
 
     /// The oldest valid message that waits, if any.
@@ -117,8 +126,8 @@ impl<M: Message + ZeroCopySend + Debug + 'static> Input for Receiver<M> {
     fn clear_wake_ups(&self) -> Result<(), ReceiveError> {
         self.source.clear()
     }
-    fn descriptor(&self) -> BorrowedFd<'_> {
-        descriptors::of_listener(&self.source.listener)
+    fn descriptor(&self) -> Option<BorrowedFd<'_>> {
+        self.source.listener.as_ref().map(descriptors::of_listener)
     }
 }
 
@@ -153,7 +162,14 @@ impl<M: PictureMeta + ZeroCopySend + Debug + 'static> PictureReceiver<M> {
         listener: Listener<Service>,
         counters: Arc<Counters>,
     ) -> Self {
-        Self { source: Source { topic, deadline, run_id: run.id(), listener, counters }, port }
+        Self { source: Source { topic, deadline, run_id: run.id(), listener: Some(listener), counters }, port }
+    }
+
+    /// Gives up being woken: senders save the system call, and whoever waits for this input spins on a core of its own.
+    #[must_use]
+    pub fn polled(mut self) -> Self {
+        self.source.listener = None;
+        self
     }
 
     /// The oldest valid picture that waits, if any.
@@ -202,7 +218,7 @@ impl<M: PictureMeta + ZeroCopySend + Debug + 'static> Input for PictureReceiver<
     fn clear_wake_ups(&self) -> Result<(), ReceiveError> {
         self.source.clear()
     }
-    fn descriptor(&self) -> BorrowedFd<'_> {
-        descriptors::of_listener(&self.source.listener)
+    fn descriptor(&self) -> Option<BorrowedFd<'_>> {
+        self.source.listener.as_ref().map(descriptors::of_listener)
     }
 }

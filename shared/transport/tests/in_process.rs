@@ -175,3 +175,48 @@ fn a_clean_stop_leaves_nothing() {
     // Sweeping what is not there is no error.
     carff_transport::remove_run_leftovers(&Run::new("never-existed", 0).unwrap()).unwrap();
 }
+
+/// A receiver that gives up being woken gets what is sent to it while it waits, finds the end of its wait, and hears a
+/// stop; others on the same topic are still woken.
+#[test]
+fn polled_receivers_need_no_wake_up() {
+    let run = TestRun::new();
+    let node = Node::open(&run.0, "test").unwrap();
+    let mut polled = node.receiver(&topics::POSTERIOR).unwrap().polled();
+    let mut woken = node.receiver(&topics::POSTERIOR).unwrap();
+    let mut output = node.publisher(&topics::POSTERIOR).unwrap();
+    let stop = Stop::new().unwrap();
+    let waiter = Waiter::new(stop.clone());
+    assert_eq!(waiter.wait_until(&[&polled], monotonic_now_ns() + 1_000_000).unwrap(), Woken::Timeout);
+    let sender = std::thread::spawn(move || {
+        std::thread::sleep(std::time::Duration::from_millis(20));
+        output.send(posterior(5)).unwrap();
+        output
+    });
+    assert_eq!(waiter.wait_until(&[&polled], in_seconds(30)).unwrap(), Woken::Input);
+    assert_eq!(polled.next().unwrap().unwrap().header.frame_id, 5);
+    assert_eq!(waiter.wait_until(&[&woken], in_seconds(30)).unwrap(), Woken::Input);
+    assert_eq!(woken.next().unwrap().unwrap().header.frame_id, 5);
+    drop(sender.join().unwrap());
+    stop.stop();
+    assert_eq!(waiter.wait(&[&polled]).unwrap(), Woken::Stopped);
+}
+
+/// A picture that is sent from elsewhere arrives whole; one of another size than its description is refused.
+#[test]
+fn pictures_are_sent_from_elsewhere() {
+    let run = TestRun::new();
+    let node = Node::open(&run.0, "test").unwrap();
+    let mut input = node.picture_receiver(&topics::FRAME).unwrap();
+    let mut output = node.picture_publisher(&topics::FRAME, 1000).unwrap();
+    let meta = frame(3, 4, 5);
+    let bytes: Vec<u8> = (0..meta.width_px * meta.height_px * 3).map(|i| i as u8).collect();
+    output.send_bytes(&bytes, meta).unwrap();
+    let picture = input.next().unwrap().unwrap();
+    assert_eq!((picture.bytes(), picture.meta().header.frame_id), (&bytes[..], 3));
+    let error = output.send_bytes(&bytes[1..], meta).unwrap_err();
+    assert!(matches!(error, SendError::Size { .. }), "{error}");
+    let error = output.send_bytes(&[0; 1001], meta).unwrap_err();
+    assert!(matches!(error, SendError::Size { max: 1000, .. }), "{error}");
+    assert!(input.next().unwrap().is_none());
+}

@@ -137,14 +137,19 @@ impl Convolution {
     }
 }
 
+/// In place: at these sizes a second copy costs as much as the convolution before it.
+fn relu6(mut x: Tensor) -> Tensor {
+    x.clamp_(0.0, 6.0)
+}
+
 impl Backbone for EfficientNetLite0 {
     fn features(&self, pictures: &Tensor) -> Tensor {
         // The published model's input is (byte - 127) / 128.
         let x = resize(pictures, self.input_px) * (255.0 / 128.0) - 127.0 / 128.0;
-        let mut x = self.stem.forward(&x).clamp(0.0, 6.0);
+        let mut x = relu6(self.stem.forward(&x));
         for block in &self.blocks {
-            let inner = block.expand.as_ref().map_or_else(|| x.shallow_clone(), |e| e.forward(&x).clamp(0.0, 6.0));
-            let out = block.project.forward(&block.depthwise.forward(&inner).clamp(0.0, 6.0));
+            let inner = block.expand.as_ref().map_or_else(|| x.shallow_clone(), |e| relu6(e.forward(&x)));
+            let out = block.project.forward(&relu6(block.depthwise.forward(&inner)));
             x = if block.skip { out + x } else { out };
         }
         x

@@ -170,6 +170,11 @@ pub(crate) trait Sender {
 
 /// The receiver's end.
 pub(crate) trait Receiver {
+    /// Gets ready to wait in this way, before anything is sent.
+    fn prepare(&mut self, _waiting: Waiting) -> anyhow::Result<()> {
+        Ok(())
+    }
+
     /// Waits for a payload and hands it out where it lies.
     fn receive(&mut self, waiting: Waiting, read: &mut dyn FnMut(&[u8])) -> anyhow::Result<()>;
 }

@@ -30,6 +30,7 @@ pub(crate) fn peer(args: &PeerArgs) -> anyhow::Result<()> {
                 let waiting = if waiting == Waiting::Busy.name() { Waiting::Busy } else { Waiting::Sleeping };
                 let receiver = receiver.as_mut().context("no receiver is open")?;
                 let mut times = Vec::with_capacity(count * size_of::<u64>());
+                receiver.prepare(waiting)?;
                 ready(b".")?;
                 for _ in 0..count {
                     let mut sent_ns = 0;

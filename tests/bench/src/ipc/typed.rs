@@ -44,38 +44,43 @@ impl TypedSender {
 
 impl Sender for TypedSender {
     fn send(&mut self, payload: &[u8], _waiting: Waiting) -> anyhow::Result<()> {
-        let mut loan = self.publisher.loan(payload.len())?;
-        loan.bytes_mut().copy_from_slice(payload);
         self.meta.header = Header::of_frame(0, monotonic_now_ns(), 1);
-        Ok(self.publisher.send(loan, self.meta)?)
+        Ok(self.publisher.send_bytes(payload, self.meta)?)
     }
 }
 
 pub(crate) struct TypedReceiver {
-    receiver: PictureReceiver<FrameMeta>,
-    _node: Node,
-    sleeping: Waiter,
-    busy: Waiter,
+    // Dropped before the node.
+    receiver: Option<PictureReceiver<FrameMeta>>,
+    polled: bool,
+    node: Node,
+    waiter: Waiter,
 }
 
 impl TypedReceiver {
     pub(crate) fn open(folder: &Path) -> anyhow::Result<Self> {
         let node = Node::open(&run_of(folder)?, "receiver")?;
-        let stop = Stop::new()?;
-        Ok(Self {
-            receiver: node.picture_receiver(&topics::FRAME)?,
-            _node: node,
-            sleeping: Waiter::new(stop.clone()),
-            busy: Waiter::busy_polling(stop),
-        })
+        let receiver = Some(node.picture_receiver(&topics::FRAME)?);
+        Ok(Self { receiver, polled: false, node, waiter: Waiter::new(Stop::new()?) })
     }
 }
 
 impl Receiver for TypedReceiver {
-    fn receive(&mut self, waiting: Waiting, read: &mut dyn FnMut(&[u8])) -> anyhow::Result<()> {
-        let waiter = if waiting == Waiting::Busy { &self.busy } else { &self.sleeping };
-        waiter.wait(&[&self.receiver])?;
-        let picture = self.receiver.newest()?.context("a payload was not valid")?;
+    fn prepare(&mut self, waiting: Waiting) -> anyhow::Result<()> {
+        let polled = waiting == Waiting::Busy;
+        if self.polled != polled {
+            self.receiver = None;
+            let receiver = self.node.picture_receiver(&topics::FRAME)?;
+            self.receiver = Some(if polled { receiver.polled() } else { receiver });
+            self.polled = polled;
+        }
+        Ok(())
+    }
+
+    fn receive(&mut self, _waiting: Waiting, read: &mut dyn FnMut(&[u8])) -> anyhow::Result<()> {
+        let receiver = self.receiver.as_mut().context("no receiver is open")?;
+        self.waiter.wait(&[receiver])?;
+        let picture = receiver.newest()?.context("a payload was not valid")?;
         read(picture.bytes());
         Ok(())
     }
