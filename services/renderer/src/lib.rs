@@ -3,7 +3,7 @@
 use anyhow::Context;
 use carff_checkpoint::Manifest;
 use carff_config::ViewChoice;
-use carff_field::{Field, RenderBuffer, RenderOptions};
+use carff_field::{Field, HypothesisBuffer, RenderBuffer, RenderOptions};
 use carff_geometry::PinholeCamera;
 use carff_messages::{Belief, Forecast, Intrinsics, LATENT_DIM, ViewKind, ViewMeta};
 use std::path::Path;
@@ -78,20 +78,24 @@ pub fn camera(field: &Field, choice: ViewChoice, width_px: u32, height_px: u32) 
     }
 }
 
-/// Renders into 8-bit RGB, rows from the top.
+/// Renders what one camera sees under each hypothesis, one picture each.
 pub fn render(
     field: &Field,
     camera: &PinholeCamera,
-    latent: &[f32; LATENT_DIM],
+    hypotheses: &[Hypothesis],
     threads: usize,
-    buffer: &mut RenderBuffer,
-    rgb: &mut [u8],
-) -> anyhow::Result<()> {
+    buffer: &mut HypothesisBuffer,
+) {
     let options = RenderOptions { threads, ..RenderOptions::default() };
-    field.render(camera, latent, &options, buffer);
-    let wanted = buffer.rgb.len();
+    let latents: Vec<[f32; LATENT_DIM]> = hypotheses.iter().map(|h| h.latent).collect();
+    field.render_hypotheses(camera, &latents, &options, buffer);
+}
+
+/// Writes a picture as 8-bit RGB, rows from the top.
+pub fn write(picture: &RenderBuffer, rgb: &mut [u8]) -> anyhow::Result<()> {
+    let wanted = picture.rgb.len();
     (rgb.len() == wanted).then_some(()).with_context(|| format!("{} bytes for a view of {wanted}", rgb.len()))?;
-    for (to, from) in rgb.iter_mut().zip(&buffer.rgb) {
+    for (to, from) in rgb.iter_mut().zip(&picture.rgb) {
         *to = (from.clamp(0.0, 1.0) * 255.0 + 0.5) as u8;
     }
     Ok(())

@@ -4,7 +4,7 @@
 //! is what the running graph would have published, bit for bit.
 
 use carff_checkpoint::{CheckpointError, Manifest};
-use carff_field::Field;
+use carff_field::{Field, PreparedPoints};
 use carff_models::{
     LATENT_DIM, LatentGaussian,
     mixture::{Draw, Mixture, MixtureNet, Sampling},
@@ -20,6 +20,7 @@ pub struct Probe {
     prober: Prober,
     calibration: Calibration,
     states: Vec<LatentGaussian>,
+    points: PreparedPoints,
     densities: Vec<f32>,
 }
 
@@ -58,8 +59,8 @@ impl Probe {
 
     /// Puts the parts together; `states` are the posteriors that stand for the known states.
     pub fn new(field: Field, prober: Prober, calibration: Calibration, states: Vec<LatentGaussian>) -> Self {
-        let densities = vec![0.0; prober.points().len()];
-        Self { field, prober, calibration, states, densities }
+        let points = field.prepare(prober.points());
+        Self { field, prober, calibration, states, points, densities: Vec::new() }
     }
 
     /// The places and states.
@@ -84,17 +85,29 @@ impl Probe {
 
     /// Probes one hypothesis.
     pub fn probe(&mut self, latent: &[f32; LATENT_DIM]) -> Probed {
-        self.field.density(self.prober.points(), latent, &mut self.densities);
-        let mut occupancies = vec![0.0; self.prober.places().len()];
-        self.prober.occupancies(&self.densities, &mut occupancies);
-        let reading = self.calibration.read(&self.prober, &occupancies);
-        Probed { occupancies, reading }
+        self.probe_all(std::slice::from_ref(latent)).remove(0)
+    }
+
+    /// Probes hypotheses, one result each.
+    pub fn probe_all(&mut self, latents: &[[f32; LATENT_DIM]]) -> Vec<Probed> {
+        let points = self.points.len().max(1);
+        self.densities.resize(points * latents.len(), 0.0);
+        self.field.density_prepared(&self.points, latents, &mut self.densities);
+        let read = |densities: &[f32]| {
+            let mut occupancies = vec![0.0; self.prober.places().len()];
+            self.prober.occupancies(densities, &mut occupancies);
+            let reading = self.calibration.read(&self.prober, &occupancies);
+            Probed { occupancies, reading }
+        };
+        self.densities.chunks_exact(points).map(read).collect()
     }
 
     /// Probes a mixture's component means and draws, and resolves the state.
     pub fn step(&mut self, mixture: Mixture, draws: Vec<Draw>, path_probability: f32) -> Step {
-        let components: Vec<Probed> = mixture.components.iter().map(|c| self.probe(&c.mean)).collect();
-        let samples: Vec<Probed> = draws.iter().map(|d| self.probe(&d.latent)).collect();
+        let latents: Vec<[f32; LATENT_DIM]> =
+            mixture.components.iter().map(|c| c.mean).chain(draws.iter().map(|d| d.latent)).collect();
+        let mut components = self.probe_all(&latents);
+        let samples = components.split_off(mixture.components.len());
         let readings = |probed: &[Probed]| probed.iter().map(|p| p.reading.clone()).collect::<Vec<_>>();
         let of: Vec<usize> = draws.iter().map(|d| d.component).collect();
         let resolved = resolve(&self.prober, &mixture.weights, &readings(&components), &readings(&samples), &of);

@@ -347,14 +347,16 @@ pub fn load_field(dir: &Path, manifest: &Manifest) -> Result<Field, CheckpointEr
     Field::from_tensors(config, rows).map_err(|source| CheckpointError::Field { path: dir.into(), source })
 }
 
-/// Writes the field, in half precision.
+/// Writes the field: weights in half precision, bit fields as bytes.
 pub fn save_field(dir: &Path, field: &Field) -> Result<(), CheckpointError> {
     let tensors: Tensors = field
         .tensors()
         .into_iter()
         .map(|t| {
             let shape: Vec<i64> = t.shape.iter().map(|&s| s as i64).collect();
-            (t.name.into_owned(), Tensor::from_slice(&t.data).view(shape.as_slice()))
+            let tensor = Tensor::from_slice(&t.data).view(shape.as_slice());
+            let kind = if t.name.ends_with(".bytes") { Kind::Uint8 } else { Kind::Float };
+            (t.name.into_owned(), tensor.to_kind(kind))
         })
         .collect();
     save_weights(dir, files::FIELD, &tensors)

@@ -5,6 +5,9 @@ use serde::{Deserialize, Serialize};
 /// Numbers in one scene latent.
 pub const LATENT_DIM: usize = 8;
 
+/// Most cells along the side of the occupancy grid.
+pub(crate) const MAX_GRID_RESOLUTION: usize = 512;
+
 /// Why a field cannot be made or loaded.
 #[derive(Debug, thiserror::Error, PartialEq)]
 pub enum FieldError {
@@ -56,7 +59,8 @@ pub struct FieldConfig {
     pub background_width: usize,
     /// Added to the raw density before the exponential: density = exp(raw + offset), 1/metre.
     pub density_offset: f32,
-    /// Cells along the side of the occupancy grid; a multiple of 8, 8..=512.
+    /// Cells along the side of the occupancy grid; a multiple of 8, 8..=512. A trained field has twice as many as it was
+    /// trained with.
     pub occupancy_resolution: usize,
     /// Samples of a ray that crosses the bounds along their longest side: sets the step inside the bounds.
     pub samples_across: f32,
@@ -155,7 +159,8 @@ impl FieldConfig {
         )?;
         check((-20.0..=20.0).contains(&self.density_offset), "density_offset", self.density_offset, "-20..=20")?;
         check(
-            self.occupancy_resolution.is_multiple_of(8) && (8..=512).contains(&self.occupancy_resolution),
+            self.occupancy_resolution.is_multiple_of(8)
+                && (8..=MAX_GRID_RESOLUTION).contains(&self.occupancy_resolution),
             "occupancy_resolution",
             self.occupancy_resolution,
             "a multiple of 8 in 8..=512",
@@ -179,13 +184,14 @@ pub struct RenderOptions {
     pub max_samples_per_ray: usize,
     /// A ray ends when less than this share of light passes.
     pub min_transmittance: f32,
-    /// Samples that weigh less than this in their pixel are given no colour of their own.
+    /// Samples that weigh less than this in their pixel are given no colour of their own, but the mean of the others'
+    /// (the heaviest one always has its own).
     pub min_weight: f32,
 }
 
 impl Default for RenderOptions {
     fn default() -> Self {
-        Self { threads: 1, max_samples_per_ray: 256, min_transmittance: 1e-3, min_weight: 2e-4 }
+        Self { threads: 1, max_samples_per_ray: 256, min_transmittance: 1e-2, min_weight: 5e-3 }
     }
 }
 
@@ -238,6 +244,9 @@ pub struct TrainerConfig {
     pub jitter: bool,
     /// Weight of the opacity regulariser: pushes each ray's opacity to 0 or 1.
     pub opacity_entropy: f32,
+    /// Weight of the distortion loss (mip-NeRF 360, eq. 15): draws what a ray sees together into thin surfaces. Distances
+    /// t count as t / (t + half the longest extent of the bounds).
+    pub distortion: f32,
     /// Steps between two refreshes of the occupancy grid.
     pub occupancy_interval: u64,
     /// Up to this step all of space counts as occupied.
@@ -282,6 +291,7 @@ impl Default for TrainerConfig {
             min_keep: 0.1,
             jitter: true,
             opacity_entropy: 0.0,
+            distortion: 0.0,
             occupancy_interval: 16,
             occupancy_warmup_steps: 256,
             target_samples_per_ray: 24.0,

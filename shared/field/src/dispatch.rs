@@ -105,6 +105,19 @@ dispatched!(
     (weights: &[f32], bias: &[f32], x: &[f32], x_stride: usize, y: &mut [f32], y_stride: usize, relu: bool)
 );
 dispatched!(
+    /// See [`kernels::bias_relu`].
+    bias_relu, bias_relu, [], (x: &[f32], bias: &[f32], y: &mut [f32], blocks_apart: usize)
+);
+dispatched!(
+    /// See [`kernels::activate`].
+    activate, activate, [],
+    (raw: &[f32], apart: usize, offset: f32, length_m: &[f32], density: &mut [f32], passes: &mut [f32])
+);
+dispatched!(
+    /// See [`kernels::densities`].
+    densities, densities, [], (raw: &[f32], apart: usize, offset: f32, density: &mut [f32])
+);
+dispatched!(
     /// See [`kernels::dense_backward_input`].
     dense_backward_input, dense_backward_input, [],
     (weights: &[f32], outputs: usize, dy: &[f32], dy_stride: usize, dx: &mut [f32], dx_stride: usize, rows: usize,

@@ -66,6 +66,18 @@ pub(crate) fn dense_forward<const FMA: bool>(
     }
 }
 
+/// y = max(x + b, 0), row by row; x and y blocks are `blocks_apart` apart.
+#[inline(always)]
+pub(crate) fn bias_relu<const FMA: bool>(x: &[f32], bias: &[f32], y: &mut [f32], blocks_apart: usize) {
+    for (xb, yb) in x.chunks_exact(blocks_apart).zip(y.chunks_exact_mut(blocks_apart)) {
+        for ((xr, yr), b) in xb.as_chunks::<LANES>().0.iter().zip(yb.as_chunks_mut::<LANES>().0).zip(bias) {
+            for l in 0..LANES {
+                yr[l] = (xr[l] + b).max(0.0);
+            }
+        }
+    }
+}
+
 /// Gradient by a layer's input: dx = W dy for the first `rows` inputs (a multiple of 4), zero where `relu_of` (the
 /// input's own activations, same layout as dx) is not positive.
 #[inline(always)]
@@ -325,11 +337,37 @@ pub(crate) fn scatter<const FMA: bool, const F: usize>(
     }
 }
 
-/// Density of one row of raw outputs: exp(raw + offset), 1/metre.
+/// From raw outputs (row 0 of each block, blocks `apart` from each other) to densities exp(raw + offset), 1/metre, and to
+/// the share of light that passes each sample's length, metres.
 #[inline(always)]
-pub(crate) fn activate_density(raw: &[f32; LANES], offset: f32, out: &mut [f32; LANES]) {
-    for l in 0..LANES {
-        out[l] = exp((raw[l] + offset).min(15.0));
+pub(crate) fn activate<const FMA: bool>(
+    raw: &[f32],
+    apart: usize,
+    offset: f32,
+    length_m: &[f32],
+    density: &mut [f32],
+    passes: &mut [f32],
+) {
+    let rows = density.as_chunks_mut::<LANES>().0.iter_mut().zip(passes.as_chunks_mut::<LANES>().0);
+    for ((block, length), (density, passes)) in raw.chunks_exact(apart).zip(length_m.as_chunks::<LANES>().0).zip(rows) {
+        let raw = row(block, 0);
+        for l in 0..LANES {
+            density[l] = exp((raw[l] + offset).min(15.0));
+            passes[l] = exp(-density[l] * length[l]);
+        }
+    }
+}
+
+/// The densities alone; the last block may be needed in part.
+#[inline(always)]
+pub(crate) fn densities<const FMA: bool>(raw: &[f32], apart: usize, offset: f32, density: &mut [f32]) {
+    for (block, out) in raw.chunks_exact(apart).zip(density.chunks_mut(LANES)) {
+        let raw = row(block, 0);
+        let mut lanes = [0.0; LANES];
+        for l in 0..LANES {
+            lanes[l] = exp((raw[l] + offset).min(15.0));
+        }
+        out.copy_from_slice(&lanes[..out.len()]);
     }
 }
 

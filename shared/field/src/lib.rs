@@ -15,6 +15,7 @@ mod kernels;
 mod layout;
 mod march;
 mod math;
+mod points;
 mod render;
 mod sampler;
 mod space;
@@ -24,7 +25,8 @@ pub use config::{FieldConfig, FieldError, LATENT_DIM, RenderOptions, TrainerConf
 pub use dispatch::InstructionSet;
 pub use field::{Field, NamedTensor};
 pub use march::{RayLimits, RaySamples};
-pub use render::RenderBuffer;
+pub use points::PreparedPoints;
+pub use render::{HypothesisBuffer, RenderBuffer};
 pub use sampler::{RAYS_PER_GROUP, RaySampler, TrainingView, changed_pixels};
 pub use space::{Contraction, OccupancyGrid};
 pub use train::{FieldTrainer, RayBatch, StepReport, TrainerState};

@@ -3,13 +3,15 @@
 use carff_geometry::Ray;
 
 use crate::config::{FieldConfig, LATENT_DIM};
-use crate::field::{Field, Folded, Scratch, grow, raw_row};
-use crate::kernels::{LANES, activate_density, stride};
-use crate::math::exp;
+use crate::dispatch;
+use crate::field::{Field, Folded, Scratch, grow};
+use crate::kernels::{LANES, stride};
 use crate::space::{Contraction, OccupancyGrid};
 
-/// Samples of a ray that are evaluated before its transmittance is looked at again.
-const WAVE: usize = 8;
+/// Samples of all rays together that are evaluated before transmittances are looked at again: enough to fill blocks.
+const WAVE: usize = 256;
+/// The fewest and the most of one ray: what comes after it has turned opaque is for nothing.
+const WAVE_OF_RAY: std::ops::RangeInclusive<usize> = 4..=16;
 /// Rays that are worked on together where their samples are listed.
 const CHUNK: usize = 64;
 /// Marks a lane that fills up a block.
@@ -23,6 +25,8 @@ pub(crate) struct Marcher {
     cone: f32,
     near: f32,
     far: f32,
+    /// Half the longest extent of the bounds, metres.
+    half_m: f32,
 }
 
 /// What ends a ray, and how finely it is sampled.
@@ -58,10 +62,16 @@ impl Marcher {
         Self {
             contraction,
             step_m: 2.0 * contraction.longest_half_m() / config.samples_across,
+            half_m: contraction.longest_half_m(),
             cone: config.cone_angle,
             near: config.near_m,
             far: config.far_m,
         }
+    }
+
+    /// A distance brought into 0..1, so that far and near count alike: t / (t + half the longest extent).
+    pub fn bounded(&self, distance_m: f32) -> f32 {
+        distance_m / (distance_m + self.half_m)
     }
 
     #[inline(always)]
@@ -81,10 +91,10 @@ impl Marcher {
         limits: &RayLimits,
         mut emit: impl FnMut([f32; 3], f32, f32),
     ) -> bool {
-        let r = grid.resolution();
-        let rf = r as f32;
         let mut left = most;
         let inverse_half = self.contraction.inverse_half();
+        let speed: [f32; 3] = std::array::from_fn(|i| ray.direction[i] * inverse_half[i]);
+        let inverse_speed = speed.map(|v| 1.0 / v);
         while left > 0 {
             if *t >= self.far || t.is_nan() {
                 return false;
@@ -93,27 +103,20 @@ impl Marcher {
             let u = self.contraction.normalized(p);
             let dt = self.step_at(*t, u, limits.step_scale);
             let q = Contraction::contract_normalized(u);
-            if limits.use_occupancy {
-                let at = q.map(|v| v * rf);
-                let cell = at.map(|v| (v as usize).min(r - 1));
-                let rc = r / 4;
-                let coarse = ((cell[2] / 4) * rc + cell[1] / 4) * rc + cell[0] / 4;
-                let coarse_empty = !grid.coarse_cell(coarse);
-                if coarse_empty || !grid.cell((cell[2] * r + cell[1]) * r + cell[0]) {
-                    // To the far wall of the empty cell, in whole steps, so that the jitter of the start is kept.
-                    let cells = if coarse_empty { rf * 0.25 } else { rf };
-                    let mut distance = f32::INFINITY;
-                    for i in 0..3 {
-                        let speed = ray.direction[i] * inverse_half[i];
-                        if speed.abs() > 1e-9 {
-                            let here = (q[i] * cells).floor();
-                            let wall = if speed > 0.0 { here + 1.0 } else { here };
-                            distance = distance.min((Contraction::uncontract_axis(wall / cells) - u[i]) / speed);
-                        }
+            if limits.use_occupancy
+                && let Some(cells) = grid.empty_around(q)
+            {
+                // To the far wall of the empty cell, in whole steps, so that the jitter of the start is kept.
+                let mut distance = f32::INFINITY;
+                for i in 0..3 {
+                    if speed[i].abs() > 1e-9 {
+                        let here = (q[i] * cells).floor();
+                        let wall = if speed[i] > 0.0 { here + 1.0 } else { here };
+                        distance = distance.min((Contraction::uncontract_axis(wall / cells) - u[i]) * inverse_speed[i]);
                     }
-                    *t += (distance / dt).ceil().max(1.0) * dt;
-                    continue;
                 }
+                *t += (distance / dt).ceil().max(1.0) * dt;
+                continue;
             }
             emit(q, *t, dt);
             *t += dt;
@@ -145,6 +148,8 @@ pub(crate) struct Samples {
     pub weight: Vec<f32>,
     /// Transmittance behind it.
     pub behind: Vec<f32>,
+    /// Share of light that passes it, for the samples of one wave.
+    passes: Vec<f32>,
     /// Features, one block for each 16 samples.
     pub features: Vec<f32>,
     /// Outputs of the density network, blocks like `features`.
@@ -177,11 +182,12 @@ impl Samples {
             let t = m.near + jitter(i) * m.step_m * limits.step_scale;
             RayState { t, transmittance: 1.0, samples: 0, alive: true }
         }));
-        let mut any_alive = true;
-        while any_alive {
+        let mut alive = self.rays.len();
+        while alive > 0 {
             let start = self.points.len();
+            let wave = (WAVE / alive).clamp(*WAVE_OF_RAY.start(), *WAVE_OF_RAY.end());
             for (i, (ray, state)) in rays.iter().zip(&mut self.rays).enumerate().filter(|(_, (_, s))| s.alive) {
-                let most = WAVE.min(limits.max_samples - state.samples);
+                let most = wave.min(limits.max_samples - state.samples);
                 let before = self.points.len();
                 state.alive = m.advance(&field.occupancy, ray, &mut state.t, most, limits, |q, t, dt| {
                     self.points.push(q);
@@ -211,22 +217,34 @@ impl Samples {
             let geometry = &mut self.geometry[blocks.start * sg..blocks.end * sg];
             field.encode(&self.points[start..end], features);
             field.density_network(folded, features, &mut scratch.hidden_a, &mut scratch.hidden_b, geometry);
-            for (density, block) in
-                self.density[start..end].as_chunks_mut::<LANES>().0.iter_mut().zip(geometry.chunks_exact(sg))
-            {
-                activate_density(raw_row(block), field.config.density_offset, density);
-            }
+            self.passes.resize(end - start, 0.0);
+            dispatch::activate(
+                field.set,
+                geometry,
+                sg,
+                field.config.density_offset,
+                &self.length_m[start..end],
+                &mut self.density[start..end],
+                &mut self.passes,
+            );
             for i in start..count {
                 let state = &mut self.rays[self.ray[i] as usize];
-                let passes = exp(-self.density[i] * self.length_m[i]);
+                if state.transmittance < limits.min_transmittance {
+                    // The ray ended earlier in this wave: what it sees does not depend on how long waves are.
+                    self.ray[i] = NO_RAY;
+                    self.weight[i] = 0.0;
+                    self.behind[i] = state.transmittance;
+                    continue;
+                }
+                let passes = self.passes[i - start];
                 self.weight[i] = state.transmittance * (1.0 - passes);
                 state.transmittance *= passes;
                 self.behind[i] = state.transmittance;
             }
-            any_alive = false;
+            alive = 0;
             for state in &mut self.rays {
                 state.alive &= state.transmittance >= limits.min_transmittance;
-                any_alive |= state.alive;
+                alive += usize::from(state.alive);
             }
         }
     }

@@ -16,10 +16,15 @@ use crate::math::{hash, sigmoid, spherical_harmonics, unit};
 const CHUNK: usize = 32;
 /// Numbers that one task of the Adam step updates.
 const ADAM_PIECE: usize = 1 << 15;
-/// Random points of each cell that are looked at when training ends.
-const LAST_LOOKS: u64 = 24;
+/// Random points of each cell that are looked at when training ends, under one latent of each state.
+const LAST_LOOKS: u64 = 10;
 /// A cell stays when a step inside the bounds through its densest point would hide this share of what is behind.
 const VISIBLE_OPACITY: f32 = 0.03;
+/// Random points of each cell at which states are compared when training ends.
+const COMPARED_POINTS: u64 = 8;
+/// States differ in a cell where their means of the opacity of a step inside the bounds, or of the colour as seen
+/// through it, differ by more than this.
+const VISIBLE_CHANGE: f32 = 0.12;
 /// Occupancy cells that one task looks at.
 const CELLS_PIECE: usize = 512;
 
@@ -101,6 +106,17 @@ struct Kept {
     raw_gradient: f32,
 }
 
+/// Sums over the samples of a ray that lie on one side of a sample.
+#[derive(Clone, Copy, Debug, Default)]
+struct RaySums {
+    /// Of weights.
+    weight: f32,
+    /// Of weights times places.
+    moment: f32,
+    /// Of weights times the loss's gradients by them.
+    gradient: f32,
+}
+
 /// What one shard of the batch works in; the order of its sums does not depend on threads.
 #[derive(Debug, Default)]
 struct Shard {
@@ -120,6 +136,7 @@ struct Shard {
     pixel: Vec<[f32; 3]>,
     pixel_gradient: Vec<[f32; 3]>,
     through_gradient: Vec<f32>,
+    ray_sums: Vec<RaySums>,
     loss: f64,
     squared_error: f64,
     ray_count: usize,
@@ -230,14 +247,16 @@ impl FieldTrainer {
         &self.field
     }
 
-    /// The field, and an end to training. Cells of the occupancy grid in which no state has anything that a picture
-    /// would show are given up: training keeps thin fog, which rendering need not walk through.
+    /// The field, and an end to training. Its grids get cells of half the side, and those in which no state has anything
+    /// that a picture would show are given up: training keeps thin fog, which rendering need not walk through. Where
+    /// states differ is noted.
     pub fn into_field(mut self) -> Field {
-        let cells: Vec<u32> =
-            (0..self.cell_density.len() as u32).filter(|cell| self.field.occupancy.cell(*cell as usize)).collect();
         if self.step < self.config.occupancy_warmup_steps || self.state_latents.is_empty() {
             return self.field;
         }
+        self.field.refine_grids();
+        let count = self.field.occupancy.resolution().pow(3) as u32;
+        let cells: Vec<u32> = (0..count).filter(|cell| self.field.occupancy.cell(*cell as usize)).collect();
         let mut densest = vec![0.0_f32; cells.len()];
         for look in 0..LAST_LOOKS {
             let round = hash(self.config.seed, 0x1a57, look);
@@ -247,12 +266,74 @@ impl FieldTrainer {
             }
         }
         let threshold = VISIBLE_OPACITY / self.field.marcher.step_m;
-        let mut kept = vec![false; self.cell_density.len()];
+        let mut kept = vec![false; count as usize];
         for (cell, density) in cells.iter().zip(densest) {
             kept[*cell as usize] = density > threshold;
         }
         self.field.occupancy.set_from(|cell| kept[cell]);
+        let cells: Vec<u32> = cells.into_iter().filter(|cell| kept[*cell as usize]).collect();
+        let mut changing = vec![false; kept.len()];
+        for (cell, change) in cells.iter().zip(self.changes(&cells)) {
+            changing[*cell as usize] = change > VISIBLE_CHANGE;
+        }
+        self.field.changing.set_from(|cell| changing[cell]);
         self.field
+    }
+
+    /// How much the states' means over each cell differ: the larger of the differences in the opacity of a step inside
+    /// the bounds and in colour as seen through it.
+    fn changes(&self, cells: &[u32]) -> Vec<f32> {
+        let field = &self.field;
+        let rounds: Vec<u64> = (0..COMPARED_POINTS).map(|look| hash(self.config.seed, 0xc4a9, look)).collect();
+        let look = |cells: &[u32]| -> Vec<f32> {
+            // Per cell the least and the largest of the states' means: opacity, and colours through it.
+            let mut range = vec![([f32::INFINITY; 4], [f32::NEG_INFINITY; 4]); cells.len()];
+            let (mut densities, mut colors) = (vec![0.0; cells.len()], vec![[0.0; 3]; cells.len()]);
+            let mut means = vec![[0.0_f32; 4]; cells.len()];
+            for state in &self.state_latents {
+                means.fill([0.0; 4]);
+                for (i, round) in rounds.iter().enumerate() {
+                    let points: Vec<[f32; 3]> =
+                        self.points_in(cells, *round).into_iter().map(|q| field.contraction.uncontract(q)).collect();
+                    let directions: Vec<[f32; 3]> = cells.iter().map(|cell| random_direction(*round, *cell)).collect();
+                    let latent = &state[i % state.len()];
+                    field.density_and_color(&points, &directions, latent, &mut densities, &mut colors);
+                    for ((mean, density), [r, g, b]) in means.iter_mut().zip(&densities).zip(&colors) {
+                        let opacity = 1.0 - (-density * field.marcher.step_m).exp();
+                        for (sum, v) in mean.iter_mut().zip([1.0, *r, *g, *b]) {
+                            *sum += opacity * v / COMPARED_POINTS as f32;
+                        }
+                    }
+                }
+                for ((low, high), mean) in range.iter_mut().zip(&means) {
+                    for k in 0..4 {
+                        low[k] = low[k].min(mean[k]);
+                        high[k] = high[k].max(mean[k]);
+                    }
+                }
+            }
+            range.iter().map(|(low, high)| (0..4).map(|k| high[k] - low[k]).fold(0.0, f32::max)).collect()
+        };
+        match &self.pool {
+            Some(pool) => pool.install(|| cells.par_chunks(CELLS_PIECE).map(look).flatten().collect()),
+            None => cells.chunks(CELLS_PIECE).flat_map(look).collect(),
+        }
+    }
+
+    /// One random point of each cell, in the unit cube.
+    fn points_in(&self, cells: &[u32], round: u64) -> Vec<[f32; 3]> {
+        let resolution = self.field.occupancy.resolution();
+        cells
+            .iter()
+            .map(|cell| {
+                let i = *cell as usize;
+                let at = [i % resolution, i / resolution % resolution, i / (resolution * resolution)];
+                std::array::from_fn(|a| {
+                    let jitter = unit(hash(round, 4 + a as u64, i as u64));
+                    (at[a] as f32 + jitter) / resolution as f32
+                })
+            })
+            .collect()
     }
 
     /// How much steps along rays are stretched just now; 1 once the occupancy grid keeps rays short.
@@ -494,20 +575,8 @@ impl FieldTrainer {
     /// The largest density under any of the latents, at one random point of each cell.
     fn densest(&self, cells: &[u32], latents: &[[f32; LATENT_DIM]], round: u64) -> Vec<f32> {
         let field = &self.field;
-        let resolution = field.occupancy.resolution();
-        let inverse = 1.0 / resolution as f32;
         let look = |cells: &[u32]| -> Vec<f32> {
-            let points: Vec<[f32; 3]> = cells
-                .iter()
-                .map(|cell| {
-                    let i = *cell as usize;
-                    let at = [i % resolution, i / resolution % resolution, i / (resolution * resolution)];
-                    std::array::from_fn(|a| {
-                        let jitter = unit(hash(round, 4 + a as u64, i as u64));
-                        (at[a] as f32 + jitter) * inverse
-                    })
-                })
-                .collect();
+            let points = self.points_in(cells, round);
             let mut densities = vec![0.0; points.len() * latents.len()];
             field.density_in_cube(&points, latents, &mut densities);
             (0..points.len())
@@ -589,6 +658,12 @@ impl FieldTrainer {
     }
 }
 
+fn random_direction(round: u64, cell: u32) -> [f32; 3] {
+    let d = [7, 8, 9].map(|salt| unit(hash(round, salt, u64::from(cell))) - 0.5);
+    let n = d.iter().map(|v| v * v).sum::<f32>().sqrt().max(1e-3);
+    d.map(|v| v / n)
+}
+
 /// What all chunks of a step share.
 struct Job<'a> {
     field: &'a Field,
@@ -630,6 +705,7 @@ impl Shard {
         self.background_forward(field);
         self.color_forward(field);
         self.pixel_loss(job);
+        self.distortion_loss(job);
         self.sample_gradients();
         let bias = &mut self.backward;
         for (b, layer) in [
@@ -788,6 +864,46 @@ impl Shard {
         }
     }
 
+    /// The distortion loss over the kept samples (mip-NeRF 360, eq. 15): per ray, the sum over all pairs of
+    /// w w' |s - s'|, and a third of the sum of w^2 times the sample's length. Leaves its gradient by each density,
+    /// divided by the sample's length, in `raw_gradient`.
+    fn distortion_loss(&mut self, job: &Job) {
+        let weight_of_loss = 3.0 * job.config.distortion;
+        if weight_of_loss <= 0.0 {
+            return;
+        }
+        let (s, marcher) = (&self.samples, &job.field.marcher);
+        let place = |i: usize| {
+            let (from, to) = (marcher.bounded(s.distance_m[i]), marcher.bounded(s.distance_m[i] + s.length_m[i]));
+            (0.5 * (from + to), to - from)
+        };
+        let begin = |sums: &mut Vec<RaySums>| {
+            sums.clear();
+            sums.resize(self.rays.len(), RaySums::default());
+        };
+        begin(&mut self.ray_sums);
+        for k in &mut self.kept {
+            let i = k.sample as usize;
+            let (front, w, (at, length)) = (&mut self.ray_sums[s.ray[i] as usize], s.weight[i], place(i));
+            let to_front = 2.0 * (at * front.weight - front.moment);
+            let own = w * length / 3.0;
+            self.loss += f64::from(weight_of_loss * w * (to_front + own));
+            k.raw_gradient = to_front + 2.0 * own;
+            front.weight += w;
+            front.moment += w * at;
+        }
+        begin(&mut self.ray_sums);
+        for k in self.kept.iter_mut().rev() {
+            let i = k.sample as usize;
+            let (behind, w, (at, _)) = (&mut self.ray_sums[s.ray[i] as usize], s.weight[i], place(i));
+            let by_weight = k.raw_gradient + 2.0 * (behind.moment - at * behind.weight);
+            k.raw_gradient = weight_of_loss * job.gradient_scale * (s.behind[i] * by_weight - behind.gradient);
+            behind.weight += w;
+            behind.moment += w * at;
+            behind.gradient += w * by_weight;
+        }
+    }
+
     /// Gradients by each kept sample's raw colour and raw density (Max 1995; the sum behind a sample, back to front).
     fn sample_gradients(&mut self) {
         let s = &self.samples;
@@ -800,7 +916,7 @@ impl Shard {
             let i = k.sample as usize;
             let ray = s.ray[i] as usize;
             let (g, behind) = (&self.pixel_gradient[ray], &mut arriving[ray]);
-            let mut by_density = -self.through_gradient[ray] * s.rays[ray].transmittance;
+            let mut by_density = k.raw_gradient - self.through_gradient[ray] * s.rays[ray].transmittance;
             for c in 0..3 {
                 by_density += g[c] * (s.behind[i] * k.color[c] - behind[c]);
                 k.color_gradient[c] = k.scale * g[c] * s.weight[i] * k.color[c] * (1.0 - k.color[c]);

@@ -77,6 +77,7 @@ fn exact_config() -> TrainerConfig {
         min_transmittance: 0.0,
         huber_delta: 0.3,
         opacity_entropy: 0.05,
+        distortion: 0.2,
         samples_per_step: usize::MAX,
         latent_gradient: true,
         occupancy_warmup_steps: 10,
@@ -297,11 +298,16 @@ fn occupancy_keeps_what_exists_in_any_state() {
     for state in [0, 1, 3] {
         assert!(opacity(state) < 0.1, "and in no other: {}", opacity(state));
     }
-    assert!(field.occupancy().contains(field.contraction().contract(center)));
+    let center = field.contraction().contract(center);
+    assert!(field.occupancy().contains(center));
+    // When training ends, the ball's place is known to change.
+    let field = trainer.into_field();
+    assert!(field.occupancy().contains(center) && field.changing().contains(center));
 }
 
 /// Matter that one of four latents alone makes keeps its cells occupied; without that state among the registered ones
-/// the same refresh empties them. (Weights set by hand: density depends on the latent only.)
+/// the same refresh empties them. When training ends, cells are known to change where one state's matter is not all
+/// states'. (Weights set by hand: density depends on the latent only.)
 #[test]
 fn occupancy_is_the_maximum_over_states() {
     let mut field = Field::new(small_config(), 2).unwrap();
@@ -323,10 +329,14 @@ fn occupancy_is_the_maximum_over_states() {
         let mut trainer = FieldTrainer::new(field.clone(), config).unwrap();
         trainer.set_state_latents(states);
         trainer.step(&RayBatch::default());
-        trainer.field().occupancy().occupied_share()
+        let before = trainer.field().occupancy().occupied_share();
+        let field = trainer.into_field();
+        assert_eq!(field.occupancy().occupied_share(), before);
+        [before, field.changing().occupied_share()]
     };
-    assert_eq!(share(&[state(0.0), state(0.5), state(2.0), state(-1.0)]), 1.0);
-    assert_eq!(share(&[state(0.0), state(0.5), state(-1.0)]), 0.0);
+    assert_eq!(share(&[state(0.0), state(0.5), state(2.0), state(-1.0)]), [1.0, 1.0]);
+    assert_eq!(share(&[state(2.0), state(2.0)]), [1.0, 0.0]);
+    assert_eq!(share(&[state(0.0), state(0.5), state(-1.0)]), [0.0, 0.0]);
 }
 
 /// Both paths of the kernels give the same gradients and losses up to rounding.

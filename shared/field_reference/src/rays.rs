@@ -92,7 +92,7 @@ impl ReferenceField {
     }
 
     /// A picture `[R, 3]` without gradients, `chunk` samples at a time; samples that weigh no more than `min_weight`
-    /// get no colour of their own.
+    /// get no colour of their own but the mean of their ray's others (the heaviest one always has its own).
     pub fn render(&self, rays: &Rays, samples: &Samples, latent: &Tensor, min_weight: f64, chunk: i64) -> Tensor {
         let chunks = |count: i64| (0..count).step_by(chunk.max(1) as usize).map(move |at| (at, chunk.min(count - at)));
         tch::no_grad(|| {
@@ -106,13 +106,22 @@ impl ReferenceField {
             let geometry = Tensor::cat(&geometry, 0);
             let (weight, transmittance) = samples.weights(&self.activate(&geometry), rays.count());
             pixels *= transmittance.unsqueeze(1);
-            let kept = weight.gt(min_weight).nonzero().view(-1);
+            let per_ray = || Tensor::zeros([rays.count()], (Kind::Float, Device::Cpu));
+            let heaviest = per_ray().index_reduce(0, &samples.ray, &weight, "amax", true);
+            let kept = weight.gt(min_weight).logical_or(&weight.ge_tensor(&heaviest.index_select(0, &samples.ray)));
+            let kept = kept.logical_and(&weight.gt(0.0)).nonzero().view(-1);
+            let kept_weight = weight.index_select(0, &kept);
+            let kept_ray = samples.ray.index_select(0, &kept);
+            let whole = per_ray().index_add(0, &samples.ray, &weight);
+            let colored = per_ray().index_add(0, &kept_ray, &kept_weight).clamp_min(1e-30);
+            let weight = kept_weight * (whole / colored).index_select(0, &kept_ray);
             for (first, count) in chunks(kept.size()[0]) {
+                let weight = weight.narrow(0, first, count);
                 let kept = kept.narrow(0, first, count);
                 let ray = samples.ray.index_select(0, &kept);
                 let harmonics = rays.harmonics.index_select(0, &ray);
                 let color = self.color(&geometry.index_select(0, &kept), &harmonics, latent);
-                let _ = pixels.index_add_(0, &ray, &(color * weight.index_select(0, &kept).unsqueeze(1)));
+                let _ = pixels.index_add_(0, &ray, &(color * weight.unsqueeze(1)));
             }
             pixels
         })

@@ -4,6 +4,10 @@
 //! something can stand are queried (not a whole picture per candidate), each box's occupancy is compared with what the
 //! known states showed, and "nobody there" and "none of the known states" are possible answers.
 //!
+//! What a field learns from pictures is surfaces: nobody sees whether a vehicle is hollow. So the points stand in upright
+//! columns, and a box is as occupied as its median column is to light: a vehicle stops it nearly everywhere, haze or a
+//! neighbour's shadow here and there.
+//!
 //! ```
 //! use carff_geometry::OrientedBox;
 //! use carff_probing::{Calibration, Place, Prober};
@@ -26,14 +30,19 @@
 use carff_geometry::OrientedBox;
 use serde::{Deserialize, Serialize};
 
-/// Points along each axis of a box that are queried.
-pub const LATTICE: [usize; 3] = [7, 4, 3];
-/// Share of a box's extent that the lattice covers: its skin belongs to the surroundings.
-const LATTICE_FILL: f64 = 0.85;
-/// Length over which a point's density becomes an occupancy, metres: 1 - exp(-density * this).
-const OCCUPANCY_LENGTH_M: f32 = 0.5;
+/// Upright columns along a box's length and its width.
+const COLUMNS: [usize; 2] = [5, 4];
+/// Points of each column.
+const COLUMN_POINTS: usize = 8;
+/// Share of a box's length and width that the columns cover: its skin belongs to the surroundings.
+const COLUMNS_FILL: f64 = 0.7;
+/// Where columns begin and end, as shares of the box's height above its bottom: clear of the ground, and over the roof.
+const COLUMN_SPAN: [f64; 2] = [0.25, 1.05];
 /// Log-likelihood ratios of one place are limited to this, so that no place alone decides for all others.
 const MAX_LOG_RATIO: f64 = 6.0;
+/// Deviations are at least this share of the distance between a place's two means: calibration sees the known states
+/// alone, and what lies between them shall be read as doubtful.
+const MIN_DEVIATION_SHARE: f64 = 0.2;
 /// A reading whose best state explains its places worse than this (mean probability of a place) names no state.
 const MIN_MEAN_PROBABILITY: f64 = 0.5;
 
@@ -82,6 +91,8 @@ pub struct Prober {
     places: Vec<Place>,
     hazard_states: Vec<bool>,
     points: Vec<[f32; 3]>,
+    /// Per place, the length of a column that one of its points stands for, metres.
+    point_lengths_m: Vec<f32>,
 }
 
 impl Prober {
@@ -99,12 +110,15 @@ impl Prober {
                 });
             }
         }
-        let points = places
+        let points = places.iter().flat_map(|p| column_points(&p.oriented_box)).collect();
+        let point_lengths_m = places
             .iter()
-            .flat_map(|p| p.oriented_box.lattice(LATTICE, LATTICE_FILL))
-            .map(|p| p.map(|v| v as f32))
+            .map(|p| {
+                let span_m = 2.0 * p.oriented_box.half_size[2] * (COLUMN_SPAN[1] - COLUMN_SPAN[0]);
+                (span_m / COLUMN_POINTS as f64) as f32
+            })
             .collect();
-        Ok(Self { places, hazard_states, points })
+        Ok(Self { places, hazard_states, points, point_lengths_m })
     }
 
     /// The places.
@@ -129,15 +143,40 @@ impl Prober {
 
     /// Densities at [`Self::points`] (1/m) to one occupancy in 0..=1 per place, written to `occupancies`.
     pub fn occupancies(&self, densities: &[f32], occupancies: &mut [f32]) {
-        let per_place = LATTICE.iter().product::<usize>();
-        for (out, chunk) in occupancies.iter_mut().zip(densities.chunks_exact(per_place)) {
-            let sum: f32 = chunk
-                .iter()
-                .map(|&d| if d.is_finite() { 1.0 - (-d.max(0.0) * OCCUPANCY_LENGTH_M).exp() } else { 0.0 })
-                .sum();
-            *out = sum / per_place as f32;
+        let columns = COLUMNS[0] * COLUMNS[1];
+        let boxes = densities.chunks_exact(columns * COLUMN_POINTS).zip(&self.point_lengths_m);
+        for (out, (densities, length_m)) in occupancies.iter_mut().zip(boxes) {
+            let stopped = |column: &[f32]| {
+                let sum: f32 = column.iter().filter(|d| d.is_finite()).map(|d| d.max(0.0)).sum();
+                1.0 - (-sum * length_m).exp()
+            };
+            let mut shares = [0.0; COLUMNS[0] * COLUMNS[1]];
+            for (share, column) in shares.iter_mut().zip(densities.chunks_exact(COLUMN_POINTS)) {
+                *share = stopped(column);
+            }
+            let (_, median, _) = shares.select_nth_unstable_by(columns / 2, f32::total_cmp);
+            *out = *median;
         }
     }
+}
+
+/// The points of a box, column by column, metres. Heights are staggered from column to column, so that a thin surface
+/// between two heights of one is met by others.
+fn column_points(b: &OrientedBox) -> Vec<[f32; 3]> {
+    let at = |i: usize, n: usize| COLUMNS_FILL * (2.0 * i as f64 / (n - 1) as f64 - 1.0);
+    let mut points = Vec::with_capacity(COLUMNS[0] * COLUMNS[1] * COLUMN_POINTS);
+    for y in 0..COLUMNS[1] {
+        for x in 0..COLUMNS[0] {
+            let stagger = ((x * 3 + y * 5) % 7) as f64 / 7.0;
+            for z in 0..COLUMN_POINTS {
+                let share = (z as f64 + stagger) / COLUMN_POINTS as f64;
+                let height = COLUMN_SPAN[0] + (COLUMN_SPAN[1] - COLUMN_SPAN[0]) * share;
+                let point = b.point([at(x, COLUMNS[0]), at(y, COLUMNS[1]), 2.0 * height - 1.0]);
+                points.push(point.map(|v| v as f32));
+            }
+        }
+    }
+    points
 }
 
 /// What the known states showed: per place how occupied it looks when taken and when free.
@@ -198,11 +237,12 @@ impl Calibration {
                     (Some(only), None) | (None, Some(only)) => (only, only),
                     (None, None) => ((0.0, 1.0), (0.0, 1.0)),
                 };
+                let least = MIN_DEVIATION_SHARE * (taken.0 - free.0).abs();
                 PlaceCalibration {
                     taken_mean: taken.0,
-                    taken_deviation: taken.1,
+                    taken_deviation: taken.1.max(least),
                     free_mean: free.0,
-                    free_deviation: free.1,
+                    free_deviation: free.1.max(least),
                 }
             })
             .collect();
@@ -377,6 +417,25 @@ mod tests {
         let r = calibration(&p).read(&p, &[0.85, 0.75]);
         assert_eq!(r.state, None);
         assert!(r.hazard_likelihood > 0.5);
+    }
+
+    /// A hollow box with a thin roof is as occupied as a solid one; what lies on the ground below, or far over the roof, is
+    /// not in the box.
+    #[test]
+    fn surfaces_count_like_solids() {
+        let p = prober();
+        let occupancy = |density: &dyn Fn(f32) -> f32| {
+            let densities: Vec<f32> = p.points().iter().map(|point| density(point[2])).collect();
+            let mut out = [9.0; 2];
+            p.occupancies(&densities, &mut out);
+            out
+        };
+        // The boxes stand from 0.5 to 1.5 m.
+        let solid = occupancy(&|z| if z < 1.5 { 20.0 } else { 0.0 });
+        let shell = occupancy(&|z| if (z - 1.3).abs() < 0.06 { 60.0 } else { 0.0 });
+        let ground = occupancy(&|z| if z < 0.7 { 60.0 } else { 0.0 });
+        assert!(solid[0] > 0.99 && shell[0] > 0.95 && ground[0] < 0.01, "{solid:?} {shell:?} {ground:?}");
+        assert_eq!(shell[0], shell[1]);
     }
 
     /// Densities that are no numbers count as empty, and never panic.

@@ -46,7 +46,7 @@ pub use node::Node;
 pub use publisher::{PictureLoan, PicturePublisher, Publisher};
 pub use receiver::{Picture, PictureReceiver, Receiver, Sample};
 pub use run::{Run, cleanup_dead, living_processes, remove_run_leftovers, run_id_of, runtime_dir};
-pub use space::check_space;
+pub use space::{SHARED_MEMORY_DIR, check_space};
 pub use topics::{Limits, PictureTopic, Topic};
 pub use wait::{Input, Stop, Waiter, Woken};
 

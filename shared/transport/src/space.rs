@@ -4,7 +4,7 @@ use crate::OpenError;
 use std::path::Path;
 
 /// Where the system keeps shared memory.
-pub(crate) const SHARED_MEMORY_DIR: &str = "/dev/shm";
+pub const SHARED_MEMORY_DIR: &str = "/dev/shm";
 
 /// What the rest of a topic (connections, wake-ups) takes, generously.
 pub(crate) const MANAGEMENT_BYTES: u64 = 1 << 20;

@@ -8,8 +8,8 @@ use anyhow::Context;
 use carff_belief::Probe;
 use carff_checkpoint::Manifest;
 use carff_field::{
-    Field, FieldConfig, FieldTrainer, LATENT_DIM, RayBatch, RayLimits, RaySamples, RenderBuffer, RenderOptions,
-    TrainerConfig,
+    Field, FieldConfig, FieldTrainer, HypothesisBuffer, LATENT_DIM, RayBatch, RayLimits, RaySamples, RenderBuffer,
+    RenderOptions, TrainerConfig,
 };
 use carff_field_reference::{Precision, Rays, ReferenceField, Samples, huber_sum};
 use carff_geometry::{PinholeCamera, Ray};
@@ -95,10 +95,26 @@ pub(crate) fn birds_eye(config: &FieldConfig, side_px: u32) -> PinholeCamera {
 }
 
 /// Multiplications and additions of the density network for one sample.
-fn density_operations(c: &FieldConfig) -> f64 {
-    let features = c.levels * c.features_per_level;
-    2.0 * (features * c.hidden_width + c.hidden_width * c.hidden_width + c.hidden_width * (1 + c.geometry_features))
-        as f64
+#[derive(Clone, Copy, Debug)]
+struct Operations {
+    /// Of the first layer: once for all latents, where there are several.
+    first: f64,
+    /// Of the others, for the density alone (four outputs, of which one counts).
+    rest: f64,
+    /// Of all layers with all outputs, as rendering needs them.
+    whole: f64,
+}
+
+impl Operations {
+    fn of(c: &FieldConfig) -> Self {
+        let (features, width) = (c.levels * c.features_per_level, c.hidden_width);
+        let twice = |products: usize| 2.0 * products as f64;
+        Self {
+            first: twice(features * width),
+            rest: twice(width * width + width * 4),
+            whole: twice(features * width + width * width + width * (1 + c.geometry_features)),
+        }
+    }
 }
 
 struct Bench {
@@ -114,7 +130,8 @@ impl Bench {
         let points: Vec<[f32; 3]> = (0..POINTS).map(|i| random_point(field.config(), i as u64)).collect();
         let latents: Vec<[f32; LATENT_DIM]> = (0..LATENTS).map(|i| random_latent(i as u64)).collect();
         let mut outs = vec![vec![0.0_f32; POINTS * LATENTS]; self.threads];
-        let operations = density_operations(field.config()) * (POINTS * LATENTS * self.threads) as f64;
+        let each = Operations::of(field.config());
+        let operations = (each.first + each.rest * LATENTS as f64) * (POINTS * self.threads) as f64;
         let native = timed(move || {
             std::thread::scope(|scope| {
                 for out in &mut outs {
@@ -196,6 +213,8 @@ impl Bench {
                 chunk,
             )));
         };
+        let hypotheses: Vec<[f32; LATENT_DIM]> = (0..HYPOTHESES).map(|i| states[i % states.len()]).collect();
+        let mut together = HypothesisBuffer::default();
         let mut buffer = RenderBuffer::new();
         let mut contenders =
             vec![round_and_round(states.len(), |s| field.render(&camera, &states[s], &options, &mut buffer))];
@@ -205,15 +224,27 @@ impl Bench {
             chunks.push(chunk.min(count as i64));
             contenders.push(round_and_round(states.len(), move |s| frame(reference, s, chunk)));
         }
-        let seconds = in_turns(self.rounds, &mut contenders);
+        contenders.push(timed(|| field.render_hypotheses(&camera, &hypotheses, &options, &mut together)));
+        let mut seconds = in_turns(self.rounds, &mut contenders);
         drop(contenders);
         println!(
             "bird's-eye view {0} x {0}: {1:.0} samples, {2:.0} of them with colour, a frame",
             self.side_px, count, kept
         );
+        let shared = Times::new(seconds.pop().unwrap_or_default()).median() / HYPOTHESES as f64;
         let native = self.versus("render", count, &chunks, &seconds, report);
-        println!("(tensor operations are given where the samples lie: they need not march)\n");
-        report.set("field.render_fps", 1.0 / native);
+        println!("(tensor operations are given where the samples lie: they need not march)");
+        let changing = together.pictures[0].changing.iter().filter(|c| **c).count() as f64
+            / f64::from(self.side_px * self.side_px);
+        println!(
+            "{HYPOTHESES} hypotheses together: {} ms, {} frames a second, each; {} of the rays meet what changes\n",
+            number(shared * 1e3),
+            number(1.0 / shared),
+            percent(changing)
+        );
+        report.set("field.render_fps", 1.0 / shared);
+        report.set("field.render_alone_fps", 1.0 / native);
+        report.set("field.render_changing_rays", changing);
         report.set("field.render_samples", count);
         report.set("field.render_colored_samples", kept);
         self.breakdown(field, states, &camera, &samples, report);
@@ -246,8 +277,9 @@ impl Bench {
         let (mut buffer, mut without_color) = (RenderBuffer::new(), RenderBuffer::new());
         let mut nothing = RenderBuffer::new();
         let options = RenderOptions::default();
-        // No sample weighs more than 1.
-        let colorless = RenderOptions { min_weight: 2.0, ..options };
+        // No sample weighs more than 1: then each ray's heaviest alone has a colour.
+        let one_color = RenderOptions { min_weight: 2.0, ..options };
+        let colored = samples.weight.iter().filter(|w| **w > options.min_weight).count() as f64;
         let up: Vec<Ray> = rays
             .iter()
             .map(|r| Ray { origin: [r.origin[0], r.origin[1], 1e6], direction: r.direction.map(|v| v * 1e-9) })
@@ -256,7 +288,7 @@ impl Bench {
             self.rounds,
             &mut [
                 timed(|| field.render(camera, z, &options, &mut buffer)),
-                timed(|| field.render(camera, z, &colorless, &mut without_color)),
+                timed(|| field.render(camera, z, &one_color, &mut without_color)),
                 // In pieces, as rendering does it: features stay in the cache.
                 timed(|| {
                     for (points, out) in points.chunks(512).zip(one.chunks_mut(512)) {
@@ -273,15 +305,19 @@ impl Bench {
                 }),
             ],
         );
-        let [all, colorless, density, ninefold, rays_alone] =
+        let [all, one_color, density, ninefold, rays_alone] =
             [0, 1, 2, 3, 4].map(|i| Times::new(seconds[i].clone()).median());
-        let network = (ninefold - density) / 8.0;
+        // One more latent costs the layers after the first, for the density alone; the rest is in proportion.
+        let (each, more) = (Operations::of(field.config()), (ninefold - density) / 8.0);
+        let network = more * each.whole / each.rest;
+        let features = density - more * (each.first + each.rest) / each.rest;
+        let color = (all - one_color) * colored / (colored - rays.len() as f64).max(1.0);
         let parts = [
-            ("features", density - network),
+            ("features", features),
             ("density_network", network),
-            ("color_network", all - colorless),
+            ("color_network", color),
             ("rays_and_background", rays_alone),
-            ("marching_and_the_rest", colorless - density - rays_alone),
+            ("marching_and_the_rest", all - color - features - network - rays_alone),
         ];
         let mut rows = vec![["where a frame's time goes (one thread)", "ms", "share"].map(str::to_owned)];
         for (name, part) in parts {
@@ -301,7 +337,8 @@ impl Bench {
                 std::array::from_fn(|k| states[i % states.len()][k] + 0.2 * noise[k])
             })
             .collect();
-        let (field, points) = (probe.field().clone(), probe.prober().points().to_vec());
+        let field = probe.field().clone();
+        let points = field.prepare(probe.prober().points());
         let mut densities = vec![0.0; points.len() * draws.len()];
         let mixture = Mixture { weights: Vec::new(), components: Vec::new() };
         let drawn = || draws.iter().map(|z| Draw { latent: *z, component: 0 }).collect::<Vec<_>>();
@@ -311,7 +348,7 @@ impl Bench {
                 timed(|| {
                     std::hint::black_box(probe.step(mixture.clone(), drawn(), 1.0));
                 }),
-                timed(|| field.density_by_latent(&points, &draws, &mut densities)),
+                timed(|| field.density_prepared(&points, &draws, &mut densities)),
             ],
         );
         let [step, alone] = [0, 1].map(|i| Times::new(seconds[i].clone()));

@@ -2,7 +2,7 @@
 
 use super::{Receiver, Sender, Size, Waiting};
 use anyhow::Context;
-use carff_transport::topics;
+use carff_transport::{SHARED_MEMORY_DIR, topics};
 use iceoryx2::node::Node;
 use iceoryx2::port::{listener::Listener, notifier::Notifier, publisher::Publisher, subscriber::Subscriber};
 use iceoryx2::prelude::{
@@ -11,6 +11,24 @@ use iceoryx2::prelude::{
 };
 use iceoryx2::service::port_factory::{event, publish_subscribe};
 use std::path::Path;
+
+/// What the names of this run's files in shared memory begin with.
+fn prefix(folder: &Path) -> String {
+    let name = folder.file_name().unwrap_or_default().to_string_lossy();
+    let letters: String = name.chars().filter(char::is_ascii_alphanumeric).take(16).collect();
+    format!("carff-bench-{letters}_")
+}
+
+/// Removes what iceoryx2 leaves in shared memory when its last node is gone; both processes have ended.
+pub(crate) fn clean_up(folder: &Path) -> std::io::Result<()> {
+    for entry in std::fs::read_dir(SHARED_MEMORY_DIR)? {
+        let entry = entry?;
+        if entry.file_name().to_string_lossy().starts_with(&prefix(folder)) {
+            std::fs::remove_file(entry.path())?;
+        }
+    }
+    Ok(())
+}
 
 struct Services {
     pictures: publish_subscribe::PortFactory<ipc::Service, [u8], ()>,
@@ -21,11 +39,9 @@ struct Services {
 impl Services {
     fn open(folder: &Path) -> anyhow::Result<Self> {
         set_log_level_from_env_or(LogLevel::Fatal);
-        let name = folder.file_name().unwrap_or_default().to_string_lossy();
-        let letters: String = name.chars().filter(char::is_ascii_alphanumeric).take(16).collect();
         let mut config = Config::default();
-        config.global.prefix = FileName::new(format!("carff-bench-{letters}_").as_bytes())
-            .map_err(|e| anyhow::anyhow!("prefix: {e:?}"))?;
+        config.global.prefix =
+            FileName::new(prefix(folder).as_bytes()).map_err(|e| anyhow::anyhow!("prefix: {e:?}"))?;
         let root = IoxPath::new(folder.as_os_str().as_encoded_bytes()).map_err(|e| anyhow::anyhow!("folder: {e:?}"))?;
         config.global.set_root_path(&root);
         let node = NodeBuilder::new()

@@ -219,6 +219,7 @@ pub(crate) fn run(args: &IpcArgs) -> anyhow::Result<Report> {
     }
     drop(pairs);
     typed::clean_up(folder.path())?;
+    bare::clean_up(folder.path())?;
 
     for waiting in Waiting::ALL {
         let mut rows = vec![
