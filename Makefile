@@ -17,7 +17,7 @@ else ifneq ($(CARGO_TARGET_DIR),)
 export LD_LIBRARY_PATH := $(CURDIR)/.libtorch/lib$(if $(LD_LIBRARY_PATH),:$(LD_LIBRARY_PATH))
 endif
 
-.PHONY: help run build test bench-peer lint fmt libtorch
+.PHONY: help run build test bench-peer lint sanitize fmt libtorch
 
 help: ## List the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -39,6 +39,11 @@ bench-peer: ## Build the program by which `carff bench ipc` measures zenoh as we
 lint: libtorch ## Check format and lints
 	cargo fmt --all --check
 	cargo clippy --release --locked --workspace --all-targets -- -D warnings
+
+sanitize: libtorch ## Run the tests around `unsafe` under the address sanitizer (needs a nightly toolchain)
+	RUSTFLAGS=-Zsanitizer=address LD_LIBRARY_PATH=$(CURDIR)/.libtorch/lib cargo +nightly test --locked --lib --tests \
+		--target x86_64-unknown-linux-gnu --target-dir $(TARGET)/sanitize \
+		-p carff-field -p carff-messages -p carff-models -p carff-transport
 
 fmt: ## Format
 	cargo fmt --all
