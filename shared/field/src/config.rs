@@ -5,6 +5,8 @@ use serde::{Deserialize, Serialize};
 /// Numbers in one scene latent.
 pub const LATENT_DIM: usize = 8;
 
+/// Widest hidden layer of the density and the colour network.
+pub(crate) const MAX_HIDDEN_WIDTH: usize = 256;
 /// Most cells along the side of the occupancy grid.
 pub(crate) const MAX_GRID_RESOLUTION: usize = 512;
 
@@ -139,7 +141,7 @@ impl FieldConfig {
             "base_resolution..=65536",
         )?;
         check(
-            self.hidden_width.is_multiple_of(4) && (8..=256).contains(&self.hidden_width),
+            self.hidden_width.is_multiple_of(4) && (8..=MAX_HIDDEN_WIDTH).contains(&self.hidden_width),
             "hidden_width",
             self.hidden_width,
             "a multiple of 4 in 8..=256",

@@ -2,7 +2,7 @@
 
 use std::cell::RefCell;
 
-use crate::config::LATENT_DIM;
+use crate::config::{LATENT_DIM, MAX_HIDDEN_WIDTH};
 use crate::dispatch;
 use crate::field::{Field, GROUP, grow};
 use crate::kernels::{LANES, stride};
@@ -95,7 +95,7 @@ impl Field {
     fn before_latents(&self, points: &[[f32; 3]], features: &mut Vec<f32>, before: &mut [f32]) {
         let l = &self.layout;
         let (sf, sw) = (stride(l.features), stride(l.width));
-        let none = [0.0; MAX_WIDTH];
+        let none = [0.0; MAX_HIDDEN_WIDTH];
         for (points, before) in points.chunks(GROUP * LANES).zip(before.chunks_mut(GROUP * sw)) {
             let features = grow(features, before.len() / sw * sf);
             self.encode(points, features);
@@ -148,6 +148,3 @@ impl Field {
         }
     }
 }
-
-/// Widest hidden layer that a configuration may have.
-const MAX_WIDTH: usize = 256;

@@ -1,6 +1,6 @@
 //! From densities in a hypothesis to the state it shows.
 //!
-//! A hypothesis is a scene latent; the field says how dense the scene is at a point. Points inside the boxes where
+//! A hypothesis is a scene latent; the field says how dense the scene is at a point. Points in the boxes where
 //! something can stand are queried (not a whole picture per candidate), each box's occupancy is compared with what the
 //! known states showed, and "nobody there" and "none of the known states" are possible answers.
 //!

@@ -1,6 +1,6 @@
 //! A graph of all stages, started as the launcher starts it, and listened to message by message.
 
-use crate::helper::cpu_seconds;
+use crate::helper::{PATIENCE, ask_to_end, cpu_seconds, end_by};
 use crate::probes::Probes;
 use anyhow::{Context, bail, ensure};
 use carff_config::GraphConfig;
@@ -10,7 +10,6 @@ use carff_transport::{
     Input, Node, PictureReceiver, Receiver, Run, Stop, Waiter, Woken, monotonic_now_ns, remove_run_leftovers,
     run_id_of, topics,
 };
-use rustix::process::{Pid, Signal, kill_process};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
@@ -23,6 +22,50 @@ const START_ORDER: [Stage; 6] =
 const WATCH_NS: u64 = 50_000_000;
 /// How long the last frames are waited for.
 const TAIL: Duration = Duration::from_millis(500);
+
+/// Which graph is measured, and on what.
+#[derive(Clone, Debug, clap::Args)]
+pub(crate) struct GraphArgs {
+    /// The graph file.
+    #[arg(long, default_value = "configs/graphs/approaching-intersection.toml")]
+    graph: PathBuf,
+    /// Data set folder, in place of the graph file's.
+    #[arg(long)]
+    dataset: Option<PathBuf>,
+    /// Checkpoint folder, in place of the graph file's.
+    #[arg(long)]
+    checkpoint: Option<PathBuf>,
+}
+
+impl GraphArgs {
+    /// Reads the graph file, and finds the folders.
+    pub(crate) fn load(&self) -> anyhow::Result<Subject> {
+        let graph = GraphConfig::load(&self.graph)?;
+        let resolve = |given: &Option<PathBuf>, own: &Path| graph.resolve(given.as_deref().unwrap_or(own));
+        Ok(Subject {
+            dataset: resolve(&self.dataset, &graph.run.dataset),
+            checkpoint: resolve(&self.checkpoint, &graph.run.checkpoint),
+            graph,
+        })
+    }
+}
+
+/// A graph, and the folders that it runs on.
+#[derive(Clone, Debug)]
+pub(crate) struct Subject {
+    pub(crate) graph: GraphConfig,
+    pub(crate) dataset: PathBuf,
+    pub(crate) checkpoint: PathBuf,
+}
+
+impl Subject {
+    /// Refuses a data set that is not there.
+    pub(crate) fn check_dataset(&self) -> anyhow::Result<()> {
+        let folder = self.dataset.display();
+        ensure!(self.dataset.is_dir(), "data set {folder} is missing: `carff launch` renders it, or give --dataset");
+        Ok(())
+    }
+}
 
 /// What to run.
 #[derive(Clone, Debug)]
@@ -342,21 +385,11 @@ impl Drop for Stages {
     fn drop(&mut self) {
         // Who speaks before who listens.
         for (_, child) in self.children.iter().rev() {
-            if let Some(pid) = Pid::from_raw(child.id() as i32) {
-                // It fails when the process has ended already, which is what is wanted.
-                let _ = kill_process(pid, Signal::TERM);
-            }
+            ask_to_end(child);
         }
-        let begun = Instant::now();
+        let deadline = Instant::now() + PATIENCE;
         for (_, child) in self.children.iter_mut().rev() {
-            while matches!(child.try_wait(), Ok(None)) {
-                if begun.elapsed() > Duration::from_secs(3) {
-                    let _ = child.kill();
-                    let _ = child.wait();
-                    break;
-                }
-                std::thread::sleep(Duration::from_millis(5));
-            }
+            end_by(child, deadline);
         }
     }
 }

@@ -1,11 +1,9 @@
 //! Camera to action, with all stages alive: how long it takes, what it costs, and the highest rate that is held.
 
 use crate::OutputArgs;
-use crate::graph::{Measured, Plan, measure};
+use crate::graph::{GraphArgs, Measured, Plan, Subject, measure};
 use crate::report::{Report, number, table};
 use crate::stats::Times;
-use carff_config::GraphConfig;
-use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 /// Settings that are measured: latents drawn, steps looked ahead, frames a second.
@@ -21,15 +19,8 @@ const SEARCH_PRECISION: f64 = 1.05;
 /// Camera to action, with all stages alive.
 #[derive(Clone, Debug, clap::Args)]
 pub struct LoopArgs {
-    /// The graph file.
-    #[arg(long, default_value = "configs/graphs/approaching-intersection.toml")]
-    graph: PathBuf,
-    /// Data set folder, in place of the graph file's.
-    #[arg(long)]
-    dataset: Option<PathBuf>,
-    /// Checkpoint folder, in place of the graph file's.
-    #[arg(long)]
-    checkpoint: Option<PathBuf>,
+    #[command(flatten)]
+    subject: GraphArgs,
     /// Seconds that each setting is measured for; the main one (n = 10, horizon 2, 10 Hz) six times as long.
     #[arg(long, default_value_t = 10.0)]
     seconds: f64,
@@ -48,23 +39,21 @@ struct Setting {
 }
 
 struct Bench {
-    graph: GraphConfig,
-    dataset: PathBuf,
-    checkpoint: PathBuf,
+    subject: Subject,
     warm_up: Duration,
 }
 
 impl Bench {
     fn measure(&self, setting: Setting, seconds: f64) -> anyhow::Result<Measured> {
-        let mut graph = self.graph.clone();
+        let mut graph = self.subject.graph.clone();
         graph.run.samples = setting.samples;
         graph.run.horizon = setting.horizon;
         graph.run.frame_rate_hz = setting.rate_hz;
         graph.camera.repeat = true;
         measure(&Plan {
             graph,
-            dataset: &self.dataset,
-            checkpoint: &self.checkpoint,
+            dataset: &self.subject.dataset,
+            checkpoint: &self.subject.checkpoint,
             warm_up: self.warm_up,
             measured: Duration::from_secs_f64(seconds.clamp(0.5, 3600.0)),
             probes: 0,
@@ -73,20 +62,9 @@ impl Bench {
 }
 
 pub(crate) fn run(args: &LoopArgs) -> anyhow::Result<Report> {
-    let graph = GraphConfig::load(&args.graph)?;
-    let resolve = |given: &Option<PathBuf>, own: &Path| graph.resolve(given.as_deref().unwrap_or(own));
-    let bench = Bench {
-        dataset: resolve(&args.dataset, &graph.run.dataset),
-        checkpoint: resolve(&args.checkpoint, &graph.run.checkpoint),
-        warm_up: Duration::from_secs_f64(if args.quick { 1.0 } else { 2.0 }),
-        graph,
-    };
-    anyhow::ensure!(
-        bench.dataset.is_dir(),
-        "data set {} is missing: `carff launch {}` renders it, or give --dataset",
-        bench.dataset.display(),
-        args.graph.display()
-    );
+    let warm_up = Duration::from_secs_f64(if args.quick { 1.0 } else { 2.0 });
+    let bench = Bench { subject: args.subject.load()?, warm_up };
+    bench.subject.check_dataset()?;
     let seconds = if args.quick { 5.0 } else { args.seconds };
     let mut report = Report::default();
     let heading =

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 /// What a helper writes once it is ready.
 const READY: &[u8] = b".";
 /// How long a helper may take to end.
-const PATIENCE: Duration = Duration::from_secs(3);
+pub(crate) const PATIENCE: Duration = Duration::from_secs(3);
 /// Clock ticks a second in the system's accounts of processor time: fixed on Linux.
 const TICKS_PER_S: f64 = 100.0;
 
@@ -54,37 +54,43 @@ impl Helper {
 
     /// Asks it to end; returns what it still had to say.
     pub(crate) fn finish(mut self) -> anyhow::Result<String> {
-        self.ask_to_end();
+        ask_to_end(&self.child);
         let mut said = String::new();
         self.answers.read_to_string(&mut said)?;
         let status = self.child.wait()?;
         ensure!(status.success(), "a process of the measurement failed: {status}");
         Ok(said)
     }
-
-    fn ask_to_end(&self) {
-        if let Some(pid) = Pid::from_raw(self.child.id() as i32) {
-            // It fails when the process has ended already, which is what is wanted.
-            let _ = kill_process(pid, Signal::TERM);
-        }
-    }
 }
 
 impl Drop for Helper {
     fn drop(&mut self) {
+        // Waited for already, its number may be another process's by now.
         if matches!(self.child.try_wait(), Ok(Some(_))) {
             return;
         }
-        self.ask_to_end();
-        let begun = Instant::now();
-        while matches!(self.child.try_wait(), Ok(None)) {
-            if begun.elapsed() > PATIENCE {
-                let _ = self.child.kill();
-                let _ = self.child.wait();
-                return;
-            }
-            std::thread::sleep(Duration::from_millis(5));
+        ask_to_end(&self.child);
+        end_by(&mut self.child, Instant::now() + PATIENCE);
+    }
+}
+
+/// Asks a process to end that has not been waited for.
+pub(crate) fn ask_to_end(child: &Child) {
+    if let Some(pid) = Pid::from_raw(child.id() as i32) {
+        // It fails when the process has ended already, which is what is wanted.
+        let _ = kill_process(pid, Signal::TERM);
+    }
+}
+
+/// Waits for a process that has been told to end, until a time; one that hangs is killed.
+pub(crate) fn end_by(child: &mut Child, deadline: Instant) {
+    while matches!(child.try_wait(), Ok(None)) {
+        if Instant::now() >= deadline {
+            let _ = child.kill();
+            let _ = child.wait();
+            return;
         }
+        std::thread::sleep(Duration::from_millis(5));
     }
 }
 

@@ -1,6 +1,7 @@
 //! The sending process: starts the other one, and tells it what to wait for.
 
 use super::{Pair, Sender, Size, Transport, Waiting, times_us};
+use crate::helper::{PATIENCE, end_by};
 use anyhow::{Context, bail};
 use carff_transport::monotonic_now_ns;
 use rustix::event::{PollFd, PollFlags, poll};
@@ -9,7 +10,7 @@ use std::io::{ErrorKind, Read, Write};
 use std::os::fd::AsFd;
 use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 /// A peer and the sender to it.
 pub(crate) struct Driver {
@@ -99,15 +100,7 @@ impl Pair for Driver {
 impl Drop for Driver {
     fn drop(&mut self) {
         self.sender = None;
-        // The peer ends by itself when told; one that hangs does not.
         let _ = writeln!(self.commands, "end");
-        for _ in 0..200 {
-            if !matches!(self.child.try_wait(), Ok(None)) {
-                return;
-            }
-            std::thread::sleep(Duration::from_millis(10));
-        }
-        let _ = self.child.kill();
-        let _ = self.child.wait();
+        end_by(&mut self.child, Instant::now() + PATIENCE);
     }
 }

@@ -3,11 +3,12 @@
 //! So none of zenoh's crates is one of this program's.
 
 use super::{Pair, Size, Waiting, times_us};
+use crate::helper::{PATIENCE, end_by};
 use anyhow::{Context, bail, ensure};
 use std::io::{ErrorKind, Read, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
-use std::time::Duration;
+use std::time::Instant;
 
 /// What the program is called.
 const PROGRAM: &str = "carff-zenoh-peer";
@@ -81,16 +82,8 @@ impl Pair for ZenohPair {
 
 impl Drop for ZenohPair {
     fn drop(&mut self) {
-        // The two end by themselves when told; one that hangs does not.
         let _ = writeln!(self.commands, "end");
-        for _ in 0..300 {
-            if !matches!(self.child.try_wait(), Ok(None)) {
-                return;
-            }
-            std::thread::sleep(Duration::from_millis(10));
-        }
-        let _ = self.child.kill();
-        let _ = self.child.wait();
+        end_by(&mut self.child, Instant::now() + PATIENCE);
     }
 }
 

@@ -10,10 +10,10 @@ mod library;
 mod settings;
 
 use crate::OutputArgs;
+use crate::graph::GraphArgs;
 use crate::report::{Report, number, table};
 use crate::stats::Times;
 use anyhow::Context;
-use carff_config::GraphConfig;
 use carff_plots::{Panel, Series};
 pub(crate) use chain::{RelayArgs, relay};
 use fit::{Fit, Law};
@@ -26,15 +26,8 @@ const FIT_STEPS: u32 = 60;
 /// How cost grows with samples, horizon, resolution, candidates, stages and probes.
 #[derive(Clone, Debug, clap::Args)]
 pub struct ScaleArgs {
-    /// The graph file.
-    #[arg(long, default_value = "configs/graphs/approaching-intersection.toml")]
-    graph: PathBuf,
-    /// Data set folder, in place of the graph file's.
-    #[arg(long)]
-    dataset: Option<PathBuf>,
-    /// Checkpoint folder, in place of the graph file's.
-    #[arg(long)]
-    checkpoint: Option<PathBuf>,
+    #[command(flatten)]
+    subject: GraphArgs,
     /// Seconds that each setting of the graph is measured for, in two rounds.
     #[arg(long, default_value_t = 20.0)]
     seconds: f64,
@@ -120,10 +113,7 @@ pub(crate) fn run(args: &ScaleArgs) -> anyhow::Result<Report> {
     carff_models::allocator::keep_large_blocks();
     let names: Vec<AxisName> =
         AxisName::ALL.into_iter().filter(|name| args.axes.is_empty() || args.axes.contains(name)).collect();
-    let graph = GraphConfig::load(&args.graph)?;
-    let resolve = |given: &Option<PathBuf>, own: &Path| graph.resolve(given.as_deref().unwrap_or(own));
-    let (dataset, checkpoint) =
-        (resolve(&args.dataset, &graph.run.dataset), resolve(&args.checkpoint, &graph.run.checkpoint));
+    let subject = args.subject.load()?;
     // Refused before the long part, not after it.
     std::fs::create_dir_all(&args.plots)
         .with_context(|| format!("cannot create the plots' folder {}", args.plots.display()))?;
@@ -131,14 +121,14 @@ pub(crate) fn run(args: &ScaleArgs) -> anyhow::Result<Report> {
     let mut axes = Vec::new();
     for name in &names {
         axes.push(match name {
-            AxisName::View => library::views(&checkpoint, args.quick)?,
-            AxisName::Candidates => library::candidates(&checkpoint, args.quick)?,
+            AxisName::View => library::views(&subject.checkpoint, args.quick)?,
+            AxisName::Candidates => library::candidates(&subject.checkpoint, args.quick)?,
             AxisName::Stages => chain::measure(args.quick)?,
             AxisName::Samples | AxisName::Horizon | AxisName::Picture | AxisName::Probes => continue,
         });
     }
     let seconds = if args.quick { 1.0 } else { args.seconds.clamp(1.0, 3600.0) };
-    let bench = GraphBench { graph, dataset, checkpoint, quick: args.quick, seconds };
+    let bench = GraphBench { subject, quick: args.quick, seconds };
     axes.extend(bench.measure(&names)?);
 
     let mut report = Report::default();

@@ -2,12 +2,12 @@
 //! ten frames a second.
 
 use super::{Axis, AxisName, Law, Row};
-use crate::graph::{Measured, Plan, measure};
+use crate::graph::{Measured, Plan, Subject, measure};
 use crate::probes::most_probes;
 use crate::report::number;
 use crate::stats::Times;
 use anyhow::{Context, ensure};
-use carff_config::{CameraSource, GraphConfig, NoiseConfig};
+use carff_config::{CameraSource, NoiseConfig};
 use carff_dataset::Image;
 use carff_messages::{MAX_HORIZON, MAX_SAMPLES, Stage};
 use std::fmt::Display;
@@ -92,9 +92,7 @@ impl Sum {
 
 /// The graph that is measured, and for how long.
 pub(crate) struct GraphBench {
-    pub(crate) graph: GraphConfig,
-    pub(crate) dataset: PathBuf,
-    pub(crate) checkpoint: PathBuf,
+    pub(crate) subject: Subject,
     pub(crate) quick: bool,
     /// Seconds for each setting, all rounds together.
     pub(crate) seconds: f64,
@@ -108,14 +106,10 @@ impl GraphBench {
         if settings.is_empty() {
             return Ok(Vec::new());
         }
-        ensure!(
-            self.dataset.is_dir(),
-            "data set {} is missing: `carff launch` renders it, or give --dataset",
-            self.dataset.display()
-        );
+        self.subject.check_dataset()?;
         let folder = tempfile::tempdir()?;
         for side_px in settings.iter().filter_map(|s| s.picture_px) {
-            write_pictures(&self.dataset.join("images"), &folder.path().join(side_px.to_string()), side_px)?;
+            write_pictures(&self.subject.dataset.join("images"), &folder.path().join(side_px.to_string()), side_px)?;
         }
         let rounds = if self.quick { 1 } else { 2 };
         let mut sums = vec![Sum::default(); settings.len()];
@@ -196,7 +190,7 @@ impl GraphBench {
     }
 
     fn run(&self, setting: Setting, pictures: &Path, seconds: f64) -> anyhow::Result<Measured> {
-        let mut graph = self.graph.clone();
+        let mut graph = self.subject.graph.clone();
         graph.run.samples = setting.samples;
         graph.run.horizon = setting.horizon;
         graph.run.frame_rate_hz = RATE_HZ;
@@ -211,8 +205,8 @@ impl GraphBench {
         }
         measure(&Plan {
             graph,
-            dataset: &self.dataset,
-            checkpoint: &self.checkpoint,
+            dataset: &self.subject.dataset,
+            checkpoint: &self.subject.checkpoint,
             warm_up: Duration::from_secs_f64(if self.quick { 0.3 } else { 1.5 }),
             measured: Duration::from_secs_f64(seconds),
             probes: setting.probes as usize,
@@ -259,6 +253,7 @@ fn scaled(image: &Image, side_px: u32) -> Image {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use carff_config::GraphConfig;
 
     /// A setting that several axes share is measured once, and each axis has all its own settings.
     #[test]
@@ -266,9 +261,11 @@ mod tests {
         let graph = GraphConfig::parse("[run]\nname = \"t\"\ndataset = \"d\"\ncheckpoint = \"c\"", Path::new("t.toml"));
         for quick in [false, true] {
             let bench = GraphBench {
-                graph: graph.as_ref().unwrap().clone(),
-                dataset: PathBuf::new(),
-                checkpoint: PathBuf::new(),
+                subject: Subject {
+                    graph: graph.as_ref().unwrap().clone(),
+                    dataset: PathBuf::new(),
+                    checkpoint: PathBuf::new(),
+                },
                 quick,
                 seconds: 1.0,
             };
