@@ -4,6 +4,7 @@
 
 use crate::kernels::{self, AdamStep};
 use crate::layout::Level;
+use crate::walk::{self, OCTET, Octet, Placed, Walk};
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Set {
@@ -69,24 +70,25 @@ const PORTABLE_FMA: bool = cfg!(any(target_arch = "aarch64", target_feature = "f
 
 /// Makes, for one generic body, its versions for each instruction set and the function that picks one.
 macro_rules! dispatched {
-    ($(#[$doc:meta])* $name:ident, $body:ident, [$($generic:tt)*], ($($arg:ident: $ty:ty),* $(,)?)) => {
+    ($(#[$doc:meta])* $name:ident, $room:ident::$body:ident, [$($generic:tt)*], ($($arg:ident: $ty:ty),* $(,)?)
+     $(-> $result:ty)?) => {
         $(#[$doc])*
         #[allow(clippy::too_many_arguments)]
-        pub(crate) fn $name(set: InstructionSet, $($arg: $ty),*) {
+        pub(crate) fn $name(set: InstructionSet, $($arg: $ty),*) $(-> $result)? {
             #[cfg(target_arch = "x86_64")]
             #[target_feature(enable = "avx2,fma")]
             #[allow(clippy::too_many_arguments)]
-            fn avx2($($arg: $ty),*) {
-                kernels::$body::<true $($generic)*>($($arg),*);
+            fn avx2($($arg: $ty),*) $(-> $result)? {
+                $room::$body::<true $($generic)*>($($arg),*)
             }
             #[cfg(target_arch = "x86_64")]
             #[target_feature(enable = "avx2,fma,avx512f,avx512vl")]
             #[allow(clippy::too_many_arguments)]
-            fn avx512($($arg: $ty),*) {
-                kernels::$body::<true $($generic)*>($($arg),*);
+            fn avx512($($arg: $ty),*) $(-> $result)? {
+                $room::$body::<true $($generic)*>($($arg),*)
             }
             match set.0 {
-                Set::Portable => kernels::$body::<PORTABLE_FMA $($generic)*>($($arg),*),
+                Set::Portable => $room::$body::<PORTABLE_FMA $($generic)*>($($arg),*),
                 // SAFETY: `Set::Avx2` is only ever made by `detect`, after the processor said that it has AVX2 and FMA.
                 #[cfg(target_arch = "x86_64")]
                 Set::Avx2 => unsafe { avx2($($arg),*) },
@@ -101,44 +103,50 @@ macro_rules! dispatched {
 
 dispatched!(
     /// See [`kernels::dense_forward`].
-    dense_forward, dense_forward, [],
+    dense_forward, kernels::dense_forward, [],
     (weights: &[f32], bias: &[f32], x: &[f32], x_stride: usize, y: &mut [f32], y_stride: usize, relu: bool)
 );
 dispatched!(
     /// See [`kernels::bias_relu`].
-    bias_relu, bias_relu, [], (x: &[f32], bias: &[f32], y: &mut [f32], blocks_apart: usize)
+    bias_relu, kernels::bias_relu, [], (x: &[f32], bias: &[f32], y: &mut [f32], blocks_apart: usize)
 );
 dispatched!(
     /// See [`kernels::activate`].
-    activate, activate, [],
+    activate, kernels::activate, [],
     (raw: &[f32], apart: usize, offset: f32, length_m: &[f32], density: &mut [f32], passes: &mut [f32])
 );
 dispatched!(
     /// See [`kernels::densities`].
-    densities, densities, [], (raw: &[f32], apart: usize, offset: f32, density: &mut [f32])
+    densities, kernels::densities, [], (raw: &[f32], apart: usize, offset: f32, density: &mut [f32])
 );
 dispatched!(
     /// See [`kernels::dense_backward_input`].
-    dense_backward_input, dense_backward_input, [],
+    dense_backward_input, kernels::dense_backward_input, [],
     (weights: &[f32], outputs: usize, dy: &[f32], dy_stride: usize, dx: &mut [f32], dx_stride: usize, rows: usize,
      relu_of: Option<&[f32]>)
 );
 dispatched!(
     /// See [`kernels::dense_backward_weights`].
-    dense_backward_weights, dense_backward_weights, [],
+    dense_backward_weights, kernels::dense_backward_weights, [],
     (x: &[f32], x_stride: usize, dy: &[f32], dy_stride: usize, dw: &mut [f32], db: &mut [f32])
 );
-dispatched!(encode2, encode, [, 2], (levels: &[Level], table: &[f32], points: &[[f32; 3]], block: &mut [f32]));
-dispatched!(encode4, encode, [, 4], (levels: &[Level], table: &[f32], points: &[[f32; 3]], block: &mut [f32]));
-dispatched!(encode8, encode, [, 8], (levels: &[Level], table: &[f32], points: &[[f32; 3]], block: &mut [f32]));
-dispatched!(scatter2, scatter, [, 2], (levels: &[Level], gradient: &mut [f32], points: &[[f32; 3]], block: &[f32]));
-dispatched!(scatter4, scatter, [, 4], (levels: &[Level], gradient: &mut [f32], points: &[[f32; 3]], block: &[f32]));
-dispatched!(scatter8, scatter, [, 8], (levels: &[Level], gradient: &mut [f32], points: &[[f32; 3]], block: &[f32]));
+dispatched!(encode2, kernels::encode, [, 2], (levels: &[Level], table: &[f32], points: &[[f32; 3]], block: &mut [f32]));
+dispatched!(encode4, kernels::encode, [, 4], (levels: &[Level], table: &[f32], points: &[[f32; 3]], block: &mut [f32]));
+dispatched!(encode8, kernels::encode, [, 8], (levels: &[Level], table: &[f32], points: &[[f32; 3]], block: &mut [f32]));
+dispatched!(scatter2, kernels::scatter, [, 2], (levels: &[Level], gradient: &mut [f32], points: &[[f32; 3]], block: &[f32]));
+dispatched!(scatter4, kernels::scatter, [, 4], (levels: &[Level], gradient: &mut [f32], points: &[[f32; 3]], block: &[f32]));
+dispatched!(scatter8, kernels::scatter, [, 8], (levels: &[Level], gradient: &mut [f32], points: &[[f32; 3]], block: &[f32]));
 dispatched!(
     /// See [`kernels::adam`].
-    adam, adam, [],
+    adam, kernels::adam, [],
     (step: AdamStep, sparse: bool, parameters: &mut [f32], first: &mut [f32], second: &mut [f32],
      gradients: &mut [&mut [f32]])
+);
+
+dispatched!(
+    /// See [`walk::walk`].
+    walk_octet, walk::walk, [],
+    (about: &Walk<'_>, octet: &mut Octet, want: [u32; OCTET], first: u32, out: &mut Placed, at: usize) -> usize
 );
 
 /// See [`kernels::encode`]; `features_per_level` is 2, 4 or 8.

@@ -3,7 +3,7 @@
 use std::borrow::Cow;
 use std::cell::RefCell;
 
-use crate::config::{FieldConfig, FieldError, LATENT_DIM, MAX_GRID_RESOLUTION};
+use crate::config::{FieldConfig, FieldError, LATENT_DIM, MAX_GRID_RESOLUTION, MAX_HIDDEN_WIDTH};
 use crate::dispatch::{self, InstructionSet};
 use crate::kernels::{LANES, stride};
 use crate::layout::Layout;
@@ -32,6 +32,31 @@ pub(crate) struct Folded {
     pub density: Vec<f32>,
     pub color: Vec<f32>,
     pub background: Vec<f32>,
+}
+
+/// What the density network begins with, block by block.
+#[derive(Clone, Copy, Debug)]
+pub(crate) enum FirstLayer<'a> {
+    /// Features.
+    Features(&'a [f32]),
+    /// What `Field::first_layer` made of them.
+    Done(&'a [f32]),
+}
+
+impl FirstLayer<'_> {
+    /// Some of the blocks.
+    pub(crate) fn blocks(&self, field: &Field, blocks: std::ops::Range<usize>) -> Self {
+        match self {
+            Self::Features(all) => {
+                let apart = stride(field.layout.features);
+                Self::Features(&all[blocks.start * apart..blocks.end * apart])
+            }
+            Self::Done(all) => {
+                let apart = stride(field.layout.width);
+                Self::Done(&all[blocks.start * apart..blocks.end * apart])
+            }
+        }
+    }
 }
 
 /// Activations of one group of blocks, reused from call to call.
@@ -188,34 +213,45 @@ impl Field {
         }
     }
 
-    /// Density network over blocks of features: raw density and geometry features into `geometry`.
+    /// What the density network's first layer makes of blocks of features, before any latent.
+    pub(crate) fn first_layer(&self, features: &[f32], before: &mut [f32]) {
+        let l = &self.layout;
+        let none = [0.0; MAX_HIDDEN_WIDTH];
+        let weights = l.density[0].weights(&self.networks);
+        let (sf, sw) = (stride(l.features), stride(l.width));
+        dispatch::dense_forward(self.set, weights, &none[..l.width], features, sf, before, sw, false);
+    }
+
+    /// Density network over blocks: raw density and geometry features into `geometry`.
     pub(crate) fn density_network(
         &self,
         folded: &Folded,
-        features: &[f32],
+        input: &FirstLayer<'_>,
         hidden_a: &mut Vec<f32>,
         hidden_b: &mut Vec<f32>,
         geometry: &mut [f32],
     ) {
         let l = &self.layout;
         let (sf, sw, sg) = (stride(l.features), stride(l.width), stride(l.geometry));
-        for (features, geometry) in features.chunks(GROUP * sf).zip(geometry.chunks_mut(GROUP * sg)) {
-            let blocks = features.len() / sf;
+        for (group, geometry) in geometry.chunks_mut(GROUP * sg).enumerate() {
+            let blocks = geometry.len() / sg;
             let a = grow(hidden_a, blocks * sw);
             let b = grow(hidden_b, blocks * sw);
             let w = &self.networks;
-            dispatch::dense_forward(self.set, l.density[0].weights(w), &folded.density, features, sf, a, sw, true);
-            dispatch::dense_forward(self.set, l.density[1].weights(w), l.density[1].biases(w), a, sw, b, sw, true);
-            dispatch::dense_forward(
-                self.set,
-                l.density[2].weights(w),
-                l.density[2].biases(w),
-                b,
-                sw,
-                geometry,
-                sg,
-                false,
-            );
+            let at = group * GROUP;
+            match input {
+                FirstLayer::Features(features) => {
+                    let features = &features[at * sf..(at + blocks) * sf];
+                    let weights = l.density[0].weights(w);
+                    dispatch::dense_forward(self.set, weights, &folded.density, features, sf, a, sw, true);
+                }
+                FirstLayer::Done(before) => {
+                    dispatch::bias_relu(self.set, &before[at * sw..(at + blocks) * sw], &folded.density, a, sw);
+                }
+            }
+            let [_, second, last] = &l.density;
+            dispatch::dense_forward(self.set, second.weights(w), second.biases(w), a, sw, b, sw, true);
+            dispatch::dense_forward(self.set, last.weights(w), last.biases(w), b, sw, geometry, sg, false);
         }
     }
 
@@ -274,7 +310,8 @@ impl Field {
                 s.points.extend(points_m[at..end].iter().map(|p| self.contraction.contract(*p)));
                 self.encode(&s.points, grow(&mut s.features, sf));
                 let geometry = grow(&mut s.geometry, sg);
-                self.density_network(&folded, &s.features[..sf], &mut s.hidden_a, &mut s.hidden_b, geometry);
+                let input = FirstLayer::Features(&s.features[..sf]);
+                self.density_network(&folded, &input, &mut s.hidden_a, &mut s.hidden_b, geometry);
                 dispatch::densities(self.set, geometry, sg, self.config.density_offset, &mut out_density[at..end]);
                 inputs[..l.geometry * LANES].copy_from_slice(&geometry[..l.geometry * LANES]);
                 for (lane, d) in directions[at..end].iter().enumerate() {

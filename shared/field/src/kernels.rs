@@ -286,13 +286,16 @@ pub(crate) fn encode<const FMA: bool, const F: usize>(
             }
         }
         let mut sums = [[0.0_f32; F]; LANES];
-        for (l, sum) in sums.iter_mut().enumerate().take(count) {
+        for l in 0..count {
+            // All eight before the sums: a check between them would keep the sums from being vectors.
+            let entries: [&[f32; F]; 8] = std::array::from_fn(|c| &table[index[c][l] as usize]);
+            let mut sum = [0.0_f32; F];
             for c in 0..8 {
-                let entry = &table[index[c][l] as usize];
                 for f in 0..F {
-                    sum[f] = fma::<FMA>(entry[f], weight[c][l], sum[f]);
+                    sum[f] = fma::<FMA>(entries[c][f], weight[c][l], sum[f]);
                 }
             }
+            sums[l] = sum;
         }
         for f in 0..F {
             for l in 0..LANES {

@@ -20,6 +20,7 @@ mod render;
 mod sampler;
 mod space;
 mod train;
+mod walk;
 
 pub use config::{FieldConfig, FieldError, LATENT_DIM, RenderOptions, TrainerConfig};
 pub use dispatch::InstructionSet;

@@ -4,9 +4,10 @@ use carff_geometry::Ray;
 
 use crate::config::{FieldConfig, LATENT_DIM};
 use crate::dispatch;
-use crate::field::{Field, Folded, Scratch, grow};
+use crate::field::{Field, FirstLayer, Folded, Scratch, grow};
 use crate::kernels::{LANES, stride};
-use crate::space::{Contraction, OccupancyGrid};
+use crate::space::Contraction;
+use crate::walk::{OCTET, Octet, Placed, Walk};
 
 /// Samples of all rays together that are evaluated before transmittances are looked at again: enough to fill blocks.
 const WAVE: usize = 256;
@@ -20,11 +21,12 @@ pub(crate) const NO_RAY: u32 = u32::MAX;
 /// Step sizes and limits of rays.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Marcher {
-    contraction: Contraction,
+    /// Least step inside the bounds.
     pub step_m: f32,
-    cone: f32,
-    near: f32,
-    far: f32,
+    /// The step is at least this times the distance.
+    pub cone: f32,
+    pub near: f32,
+    pub far: f32,
     /// Half the longest extent of the bounds, metres.
     half_m: f32,
 }
@@ -60,7 +62,6 @@ pub struct RaySamples {
 impl Marcher {
     pub fn new(config: &FieldConfig, contraction: Contraction) -> Self {
         Self {
-            contraction,
             step_m: 2.0 * contraction.longest_half_m() / config.samples_across,
             half_m: contraction.longest_half_m(),
             cone: config.cone_angle,
@@ -73,179 +74,233 @@ impl Marcher {
     pub fn bounded(&self, distance_m: f32) -> f32 {
         distance_m / (distance_m + self.half_m)
     }
-
-    #[inline(always)]
-    fn step_at(&self, t: f32, u: [f32; 3], scale: f32) -> f32 {
-        let stretch = u[0].abs().max(u[1].abs()).max(u[2].abs()).max(1.0);
-        self.step_m.max(self.cone * t) * stretch * scale
-    }
-
-    /// Emits up to `most` samples (cube point, distance, length) from `t` on; false when the ray is past its end.
-    #[inline(always)]
-    fn advance(
-        &self,
-        grid: &OccupancyGrid,
-        ray: &Ray,
-        t: &mut f32,
-        most: usize,
-        limits: &RayLimits,
-        mut emit: impl FnMut([f32; 3], f32, f32),
-    ) -> bool {
-        let mut left = most;
-        let inverse_half = self.contraction.inverse_half();
-        let speed: [f32; 3] = std::array::from_fn(|i| ray.direction[i] * inverse_half[i]);
-        let inverse_speed = speed.map(|v| 1.0 / v);
-        while left > 0 {
-            if *t >= self.far || t.is_nan() {
-                return false;
-            }
-            let p = [0, 1, 2].map(|i| ray.origin[i] + *t * ray.direction[i]);
-            let u = self.contraction.normalized(p);
-            let dt = self.step_at(*t, u, limits.step_scale);
-            let q = Contraction::contract_normalized(u);
-            if limits.use_occupancy
-                && let Some(cells) = grid.empty_around(q)
-            {
-                // To the far wall of the empty cell, in whole steps, so that the jitter of the start is kept.
-                let mut distance = f32::INFINITY;
-                for i in 0..3 {
-                    if speed[i].abs() > 1e-9 {
-                        let here = (q[i] * cells).floor();
-                        let wall = if speed[i] > 0.0 { here + 1.0 } else { here };
-                        distance = distance.min((Contraction::uncontract_axis(wall / cells) - u[i]) * inverse_speed[i]);
-                    }
-                }
-                *t += (distance / dt).ceil().max(1.0) * dt;
-                continue;
-            }
-            emit(q, *t, dt);
-            *t += dt;
-            left -= 1;
-        }
-        true
-    }
 }
 
-/// State of one ray.
+/// State of one ray under one latent.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct RayState {
-    t: f32,
     pub transmittance: f32,
-    samples: usize,
-    alive: bool,
+    /// Whether enough light passes for what comes next to be seen.
+    lit: bool,
 }
 
-/// Samples of a chunk of rays, in waves; each wave fills whole blocks.
+/// What one latent makes of the samples.
 #[derive(Debug, Default)]
-pub(crate) struct Samples {
-    /// In the unit cube.
-    pub points: Vec<[f32; 3]>,
-    pub distance_m: Vec<f32>,
-    pub length_m: Vec<f32>,
+pub(crate) struct Seen {
+    /// Each sample's ray; `NO_RAY` for samples behind the ray's end, and for those that fill up a block.
     pub ray: Vec<u32>,
     pub density: Vec<f32>,
     /// Share of the light that reaches the camera from this sample.
     pub weight: Vec<f32>,
     /// Transmittance behind it.
     pub behind: Vec<f32>,
-    /// Share of light that passes it, for the samples of one wave.
-    passes: Vec<f32>,
-    /// Features, one block for each 16 samples.
-    pub features: Vec<f32>,
-    /// Outputs of the density network, blocks like `features`.
+    /// Outputs of the density network, one block for each 16 samples.
     pub geometry: Vec<f32>,
     pub rays: Vec<RayState>,
+    /// Share of light that passes each sample of one wave.
+    passes: Vec<f32>,
 }
 
-impl Samples {
-    /// Marches all rays (one latent) until each is opaque or at its end. `jitter` gives the start in steps, 0..1.
-    pub fn march(
-        &mut self,
-        field: &Field,
-        folded: &Folded,
-        rays: &[Ray],
-        limits: &RayLimits,
-        scratch: &mut Scratch,
-        jitter: impl Fn(usize) -> f32,
-    ) {
-        let (sf, sg) = (stride(field.layout.features), stride(field.layout.geometry));
-        let m = &field.marcher;
-        self.points.clear();
-        self.distance_m.clear();
-        self.length_m.clear();
+/// Samples of a chunk of rays, in waves; each wave fills whole blocks.
+#[derive(Debug, Default)]
+pub(crate) struct Samples {
+    pub placed: Placed,
+    /// One for each latent.
+    pub seen: Vec<Seen>,
+    /// Features, one block for each 16 samples.
+    pub features: Vec<f32>,
+    /// What the first layer makes of them before any latent, where there are several; of one wave.
+    before: Vec<f32>,
+    octets: Vec<Octet>,
+    /// How many samples each ray may still take; 0 for a ray that has ended.
+    left: Vec<u32>,
+}
+
+impl Seen {
+    fn begin(&mut self, rays: usize) {
         self.ray.clear();
         self.density.clear();
         self.weight.clear();
         self.behind.clear();
         self.rays.clear();
-        self.rays.extend(rays.iter().enumerate().map(|(i, _)| {
-            let t = m.near + jitter(i) * m.step_m * limits.step_scale;
-            RayState { t, transmittance: 1.0, samples: 0, alive: true }
-        }));
-        let mut alive = self.rays.len();
-        while alive > 0 {
-            let start = self.points.len();
-            let wave = (WAVE / alive).clamp(*WAVE_OF_RAY.start(), *WAVE_OF_RAY.end());
-            for (i, (ray, state)) in rays.iter().zip(&mut self.rays).enumerate().filter(|(_, (_, s))| s.alive) {
-                let most = wave.min(limits.max_samples - state.samples);
-                let before = self.points.len();
-                state.alive = m.advance(&field.occupancy, ray, &mut state.t, most, limits, |q, t, dt| {
-                    self.points.push(q);
-                    self.distance_m.push(t);
-                    self.length_m.push(dt);
-                    self.ray.push(i as u32);
-                });
-                state.samples += self.points.len() - before;
-                state.alive &= state.samples < limits.max_samples;
+        self.rays.resize(rays, RayState { transmittance: 1.0, lit: true });
+    }
+
+    /// Weighs the samples from `start` on.
+    fn weigh(&mut self, placed: &Placed, start: usize, min_transmittance: f32) {
+        let end = placed.len();
+        self.ray.extend_from_slice(&placed.ray[start..]);
+        self.weight.resize(end, 0.0);
+        self.behind.resize(end, 0.0);
+        for i in start..end {
+            let Some(state) = self.rays.get_mut(placed.ray[i] as usize) else { continue };
+            if !state.lit {
+                // The ray ended earlier in this wave: what it sees does not depend on how long waves are.
+                self.ray[i] = NO_RAY;
+                self.behind[i] = state.transmittance;
+                continue;
             }
-            let count = self.points.len();
-            if count == start {
+            let passes = self.passes[i - start];
+            self.weight[i] = state.transmittance * (1.0 - passes);
+            state.transmittance *= passes;
+            state.lit = state.transmittance >= min_transmittance;
+            self.behind[i] = state.transmittance;
+        }
+    }
+}
+
+impl Samples {
+    /// Marches all rays until each is opaque or at its end, under each latent (at least one). Where samples lie and
+    /// their features are the same for all latents. Where no sample of a block is at a place where states differ, the
+    /// first latent's densities serve for all. `jitter` gives the start in steps, 0..1.
+    pub fn march(
+        &mut self,
+        field: &Field,
+        latents: &[Folded],
+        rays: &[Ray],
+        limits: &RayLimits,
+        scratch: &mut Scratch,
+        jitter: impl Fn(usize) -> f32,
+    ) {
+        let sf = stride(field.layout.features);
+        let m = &field.marcher;
+        let Self { placed, seen, features, before, octets, left } = self;
+        placed.resize(0, NO_RAY);
+        seen.resize_with(latents.len(), Seen::default);
+        for seen in seen.iter_mut() {
+            seen.begin(rays.len());
+        }
+        octets.clear();
+        octets.extend(rays.chunks(OCTET).enumerate().map(|(o, eight)| {
+            Octet::new(eight, &field.contraction, |l| m.near + jitter(o * OCTET + l) * m.step_m * limits.step_scale)
+        }));
+        left.clear();
+        left.resize(rays.len(), u32::try_from(limits.max_samples).unwrap_or(u32::MAX));
+        let walk = Walk {
+            marcher: m,
+            occupancy: limits.use_occupancy.then_some(&field.occupancy),
+            changing: &field.changing,
+            step_scale: limits.step_scale,
+        };
+        loop {
+            let going = left.iter().filter(|n| **n > 0).count();
+            if going == 0 {
                 break;
             }
-            let end = count.next_multiple_of(LANES);
-            self.points.resize(end, [0.5; 3]);
-            self.distance_m.resize(end, 0.0);
-            self.length_m.resize(end, 0.0);
-            self.ray.resize(end, NO_RAY);
-            self.density.resize(end, 0.0);
-            self.weight.resize(end, 0.0);
-            self.behind.resize(end, 0.0);
-            let blocks = start / LANES..end / LANES;
-            grow(&mut self.features, blocks.end * sf);
-            grow(&mut self.geometry, blocks.end * sg);
-            let features = &mut self.features[blocks.start * sf..blocks.end * sf];
-            let geometry = &mut self.geometry[blocks.start * sg..blocks.end * sg];
-            field.encode(&self.points[start..end], features);
-            field.density_network(folded, features, &mut scratch.hidden_a, &mut scratch.hidden_b, geometry);
-            self.passes.resize(end - start, 0.0);
+            let start = placed.len();
+            let wave = (WAVE / going).clamp(*WAVE_OF_RAY.start(), *WAVE_OF_RAY.end()) as u32;
+            let mut end = start;
+            placed.resize(start + going * wave as usize, NO_RAY);
+            for (o, (octet, left)) in octets.iter_mut().zip(left.chunks_mut(OCTET)).enumerate() {
+                let mut want = [0; OCTET];
+                for (want, left) in want.iter_mut().zip(left.iter()) {
+                    *want = wave.min(*left);
+                }
+                if want == [0; OCTET] {
+                    continue;
+                }
+                let first = o * OCTET;
+                let next = dispatch::walk_octet(field.set, &walk, octet, want, first as u32, placed, end);
+                for ray in &placed.ray[end..next] {
+                    left[*ray as usize - first] -= 1;
+                }
+                for (l, left) in left.iter_mut().enumerate() {
+                    *left = if octet.goes_on(l, m.far) { *left } else { 0 };
+                }
+                end = next;
+            }
+            placed.resize(end, NO_RAY);
+            if end == start {
+                break;
+            }
+            placed.resize(end.next_multiple_of(LANES), NO_RAY);
+            let blocks = start / LANES..placed.len() / LANES;
+            grow(features, blocks.end * sf);
+            let features = &mut features[blocks.start * sf..blocks.end * sf];
+            field.encode(&placed.points[start..], features);
+            let input = if latents.len() > 1 {
+                let before = grow(before, blocks.len() * stride(field.layout.width));
+                field.first_layer(features, before);
+                FirstLayer::Done(before)
+            } else {
+                FirstLayer::Features(features)
+            };
+            see(field, latents, seen, placed, blocks, &input, scratch);
+            for seen in seen.iter_mut() {
+                seen.weigh(placed, start, limits.min_transmittance);
+            }
+            for (i, left) in left.iter_mut().enumerate() {
+                if !seen.iter().any(|s| s.rays[i].lit) {
+                    *left = 0;
+                }
+            }
+        }
+    }
+}
+
+/// The density network over one wave's blocks, under each latent.
+fn see(
+    field: &Field,
+    latents: &[Folded],
+    seen: &mut [Seen],
+    placed: &Placed,
+    blocks: std::ops::Range<usize>,
+    input: &FirstLayer<'_>,
+    scratch: &mut Scratch,
+) {
+    let sg = stride(field.layout.geometry);
+    let samples = blocks.start * LANES..blocks.end * LANES;
+    let lit = |seen: &Seen, block: usize| {
+        let rays = &placed.ray[block * LANES..][..LANES];
+        rays.iter().any(|r| seen.rays.get(*r as usize).is_some_and(|r| r.lit))
+    };
+    for (k, folded) in latents.iter().enumerate() {
+        let (first, rest) = seen.split_at_mut(k.min(1));
+        let Some(now) = (if k == 0 { rest.first_mut() } else { rest.get_mut(k - 1) }) else { return };
+        grow(&mut now.geometry, blocks.end * sg);
+        now.density.resize(samples.end, 0.0);
+        now.passes.resize(samples.len(), 0.0);
+        let shared = |block: usize| {
+            first.first().filter(|f| lit(f, block) && !placed.changing[block * LANES..][..LANES].contains(&true))
+        };
+        let mut at = blocks.start;
+        while at < blocks.end {
+            if !lit(now, at) {
+                at += 1;
+                continue;
+            }
+            if let Some(first) = shared(at) {
+                now.geometry[at * sg..(at + 1) * sg].copy_from_slice(&first.geometry[at * sg..(at + 1) * sg]);
+                let (from, to) = (at * LANES, (at + 1) * LANES);
+                now.density[from..to].copy_from_slice(&first.density[from..to]);
+                let (from, to) = (from - samples.start, to - samples.start);
+                now.passes[from..to].copy_from_slice(&first.passes[from..to]);
+                at += 1;
+                continue;
+            }
+            let mut end = at + 1;
+            while end < blocks.end && lit(now, end) && shared(end).is_none() {
+                end += 1;
+            }
+            let geometry = &mut now.geometry[at * sg..end * sg];
+            field.density_network(
+                folded,
+                &input.blocks(field, at - blocks.start..end - blocks.start),
+                &mut scratch.hidden_a,
+                &mut scratch.hidden_b,
+                geometry,
+            );
+            let (from, to) = (at * LANES, end * LANES);
             dispatch::activate(
                 field.set,
                 geometry,
                 sg,
                 field.config.density_offset,
-                &self.length_m[start..end],
-                &mut self.density[start..end],
-                &mut self.passes,
+                &placed.length_m[from..to],
+                &mut now.density[from..to],
+                &mut now.passes[from - samples.start..to - samples.start],
             );
-            for i in start..count {
-                let state = &mut self.rays[self.ray[i] as usize];
-                if state.transmittance < limits.min_transmittance {
-                    // The ray ended earlier in this wave: what it sees does not depend on how long waves are.
-                    self.ray[i] = NO_RAY;
-                    self.weight[i] = 0.0;
-                    self.behind[i] = state.transmittance;
-                    continue;
-                }
-                let passes = self.passes[i - start];
-                self.weight[i] = state.transmittance * (1.0 - passes);
-                state.transmittance *= passes;
-                self.behind[i] = state.transmittance;
-            }
-            alive = 0;
-            for state in &mut self.rays {
-                state.alive &= state.transmittance >= limits.min_transmittance;
-                alive += usize::from(state.alive);
-            }
+            at = end;
         }
     }
 }
@@ -262,17 +317,18 @@ impl Field {
         out.ray.clear();
         self.fold(latent, &mut folded);
         for (c, chunk) in rays.chunks(CHUNK).enumerate() {
-            samples.march(self, &folded, chunk, &limits, &mut scratch, |_| 0.5);
+            samples.march(self, std::slice::from_ref(&folded), chunk, &limits, &mut scratch, |_| 0.5);
+            let (placed, seen) = (&samples.placed, &samples.seen[0]);
             // Waves go round all rays: sorted by ray, each one's samples keep their order.
-            let mut order: Vec<usize> = (0..samples.ray.len()).filter(|i| samples.ray[*i] != NO_RAY).collect();
-            order.sort_by_key(|i| samples.ray[*i]);
+            let mut order: Vec<usize> = (0..placed.len()).filter(|i| seen.ray[*i] != NO_RAY).collect();
+            order.sort_by_key(|i| seen.ray[*i]);
             for i in order {
-                out.ray.push((c * CHUNK) as u32 + samples.ray[i]);
-                out.distance_m.push(samples.distance_m[i]);
-                out.length_m.push(samples.length_m[i]);
-                out.weight.push(samples.weight[i]);
+                out.ray.push((c * CHUNK) as u32 + seen.ray[i]);
+                out.distance_m.push(placed.distance_m[i]);
+                out.length_m.push(placed.length_m[i]);
+                out.weight.push(seen.weight[i]);
             }
-            out.transmittance.extend(samples.rays.iter().map(|r| r.transmittance));
+            out.transmittance.extend(seen.rays.iter().map(|r| r.transmittance));
         }
     }
 }

@@ -2,7 +2,7 @@
 
 use std::cell::RefCell;
 
-use crate::config::{LATENT_DIM, MAX_HIDDEN_WIDTH};
+use crate::config::LATENT_DIM;
 use crate::dispatch;
 use crate::field::{Field, GROUP, grow};
 use crate::kernels::{LANES, stride};
@@ -95,12 +95,10 @@ impl Field {
     fn before_latents(&self, points: &[[f32; 3]], features: &mut Vec<f32>, before: &mut [f32]) {
         let l = &self.layout;
         let (sf, sw) = (stride(l.features), stride(l.width));
-        let none = [0.0; MAX_HIDDEN_WIDTH];
         for (points, before) in points.chunks(GROUP * LANES).zip(before.chunks_mut(GROUP * sw)) {
             let features = grow(features, before.len() / sw * sf);
             self.encode(points, features);
-            let weights = l.density[0].weights(&self.networks);
-            dispatch::dense_forward(self.set, weights, &none[..l.width], features, sf, before, sw, false);
+            self.first_layer(features, before);
         }
     }
 

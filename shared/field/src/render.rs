@@ -8,8 +8,9 @@ use rayon::prelude::*;
 use crate::config::{LATENT_DIM, RenderOptions};
 use crate::field::{Field, Folded, Scratch, grow, write_direction};
 use crate::kernels::{LANES, stride};
-use crate::march::{NO_RAY, RayLimits, Samples};
+use crate::march::{NO_RAY, RayLimits, Samples, Seen};
 use crate::math::{sigmoid, spherical_harmonics};
+use crate::walk::Placed;
 
 /// Rays that are worked on together: a square of the picture, whose rays meet the same entries of the hash grid.
 const CHUNK: usize = TILE_PX as usize * TILE_PX as usize;
@@ -53,7 +54,27 @@ pub struct HypothesisBuffer {
     /// Rays that meet a place where the states differ, by their place in the picture.
     changing: Vec<u32>,
     rays: Vec<Ray>,
+    /// What these rays find under each latent but the first, see [`Latents::Together`].
+    by_ray: Results,
     pool: Option<(usize, rayon::ThreadPool)>,
+}
+
+/// Which latents rays are rendered under.
+enum Latents<'a> {
+    /// The latent of each ray; the last one serves the rest. One result for each ray.
+    ByRay(&'a [[f32; LATENT_DIM]]),
+    /// Every ray under every latent. Results lie chunk by chunk, in each chunk latent by latent.
+    Together(&'a [[f32; LATENT_DIM]]),
+}
+
+impl Latents<'_> {
+    /// Results for each ray.
+    fn each(&self) -> usize {
+        match self {
+            Self::ByRay(_) => 1,
+            Self::Together(latents) => latents.len(),
+        }
+    }
 }
 
 /// What one thread works in.
@@ -61,11 +82,19 @@ pub struct HypothesisBuffer {
 struct Worker {
     scratch: Scratch,
     samples: Samples,
-    folded: Folded,
+    /// One for each latent.
+    folded: Vec<Folded>,
+    harmonics: Vec<[f32; 16]>,
+    directions: Vec<f32>,
+    colors: Colors,
+}
+
+/// What turns weighed samples into pixels.
+#[derive(Default)]
+struct Colors {
     kept: Vec<u32>,
     inputs: Vec<f32>,
     output: Vec<f32>,
-    harmonics: Vec<[f32; 16]>,
     pixels: Vec<Pixel>,
 }
 
@@ -101,11 +130,11 @@ impl RenderBuffer {
     }
 
     /// Writes what a ray found to a pixel.
-    fn put(&mut self, pixel: usize, ray: usize) {
-        self.rgb[pixel * 3..pixel * 3 + 3].copy_from_slice(&self.by_ray.rgb[ray * 3..ray * 3 + 3]);
-        self.depth_m[pixel] = self.by_ray.depth_m[ray];
-        self.opacity[pixel] = self.by_ray.opacity[ray];
-        self.changing[pixel] = self.by_ray.changing[ray];
+    fn put(&mut self, pixel: usize, found: &Results, ray: usize) {
+        self.rgb[pixel * 3..pixel * 3 + 3].copy_from_slice(&found.rgb[ray * 3..ray * 3 + 3]);
+        self.depth_m[pixel] = found.depth_m[ray];
+        self.opacity[pixel] = found.opacity[ray];
+        self.changing[pixel] = found.changing[ray];
     }
 }
 
@@ -131,19 +160,24 @@ impl Field {
                 }
             }
         }
-        self.render_into(&out.rays, std::slice::from_ref(latent), options, &mut out.by_ray, &mut out.pool);
+        let latents = Latents::ByRay(std::slice::from_ref(latent));
+        self.render_into(&out.rays, &latents, options, &mut out.by_ray, &mut out.pool);
         let count = out.rays.len();
         out.rgb.resize(count * 3, 0.0);
         out.depth_m.resize(count, 0.0);
         out.opacity.resize(count, 0.0);
         out.changing.resize(count, false);
+        let found = std::mem::take(&mut out.by_ray);
         for i in 0..count {
-            out.put(out.pixels[i] as usize, i);
+            out.put(out.pixels[i] as usize, &found, i);
         }
+        out.by_ray = found;
     }
 
     /// Renders what `camera` sees under each of several latents. Rays that meet no place where the states differ
-    /// ([`Field::changing`]) are rendered once, under the first latent, for all of them.
+    /// ([`Field::changing`]) are rendered once, under the first latent, for all of them. The others are marched once for
+    /// all other latents, and where such a ray crosses places where the states do not differ, one latent's density
+    /// serves for all.
     pub fn render_hypotheses(
         &self,
         camera: &PinholeCamera,
@@ -151,7 +185,7 @@ impl Field {
         options: &RenderOptions,
         out: &mut HypothesisBuffer,
     ) {
-        let HypothesisBuffer { pictures, changing, rays, pool } = out;
+        let HypothesisBuffer { pictures, changing, rays, by_ray, pool } = out;
         pictures.resize_with(latents.len(), RenderBuffer::default);
         let Some((first, others)) = pictures.split_first_mut() else { return };
         self.render(camera, &latents[0], options, first);
@@ -159,14 +193,19 @@ impl Field {
         changing.extend((0..first.rays.len() as u32).filter(|i| first.by_ray.changing[*i as usize]));
         rays.clear();
         rays.extend(changing.iter().map(|i| first.rays[*i as usize]));
-        for (latent, picture) in latents[1..].iter().zip(others) {
+        if others.is_empty() {
+            return;
+        }
+        self.render_into(rays, &Latents::Together(&latents[1..]), options, by_ray, pool);
+        for (k, picture) in others.iter_mut().enumerate() {
             picture.rgb.clone_from(&first.rgb);
             picture.depth_m.clone_from(&first.depth_m);
             picture.opacity.clone_from(&first.opacity);
             picture.changing.clone_from(&first.changing);
-            self.render_into(rays, std::slice::from_ref(latent), options, &mut picture.by_ray, pool);
             for (at, i) in changing.iter().enumerate() {
-                picture.put(first.pixels[*i as usize] as usize, at);
+                let start = at - at % CHUNK;
+                let place = start * (latents.len() - 1) + k * CHUNK.min(rays.len() - start) + at % CHUNK;
+                picture.put(first.pixels[*i as usize] as usize, by_ray, place);
             }
         }
     }
@@ -180,7 +219,7 @@ impl Field {
         options: &RenderOptions,
         out: &mut RenderBuffer,
     ) {
-        self.render_into(rays, latents, options, &mut out.by_ray, &mut out.pool);
+        self.render_into(rays, &Latents::ByRay(latents), options, &mut out.by_ray, &mut out.pool);
         out.rgb.clone_from(&out.by_ray.rgb);
         out.depth_m.clone_from(&out.by_ray.depth_m);
         out.opacity.clone_from(&out.by_ray.opacity);
@@ -190,47 +229,54 @@ impl Field {
     fn render_into(
         &self,
         rays: &[Ray],
-        latents: &[[f32; LATENT_DIM]],
+        latents: &Latents<'_>,
         options: &RenderOptions,
         out: &mut Results,
         pool: &mut Option<(usize, rayon::ThreadPool)>,
     ) {
-        out.rgb.resize(rays.len() * 3, 0.0);
-        out.depth_m.resize(rays.len(), 0.0);
-        out.opacity.resize(rays.len(), 0.0);
-        out.changing.resize(rays.len(), false);
+        let each = latents.each();
+        let count = rays.len() * each;
+        out.rgb.resize(count * 3, 0.0);
+        out.depth_m.resize(count, 0.0);
+        out.opacity.resize(count, 0.0);
+        out.changing.resize(count, false);
         let threads = options.threads.max(1);
         if threads > 1 && pool.as_ref().is_none_or(|(n, _)| *n != threads) {
             // A pool that cannot be made (no threads to be had) is done without.
             *pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().ok().map(|pool| (threads, pool));
         }
         let Results { rgb, depth_m, opacity, changing } = out;
+        let chunk = CHUNK * each;
         let one = |i: usize, rgb: &mut [f32], depth: &mut [f32], opacity: &mut [f32], changing: &mut [bool]| {
             let first = i * CHUNK;
-            let rays = &rays[first..first + depth.len()];
+            let rays = &rays[first..first + depth.len() / each];
             let out = Piece { rgb, depth, opacity, changing };
-            WORKER.with_borrow_mut(|worker| self.render_chunk(worker, rays, first, latents, options, out));
+            WORKER.with_borrow_mut(|worker| match latents {
+                Latents::ByRay(latents) => self.render_runs(worker, rays, first, latents, options, out),
+                Latents::Together(latents) => self.render_chunk(worker, rays, latents, options, out),
+            });
         };
         match pool {
             Some((n, pool)) if threads > 1 && *n == threads => pool.install(|| {
-                rgb.par_chunks_mut(CHUNK * 3)
-                    .zip(depth_m.par_chunks_mut(CHUNK))
-                    .zip(opacity.par_chunks_mut(CHUNK))
-                    .zip(changing.par_chunks_mut(CHUNK))
+                rgb.par_chunks_mut(chunk * 3)
+                    .zip(depth_m.par_chunks_mut(chunk))
+                    .zip(opacity.par_chunks_mut(chunk))
+                    .zip(changing.par_chunks_mut(chunk))
                     .enumerate()
                     .for_each(|(i, (((rgb, depth), opacity), changing))| one(i, rgb, depth, opacity, changing));
             }),
             _ => rgb
-                .chunks_mut(CHUNK * 3)
-                .zip(depth_m.chunks_mut(CHUNK))
-                .zip(opacity.chunks_mut(CHUNK))
-                .zip(changing.chunks_mut(CHUNK))
+                .chunks_mut(chunk * 3)
+                .zip(depth_m.chunks_mut(chunk))
+                .zip(opacity.chunks_mut(chunk))
+                .zip(changing.chunks_mut(chunk))
                 .enumerate()
                 .for_each(|(i, (((rgb, depth), opacity), changing))| one(i, rgb, depth, opacity, changing)),
         }
     }
 
-    fn render_chunk(
+    /// Renders the rays of one chunk, each under its own latent; runs of equal latents go together.
+    fn render_runs(
         &self,
         worker: &mut Worker,
         rays: &[Ray],
@@ -248,66 +294,105 @@ impl Field {
             while end < rays.len() && latent_of(end) == latent {
                 end += 1;
             }
-            self.fold(&latent, &mut worker.folded);
             let run = Piece {
                 rgb: &mut rgb[start * 3..end * 3],
                 depth: &mut depth[start..end],
                 opacity: &mut opacity[start..end],
                 changing: &mut changing[start..end],
             };
-            self.render_run(worker, &rays[start..end], options, run);
+            self.render_chunk(worker, &rays[start..end], &[latent], options, run);
             start = end;
         }
     }
 
-    /// Renders rays that share the folded latent of `worker`.
-    fn render_run(&self, worker: &mut Worker, rays: &[Ray], options: &RenderOptions, out: Piece<'_>) {
+    /// Renders rays under each latent; `out` holds all rays of the first latent, then all of the second, and so on.
+    fn render_chunk(
+        &self,
+        worker: &mut Worker,
+        rays: &[Ray],
+        latents: &[[f32; LATENT_DIM]],
+        options: &RenderOptions,
+        out: Piece<'_>,
+    ) {
         let Piece { rgb, depth, opacity, changing } = out;
         let l = &self.layout;
-        let (sg, si, so) = (stride(l.geometry), stride(l.color[0].inputs), stride(4));
-        let Worker { scratch, samples, folded, kept, inputs, output, harmonics, pixels } = worker;
+        worker.folded.resize_with(latents.len(), Folded::default);
+        for (latent, folded) in latents.iter().zip(&mut worker.folded) {
+            self.fold(latent, folded);
+        }
         let limits = RayLimits {
             max_samples: options.max_samples_per_ray.max(1),
             min_transmittance: options.min_transmittance,
             step_scale: 1.0,
             use_occupancy: true,
         };
-        samples.march(self, folded, rays, &limits, scratch, |_| 0.5);
-        pixels.clear();
-        pixels.resize(rays.len(), Pixel::default());
-        changing.fill(false);
-        for (i, (ray, weight)) in
-            samples.ray.iter().zip(&samples.weight).enumerate().filter(|(_, (r, _))| **r != NO_RAY)
-        {
-            let pixel = &mut pixels[*ray as usize];
-            pixel.weight += weight;
-            pixel.distance += weight * (samples.distance_m[i] + 0.5 * samples.length_m[i]);
-            if *weight > pixel.heaviest.1 {
-                pixel.heaviest = (i as u32, *weight);
-            }
-            let arriving = weight + samples.behind[i];
-            changing[*ray as usize] |= arriving > VISIBLE_LIGHT && self.changing.contains(samples.points[i]);
-        }
-        kept.clear();
-        kept.extend((0..samples.ray.len() as u32).filter(|i| {
-            let (ray, weight) = (samples.ray[*i as usize], samples.weight[*i as usize]);
-            ray != NO_RAY && weight > 0.0 && (weight > options.min_weight || pixels[ray as usize].heaviest.0 == *i)
-        }));
-
-        // Background for every ray: its share is what passes.
-        let blocks = rays.len().div_ceil(LANES);
-        let directions = grow(inputs, blocks * stride(l.direction));
+        worker.samples.march(self, &worker.folded, rays, &limits, &mut worker.scratch, |_| 0.5);
+        let Worker { samples, folded, harmonics, directions, scratch, colors } = worker;
         harmonics.clear();
         harmonics.extend(rays.iter().map(|ray| spherical_harmonics(ray.direction)));
+        let directions = grow(directions, rays.len().div_ceil(LANES) * stride(l.direction));
         for (i, harmonics) in harmonics.iter().enumerate() {
             let block = &mut directions[i / LANES * stride(l.direction)..];
             write_direction(block, 0, l.direction, i % LANES, harmonics);
         }
+        let count = rays.len();
+        let pieces = rgb
+            .chunks_mut(3 * count)
+            .zip(depth.chunks_mut(count))
+            .zip(opacity.chunks_mut(count))
+            .zip(changing.chunks_mut(count));
+        for ((seen, folded), (((rgb, depth), opacity), changing)) in samples.seen.iter().zip(folded.iter()).zip(pieces)
+        {
+            let out = Piece { rgb, depth, opacity, changing };
+            colors.pixels(self, folded, &samples.placed, seen, harmonics, directions, options, scratch, out);
+        }
+    }
+}
+
+impl Colors {
+    /// Pixels under one latent, from its weighed samples.
+    #[allow(clippy::too_many_arguments)]
+    fn pixels(
+        &mut self,
+        field: &Field,
+        folded: &Folded,
+        placed: &Placed,
+        seen: &Seen,
+        harmonics: &[[f32; 16]],
+        directions: &[f32],
+        options: &RenderOptions,
+        scratch: &mut Scratch,
+        out: Piece<'_>,
+    ) {
+        let Piece { rgb, depth, opacity, changing } = out;
+        let Self { kept, inputs, output, pixels } = self;
+        let l = &field.layout;
+        let (sg, si, so) = (stride(l.geometry), stride(l.color[0].inputs), stride(4));
+        pixels.clear();
+        pixels.resize(depth.len(), Pixel::default());
+        changing.fill(false);
+        for (i, (ray, weight)) in seen.ray.iter().zip(&seen.weight).enumerate().filter(|(_, (r, _))| **r != NO_RAY) {
+            let pixel = &mut pixels[*ray as usize];
+            pixel.weight += weight;
+            pixel.distance += weight * (placed.distance_m[i] + 0.5 * placed.length_m[i]);
+            if *weight > pixel.heaviest.1 {
+                pixel.heaviest = (i as u32, *weight);
+            }
+            changing[*ray as usize] |= placed.changing[i] && weight + seen.behind[i] > VISIBLE_LIGHT;
+        }
+        kept.clear();
+        kept.extend((0..seen.ray.len() as u32).filter(|i| {
+            let (ray, weight) = (seen.ray[*i as usize], seen.weight[*i as usize]);
+            ray != NO_RAY && weight > 0.0 && (weight > options.min_weight || pixels[ray as usize].heaviest.0 == *i)
+        }));
+
+        // Background for every ray: its share is what passes.
+        let blocks = depth.len().div_ceil(LANES);
         let out = grow(output, blocks * so);
         let hidden = grow(&mut scratch.hidden_a, blocks * stride(l.background[0].outputs));
-        self.background_network(folded, directions, hidden, out);
+        field.background_network(folded, directions, hidden, out);
         for (i, pixel) in rgb.chunks_exact_mut(3).enumerate() {
-            let passes = samples.rays[i].transmittance;
+            let passes = seen.rays[i].transmittance;
             for (c, v) in pixel.iter_mut().enumerate() {
                 *v = passes * sigmoid(out[i / LANES * so + c * LANES + i % LANES]);
             }
@@ -321,19 +406,19 @@ impl Field {
             let inputs = grow(inputs, blocks * si);
             for (at, i) in kept.iter().enumerate() {
                 let i = *i as usize;
-                let from = &samples.geometry[i / LANES * sg..];
+                let from = &seen.geometry[i / LANES * sg + i % LANES..];
                 let block = &mut inputs[at / LANES * si..];
                 for r in 0..l.geometry {
-                    block[r * LANES + at % LANES] = from[r * LANES + i % LANES];
+                    block[r * LANES + at % LANES] = from[r * LANES];
                 }
-                let harmonics = &harmonics[samples.ray[i] as usize];
+                let harmonics = &harmonics[seen.ray[i] as usize];
                 write_direction(block, l.geometry, l.direction, at % LANES, harmonics);
             }
             let out = grow(output, blocks * so);
-            self.color_network(folded, inputs, &mut scratch.hidden_a, &mut scratch.hidden_b, out);
+            field.color_network(folded, inputs, &mut scratch.hidden_a, &mut scratch.hidden_b, out);
             for (at, i) in kept.iter().enumerate() {
                 let i = *i as usize;
-                let (pixel, weight) = (&mut pixels[samples.ray[i] as usize], samples.weight[i]);
+                let (pixel, weight) = (&mut pixels[seen.ray[i] as usize], seen.weight[i]);
                 pixel.colored.0 += weight;
                 for c in 0..3 {
                     pixel.colored.1[c] += weight * sigmoid(out[at / LANES * so + c * LANES + at % LANES]);
@@ -368,8 +453,12 @@ mod tests {
         PinholeCamera::look_at([3.0, -20.0, 12.0], [0.0, 0.0, 1.0], [0.0, 0.0, 1.0], 24, 17, 50.0)
     }
 
-    /// Under several latents at once, rays that meet a place where the states differ show what each latent shows alone;
-    /// the others show what the first one does. Marking more places never changes a picture that was right.
+    fn largest_difference<'a>(a: impl IntoIterator<Item = &'a f32>, b: impl IntoIterator<Item = &'a f32>) -> f32 {
+        a.into_iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max)
+    }
+
+    /// Under several latents at once, every picture is what its latent shows alone while all places may differ. Where
+    /// none may, all show what the first one does; and rays that meet no place that may differ do so in any case.
     #[test]
     fn hypotheses_share_what_does_not_change() {
         let mut field = field();
@@ -383,22 +472,33 @@ mod tests {
                 one.rgb
             })
             .collect();
-        assert_ne!(alone[0], alone[1]);
+        assert!(largest_difference(&alone[0], &alone[1]) > 1e-2);
         let mut buffer = HypothesisBuffer::default();
-        field.render_hypotheses(&camera(), &latents, &options, &mut buffer);
-        for (picture, alone) in buffer.pictures.iter().zip(&alone) {
-            assert_eq!(&picture.rgb, alone);
+        for threads in [1, 2] {
+            let options = RenderOptions { threads, ..options };
+            field.render_hypotheses(&camera(), &latents, &options, &mut buffer);
+            for (picture, alone) in buffer.pictures.iter().zip(&alone) {
+                assert!(largest_difference(&picture.rgb, alone) < 1e-5);
+            }
         }
         field.changing.set_from(|i| i % 16 < 8);
         field.render_hypotheses(&camera(), &latents, &options, &mut buffer);
         let changing = buffer.pictures[0].changing.clone();
         let share = changing.iter().filter(|c| **c).count();
         assert!(share > 20 && share + 20 < changing.len(), "{share} of {}", changing.len());
-        for (picture, alone) in buffer.pictures.iter().zip(&alone) {
+        for (k, picture) in buffer.pictures.iter().enumerate() {
+            let mut apart = 0;
             for (i, pixel) in picture.rgb.chunks_exact(3).enumerate() {
-                let wanted = if changing[i] { alone } else { &buffer.pictures[0].rgb };
-                assert_eq!(pixel, &wanted[3 * i..3 * i + 3]);
+                let first = &alone[0][3 * i..3 * i + 3];
+                assert!(changing[i] || pixel == first);
+                apart += usize::from(largest_difference(pixel, first) > 1e-3);
             }
+            assert!(if k == 0 { apart == 0 } else { apart > 20 }, "{apart} pixels of picture {k}");
+        }
+        field.changing.set_from(|_| false);
+        field.render_hypotheses(&camera(), &latents, &options, &mut buffer);
+        for picture in &buffer.pictures {
+            assert_eq!(largest_difference(&picture.rgb, &alone[0]), 0.0);
         }
         field.render_hypotheses(&camera(), &[], &options, &mut buffer);
         assert!(buffer.pictures.is_empty());

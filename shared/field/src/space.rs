@@ -35,11 +35,16 @@ impl Contraction {
     /// Box units to the unit cube.
     #[inline(always)]
     pub fn contract_normalized(u: [f32; 3]) -> [f32; 3] {
-        u.map(|u| {
-            let a = u.abs();
-            let g = if a <= 1.0 { a } else { 2.0 - 1.0 / a };
-            0.5 + 0.25 * g.copysign(u)
-        })
+        u.map(Self::contract_axis)
+    }
+
+    /// One coordinate in box units to the unit cube.
+    #[inline(always)]
+    pub(crate) fn contract_axis(u: f32) -> f32 {
+        let a = u.abs();
+        let outside = 2.0 - 1.0 / a;
+        let g = if a <= 1.0 { a } else { outside };
+        0.5 + 0.25 * g.copysign(u)
     }
 
     /// World metres to the unit cube.
@@ -58,7 +63,8 @@ impl Contraction {
     pub(crate) fn uncontract_axis(q: f32) -> f32 {
         let g = (q - 0.5) * 4.0;
         let a = g.abs();
-        let u = if a <= 1.0 { a } else { 1.0 / (2.0 - a).max(1e-4) };
+        let outside = 1.0 / (2.0 - a).max(1e-4);
+        let u = if a <= 1.0 { a } else { outside };
         u.copysign(g)
     }
 
@@ -80,7 +86,7 @@ pub struct OccupancyGrid {
 }
 
 /// Side of the coarser level's cells, in cells.
-const COARSE: usize = 4;
+pub(crate) const COARSE: usize = 4;
 
 impl OccupancyGrid {
     /// A grid of `resolution`^3 cells, all occupied.
@@ -142,19 +148,10 @@ impl OccupancyGrid {
         self.cell((c[2] * r + c[1]) * r + c[0])
     }
 
-    /// When there is no matter at a point of the unit cube: cells along the cube's side of the coarsest level whose cell
-    /// around the point is empty.
+    /// Whether any cell of a cell of the coarser level is occupied, by the latter's index.
     #[inline(always)]
-    pub(crate) fn empty_around(&self, q: [f32; 3]) -> Option<f32> {
-        let r = self.resolution;
-        let cell = q.map(|v| ((v * r as f32) as usize).min(r - 1));
-        let n = r.div_ceil(COARSE);
-        let [x, y, z] = cell.map(|v| v / COARSE);
-        let index = (z * n + y) * n + x;
-        if (self.coarse[index >> 6] >> (index & 63)) & 1 == 0 {
-            return Some(r as f32 / COARSE as f32);
-        }
-        (!self.cell((cell[2] * r + cell[1]) * r + cell[0])).then_some(r as f32)
+    pub(crate) fn coarse_cell(&self, index: usize) -> bool {
+        (self.coarse[index >> 6] >> (index & 63)) & 1 == 1
     }
 
     /// The bits as bytes, cell 0 in the lowest bit of byte 0.
@@ -233,10 +230,6 @@ mod tests {
             assert_eq!(fine.contains(q), grid.contains(q));
         }
         grid.set_from(|i| i == (9 * 16 + 2) * 16 + 14);
-        // Beside it, in its cube of 4, only the cell itself is empty.
-        let at = |x: f32, y: f32, z: f32| grid.empty_around([x, y, z].map(|v| (v + 0.5) / 16.0));
-        assert_eq!([at(14.0, 2.0, 9.0), at(13.0, 2.0, 9.0), at(3.0, 2.0, 9.0)], [None, Some(16.0), Some(4.0)]);
-        grid.set_from(|_| false);
-        assert_eq!(grid.empty_around([0.3, 0.6, 0.9]), Some(4.0));
+        assert_eq!((0..64).filter(|i| grid.coarse_cell(*i)).collect::<Vec<_>>(), [(2 * 4) * 4 + 3]);
     }
 }

@@ -698,9 +698,16 @@ impl Shard {
         self.targets.clear();
         self.targets.extend(order.iter().map(|i| job.batch.target_rgb[*i as usize]));
         let (seed, step) = (hash(job.config.seed, 0x7261, job.step), job.config.jitter);
-        self.samples.march(field, &self.folded, &self.rays, &job.limits, &mut self.scratch, |i| {
-            if step { unit(hash(seed, 1, u64::from(order[i]))) } else { 0.5 }
-        });
+        self.samples.march(
+            field,
+            std::slice::from_ref(&self.folded),
+            &self.rays,
+            &job.limits,
+            &mut self.scratch,
+            |i| {
+                if step { unit(hash(seed, 1, u64::from(order[i]))) } else { 0.5 }
+            },
+        );
         self.select(job, order, seed);
         self.background_forward(field);
         self.color_forward(field);
@@ -733,7 +740,7 @@ impl Shard {
     fn select(&mut self, job: &Job, order: &[u32], seed: u64) {
         let c = job.config;
         self.kept.clear();
-        let samples = &self.samples;
+        let samples = &self.samples.seen[0];
         let mut real = 0;
         for i in 0..samples.ray.len() {
             if samples.ray[i] == NO_RAY {
@@ -807,7 +814,7 @@ impl Shard {
                 for r in 0..l.features {
                     to[r * LANES] = from[r * LANES];
                 }
-                let harmonics = spherical_harmonics(self.rays[self.samples.ray[i] as usize].direction);
+                let harmonics = spherical_harmonics(self.rays[self.samples.seen[0].ray[i] as usize].direction);
                 write_direction(&mut inputs[at / LANES * si..], l.geometry, l.direction, at % LANES, &harmonics);
             }
             let (set, [d0, d1, d2], [c0, c1, c2]) = (field.set, &l.density, &l.color);
@@ -833,17 +840,18 @@ impl Shard {
         let c = job.config;
         self.pixel.clear();
         let through = |s: &RayState| s.transmittance;
-        self.pixel.extend(self.samples.rays.iter().zip(&self.behind_rgb).map(|(s, b)| b.map(|v| v * through(s))));
+        self.pixel
+            .extend(self.samples.seen[0].rays.iter().zip(&self.behind_rgb).map(|(s, b)| b.map(|v| v * through(s))));
         for k in &self.kept {
             let i = k.sample as usize;
-            let pixel = &mut self.pixel[self.samples.ray[i] as usize];
+            let pixel = &mut self.pixel[self.samples.seen[0].ray[i] as usize];
             for (p, color) in pixel.iter_mut().zip(&k.color) {
-                *p += self.samples.weight[i] * color;
+                *p += self.samples.seen[0].weight[i] * color;
             }
         }
         self.pixel_gradient.clear();
         self.through_gradient.clear();
-        for ((pixel, target), state) in self.pixel.iter().zip(&self.targets).zip(&self.samples.rays) {
+        for ((pixel, target), state) in self.pixel.iter().zip(&self.targets).zip(&self.samples.seen[0].rays) {
             let mut gradient = [0.0; 3];
             for ch in 0..3 {
                 let e = pixel[ch] - target[ch];
@@ -872,9 +880,10 @@ impl Shard {
         if weight_of_loss <= 0.0 {
             return;
         }
-        let (s, marcher) = (&self.samples, &job.field.marcher);
+        let (placed, s, marcher) = (&self.samples.placed, &self.samples.seen[0], &job.field.marcher);
         let place = |i: usize| {
-            let (from, to) = (marcher.bounded(s.distance_m[i]), marcher.bounded(s.distance_m[i] + s.length_m[i]));
+            let from = placed.distance_m[i];
+            let (from, to) = (marcher.bounded(from), marcher.bounded(from + placed.length_m[i]));
             (0.5 * (from + to), to - from)
         };
         let begin = |sums: &mut Vec<RaySums>| {
@@ -906,7 +915,7 @@ impl Shard {
 
     /// Gradients by each kept sample's raw colour and raw density (Max 1995; the sum behind a sample, back to front).
     fn sample_gradients(&mut self) {
-        let s = &self.samples;
+        let (placed, s) = (&self.samples.placed, &self.samples.seen[0]);
         // From here on `behind_rgb` turns into the colour that arrives from behind each sample.
         let mut arriving: Vec<[f32; 3]> = std::mem::take(&mut self.pixel);
         for ((a, state), b) in arriving.iter_mut().zip(&s.rays).zip(&self.behind_rgb) {
@@ -922,7 +931,7 @@ impl Shard {
                 k.color_gradient[c] = k.scale * g[c] * s.weight[i] * k.color[c] * (1.0 - k.color[c]);
                 behind[c] += s.weight[i] * k.color[c];
             }
-            k.raw_gradient = k.scale * by_density * s.length_m[i] * s.density[i];
+            k.raw_gradient = k.scale * by_density * placed.length_m[i] * s.density[i];
         }
         self.pixel = arriving;
     }
@@ -984,7 +993,7 @@ impl Shard {
             }
             dispatch::dense_backward_input(set, d0.weights(w), d0.outputs, gb, sw, g_features, sf, l.features, None);
             b.points.clear();
-            b.points.extend(kept.iter().map(|k| self.samples.points[k.sample as usize]));
+            b.points.extend(kept.iter().map(|k| self.samples.placed.points[k.sample as usize]));
             for (points, block) in b.points.chunks(LANES).zip(g_features.chunks_exact(sf)) {
                 dispatch::scatter(set, l.features_per_level, &l.levels, &mut self.table_gradient, points, block);
             }
@@ -1000,7 +1009,7 @@ impl Shard {
         let d_output = grow(&mut b.output, blocks * so);
         d_output.fill(0.0);
         let mut any = false;
-        for (i, state) in self.samples.rays.iter().enumerate() {
+        for (i, state) in self.samples.seen[0].rays.iter().enumerate() {
             any |= state.transmittance > 1e-3;
             for c in 0..3 {
                 let v = self.behind_rgb[i][c];

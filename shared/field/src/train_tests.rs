@@ -277,7 +277,7 @@ fn occupancy_keeps_what_exists_in_any_state() {
     )
     .unwrap();
     trainer.set_state_latents(&states.iter().map(|z| vec![*z]).collect::<Vec<_>>());
-    for step in 0..250 {
+    for step in 0..400 {
         let mut batch = random_batch(128, 4, 1000 + step);
         batch.latents = states.clone();
         for (i, ray) in batch.rays.iter().enumerate() {

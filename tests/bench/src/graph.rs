@@ -96,19 +96,25 @@ struct Frame {
 }
 
 impl Frame {
-    /// Time between the stages: from one's sending to the next one's begin, nanoseconds. `None` when a message was
-    /// not seen.
-    fn between_ns(&self) -> Option<u64> {
+    /// Time between the stages: from one's sending to the next one's begin, nanoseconds, by hand-over, of which one may
+    /// come several times. `None` when a message was not seen.
+    fn gaps_ns(&self) -> Option<Vec<(HandOver, u64)>> {
         let (begin, mut end) = self.encoded_ns?;
-        let mut sum = begin.saturating_sub(self.published_ns);
+        let mut gaps = vec![("camera to encoder", begin.saturating_sub(self.published_ns))];
+        let mut from = "encoder to forecaster";
         for (step, forecast) in &self.forecast_ns {
             let probed = self.probed_ns.get(step)?;
-            sum += forecast.0.saturating_sub(end) + probed.0.saturating_sub(forecast.1);
-            end = probed.1;
+            gaps.push((from, forecast.0.saturating_sub(end)));
+            gaps.push(("forecaster to prober", probed.0.saturating_sub(forecast.1)));
+            (from, end) = ("prober to forecaster", probed.1);
         }
-        Some(sum + self.decided_ns?.saturating_sub(end))
+        gaps.push(("prober to controller", self.decided_ns?.saturating_sub(end)));
+        Some(gaps)
     }
 }
+
+/// From which stage to which.
+pub(crate) type HandOver = &'static str;
 
 /// What a stage used while it was measured.
 #[derive(Clone, Debug)]
@@ -127,6 +133,8 @@ pub(crate) struct Measured {
     pub(crate) latency_ms: Vec<f64>,
     /// Time between stages as a share of the time from camera to action, over all frames.
     pub(crate) ipc_share: f64,
+    /// The time that each hand-over took, milliseconds, frame by frame.
+    pub(crate) hand_overs_ms: BTreeMap<HandOver, Vec<f64>>,
     /// Frames taken, and those of them that no action rests on.
     pub(crate) frames: usize,
     pub(crate) missed: usize,
@@ -233,10 +241,13 @@ fn listen(
     );
     let decided: Vec<(&Frame, u64)> = frames.iter().filter_map(|f| Some((*f, f.decided_ns?))).collect();
     let (mut all_ns, mut between_ns) = (0, 0);
+    let mut hand_overs_ms = BTreeMap::<HandOver, Vec<f64>>::new();
     for (frame, decided_ns) in &decided {
-        if let Some(between) = frame.between_ns() {
-            all_ns += decided_ns - frame.captured_ns;
-            between_ns += between;
+        let Some(gaps) = frame.gaps_ns() else { continue };
+        all_ns += decided_ns - frame.captured_ns;
+        for (name, gap_ns) in gaps {
+            between_ns += gap_ns;
+            hand_overs_ms.entry(name).or_default().push(gap_ns as f64 / 1e6);
         }
     }
     let span_ns = frames.last().map_or(0, |f| f.captured_ns) - frames.first().map_or(0, |f| f.captured_ns);
@@ -244,6 +255,7 @@ fn listen(
     Ok(Measured {
         latency_ms: decided.iter().map(|(f, at)| (at - f.captured_ns) as f64 / 1e6).collect(),
         ipc_share: between_ns as f64 / all_ns as f64,
+        hand_overs_ms,
         missed: count - decided.len(),
         frames: count,
         rate_hz: count.saturating_sub(1) as f64 / (span_ns as f64 / 1e9),
@@ -404,8 +416,7 @@ fn resident_bytes(pid: u32) -> f64 {
 mod tests {
     use super::*;
 
-    /// Time between stages is the sum of the gaps along the frame's way, over both steps; a frame with a message
-    /// missing has none.
+    /// Time between stages is every gap along the frame's way, over both steps; a frame with a message missing has none.
     #[test]
     fn gaps_add_up() {
         let mut frame = Frame {
@@ -416,10 +427,14 @@ mod tests {
             probed_ns: [(1, (64, 80)), (2, (96, 100))].into(),
             decided_ns: Some(107),
         };
-        assert_eq!(frame.between_ns(), Some(2 + 3 + 4 + 5 + 6 + 7));
+        let names = ["encoder to forecaster", "forecaster to prober", "prober to forecaster", "forecaster to prober"];
+        let mut wanted = vec![("camera to encoder", 2)];
+        wanted.extend(names.into_iter().zip(3..7));
+        wanted.push(("prober to controller", 7));
+        assert_eq!(frame.gaps_ns(), Some(wanted));
         frame.probed_ns.remove(&1);
-        assert_eq!(frame.between_ns(), None);
-        assert_eq!(Frame::default().between_ns(), None);
+        assert_eq!(frame.gaps_ns(), None);
+        assert_eq!(Frame::default().gaps_ns(), None);
     }
 
     /// A rate is held when no frame was missed and the camera was not late.
@@ -428,6 +443,7 @@ mod tests {
         let measured = |missed, rate_hz| Measured {
             latency_ms: Vec::new(),
             ipc_share: 0.0,
+            hand_overs_ms: BTreeMap::new(),
             frames: 100,
             missed,
             rate_hz,

@@ -81,6 +81,14 @@ pub(crate) fn run(args: &LoopArgs) -> anyhow::Result<Report> {
         report.set(&format!("loop.stages.{}.cores", used.stage), used.cores);
         report.set(&format!("loop.stages.{}.memory_mb", used.stage), memory_mb);
     }
+    let mut hand_overs = vec![["between stages (main setting)", "p50 us", "p99"].map(str::to_owned)];
+    for (name, ms) in &measured.hand_overs_ms {
+        let times = Times::new(ms.clone());
+        let [p50, p99] = [0.5, 0.99].map(|q| times.quantile(q) * 1e3);
+        hand_overs.push([(*name).to_owned(), number(p50), number(p99)]);
+        report.set(&format!("loop.hand_overs.{}.p50_us", name.replace(' ', "_")), p50);
+        report.set(&format!("loop.hand_overs.{}.p99_us", name.replace(' ', "_")), p99);
+    }
     if !args.quick {
         for samples in SAMPLES {
             for horizon in HORIZONS {
@@ -108,7 +116,7 @@ pub(crate) fn run(args: &LoopArgs) -> anyhow::Result<Report> {
     if let Some((rate_hz, measured)) = &held {
         rows.push(row(Setting { rate_hz: *rate_hz, ..MAIN }, measured, "loop.at_held_rate", &mut report));
     }
-    println!("\n{}\n{}", table(&rows), table(&uses));
+    println!("\n{}\n{}\n{}", table(&rows), table(&hand_overs), table(&uses));
     println!("renderer: {} views while the main setting was measured", measured.views);
     let rate_hz = held.map_or(0.0, |(rate_hz, _)| rate_hz);
     println!("highest rate held without a missed frame: {} Hz", number(rate_hz));

@@ -285,6 +285,7 @@ mod tests {
     #[test]
     fn rounds_add_up() {
         let round = |latency_ms: &[f64], missed, cores| Measured {
+            hand_overs_ms: std::collections::BTreeMap::new(),
             latency_ms: latency_ms.to_vec(),
             ipc_share: 0.0,
             frames: latency_ms.len() + missed,
