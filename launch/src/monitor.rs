@@ -4,7 +4,7 @@ use carff_messages::{
     Action, ActionCode, Belief, FrameMeta, Gaussian, Health, HealthState, Observability, Posterior, Reason, Stage,
     ViewMeta,
 };
-use carff_transport::{Input, Node, OpenError, PictureReceiver, ReceiveError, Receiver, topics};
+use carff_transport::{Node, OpenError, PictureReceiver, ReceiveError, Receiver, topics};
 use std::collections::BTreeMap;
 
 /// Everything known about one camera frame. What is from the data set is -1 or `Unknown` where there is none.
@@ -192,26 +192,18 @@ pub struct Monitor {
 }
 
 impl Monitor {
-    /// Subscribes.
+    /// Subscribes, without being woken by messages: that would take a core from the stages at each hand-over.
     pub fn open(node: &Node) -> Result<Self, OpenError> {
-        let healths = Stage::ALL.iter().map(|&stage| node.receiver(&topics::health(stage)));
+        let healths = Stage::ALL.iter().map(|&stage| Ok(node.receiver(&topics::health(stage))?.polled()));
         Ok(Self {
-            frames: node.picture_receiver(&topics::FRAME)?,
-            posteriors: node.receiver(&topics::POSTERIOR)?,
-            beliefs: node.receiver(&topics::BELIEF)?,
-            actions: node.receiver(&topics::ACTION)?,
-            views: node.picture_receiver(&topics::VIEW)?,
+            frames: node.picture_receiver(&topics::FRAME)?.polled(),
+            posteriors: node.receiver(&topics::POSTERIOR)?.polled(),
+            beliefs: node.receiver(&topics::BELIEF)?.polled(),
+            actions: node.receiver(&topics::ACTION)?.polled(),
+            views: node.picture_receiver(&topics::VIEW)?.polled(),
             healths: healths.collect::<Result<_, _>>()?,
             records: Records::default(),
         })
-    }
-
-    /// What to wait for.
-    pub fn inputs(&self) -> Vec<&dyn Input> {
-        let mut inputs: Vec<&dyn Input> =
-            vec![&self.frames, &self.posteriors, &self.beliefs, &self.actions, &self.views];
-        inputs.extend(self.healths.iter().map(|h| h as &dyn Input));
-        inputs
     }
 
     /// Takes in all that waits. Calls `decided` for each frame that was decided on.

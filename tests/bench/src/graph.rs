@@ -7,8 +7,8 @@ use carff_config::GraphConfig;
 use carff_messages::{Action, Belief, Forecast, FrameMeta, Health, HealthState, Posterior, Stage};
 use carff_stage::StageArgs;
 use carff_transport::{
-    Input, Node, PictureReceiver, Receiver, Run, Stop, Waiter, Woken, monotonic_now_ns, remove_run_leftovers,
-    run_id_of, topics,
+    Node, PictureReceiver, Receiver, Run, Stop, Waiter, Woken, monotonic_now_ns, remove_run_leftovers, run_id_of,
+    topics,
 };
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -20,6 +20,8 @@ const START_ORDER: [Stage; 6] =
     [Stage::Controller, Stage::Renderer, Stage::Prober, Stage::Forecaster, Stage::Encoder, Stage::Camera];
 /// How often stages are looked at while they start.
 const WATCH_NS: u64 = 50_000_000;
+/// How often messages are looked at.
+const LOOK_NS: u64 = 10_000_000;
 /// How long the last frames are waited for.
 const TAIL: Duration = Duration::from_millis(500);
 
@@ -187,7 +189,7 @@ fn listen(
 ) -> anyhow::Result<Measured> {
     let waiter = Waiter::new(Stop::on_signals()?);
     let take = |listener: &mut Listener, until_ns: u64| -> anyhow::Result<()> {
-        ensure!(waiter.wait_until(&listener.inputs(), until_ns)? != Woken::Stopped, "interrupted");
+        ensure!(waiter.wait_until(&[], until_ns.min(monotonic_now_ns() + LOOK_NS))? != Woken::Stopped, "interrupted");
         listener.drain()
     };
     let limit = Duration::from_millis(plan.graph.launcher.start_timeout_ms);
@@ -266,7 +268,7 @@ fn listen(
     })
 }
 
-/// Hears all that a run says.
+/// Hears all that a run says. It looks now and then: were it woken by each message, it would take a core from the stages.
 struct Listener {
     frames_in: PictureReceiver<FrameMeta>,
     posteriors: Receiver<Posterior>,
@@ -282,26 +284,19 @@ struct Listener {
 
 impl Listener {
     fn open(node: &Node) -> anyhow::Result<Self> {
-        let healths = Stage::ALL.iter().map(|&stage| node.receiver(&topics::health(stage)));
+        let healths = Stage::ALL.iter().map(|&stage| Ok(node.receiver(&topics::health(stage))?.polled()));
         Ok(Self {
-            frames_in: node.picture_receiver(&topics::FRAME)?,
-            posteriors: node.receiver(&topics::POSTERIOR)?,
-            forecasts: node.receiver(&topics::FORECAST)?,
-            beliefs: node.receiver(&topics::BELIEF)?,
-            actions: node.receiver(&topics::ACTION)?,
-            views_in: node.picture_receiver(&topics::VIEW)?,
-            healths: healths.collect::<Result<_, _>>()?,
+            frames_in: node.picture_receiver(&topics::FRAME)?.polled(),
+            posteriors: node.receiver(&topics::POSTERIOR)?.polled(),
+            forecasts: node.receiver(&topics::FORECAST)?.polled(),
+            beliefs: node.receiver(&topics::BELIEF)?.polled(),
+            actions: node.receiver(&topics::ACTION)?.polled(),
+            views_in: node.picture_receiver(&topics::VIEW)?.polled(),
+            healths: healths.collect::<Result<_, carff_transport::OpenError>>()?,
             frames: BTreeMap::new(),
             views: 0,
             ready: BTreeMap::new(),
         })
-    }
-
-    fn inputs(&self) -> Vec<&dyn Input> {
-        let mut inputs: Vec<&dyn Input> =
-            vec![&self.frames_in, &self.posteriors, &self.forecasts, &self.beliefs, &self.actions, &self.views_in];
-        inputs.extend(self.healths.iter().map(|h| h as &dyn Input));
-        inputs
     }
 
     fn drain(&mut self) -> anyhow::Result<()> {
