@@ -51,7 +51,7 @@ pub fn evaluate(outcome: &RunOutcome) -> anyhow::Result<Option<Planning>> {
     }
     carff_models::allocator::keep_large_blocks();
     let setup = Setup::load(outcome)?;
-    let decisive = decisive_frames(outcome, setup.scenario.timestamps, &setup.scenario.hazard_branches);
+    let decisive = decisive_frames(outcome, &setup.scenario);
     let (drives, live) = drives_table(&setup, &decisive);
     let mut planning = json!({ "drives": drives, "threshold": setup.threshold, "live": live });
     let split = PoseSplit::for_dataset(&setup.dataset, setup.split_seed);
@@ -188,24 +188,17 @@ fn views_table(setup: &Setup, views: &[usize]) -> anyhow::Result<(PlanningTable,
 }
 
 /// Per drive the frame whose decision counts: the last decided one of the first timestamp at which the drive is a
-/// trial (hazard: actor's branch, actor not visible; clear: other branch, place fully visible; not the last timestamp).
-pub fn decisive_frames(
-    outcome: &RunOutcome,
-    timestamps: usize,
-    hazard_branches: &[usize],
-) -> Vec<(FrameRecord, DriveKind)> {
+/// trial, as [`ScenarioInfo::trial_kind`] says.
+pub fn decisive_frames(outcome: &RunOutcome, scenario: &ScenarioInfo) -> Vec<(FrameRecord, DriveKind)> {
     let mut by_drive: BTreeMap<i32, (FrameRecord, DriveKind)> = BTreeMap::new();
     for frame in outcome.records.frames.values() {
-        if frame.drive < 0 || frame.timestamp < 0 || frame.timestamp as usize + 2 > timestamps || frame.action.is_none()
-        {
+        let (Ok(branch), Ok(timestamp)) = (usize::try_from(frame.branch), usize::try_from(frame.timestamp)) else {
+            continue;
+        };
+        if frame.drive < 0 || frame.action.is_none() {
             continue;
         }
-        let hazard = usize::try_from(frame.branch).is_ok_and(|b| hazard_branches.contains(&b));
-        let kind = match (hazard, frame.observability) {
-            (true, Observability::None) => DriveKind::Hazard,
-            (false, Observability::Full) => DriveKind::Clear,
-            _ => continue,
-        };
+        let Some(kind) = scenario.trial_kind(branch, timestamp, seen(frame.observability)) else { continue };
         match by_drive.get(&frame.drive) {
             Some((there, _)) if there.timestamp < frame.timestamp => {}
             _ => {
@@ -214,6 +207,16 @@ pub fn decisive_frames(
         }
     }
     by_drive.into_values().collect()
+}
+
+/// The message's observability, as data sets have it.
+fn seen(observability: Observability) -> Option<carff_dataset::Observability> {
+    match observability {
+        Observability::Unknown => None,
+        Observability::None => Some(carff_dataset::Observability::None),
+        Observability::Partial => Some(carff_dataset::Observability::Partial),
+        Observability::Full => Some(carff_dataset::Observability::Full),
+    }
 }
 
 /// The tables as text.
@@ -334,7 +337,20 @@ pub(crate) mod tests {
             at(3, 2, 0, Observability::None),
             at(-1, 0, 0, Observability::None),
         ]);
-        let found: Vec<_> = decisive_frames(&outcome, 3, &[0]).iter().map(|(f, kind)| (f.frame_id, *kind)).collect();
+        let scenario = ScenarioInfo {
+            name: "test".into(),
+            bounds: [[-1.0; 3], [1.0; 3]],
+            branches: vec!["hazard".into(), "clear".into()],
+            timestamps: 3,
+            bev_view: None,
+            states: Vec::new(),
+            candidates: Vec::new(),
+            static_boxes: Vec::new(),
+            hazard_branches: vec![0],
+            hazard_action: "halt".into(),
+            clear_action: "advance".into(),
+        };
+        let found: Vec<_> = decisive_frames(&outcome, &scenario).iter().map(|(f, kind)| (f.frame_id, *kind)).collect();
         assert_eq!(found, [(1, DriveKind::Hazard), (5, DriveKind::Clear)]);
     }
 
