@@ -18,25 +18,32 @@ pub struct ScenarioCamera {
     pub camera: PinholeCamera,
 }
 
-/// Cameras keep this far from static things, metres.
-const CLEARANCE_M: f32 = 0.45;
+/// Of the clearance from static things, the share that is kept above the ground.
+const ABOVE_GROUND: f32 = 0.3 / 0.45;
+/// And from where moving things can be.
+const FROM_MOVING: f32 = 0.05 / 0.45;
 /// Places tried for each camera before giving up.
 const MAX_TRIES: usize = 400;
 
 /// Spaces where no camera may be.
 pub(crate) struct Obstacles {
     boxes: Vec<Aabb>,
+    lowest: f32,
 }
 
 impl Obstacles {
-    pub fn new(still: impl Iterator<Item = Aabb>, moving: impl Iterator<Item = Aabb>) -> Self {
+    /// `clearance_m` is that of static things.
+    pub fn new(clearance_m: f32, still: impl Iterator<Item = Aabb>, moving: impl Iterator<Item = Aabb>) -> Self {
         let grow = |aabb: Aabb, by: f32| Aabb::new(aabb.mins - Vec3::splat(by), aabb.maxs + Vec3::splat(by));
-        Self { boxes: still.map(|a| grow(a, CLEARANCE_M)).chain(moving.map(|a| grow(a, 0.05))).collect() }
+        let still = still.map(|a| grow(a, clearance_m));
+        let moving = moving.map(|a| grow(a, FROM_MOVING * clearance_m));
+        Self { boxes: still.chain(moving).collect(), lowest: ABOVE_GROUND * clearance_m }
     }
 
-    fn clear(&self, at: [f64; 3]) -> bool {
+    /// Whether a camera may stand there.
+    pub fn clear(&self, at: [f64; 3]) -> bool {
         let p = Vec3::from_array(at.map(|v| v as f32));
-        p.z > 0.3
+        p.z > self.lowest
             && !self.boxes.iter().any(|b| {
                 p.x > b.mins.x && p.y > b.mins.y && p.z > b.mins.z && p.x < b.maxs.x && p.y < b.maxs.y && p.z < b.maxs.z
             })

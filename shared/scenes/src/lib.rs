@@ -18,6 +18,7 @@ mod cameras;
 pub mod config;
 mod error;
 mod materials;
+mod movers;
 mod scenario;
 mod scenery;
 mod shapes;
