@@ -5,7 +5,7 @@ use crate::monitor::FrameRecord;
 use crate::report::RunOutcome;
 use anyhow::Context;
 use carff_belief::{Plan, Probe, Step, decision, look_ahead};
-use carff_config::{CheckpointPlanning, GraphConfig};
+use carff_config::{CameraSource, CheckpointPlanning, GraphConfig};
 use carff_dataset::{
     Dataset, PoseRole, PoseSplit, ScenarioInfo,
     drives::{DriveKind, EligibleInput, eligible_inputs},
@@ -15,6 +15,7 @@ use carff_evaluation::{Models, PlanningTable, SAMPLE_COUNTS, count, planning_tab
 use carff_messages::{ActionCode, Observability};
 use carff_models::{LatentGaussian, mixture::Sampling};
 use carff_planning::Rule;
+use carff_scenes::Scenario;
 use serde_json::{Map, Value, json};
 use std::collections::BTreeMap;
 use std::fmt::Write;
@@ -53,7 +54,9 @@ pub fn evaluate(outcome: &RunOutcome) -> anyhow::Result<Option<Planning>> {
     let setup = Setup::load(outcome)?;
     let decisive = decisive_frames(outcome, &setup.scenario);
     let (drives, live) = drives_table(&setup, &decisive);
-    let mut planning = json!({ "drives": drives, "threshold": setup.threshold, "live": live });
+    let mut planning = json!({ "threshold": setup.threshold, "live": live });
+    let name = if setup.free.is_some() { "free_drives" } else { "drives" };
+    planning[name] = serde_json::to_value(drives)?;
     let split = PoseSplit::for_dataset(&setup.dataset, setup.split_seed);
     for (name, role) in [("all_views", PoseRole::Rest), ("unseen_views", PoseRole::Unseen)] {
         let (table, views) = views_table(&setup, &split.views(role))?;
@@ -76,6 +79,8 @@ pub struct Setup {
     pub dataset: Dataset,
     /// Its scenario.
     pub scenario: ScenarioInfo,
+    /// What free drives are rendered from; none for a run of other pictures.
+    pub free: Option<Scenario>,
     /// The trained models.
     pub models: Models,
     /// Threshold of the calibrated rule.
@@ -83,7 +88,7 @@ pub struct Setup {
     /// Seed of the split into trained and unseen poses.
     split_seed: u64,
     /// The run's seed.
-    seed: u64,
+    pub seed: u64,
 }
 
 impl Setup {
@@ -92,7 +97,12 @@ impl Setup {
         let dataset = Dataset::open(&outcome.dataset)?;
         let scenario = dataset.scenario().context("the data set has no scenario")?.clone();
         let known = CheckpointPlanning::load(&outcome.checkpoint)?;
+        let free = match (graph.camera.source, graph.scenario_path()) {
+            (CameraSource::FreeDrives, Some(path)) => Some(Scenario::load(&path)?),
+            _ => None,
+        };
         Ok(Self {
+            free,
             run: outcome.run.clone(),
             dataset,
             scenario,
@@ -229,9 +239,13 @@ pub fn text(report: &Value) -> String {
     let _ = writeln!(out, "\nPlanning: right actions out of trials, with 95 % interval of the rate");
     for (name, title) in [
         ("drives", "drives of this run"),
+        ("free_drives", "free drives of this run: moving, from poses that no training saw"),
         ("all_views", "every eligible view of the trained poses"),
         ("unseen_views", "every eligible view of poses never trained on"),
     ] {
+        if planning[name].is_null() {
+            continue;
+        }
         let views = &planning["views"][name];
         let times = match (views["hazard"].as_u64(), views["clear"].as_u64(), views["repeats"].as_u64()) {
             (Some(hazard), Some(clear), Some(repeats)) => {

@@ -87,7 +87,7 @@ pub enum Extras {
 }
 
 /// Where each mover is; absent ones are `None`.
-type Placement = Vec<Option<Pose>>;
+pub(crate) type Placement = Vec<Option<Pose>>;
 
 /// Where a vehicle stands in any state (x, y, yaw), each place once.
 fn places(config: &ScenarioConfig, placements: &[Vec<Placement>], name: &str) -> Vec<[f64; 3]> {
@@ -184,10 +184,10 @@ impl Scenario {
                 Scene::new(scenery.bodies.iter().cloned().chain(still).chain(moving).collect())
             });
         };
-        for (branch, steps) in placements.iter().enumerate() {
+        for steps in &placements {
             for (timestamp, placement) in steps.iter().enumerate() {
                 build(placement);
-                for other in counterparts(&placements, actor.as_ref(), branch, timestamp) {
+                for other in counterparts(placement, &placements, actor.as_ref(), timestamp) {
                     build(&other);
                 }
             }
@@ -267,6 +267,40 @@ impl Scenario {
         }
     }
 
+    pub(crate) fn config(&self) -> &ScenarioConfig {
+        &self.config
+    }
+
+    pub(crate) fn obstacles(&self) -> &Obstacles {
+        &self.obstacles
+    }
+
+    /// By branch, then timestamp.
+    pub(crate) fn placements(&self) -> &[Vec<Placement>] {
+        &self.placements
+    }
+
+    /// Where a vehicle stands in any state: x, y, yaw.
+    pub(crate) fn places_of(&self, vehicle: &str) -> Vec<[f64; 3]> {
+        places(&self.config, &self.placements, vehicle)
+    }
+
+    /// The picture of a placement that need not be a state's.
+    pub(crate) fn picture_of(&self, placement: &Placement, camera: &PinholeCamera) -> Image {
+        self.scene(placement).picture(&self.setting, camera).0
+    }
+
+    /// How much of the actor is seen in a placement that differs from a state's in who is not the actor.
+    pub(crate) fn observability_of(
+        &self,
+        placement: &Placement,
+        timestamp: usize,
+        camera: &PinholeCamera,
+    ) -> Option<Observability> {
+        let mut shots = Shots { scenario: self, camera, taken: HashMap::new() };
+        Some(self.actor_view(&mut shots, placement, timestamp)?.observability)
+    }
+
     /// Takes one picture from any camera.
     pub fn render(
         &self,
@@ -300,9 +334,9 @@ impl Scenario {
                 branches: self.info.branches.len(),
                 timestamps: self.info.timestamps,
             })?;
-        let actor = match (detail, &self.actor) {
-            (Detail::Observability, Some(actor)) => Some(self.actor_view(shots, branch, timestamp, actor.dynamic)),
-            _ => None,
+        let actor = match detail {
+            Detail::Observability => self.actor_view(shots, placement, timestamp),
+            Detail::Picture => None,
         };
         let shot = shots.take(placement);
         Ok(Rendering {
@@ -314,13 +348,12 @@ impl Scenario {
     }
 
     /// One ray per pixel centre against the actor alone in an unbounded picture, and against everything.
-    fn actor_view(&self, shots: &mut Shots, branch: usize, timestamp: usize, dynamic: usize) -> ActorView {
+    /// `None` when nothing is dynamic.
+    fn actor_view(&self, shots: &mut Shots, placement: &Placement, timestamp: usize) -> Option<ActorView> {
         let camera = shots.camera;
-        let placement = &self.placements[branch][timestamp];
-        let others = counterparts(&self.placements, self.actor.as_ref(), branch, timestamp);
-        let Some(mover) = movers(&self.config).nth(dynamic) else {
-            return ActorView { visible_fraction: 0.0, actor_px: 0, observability: Observability::None };
-        };
+        let others = counterparts(placement, &self.placements, self.actor.as_ref(), timestamp);
+        let dynamic = self.actor.as_ref()?.dynamic;
+        let mover = movers(&self.config).nth(dynamic)?;
         let object = self.scenery.next_object + dynamic as u16;
         let (mut visible, mut would_be) = (0_u32, 0_u32);
         let poses: Vec<Pose> = match placement[dynamic] {
@@ -370,7 +403,7 @@ impl Scenario {
         } else {
             Observability::Partial
         };
-        ActorView { visible_fraction: fraction as f32, actor_px: visible, observability }
+        Some(ActorView { visible_fraction: fraction as f32, actor_px: visible, observability })
     }
 
     /// Renders every camera in every state into a posed data set, in parallel. `progress` is told how many pictures
@@ -534,13 +567,12 @@ struct Actor {
 /// The same placement with the actor gone, where it is there; with the actor at each place that it has at this
 /// timestamp in other branches, where it is not.
 fn counterparts(
+    own: &Placement,
     placements: &[Vec<Placement>],
     actor: Option<&Actor>,
-    branch: usize,
     timestamp: usize,
 ) -> Vec<Placement> {
     let Some(actor) = actor else { return Vec::new() };
-    let own = &placements[branch][timestamp];
     let as_in = |other: Option<&Placement>| {
         let mut placement = own.clone();
         for &m in std::iter::once(&actor.dynamic).chain(&actor.followers) {

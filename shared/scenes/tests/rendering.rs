@@ -338,20 +338,6 @@ fn shipped(name: &str) -> Scenario {
     Scenario::load(&folder.join(name).with_extension("toml")).unwrap()
 }
 
-/// The same camera with fewer pixels: observability is judged by shares, and small pictures are quick.
-fn small_camera(camera: &PinholeCamera, side_px: u32) -> PinholeCamera {
-    let scale = f64::from(side_px) / f64::from(camera.width_px);
-    PinholeCamera {
-        width_px: side_px,
-        height_px: side_px,
-        fl_x_px: camera.fl_x_px * scale,
-        fl_y_px: camera.fl_y_px * scale,
-        cx_px: camera.cx_px * scale,
-        cy_px: camera.cy_px * scale,
-        ..*camera
-    }
-}
-
 /// Every shipped scenario has a training and a graph file of its name, a hundred poses of which none is inside a box, and
 /// a bird's-eye view straight down that sees the middle of every box that moves.
 #[test]
@@ -398,7 +384,7 @@ fn every_shipped_scenario_has_seeing_and_blind_views() {
         let scenario = shipped(name);
         let mut seen = Vec::new();
         for camera in scenario.cameras().iter().step_by(4) {
-            let camera = small_camera(&camera.camera, 48);
+            let camera = camera.camera.resized(48, 48);
             seen.push(scenario.render(0, 0, &camera, &RenderOptions::default()).unwrap().actor.unwrap().observability);
         }
         for wanted in [Observability::Full, Observability::None] {
@@ -421,7 +407,7 @@ fn undecided_first_timestamps_look_the_same() {
         let options = RenderOptions { detail: Detail::Picture };
         let mut differing = 0;
         for camera in scenario.cameras().iter().step_by(10) {
-            let camera = small_camera(&camera.camera, 48);
+            let camera = camera.camera.resized(48, 48);
             let picture = |b: usize, t: usize| scenario.render(b, t, &camera, &options).unwrap().image;
             assert_eq!(picture(0, 0), picture(1, 0), "{name}");
             differing += usize::from(picture(0, last) != picture(1, last));
