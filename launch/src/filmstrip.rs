@@ -126,22 +126,32 @@ struct Artist<'a> {
 
 impl Artist<'_> {
     fn row(&mut self, frame: &FrameRecord, kind: DriveKind) -> anyhow::Result<StripRow> {
-        let place = [frame.branch, frame.timestamp, frame.view].map(usize::try_from);
-        let [Ok(branch), Ok(timestamp), Ok(view)] = place else {
-            anyhow::bail!("frame {} of drive {} names no picture of the data set", frame.frame_id, frame.drive);
+        let ([Ok(branch), Ok(timestamp)], view) =
+            ([frame.branch, frame.timestamp].map(usize::try_from), usize::try_from(frame.view).ok())
+        else {
+            anyhow::bail!("frame {} of drive {} names no state", frame.frame_id, frame.drive);
         };
         let samples = self.setup.graph.run.samples as usize;
         let steps = self.setup.look_ahead(&mut self.probe, frame, samples).unwrap_or_default();
         let right = halts(frame) == (kind == DriveKind::Hazard);
         let shown = StripCell {
-            image: self.picture(branch, timestamp, view)?,
-            caption: vec![format!("camera, t{timestamp}"), format!("view {view}")],
+            image: match view {
+                Some(view) => self.picture(branch, timestamp, view)?,
+                None => self.free_picture(frame)?,
+            },
+            caption: vec![
+                format!("camera, t{timestamp}"),
+                view.map_or("free pose".to_owned(), |view| format!("view {view}")),
+            ],
             emphasis: Some(if right { RIGHT } else { WRONG }),
         };
         let above = self.setup.scenario.bev_view;
         let hazard = self.setup.scenario.is_hazard(branch);
         let truth = StripCell {
-            image: self.picture(branch, timestamp + 1, above.unwrap_or(view))?,
+            image: match above.or(view) {
+                Some(view) => self.picture(branch, timestamp + 1, view)?,
+                None => anyhow::bail!("the data set names no bird's-eye view (`bev_view`)"),
+            },
             caption: vec![
                 format!("what came, t{}", timestamp + 1),
                 format!("true picture from {}", if above.is_some() { "above" } else { "the same view" }),
@@ -175,6 +185,19 @@ impl Artist<'_> {
             lines.push(format!("because of: {}", reason.name()));
         }
         lines
+    }
+
+    /// What a free drive showed, rendered again.
+    fn free_picture(&self, frame: &FrameRecord) -> anyhow::Result<Image> {
+        let (scenario, number) = self
+            .setup
+            .free
+            .as_ref()
+            .zip(u64::try_from(frame.drive).ok())
+            .with_context(|| format!("frame {} of drive {} names no picture", frame.frame_id, frame.drive))?;
+        let frames = self.setup.graph.camera.frames_per_timestamp as usize;
+        let drive = scenario.free_drive(number, frames, self.setup.seed)?;
+        Ok(scenario.free_frame(&drive, usize::try_from(frame.frame_in_drive)?)?.image)
     }
 
     fn picture(&self, branch: usize, timestamp: usize, view: usize) -> anyhow::Result<Image> {

@@ -5,7 +5,7 @@ use crate::monitor::FrameRecord;
 use crate::report::RunOutcome;
 use anyhow::Context;
 use carff_belief::{Plan, Probe, Step, decision, look_ahead};
-use carff_config::{CheckpointPlanning, GraphConfig};
+use carff_config::{CameraSource, CheckpointPlanning, GraphConfig};
 use carff_dataset::{
     Dataset, PoseRole, PoseSplit, ScenarioInfo,
     drives::{DriveKind, EligibleInput, eligible_inputs},
@@ -15,6 +15,7 @@ use carff_evaluation::{Models, PlanningTable, SAMPLE_COUNTS, count, planning_tab
 use carff_messages::{ActionCode, Observability};
 use carff_models::{LatentGaussian, mixture::Sampling};
 use carff_planning::Rule;
+use carff_scenes::Scenario;
 use serde_json::{Map, Value, json};
 use std::collections::BTreeMap;
 use std::fmt::Write;
@@ -51,9 +52,11 @@ pub fn evaluate(outcome: &RunOutcome) -> anyhow::Result<Option<Planning>> {
     }
     carff_models::allocator::keep_large_blocks();
     let setup = Setup::load(outcome)?;
-    let decisive = decisive_frames(outcome, setup.scenario.timestamps, &setup.scenario.hazard_branches);
+    let decisive = decisive_frames(outcome, &setup.scenario);
     let (drives, live) = drives_table(&setup, &decisive);
-    let mut planning = json!({ "drives": drives, "threshold": setup.threshold, "live": live });
+    let mut planning = json!({ "threshold": setup.threshold, "live": live });
+    let name = if setup.free.is_some() { "free_drives" } else { "drives" };
+    planning[name] = serde_json::to_value(drives)?;
     let split = PoseSplit::for_dataset(&setup.dataset, setup.split_seed);
     for (name, role) in [("all_views", PoseRole::Rest), ("unseen_views", PoseRole::Unseen)] {
         let (table, views) = views_table(&setup, &split.views(role))?;
@@ -76,6 +79,8 @@ pub struct Setup {
     pub dataset: Dataset,
     /// Its scenario.
     pub scenario: ScenarioInfo,
+    /// What free drives are rendered from; none for a run of other pictures.
+    pub free: Option<Scenario>,
     /// The trained models.
     pub models: Models,
     /// Threshold of the calibrated rule.
@@ -83,7 +88,7 @@ pub struct Setup {
     /// Seed of the split into trained and unseen poses.
     split_seed: u64,
     /// The run's seed.
-    seed: u64,
+    pub seed: u64,
 }
 
 impl Setup {
@@ -92,7 +97,12 @@ impl Setup {
         let dataset = Dataset::open(&outcome.dataset)?;
         let scenario = dataset.scenario().context("the data set has no scenario")?.clone();
         let known = CheckpointPlanning::load(&outcome.checkpoint)?;
+        let free = match (graph.camera.source, graph.scenario_path()) {
+            (CameraSource::FreeDrives, Some(path)) => Some(Scenario::load(&path)?),
+            _ => None,
+        };
         Ok(Self {
+            free,
             run: outcome.run.clone(),
             dataset,
             scenario,
@@ -188,24 +198,17 @@ fn views_table(setup: &Setup, views: &[usize]) -> anyhow::Result<(PlanningTable,
 }
 
 /// Per drive the frame whose decision counts: the last decided one of the first timestamp at which the drive is a
-/// trial (hazard: actor's branch, actor not visible; clear: other branch, place fully visible; not the last timestamp).
-pub fn decisive_frames(
-    outcome: &RunOutcome,
-    timestamps: usize,
-    hazard_branches: &[usize],
-) -> Vec<(FrameRecord, DriveKind)> {
+/// trial, as [`ScenarioInfo::trial_kind`] says.
+pub fn decisive_frames(outcome: &RunOutcome, scenario: &ScenarioInfo) -> Vec<(FrameRecord, DriveKind)> {
     let mut by_drive: BTreeMap<i32, (FrameRecord, DriveKind)> = BTreeMap::new();
     for frame in outcome.records.frames.values() {
-        if frame.drive < 0 || frame.timestamp < 0 || frame.timestamp as usize + 2 > timestamps || frame.action.is_none()
-        {
+        let (Ok(branch), Ok(timestamp)) = (usize::try_from(frame.branch), usize::try_from(frame.timestamp)) else {
+            continue;
+        };
+        if frame.drive < 0 || frame.action.is_none() {
             continue;
         }
-        let hazard = usize::try_from(frame.branch).is_ok_and(|b| hazard_branches.contains(&b));
-        let kind = match (hazard, frame.observability) {
-            (true, Observability::None) => DriveKind::Hazard,
-            (false, Observability::Full) => DriveKind::Clear,
-            _ => continue,
-        };
+        let Some(kind) = scenario.trial_kind(branch, timestamp, seen(frame.observability)) else { continue };
         match by_drive.get(&frame.drive) {
             Some((there, _)) if there.timestamp < frame.timestamp => {}
             _ => {
@@ -214,6 +217,16 @@ pub fn decisive_frames(
         }
     }
     by_drive.into_values().collect()
+}
+
+/// The message's observability, as data sets have it.
+fn seen(observability: Observability) -> Option<carff_dataset::Observability> {
+    match observability {
+        Observability::Unknown => None,
+        Observability::None => Some(carff_dataset::Observability::None),
+        Observability::Partial => Some(carff_dataset::Observability::Partial),
+        Observability::Full => Some(carff_dataset::Observability::Full),
+    }
 }
 
 /// The tables as text.
@@ -226,9 +239,13 @@ pub fn text(report: &Value) -> String {
     let _ = writeln!(out, "\nPlanning: right actions out of trials, with 95 % interval of the rate");
     for (name, title) in [
         ("drives", "drives of this run"),
+        ("free_drives", "free drives of this run: moving, from poses that no training saw"),
         ("all_views", "every eligible view of the trained poses"),
         ("unseen_views", "every eligible view of poses never trained on"),
     ] {
+        if planning[name].is_null() {
+            continue;
+        }
         let views = &planning["views"][name];
         let times = match (views["hazard"].as_u64(), views["clear"].as_u64(), views["repeats"].as_u64()) {
             (Some(hazard), Some(clear), Some(repeats)) => {
@@ -334,7 +351,20 @@ pub(crate) mod tests {
             at(3, 2, 0, Observability::None),
             at(-1, 0, 0, Observability::None),
         ]);
-        let found: Vec<_> = decisive_frames(&outcome, 3, &[0]).iter().map(|(f, kind)| (f.frame_id, *kind)).collect();
+        let scenario = ScenarioInfo {
+            name: "test".into(),
+            bounds: [[-1.0; 3], [1.0; 3]],
+            branches: vec!["hazard".into(), "clear".into()],
+            timestamps: 3,
+            bev_view: None,
+            states: Vec::new(),
+            candidates: Vec::new(),
+            static_boxes: Vec::new(),
+            hazard_branches: vec![0],
+            hazard_action: "halt".into(),
+            clear_action: "advance".into(),
+        };
+        let found: Vec<_> = decisive_frames(&outcome, &scenario).iter().map(|(f, kind)| (f.frame_id, *kind)).collect();
         assert_eq!(found, [(1, DriveKind::Hazard), (5, DriveKind::Clear)]);
     }
 

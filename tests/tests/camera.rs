@@ -74,3 +74,36 @@ fn drives_with_bad_pictures() {
     assert_eq!(wrong_sized.status.code(), Some(1), "{}", wrong_sized.text);
     assert!(wrong_sized.text.contains("4x4") && wrong_sized.text.contains("8x8"), "{}", wrong_sized.text);
 }
+
+/// Free drives are rendered and published as they go: every frame of each drive, with its truth, at poses of which no two
+/// are the same.
+#[test]
+fn free_drives_are_published() {
+    let scenario = carff_tests::project_root().join("configs/scenarios/approaching-intersection");
+    let rest = format!(
+        "scenario = \"{}\"\nframe_rate_hz = 5.0\n[camera]\nsource = \"free-drives\"\ndrives = 2\n\
+         frames_per_timestamp = 1\n",
+        scenario.display()
+    );
+    let graph = TestGraph::new(Path::new("none"), Path::new("none"), &rest);
+    let node = Node::open(graph.run(), "test").unwrap();
+    let mut frames = node.picture_receiver(&topics::FRAME).unwrap();
+    let camera = graph.stage(Stage::Camera);
+    let mut shown = Vec::new();
+    let done = eventually(|| {
+        while let Some(frame) = frames.next().unwrap() {
+            let meta = frame.meta();
+            let view = meta.dataset_view;
+            shown.push((view.drive, view.timestamp, view.branch, meta.world_from_camera.map(f64::to_bits)));
+        }
+        shown.len() >= 6
+    });
+    let finished = camera.end();
+    assert!(done, "{}", finished.text);
+    finished.assert_success();
+    let truth: Vec<_> = shown.iter().map(|(drive, timestamp, branch, _)| (*drive, *timestamp, *branch)).collect();
+    assert_eq!(truth, [(0, 0, 0), (0, 1, 0), (0, 2, 0), (1, 0, 1), (1, 1, 1), (1, 2, 1)]);
+    for (i, (.., pose)) in shown.iter().enumerate() {
+        assert!(shown[..i].iter().all(|(.., other)| other != pose));
+    }
+}

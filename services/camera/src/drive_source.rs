@@ -93,12 +93,7 @@ impl Source for DriveSource {
         let timestamp = frame_in_drive / self.frames_per_timestamp;
         self.current = planned.frames[timestamp];
         let frame = &self.dataset.frames()[self.current];
-        let observability = match frame.observability {
-            None => Observability::Unknown,
-            Some(carff_dataset::Observability::None) => Observability::None,
-            Some(carff_dataset::Observability::Partial) => Observability::Partial,
-            Some(carff_dataset::Observability::Full) => Observability::Full,
-        };
+        let observability = frame.observability.map_or(Observability::Unknown, seen);
         let dataset_view = DatasetView {
             known: 1,
             view: planned.view as i32,
@@ -116,6 +111,15 @@ impl Source for DriveSource {
         let image = self.images.get(&self.current).context("no frame has been advanced to")?;
         let key = Key { seed: self.seed, frame: frame_id, step: 0, sample: 0 };
         Ok(apply_noise_into(&image.rgb, picture, &self.noise, key)?)
+    }
+}
+
+/// The set's observability, as messages have it.
+pub(crate) fn seen(observability: carff_dataset::Observability) -> Observability {
+    match observability {
+        carff_dataset::Observability::None => Observability::None,
+        carff_dataset::Observability::Partial => Observability::Partial,
+        carff_dataset::Observability::Full => Observability::Full,
     }
 }
 

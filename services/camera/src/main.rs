@@ -2,7 +2,7 @@
 //! What a picture means lives in the encoder.
 
 use anyhow::Context;
-use carff_camera::{DriveSource, FolderSource, Source};
+use carff_camera::{DriveSource, FolderSource, FreeDriveSource, Source};
 use carff_config::CameraSource;
 use carff_messages::{Header, Stage};
 use carff_stage::StageContext;
@@ -44,6 +44,10 @@ fn open_source(stage: &mut StageContext) -> anyhow::Result<Box<dyn Source>> {
         CameraSource::Drives => {
             let drives = stage.args.drives.unwrap_or(stage.graph.camera.drives);
             Ok(Box::new(DriveSource::open(&stage.dataset, &stage.checkpoint, &stage.graph, drives)?))
+        }
+        CameraSource::FreeDrives => {
+            let drives = stage.args.drives.unwrap_or(stage.graph.camera.drives);
+            Ok(Box::new(FreeDriveSource::open(&stage.graph, drives)?))
         }
         CameraSource::Folder => {
             let folder = match &stage.graph.camera.folder {

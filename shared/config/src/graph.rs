@@ -168,6 +168,9 @@ pub enum CameraSource {
     /// Drives through a data set.
     #[default]
     Drives,
+    /// Drives through the scenario itself (`run.scenario`), rendered as they go: the ego moves, and no pose is one of a
+    /// data set.
+    FreeDrives,
     /// The pictures of a folder, in the order of their names.
     Folder,
 }
@@ -207,7 +210,8 @@ impl Default for NoiseConfig {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct CameraConfig {
-    /// `drives` through the data set, or the pictures of a `folder`. Default `drives`.
+    /// `drives` through the data set, `free-drives` through the scenario, or the pictures of a `folder`. Default
+    /// `drives`.
     pub source: CameraSource,
     /// The folder, when `source` is `folder`. Default: the data set's `images`.
     pub folder: Option<PathBuf>,
@@ -217,11 +221,11 @@ pub struct CameraConfig {
     pub frames_per_timestamp: u32,
     /// The sensor's noise, drawn anew for each frame.
     pub noise: NoiseConfig,
-    /// Which poses drives are taken from: `trained` (the paper's setting) or `unseen`. Default `trained`.
+    /// Which poses `drives` are taken from: `trained` (the paper's setting) or `unseen`. Default `trained`.
     pub poses: PoseChoice,
     /// Seed of the split into trained and unseen poses, in place of the checkpoint's. Default: none.
     pub split_seed: Option<u64>,
-    /// Begin again at the end, for ever. Default false.
+    /// Begin again at the end, for ever; free drives never repeat, they just go on. Default false.
     pub repeat: bool,
     /// Time to stay after the last frame, so that it can be worked on, milliseconds, 0 to 60000. Default 500.
     pub linger_ms: u64,
@@ -528,6 +532,10 @@ impl GraphConfig {
         within(source, "threads.renderer", threads.renderer, 1..=256)?;
         let camera = &self.camera;
         within(source, "camera.drives", camera.drives, 1..=100_000)?;
+        if camera.source == CameraSource::FreeDrives && run.scenario.is_none() {
+            let allowed = "`free-drives` where `run.scenario` says what to render".to_owned();
+            return Err(source.range("camera.source", "\"free-drives\"".to_owned(), allowed));
+        }
         within(source, "camera.frames_per_timestamp", camera.frames_per_timestamp, 1..=1000)?;
         within(source, "camera.noise.sigma", camera.noise.sigma, 0.0..=64.0)?;
         within(source, "camera.noise.gain_sigma", camera.noise.gain_sigma, 0.0..=0.5)?;

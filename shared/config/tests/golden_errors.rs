@@ -20,6 +20,11 @@ fn wrong_files_have_golden_messages() {
             "graph.toml:5: `run.horizn`: unknown field `horizn`, expected one of `name`, `seed`, `dataset`, `scenario`, \
              `checkpoint`, `horizon`, `samples`, `sampling`, `frame_rate_hz`, `busy_polling`",
         ),
+        (
+            format!("{HEAD}[camera]\nsource = \"free-drives\"\n"),
+            "graph.toml:6: `camera.source` is \"free-drives\"; allowed: `free-drives` where `run.scenario` says what to \
+             render",
+        ),
         (format!("{HEAD}horizon = 9\n"), "graph.toml:5: `run.horizon` is 9; allowed: 1 to 8"),
         (
             format!("{HEAD}horizon = \"two\"\n"),

@@ -1,10 +1,11 @@
 //! Drives through a set: a hidden course of events, seen from one pose, timestamp by timestamp.
 //!
-//! A trial of the planner is an input view with one right answer (section 4.3 of the paper). Hazard: the actor's
-//! branch, and the actor is not visible. Clear: the other branch, and its place is fully visible. The last timestamp
-//! is no input, as nothing comes after it.
+//! A trial of the planner is an input view with one right answer (section 4.3 of the paper). Hazard: a hazard branch,
+//! and nothing seen tells so: the actor is not visible, or the state is one that a clear branch has as well. Clear:
+//! another branch, its place is fully visible, and the state is none of a hazard branch. The last timestamp is no input,
+//! as nothing comes after it. Where no branch is a hazard, every input is a clear one.
 
-use crate::{Dataset, Observability};
+use crate::{Dataset, Observability, ScenarioInfo};
 use carff_random::Key;
 use rand::Rng;
 use rand::seq::SliceRandom;
@@ -81,20 +82,46 @@ pub enum DrivesError {
     },
 }
 
+impl ScenarioInfo {
+    /// The right answer to a view of a state, if there is one: see the module's text.
+    pub fn trial_kind(
+        &self,
+        branch: usize,
+        timestamp: usize,
+        observability: Option<Observability>,
+    ) -> Option<DriveKind> {
+        if timestamp + 2 > self.timestamps || branch >= self.branches.len() {
+            return None;
+        }
+        if self.hazard_branches.is_empty() {
+            return Some(DriveKind::Clear);
+        }
+        match (self.is_hazard(branch), self.is_undecided(branch, timestamp), observability) {
+            (true, true, _) | (true, false, Some(Observability::None)) => Some(DriveKind::Hazard),
+            (false, false, Some(Observability::Full)) => Some(DriveKind::Clear),
+            _ => None,
+        }
+    }
+
+    /// Whether a branch with the other right action has the very same state at this timestamp: the same known boxes.
+    fn is_undecided(&self, branch: usize, timestamp: usize) -> bool {
+        let boxes = |b: usize| self.state(b, timestamp).and_then(|s| self.states.get(s)).map(|s| &s.boxes);
+        let own = boxes(branch).filter(|boxes| !boxes.is_empty());
+        own.is_some()
+            && (0..self.branches.len()).any(|b| self.is_hazard(b) != self.is_hazard(branch) && boxes(b) == own)
+    }
+}
+
 /// All input views with one right answer among some poses, in the order of poses, branches and timestamps.
 pub fn eligible_inputs(dataset: &Dataset, views: &[usize]) -> Result<Vec<EligibleInput>, DrivesError> {
     let scenario = dataset.scenario().ok_or(DrivesError::NoScenario)?;
     let mut inputs = Vec::new();
     for frame in dataset.frames() {
         let (Some(view), Some(branch), Some(timestamp)) = (frame.view, frame.branch, frame.timestamp) else { continue };
-        if !views.contains(&view) || timestamp + 2 > scenario.timestamps {
+        if !views.contains(&view) {
             continue;
         }
-        let kind = match (scenario.is_hazard(branch), frame.observability) {
-            (true, Some(Observability::None)) => DriveKind::Hazard,
-            (false, Some(Observability::Full)) => DriveKind::Clear,
-            _ => continue,
-        };
+        let Some(kind) = scenario.trial_kind(branch, timestamp, frame.observability) else { continue };
         inputs.push(EligibleInput { view, branch, timestamp, kind });
     }
     inputs.sort_by_key(|i| (i.view, i.branch, i.timestamp));
@@ -102,13 +129,12 @@ pub fn eligible_inputs(dataset: &Dataset, views: &[usize]) -> Result<Vec<Eligibl
 }
 
 /// Plans drives: hazard and clear ones in turn, their poses drawn by seed out of `views` without replacement while
-/// they last. The same arguments give the same drives.
+/// they last; clear ones alone where the scenario has no hazard. The same arguments give the same drives.
 pub fn plan_drives(dataset: &Dataset, views: &[usize], count: usize, seed: u64) -> Result<Vec<Drive>, DrivesError> {
     let scenario = dataset.scenario().ok_or(DrivesError::NoScenario)?;
     let inputs = eligible_inputs(dataset, views)?;
     let mut rng = carff_random::stream(Key { seed, frame: STREAM, step: 0, sample: 0 });
-    let mut deck = |kind: DriveKind| -> Result<Vec<Drive>, DrivesError> {
-        let wanted = count.div_ceil(2);
+    let mut deck = |kind: DriveKind, wanted: usize| -> Result<Vec<Drive>, DrivesError> {
         // One entry for each pose, with all its inputs of this kind.
         let mut poses: Vec<(usize, Vec<EligibleInput>)> = Vec::new();
         for input in inputs.iter().filter(|i| i.kind == kind) {
@@ -138,14 +164,18 @@ pub fn plan_drives(dataset: &Dataset, views: &[usize], count: usize, seed: u64) 
         }
         Ok(drives)
     };
-    let (hazard, clear) = (deck(DriveKind::Hazard)?, deck(DriveKind::Clear)?);
+    if scenario.hazard_branches.is_empty() {
+        return deck(DriveKind::Clear, count);
+    }
+    let wanted = count.div_ceil(2);
+    let (hazard, clear) = (deck(DriveKind::Hazard, wanted)?, deck(DriveKind::Clear, wanted)?);
     Ok(hazard.into_iter().zip(clear).flat_map(|(h, c)| [h, c]).take(count).collect())
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{DatasetWriter, FrameRecord, Image, ScenarioInfo};
+    use crate::{DatasetWriter, FrameRecord, Image};
     use carff_geometry::PinholeCamera;
 
     /// Two branches (0 holds the hazard) x three timestamps x six poses: pose 0 to 2 see nothing of the actor,
@@ -168,20 +198,7 @@ mod tests {
             });
             records.push(record);
         }
-        let scenario = ScenarioInfo {
-            name: "test".into(),
-            bounds: [[-1.0; 3], [1.0; 3]],
-            branches: vec!["hazard".into(), "clear".into()],
-            timestamps: 3,
-            bev_view: None,
-            states: Vec::new(),
-            candidates: Vec::new(),
-            static_boxes: Vec::new(),
-            hazard_branches: vec![0],
-            hazard_action: "halt".into(),
-            clear_action: "advance".into(),
-        };
-        writer.finish(&records, Some(&scenario)).unwrap();
+        writer.finish(&records, Some(&scenario(Vec::new()))).unwrap();
         Dataset::open(folder).unwrap()
     }
 
@@ -195,6 +212,59 @@ mod tests {
         assert_eq!(inputs.iter().filter(|i| i.kind == DriveKind::Hazard).count(), 6);
         assert_eq!(inputs.iter().filter(|i| i.kind == DriveKind::Clear).count(), 4);
         assert!(inputs.iter().all(|i| i.timestamp < 2 && (i.branch == 0) == (i.view < 3) && i.view < 5));
+    }
+
+    fn scenario(states: Vec<crate::StateInfo>) -> ScenarioInfo {
+        ScenarioInfo {
+            name: "test".into(),
+            bounds: [[-1.0; 3], [1.0; 3]],
+            branches: vec!["hazard".into(), "clear".into()],
+            timestamps: 3,
+            bev_view: None,
+            states,
+            candidates: Vec::new(),
+            static_boxes: Vec::new(),
+            hazard_branches: vec![0],
+            hazard_action: "halt".into(),
+            clear_action: "advance".into(),
+        }
+    }
+
+    /// Where both branches are one state, however well it is seen, care is right in the hazard branch, and the clear one
+    /// is no trial. Where they differ, what is seen decides. Without hazards every view but the last step's is clear.
+    #[test]
+    fn undecided_states_and_no_hazard() {
+        use crate::{NamedBox, StateInfo};
+        let at = |x: f64| NamedBox {
+            name: "actor".into(),
+            role: None,
+            oriented_box: carff_geometry::OrientedBox { center: [x, 0.0, 1.0], half_size: [1.0; 3], yaw: 0.0 },
+            dynamic: true,
+        };
+        let places = [[0.0, 6.0, 12.0], [0.0, 3.0, 6.0]];
+        let state = |s: usize| {
+            let (branch, timestamp) = (s / 3, s % 3);
+            StateInfo { branch, timestamp, boxes: vec![at(places[branch][timestamp])] }
+        };
+        let mut merge = scenario((0..6).map(state).collect());
+        let [full, none] = [Observability::Full, Observability::None].map(Some);
+        for (branch, timestamp, seen, expected) in [
+            (0, 0, full, Some(DriveKind::Hazard)),
+            (0, 0, none, Some(DriveKind::Hazard)),
+            (1, 0, full, None),
+            (1, 0, none, None),
+            (0, 1, full, None),
+            (0, 1, none, Some(DriveKind::Hazard)),
+            (1, 1, full, Some(DriveKind::Clear)),
+            (1, 1, none, None),
+            (0, 2, none, None),
+            (1, 2, full, None),
+        ] {
+            assert_eq!(merge.trial_kind(branch, timestamp, seen), expected, "{branch} {timestamp} {seen:?}");
+        }
+        merge.hazard_branches.clear();
+        assert_eq!(merge.trial_kind(0, 1, none), Some(DriveKind::Clear));
+        assert_eq!(merge.trial_kind(0, 2, full), None);
     }
 
     /// Half the drives are hazard ones, poses repeat only when all were used, and the same seed plans the same.

@@ -158,12 +158,14 @@ fn hidden_pairs(dataset: &Dataset, images: &[Image]) -> Vec<HiddenPair> {
             hidden.entry((view, timestamp)).or_default().push((branch, i));
         }
     }
-    let is_hazard = |branch: usize| dataset.scenario().is_some_and(|s| s.is_hazard(branch));
+    // Where no branch is a hazard, all of them are compared.
+    let hazards = dataset.scenario().map_or(&[][..], |s| &s.hazard_branches);
+    let alike = |a: usize, b: usize| !hazards.is_empty() && hazards.contains(&a) == hazards.contains(&b);
     let mut pairs = Vec::new();
     for ((view, timestamp), branches) in hidden {
         for (n, &(branch_a, a)) in branches.iter().enumerate() {
             for &(branch_b, b) in &branches[n + 1..] {
-                if is_hazard(branch_a) == is_hazard(branch_b) || images[a].rgb.len() != images[b].rgb.len() {
+                if alike(branch_a, branch_b) || images[a].rgb.len() != images[b].rgb.len() {
                     continue;
                 }
                 let differences = images[a].rgb.iter().zip(&images[b].rgb).map(|(a, b)| a.abs_diff(*b));

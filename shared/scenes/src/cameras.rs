@@ -18,25 +18,32 @@ pub struct ScenarioCamera {
     pub camera: PinholeCamera,
 }
 
-/// Cameras keep this far from static things, metres.
-const CLEARANCE_M: f32 = 0.45;
+/// Of the clearance from static things, the share that is kept above the ground.
+const ABOVE_GROUND: f32 = 0.3 / 0.45;
+/// And from where moving things can be.
+const FROM_MOVING: f32 = 0.05 / 0.45;
 /// Places tried for each camera before giving up.
 const MAX_TRIES: usize = 400;
 
 /// Spaces where no camera may be.
 pub(crate) struct Obstacles {
     boxes: Vec<Aabb>,
+    lowest: f32,
 }
 
 impl Obstacles {
-    pub fn new(still: impl Iterator<Item = Aabb>, moving: impl Iterator<Item = Aabb>) -> Self {
+    /// `clearance_m` is that of static things.
+    pub fn new(clearance_m: f32, still: impl Iterator<Item = Aabb>, moving: impl Iterator<Item = Aabb>) -> Self {
         let grow = |aabb: Aabb, by: f32| Aabb::new(aabb.mins - Vec3::splat(by), aabb.maxs + Vec3::splat(by));
-        Self { boxes: still.map(|a| grow(a, CLEARANCE_M)).chain(moving.map(|a| grow(a, 0.05))).collect() }
+        let still = still.map(|a| grow(a, clearance_m));
+        let moving = moving.map(|a| grow(a, FROM_MOVING * clearance_m));
+        Self { boxes: still.chain(moving).collect(), lowest: ABOVE_GROUND * clearance_m }
     }
 
-    fn clear(&self, at: [f64; 3]) -> bool {
+    /// Whether a camera may stand there.
+    pub fn clear(&self, at: [f64; 3]) -> bool {
         let p = Vec3::from_array(at.map(|v| v as f32));
-        p.z > 0.3
+        p.z > self.lowest
             && !self.boxes.iter().any(|b| {
                 p.x > b.mins.x && p.y > b.mins.y && p.z > b.mins.z && p.x < b.maxs.x && p.y < b.maxs.y && p.z < b.maxs.z
             })
@@ -158,18 +165,14 @@ fn dash(
     })
 }
 
-fn dash_at(
-    config: &ScenarioConfig,
-    group: &DashConfig,
-    [x, y, yaw]: [f64; 3],
-    turn: f64,
-    [f, h, d]: [f64; 3],
-) -> Candidate {
-    let heading = yaw + mix(group.left_deg, turn).to_radians();
-    let down = mix(group.down_deg, d).to_radians();
-    let forward = mix(group.forward_m, f);
-    let eye = [x + forward * yaw.cos(), y + forward * yaw.sin(), mix(group.height_m, h)];
-    let target = [eye[0] + down.cos() * heading.cos(), eye[1] + down.cos() * heading.sin(), eye[2] - down.sin()];
+fn dash_at(config: &ScenarioConfig, group: &DashConfig, place: [f64; 3], turn: f64, [f, h, d]: [f64; 3]) -> Candidate {
+    let mount = Mount {
+        forward_m: mix(group.forward_m, f),
+        height_m: mix(group.height_m, h),
+        left: mix(group.left_deg, turn).to_radians(),
+        down: mix(group.down_deg, d).to_radians(),
+    };
+    let (eye, target) = mount.at(place);
     (eye, look(config, &group.view_kind, eye, target, [0.0, 0.0, 1.0]))
 }
 
@@ -182,6 +185,48 @@ fn street_at(config: &ScenarioConfig, group: &StreetConfig, eye: [f64; 3], targe
     (eye, look(config, &group.view_kind, eye, target, [0.0, 0.0, 1.0]))
 }
 
+/// The groups that cameras are drawn from, each with its share.
+struct Groups<'a>(Vec<(usize, Group<'a>)>);
+
+impl<'a> Groups<'a> {
+    fn new(config: &'a ScenarioConfig, places: impl Fn(&str) -> Vec<[f64; 3]>) -> Self {
+        let dash = |group: &'a DashConfig| {
+            let places = places(group.vehicle.get_ref());
+            (group.count_per_place * places.len(), Group::Dash(group, places))
+        };
+        let groups = (config.orbit.iter().map(|g| (g.count, Group::Orbit(g))))
+            .chain(config.overhead.iter().map(|g| (g.count, Group::Overhead(g))))
+            .chain(config.dash.iter().map(dash))
+            .chain(config.street.iter().map(|g| (g.count, Group::Street(g))));
+        Self(groups.collect())
+    }
+
+    /// One camera that stands clear, or the key of the group that found no room.
+    fn draw(
+        &self,
+        config: &ScenarioConfig,
+        obstacles: &Obstacles,
+        rng: &mut impl Rng,
+    ) -> Result<ScenarioCamera, &'static str> {
+        let total: usize = self.0.iter().map(|(share, _)| share).sum();
+        if total == 0 {
+            return Err("orbit");
+        }
+        let mut nth = rng.random_range(0..total);
+        let group = self.0.iter().find(|(share, _)| {
+            let here = nth < *share;
+            nth = nth.saturating_sub(*share);
+            here
+        });
+        let (_, group) = group.ok_or("orbit")?;
+        (0..MAX_TRIES)
+            .map(|_| group.candidate(config, rng))
+            .find(|(eye, _)| obstacles.clear(*eye))
+            .map(|(_, camera)| camera)
+            .ok_or(group.key())
+    }
+}
+
 /// `count` cameras drawn at random from the ranges of the fixed ones, each group as often as its share of those; or
 /// the key of the group that found no room.
 pub(crate) fn free_cameras(
@@ -191,34 +236,53 @@ pub(crate) fn free_cameras(
     count: usize,
     seed: u64,
 ) -> Result<Vec<ScenarioCamera>, &'static str> {
-    let dash: Vec<(&DashConfig, Vec<[f64; 3]>)> =
-        config.dash.iter().map(|group| (group, places(group.vehicle.get_ref()))).collect();
-    let groups: Vec<(usize, Group)> = (config.orbit.iter().map(|g| (g.count, Group::Orbit(g))))
-        .chain(config.overhead.iter().map(|g| (g.count, Group::Overhead(g))))
-        .chain(dash.iter().map(|(g, places)| (g.count_per_place * places.len(), Group::Dash(g, places))))
-        .chain(config.street.iter().map(|g| (g.count, Group::Street(g))))
-        .collect();
-    let total: usize = groups.iter().map(|(share, _)| share).sum();
-    if total == 0 {
-        return Err("orbit");
-    }
+    let groups = Groups::new(config, places);
     (0..count)
         .map(|i| {
             let mut rng = carff_random::stream(Key { seed, frame: i as u64, step: FREE_STREAM, sample: 0 });
-            let mut nth = rng.random_range(0..total);
-            let group = groups.iter().find(|(share, _)| {
-                let here = nth < *share;
-                nth = nth.saturating_sub(*share);
-                here
-            });
-            let (_, group) = group.ok_or("orbit")?;
-            (0..MAX_TRIES)
-                .map(|_| group.candidate(config, &mut rng))
-                .find(|(eye, _)| obstacles.clear(*eye))
-                .map(|(_, camera)| camera)
-                .ok_or(group.key())
+            groups.draw(config, obstacles, &mut rng)
         })
         .collect()
+}
+
+/// One camera drawn as [`free_cameras`] does, from a stream of the caller's.
+pub(crate) fn free_camera(
+    config: &ScenarioConfig,
+    obstacles: &Obstacles,
+    places: impl Fn(&str) -> Vec<[f64; 3]>,
+    rng: &mut impl Rng,
+) -> Result<ScenarioCamera, &'static str> {
+    Groups::new(config, places).draw(config, obstacles, rng)
+}
+
+/// How a camera sits on a vehicle's roof.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Mount {
+    pub forward_m: f64,
+    pub height_m: f64,
+    /// Left of straight ahead, and below the horizon, radians.
+    pub left: f64,
+    pub down: f64,
+}
+
+impl Mount {
+    /// Drawn from the ranges of a group.
+    pub fn draw(group: &DashConfig, rng: &mut impl Rng) -> Self {
+        Self {
+            forward_m: mix(group.forward_m, rng.random()),
+            height_m: mix(group.height_m, rng.random()),
+            left: mix(group.left_deg, rng.random()).to_radians(),
+            down: mix(group.down_deg, rng.random()).to_radians(),
+        }
+    }
+
+    /// Where it is and looks when the vehicle stands at x, y, turned by yaw: eye and target.
+    pub fn at(&self, [x, y, yaw]: [f64; 3]) -> ([f64; 3], [f64; 3]) {
+        let heading = yaw + self.left;
+        let eye = [x + self.forward_m * yaw.cos(), y + self.forward_m * yaw.sin(), self.height_m];
+        let ahead = [self.down.cos() * heading.cos(), self.down.cos() * heading.sin(), -self.down.sin()];
+        (eye, [0, 1, 2].map(|i| eye[i] + ahead[i]))
+    }
 }
 
 /// Names this use of a seed.
@@ -227,7 +291,7 @@ const FREE_STREAM: u32 = 0x6672_6565;
 enum Group<'a> {
     Orbit(&'a OrbitConfig),
     Overhead(&'a OverheadConfig),
-    Dash(&'a DashConfig, &'a [[f64; 3]]),
+    Dash(&'a DashConfig, Vec<[f64; 3]>),
     Street(&'a StreetConfig),
 }
 

@@ -36,6 +36,9 @@ pub struct ScenarioConfig {
     /// Colour of the open ground, `#rrggbb`.
     #[serde(default = "default_ground", deserialize_with = "colour")]
     pub ground_colour: [f32; 3],
+    /// What the open ground is: `grass` or `plain`.
+    #[serde(default)]
+    pub ground_surface: GroundSurface,
     /// Asphalt strips on the ground.
     #[serde(default)]
     pub road: Vec<RoadConfig>,
@@ -57,6 +60,15 @@ pub struct ScenarioConfig {
     /// Everything that drives or is parked.
     #[serde(default)]
     pub vehicle: Vec<VehicleConfig>,
+    /// Things made of simple forms, still or moving.
+    #[serde(default)]
+    pub object: Vec<ObjectConfig>,
+    /// Least distance of cameras from static things, 0.001 to 100.
+    #[serde(default = "default_clearance", deserialize_with = "clearance")]
+    pub clearance_m: f64,
+    /// Light from the sky is blocked by what is nearer than this: about the size of what casts soft shadows, 0.001 to 100.
+    #[serde(default = "default_shade_reach", deserialize_with = "clearance")]
+    pub shade_reach_m: f64,
     /// Cameras on a dome that look inwards. Views are numbered in the order orbit, overhead, dash, street.
     #[serde(default)]
     pub orbit: Vec<OrbitConfig>,
@@ -166,6 +178,17 @@ pub struct MarkingConfig {
     /// Its colour, `#rrggbb`.
     #[serde(default = "default_marking", deserialize_with = "colour")]
     pub colour: [f32; 3],
+}
+
+/// What the open ground is.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum GroundSurface {
+    /// Grass.
+    #[default]
+    Grass,
+    /// Its one colour.
+    Plain,
 }
 
 /// What a slab is covered with.
@@ -368,6 +391,142 @@ pub struct CourseConfig {
     pub poses: Spanned<Vec<[f64; 3]>>,
 }
 
+/// A thing made of simple forms. Their places are in the thing's own axes: +X ahead, +Y left, +Z up.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ObjectConfig {
+    /// Its name, as it appears among the boxes.
+    pub name: String,
+    /// Its part: `actor`, `static`, or any other word.
+    pub role: String,
+    /// Whether its presence or motion is what the forecast is about. At most one vehicle or object is.
+    #[serde(default)]
+    pub dynamic: bool,
+    /// Name of the dynamic object, if this one is there and gone with it, as an arm with its hand.
+    pub follows: Option<Spanned<String>>,
+    /// Where it always is, when it has no course: x, y, z, yaw in degrees.
+    #[serde(default, deserialize_with = "pose4")]
+    pub at: [f64; 4],
+    /// Cuboids.
+    #[serde(default, rename = "box")]
+    pub boxes: Vec<BoxConfig>,
+    /// Ellipsoids.
+    #[serde(default)]
+    pub ellipsoid: Vec<EllipsoidConfig>,
+    /// Cylinders.
+    #[serde(default)]
+    pub cylinder: Vec<RodConfig>,
+    /// Cylinders with round ends.
+    #[serde(default)]
+    pub capsule: Vec<RodConfig>,
+    /// Where it is. In a branch that no course names, it is absent.
+    #[serde(default)]
+    pub course: Vec<ObjectCourseConfig>,
+}
+
+/// A cuboid.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct BoxConfig {
+    /// Its middle.
+    #[serde(deserialize_with = "point3")]
+    pub center: [f64; 3],
+    /// Its edges, whole lengths.
+    #[serde(deserialize_with = "edges")]
+    pub size_m: [f64; 3],
+    /// Yaw about +Z, pitch (nose down) and roll (left side up), one after the other.
+    #[serde(default, deserialize_with = "point3")]
+    pub turn_deg: [f64; 3],
+    /// Its colour, `#rrggbb`; with `faces`, that of the joints.
+    #[serde(deserialize_with = "colour")]
+    pub colour: [f32; 3],
+    /// A second colour, in squares.
+    pub checks: Option<ChecksConfig>,
+    /// Colours of its sides.
+    pub faces: Option<FacesConfig>,
+    /// Variants of the object that have this part. Default: all.
+    #[serde(default)]
+    pub variants: Vec<String>,
+}
+
+/// Squares of a second colour.
+#[derive(Clone, Copy, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ChecksConfig {
+    /// The second colour, `#rrggbb`.
+    #[serde(deserialize_with = "colour")]
+    pub colour: [f32; 3],
+    /// Edge of a square.
+    #[serde(deserialize_with = "positive")]
+    pub size_m: f64,
+}
+
+/// Colours of the six sides of a cuboid.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct FacesConfig {
+    /// +X, -X, +Y, -Y, +Z, -Z, each `#rrggbb`.
+    #[serde(deserialize_with = "six_colours")]
+    pub colours: [[f32; 3]; 6],
+    /// Squares along each edge, 1 to 64.
+    #[serde(default = "one", deserialize_with = "count")]
+    pub tiles: usize,
+}
+
+/// An ellipsoid.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct EllipsoidConfig {
+    /// Its middle.
+    #[serde(deserialize_with = "point3")]
+    pub center: [f64; 3],
+    /// Its diameters.
+    #[serde(deserialize_with = "edges")]
+    pub size_m: [f64; 3],
+    /// As that of a box.
+    #[serde(default, deserialize_with = "point3")]
+    pub turn_deg: [f64; 3],
+    /// Its colour, `#rrggbb`.
+    #[serde(deserialize_with = "colour")]
+    pub colour: [f32; 3],
+    /// Variants of the object that have this part. Default: all.
+    #[serde(default)]
+    pub variants: Vec<String>,
+}
+
+/// A cylinder or capsule.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RodConfig {
+    /// Start of its axis. A capsule's round end begins there.
+    #[serde(deserialize_with = "point3")]
+    pub from: [f64; 3],
+    /// End of its axis.
+    #[serde(deserialize_with = "point3")]
+    pub to: [f64; 3],
+    /// Its radius.
+    #[serde(deserialize_with = "positive")]
+    pub radius_m: f64,
+    /// Its colour, `#rrggbb`.
+    #[serde(deserialize_with = "colour")]
+    pub colour: [f32; 3],
+    /// Variants of the object that have this part. Default: all.
+    #[serde(default)]
+    pub variants: Vec<String>,
+}
+
+/// Where an object is in some branches.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ObjectCourseConfig {
+    /// Names of the branches.
+    pub branches: Vec<Spanned<String>>,
+    /// One [x, y, z, yaw in degrees] per timestamp.
+    pub poses: Spanned<Vec<[f64; 4]>>,
+    /// One variant per timestamp: which parts it has then. Default: those that name no variant.
+    pub variants: Option<Spanned<Vec<String>>>,
+}
+
 /// Cameras on a dome, spread by the golden angle.
 #[derive(Clone, Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -462,6 +621,14 @@ fn default_trim() -> [f32; 3] {
     parse_colour("#d8d2c4").unwrap_or([0.7; 3])
 }
 
+fn default_clearance() -> f64 {
+    0.45
+}
+
+fn default_shade_reach() -> f64 {
+    1.6
+}
+
 fn one() -> usize {
     1
 }
@@ -489,6 +656,16 @@ fn parse_colour(text: &str) -> Option<[f32; 3]> {
 fn colour<'de, D: Deserializer<'de>>(d: D) -> Result<[f32; 3], D::Error> {
     let text = String::deserialize(d)?;
     parse_colour(&text).ok_or_else(|| D::Error::custom(format!("`{text}` is not a colour; write `#rrggbb`")))
+}
+
+fn six_colours<'de, D: Deserializer<'de>>(d: D) -> Result<[[f32; 3]; 6], D::Error> {
+    let texts = <[String; 6]>::deserialize(d)?;
+    let mut colours = [[0.0; 3]; 6];
+    for (colour, text) in colours.iter_mut().zip(&texts) {
+        *colour =
+            parse_colour(text).ok_or_else(|| D::Error::custom(format!("`{text}` is not a colour; write `#rrggbb`")))?;
+    }
+    Ok(colours)
 }
 
 fn in_range<'de, D: Deserializer<'de>>(d: D, low: f64, high: f64, what: &str) -> Result<f64, D::Error> {
@@ -563,6 +740,23 @@ fn point2<'de, D: Deserializer<'de>>(d: D) -> Result<[f64; 2], D::Error> {
 
 fn point3<'de, D: Deserializer<'de>>(d: D) -> Result<[f64; 3], D::Error> {
     vector(d)
+}
+
+fn pose4<'de, D: Deserializer<'de>>(d: D) -> Result<[f64; 4], D::Error> {
+    vector(d)
+}
+
+fn edges<'de, D: Deserializer<'de>>(d: D) -> Result<[f64; 3], D::Error> {
+    let size = vector(d)?;
+    if size.iter().all(|v| (1e-3..=1e4).contains(v)) {
+        Ok(size)
+    } else {
+        Err(D::Error::custom("a length is out of range; 0.001 to 10000 is allowed"))
+    }
+}
+
+fn clearance<'de, D: Deserializer<'de>>(d: D) -> Result<f64, D::Error> {
+    in_range(d, 1e-3, 100.0, "a length")
 }
 
 fn size3<'de, D: Deserializer<'de>>(d: D) -> Result<[f64; 3], D::Error> {

@@ -58,6 +58,20 @@ pub enum ScenarioError {
         /// The group of cameras.
         key: &'static str,
     },
+    /// No drive of a kind was found.
+    #[error(
+        "{}: none of {tries} drawn drives is a {} trial: the scenario needs branches with and without a hazard, and \
+         cameras that see nothing, or all, of the actor before the last timestamp",
+        path.display(), kind.name()
+    )]
+    NoDrive {
+        /// The scenario file.
+        path: PathBuf,
+        /// Which kind.
+        kind: carff_dataset::drives::DriveKind,
+        /// How many were drawn.
+        tries: u32,
+    },
     /// The set cannot be written.
     #[error(transparent)]
     Dataset(#[from] DatasetError),

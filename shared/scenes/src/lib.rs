@@ -17,7 +17,9 @@
 mod cameras;
 pub mod config;
 mod error;
+mod free_drives;
 mod materials;
+mod movers;
 mod scenario;
 mod scenery;
 mod shapes;
@@ -25,6 +27,7 @@ mod tracer;
 
 pub use cameras::ScenarioCamera;
 pub use error::ScenarioError;
+pub use free_drives::{FreeDrive, FreeFrame};
 pub use scenario::{
     ActorView, Detail, Extras, FULL_FRACTION, FULL_PIXELS, NONE_FRACTION, NONE_MEAN_DIFFERENCE, RenderOptions,
     Rendering, Scenario,

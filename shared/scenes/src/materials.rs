@@ -65,6 +65,23 @@ pub(crate) enum Material {
         size: f32,
         strength: f32,
     },
+    /// One colour.
+    Plain {
+        colour: Vec3,
+    },
+    /// Two colours in turn, in squares of the given size, in the solid's own axes.
+    Checks {
+        colours: [Vec3; 2],
+        size: f32,
+    },
+    /// A cuboid whose sides have colours of their own: +X, -X, +Y, -Y, +Z, -Z; `tiles` squares a side, with joints of
+    /// the ground colour between them.
+    Faces {
+        half: Vec3,
+        colours: [Vec3; 6],
+        joint: Vec3,
+        tiles: f32,
+    },
     /// Slabs with joints.
     Slabs {
         colour: Vec3,
@@ -154,6 +171,24 @@ impl Material {
         match self {
             Self::Mottled { colour, size, strength } => {
                 Surface::matte(*colour * (1.0 + strength * blotches(world, *size, footprint)))
+            }
+            Self::Plain { colour } => Surface::matte(*colour),
+            Self::Checks { colours, size } => {
+                // A hair's breadth inwards, so that a face that lies on a boundary shows one layer of squares.
+                let cell = ((local - normal * (0.01 * size)) / *size).floor();
+                let odd = (cell.x + cell.y + cell.z).rem_euclid(2.0) > 0.5;
+                let (a, b) = if odd { (colours[1], colours[0]) } else { (colours[0], colours[1]) };
+                let seen = resolved(*size, footprint);
+                Surface::matte(a * (0.5 + 0.5 * seen) + b * (0.5 - 0.5 * seen))
+            }
+            Self::Faces { half, colours, joint, tiles } => {
+                let axis = (0..3).max_by(|&i, &j| normal[i].abs().total_cmp(&normal[j].abs())).unwrap_or(2);
+                let in_tile = |i: usize| {
+                    let at = (local[i] / half[i] * 0.5 + 0.5).clamp(0.0, 0.999) * tiles;
+                    (0.09..0.91).contains(&at.fract())
+                };
+                let painted = in_tile((axis + 1) % 3) && in_tile((axis + 2) % 3);
+                Surface::matte(if painted { colours[2 * axis + usize::from(normal[axis] < 0.0)] } else { *joint })
             }
             Self::Slabs { colour, size } => {
                 let edge = to_joint(world.x, *size).min(to_joint(world.y, *size));

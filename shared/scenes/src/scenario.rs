@@ -13,7 +13,8 @@ use toml::Spanned;
 use crate::cameras::{Obstacles, ScenarioCamera, cameras, free_cameras};
 use crate::config::ScenarioConfig;
 use crate::error::ScenarioError;
-use crate::scenery::{Body, Pose, Scenery, scenery, vehicle_bodies, vehicle_box};
+use crate::movers::{Mover, Pose, movers};
+use crate::scenery::{Body, Scenery, scenery};
 use crate::tracer::{Scene, Setting, ray};
 
 /// A view is `full` from this visible fraction on.
@@ -70,7 +71,7 @@ pub struct Rendering {
     /// What the ray through each pixel's centre meets first: 0 sky, 1 ground, then objects as in
     /// [`Scenario::object_name`].
     pub object_id: Vec<u16>,
-    /// How much of the actor it shows; `None` when not asked for or when the scenario has no dynamic vehicle.
+    /// How much of the actor it shows; `None` when not asked for or when nothing in the scenario is dynamic.
     pub actor: Option<ActorView>,
 }
 
@@ -85,24 +86,26 @@ pub enum Extras {
     DepthAndMasks,
 }
 
-/// Where each vehicle stands; absent ones are `None`.
-type Placement = Vec<Option<Pose>>;
+/// Where each mover is; absent ones are `None`.
+pub(crate) type Placement = Vec<Option<Pose>>;
+
 /// Where a vehicle stands in any state (x, y, yaw), each place once.
 fn places(config: &ScenarioConfig, placements: &[Vec<Placement>], name: &str) -> Vec<[f64; 3]> {
     let Some(index) = config.vehicle.iter().position(|v| v.name == name) else { return Vec::new() };
-    let mut seen: Vec<Pose> = Vec::new();
+    let mut seen: Vec<[f64; 3]> = Vec::new();
     for pose in (0..config.timestamps).flat_map(|t| placements.iter().filter_map(move |b| b[t][index])) {
-        if !seen.contains(&pose) {
-            seen.push(pose);
+        let place = [pose.position_m[0], pose.position_m[1], pose.yaw];
+        if !seen.contains(&place) {
+            seen.push(place);
         }
     }
     seen
 }
 
-type PlacementKey = Vec<Option<[u64; 3]>>;
+type PlacementKey = Vec<Option<[u64; 5]>>;
 
 fn key_of(placement: &Placement) -> PlacementKey {
-    placement.iter().map(|p| p.map(|p| p.map(f64::to_bits))).collect()
+    placement.iter().map(|p| p.as_ref().map(Pose::key)).collect()
 }
 
 /// A scenario, ready to be rendered.
@@ -116,7 +119,7 @@ pub struct Scenario {
     info: ScenarioInfo,
     /// By branch, then timestamp.
     placements: Vec<Vec<Placement>>,
-    dynamic: Option<usize>,
+    actor: Option<Actor>,
     scenes: HashMap<PlacementKey, Scene>,
 }
 
@@ -168,29 +171,31 @@ impl Scenario {
         let config: ScenarioConfig = toml::from_str(text)
             .map_err(|source| ScenarioError::Toml { path: path.to_owned(), source: Box::new(source) })?;
         let source = Source { path, text };
-        let (placements, dynamic, hazard_branches) = check(&source, &config)?;
+        let (placements, actor, hazard_branches) = check(&source, &config)?;
 
         let scenery = scenery(&config);
         let mut scenes = HashMap::new();
-        let mut still_and_moving: Vec<Body> = Vec::new();
+        let (mut still_bodies, mut moving_bodies): (Vec<Body>, Vec<Body>) = (Vec::new(), Vec::new());
         let mut build = |placement: &Placement| {
             scenes.entry(key_of(placement)).or_insert_with(|| {
-                let vehicles = vehicles(&config, &scenery, placement);
-                still_and_moving.extend(vehicles.iter().cloned());
-                Scene::new(scenery.bodies.iter().cloned().chain(vehicles).collect())
+                let (still, moving) = placed(&config, &scenery, placement);
+                still_bodies.clone_from(&still);
+                moving_bodies.extend(moving.iter().cloned());
+                Scene::new(scenery.bodies.iter().cloned().chain(still).chain(moving).collect())
             });
         };
-        for (branch, steps) in placements.iter().enumerate() {
+        for steps in &placements {
             for (timestamp, placement) in steps.iter().enumerate() {
                 build(placement);
-                for other in counterparts(&placements, dynamic, branch, timestamp) {
+                for other in counterparts(placement, &placements, actor.as_ref(), timestamp) {
                     build(&other);
                 }
             }
         }
         let obstacles = Obstacles::new(
-            scenery.bodies.iter().map(|b| b.solid.aabb()),
-            still_and_moving.iter().map(|b| b.solid.aabb()),
+            config.clearance_m as f32,
+            scenery.bodies.iter().chain(&still_bodies).map(|b| b.solid.aabb()),
+            moving_bodies.iter().map(|b| b.solid.aabb()),
         );
         let places = |name: &str| places(&config, &placements, name);
         let cameras = cameras(&config, &obstacles, places).map_err(|key| {
@@ -214,7 +219,7 @@ impl Scenario {
             cameras,
             info,
             placements,
-            dynamic,
+            actor,
             scenes,
         })
     }
@@ -244,22 +249,56 @@ impl Scenario {
         Ok(self)
     }
 
-    /// Object index of a vehicle by name, as it appears in [`Rendering::object_id`].
-    pub fn object_of_vehicle(&self, name: &str) -> Option<u16> {
-        let index = self.config.vehicle.iter().position(|v| v.name == name)?;
+    /// Object index of a vehicle or object by name, as it appears in [`Rendering::object_id`].
+    pub fn object_of(&self, name: &str) -> Option<u16> {
+        let index = movers(&self.config).position(|m| m.name() == name)?;
         Some(self.scenery.next_object + index as u16)
     }
 
-    /// What an object index stands for: `sky`, `ground`, a vehicle's name, or `static`.
+    /// What an object index stands for: `sky`, `ground`, the name of a vehicle or object, or `static`.
     pub fn object_name(&self, object: u16) -> &str {
         match object {
             0 => "sky",
             1 => "ground",
             _ => object
                 .checked_sub(self.scenery.next_object)
-                .and_then(|i| self.config.vehicle.get(i as usize))
-                .map_or("static", |v| v.name.as_str()),
+                .and_then(|i| movers(&self.config).nth(i as usize))
+                .map_or("static", |m| m.name()),
         }
+    }
+
+    pub(crate) fn config(&self) -> &ScenarioConfig {
+        &self.config
+    }
+
+    pub(crate) fn obstacles(&self) -> &Obstacles {
+        &self.obstacles
+    }
+
+    /// By branch, then timestamp.
+    pub(crate) fn placements(&self) -> &[Vec<Placement>] {
+        &self.placements
+    }
+
+    /// Where a vehicle stands in any state: x, y, yaw.
+    pub(crate) fn places_of(&self, vehicle: &str) -> Vec<[f64; 3]> {
+        places(&self.config, &self.placements, vehicle)
+    }
+
+    /// The picture of a placement that need not be a state's.
+    pub(crate) fn picture_of(&self, placement: &Placement, camera: &PinholeCamera) -> Image {
+        self.scene(placement).picture(&self.setting, camera).0
+    }
+
+    /// How much of the actor is seen in a placement that differs from a state's in who is not the actor.
+    pub(crate) fn observability_of(
+        &self,
+        placement: &Placement,
+        timestamp: usize,
+        camera: &PinholeCamera,
+    ) -> Option<Observability> {
+        let mut shots = Shots { scenario: self, camera, taken: HashMap::new() };
+        Some(self.actor_view(&mut shots, placement, timestamp)?.observability)
     }
 
     /// Takes one picture from any camera.
@@ -273,6 +312,12 @@ impl Scenario {
         camera.validate()?;
         let mut shots = Shots { scenario: self, camera, taken: HashMap::new() };
         self.render_with(&mut shots, branch, timestamp, options.detail)
+    }
+
+    /// Everything, with the movers at a placement.
+    fn scene(&self, placement: &Placement) -> Scene {
+        let (still, moving) = placed(&self.config, &self.scenery, placement);
+        Scene::new(self.scenery.bodies.iter().cloned().chain(still).chain(moving).collect())
     }
 
     fn render_with(
@@ -289,9 +334,9 @@ impl Scenario {
                 branches: self.info.branches.len(),
                 timestamps: self.info.timestamps,
             })?;
-        let actor = match (detail, self.dynamic) {
-            (Detail::Observability, Some(dynamic)) => Some(self.actor_view(shots, branch, timestamp, dynamic)),
-            _ => None,
+        let actor = match detail {
+            Detail::Observability => self.actor_view(shots, placement, timestamp),
+            Detail::Picture => None,
         };
         let shot = shots.take(placement);
         Ok(Rendering {
@@ -303,11 +348,12 @@ impl Scenario {
     }
 
     /// One ray per pixel centre against the actor alone in an unbounded picture, and against everything.
-    fn actor_view(&self, shots: &mut Shots, branch: usize, timestamp: usize, dynamic: usize) -> ActorView {
+    /// `None` when nothing is dynamic.
+    fn actor_view(&self, shots: &mut Shots, placement: &Placement, timestamp: usize) -> Option<ActorView> {
         let camera = shots.camera;
-        let placement = &self.placements[branch][timestamp];
-        let others = counterparts(&self.placements, self.dynamic, branch, timestamp);
-        let vehicle = &self.config.vehicle[dynamic];
+        let others = counterparts(placement, &self.placements, self.actor.as_ref(), timestamp);
+        let dynamic = self.actor.as_ref()?.dynamic;
+        let mover = movers(&self.config).nth(dynamic)?;
         let object = self.scenery.next_object + dynamic as u16;
         let (mut visible, mut would_be) = (0_u32, 0_u32);
         let poses: Vec<Pose> = match placement[dynamic] {
@@ -315,7 +361,7 @@ impl Scenario {
             None => others.iter().filter_map(|o| o[dynamic]).collect(),
         };
         for pose in poses {
-            let alone = Scene::new(vehicle_bodies(vehicle, pose, object));
+            let alone = Scene::new(mover.bodies(pose, object));
             let shot = shots.take(placement);
             let corners = alone.bodies().iter().flat_map(|b| {
                 let aabb = b.solid.aabb();
@@ -357,7 +403,7 @@ impl Scenario {
         } else {
             Observability::Partial
         };
-        ActorView { visible_fraction: fraction as f32, actor_px: visible, observability }
+        Some(ActorView { visible_fraction: fraction as f32, actor_px: visible, observability })
     }
 
     /// Renders every camera in every state into a posed data set, in parallel. `progress` is told how many pictures
@@ -430,7 +476,7 @@ impl Scenario {
             let depth = format!("depth/{name}");
             writer.write_depth(&depth, &rendering.depth_m, w, h)?;
             record.depth_file_path = Some(depth);
-            let object = self.dynamic.map(|d| self.scenery.next_object + d as u16);
+            let object = self.actor.as_ref().map(|a| self.scenery.next_object + a.dynamic as u16);
             let mask: Vec<bool> = rendering.object_id.iter().map(|id| Some(*id) == object).collect();
             let path = format!("masks/{name}");
             writer.write_mask(&path, &mask, w, h)?;
@@ -466,8 +512,7 @@ impl Shots<'_> {
             if let Some(scene) = scenario.scenes.get(key) {
                 return snap(scene);
             }
-            let vehicles = vehicles(&scenario.config, &scenario.scenery, placement);
-            snap(&Scene::new(scenario.scenery.bodies.iter().cloned().chain(vehicles).collect()))
+            snap(&scenario.scene(placement))
         })
     }
 }
@@ -500,50 +545,108 @@ fn reach(camera: &PinholeCamera, points: impl Iterator<Item = [f64; 3]>) -> ([i6
     }
 }
 
-fn vehicles(config: &ScenarioConfig, scenery: &Scenery, placement: &Placement) -> Vec<Body> {
-    let placed = config.vehicle.iter().zip(placement).enumerate();
-    placed
-        .filter_map(|(i, (vehicle, pose))| {
-            pose.map(|pose| vehicle_bodies(vehicle, pose, scenery.next_object + i as u16))
-        })
-        .flatten()
-        .collect()
+/// The solids of still objects, and those of everything else that is placed.
+fn placed(config: &ScenarioConfig, scenery: &Scenery, placement: &Placement) -> (Vec<Body>, Vec<Body>) {
+    let (mut still, mut moving) = (Vec::new(), Vec::new());
+    for (i, (mover, pose)) in movers(config).zip(placement).enumerate() {
+        let Some(pose) = pose else { continue };
+        let bodies = mover.bodies(*pose, scenery.next_object + i as u16);
+        if mover.still().is_some() { &mut still } else { &mut moving }.extend(bodies);
+    }
+    (still, moving)
+}
+
+/// Who the forecast is about, as indices of movers.
+#[derive(Clone, Debug)]
+struct Actor {
+    dynamic: usize,
+    /// Those that are there and gone with it.
+    followers: Vec<usize>,
 }
 
 /// The same placement with the actor gone, where it is there; with the actor at each place that it has at this
 /// timestamp in other branches, where it is not.
 fn counterparts(
+    own: &Placement,
     placements: &[Vec<Placement>],
-    dynamic: Option<usize>,
-    branch: usize,
+    actor: Option<&Actor>,
     timestamp: usize,
 ) -> Vec<Placement> {
-    let Some(dynamic) = dynamic else { return Vec::new() };
-    let own = &placements[branch][timestamp];
-    if own[dynamic].is_some() {
-        let mut without = own.clone();
-        without[dynamic] = None;
-        return vec![without];
+    let Some(actor) = actor else { return Vec::new() };
+    let as_in = |other: Option<&Placement>| {
+        let mut placement = own.clone();
+        for &m in std::iter::once(&actor.dynamic).chain(&actor.followers) {
+            placement[m] = other.and_then(|o| o[m]);
+        }
+        placement
+    };
+    if own[actor.dynamic].is_some() {
+        return vec![as_in(None)];
     }
-    let mut poses: Vec<Pose> = Vec::new();
-    for pose in placements.iter().filter_map(|b| b[timestamp][dynamic]) {
-        if !poses.contains(&pose) {
-            poses.push(pose);
+    let mut all: Vec<Placement> = Vec::new();
+    for other in placements.iter().map(|b| &b[timestamp]).filter(|o| o[actor.dynamic].is_some()) {
+        let with = as_in(Some(other));
+        if !all.contains(&with) {
+            all.push(with);
         }
     }
-    poses
-        .into_iter()
-        .map(|pose| {
-            let mut with = own.clone();
-            with[dynamic] = Some(pose);
-            with
-        })
-        .collect()
+    all
 }
 
-type Checked = (Vec<Vec<Placement>>, Option<usize>, Vec<usize>);
+/// Puts a mover where its courses say; `replaces` puts it there, and says whether it was there already.
+fn place(
+    source: &Source,
+    config: &ScenarioConfig,
+    mover: Mover,
+    branch_index: impl Fn(&Spanned<String>, &str) -> Result<usize, ScenarioError>,
+    mut replaces: impl FnMut(usize, usize, Pose) -> bool,
+) -> Result<(), ScenarioError> {
+    let known = mover.variants();
+    for course in mover.courses() {
+        let each = |found: usize, what: &str| {
+            (found != config.timestamps)
+                .then(|| format!("{found} {what}; one for each of the {} timestamps is needed", config.timestamps))
+        };
+        if let Some(problem) = each(course.poses.len(), "poses") {
+            return Err(source.error(course.poses_at.start, "poses", problem));
+        }
+        if course.poses.iter().flatten().any(|value| value.is_nan() || value.abs() > 1e5) {
+            let problem = match mover {
+                Mover::Vehicle(_) => "a value is out of range; [x, y, yaw in degrees]",
+                Mover::Object(_) => "a value is out of range; [x, y, z, yaw in degrees]",
+            };
+            return Err(source.error(course.poses_at.start, "poses", problem));
+        }
+        let mut variants = vec![None; config.timestamps];
+        if let Some(names) = course.variants {
+            if let Some(problem) = each(names.get_ref().len(), "variants") {
+                return Err(source.error_at(names, "variants", problem));
+            }
+            for (variant, name) in variants.iter_mut().zip(names.get_ref()) {
+                let Some(index) = known.iter().position(|k| k == name) else {
+                    let problem = format!("no part has the variant `{name}`; there are {known:?}");
+                    return Err(source.error_at(names, "variants", problem));
+                };
+                *variant = Some(index);
+            }
+        }
+        for name in course.branches {
+            let branch = branch_index(name, "branches")?;
+            for (timestamp, ([x, y, z, yaw], variant)) in course.poses.iter().zip(&variants).enumerate() {
+                let pose = Pose { position_m: [*x, *y, *z], yaw: yaw.to_radians(), variant: *variant };
+                if replaces(branch, timestamp, pose) {
+                    let problem = format!("`{}` has two courses in branch `{}`", mover.name(), name.get_ref());
+                    return Err(source.error_at(name, "branches", problem));
+                }
+            }
+        }
+    }
+    Ok(())
+}
 
-/// Cross-references: names, lengths of courses, at most one dynamic vehicle.
+type Checked = (Vec<Vec<Placement>>, Option<Actor>, Vec<usize>);
+
+/// Cross-references: names, lengths of courses, at most one dynamic mover.
 fn check(source: &Source, config: &ScenarioConfig) -> Result<Checked, ScenarioError> {
     if config.branches.is_empty() || config.branches.len() > 64 {
         return Err(source.error_in("branches", format!("{} names; from 1 to 64 are allowed", config.branches.len())));
@@ -572,42 +675,34 @@ fn check(source: &Source, config: &ScenarioConfig) -> Result<Checked, ScenarioEr
             return Err(source.error_in(key, format!("`min` {min:?} must be below `max` {max:?} along both axes")));
         }
     }
-    let mut placements = vec![vec![vec![None; config.vehicle.len()]; config.timestamps]; config.branches.len()];
+    let count = movers(config).count();
+    let mut placements = vec![vec![vec![None; count]; config.timestamps]; config.branches.len()];
     let mut dynamic = None;
-    for (v, vehicle) in config.vehicle.iter().enumerate() {
-        if config.vehicle[..v].iter().any(|other| other.name == vehicle.name) {
-            return Err(source.error_in("vehicle", format!("`{}` is named twice", vehicle.name)));
+    for (m, mover) in movers(config).enumerate() {
+        if movers(config).take(m).any(|other| other.name() == mover.name()) {
+            return Err(source.error_in(mover.key(), format!("`{}` is named twice", mover.name())));
         }
-        if vehicle.dynamic && dynamic.replace(v).is_some() {
-            return Err(source.error_in("dynamic", "more than one vehicle is dynamic; at most one may be"));
+        if mover.dynamic() && dynamic.replace(m).is_some() {
+            return Err(source.error_in("dynamic", "more than one vehicle or object is dynamic; at most one may be"));
         }
-        for course in &vehicle.course {
-            let poses = course.poses.get_ref();
-            if poses.len() != config.timestamps {
-                return Err(source.error_at(
-                    &course.poses,
-                    "poses",
-                    format!("{} poses; one for each of the {} timestamps is needed", poses.len(), config.timestamps),
-                ));
-            }
-            if poses.iter().flatten().any(|value| value.is_nan() || value.abs() > 1e5) {
-                return Err(source.error_at(&course.poses, "poses", "a value is out of range; [x, y, yaw in degrees]"));
-            }
-            for name in &course.branches {
-                let branch = branch_index(name, "branches")?;
-                for (timestamp, pose) in poses.iter().enumerate() {
-                    let slot: &mut Option<Pose> = &mut placements[branch][timestamp][v];
-                    if slot.replace([pose[0], pose[1], pose[2].to_radians()]).is_some() {
-                        return Err(source.error_at(
-                            name,
-                            "branches",
-                            format!("`{}` has two courses in branch `{}`", vehicle.name, name.get_ref()),
-                        ));
-                    }
-                }
-            }
+        if let Some(pose) = mover.still() {
+            placements.iter_mut().flatten().for_each(|placement| placement[m] = Some(pose));
         }
+        place(source, config, mover, branch_index, |branch, timestamp, pose| {
+            placements[branch][timestamp][m].replace(pose).is_some()
+        })?;
     }
+    let mut followers = Vec::new();
+    for (m, mover) in movers(config).enumerate() {
+        let Some(leader) = mover.follows() else { continue };
+        let is_leader = |d: usize| movers(config).nth(d).is_some_and(|l| l.name() == leader.get_ref()) && d != m;
+        if !dynamic.is_some_and(is_leader) {
+            let problem = format!("`{}` is no other, dynamic vehicle or object", leader.get_ref());
+            return Err(source.error_at(leader, "follows", problem));
+        }
+        followers.push(m);
+    }
+    let actor = dynamic.map(|dynamic| Actor { dynamic, followers });
     for group in &config.dash {
         if !config.vehicle.iter().any(|v| v.name == *group.vehicle.get_ref()) {
             return Err(source.error_at(
@@ -617,7 +712,7 @@ fn check(source: &Source, config: &ScenarioConfig) -> Result<Checked, ScenarioEr
             ));
         }
     }
-    Ok((placements, dynamic, hazard_branches))
+    Ok((placements, actor, hazard_branches))
 }
 
 fn info(
@@ -631,10 +726,9 @@ fn info(
     for (branch, steps) in placements.iter().enumerate() {
         for (timestamp, placement) in steps.iter().enumerate() {
             let mut boxes = Vec::new();
-            for (vehicle, pose) in config.vehicle.iter().zip(placement) {
-                let Some(pose) = pose else { continue };
-                let named_box = vehicle_box(vehicle, *pose);
-                if vehicle.dynamic {
+            for (mover, pose) in movers(config).zip(placement).filter(|(mover, _)| mover.still().is_none()) {
+                let Some(named_box) = pose.and_then(|pose| mover.named_box(pose)) else { continue };
+                if mover.dynamic() {
                     let candidate =
                         Candidate { branch: None, timestamp: Some(timestamp), named_box: named_box.clone() };
                     if !candidates.contains(&candidate) {
@@ -647,6 +741,7 @@ fn info(
         }
     }
     candidates.sort_by_key(|c| c.timestamp);
+    let still_objects = movers(config).filter_map(|mover| mover.named_box(mover.still()?));
     ScenarioInfo {
         name: config.name.clone(),
         bounds: config.bounds_m,
@@ -655,7 +750,7 @@ fn info(
         bev_view: config.bev_view.as_ref().map(|v| *v.get_ref()),
         states,
         candidates,
-        static_boxes: scenery.boxes.clone(),
+        static_boxes: scenery.boxes.iter().cloned().chain(still_objects).collect(),
         hazard_branches,
         hazard_action: config.actions.hazard.clone(),
         clear_action: config.actions.clear.clone(),

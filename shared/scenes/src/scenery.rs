@@ -24,19 +24,16 @@ pub(crate) const SKY: u16 = 0;
 pub(crate) const GROUND: u16 = 1;
 const FIRST_OBJECT: u16 = 2;
 
-/// Where a vehicle stands: x, y in metres, yaw in radians.
-pub(crate) type Pose = [f64; 3];
-
-/// Everything that never moves.
+/// Everything that never moves, but for objects.
 #[derive(Clone, Debug)]
 pub(crate) struct Scenery {
     pub bodies: Vec<Body>,
     pub boxes: Vec<NamedBox>,
-    /// First free object index; vehicle i is this plus i.
+    /// First free object index; mover i is this plus i.
     pub next_object: u16,
 }
 
-fn vec3(x: f64, y: f64, z: f64) -> Vec3 {
+pub(crate) fn vec3(x: f64, y: f64, z: f64) -> Vec3 {
     Vec3::new(x as f32, y as f32, z as f32)
 }
 
@@ -228,21 +225,6 @@ fn add_prop(bodies: &mut Vec<Body>, prop: &PropConfig, object: u16) {
     }
 }
 
-/// The box that a vehicle fills at a pose.
-pub(crate) fn vehicle_box(vehicle: &VehicleConfig, pose: Pose) -> NamedBox {
-    let [l, w, h] = vehicle.size_m;
-    NamedBox {
-        name: vehicle.name.clone(),
-        role: Some(vehicle.role.clone()),
-        oriented_box: OrientedBox {
-            center: [pose[0], pose[1], h / 2.0],
-            half_size: [l / 2.0, w / 2.0, h / 2.0],
-            yaw: pose[2],
-        },
-        dynamic: vehicle.dynamic,
-    }
-}
-
 /// A cuboid with its edges cut off by `c`.
 fn chamfered(half: Vec3, c: f32) -> Form {
     let mut planes = Vec::with_capacity(12);
@@ -278,12 +260,12 @@ fn cabin(half: Vec3, front: f32, rear: f32, side: f32) -> Form {
     Form::Cut { half, planes }
 }
 
-/// The solids of a vehicle at a pose.
-pub(crate) fn vehicle_bodies(vehicle: &VehicleConfig, pose: Pose, object: u16) -> Vec<Body> {
+/// The solids of a vehicle whose middle stands on the ground at x, y (metres), turned by `yaw` (radians).
+pub(crate) fn vehicle_bodies(vehicle: &VehicleConfig, [x, y, yaw]: [f64; 3], object: u16) -> Vec<Body> {
     let [l, w, h] = vehicle.size_m.map(|v| v as f32);
     let colour = Vec3::from_array(vehicle.colour);
-    let origin = vec3(pose[0], pose[1], 0.0);
-    let yaw = pose[2] as f32;
+    let origin = vec3(x, y, 0.0);
+    let yaw = yaw as f32;
     let mut bodies = Vec::new();
     let mut add = |form: Form, center: Vec3, material: Material| {
         bodies.push(Body { solid: Solid::new(form, center, 0.0).placed(origin, yaw), material, object });

@@ -20,15 +20,17 @@ pub(crate) enum Form {
     Cone { base: f32, half_height: f32 },
     /// An ellipsoid, by radii.
     Ellipsoid(Vec3),
+    /// A cylinder about Z with a half ball on each end; `half_length` is that of the cylinder.
+    Capsule { radius: f32, half_length: f32 },
 }
 
-/// A form, placed and turned about the vertical axis.
+/// A form, placed and turned.
 #[derive(Clone, Debug)]
 pub(crate) struct Solid {
     pub form: Form,
     pub center: Vec3,
-    sin: f32,
-    cos: f32,
+    /// The solid's own X, Y and Z, in world space.
+    axes: [Vec3; 3],
 }
 
 /// Where a ray enters a solid.
@@ -40,26 +42,31 @@ pub(crate) struct Entry {
 }
 
 impl Solid {
+    /// Turned about the vertical axis.
     pub fn new(form: Form, center: Vec3, yaw: f32) -> Self {
-        let (sin, cos) = yaw.sin_cos();
-        Self { form, center, sin, cos }
+        Self::turned(form, center, turn(yaw, 0.0, 0.0))
     }
 
-    /// The same solid, turned about the world's origin by `yaw` and then moved.
+    /// Turned so that its own X, Y and Z lie along `axes`.
+    pub fn turned(form: Form, center: Vec3, axes: [Vec3; 3]) -> Self {
+        Self { form, center, axes }
+    }
+
+    /// The same solid, turned about the world's vertical axis by `yaw` and then moved.
     pub fn placed(mut self, origin: Vec3, yaw: f32) -> Self {
         let (s, c) = yaw.sin_cos();
-        let p = self.center;
-        self.center = origin + Vec3::new(c * p.x - s * p.y, s * p.x + c * p.y, p.z);
-        (self.sin, self.cos) = (self.sin * c + self.cos * s, self.cos * c - self.sin * s);
+        let about = |p: Vec3| Vec3::new(c * p.x - s * p.y, s * p.x + c * p.y, p.z);
+        self.center = origin + about(self.center);
+        self.axes = self.axes.map(about);
         self
     }
 
     pub fn to_local(&self, v: Vec3) -> Vec3 {
-        Vec3::new(self.cos * v.x + self.sin * v.y, -self.sin * v.x + self.cos * v.y, v.z)
+        Vec3::new(self.axes[0].dot(v), self.axes[1].dot(v), self.axes[2].dot(v))
     }
 
     pub fn to_world(&self, v: Vec3) -> Vec3 {
-        Vec3::new(self.cos * v.x - self.sin * v.y, self.sin * v.x + self.cos * v.y, v.z)
+        self.axes[0] * v.x + self.axes[1] * v.y + self.axes[2] * v.z
     }
 
     fn half(&self) -> Vec3 {
@@ -72,14 +79,13 @@ impl Solid {
             }
             Form::Cone { base, half_height } => Vec3::new(*base, *base, *half_height),
             Form::Ellipsoid(radii) => *radii,
+            Form::Capsule { radius, half_length } => Vec3::new(*radius, *radius, half_length + radius),
         }
     }
 
     pub fn aabb(&self) -> Aabb {
         let h = self.half();
-        let x = (self.cos * h.x).abs() + (self.sin * h.y).abs();
-        let y = (self.sin * h.x).abs() + (self.cos * h.y).abs();
-        let half = Vec3::new(x, y, h.z);
+        let half = self.axes[0].abs() * h.x + self.axes[1].abs() * h.y + self.axes[2].abs() * h.z;
         Aabb::new(self.center - half, self.center + half)
     }
 
@@ -93,8 +99,27 @@ impl Solid {
             Form::Cylinder { axis, radius, half_length } => cylinder(o, d, *axis, *radius, *half_length, limit),
             Form::Cone { base, half_height } => cone(o, d, *base, *half_height, limit),
             Form::Ellipsoid(radii) => ellipsoid(o, d, *radii, limit),
+            Form::Capsule { radius, half_length } => capsule(o, d, *radius, *half_length, limit),
         }
     }
+}
+
+/// Axes turned about Z by `yaw`, then about their own Y by `pitch` (down for positive ones), then about their own X by
+/// `roll`, radians.
+pub(crate) fn turn(yaw: f32, pitch: f32, roll: f32) -> [Vec3; 3] {
+    let ((sy, cy), (sp, cp), (sr, cr)) = (yaw.sin_cos(), pitch.sin_cos(), roll.sin_cos());
+    [
+        Vec3::new(cy * cp, sy * cp, -sp),
+        Vec3::new(cy * sp * sr - sy * cr, sy * sp * sr + cy * cr, cp * sr),
+        Vec3::new(cy * sp * cr + sy * sr, sy * sp * cr - cy * sr, cp * cr),
+    ]
+}
+
+/// Axes of which the third lies along a unit vector.
+pub(crate) fn upright_along(z: Vec3) -> [Vec3; 3] {
+    let helper = if z.z.abs() < 0.9 { Vec3::Z } else { Vec3::X };
+    let x = helper.cross(z).normalize();
+    [x, z.cross(x), z]
 }
 
 fn cuboid(o: Vec3, d: Vec3, half: Vec3, planes: &[(Vec3, f32)], limit: f32) -> Option<Entry> {
@@ -212,6 +237,35 @@ fn ellipsoid(o: Vec3, d: Vec3, radii: Vec3, limit: f32) -> Option<Entry> {
     (t > 0.0 && t < limit).then(|| Entry { t, normal: ((p + q * t) / radii).normalize_or_zero() })
 }
 
+fn capsule(o: Vec3, d: Vec3, radius: f32, half_length: f32, limit: f32) -> Option<Entry> {
+    let mut best: Option<Entry> = None;
+    let mut offer = |t: f32, normal: Vec3| {
+        if t > 0.0 && t < limit && best.is_none_or(|e| t < e.t) {
+            best = Some(Entry { t, normal });
+        }
+    };
+    let a = d.x * d.x + d.y * d.y;
+    let b = o.x * d.x + o.y * d.y;
+    let discriminant = b * b - a * (o.x * o.x + o.y * o.y - radius * radius);
+    if discriminant > 0.0 && a > 1e-12 {
+        let t = (-b - discriminant.sqrt()) / a;
+        let p = o + d * t;
+        if p.z.abs() <= half_length {
+            offer(t, Vec3::new(p.x, p.y, 0.0) / radius);
+        }
+    }
+    for end in [-1.0, 1.0] {
+        let middle = Vec3::new(0.0, 0.0, end * half_length);
+        if let Some(entry) = ellipsoid(o - middle, d, Vec3::splat(radius), limit) {
+            let p = o + d * entry.t;
+            if (p.z - middle.z) * end >= 0.0 {
+                offer(entry.t, entry.normal);
+            }
+        }
+    }
+    best
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -229,6 +283,8 @@ mod tests {
             (Form::Cylinder { axis: 2, radius: 2.0, half_length: 1.0 }, 8.0, Vec3::new(-1.0, 0.0, 0.0)),
             (Form::Cylinder { axis: 0, radius: 2.0, half_length: 1.0 }, 9.0, Vec3::new(-1.0, 0.0, 0.0)),
             (Form::Ellipsoid(Vec3::new(3.0, 1.0, 1.0)), 10.0 - 3.0 * 0.75_f32.sqrt(), Vec3::ZERO),
+            (Form::Capsule { radius: 2.0, half_length: 0.6 }, 8.0, Vec3::new(-1.0, 0.0, 0.0)),
+            (Form::Capsule { radius: 2.0, half_length: 0.2 }, 10.0 - 3.91_f32.sqrt(), Vec3::ZERO),
             (Form::Cone { base: 2.0, half_height: 1.0 }, 9.5, Vec3::new(-1.0, 0.0, 1.0).normalize()),
         ] {
             let entry = along_x(&Solid::new(form.clone(), Vec3::ZERO, 0.0), 0.0, up).unwrap();
@@ -236,7 +292,7 @@ mod tests {
             if normal != Vec3::ZERO {
                 assert!((entry.normal - normal).length() < 1e-4, "{form:?}: {}", entry.normal);
             }
-            assert!(along_x(&Solid::new(form, Vec3::ZERO, 0.0), 0.0, 2.5).is_none());
+            assert!(along_x(&Solid::new(form, Vec3::ZERO, 0.0), 0.0, 2.7).is_none());
         }
     }
 
@@ -250,6 +306,26 @@ mod tests {
         assert!((entry.t - 9.5).abs() < 1e-4);
         assert!((entry.normal - diagonal).length() < 1e-6);
         assert!((along_x(&solid, 0.0, -0.5).unwrap().t - 9.0).abs() < 1e-5);
+    }
+
+    /// Yaw turns to the left, pitch down, roll the left side up; axes stay square and right-handed; a solid turned by
+    /// them is entered where its turned faces are, and its bounding box holds its corners.
+    #[test]
+    fn turns_are_about_the_own_axes() {
+        let quarter = std::f32::consts::FRAC_PI_2;
+        let near = |a: Vec3, b: Vec3| (a - b).length() < 1e-5;
+        assert!(near(turn(quarter, 0.0, 0.0)[0], Vec3::Y));
+        assert!(near(turn(0.0, quarter, 0.0)[0], -Vec3::Z));
+        assert!(near(turn(0.0, 0.0, quarter)[1], Vec3::Z));
+        for axes in [turn(0.7, -0.4, 1.9), upright_along(Vec3::new(0.3, -0.8, 0.5).normalize()), upright_along(Vec3::Z)]
+        {
+            assert!(near(axes[0].cross(axes[1]), axes[2]) && axes[0].dot(axes[1]).abs() < 1e-6);
+        }
+        // A rod of 2 x 0.2 x 0.2 half extents, nose down: it stands upright, 0.2 m wide towards the ray.
+        let rod = Solid::turned(Form::Cuboid(Vec3::new(2.0, 0.2, 0.2)), Vec3::ZERO, turn(0.0, quarter, 0.0));
+        assert!((along_x(&rod, 0.0, 1.9).unwrap().t - 9.8).abs() < 1e-4);
+        assert!(along_x(&rod, 0.0, 2.1).is_none());
+        assert!((rod.aabb().maxs - Vec3::new(0.2, 0.2, 2.0)).length() < 1e-5);
     }
 
     /// Turning and moving a solid moves its entry and its bounding box alike.

@@ -8,14 +8,16 @@ use parry3d::partitioning::{Bvh, BvhBuildStrategy};
 use parry3d::query::Ray;
 use rayon::prelude::*;
 
-use crate::config::{MarkingConfig, RoadConfig, ScenarioConfig};
+use crate::config::{GroundSurface, MarkingConfig, RoadConfig, ScenarioConfig};
 use crate::materials::{Material, Surface, asphalt, marking};
 use crate::scenery::{Body, GROUND, SKY};
 use crate::shapes::Vec3;
 
 const FAR_M: f32 = 2000.0;
-/// Sky light is blocked by what is nearer than this, metres.
-const OCCLUSION_M: f32 = 1.6;
+/// Rays of light start this far off a surface, metres, where things are as large as vehicles.
+const START_M: f32 = 2e-3;
+/// How far sky light is blocked there, metres.
+const VEHICLE_SHADE_REACH_M: f32 = 1.6;
 const SUN: Vec3 = Vec3::new(1.50, 1.42, 1.27);
 const SKY_LIGHT: Vec3 = Vec3::new(0.50, 0.58, 0.70);
 const BOUNCE: Vec3 = Vec3::new(0.20, 0.20, 0.175);
@@ -88,8 +90,12 @@ impl Strip {
 pub(crate) struct Setting {
     roads: Vec<Strip>,
     markings: Vec<Strip>,
-    grass: Material,
+    open: Material,
     sun: Vec3,
+    /// Sky light is blocked by what is nearer than this, metres.
+    shade_reach_m: f32,
+    /// Rays of light start this far off a surface, metres.
+    start_m: f32,
     /// Directions to 16 points of the sun's disc.
     sun_points: [Vec3; 16],
 }
@@ -108,10 +114,16 @@ impl Setting {
             let (r, a) = ((n / 16.0).sqrt() * radius, n * 2.399_963);
             (sun + u * (r * a.cos()) + v * (r * a.sin())).normalize()
         });
+        let shade_reach_m = config.shade_reach_m as f32;
         Self {
+            shade_reach_m,
+            start_m: START_M * (shade_reach_m / VEHICLE_SHADE_REACH_M),
             roads: config.road.iter().map(Strip::road).collect(),
             markings: config.marking.iter().map(Strip::marking).collect(),
-            grass: Material::Grass { colour: Vec3::from_array(config.ground_colour) },
+            open: match config.ground_surface {
+                GroundSurface::Grass => Material::Grass { colour: Vec3::from_array(config.ground_colour) },
+                GroundSurface::Plain => Material::Plain { colour: Vec3::from_array(config.ground_colour) },
+            },
             sun,
             sun_points,
         }
@@ -124,7 +136,7 @@ impl Setting {
                 None => asphalt(p, footprint),
             };
         }
-        self.grass.at(p, p, Vec3::Z, footprint)
+        self.open.at(p, p, Vec3::Z, footprint)
     }
 }
 
@@ -219,11 +231,11 @@ impl Scene {
                 (surface, body.solid.to_world(local_normal), body.object)
             }
         };
-        let start = p + normal * 2e-3;
+        let start = p + normal * setting.start_m;
         let to_sun = setting.sun_points[sample];
         let facing = normal.dot(setting.sun);
         let sun = if facing > 0.0 && !self.blocked(start, to_sun, FAR_M) { facing } else { 0.0 };
-        let open = if self.blocked(start, sky_direction(normal, sample), OCCLUSION_M) { 0.0 } else { 1.0 };
+        let open = if self.blocked(start, sky_direction(normal, sample), setting.shade_reach_m) { 0.0 } else { 1.0 };
         let up = 0.5 + 0.5 * normal.z;
         let ambient = (SKY_LIGHT * up + BOUNCE * (1.0 - up)) * (0.25 + 0.75 * open);
         let mut colour = surface.albedo * (SUN * sun + ambient);

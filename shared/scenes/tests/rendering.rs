@@ -100,7 +100,7 @@ fn depth_agrees_with_the_planes() {
     let scenario = small();
     let camera = scenario.cameras()[0].camera;
     let rendering = scenario.render(0, 0, &camera, &RenderOptions { detail: Detail::Picture }).unwrap();
-    let block = scenario.object_of_vehicle("block").unwrap();
+    let block = scenario.object_of("block").unwrap();
     let (mut ground, mut top) = (0, 0);
     for y in 0..80_usize {
         for x in 0..96_usize {
@@ -229,7 +229,7 @@ fn rendered_sets_are_read() {
     let text = std::fs::read_to_string(out.join("transforms.json")).unwrap();
     assert!(text.contains("\"depth_file_path\":\"depth/b0_t1_v001.png\"") && text.contains("\"role\":\"actor\""));
     let mask = carff_dataset::Image::load_png(&out.join("masks/b0_t1_v001.png")).unwrap();
-    let block = scenario.object_of_vehicle("block").unwrap();
+    let block = scenario.object_of("block").unwrap();
     let expected = rendering.object_id.iter().filter(|id| **id == block).count();
     assert!(expected > 0 && mask.rgb.chunks(3).filter(|p| p[0] == 255).count() == expected);
     assert_eq!(scenario.object_name(block), "block");
@@ -330,5 +330,199 @@ fn the_shipped_scenario() {
     }
     for camera in scenario.cameras() {
         assert!(info.static_boxes.iter().all(|b| !b.oriented_box.contains(camera.camera.position_m())));
+    }
+}
+
+fn shipped(name: &str) -> Scenario {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs/scenarios");
+    Scenario::load(&folder.join(name).with_extension("toml")).unwrap()
+}
+
+/// Every shipped scenario has a training and a graph file of its name, a hundred poses of which none is inside a box, and
+/// a bird's-eye view straight down that sees the middle of every box that moves.
+#[test]
+fn every_shipped_scenario_is_whole() {
+    let configs = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs");
+    let mut names = Vec::new();
+    for entry in std::fs::read_dir(configs.join("scenarios")).unwrap() {
+        let path = entry.unwrap().path();
+        let name = path.file_stem().unwrap().to_str().unwrap().to_owned();
+        let scenario = Scenario::load(&path).unwrap();
+        let info = scenario.info();
+        assert_eq!(info.name, name);
+        for folder in ["training", "graphs"] {
+            assert!(configs.join(folder).join(&name).with_extension("toml").is_file(), "{folder} of {name}");
+        }
+        assert_eq!(scenario.cameras().len(), 100, "{name}");
+        let bev = scenario.cameras()[info.bev_view.unwrap()].camera;
+        let (w, h) = (f64::from(bev.width_px), f64::from(bev.height_px));
+        assert!((bev.ray(w / 2.0, h / 2.0).direction[2] + 1.0).abs() < 1e-6, "{name}");
+        for named in info.states.iter().flat_map(|s| &s.boxes) {
+            let ([x, y], _) = bev.project(named.oriented_box.center).unwrap();
+            assert!((0.0..=w).contains(&x) && (0.0..=h).contains(&y), "{name}: {} at {x} {y}", named.name);
+            let inside = |c: &carff_scenes::ScenarioCamera| named.oriented_box.contains(c.camera.position_m());
+            assert!(!scenario.cameras().iter().any(inside), "{name}: {}", named.name);
+        }
+        for still in &info.static_boxes {
+            let inside = |c: &carff_scenes::ScenarioCamera| still.oriented_box.contains(c.camera.position_m());
+            assert!(!scenario.cameras().iter().any(inside), "{name}: {}", still.name);
+        }
+        names.push(name);
+    }
+    names.sort();
+    let expected =
+        ["approaching-intersection", "hand-reaching", "single-approaching-intersection", "toy", "two-lane-merge"];
+    assert_eq!(names, expected);
+}
+
+/// Each scenario has views of the first timestamp that show the actor fully, and views that show nothing of it.
+#[test]
+fn every_shipped_scenario_has_seeing_and_blind_views() {
+    for name in
+        ["approaching-intersection", "hand-reaching", "single-approaching-intersection", "toy", "two-lane-merge"]
+    {
+        let scenario = shipped(name);
+        let mut seen = Vec::new();
+        for camera in scenario.cameras().iter().step_by(4) {
+            let camera = camera.camera.resized(48, 48);
+            seen.push(scenario.render(0, 0, &camera, &RenderOptions::default()).unwrap().actor.unwrap().observability);
+        }
+        for wanted in [Observability::Full, Observability::None] {
+            assert!(seen.iter().filter(|o| **o == wanted).count() >= 3, "{name}: {wanted:?} among {seen:?}");
+        }
+    }
+}
+
+/// Where a course of events is not decided yet at the first timestamp, both branches are one state and one picture
+/// there, and two afterwards.
+#[test]
+fn undecided_first_timestamps_look_the_same() {
+    for name in ["two-lane-merge", "toy", "hand-reaching"] {
+        let scenario = shipped(name);
+        let info = scenario.info();
+        let last = info.timestamps - 1;
+        let boxes = |branch: usize, timestamp: usize| &info.states[branch * info.timestamps + timestamp].boxes;
+        assert_eq!(boxes(0, 0), boxes(1, 0), "{name}");
+        assert_ne!(boxes(0, last), boxes(1, last), "{name}");
+        let options = RenderOptions { detail: Detail::Picture };
+        let mut differing = 0;
+        for camera in scenario.cameras().iter().step_by(10) {
+            let camera = camera.camera.resized(48, 48);
+            let picture = |b: usize, t: usize| scenario.render(b, t, &camera, &options).unwrap().image;
+            assert_eq!(picture(0, 0), picture(1, 0), "{name}");
+            differing += usize::from(picture(0, last) != picture(1, last));
+        }
+        assert!(differing >= 5, "{name}: {differing}");
+    }
+}
+
+/// An object is made of its parts, those of its variant alone, wherever its course puts it; what follows the actor is
+/// gone with it; an object without a course is a static box.
+#[test]
+fn objects_are_data() {
+    let text = r##"
+name = "objects"
+bounds_m = [[-1.0, -1.0, 0.0], [1.0, 1.0, 1.0]]
+timestamps = 2
+branches = ["there", "gone"]
+picture = { width_px = 64, height_px = 64, fov_deg = 40.0 }
+ground_surface = "plain"
+ground_colour = "#808080"
+clearance_m = 0.05
+
+[[object]]
+name = "dice"
+role = "actor"
+dynamic = true
+
+[[object.box]]
+center = [0.0, 0.0, 0.1]
+size_m = [0.2, 0.2, 0.2]
+colour = "#000000"
+faces = { colours = ["#ff0000", "#00ff00", "#0000ff", "#ffff00", "#ff00ff", "#ffffff"] }
+
+[[object.capsule]]
+variants = ["tall"]
+from = [0.0, 0.0, 0.2]
+to = [0.0, 0.0, 0.5]
+radius_m = 0.05
+colour = "#00ffff"
+
+[[object.course]]
+branches = ["there"]
+poses = [[0.0, 0.0, 0.0, 0.0], [0.4, 0.0, 0.1, 90.0]]
+variants = ["tall", "tall"]
+
+[[object]]
+name = "tail"
+role = "tail"
+follows = "dice"
+
+[[object.ellipsoid]]
+center = [-0.4, 0.0, 0.1]
+size_m = [0.1, 0.1, 0.1]
+colour = "#ff8800"
+
+[[object.course]]
+branches = ["there"]
+poses = [[0.0, 0.0, 0.0, 0.0], [0.4, 0.0, 0.1, 90.0]]
+
+[[object]]
+name = "post"
+role = "static"
+at = [0.0, 0.6, 0.0, 0.0]
+
+[[object.cylinder]]
+from = [0.0, 0.0, 0.0]
+to = [0.0, 0.0, 0.4]
+radius_m = 0.03
+colour = "#404040"
+
+[[overhead]]
+view_kind = "bev"
+count = 1
+center = [0.0, 0.0]
+height_m = 3.0
+spread_m = 0.0
+"##;
+    let scenario = Scenario::parse("objects.toml".as_ref(), text).unwrap();
+    let info = scenario.info();
+    let dice = &info.states[0].boxes[0].oriented_box;
+    assert_eq!((dice.center, dice.half_size), ([0.0, 0.0, 0.275], [0.1, 0.1, 0.275]));
+    let moved = &info.states[1].boxes[0].oriented_box;
+    assert!((moved.center[0] - 0.4).abs() < 1e-6 && (moved.center[2] - 0.375).abs() < 1e-6);
+    let tail = &info.states[1].boxes[1].oriented_box;
+    assert!((tail.center[0] - 0.4).abs() < 1e-6 && (tail.center[1] + 0.4).abs() < 1e-6, "{tail:?}");
+    assert!(info.states[2].boxes.is_empty());
+    assert_eq!(info.static_boxes.iter().map(|b| b.name.as_str()).collect::<Vec<_>>(), ["post"]);
+
+    // From -X the side -X is seen, green; the capsule stands on it; 90 degrees to the left, the side +Y, blue.
+    let camera = PinholeCamera::look_at([-3.0, 0.0, 0.3], [0.0, 0.0, 0.3], [0.0, 0.0, 1.0], 64, 64, 20.0);
+    let picture = |t: usize| scenario.render(0, t, &camera, &RenderOptions::default()).unwrap();
+    let below = |image: &carff_dataset::Image, z: f64| image.pixel(32, (32.0 - (z - 0.3) * 60.5) as u32).unwrap();
+    let before = picture(0).image;
+    let [r, g, b] = below(&before, 0.17);
+    assert!(g > 60 && r < g / 2 && b < g / 2, "{r} {g} {b}");
+    let [r, g, b] = below(&before, 0.45);
+    assert!(g > 60 && b > 60 && r < g / 2, "{r} {g} {b}");
+    let [r, g, b] = below(&picture(1).image, 0.22);
+    assert!(b > 60 && r < b / 2 && g < b / 2, "{r} {g} {b}");
+
+    // A view that sees the tail alone is not blind: the dice's picture without the actor lacks the tail too.
+    let tail_alone = PinholeCamera::look_at([-0.4, 0.0, 1.0], [-0.4, 0.0, 0.0], [0.0, 1.0, 0.0], 64, 64, 15.0);
+    let view = scenario.render(0, 0, &tail_alone, &RenderOptions::default()).unwrap();
+    assert_eq!(view.actor.unwrap().actor_px, 0);
+    assert_eq!(view.actor.unwrap().observability, Observability::Partial);
+
+    for (from, to, expected) in [
+        ("variants = [\"tall\", \"tall\"]", "variants = [\"tall\", \"wide\"]", "no part has the variant `wide`"),
+        ("variants = [\"tall\", \"tall\"]", "variants = [\"tall\"]", "1 variants; one for each of the 2 timestamps"),
+        ("follows = \"dice\"", "follows = \"post\"", "key `follows`: `post` is no other, dynamic"),
+        ("name = \"post\"", "name = \"tail\"", "`tail` is named twice"),
+        ("size_m = [0.1, 0.1, 0.1]", "size_m = [0.1, 0.0, 0.1]", "0.001 to 10000 is allowed"),
+    ] {
+        assert!(text.contains(from), "{from}");
+        let error = Scenario::parse("o.toml".as_ref(), &text.replacen(from, to, 1)).unwrap_err().to_string();
+        assert!(error.contains(expected), "{to}: {error}");
     }
 }

@@ -197,7 +197,9 @@ pub fn places(pictures: &Pictures) -> Vec<Place> {
         let near = |other: &Place| {
             let o = other.oriented_box;
             let distance: f64 = (0..3).map(|i| (o.center[i] - b.center[i]).powi(2)).sum();
-            other.name == named.name && distance.sqrt() < 0.25 && (o.yaw - b.yaw).abs() < 0.1
+            // What is small moves by little: a hand's places lie closer than a car's.
+            let close = (0.2 * b.half_size.iter().map(|h| h * h).sum::<f64>().sqrt()).min(0.25);
+            other.name == named.name && distance.sqrt() < close && (o.yaw - b.yaw).abs() < 0.1
         };
         let at = places.iter().position(near).unwrap_or_else(|| {
             places.push(Place {
@@ -256,6 +258,10 @@ fn calibrate_threshold(
 ) -> Result<(), TrainingError> {
     let settings = &config.calibration;
     let unfit = |e: &dyn std::fmt::Display| TrainingError::Unfit(e.to_string());
+    if pictures.scenario.hazard_branches.is_empty() {
+        // Nothing is to be told apart, so nothing is chosen; no state is a hazard, and no threshold above 0 is reached.
+        return CheckpointPlanning::new(config.split_seed, 0.5).save(out).map_err(|e| unfit(&e));
+    }
     let inputs =
         eligible_inputs(&pictures.dataset, &pictures.split.views(PoseRole::Calibration)).map_err(|e| unfit(&e))?;
     let trials = trials(&models.encoder, &pictures.dataset, &inputs, settings.repeats, &settings.sensor, config.seed)?;

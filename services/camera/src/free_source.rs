@@ -1,0 +1,101 @@
+//! Renders what a moving ego sees, as it goes.
+
+use crate::drive_source::{meta, seen};
+use crate::source::{Source, sensor_noise};
+use anyhow::Context;
+use carff_config::GraphConfig;
+use carff_dataset::sensor::{SensorNoise, apply_noise_into};
+use carff_messages::{DatasetView, FrameMeta, Observability};
+use carff_random::Key;
+use carff_scenes::{FreeDrive, FreeFrame, Scenario};
+
+/// Free drives through a scenario; each is planned when the one before it has ended.
+#[derive(Debug)]
+pub struct FreeDriveSource {
+    scenario: Scenario,
+    noise: SensorNoise,
+    seed: u64,
+    frames_per_timestamp: usize,
+    /// How many drives; `None`: no end.
+    drives: Option<u64>,
+    /// Number of the next drive, and the one that is shown.
+    next: u64,
+    drive: Option<FreeDrive>,
+    frame_in_drive: usize,
+    current: Option<FreeFrame>,
+    /// One thread: the other cores are for the stages that wait for the picture.
+    pool: rayon::ThreadPool,
+}
+
+impl FreeDriveSource {
+    /// Loads the scenario and tries one drive of each kind, so that a scenario that has none ends here.
+    pub fn open(graph: &GraphConfig, drives: u32) -> anyhow::Result<Self> {
+        let path = graph.scenario_path().context("`run.scenario` does not say which scenario to render")?;
+        let scenario = Scenario::load(&path)?;
+        let frames_per_timestamp = graph.camera.frames_per_timestamp as usize;
+        for number in 0..2 {
+            scenario.free_drive(number, frames_per_timestamp, graph.run.seed)?;
+        }
+        Ok(Self {
+            scenario,
+            noise: sensor_noise(&graph.camera.noise),
+            seed: graph.run.seed,
+            frames_per_timestamp,
+            drives: (!graph.camera.repeat).then_some(u64::from(drives)),
+            next: 0,
+            drive: None,
+            frame_in_drive: 0,
+            current: None,
+            pool: rayon::ThreadPoolBuilder::new().num_threads(1).build()?,
+        })
+    }
+
+    /// Renders the next frame, of the next drive where one has ended.
+    fn render(&mut self) -> anyhow::Result<Option<FreeFrame>> {
+        self.frame_in_drive += 1;
+        if self.drive.as_ref().is_none_or(|drive| self.frame_in_drive >= drive.frame_count()) {
+            if self.drives.is_some_and(|drives| self.next >= drives) {
+                return Ok(None);
+            }
+            let (scenario, number, frames, seed) = (&self.scenario, self.next, self.frames_per_timestamp, self.seed);
+            self.drive = Some(self.pool.install(|| scenario.free_drive(number, frames, seed))?);
+            self.next += 1;
+            self.frame_in_drive = 0;
+        }
+        let (scenario, frame) = (&self.scenario, self.frame_in_drive);
+        let drive = self.drive.as_ref().context("no drive is planned")?;
+        Ok(Some(self.pool.install(|| scenario.free_frame(drive, frame))?))
+    }
+}
+
+impl Source for FreeDriveSource {
+    fn max_picture_bytes(&self) -> usize {
+        self.scenario.cameras().first().map_or(0, |c| (c.camera.width_px * c.camera.height_px) as usize * 3)
+    }
+
+    fn advance(&mut self) -> Option<FrameMeta> {
+        let frame = self.render().unwrap_or_else(|error| {
+            tracing::error!(error = format!("{error:#}"), "no more drives");
+            None
+        });
+        self.current = frame;
+        let frame = self.current.as_ref()?;
+        let dataset_view = DatasetView {
+            known: 1,
+            view: -1,
+            branch: frame.branch as i32,
+            timestamp: frame.timestamp as i32,
+            drive: self.next as i32 - 1,
+            frame_in_drive: self.frame_in_drive as i32,
+            observability: frame.observability.map_or(Observability::Unknown, seen).code(),
+            last_of_timestamp: u32::from(frame.last_of_timestamp),
+        };
+        Some(meta(&frame.camera, dataset_view))
+    }
+
+    fn write(&mut self, frame_id: u64, picture: &mut [u8]) -> anyhow::Result<()> {
+        let frame = self.current.as_ref().context("no frame has been advanced to")?;
+        let key = Key { seed: self.seed, frame: frame_id, step: 0, sample: 0 };
+        Ok(apply_noise_into(&frame.image.rgb, picture, &self.noise, key)?)
+    }
+}

@@ -1,0 +1,117 @@
+//! Contracts of free drives: smooth, never a pose of a data set, the same whenever asked, and with the truth beside them.
+
+#![allow(clippy::unwrap_used)] // The helpers below are parts of tests.
+
+use std::path::Path;
+
+use carff_dataset::Observability;
+use carff_dataset::drives::DriveKind;
+use carff_geometry::PinholeCamera;
+use carff_scenes::{RenderOptions, Scenario};
+
+const FRAMES: usize = 6;
+
+fn shipped(name: &str) -> Scenario {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs/scenarios");
+    Scenario::load(&folder.join(name).with_extension("toml")).unwrap()
+}
+
+/// Distance of the places, metres, and angle between the lines of sight, radians.
+fn apart(a: &PinholeCamera, b: &PinholeCamera) -> (f64, f64) {
+    let (p, q) = (a.position_m(), b.position_m());
+    let distance = (0..3).map(|i| (p[i] - q[i]).powi(2)).sum::<f64>().sqrt();
+    let cosine: f64 = (0..3).map(|i| a.world_from_camera[i][2] * b.world_from_camera[i][2]).sum();
+    (distance, cosine.clamp(-1.0, 1.0).acos())
+}
+
+/// A frame is named by seed, drive and frame: whatever was rendered before it, it has the same bytes, pose and truth.
+/// Another seed or number is another drive.
+#[test]
+fn frames_are_named_by_seed_drive_and_frame() {
+    let scenario = shipped("approaching-intersection");
+    let drive = scenario.free_drive(3, FRAMES, 1).unwrap();
+    let frames: Vec<_> = scenario.free_frames(&drive).map(Result::unwrap).collect();
+    assert_eq!(frames.len(), 3 * FRAMES);
+    let again = shipped("approaching-intersection");
+    let drive_again = again.free_drive(3, FRAMES, 1).unwrap();
+    assert_eq!(drive, drive_again);
+    for frame in [7, 2, 17] {
+        assert_eq!(frames[frame], again.free_frame(&drive_again, frame).unwrap());
+    }
+    assert_ne!(drive, scenario.free_drive(3, FRAMES, 2).unwrap());
+    assert_ne!(drive, scenario.free_drive(5, FRAMES, 1).unwrap());
+    let error = scenario.free_frame(&drive, 3 * FRAMES).unwrap_err().to_string();
+    assert!(error.contains("timestamp 3"), "{error}");
+}
+
+/// From frame to frame a camera moves by little, and it does move; no pose is one of the hundred, nor one that encoders
+/// are trained on; the last frame of each timestamp says so.
+#[test]
+fn poses_are_smooth_and_new() {
+    let scenario = shipped("approaching-intersection");
+    let trained = shipped("approaching-intersection").with_free_cameras(400, 11).unwrap();
+    let known: Vec<PinholeCamera> =
+        scenario.cameras().iter().chain(trained.cameras()).map(|camera| camera.camera).collect();
+    for number in 0..4 {
+        let drive = scenario.free_drive(number, FRAMES, 1).unwrap();
+        let frames: Vec<_> = scenario.free_frames(&drive).map(Result::unwrap).collect();
+        for (i, frame) in frames.iter().enumerate() {
+            assert_eq!((frame.timestamp, frame.last_of_timestamp), (i / FRAMES, i % FRAMES == FRAMES - 1));
+            for pose in &known {
+                let (distance_m, angle) = apart(&frame.camera, pose);
+                assert!(distance_m > 1e-4 || angle > 1e-4, "drive {number} frame {i} is a known pose");
+            }
+        }
+        for pair in frames.windows(2) {
+            let (distance_m, angle) = apart(&pair[0].camera, &pair[1].camera);
+            // The ego does 3 m in a timestamp of six frames; sway comes on top.
+            assert!(distance_m < 0.75 && angle < 0.05, "drive {number}: {distance_m} m, {angle} rad");
+            assert!(distance_m > 1e-3, "drive {number} stands still");
+        }
+        if drive.kind() == DriveKind::Hazard {
+            assert_eq!(drive.view_kind(), "dash");
+            let (distance_m, _) = apart(&frames[0].camera, &frames[frames.len() - 1].camera);
+            assert!(distance_m > 5.0, "the ego moves: {distance_m} m");
+        }
+    }
+}
+
+/// Hazard and clear trials alternate; a hazard trial is of a hazard branch and shows nothing of the actor, a clear one is
+/// of the other and shows its whole place: so says the state itself, rendered from the same pose.
+#[test]
+fn the_truth_is_true() {
+    let scenario = shipped("approaching-intersection");
+    for number in 0..8 {
+        let drive = scenario.free_drive(number, FRAMES, 5).unwrap();
+        let hazard = number % 2 == 0;
+        assert_eq!(drive.kind(), if hazard { DriveKind::Hazard } else { DriveKind::Clear });
+        assert_eq!(scenario.info().is_hazard(drive.branch()), hazard);
+        let frame = scenario.free_frame(&drive, drive.decisive_frame()).unwrap();
+        assert!(frame.last_of_timestamp && frame.timestamp == drive.eligible_timestamp() && frame.timestamp < 2);
+        let state = scenario.render(frame.branch, frame.timestamp, &frame.camera, &RenderOptions::default()).unwrap();
+        let seen = state.actor.unwrap().visible_fraction;
+        if hazard {
+            assert_eq!(frame.observability, Some(Observability::None));
+            assert!(seen < 0.05, "drive {number}: {seen}");
+        } else {
+            assert_eq!(frame.observability, Some(Observability::Full));
+            assert!(seen > 0.7, "drive {number}: {seen}");
+        }
+    }
+}
+
+/// Every shipped scenario can be driven through; those without hazards have clear trials alone.
+#[test]
+fn every_shipped_scenario_can_be_driven() {
+    for name in ["hand-reaching", "single-approaching-intersection", "toy", "two-lane-merge"] {
+        let scenario = shipped(name);
+        for number in 0..2 {
+            let drive = scenario.free_drive(number, 2, 1).unwrap();
+            let hazard = number == 0 && !scenario.info().hazard_branches.is_empty();
+            assert_eq!(drive.kind() == DriveKind::Hazard, hazard, "{name}");
+            let frame = scenario.free_frame(&drive, drive.decisive_frame()).unwrap();
+            let kind = scenario.info().trial_kind(frame.branch, frame.timestamp, frame.observability);
+            assert_eq!(kind, Some(drive.kind()), "{name}");
+        }
+    }
+}
