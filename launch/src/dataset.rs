@@ -39,8 +39,8 @@ pub enum DatasetCommand {
         #[arg(long, default_value_t = 256, value_parser = clap::value_parser!(u32).range(16..=8192))]
         max_side: u32,
         /// The box that matters, in the set's units: x0,y0,z0,x1,y1,z1. Default: about what the cameras look at.
-        #[arg(long, value_delimiter = ',', num_args = 6, allow_hyphen_values = true)]
-        bounds: Option<Vec<f64>>,
+        #[arg(long, value_parser = corners, allow_hyphen_values = true)]
+        bounds: Option<[[f64; 3]; 2]>,
     },
     /// Check a data set and print its statistics.
     Check {
@@ -70,7 +70,6 @@ pub fn run(command: DatasetCommand) -> anyhow::Result<()> {
             Ok(())
         }
         DatasetCommand::Import { dir, out, max_side, bounds } => {
-            let bounds = bounds.as_deref().map(corners).transpose()?;
             let options = ImportOptions { max_side_px: max_side, bounds, ..ImportOptions::default() };
             let imported = import(&dir, &out, &options)?;
             println!(
@@ -90,13 +89,16 @@ pub fn run(command: DatasetCommand) -> anyhow::Result<()> {
     }
 }
 
-/// Two corners out of six numbers.
-fn corners(values: &[f64]) -> anyhow::Result<[[f64; 3]; 2]> {
-    let &[x0, y0, z0, x1, y1, z1] = values else { bail!("--bounds takes six numbers: x0,y0,z0,x1,y1,z1") };
-    if values.iter().all(|v| v.is_finite()) && x0 < x1 && y0 < y1 && z0 < z1 {
-        Ok([[x0, y0, z0], [x1, y1, z1]])
-    } else {
-        bail!("--bounds {values:?}: the first three numbers must be below the last three")
+/// Two corners out of six numbers with commas between them.
+fn corners(text: &str) -> Result<[[f64; 3]; 2], String> {
+    let values: Result<Vec<f64>, _> = text.split(',').map(|part| part.trim().parse()).collect();
+    match values.as_deref() {
+        Ok(&[x0, y0, z0, x1, y1, z1])
+            if [x0, y0, z0, x1, y1, z1].iter().all(|v| v.is_finite()) && x0 < x1 && y0 < y1 && z0 < z1 =>
+        {
+            Ok([[x0, y0, z0], [x1, y1, z1]])
+        }
+        _ => Err("six numbers are needed: x0,y0,z0,x1,y1,z1, the first three below the last three".to_owned()),
     }
 }
 
@@ -186,9 +188,9 @@ spread_m = 1.0
     /// A box has six finite numbers, the lower corner first.
     #[test]
     fn boxes_of_six_numbers() {
-        assert_eq!(corners(&[0.0, 1.0, 2.0, 3.0, 4.0, 5.0]).unwrap(), [[0.0, 1.0, 2.0], [3.0, 4.0, 5.0]]);
-        for wrong in [&[0.0, 1.0][..], &[0.0, 1.0, 2.0, 3.0, 0.5, 5.0], &[0.0, 1.0, f64::NAN, 3.0, 4.0, 5.0]] {
-            assert!(corners(wrong).unwrap_err().to_string().contains("--bounds"));
+        assert_eq!(corners("-1,1,2, 3,4,5.5").unwrap(), [[-1.0, 1.0, 2.0], [3.0, 4.0, 5.5]]);
+        for wrong in ["0,1", "0,1,2,3,0.5,5", "0,1,nan,3,4,5", "a,b,c,d,e,f", ""] {
+            assert!(corners(wrong).unwrap_err().contains("x0,y0,z0"), "{wrong}");
         }
     }
 

@@ -22,7 +22,7 @@ fn put(dir: &Path, name: &str, set: &Value) {
     std::fs::write(dir.join(name), set.to_string()).unwrap();
 }
 
-/// The layout of instant-ngp and of the NeRF authors' synthetic scenes: an angle for a focal length, names without
+/// The layout of instant-ngp and of the `NeRF` authors' synthetic scenes: an angle for a focal length, names without
 /// extension, files for each split, transparent pictures.
 #[test]
 fn instant_ngp_layout() {
