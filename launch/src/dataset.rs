@@ -30,7 +30,7 @@ pub enum DatasetCommand {
     },
     /// Turn a plain set, as nerfstudio and instant-ngp write them, into a set of one state.
     Import {
-        /// Folder of the set: transforms.json, or transforms_train.json and so on, with PNG or JPEG pictures.
+        /// Folder of the set: one `transforms.json` or three (`transforms_train.json` and so on), and PNG or JPEG pictures.
         dir: PathBuf,
         /// Folder to write; it must be new, empty, or a set that this program wrote.
         #[arg(long)]

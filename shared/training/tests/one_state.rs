@@ -1,4 +1,5 @@
-//! Contract of sets of one state, as imported ones are: the field alone is trained, and judged on poses it never saw.
+//! Contracts of sets of one state, as imported ones are (the field alone is trained, and judged on poses it never saw),
+//! and of the training files that ship.
 
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
@@ -121,4 +122,18 @@ fn an_imported_set_trains_the_field() {
     assert!(path("views.png").is_file() && path("out/field.safetensors").is_file());
     // A finished training is not done again.
     assert_eq!(train(Stage::All).unwrap(), metrics);
+}
+
+/// Every shipped training file is valid, names its scenario, and writes to the checkpoint of its own name.
+#[test]
+fn every_shipped_training_file_is_valid() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).ancestors().nth(2).unwrap();
+    for entry in std::fs::read_dir(root.join("configs/training")).unwrap() {
+        let path = entry.unwrap().path();
+        let config = TrainingConfig::load(&path).unwrap();
+        assert!(root.join(config.scenario.unwrap()).is_file(), "{}", path.display());
+        let name = path.file_stem().unwrap().to_str().unwrap();
+        let out = config.out.to_str().unwrap().to_owned();
+        assert!(out.ends_with(&format!("checkpoints/{name}")) || out.starts_with("runs/"), "{name}: {out}");
+    }
 }
