@@ -1,10 +1,10 @@
-//! `carff dataset`: renders scenarios into data sets, and checks data sets.
+//! `carff dataset`: renders scenarios into data sets, checks data sets, and imports plain ones.
 
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
-use carff_dataset::{Dataset, DatasetReport, SheetOptions, contact_sheet};
+use carff_dataset::{Dataset, DatasetReport, ImportOptions, SheetOptions, contact_sheet, import};
 use carff_scenes::{Extras, Scenario};
 use indicatif::{ProgressBar, ProgressStyle};
 
@@ -27,6 +27,20 @@ pub enum DatasetCommand {
         /// Seed of the free poses.
         #[arg(long, default_value_t = 1)]
         seed: u64,
+    },
+    /// Turn a plain set, as nerfstudio and instant-ngp write them, into a set of one state.
+    Import {
+        /// Folder of the set: one `transforms.json` or three (`transforms_train.json` and so on), and PNG or JPEG pictures.
+        dir: PathBuf,
+        /// Folder to write; it must be new, empty, or a set that this program wrote.
+        #[arg(long)]
+        out: PathBuf,
+        /// Longest side of a picture, pixels; larger ones are scaled down.
+        #[arg(long, default_value_t = 256, value_parser = clap::value_parser!(u32).range(16..=8192))]
+        max_side: u32,
+        /// The box that matters, in the set's units: x0,y0,z0,x1,y1,z1. Default: about what the cameras look at.
+        #[arg(long, value_parser = corners, allow_hyphen_values = true)]
+        bounds: Option<[[f64; 3]; 2]>,
     },
     /// Check a data set and print its statistics.
     Check {
@@ -55,9 +69,36 @@ pub fn run(command: DatasetCommand) -> anyhow::Result<()> {
             println!("{pictures} pictures in {}", out.display());
             Ok(())
         }
+        DatasetCommand::Import { dir, out, max_side, bounds } => {
+            let options = ImportOptions { max_side_px: max_side, bounds, ..ImportOptions::default() };
+            let imported = import(&dir, &out, &options)?;
+            println!(
+                "{} pictures in {} ({} undistorted, {} scaled down)",
+                imported.frames,
+                out.display(),
+                imported.undistorted,
+                imported.scaled
+            );
+            let [low, high] = imported.bounds.map(|corner| corner.map(|v| (v * 1000.0).round() / 1000.0));
+            println!("Bounds {low:?} to {high:?}; what lies beyond is background: give --bounds if that is wrong");
+            Ok(())
+        }
         DatasetCommand::Check { dir, contact_sheet, columns } => {
             check(&dir, contact_sheet.as_deref(), usize::from(columns))
         }
+    }
+}
+
+/// Two corners out of six numbers with commas between them.
+fn corners(text: &str) -> Result<[[f64; 3]; 2], String> {
+    let values: Result<Vec<f64>, _> = text.split(',').map(|part| part.trim().parse()).collect();
+    match values.as_deref() {
+        Ok(&[x0, y0, z0, x1, y1, z1])
+            if [x0, y0, z0, x1, y1, z1].iter().all(|v| v.is_finite()) && x0 < x1 && y0 < y1 && z0 < z1 =>
+        {
+            Ok([[x0, y0, z0], [x1, y1, z1]])
+        }
+        _ => Err("six numbers are needed: x0,y0,z0,x1,y1,z1, the first three below the last three".to_owned()),
     }
 }
 
@@ -142,6 +183,15 @@ spread_m = 1.0
         let error = run(render_command(&scenario, &foreign)).unwrap_err();
         assert!(format!("{error:#}").contains("not a set that this program wrote"), "{error:#}");
         assert_eq!(std::fs::read_to_string(foreign.join("thesis.txt")).unwrap(), "irreplaceable");
+    }
+
+    /// A box has six finite numbers, the lower corner first.
+    #[test]
+    fn boxes_of_six_numbers() {
+        assert_eq!(corners("-1,1,2, 3,4,5.5").unwrap(), [[-1.0, 1.0, 2.0], [3.0, 4.0, 5.5]]);
+        for wrong in ["0,1", "0,1,2,3,0.5,5", "0,1,nan,3,4,5", "a,b,c,d,e,f", ""] {
+            assert!(corners(wrong).unwrap_err().contains("x0,y0,z0"), "{wrong}");
+        }
     }
 
     /// A scenario that is neither a file nor a name is an error that names both places.

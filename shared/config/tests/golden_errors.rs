@@ -94,6 +94,21 @@ fn the_shipped_graph_is_valid() {
     assert!(graph.resolve(Path::new("configs/graphs")).is_dir());
 }
 
+/// Every shipped graph loads without a warning, and its scenario is there.
+#[test]
+fn every_shipped_graph_is_valid() {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs/graphs");
+    let mut names = std::collections::BTreeSet::new();
+    for entry in std::fs::read_dir(folder).unwrap() {
+        let path = entry.unwrap().path();
+        let graph = GraphConfig::load(&path).unwrap();
+        assert_eq!(graph.warnings(), Vec::<String>::new(), "{}", path.display());
+        assert!(graph.scenario_path().unwrap().is_file(), "{}", path.display());
+        assert!(names.insert(graph.run.name.clone()), "{}: two graphs under one name", path.display());
+    }
+    assert!(names.len() >= 6, "{names:?}");
+}
+
 /// Odd but allowed settings are warned of.
 #[test]
 fn odd_settings_are_warned_of() {

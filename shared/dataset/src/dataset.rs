@@ -171,7 +171,7 @@ impl Dataset {
     /// Reads and checks `transforms.json`, or else `transforms_train.json`, `transforms_val.json` and
     /// `transforms_test.json` together. Pictures are looked for but not decoded.
     pub fn open(dir: &Path) -> Result<Self, DatasetError> {
-        let read = transforms::read(dir)?;
+        let read = transforms::read(dir, transforms::Pictures::Png)?;
         let view_count = read.frames.iter().filter_map(|f| f.view).max().map_or(0, |v| v + 1);
         Ok(Self {
             dir: dir.to_owned(),

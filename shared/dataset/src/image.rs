@@ -4,8 +4,9 @@ use std::fs::File;
 use std::io::{BufReader, BufWriter};
 use std::path::Path;
 
+use image::codecs::jpeg::JpegDecoder;
 use image::codecs::png::{PngDecoder, PngEncoder};
-use image::{ColorType, ExtendedColorType, ImageDecoder, ImageEncoder, Limits};
+use image::{ColorType, ExtendedColorType, ImageDecoder, ImageEncoder, ImageFormat, ImageReader, Limits};
 
 use crate::dataset::MAX_IMAGE_SIDE_PX;
 use crate::error::DatasetError;
@@ -114,14 +115,42 @@ impl Image {
     }
 }
 
-/// Reads width and height from a PNG file's header, pixels.
-pub(crate) fn png_dimensions(path: &Path) -> Result<(u32, u32), DatasetError> {
+/// Whether a file is a JPEG, by its name.
+fn is_jpeg(path: &Path) -> bool {
+    path.extension().is_some_and(|e| e.eq_ignore_ascii_case("jpg") || e.eq_ignore_ascii_case("jpeg"))
+}
+
+/// Reads width and height from the header of a PNG or JPEG file, pixels.
+pub(crate) fn dimensions(path: &Path) -> Result<(u32, u32), DatasetError> {
     let file = File::open(path).map_err(|source| DatasetError::Io { path: path.to_owned(), source })?;
-    let decoder = PngDecoder::new(BufReader::new(file)).map_err(|error| DatasetError::Image {
+    let file = BufReader::new(file);
+    let found = if is_jpeg(path) {
+        JpegDecoder::new(file).map(|decoder| decoder.dimensions())
+    } else {
+        PngDecoder::new(file).map(|decoder| decoder.dimensions())
+    };
+    found.map_err(|error| DatasetError::Image {
         path: path.to_owned(),
-        problem: format!("not a readable PNG picture: {error}"),
-    })?;
-    Ok(decoder.dimensions())
+        problem: format!("not a readable picture: {error}"),
+    })
+}
+
+/// Reads a PNG or JPEG file of any pixel type as RGB, over `background` where it is transparent.
+pub(crate) fn load_any(path: &Path, background: [u8; 3]) -> Result<Image, DatasetError> {
+    let problem = |problem: String| DatasetError::Image { path: path.to_owned(), problem };
+    let file = File::open(path).map_err(|source| DatasetError::Io { path: path.to_owned(), source })?;
+    let mut limits = Limits::default();
+    limits.max_image_width = Some(MAX_IMAGE_SIDE_PX);
+    limits.max_image_height = Some(MAX_IMAGE_SIDE_PX);
+    let format = if is_jpeg(path) { ImageFormat::Jpeg } else { ImageFormat::Png };
+    let mut reader = ImageReader::with_format(BufReader::new(file), format);
+    reader.limits(limits);
+    let rgba = reader.decode().map_err(|error| problem(format!("not a readable picture: {error}")))?.into_rgba8();
+    let over = |value: u8, below: u8, alpha: u8| {
+        ((u32::from(value) * u32::from(alpha) + u32::from(below) * u32::from(255 - alpha) + 127) / 255) as u8
+    };
+    let rgb = rgba.pixels().flat_map(|p| [0, 1, 2].map(|c| over(p.0[c], background[c], p.0[3]))).collect();
+    Ok(Image { width_px: rgba.width(), height_px: rgba.height(), rgb })
 }
 
 /// Writes bytes of the given type as a PNG file.

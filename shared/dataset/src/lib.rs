@@ -19,6 +19,7 @@ pub mod drives;
 mod equivalence;
 mod error;
 mod image;
+mod import;
 mod report;
 pub mod sensor;
 mod split;
@@ -32,6 +33,7 @@ pub use dataset::{
 pub use equivalence::{Equivalence, MAX_DIFFERENT_PIXELS, PIXEL_TOLERANCE, looks_same};
 pub use error::DatasetError;
 pub use image::Image;
+pub use import::{ImportOptions, Imported, import};
 pub use report::{DatasetReport, HiddenPair, SheetOptions, contact_sheet};
 pub use split::{PoseRole, PoseSplit};
 pub use writer::{DatasetWriter, FrameRecord};

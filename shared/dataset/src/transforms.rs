@@ -11,20 +11,34 @@ use crate::dataset::{
     StateInfo,
 };
 use crate::error::DatasetError;
-use crate::image::png_dimensions;
+use crate::image::dimensions;
 
 const MAX_BRANCHES: usize = 1024;
 const MAX_TIMESTAMPS: usize = 4096;
 /// Poses of one view may differ by this much among states (metres, or entries of the rotation).
 const POSE_TOLERANCE: f64 = 1e-4;
 
+/// Which pictures frames may name.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Pictures {
+    /// PNG files inside the set's folder: what this program works on.
+    Png,
+    /// Also JPEG files: what it imports.
+    PngOrJpeg,
+}
+
+/// Lens distortion of the `OPENCV` model: k1, k2, k3, k4 (radial, of the 2nd, 4th, 6th and 8th power), p1, p2.
+pub(crate) type Distortion = [f64; 6];
+
 pub(crate) struct Transforms {
     pub frames: Vec<Frame>,
+    /// One for each frame.
+    pub distortions: Vec<Distortion>,
     pub scenario: Option<ScenarioInfo>,
     pub warnings: Vec<String>,
 }
 
-pub(crate) fn read(dir: &Path) -> Result<Transforms, DatasetError> {
+pub(crate) fn read(dir: &Path, pictures: Pictures) -> Result<Transforms, DatasetError> {
     if !dir.is_dir() {
         return Err(DatasetError::NotAFolder { path: dir.to_owned() });
     }
@@ -61,7 +75,7 @@ pub(crate) fn read(dir: &Path) -> Result<Transforms, DatasetError> {
         }
     }
 
-    let mut frames = Vec::new();
+    let (mut frames, mut distortions) = (Vec::new(), Vec::new());
     let mut places: Vec<(PathBuf, String)> = Vec::new();
     let mut warnings = Vec::new();
     for document in &documents {
@@ -78,7 +92,9 @@ pub(crate) fn read(dir: &Path) -> Result<Transforms, DatasetError> {
                 |name| format!("frame {index} ({})", name.chars().take(120).collect::<String>()),
             );
             let place = Place { path: &document.path, place: label };
-            frames.push(read_frame(dir, &place, place.object(value)?, top, scenario.as_ref())?);
+            let frame = place.object(value)?;
+            distortions.push(read_distortion(&place, frame, top)?);
+            frames.push(read_frame(dir, &place, frame, top, scenario.as_ref(), pictures)?);
             places.push((document.path.clone(), place.place));
         }
     }
@@ -89,8 +105,15 @@ pub(crate) fn read(dir: &Path) -> Result<Transforms, DatasetError> {
     if scenario.is_none() {
         derive_states_without_scenario(&mut frames);
     }
+    if scenario.is_some() {
+        if frames.iter().all(|f| f.view.is_none()) {
+            number_views_by_pose(&mut frames);
+        } else {
+            number_views_of_parts(&mut frames, &places);
+        }
+    }
     check_views(&frames, &places, scenario.as_ref())?;
-    Ok(Transforms { frames, scenario, warnings })
+    Ok(Transforms { frames, distortions, scenario, warnings })
 }
 
 struct Document {
@@ -188,6 +211,22 @@ fn kind(value: &Value) -> &'static str {
     }
 }
 
+/// The frame's own coefficients, or else those at top level.
+fn read_distortion(
+    place: &Place,
+    frame: &Map<String, Value>,
+    top: &Map<String, Value>,
+) -> Result<Distortion, DatasetError> {
+    let mut distortion = [0.0; 6];
+    for (value, key) in distortion.iter_mut().zip(["k1", "k2", "k3", "k4", "p1", "p2"]) {
+        *value = match place.number(frame, key)? {
+            Some(own) => own,
+            None => place.within("top level".to_owned()).number(top, key)?.unwrap_or(0.0),
+        };
+    }
+    Ok(distortion)
+}
+
 fn warn_about_distortion(path: &Path, top: &Map<String, Value>, warnings: &mut Vec<String>) {
     for key in ["k1", "k2", "k3", "k4", "p1", "p2"] {
         if top.get(key).and_then(Value::as_f64).is_some_and(|v| v.abs() > 1e-9) {
@@ -205,8 +244,9 @@ fn read_frame(
     frame: &Map<String, Value>,
     top: &Map<String, Value>,
     scenario: Option<&ScenarioInfo>,
+    pictures: Pictures,
 ) -> Result<Frame, DatasetError> {
-    let image_path = read_image_path(dir, place, frame)?;
+    let image_path = read_image_path(dir, place, frame, pictures)?;
     let camera = read_camera(place, frame, top, &image_path)?;
     let (state, branch, timestamp) = read_state(place, frame, scenario)?;
     let view = match place.index(frame, "view_id", MAX_FRAMES)? {
@@ -242,7 +282,12 @@ fn read_frame(
     })
 }
 
-fn read_image_path(dir: &Path, place: &Place, frame: &Map<String, Value>) -> Result<PathBuf, DatasetError> {
+fn read_image_path(
+    dir: &Path,
+    place: &Place,
+    frame: &Map<String, Value>,
+    pictures: Pictures,
+) -> Result<PathBuf, DatasetError> {
     let name = place
         .text(frame, "file_path")?
         .filter(|name| !name.is_empty())
@@ -262,8 +307,12 @@ fn read_image_path(dir: &Path, place: &Place, frame: &Map<String, Value>) -> Res
             relative.set_extension("png");
         }
         Some(extension) if extension == "png" => {}
+        Some(extension) if pictures == Pictures::PngOrJpeg && matches!(&*extension, "jpg" | "jpeg") => {}
         Some(extension) => {
-            return Err(place.error("file_path", format!("is a .{extension} file; only .png pictures are read")));
+            return Err(place.error(
+                "file_path",
+                format!("is a .{extension} file; only .png pictures are read (`carff dataset import` also takes .jpg)"),
+            ));
         }
     }
     let path = dir.join(relative);
@@ -298,7 +347,7 @@ fn read_camera(
     let (width_px, height_px) = match (side("w")?, side("h")?) {
         (Some(w), Some(h)) => (w, h),
         (None, None) => {
-            let (w, h) = png_dimensions(image_path)?;
+            let (w, h) = dimensions(image_path)?;
             if w > MAX_IMAGE_SIDE_PX || h > MAX_IMAGE_SIDE_PX {
                 return Err(place.error("file_path", format!("{w}x{h} pixels; at most {MAX_IMAGE_SIDE_PX} a side")));
             }
@@ -411,6 +460,59 @@ fn derive_states_without_scenario(frames: &mut [Frame]) {
     }
 }
 
+fn same_pose(a: &PinholeCamera, b: &PinholeCamera) -> bool {
+    let (a, b) = (a.world_from_camera.iter().flatten(), b.world_from_camera.iter().flatten());
+    a.zip(b).all(|(a, b)| (a - b).abs() <= POSE_TOLERANCE)
+}
+
+/// Frames that name no view: each distinct pose is one, in the order in which they come.
+fn number_views_by_pose(frames: &mut [Frame]) {
+    // Poses in cells of the tolerance's size; the same pose may fall into a neighbour's cell along the position.
+    let mut known: HashMap<[i64; 3], Vec<(PinholeCamera, usize)>> = HashMap::new();
+    let mut next = 0;
+    for frame in frames {
+        let position = frame.camera.position_m();
+        let cell = position.map(|v| (v / (4.0 * POSE_TOLERANCE)).floor() as i64);
+        let neighbours =
+            (0..27).map(|i| [0, 1, 2].map(|axis| cell[axis].saturating_add(i / 3_i64.pow(axis as u32) % 3 - 1)));
+        let found = neighbours
+            .filter_map(|cell| known.get(&cell))
+            .flatten()
+            .find(|(camera, _)| same_pose(camera, &frame.camera))
+            .map(|(_, view)| *view);
+        let view = found.unwrap_or_else(|| {
+            known.entry(cell).or_default().push((frame.camera, next));
+            next += 1;
+            next - 1
+        });
+        frame.view = Some(view);
+    }
+}
+
+/// Parts of a set that number their views each from 0: where a number means different poses in two files, those of later
+/// files are counted on.
+fn number_views_of_parts(frames: &mut [Frame], places: &[(PathBuf, String)]) {
+    let mut first: HashMap<usize, usize> = HashMap::new();
+    let collide = frames.iter().enumerate().any(|(i, frame)| {
+        let Some(view) = frame.view else { return false };
+        let other = *first.entry(view).or_insert(i);
+        places[other].0 != places[i].0 && !same_pose(&frames[other].camera, &frame.camera)
+    });
+    if !collide {
+        return;
+    }
+    let (mut offset, mut end) = (0, 0);
+    for i in 0..frames.len() {
+        if i > 0 && places[i].0 != places[i - 1].0 {
+            offset = end;
+        }
+        if let Some(view) = &mut frames[i].view {
+            *view += offset;
+            end = end.max(*view + 1);
+        }
+    }
+}
+
 /// A view is one pose, once in every state of the scenario; view indices have no gaps.
 fn check_views(
     frames: &[Frame],
@@ -433,13 +535,7 @@ fn check_views(
         by_state_and_view.insert((state, view), i);
         let first = *first_of_view.entry(view).or_insert(i);
         let (a, b) = (&frames[first].camera, &frame.camera);
-        let moved = a
-            .world_from_camera
-            .iter()
-            .flatten()
-            .zip(b.world_from_camera.iter().flatten())
-            .any(|(a, b)| (a - b).abs() > POSE_TOLERANCE);
-        if moved {
+        if !same_pose(a, b) {
             return Err(place(i).error(
                 "transform_matrix",
                 format!("differs from that of the same view {view} in {}; a view is one fixed pose", places[first].1),

@@ -135,6 +135,49 @@ fn plain_set_in_three_files() {
     assert_eq!(dataset.load_all_images().unwrap().len(), 6);
 }
 
+/// A scenario in three files: parts that number their views each from 0 are counted on, and frames that name no view have
+/// one for each pose. Sizes may be anything from 64 to 512 pixels, and differ.
+#[test]
+fn scenario_in_three_files() {
+    for named in [true, false] {
+        let dir = tempfile::tempdir().unwrap();
+        let mut scenario = whole()["scenario"].clone();
+        scenario["bev_view"] = json!(1);
+        let mut x = 0.0;
+        for (part, side, views) in [("train", 64, 3), ("val", 200, 1), ("test", 512, 2)] {
+            let mut frames = Vec::new();
+            for view in 0..views {
+                x += 1.0;
+                let mut pose = IDENTITY;
+                pose[0][3] = x;
+                for state in 0..4 {
+                    let name = format!("{part}/v{view}_s{state}.png");
+                    std::fs::create_dir_all(dir.path().join(part)).unwrap();
+                    Image::filled(side, side, [10, 20, 30]).save_png(&dir.path().join(&name)).unwrap();
+                    let mut frame = json!({"file_path": name, "transform_matrix": pose, "scene_id": state});
+                    if named {
+                        frame["view_index"] = json!(view);
+                    }
+                    frames.push(frame);
+                }
+            }
+            let mut set = json!({"camera_angle_x": 0.9, "frames": frames});
+            if part == "train" {
+                set["scenario"] = scenario.clone();
+            }
+            std::fs::write(dir.path().join(format!("transforms_{part}.json")), set.to_string()).unwrap();
+        }
+        let dataset = Dataset::open(dir.path()).unwrap();
+        assert_eq!((dataset.view_count(), dataset.frames().len()), (6, 24), "named: {named}");
+        for (i, frame) in dataset.frames().iter().enumerate() {
+            assert_eq!((frame.view, frame.state), (Some(i / 4), Some(i % 4)));
+            assert!((frame.camera.position_m()[0] - (i / 4 + 1) as f64).abs() < 1e-9);
+        }
+        let sizes: Vec<u32> = dataset.load_all_images().unwrap().iter().step_by(4).map(|i| i.width_px).collect();
+        assert_eq!(sizes, [64, 64, 64, 200, 512, 512]);
+    }
+}
+
 /// Branch and timestamp without a scenario still tell states apart.
 #[test]
 fn states_without_scenario() {
@@ -185,7 +228,7 @@ fn golden_errors() {
         ),
         (
             at("/frames/3/file_path", json!("b.jpg")),
-            "SET/transforms.json: frame 3 (b.jpg): key `file_path`: is a .jpg file; only .png pictures are read".into(),
+            "SET/transforms.json: frame 3 (b.jpg): key `file_path`: is a .jpg file; only .png pictures are read (`carff dataset import` also takes .jpg)".into(),
         ),
         (
             without("/frames/3", "file_path"),

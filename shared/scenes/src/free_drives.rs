@@ -8,7 +8,7 @@
 //!
 //! All that is drawn for drive `n` comes from the streams (seed, frame `n`, step `0x6472_7666`, sample `try`): drives can
 //! be made one by one, in any order. A drive is a trial of its kind as [`carff_dataset::ScenarioInfo::trial_kind`] says, which is judged
-//! on pictures of half the width and height.
+//! on pictures of a third of the width and height.
 //!
 //! ```no_run
 //! use carff_scenes::Scenario;
@@ -53,6 +53,8 @@ const SWAY: f64 = 0.012;
 const SWAYS: f64 = 1.5;
 /// How far a camera that is not on the ego drifts in a timestamp, along each axis, metres.
 const DRIFT_M: f64 = 0.4;
+/// Truth is judged on pictures so many times smaller, along each side: it costs up to two of them.
+const TRUTH_SHARE: u32 = 3;
 /// Least distance from things in scenarios as large as roads, metres: others are as much smaller as theirs is.
 const ROAD_CLEARANCE_M: f64 = 0.45;
 
@@ -220,14 +222,14 @@ impl Scenario {
         (0..drive.frame_count()).map(|frame| self.free_frame(drive, frame))
     }
 
-    /// Judged on a smaller picture: it is a share of pixels, and costs up to two pictures.
+    /// Judged on a smaller picture, as it is a share of pixels.
     fn free_observability(
         &self,
         placement: &Placement,
         timestamp: usize,
         camera: &PinholeCamera,
     ) -> Option<Observability> {
-        let camera = camera.resized((camera.width_px / 2).max(1), (camera.height_px / 2).max(1));
+        let camera = camera.resized(camera.width_px.div_ceil(TRUTH_SHARE), camera.height_px.div_ceil(TRUTH_SHARE));
         self.observability_of(placement, timestamp, &camera)
     }
 

@@ -1,6 +1,6 @@
-//! Scenarios as data, and the ray tracer that takes their pictures.
+//! Scenarios as data, the ray tracer that takes their pictures, and free drives through them.
 //!
-//! A scenario is a TOML file: what stands where, who drives where in which branch, and which cameras look. Nothing
+//! A scenario is a TOML file: what stands where, who moves where in which branch, and which cameras look. Nothing
 //! here knows of models, data-set readers or processes.
 //!
 //! ```no_run

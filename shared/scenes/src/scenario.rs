@@ -287,7 +287,7 @@ impl Scenario {
 
     /// The picture of a placement that need not be a state's.
     pub(crate) fn picture_of(&self, placement: &Placement, camera: &PinholeCamera) -> Image {
-        self.scene(placement).picture(&self.setting, camera).0
+        self.scene(placement).image(&self.setting, camera)
     }
 
     /// How much of the actor is seen in a placement that differs from a state's in who is not the actor.

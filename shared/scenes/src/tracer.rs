@@ -253,27 +253,41 @@ impl Scene {
         (colour + (HORIZON - colour) * haze, object)
     }
 
+    /// A picture: RGB alone.
+    pub fn image(&self, setting: &Setting, camera: &PinholeCamera) -> Image {
+        let (w, h) = (camera.width_px as usize, camera.height_px as usize);
+        let mut rgb = vec![0_u8; w * h * 3];
+        rgb.par_chunks_mut(w * 3).enumerate().for_each(|(y, row)| self.row(setting, camera, y, row));
+        Image { width_px: camera.width_px, height_px: camera.height_px, rgb }
+    }
+
     /// A picture: RGB, depth along the ray through each pixel's centre (metres; infinite for the sky), and whose the
     /// first hit there is.
     pub fn picture(&self, setting: &Setting, camera: &PinholeCamera) -> (Image, Vec<f32>, Vec<u16>) {
         let (w, h) = (camera.width_px as usize, camera.height_px as usize);
-        let pixel_angle = (1.0 / camera.fl_x_px) as f32;
         let mut rgb = vec![0_u8; w * h * 3];
         let mut depth_m = vec![0.0_f32; w * h];
         let mut object_id = vec![0_u16; w * h];
         rgb.par_chunks_mut(w * 3).zip(depth_m.par_chunks_mut(w)).zip(object_id.par_chunks_mut(w)).enumerate().for_each(
             |(y, ((rgb, depth_m), object_id))| {
+                self.row(setting, camera, y, rgb);
                 for x in 0..w {
-                    let colour = self.pixel(setting, camera, x, y, pixel_angle);
-                    for (to, c) in rgb[x * 3..x * 3 + 3].iter_mut().zip(colour.to_array()) {
-                        *to = (encode(c) * 255.0).round() as u8;
-                    }
                     let (origin, direction) = ray(camera, x as f64 + 0.5, y as f64 + 0.5);
                     (depth_m[x], object_id[x]) = self.probe(origin, direction);
                 }
             },
         );
         (Image { width_px: camera.width_px, height_px: camera.height_px, rgb }, depth_m, object_id)
+    }
+
+    fn row(&self, setting: &Setting, camera: &PinholeCamera, y: usize, rgb: &mut [u8]) {
+        let pixel_angle = (1.0 / camera.fl_x_px) as f32;
+        for (x, pixel) in rgb.chunks_exact_mut(3).enumerate() {
+            let colour = self.pixel(setting, camera, x, y, pixel_angle);
+            for (to, c) in pixel.iter_mut().zip(colour.to_array()) {
+                *to = (encode(c) * 255.0).round() as u8;
+            }
+        }
     }
 
     fn pixel(&self, setting: &Setting, camera: &PinholeCamera, x: usize, y: usize, pixel_angle: f32) -> Vec3 {

@@ -153,7 +153,7 @@ impl Pictures {
                 // The configuration was validated and the lengths are equal: nothing is left that could be wrong.
                 noisy.copy_from_slice(&image.rgb);
             }
-            planes.push(Tensor::from_slice(&noisy).view([i64::from(image.height_px), i64::from(image.width_px), 3]));
+            planes.push(Tensor::from_slice(&noisy).view([1, i64::from(image.height_px), i64::from(image.width_px), 3]));
             let mut rng = carff_random::stream(Key { sample: 1, ..key });
             let mut within = |limit: f64| if limit > 0.0 { rng.random_range(-limit..=limit) } else { 0.0 };
             let (angle, zoom) = (within(augmentation.rotation_deg).to_radians(), 1.0 + within(augmentation.zoom));
@@ -161,7 +161,18 @@ impl Pictures {
             let (s, c) = (angle.sin() * zoom, angle.cos() * zoom);
             affine.extend([c, -s, dx, s, c, dy].map(|v| v as f32));
         }
-        let pictures = carff_models::encoder::pictures_from_bytes(&Tensor::stack(&planes, 0));
+        let one_size = planes.windows(2).all(|pair| pair[0].size() == pair[1].size());
+        let pictures = if one_size {
+            carff_models::encoder::pictures_from_bytes(&Tensor::cat(&planes, 0))
+        } else {
+            // Sets may mix sizes: a batch takes that of its first picture.
+            let size = planes[0].size();
+            let resized = planes.iter().map(|plane| {
+                let picture = carff_models::encoder::pictures_from_bytes(plane);
+                picture.internal_upsample_bilinear2d_aa([size[1], size[2]], false, None, None)
+            });
+            Tensor::cat(&resized.collect::<Vec<_>>(), 0)
+        };
         if copy == 0 {
             return pictures;
         }

@@ -13,7 +13,7 @@ use carff_checkpoint::{FORMAT_VERSION, Manifest, ScenarioIdentity, SplitRecord, 
 use carff_config::CheckpointPlanning;
 use carff_dataset::{Observability, PoseRole, drives::eligible_inputs};
 use carff_evaluation::{Input, Models, birds_eye, planning_table, sample_accuracy, trials};
-use carff_field::Field;
+use carff_field::{Field, RenderBuffer, RenderOptions};
 use carff_models::{LATENT_DIM, LatentGaussian, mixture::Sampling};
 use carff_planning::{CalibrationTrial, Rule, choose_threshold};
 use carff_probing::{Calibration, Place, Prober};
@@ -53,6 +53,9 @@ pub fn train(
         pictures.add_free(free)?;
     }
     let states = pictures.scenario.state_count();
+    if states == 1 {
+        return field_alone(config, &pictures, out, stage, run);
+    }
     let pretrained = config.pretrained_backbone.as_deref();
     let mut vae = Vae::new(config, pictures.dataset.view_count(), states, pretrained)?;
     let posteriors = match finished(run, "vae", config.vae.epochs, |state| vae.restore_weights(state)) {
@@ -112,7 +115,7 @@ pub fn train(
         let (prober, calibration) = calibrate_probing(&manifest, &field, &clouds, config.seed)?;
         metrics["probing"] = json!({"separations": calibration.separations(), "places": prober.places().len()});
         if let Some(view) = birds_eye(&field, &manifest.states, &pictures.dataset, config.threads.max(1) as usize)? {
-            write_birds_eye(run, &view)?;
+            write_strip(run, "birds_eye.png", &view)?;
             metrics["birds_eye"] = serde_json::to_value(&view).unwrap_or(Value::Null);
         }
         manifest.probing = Some(calibration);
@@ -128,6 +131,73 @@ pub fn train(
         }
         manifest.save(out)?;
     }
+    run.metric(&json!({"stage": "done", "metrics": manifest.metrics}))?;
+    Ok(manifest.metrics)
+}
+
+/// Of a set of one state, as imported ones are, there is nothing to encode or to forecast: the field alone is trained, on
+/// one latent, and judged on the poses that were kept away from it.
+fn field_alone(
+    config: &TrainingConfig,
+    pictures: &Pictures,
+    out: &Path,
+    stage: Stage,
+    run: &Run,
+) -> Result<Value, TrainingError> {
+    if matches!(stage, Stage::Vae | Stage::Mdn) {
+        return Err(TrainingError::Unfit(
+            "the data set has one state: there is nothing to encode or to forecast; train the field, with `--stage nerf`"
+                .into(),
+        ));
+    }
+    let only = LatentGaussian { mean: [0.0; LATENT_DIM], log_variance: [-10.0; LATENT_DIM] };
+    let clouds = Clouds::new(pictures, &vec![only; pictures.images.len()])?;
+    let mut field = field::train(config, pictures, &clouds, run)?;
+    field.round_to_f16();
+    save_field(out, &field)?;
+    let options = RenderOptions { threads: config.threads.max(1) as usize, ..RenderOptions::default() };
+    let mut buffer = RenderBuffer::new();
+    let mut strip = carff_evaluation::BirdsEye::default();
+    let mut metrics = serde_json::Map::new();
+    for (name, role) in [("trained", PoseRole::Rest), ("unseen", PoseRole::Unseen)] {
+        let mut psnr_db = Vec::new();
+        for i in pictures.with_roles(&[role]) {
+            let (camera, truth) = (pictures.dataset.frames()[i].camera, &pictures.images[i]);
+            field.render(&camera, &only.mean, &options, &mut buffer);
+            let true_values: Vec<f32> = truth.rgb.iter().map(|&b| f32::from(b) / 255.0).collect();
+            psnr_db.extend(carff_metrics::psnr_db(&buffer.rgb, &true_values));
+            let alike =
+                strip.truths.first().is_none_or(|t| (t.width_px, t.height_px) == (truth.width_px, truth.height_px));
+            if role == PoseRole::Unseen && alike && strip.truths.len() < 8 {
+                let rgb = buffer.rgb.iter().map(|v| (v.clamp(0.0, 1.0) * 255.0 + 0.5) as u8).collect();
+                strip.pictures.push(carff_dataset::Image { rgb, ..*truth });
+                strip.truths.push(truth.clone());
+            }
+        }
+        let mean = carff_metrics::mean(&psnr_db);
+        metrics.insert(name.into(), json!({"poses": psnr_db.len(), "psnr_db": mean}));
+    }
+    write_strip(run, "views.png", &strip)?;
+    let manifest = Manifest {
+        format_version: FORMAT_VERSION,
+        scenario: ScenarioIdentity::of(&pictures.scenario, pictures.dataset.view_count()),
+        seed: config.seed,
+        split: SplitRecord {
+            seed: config.split_seed,
+            unseen: pictures.split.views(PoseRole::Unseen),
+            calibration: pictures.split.views(PoseRole::Calibration),
+        },
+        encoder: config.encoder.clone(),
+        decoder: config.decoder.clone(),
+        mixture: config.mixture.clone(),
+        field: Some(field.config().clone()),
+        states: vec![only],
+        places: Vec::new(),
+        probing: None,
+        training: serde_json::to_value(config).unwrap_or(Value::Null),
+        metrics: json!({"views": metrics}),
+    };
+    manifest.save(out)?;
     run.metric(&json!({"stage": "done", "metrics": manifest.metrics}))?;
     Ok(manifest.metrics)
 }
@@ -349,8 +419,8 @@ fn figures(
     Ok(json!({"planning": planning, "samples": samples}))
 }
 
-/// Rendered above true, one column a state.
-fn write_birds_eye(run: &Run, view: &carff_evaluation::BirdsEye) -> Result<(), TrainingError> {
+/// Rendered above true, one column a picture.
+fn write_strip(run: &Run, name: &str, view: &carff_evaluation::BirdsEye) -> Result<(), TrainingError> {
     let (Some(first), columns) = (view.pictures.first(), view.pictures.len()) else { return Ok(()) };
     let (w, h) = (first.width_px as usize, first.height_px as usize);
     let mut sheet = carff_dataset::Image {
@@ -366,7 +436,7 @@ fn write_birds_eye(run: &Run, view: &carff_evaluation::BirdsEye) -> Result<(), T
             }
         }
     }
-    Ok(sheet.save_png(&run.dir.join("birds_eye.png"))?)
+    Ok(sheet.save_png(&run.dir.join(name))?)
 }
 
 /// A progress line for those who have no bar.
@@ -408,6 +478,13 @@ pub fn summary(metrics: &Value) -> String {
         &[
             ("trained poses", number("/samples/trained/accuracy"), 100.0, " %"),
             ("unseen poses", number("/samples/unseen/accuracy"), 100.0, " %"),
+        ],
+    );
+    line(
+        "PSNR of views",
+        &[
+            ("trained poses", number("/views/trained/psnr_db"), 1.0, " dB"),
+            ("unseen poses", number("/views/unseen/psnr_db"), 1.0, " dB"),
         ],
     );
     line(

@@ -111,6 +111,9 @@ pub(crate) fn resize(pictures: &Tensor, side: i64) -> Tensor {
     let size = pictures.size();
     if size[2] == side && size[3] == side {
         pictures.shallow_clone()
+    } else if size[2] > side || size[3] > side {
+        // Averaged, so that what is finer than the new pixels leaves no pattern.
+        pictures.internal_upsample_bilinear2d_aa([side, side], false, None, None)
     } else {
         pictures.upsample_bilinear2d([side, side], false, None, None)
     }

@@ -1,0 +1,139 @@
+//! Contracts of sets of one state, as imported ones are (the field alone is trained, and judged on poses it never saw),
+//! and of the training files that ship.
+
+#![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
+
+use carff_dataset::{Dataset, ImportOptions, import};
+use carff_scenes::{Extras, Scenario};
+use carff_training::{
+    TrainingError,
+    config::TrainingConfig,
+    pipeline::{self, Stage},
+    run::{Progress, Run},
+};
+use std::ops::ControlFlow;
+use std::path::Path;
+use std::sync::atomic::AtomicBool;
+
+/// Two blocks of different colours, seen from above and around.
+const SCENARIO: &str = r##"
+name = "still"
+bounds_m = [[-3.0, -3.0, 0.0], [3.0, 3.0, 2.0]]
+timestamps = 1
+branches = ["only"]
+picture = { width_px = 48, height_px = 48, fov_deg = 45.0 }
+ground_surface = "plain"
+ground_colour = "#808080"
+
+[[object]]
+name = "red"
+role = "static"
+at = [-1.0, 0.0, 0.0, 20.0]
+
+[[object.box]]
+center = [0.0, 0.0, 0.6]
+size_m = [1.6, 1.0, 1.2]
+colour = "#d02010"
+
+[[object]]
+name = "blue"
+role = "static"
+at = [1.2, 0.6, 0.0, 0.0]
+
+[[object.cylinder]]
+from = [0.0, 0.0, 0.0]
+to = [0.0, 0.0, 1.4]
+radius_m = 0.6
+colour = "#1030d0"
+
+[[orbit]]
+view_kind = "orbit"
+count = 30
+center = [0.0, 0.0, 0.5]
+radius_m = [6.0, 7.0]
+elevation_deg = [25.0, 70.0]
+"##;
+
+const TRAINING: &str = r#"
+dataset = "set"
+out = "out"
+seed = 3
+split_seed = 5
+threads = 1
+
+[field]
+levels = 6
+log2_table_size = 13
+max_resolution = 128
+hidden_width = 32
+samples_across = 64.0
+
+[nerf]
+rays = 1024
+
+[nerf.trainer]
+steps = 500
+occupancy_warmup_steps = 100
+threads = 1
+"#;
+
+/// An imported set trains with `--stage nerf` and with all stages alike, shows poses that were kept away better than
+/// their own mean colours, and is refused by stages that have nothing to do.
+#[test]
+fn an_imported_set_trains_the_field() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name);
+    let scenario = Scenario::parse(Path::new("still.toml"), SCENARIO).unwrap();
+    scenario.render_dataset(&path("rendered"), Extras::None, |_, _| ControlFlow::Continue(())).unwrap();
+    // Without its scenario it is as plain as anybody's.
+    let text = std::fs::read_to_string(path("rendered/transforms.json")).unwrap();
+    let mut plain: serde_json::Value = serde_json::from_str(&text).unwrap();
+    plain.as_object_mut().unwrap().remove("scenario");
+    std::fs::write(path("rendered/transforms.json"), plain.to_string()).unwrap();
+    let options = ImportOptions { bounds: Some(scenario.info().bounds), ..ImportOptions::default() };
+    import(&path("rendered"), &path("set"), &options).unwrap();
+
+    std::fs::write(path("training.toml"), TRAINING).unwrap();
+    let config = TrainingConfig::load(&path("training.toml")).unwrap();
+    let (stop, on_progress) = (AtomicBool::new(false), |_: &Progress| {});
+    let train = |stage: Stage| {
+        let run = Run { dir: folder.path().to_owned(), on_progress: &on_progress, stop: &stop };
+        pipeline::train(&config, &path("set"), None, &path("out"), stage, &run)
+    };
+    for stage in [Stage::Vae, Stage::Mdn] {
+        let error = train(stage).unwrap_err();
+        assert!(matches!(error, TrainingError::Unfit(_)) && error.to_string().contains("--stage nerf"), "{error}");
+    }
+    let metrics = train(Stage::Nerf).unwrap();
+    let figure = |path: &str| metrics.pointer(path).and_then(serde_json::Value::as_f64).unwrap();
+    assert_eq!((figure("/views/trained/poses"), figure("/views/unseen/poses")), (24.0, 3.0));
+
+    let images = Dataset::open(&path("set")).unwrap().load_all_images().unwrap();
+    let mut of_mean = 0.0;
+    for image in &images {
+        let pixels = image.rgb.len() / 3;
+        let sum = |c: usize| image.rgb.iter().skip(c).step_by(3).map(|&v| u64::from(v)).sum::<u64>();
+        let mean = [0, 1, 2].map(|c| (sum(c) / pixels as u64) as u8);
+        let flat = carff_dataset::Image::filled(image.width_px, image.height_px, mean);
+        of_mean += flat.psnr_db(image).unwrap() / images.len() as f64;
+    }
+    let unseen = figure("/views/unseen/psnr_db");
+    assert!(unseen > of_mean + 4.0, "{unseen} dB, mean colours {of_mean} dB");
+    assert!(path("views.png").is_file() && path("out/field.safetensors").is_file());
+    // A finished training is not done again.
+    assert_eq!(train(Stage::All).unwrap(), metrics);
+}
+
+/// Every shipped training file is valid, names its scenario, and writes to the checkpoint of its own name.
+#[test]
+fn every_shipped_training_file_is_valid() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).ancestors().nth(2).unwrap();
+    for entry in std::fs::read_dir(root.join("configs/training")).unwrap() {
+        let path = entry.unwrap().path();
+        let config = TrainingConfig::load(&path).unwrap();
+        assert!(root.join(config.scenario.unwrap()).is_file(), "{}", path.display());
+        let name = path.file_stem().unwrap().to_str().unwrap();
+        let out = config.out.to_str().unwrap().to_owned();
+        assert!(out.ends_with(&format!("checkpoints/{name}")) || out.starts_with("runs/"), "{name}: {out}");
+    }
+}
