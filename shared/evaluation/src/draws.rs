@@ -96,12 +96,7 @@ fn means(trials: &[TrialCurve]) -> Curve {
     let mut pictures: Vec<usize> = trials.iter().map(|t| t.picture).collect();
     pictures.sort_unstable();
     pictures.dedup();
-    Curve {
-        mean: (0..counts).map(mean).collect(),
-        band: Vec::new(),
-        trials: trials.len(),
-        pictures: pictures.len(),
-    }
+    Curve { mean: (0..counts).map(mean).collect(), band: Vec::new(), trials: trials.len(), pictures: pictures.len() }
 }
 
 /// Share of right samples among the first n, for each n.
@@ -128,12 +123,16 @@ pub fn met_all(met: impl IntoIterator<Item = u64>, wanted: u64) -> Vec<f64> {
         .collect()
 }
 
-/// Recall that an even mixture of two outcomes allows with n independent draws, 1 - 0.5^n, and the band in which 95 % of
-/// measurements with so many trials lie.
-pub fn even_mixture_recall(n: usize, trials: usize) -> (f64, [f64; 2]) {
-    let p = 1.0 - 0.5_f64.powi(n as i32);
-    let half = 1.96 * (p * (1.0 - p) / trials.max(1) as f64).sqrt() + 0.5 / trials.max(1) as f64;
-    (p, [(p - half).max(0.0), (p + half).min(1.0)])
+/// Recall that is to be expected with n independent draws, where each trial's true outcome has its `probabilities` share
+/// of the belief (two equally open ones: 1 - 0.5^n), and the band in which 95 % of measurements lie. 0 for no trials.
+pub fn expected_recall(n: usize, probabilities: &[f64]) -> (f64, [f64; 2]) {
+    let trials = probabilities.len().max(1) as f64;
+    let met = || probabilities.iter().map(|p| 1.0 - (1.0 - p).powi(n as i32));
+    let mean = met().sum::<f64>() / trials;
+    let variance = met().map(|m| m * (1.0 - m)).sum::<f64>() / trials.powi(2);
+    // Half a trial more on both sides: a share of trials comes in steps.
+    let half = 1.96 * variance.sqrt() + 0.5 / trials;
+    (mean, [(mean - half).max(0.0), (mean + half).min(1.0)])
 }
 
 /// One input whose picture leaves several outcomes open.
@@ -268,15 +267,18 @@ mod tests {
             recall_curve(&trials)
         };
         let within = |curve: &Curve| {
-            (1..=8).filter(|&n| {
-                let (_, [low, high]) = even_mixture_recall(n, curve.trials);
-                (low..=high).contains(&curve.mean[n - 1])
-            })
-            .count()
+            (1..=8)
+                .filter(|&n| {
+                    let (_, [low, high]) = expected_recall(n, &vec![0.5; curve.trials]);
+                    (low..=high).contains(&curve.mean[n - 1])
+                })
+                .count()
         };
         assert!(within(&recall(0.5)) >= 5, "{:?}", recall(0.5).mean);
         assert!(within(&recall(0.4)) <= 2, "{:?}", recall(0.4).mean);
-        assert_eq!(even_mixture_recall(1, 100).0, 0.5);
+        assert_eq!(expected_recall(2, &[0.5; 100]).0, 0.75);
+        assert_eq!(expected_recall(1, &[0.25, 0.75]).0, 0.5);
+        assert_eq!(expected_recall(3, &[]).0, 0.0);
     }
 
     /// Inputs are grouped by what is open; shares, unknown and ruled-out samples add up to one; a sure input is left out.

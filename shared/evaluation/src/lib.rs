@@ -5,6 +5,7 @@
 
 mod birds_eye;
 pub mod draws;
+pub mod hypotheses;
 mod pairs;
 mod planning;
 mod samples;
