@@ -26,7 +26,7 @@ pub struct EvalArgs {
     /// Folder of the training run, for its curves; else runs/NAME or the checkpoint's parent, where they have any.
     #[arg(long)]
     run_dir: Option<PathBuf>,
-    /// Threads.
+    /// Threads that render and probe.
     #[arg(long, default_value_t = 2, value_parser = clap::value_parser!(u16).range(1..=256))]
     threads: u16,
     /// Seed of sensor noise, draws and folds.
@@ -70,6 +70,8 @@ impl From<TableName> for Table {
 /// Runs the command.
 pub fn run(args: &EvalArgs) -> anyhow::Result<ExitCode> {
     let options = options(&args.device, args.threads, args.seed)?;
+    // A picture at a time gains little from a second thread, and loses much where cores are taken.
+    carff_models::device::set_threads(1);
     let manifest = Manifest::load(&args.checkpoint)?;
     let dataset = match &args.dataset {
         Some(dataset) => dataset.clone(),
@@ -94,10 +96,9 @@ pub fn run(args: &EvalArgs) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-/// Sets up libtorch, and says how to evaluate.
+/// Sets up the allocator, and says how to evaluate.
 pub fn options(device: &str, threads: u16, seed: u64) -> anyhow::Result<EvalOptions> {
     carff_models::allocator::keep_large_blocks();
-    carff_models::device::set_threads(threads);
     Ok(EvalOptions { device: carff_models::device::parse(device)?, threads: usize::from(threads), seed })
 }
 

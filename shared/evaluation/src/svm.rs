@@ -13,6 +13,8 @@ use rand::seq::SliceRandom;
 /// A latent, as the machines see it.
 pub type Row = [f32; LATENT_DIM];
 
+/// Where the solver stops, as scikit-learn's does.
+const SOLVER_TOLERANCE: f64 = 1e-3;
 /// Names this use of a seed.
 const STREAM: u64 = 0x7376_6d20_666f_6c64;
 
@@ -43,6 +45,7 @@ pub fn fit_and_name(rows: &[Row], states: &[usize], asked: &[Row]) -> Vec<usize>
             let machine = Svm::<f64, bool>::params()
                 .gaussian_kernel(1.0 / gamma)
                 .pos_neg_weights(1.0, 1.0)
+                .eps(SOLVER_TOLERANCE)
                 .fit(&Dataset::new(records, is_first));
             let Ok(machine) = machine else { continue };
             let answers: Array1<bool> = machine.predict(&asked_table);

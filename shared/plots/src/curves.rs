@@ -456,7 +456,7 @@ mod tests {
         let of = |series: Series| draw("", &[Panel { series: vec![series], ..Panel::default() }]).unwrap();
         let tinted = |image: &Image| {
             let paper = [PAPER.0, PAPER.1, PAPER.2];
-            let coloured = |p: &&[u8]| *p != paper && i16::from(p[2]) - i16::from(p[0]) > 12;
+            let coloured = |p: &&[u8]| *p != paper && i16::from(p[2]) - i16::from(p[0]) > 25;
             image.rgb.chunks_exact(3).filter(coloured).count()
         };
         let points = vec![(0.0, 1.0), (10.0, 1.0)];

@@ -420,10 +420,13 @@ fn reliability(page: &mut String, results: &Results) {
          that has a next step, taken once with sensor noise, against whether its branch is one with a hazard. Bins of a \
          tenth.\n\n![Reliability](reliability.png)\n"
     );
-    head(page, &["poses", "pictures", "expected calibration error"]);
+    head(page, &["poses", "pictures", "expected calibration error", "bins: forecast, found share, pictures"]);
     for part in PARTS {
         let Some(r) = results.hazard_reliability.get(part) else { continue };
-        row(page, &[part.into(), r.trials.to_string(), format!("{:.3}", r.expected_calibration_error)]);
+        let bin = |b: &carff_metrics::ReliabilityBin| format!("{:.2}: {:.2} of {}", b.forecast, b.happened, b.trials);
+        let bins: Vec<String> = r.bins.iter().map(bin).collect();
+        let error = format!("{:.3}", r.expected_calibration_error);
+        row(page, &[part.into(), r.trials.to_string(), error, bins.join("; ")]);
     }
     page.push('\n');
 }
@@ -521,7 +524,7 @@ mod tests {
         };
         let page = page(&results);
         assert_tables_are_even(&page);
-        assert!(page.contains("| a t0 | **30.0** | 20.0 |") && !page.contains("| a t1 |"), "{page}");
+        assert!(page.contains("| a t0 | **30.0** | 20.0 |") && !page.contains("\n| a t1 "), "{page}");
         assert!(page.contains("| paper | 10 | - | 1/1 (21 to 100 %) |"), "{page}");
         assert!(page.contains("| unseen | - | - | - |"), "{page}");
     }
