@@ -61,10 +61,9 @@ pub fn fit_and_name(rows: &[Row], states: &[usize], asked: &[Row]) -> Vec<usize>
     votes.iter().map(winner).collect()
 }
 
-/// The state named for each row by machines that were fitted without the fold it is in: `folds` folds, each with its
-/// share of every state, drawn by `seed`.
-pub fn cross_validated(rows: &[Row], states: &[usize], folds: usize, seed: u64) -> Vec<usize> {
-    let fold_of = stratified_folds(states, folds, seed);
+/// The state named for each row by machines that were fitted without the fold it is in.
+pub fn cross_validated(rows: &[Row], states: &[usize], fold_of: &[usize]) -> Vec<usize> {
+    let folds = fold_of.iter().max().map_or(0, |f| f + 1);
     let mut named = vec![0; rows.len()];
     for fold in 0..folds {
         let (out, within): (Vec<usize>, Vec<usize>) = (0..rows.len()).partition(|&i| fold_of[i] == fold);
@@ -77,17 +76,31 @@ pub fn cross_validated(rows: &[Row], states: &[usize], folds: usize, seed: u64) 
     named
 }
 
-/// Per row its fold: rows of each state are shuffled and dealt out in turn.
-fn stratified_folds(states: &[usize], folds: usize, seed: u64) -> Vec<usize> {
-    let mut rng = carff_random::stream(Key { seed, frame: STREAM, step: 0, sample: 0 });
+/// Per row its fold, with its share of every state: rows of each state are shuffled by `seed` and dealt out in turn.
+pub fn stratified_folds(states: &[usize], folds: usize, seed: u64) -> Vec<usize> {
     let mut order: Vec<usize> = (0..states.len()).collect();
-    order.shuffle(&mut rng);
+    order.shuffle(&mut rng(seed));
     order.sort_by_key(|&i| states[i]);
     let mut fold_of = vec![0; states.len()];
     for (place, i) in order.into_iter().enumerate() {
         fold_of[i] = place % folds.max(1);
     }
     fold_of
+}
+
+/// Per row its fold, with all rows of a group (a camera pose) in one: groups are shuffled by `seed` and dealt out in
+/// turn.
+pub fn grouped_folds(groups: &[usize], folds: usize, seed: u64) -> Vec<usize> {
+    let mut known: Vec<usize> = groups.to_vec();
+    known.sort_unstable();
+    known.dedup();
+    known.shuffle(&mut rng(seed));
+    let place = |group: &usize| known.iter().position(|k| k == group).unwrap_or(0);
+    groups.iter().map(|group| place(group) % folds.max(1)).collect()
+}
+
+fn rng(seed: u64) -> impl rand::Rng {
+    carff_random::stream(Key { seed, frame: STREAM, step: 0, sample: 0 })
 }
 
 #[cfg(test)]
@@ -113,7 +126,7 @@ mod tests {
     fn separable_states_are_named() {
         let rows = [cloud(-1.0, 20, 1), cloud(0.0, 20, 2), cloud(1.0, 20, 3)].concat();
         let states: Vec<usize> = (0..60).map(|i| [4, 7, 9][i / 20]).collect();
-        assert_eq!(cross_validated(&rows, &states, 10, 5), states);
+        assert_eq!(cross_validated(&rows, &states, &stratified_folds(&states, 10, 5)), states);
     }
 
     /// Two states that share every point cannot be told apart: about half is right, which is the ceiling.
@@ -121,7 +134,7 @@ mod tests {
     fn duplicated_points_stay_at_the_ceiling() {
         let rows = [cloud(0.0, 100, 1), cloud(0.0, 100, 1)].concat();
         let states: Vec<usize> = (0..200).map(|i| i / 100).collect();
-        let share = right(&cross_validated(&rows, &states, 10, 5), &states) as f64 / 200.0;
+        let share = right(&cross_validated(&rows, &states, &stratified_folds(&states, 10, 5)), &states) as f64 / 200.0;
         assert!(share < 0.6, "{share}");
     }
 
@@ -136,7 +149,7 @@ mod tests {
         });
         let rows: Vec<Row> = ring.chain(cloud(0.0, 40, 3)).collect();
         let states: Vec<usize> = (0..80).map(|i| i / 40).collect();
-        assert_eq!(right(&cross_validated(&rows, &states, 10, 1), &states), 80);
+        assert_eq!(right(&cross_validated(&rows, &states, &stratified_folds(&states, 10, 1)), &states), 80);
     }
 
     /// gamma is scikit-learn's: of half zeros and half ones the variance is 1/4, so 1 / (8 / 4); even rows have 1.
@@ -155,6 +168,19 @@ mod tests {
         for fold in 0..10 {
             let of = |state| (0..95).filter(|&i| folds[i] == fold && states[i] == state).count();
             assert!((4..=5).contains(&of(0)) && (5..=6).contains(&of(1)), "{} {}", of(0), of(1));
+        }
+    }
+
+    /// Rows of one group are never apart, and folds have as many groups as any other, to within one.
+    #[test]
+    fn groups_stay_together() {
+        let groups: Vec<usize> = (0..90).map(|i| i / 6 * 3).collect();
+        let folds = grouped_folds(&groups, 10, 3);
+        for i in 0..90 {
+            assert!((0..90).all(|j| groups[i] != groups[j] || folds[i] == folds[j]));
+        }
+        for fold in 0..10 {
+            assert!((6..=12).contains(&folds.iter().filter(|f| **f == fold).count()));
         }
     }
 }

@@ -2,7 +2,7 @@
 
 use crate::subject::{ROLES, Subject};
 use carff_dataset::PoseRole;
-use carff_evaluation::svm::{cross_validated, fit_and_name};
+use carff_evaluation::svm::{cross_validated, fit_and_name, grouped_folds, stratified_folds};
 use carff_models::LATENT_DIM;
 use carff_training::{
     accuracy::{ByObservability, Centroids, Share, state_accuracy},
@@ -34,8 +34,11 @@ pub struct EncoderTable {
 /// Scores of the support vector machine (RBF, C = 1, gamma = 1 / (8 variance)).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct SvmTable {
-    /// All trained poses, 10 folds drawn by picture, as the paper does it.
+    /// All trained poses, 10 folds drawn by picture, as the paper does it. Of states that are one picture, the doubles of
+    /// a picture that is left out stay in, under other names: that keeps the accuracy below its ceiling.
     pub trained: SvmScore,
+    /// The same with 10 folds drawn by pose: no double stays in, and the pose is new to the machine.
+    pub trained_by_pose: SvmScore,
     /// Poses never trained on; fitted on all trained ones.
     pub unseen: SvmScore,
 }
@@ -123,8 +126,11 @@ fn svm(subject: &Subject) -> SvmTable {
     };
     let (trained, unseen) = (pictures.trained(), pictures.with_roles(&[PoseRole::Unseen]));
     let (rows, states) = pick(&trained);
+    let views: Vec<usize> = trained.iter().map(|&i| pictures.labels[i].view).collect();
+    let seed = subject.options.seed;
     SvmTable {
-        trained: score(&trained, &cross_validated(&rows, &states, FOLDS, subject.options.seed)),
+        trained: score(&trained, &cross_validated(&rows, &states, &stratified_folds(&states, FOLDS, seed))),
+        trained_by_pose: score(&trained, &cross_validated(&rows, &states, &grouped_folds(&views, FOLDS, seed))),
         unseen: score(&unseen, &fit_and_name(&rows, &states, &pick(&unseen).0)),
     }
 }

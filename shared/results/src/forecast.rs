@@ -286,7 +286,11 @@ fn frequency_table(subject: &Subject, open: &[Trial]) -> FrequencyTable {
     let presence = ["somebody there", "nobody there"].map(str::to_owned);
     FrequencyTable {
         by_branch: frequencies(&count(scenario.branches.len(), &|s| s / steps), &scenario.branches),
-        by_presence: frequencies(&count(2, &|s| usize::from(!present(s))), &presence),
+        by_presence: if scenario.branches.len() > 2 {
+            frequencies(&count(2, &|s| usize::from(!present(s))), &presence)
+        } else {
+            Vec::new()
+        },
     }
 }
 

@@ -90,7 +90,8 @@ pub fn gallery(subject: &Subject, out: &Path, on_progress: &dyn Fn(&Progress)) -
         "latents.png",
         "Latents",
         "t-SNE of the posterior means of all pictures, one map in three panels. Where the actor's place is seen, latents \
-         of a state lie together and apart from others; where it is hidden, states that are one picture mix, as they must.",
+         of a state lie together and apart from others; where it is hidden, states that are one picture mix, as they \
+         must. Pictures that are the same lie on each other.",
     );
     tell(5, "training curves");
     let run = subject.run_dir.as_deref();

@@ -163,7 +163,7 @@ pub struct About {
 pub struct FrequencyTable {
     /// Outcome: the branch.
     pub by_branch: Vec<Frequencies>,
-    /// Outcome: whether any of the boxes that come and go stands there.
+    /// Outcome: whether any of the boxes that come and go stands there. Empty with two branches, which say as much.
     pub by_presence: Vec<Frequencies>,
 }
 
@@ -178,7 +178,7 @@ pub fn evaluate(
     let mut results = Results { subject: subject.about(), ..Results::default() };
     let has = |table| tables.contains(&table);
     if has(Table::Psnr) {
-        match pictures::picture_table(subject, on_progress)? {
+        match pictures::picture_table(subject, on_progress) {
             Ok(table) => results.pictures = Some(table),
             Err(why) => results.leave_out(Table::Psnr, why),
         }

@@ -1,6 +1,5 @@
 //! Table 1: pictures of the field against true ones, from above and from poses it was not trained on.
 
-use crate::ResultsError;
 use crate::subject::{ROLES, Subject};
 use carff_belief::Probe;
 use carff_dataset::{Image, PoseRole};
@@ -73,14 +72,8 @@ const MOST_PICTURES: usize = 60;
 /// Renderings for each forecast state.
 const PREDICTED: usize = 6;
 
-pub fn picture_table(
-    subject: &Subject,
-    on_progress: &dyn Fn(&Progress),
-) -> Result<Result<PictureTable, String>, ResultsError> {
-    let probe = match &subject.probe {
-        Ok(probe) => probe,
-        Err(why) => return Ok(Err(why.clone())),
-    };
+pub fn picture_table(subject: &Subject, on_progress: &dyn Fn(&Progress)) -> Result<PictureTable, String> {
+    let probe = subject.probe.as_ref().map_err(Clone::clone)?;
     let states = subject.manifest.scenario.state_count();
     let mut artist = Artist::new(probe, subject.options.threads);
     let mut table = PictureTable { states: (0..states).map(|s| subject.state_name(s)).collect(), ..Default::default() };
@@ -103,7 +96,7 @@ pub fn picture_table(
         }
     }
     tell(4, "");
-    Ok(Ok(table))
+    Ok(table)
 }
 
 /// Per state latents drawn from forecasts of the step before it, one from each of some pictures of trained poses that

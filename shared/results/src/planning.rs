@@ -91,10 +91,8 @@ pub fn planning(subject: &Subject, on_progress: &dyn Fn(&Progress)) -> Result<Fo
     if scenario.hazard_branches.len() == scenario.branches.len() {
         return Ok(Err("every branch of the scenario is a hazard".into()));
     }
-    for part in [subject.probe.as_ref().err(), subject.mixture.as_ref().err()] {
-        if let Some(why) = part {
-            return Ok(Err(why.clone()));
-        }
+    if let Some(why) = subject.probe.as_ref().err().or(subject.mixture.as_ref().err()) {
+        return Ok(Err(why.clone()));
     }
     let mut rules = vec![Rule::Underconfident, Rule::Overconfident, Rule::Paper];
     rules.extend(subject.threshold.map(|threshold| Rule::Calibrated { threshold }));
