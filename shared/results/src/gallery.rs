@@ -348,12 +348,21 @@ fn embedded(rows: &[&[f32]], seed: u64) -> Vec<(f64, f64)> {
         let key = Key { seed, frame: i as u64, step: 0x7473_6e65, sample: 0 };
         carff_random::gaussians::<2>(key).map(|u| u * 1e-2)
     });
-    let mut map = bhtsne::tSNE::<f32, &[f32], 2>::new(rows);
-    map.perplexity(PERPLEXITY.min((rows.len() - 1) as f32 / 4.0))
-        .epochs(EPOCHS)
-        .initial_embedding(start.collect::<Vec<f32>>())
-        .exact(|a, b| a.iter().zip(b.iter()).map(|(a, b)| (a - b).powi(2)).sum());
-    map.embedding().chunks_exact(2).map(|p| (f64::from(p[0]), f64::from(p[1]))).collect()
+    let start: Vec<f32> = start.collect();
+    let fit = || {
+        let mut map = bhtsne::tSNE::<f32, &[f32], 2>::new(rows);
+        map.perplexity(PERPLEXITY.min((rows.len() - 1) as f32 / 4.0))
+            .epochs(EPOCHS)
+            .initial_embedding(start)
+            .exact(|a, b| a.iter().zip(b.iter()).map(|(a, b)| (a - b).powi(2)).sum());
+        map.embedding()
+    };
+    // On several threads it sums in an order of its own each time.
+    let map = match rayon::ThreadPoolBuilder::new().num_threads(1).build() {
+        Ok(pool) => pool.install(fit),
+        Err(_) => fit(),
+    };
+    map.chunks_exact(2).map(|p| (f64::from(p[0]), f64::from(p[1]))).collect()
 }
 
 #[cfg(test)]
