@@ -1,7 +1,9 @@
 //! The `carff` command's parts: starting a graph, watching it, recording what it does, and data sets.
 //! What the stages compute lives in the stages.
 
+pub mod ablate;
 pub mod dataset;
+pub mod eval;
 mod filmstrip;
 pub mod launch;
 pub mod lock;

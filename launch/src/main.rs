@@ -1,6 +1,8 @@
 //! The `carff` command.
 
+use carff::ablate::AblateArgs;
 use carff::dataset::DatasetCommand;
+use carff::eval::EvalArgs;
 use carff::launch::LaunchArgs;
 use carff::train::TrainArgs;
 use carff_bench::BenchCommand;
@@ -24,6 +26,10 @@ enum Command {
     Dataset(DatasetCommand),
     /// Train a scenario's models; goes on where an earlier run stopped.
     Train(TrainArgs),
+    /// Judge a checkpoint: every table and picture, as JSON and one page.
+    Eval(EvalArgs),
+    /// Train the encoder with one thing changed at a time, and tabulate; goes on where an earlier run stopped.
+    Ablate(AblateArgs),
     /// Measure the program's parts, and the whole loop, on this machine.
     #[command(subcommand)]
     Bench(BenchCommand),
@@ -33,6 +39,8 @@ fn main() -> ExitCode {
     let result = match Cli::parse().command {
         Command::Launch(args) => carff::launch::run(&args),
         Command::Train(args) => carff::train::run(&args),
+        Command::Eval(args) => carff::eval::run(&args),
+        Command::Ablate(args) => carff::ablate::run(&args),
         Command::Bench(command) => carff_bench::run(command),
         Command::Dataset(command) => carff::dataset::run(command).map(|()| ExitCode::SUCCESS),
     };

@@ -55,26 +55,17 @@ enum StageName {
 /// Runs the command.
 pub fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
     let config = TrainingConfig::load(&args.config)?;
-    let dataset = args.dataset.clone().unwrap_or_else(|| config.dataset.clone());
     let out = args.out.clone().unwrap_or_else(|| config.out.clone());
     if args.dataset.is_some() && args.out.is_none() {
         bail!("--dataset without --out would overwrite {}: say where this checkpoint goes", config.out.display());
     }
-    if !dataset.join("transforms.json").is_file() && args.dataset.is_none() {
-        render(&scenario(&config)?, &dataset, Extras::None)?;
-    }
-    let free = free_poses(&config, args)?;
+    let (dataset, free) = data_sets(&config, args.dataset.as_deref())?;
     let name = out.file_name().map_or_else(|| "training".into(), |n| n.to_string_lossy().into_owned());
     let dir = args.run_dir.clone().unwrap_or_else(|| Path::new("runs").join(name));
     std::fs::create_dir_all(&dir).with_context(|| format!("cannot make {}", dir.display()))?;
     refuse_another_configuration(&dir, &config, &dataset)?;
 
-    let stop = Arc::new(AtomicBool::new(false));
-    for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
-        // The second Ctrl-C ends the program at once.
-        signal_hook::flag::register_conditional_shutdown(signal, 130, Arc::clone(&stop))?;
-        signal_hook::flag::register(signal, Arc::clone(&stop))?;
-    }
+    let stop = stop_on_signals()?;
     let display = Display::default();
     let report = |progress: &Progress| display.show(progress);
     let run = Run { dir: dir.clone(), on_progress: &report, stop: &stop };
@@ -102,6 +93,26 @@ pub fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
     }
 }
 
+/// A flag that Ctrl-C sets; the second one ends the program at once.
+pub fn stop_on_signals() -> anyhow::Result<Arc<AtomicBool>> {
+    let stop = Arc::new(AtomicBool::new(false));
+    for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
+        signal_hook::flag::register_conditional_shutdown(signal, 130, Arc::clone(&stop))?;
+        signal_hook::flag::register(signal, Arc::clone(&stop))?;
+    }
+    Ok(stop)
+}
+
+/// The data set and the set of freely drawn poses, if any; what the training file's scenario can make is rendered when it
+/// is missing.
+pub fn data_sets(config: &TrainingConfig, given: Option<&Path>) -> anyhow::Result<(PathBuf, Option<PathBuf>)> {
+    let dataset = given.unwrap_or(&config.dataset).to_owned();
+    if !dataset.join("transforms.json").is_file() && given.is_none() {
+        render(&scenario(config)?, &dataset, Extras::None)?;
+    }
+    Ok((dataset, free_poses(config, given)?))
+}
+
 fn scenario(config: &TrainingConfig) -> anyhow::Result<Scenario> {
     match &config.scenario {
         Some(path) => Ok(Scenario::load(path)?),
@@ -113,9 +124,9 @@ fn scenario(config: &TrainingConfig) -> anyhow::Result<Scenario> {
 }
 
 /// The set of freely drawn poses, rendered when it is missing; none for a data set that the scenario did not make.
-fn free_poses(config: &TrainingConfig, args: &TrainArgs) -> anyhow::Result<Option<PathBuf>> {
+fn free_poses(config: &TrainingConfig, given: Option<&Path>) -> anyhow::Result<Option<PathBuf>> {
     let FreePoses { count, seed } = config.free_poses;
-    if count == 0 || args.dataset.is_some() || config.scenario.is_none() {
+    if count == 0 || given.is_some() || config.scenario.is_none() {
         return Ok(None);
     }
     let mut name = config.dataset.file_name().unwrap_or_default().to_owned();
@@ -128,7 +139,7 @@ fn free_poses(config: &TrainingConfig, args: &TrainArgs) -> anyhow::Result<Optio
 }
 
 /// A run folder belongs to one configuration and one data set: going on with another would mix them.
-fn refuse_another_configuration(dir: &Path, config: &TrainingConfig, dataset: &Path) -> anyhow::Result<()> {
+pub fn refuse_another_configuration(dir: &Path, config: &TrainingConfig, dataset: &Path) -> anyhow::Result<()> {
     let path = dir.join("configuration.json");
     let mut mine = serde_json::to_value(config)?;
     mine["dataset"] = serde_json::to_value(dataset)?;
@@ -152,7 +163,7 @@ fn refuse_another_configuration(dir: &Path, config: &TrainingConfig, dataset: &P
 
 /// One bar a stage on a terminal; a line now and then elsewhere.
 #[derive(Default)]
-struct Display {
+pub struct Display {
     bars: Mutex<BTreeMap<String, (ProgressBar, Instant)>>,
 }
 
@@ -160,7 +171,8 @@ struct Display {
 const LINE_EVERY: Duration = Duration::from_secs(15);
 
 impl Display {
-    fn show(&self, progress: &Progress) {
+    /// Shows a step.
+    pub fn show(&self, progress: &Progress) {
         let live = std::io::stderr().is_terminal();
         let Ok(mut bars) = self.bars.lock() else { return };
         let (bar, last) = bars.entry(progress.stage.to_owned()).or_insert_with(|| {
@@ -187,7 +199,8 @@ impl Display {
         }
     }
 
-    fn finish(&self) {
+    /// Leaves the bars as they are.
+    pub fn finish(&self) {
         if let Ok(bars) = self.bars.lock() {
             for (bar, _) in bars.values() {
                 if !bar.is_finished() {

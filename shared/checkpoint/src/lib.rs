@@ -285,9 +285,14 @@ fn model(dir: &Path) -> impl Fn(ModelError) -> CheckpointError + '_ {
 
 /// Reads the encoder.
 pub fn load_encoder(dir: &Path, manifest: &Manifest) -> Result<Encoder, CheckpointError> {
+    load_encoder_on(dir, manifest, Device::Cpu)
+}
+
+/// Reads the encoder onto a device.
+pub fn load_encoder_on(dir: &Path, manifest: &Manifest, device: Device) -> Result<Encoder, CheckpointError> {
     let wrong = model(dir);
-    let backbone = VarStore::new(Device::Cpu);
-    let head = VarStore::new(Device::Cpu);
+    let backbone = VarStore::new(device);
+    let head = VarStore::new(device);
     let frozen = manifest.encoder.backbone.frozen;
     let file = dir.join(files::BACKBONE);
     let pretrained = (frozen && file.is_file()).then_some(file.as_path());

@@ -4,10 +4,15 @@
 //! training, processes. Every table says its trials; poses that were never trained on stand apart.
 
 mod birds_eye;
+pub mod draws;
+pub mod hypotheses;
+mod pairs;
 mod planning;
 mod samples;
+pub mod svm;
 
 pub use birds_eye::{BirdsEye, birds_eye};
+pub use pairs::{PairMeans, pair_means};
 pub use planning::{Count, PlanningTable, SAMPLE_COUNTS, Trial, TrialOutcome, count, planning_table, trials};
 pub use samples::{Input, SampleAccuracy, sample_accuracy};
 

@@ -190,6 +190,22 @@ impl OrientedBox {
         [self.center[0] + c * l[0] - s * l[1], self.center[1] + s * l[0] + c * l[1], self.center[2] + l[2]]
     }
 
+    /// Whether a ray meets the box in front of its start.
+    pub fn is_met_by(&self, ray: &Ray) -> bool {
+        let (s, c) = self.yaw.sin_cos();
+        let turned = |v: [f64; 3]| [c * v[0] + s * v[1], -s * v[0] + c * v[1], v[2]];
+        let origin = turned(sub(ray.origin.map(f64::from), self.center));
+        let direction = turned(ray.direction.map(f64::from));
+        let (mut near, mut far) = (0.0_f64, f64::INFINITY);
+        for axis in 0..3 {
+            let [a, b] = [-1.0, 1.0].map(|side| (side * self.half_size[axis] - origin[axis]) / direction[axis]);
+            // Along a face both are infinite or no number, and `min` and `max` pass over the latter.
+            near = near.max(a.min(b));
+            far = far.min(a.max(b));
+        }
+        near <= far
+    }
+
     /// Whether a world point lies inside (faces included).
     pub fn contains(&self, point_m: [f64; 3]) -> bool {
         let (s, c) = self.yaw.sin_cos();
@@ -273,5 +289,20 @@ mod tests {
         assert_eq!(points.len(), 24);
         assert!(points.iter().all(|&p| b.contains(p)));
         assert!(!b.contains([1.0, 2.0, 3.6]));
+    }
+
+    /// A box is met by rays through it from any side, turned or not, and not by rays beside it, away from it, or along it.
+    #[test]
+    fn boxes_are_met() {
+        let upright = OrientedBox { center: [3.0, 0.0, 1.0], half_size: [1.0, 0.2, 1.0], yaw: 0.0 };
+        let turned = OrientedBox { yaw: std::f64::consts::FRAC_PI_2, ..upright };
+        let ray = |origin, direction| Ray { origin, direction };
+        let along_x = |y| ray([-5.0, y, 1.0], [1.0, 0.0, 0.0]);
+        assert!(upright.is_met_by(&along_x(0.1)) && !upright.is_met_by(&along_x(0.5)));
+        assert!(turned.is_met_by(&along_x(0.5)) && !turned.is_met_by(&along_x(1.5)));
+        assert!(!upright.is_met_by(&ray([-5.0, 0.0, 1.0], [-1.0, 0.0, 0.0])));
+        assert!(upright.is_met_by(&ray([3.5, 0.1, 9.0], [0.0, 0.0, -1.0])));
+        assert!(!upright.is_met_by(&ray([4.5, 0.1, 9.0], [0.0, 0.0, -1.0])));
+        assert!(upright.is_met_by(&ray([3.0, 0.0, 1.0], [0.0, 1.0, 0.0])), "from within");
     }
 }

@@ -12,11 +12,14 @@ pub struct DecoderConfig {
     pub hidden: i64,
     /// Channels at 8x8; halved at most once on the way up.
     pub channels: i64,
+    /// Whether it is told the pose. Without, one latent has one picture, and the encoder must put the pose into it; the
+    /// residual over the pose's mean picture would tell the pose too (`vae.residual = false`).
+    pub pose_condition: bool,
 }
 
 impl Default for DecoderConfig {
     fn default() -> Self {
-        Self { hidden: 256, channels: 64 }
+        Self { hidden: 256, channels: 64, pose_condition: true }
     }
 }
 
@@ -47,6 +50,7 @@ impl Decoder {
     pub fn new(path: &nn::Path, config: &DecoderConfig, poses: i64) -> Self {
         let same = nn::ConvConfig { padding: 1, ..Default::default() };
         let c = config.channels;
+        let poses = if config.pose_condition { poses } else { 0 };
         let linear = nn::LinearConfig::default();
         Self {
             join: nn::linear(path / "join", joined(poses), config.hidden, linear),
@@ -81,5 +85,27 @@ impl Decoder {
         let x = self.up32.forward(&double(&x)).relu();
         let x = self.up64.forward(&double(&x)).relu();
         self.out.forward(&x).pixel_shuffle(2)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use tch::{Device, Kind, nn::VarStore};
+
+    /// A decoder that is told the pose draws another picture for another pose; one that is not draws the same.
+    #[test]
+    fn pose_condition_is_a_setting() {
+        let differs = |pose_condition| {
+            tch::manual_seed(1);
+            let store = VarStore::new(Device::Cpu);
+            let config = DecoderConfig { hidden: 16, channels: 16, pose_condition };
+            let decoder = Decoder::new(&store.root(), &config, 3);
+            let latents = Tensor::ones([2, LATENT_DIM as i64], (Kind::Float, Device::Cpu));
+            let out = decoder.forward(&latents, &Tensor::from_slice(&[0_i64, 2]));
+            assert_eq!(out.size(), [2, 3, PICTURE_PX, PICTURE_PX]);
+            (out.get(0) - out.get(1)).abs().max().double_value(&[]) > 1e-6
+        };
+        assert!(differs(true) && !differs(false));
     }
 }

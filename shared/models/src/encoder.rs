@@ -104,8 +104,9 @@ impl Encoder {
         Ok(Self { stem, backbone, head })
     }
 
-    /// `[N, 3, H, W]` in 0..=1 to backbone features `[N, C, h, w]`.
+    /// `[N, 3, H, W]` in 0..=1 to backbone features `[N, C, h, w]`, on the encoder's device.
     pub fn features(&self, pictures: &Tensor) -> Tensor {
+        let pictures = &pictures.to_device(self.head.center.device());
         match &self.stem {
             None => self.backbone.features(pictures),
             Some((first, last)) => self.backbone.features(&(pictures + last.forward(&first.forward(pictures).relu()))),

@@ -10,6 +10,7 @@ pub mod allocator;
 pub mod backbone;
 pub mod borrow;
 pub mod decoder;
+pub mod device;
 pub mod encoder;
 pub mod mixture;
 pub mod weights;

@@ -5,8 +5,8 @@ use crate::canvas::{Area, Canvas, FAINT_INK, Font, INK, OVERSAMPLING, PAPER, dra
 use carff_dataset::Image;
 use plotters::coord::Shift;
 use plotters::coord::ranged1d::{KeyPointHint, NoDefaultFormatting, Ranged, ValueFormatter};
-use plotters::prelude::{BitMapBackend, ChartBuilder, Circle, DrawingArea, PathElement, RGBColor, Rectangle};
-use plotters::style::Color;
+use plotters::prelude::{BitMapBackend, ChartBuilder, Circle, DrawingArea, PathElement, Polygon, RGBColor, Rectangle};
+use plotters::style::{Color, ShapeStyle};
 use std::ops::Range;
 use std::path::Path;
 
@@ -36,6 +36,20 @@ pub struct Series {
     pub name: String,
     /// Points `(x, y)` in the order of the line; it is broken where one is not finite.
     pub points: Vec<(f64, f64)>,
+    /// A band behind the line, `(x, low, high)` in the order of x.
+    pub band: Vec<(f64, f64, f64)>,
+    /// How points are shown.
+    pub marks: Marks,
+}
+
+/// How a series' points are shown.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Marks {
+    /// Joined by a line.
+    #[default]
+    Line,
+    /// Each by itself.
+    Dots,
 }
 
 const MARGIN: u32 = 20;
@@ -132,11 +146,15 @@ fn legend(canvas: &mut Canvas, series: &[Series], left: u32, top: u32, width: u3
 fn plot(area: &Page, panel: &Panel) -> Result<(), PlotError> {
     let lines: Vec<Vec<Vec<(f64, f64)>>> = panel.series.iter().map(|s| pieces(&s.points, panel)).collect();
     let all = || lines.iter().flatten().flatten();
-    let (Some(x), Some(mut y)) = (range(all().map(|p| p.0), 0.0), range(all().map(|p| p.1), 0.06)) else {
+    let bands: Vec<Vec<(f64, f64)>> = panel.series.iter().map(|s| outline(&s.band, panel)).collect();
+    let any = || all().chain(bands.iter().flatten());
+    // Lines begin at the axis; dots keep away from it.
+    let aside = if panel.series.iter().any(|s| s.marks == Marks::Dots) { 0.04 } else { 0.0 };
+    let (Some(x), Some(mut y)) = (range(any().map(|p| p.0), aside), range(any().map(|p| p.1), 0.06)) else {
         return empty(area);
     };
     if panel.from_zero && !panel.log_y {
-        y = if all().all(|p| p.1 >= 0.0) { 0.0..y.end } else { y.start..y.end.max(0.0) };
+        y = if any().all(|p| p.1 >= 0.0) { 0.0..y.end } else { y.start..y.end.max(0.0) };
     }
     let ticks = |range: &Range<f64>, log: bool| if log { logarithmic_ticks(range) } else { linear_ticks(range, 6) };
     let (x_ticks, y_ticks) = (ticks(&x, panel.log_x), ticks(&y, panel.log_y));
@@ -159,7 +177,19 @@ fn plot(area: &Page, panel: &Panel) -> Result<(), PlotError> {
         .axis_desc_style(LABEL.style(INK)?)
         .draw()
         .map_err(drawing)?;
-    for (pieces, colour) in lines.iter().zip(COLOURS.iter().cycle()) {
+    for (band, colour) in bands.into_iter().zip(COLOURS.iter().cycle()) {
+        if !band.is_empty() {
+            chart.draw_series(std::iter::once(Polygon::new(band, colour.mix(0.18)))).map_err(drawing)?;
+        }
+    }
+    for (i, (pieces, colour)) in lines.iter().zip(COLOURS.iter().cycle()).enumerate() {
+        if panel.series[i].marks == Marks::Dots {
+            // Colours that come a second time are rings.
+            let style = ShapeStyle { filled: i < COLOURS.len(), ..colour.stroke_width(OVERSAMPLING) };
+            let dot = |p: &(f64, f64)| Circle::new(*p, 3 * OVERSAMPLING, style);
+            chart.draw_series(pieces.iter().flatten().map(dot)).map_err(drawing)?;
+            continue;
+        }
         let dots = pieces.iter().map(Vec::len).sum::<usize>() <= FEW_POINTS;
         for piece in pieces {
             let line = PathElement::new(piece.clone(), colour.stroke_width(2 * OVERSAMPLING));
@@ -222,6 +252,15 @@ fn pieces(points: &[(f64, f64)], panel: &Panel) -> Vec<Vec<(f64, f64)>> {
     let drawn = |v: f64, log: bool| if log { v.log10() } else { v };
     let points: Vec<_> = points.iter().map(|&(x, y)| (drawn(x, panel.log_x), drawn(y, panel.log_y))).collect();
     points.split(|&(x, y)| !(shown(x) && shown(y))).filter(|piece| !piece.is_empty()).map(<[_]>::to_vec).collect()
+}
+
+/// The outline of a band as a polygon, as it is drawn; empty without any point that can be shown.
+fn outline(band: &[(f64, f64, f64)], panel: &Panel) -> Vec<(f64, f64)> {
+    let edge =
+        |of: fn(&(f64, f64, f64)) -> (f64, f64)| pieces(&band.iter().map(of).collect::<Vec<_>>(), panel).concat();
+    let (low, mut high) = (edge(|b| (b.0, b.1)), edge(|b| (b.0, b.2)));
+    high.reverse();
+    [low, high].concat()
 }
 
 /// From the least to the largest value, with a share of that added at both ends; `None` for no values.
@@ -295,7 +334,7 @@ mod tests {
             x_label: "epoch".into(),
             y_label: "loss".into(),
             log_y,
-            series: vec![Series { name: "all".into(), points }],
+            series: vec![Series { name: "all".into(), points, ..Series::default() }],
             ..Panel::default()
         }
     }
@@ -409,5 +448,23 @@ mod tests {
             linear_ticks(&(0.0..1.0), 5).iter().map(|t| t.1.as_str()).collect::<Vec<_>>(),
             ["0.0", "0.2", "0.4", "0.6", "0.8", "1.0"]
         );
+    }
+
+    /// A band is drawn between its edges and the axes hold it; dots are not joined.
+    #[test]
+    fn bands_and_dots() {
+        let of = |series: Series| draw("", &[Panel { series: vec![series], ..Panel::default() }]).unwrap();
+        let tinted = |image: &Image| {
+            let paper = [PAPER.0, PAPER.1, PAPER.2];
+            let coloured = |p: &&[u8]| *p != paper && i16::from(p[2]) - i16::from(p[0]) > 25;
+            image.rgb.chunks_exact(3).filter(coloured).count()
+        };
+        let points = vec![(0.0, 1.0), (10.0, 1.0)];
+        let line = of(Series { points: points.clone(), ..Series::default() });
+        let band =
+            of(Series { points: points.clone(), band: vec![(0.0, 0.0, 2.0), (10.0, 0.0, 2.0)], ..Series::default() });
+        assert!(tinted(&band) > 20 * tinted(&line), "{} {}", tinted(&band), tinted(&line));
+        let dots = of(Series { points, marks: Marks::Dots, ..Series::default() });
+        assert!(tinted(&dots) * 4 < tinted(&line), "{} {}", tinted(&dots), tinted(&line));
     }
 }

@@ -7,7 +7,7 @@ mod canvas;
 mod curves;
 mod filmstrip;
 
-pub use curves::{Panel, Series, curves};
+pub use curves::{Marks, Panel, Series, curves};
 pub use filmstrip::{StripCell, StripRow, filmstrip};
 
 /// Longest side of a picture that is drawn, pixels.

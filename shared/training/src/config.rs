@@ -214,7 +214,8 @@ impl TrainingConfig {
         Ok(config)
     }
 
-    fn validate(&self) -> Result<(), String> {
+    /// Checks that settings are in range and agree; the error names the key.
+    pub fn validate(&self) -> Result<(), String> {
         let counts = [
             ("vae.epochs", self.vae.epochs, 1, 10_000),
             ("vae.batch", self.vae.batch, 2, 4096),
@@ -259,6 +260,13 @@ impl TrainingConfig {
             if !(0.0..=high).contains(&value) {
                 return Err(format!("`{key}` = {value}: 0 to {high} are allowed"));
             }
+        }
+        if self.vae.residual && !self.decoder.pose_condition {
+            return Err(
+                "`vae.residual` = true tells the decoder the pose, `decoder.pose_condition` = false does not: \
+                        set `vae.residual` to false"
+                    .into(),
+            );
         }
         self.field.validate().map_err(|e| format!("[field] {e}"))?;
         self.calibration.sensor.validate().map_err(|e| format!("[calibration.sensor] {e}"))?;

@@ -97,17 +97,23 @@ const CHARTS: [Chart; 9] = [
 
 /// Draws `curves.png` in a run's folder from its `metrics.jsonl`. Without any figure there is no picture.
 pub fn draw(dir: &Path) -> Result<(), TrainingError> {
+    draw_to(dir, &dir.join("curves.png")).map(|_| ())
+}
+
+/// [`draw`] into another file; says whether there was anything to draw.
+pub fn draw_to(dir: &Path, picture: &Path) -> Result<bool, TrainingError> {
     let path = dir.join("metrics.jsonl");
     let bytes = match std::fs::read(&path) {
         Ok(bytes) => bytes,
-        Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(()),
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(false),
         Err(source) => return Err(TrainingError::File { path, source }),
     };
     let panels = panels(&String::from_utf8_lossy(&bytes));
     if panels.is_empty() {
-        return Ok(());
+        return Ok(false);
     }
-    Ok(carff_plots::curves(&dir.join("curves.png"), "Training", &panels)?)
+    carff_plots::curves(picture, "Training", &panels)?;
+    Ok(true)
 }
 
 /// The charts for which there are figures. A line that was cut off when a run was killed is passed over.
@@ -122,7 +128,11 @@ fn panel(chart: &Chart, records: &[Value]) -> Panel {
         let figure = |record: &Value| record.pointer(pointer).and_then(Value::as_f64);
         rows.iter().filter_map(|(x, record)| Some((*x as f64, figure(record)? * chart.factor))).collect()
     };
-    let series = chart.lines.iter().map(|(name, pointer)| Series { name: (*name).into(), points: points(pointer) });
+    let series = chart.lines.iter().map(|(name, pointer)| Series {
+        name: (*name).into(),
+        points: points(pointer),
+        ..Series::default()
+    });
     Panel {
         title: chart.title.into(),
         x_label: chart.x.into(),

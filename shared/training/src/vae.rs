@@ -22,6 +22,7 @@ use carff_models::{
 };
 use carff_random::Key;
 use rand::seq::SliceRandom;
+use serde::{Deserialize, Serialize};
 use serde_json::json;
 use std::path::Path;
 use tch::{Device, Kind, Tensor, nn, nn::Module, nn::VarStore};
@@ -117,6 +118,9 @@ pub struct Inputs<'a> {
 /// Pictures through the backbone at a time: measured best among 1, 4 and 30, since the maps stay in the caches.
 const FEATURE_BATCH: usize = 4;
 
+/// Pictures that a head before a learning backbone is standardised on.
+const STANDARDISED: usize = 64;
+
 impl<'a> Inputs<'a> {
     /// Computes what can be kept: features `[copies + 1, N, C, h, w]` in half precision.
     pub fn new(
@@ -146,6 +150,16 @@ impl<'a> Inputs<'a> {
             let features = Tensor::cat(&rows, 0);
             vae.encoder.standardise(&features.narrow(0, 0, all.len() as i64).to_kind(Kind::Float));
             this.features = Some(features);
+        } else if run.load("vae")?.is_none() {
+            // A backbone that learns changes its features; the head is set to how they are at first, and learns the rest.
+            let count = pictures.images.len().min(STANDARDISED);
+            let some: Vec<usize> = (0..count).map(|i| i * pictures.images.len() / count).collect();
+            let rows = some.chunks(FEATURE_BATCH).map(|chunk| {
+                let inputs = pictures.inputs(chunk, 0, &config.augmentation, config.seed);
+                tch::no_grad(|| vae.encoder.features(&inputs))
+            });
+            let rows: Vec<Tensor> = rows.collect();
+            vae.encoder.standardise(&Tensor::cat(&rows, 0));
         }
         Ok(this)
     }
@@ -421,32 +435,76 @@ pub fn evaluate(
         "unseen": accuracy(&[PoseRole::Unseen]),
     });
     if picture_quality {
-        let [mut error, mut mean_error, mut changed_error, mut changed_count, mut count] = [0.0_f64; 5];
-        tch::no_grad(|| {
-            for chunk in pictures.trained().chunks(60) {
-                let latents: Vec<f32> = chunk.iter().flat_map(|&i| posteriors[i].mean).collect();
-                let views: Vec<i64> = chunk.iter().map(|&i| pictures.labels[i].view as i64).collect();
-                let views = Tensor::from_slice(&views);
-                let means = pictures.pose_means.index_select(0, &views);
-                let out = vae.decoder.forward(&Tensor::from_slice(&latents).view([-1, LATENT_DIM as i64]), &views);
-                let out = if config.vae.residual { out + &means } else { out }.clamp(0.0, 1.0);
-                let targets = pictures.targets(chunk);
-                let residual = &targets - &means;
-                let changed = residual.abs().amax([1_i64].as_slice(), true).gt(12.0 / 255.0).to_kind(Kind::Float);
-                let squares = (&out - &targets).square();
-                error += squares.sum(Kind::Double).double_value(&[]);
-                mean_error += residual.square().sum(Kind::Double).double_value(&[]);
-                changed_error += (squares * &changed).sum(Kind::Double).double_value(&[]);
-                changed_count += changed.sum(Kind::Double).double_value(&[]) * 3.0;
-                count += targets.numel() as f64;
-            }
-        });
-        let psnr = |sum: f64, n: f64| carff_metrics::psnr_of_mse(sum / n.max(1.0));
-        report["psnr_db"] = json!(psnr(error, count));
-        report["mean_picture_psnr_db"] = json!(psnr(mean_error, count));
-        report["changed_pixels_psnr_db"] = json!(psnr(changed_error, changed_count));
+        let pairs: Vec<_> = pictures.trained().into_iter().map(|i| (i, posteriors[i].mean)).collect();
+        let quality = decoded_quality(pictures, &vae.decoder, config.vae.residual, &pairs);
+        report["psnr_db"] = json!(quality.psnr_db);
+        report["mean_picture_psnr_db"] = json!(quality.mean_picture_psnr_db);
+        report["changed_pixels_psnr_db"] = json!(quality.changed_pixels_psnr_db);
     }
     Ok(report)
+}
+
+/// How good decoded pictures are, over all pixels of all of them.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct DecodedQuality {
+    /// PSNR, dB.
+    pub psnr_db: f64,
+    /// PSNR of each pose's mean picture over the states, which takes no encoder, dB.
+    pub mean_picture_psnr_db: f64,
+    /// PSNR over the pixels that differ by more than 12 of 255 from it, dB.
+    pub changed_pixels_psnr_db: f64,
+    /// Pictures.
+    pub pictures: usize,
+}
+
+/// Quality of what the decoder makes of latents, each against one of the data set's pictures. `residual` says what it
+/// was trained for.
+pub fn decoded_quality(
+    pictures: &Pictures,
+    decoder: &Decoder,
+    residual: bool,
+    pairs: &[(usize, [f32; LATENT_DIM])],
+) -> DecodedQuality {
+    let [mut error, mut mean_error, mut changed_error, mut changed_count, mut count] = [0.0_f64; 5];
+    for chunk in pairs.chunks(60) {
+        let chosen: Vec<usize> = chunk.iter().map(|pair| pair.0).collect();
+        let (out, means) = decoded(pictures, decoder, residual, chunk);
+        let targets = pictures.targets(&chosen);
+        let difference = &targets - &means;
+        let changed = difference.abs().amax([1_i64].as_slice(), true).gt(12.0 / 255.0).to_kind(Kind::Float);
+        let squares = (&out - &targets).square();
+        error += squares.sum(Kind::Double).double_value(&[]);
+        mean_error += difference.square().sum(Kind::Double).double_value(&[]);
+        changed_error += (squares * &changed).sum(Kind::Double).double_value(&[]);
+        changed_count += changed.sum(Kind::Double).double_value(&[]) * 3.0;
+        count += targets.numel() as f64;
+    }
+    let psnr = |sum: f64, n: f64| carff_metrics::psnr_of_mse(sum / n.max(1.0));
+    DecodedQuality {
+        psnr_db: psnr(error, count),
+        mean_picture_psnr_db: psnr(mean_error, count),
+        changed_pixels_psnr_db: psnr(changed_error, changed_count),
+        pictures: pairs.len(),
+    }
+}
+
+/// Decoded pictures `[N, 3, 128, 128]` in 0..=1 of latents, each from the pose of one of the data set's pictures; and the
+/// mean pictures of these poses.
+pub fn decoded(
+    pictures: &Pictures,
+    decoder: &Decoder,
+    residual: bool,
+    pairs: &[(usize, [f32; LATENT_DIM])],
+) -> (Tensor, Tensor) {
+    tch::no_grad(|| {
+        let latents: Vec<f32> = pairs.iter().flat_map(|pair| pair.1).collect();
+        let views: Vec<i64> = pairs.iter().map(|pair| pictures.labels[pair.0].view as i64).collect();
+        let views = Tensor::from_slice(&views);
+        let means = pictures.pose_means.index_select(0, &views);
+        let out = decoder.forward(&Tensor::from_slice(&latents).view([-1, LATENT_DIM as i64]), &views);
+        let out = if residual { out + &means } else { out };
+        (out.clamp(0.0, 1.0), means)
+    })
 }
 
 #[cfg(test)]

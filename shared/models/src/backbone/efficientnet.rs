@@ -1,6 +1,7 @@
-//! EfficientNet-Lite0 (Tan and Le 2019, Lite variant: no squeeze-and-excite, `ReLU6`), up to stride 16, weights frozen.
+//! EfficientNet-Lite0 (Tan and Le 2019, Lite variant: no squeeze-and-excite, `ReLU6`), up to stride 16.
 //!
-//! Frozen, so batch normalisation is folded into the convolutions when the weights are read.
+//! Batch normalisation is folded into the convolutions when the weights are read, also where they learn on: batches are
+//! small, and what the network is told of pictures in general shall stay.
 
 use super::{Backbone, resize};
 use crate::{ModelError, weights::Tensors};
@@ -50,7 +51,7 @@ struct Convolution {
 impl EfficientNetLite0 {
     /// Reads the weights in the names of the published state dict (`_conv_stem.weight`, `_blocks.0._bn1.weight`, ..);
     /// with none, the weights are random (for tests and for filling from a checkpoint).
-    /// The folded weights are registered in `path`, not trainable.
+    /// The folded weights are registered in `path`; whoever wants them frozen freezes its store.
     pub fn new(path: &nn::Path, tensors: Option<&Tensors>, input_px: i64) -> Result<Self, ModelError> {
         let read = |conv: &str, norm: &str, shape: [i64; 4], stride: i64, groups: i64| {
             let target = conv.split('.').fold(path.clone(), |p, part| p / part);
@@ -111,7 +112,8 @@ fn folded(
             (take(format!("{conv}.weight"), &shape)? * scale.view([-1, 1, 1, 1]), shift - mean * scale)
         }
     };
-    Ok(Convolution { weight: path.add("weight", weight, false), bias: path.add("bias", bias, false), stride, groups })
+    let [weight, bias] = [weight, bias].map(|t| t.to_device(path.device()));
+    Ok(Convolution { weight: path.add("weight", weight, true), bias: path.add("bias", bias, true), stride, groups })
 }
 
 impl Convolution {

@@ -220,6 +220,7 @@ impl Axis {
         let series = |name: &str, y: fn(&Row) -> f64| Series {
             name: name.to_owned(),
             points: self.rows.iter().map(|row| (f64::from(row.x), y(row))).collect(),
+            ..Series::default()
         };
         let panel = |title: &str, y_label: &str, measured: Vec<Series>, fit: Option<Fit>| {
             let fitted = fit.map(|fit| {
@@ -228,7 +229,8 @@ impl Axis {
                     Law::Area => "fit: straight line over pixels".to_owned(),
                     Law::Power => format!("fit: power {:.2}", fit.rate),
                 };
-                Series { name, points: self.between(log).into_iter().map(|x| (x, fit.at(x))).collect() }
+                let points = self.between(log).into_iter().map(|x| (x, fit.at(x))).collect();
+                Series { name, points, ..Series::default() }
             });
             Panel {
                 title: title.to_owned(),

@@ -1,0 +1,39 @@
+//! Where tensors are computed: the processor or a CUDA device.
+
+use crate::ModelError;
+use tch::{Cuda, Device};
+
+/// What `--device` names: `auto` (the first CUDA device if libtorch finds one, else the processor), `cpu`, or `cuda:N`.
+pub fn parse(name: &str) -> Result<Device, ModelError> {
+    let devices = Cuda::device_count().max(0) as usize;
+    let wrong = |allowed| Err(ModelError::Setting { key: "--device", value: name.to_owned(), allowed });
+    match (name, name.strip_prefix("cuda:").map(str::parse::<usize>)) {
+        ("auto", _) => Ok(Device::cuda_if_available()),
+        ("cpu", _) => Ok(Device::Cpu),
+        (_, Some(Ok(number))) if number < devices => Ok(Device::Cuda(number)),
+        (_, Some(Ok(_))) if devices == 0 => wrong("this libtorch finds no CUDA device; take `cpu` or `auto`"),
+        (_, Some(Ok(_))) => wrong("there is no CUDA device of this number"),
+        _ => wrong("`auto`, `cpu`, or `cuda:0` and so on"),
+    }
+}
+
+/// Tells libtorch how many threads it may use in this process.
+pub fn set_threads(threads: u16) {
+    tch::set_num_threads(i32::from(threads.max(1)));
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The processor is always there; a device that is not, or no device's name, is an error that says what is.
+    #[test]
+    fn devices_are_named() {
+        assert_eq!(parse("cpu").unwrap(), Device::Cpu);
+        assert_eq!(parse("auto").unwrap(), Device::cuda_if_available());
+        assert!(parse("cuda:4096").unwrap_err().to_string().contains("CUDA device"));
+        for name in ["gpu", "cuda", "cuda:", "cuda:-1", ""] {
+            assert!(parse(name).unwrap_err().to_string().contains("`auto`, `cpu`"), "{name}");
+        }
+    }
+}
