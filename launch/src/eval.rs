@@ -4,10 +4,17 @@ use crate::dataset::render;
 use crate::train::Display;
 use anyhow::{Context, bail};
 use carff_checkpoint::Manifest;
+use carff_dataset::{Image, drives::DriveKind};
 use carff_results::{EvalOptions, Subject, Table, evaluate};
 use carff_scenes::{Extras, Scenario};
+use carff_training::run::Progress;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
+
+/// Frames of a free drive between two states.
+const FRAMES_PER_TIMESTAMP: usize = 6;
+/// Cameras that are no further apart, metres, are the same.
+const SAME_PLACE_M: f64 = 1e-3;
 
 /// What to judge, and where the results go.
 #[derive(Debug, clap::Args)]
@@ -29,9 +36,13 @@ pub struct EvalArgs {
     /// Threads that render and probe.
     #[arg(long, default_value_t = 2, value_parser = clap::value_parser!(u16).range(1..=256))]
     threads: u16,
-    /// Seed of sensor noise, draws and folds.
+    /// Seed of sensor noise, draws, folds and free drives.
     #[arg(long, default_value_t = 2)]
     seed: u64,
+    /// Free drives to judge planning by, half of them with a hazard; rendered, where the data set's scenario file is at
+    /// hand.
+    #[arg(long, default_value_t = 400, value_parser = clap::value_parser!(u32).range(0..=100_000))]
+    free_drives: u32,
     /// Folder for results.json, README.md and pictures; files of an earlier evaluation are written over.
     #[arg(long)]
     out: PathBuf,
@@ -82,6 +93,11 @@ pub fn run(args: &EvalArgs) -> anyhow::Result<ExitCode> {
     subject.run_dir = run_dir(args);
     let asked: Vec<Table> = args.only.iter().map(|t| Table::from(*t)).collect();
     let tables = if asked.is_empty() { Table::ALL.to_vec() } else { asked };
+    if tables.contains(&Table::Planning)
+        && let Some(scenario) = shown_scenario(&subject)
+    {
+        subject.free_drives = free_drives(&scenario, args.free_drives, args.seed, &display)?;
+    }
     let results = evaluate(&mut subject, &tables, &args.out, &|p| display.show(p))?;
     display.finish();
     for target in &results.targets {
@@ -117,6 +133,44 @@ fn trained_on(manifest: &Manifest) -> anyhow::Result<PathBuf> {
         }
     }
     Ok(dataset)
+}
+
+/// The scenario that the data set was rendered from: the checkpoint's, when its cameras stand where the set's do.
+fn shown_scenario(subject: &Subject) -> Option<Scenario> {
+    let path = subject.manifest.training.get("scenario").and_then(|v| v.as_str()).map(PathBuf::from)?;
+    let scenario = Scenario::load(&path).ok()?;
+    let dataset = &subject.pictures.dataset;
+    let stands = |view: usize, there: &carff_scenes::ScenarioCamera| {
+        let frame = dataset.frame_index(0, view).and_then(|i| dataset.frames().get(i));
+        frame.is_some_and(|frame| {
+            let (a, b) = (frame.camera.position_m(), there.camera.position_m());
+            (0..3).all(|k| (a[k] - b[k]).abs() < SAME_PLACE_M)
+        })
+    };
+    let same = scenario.cameras().len() == dataset.view_count()
+        && scenario.cameras().iter().enumerate().all(|(view, there)| stands(view, there));
+    same.then_some(scenario)
+}
+
+/// Of each free drive the picture whose decision counts, and what is right.
+fn free_drives(
+    scenario: &Scenario,
+    count: u32,
+    seed: u64,
+    display: &Display,
+) -> anyhow::Result<Vec<(Image, DriveKind)>> {
+    if scenario.info().hazard_branches.is_empty() {
+        return Ok(Vec::new());
+    }
+    let total = count as usize;
+    (0..total)
+        .map(|done| {
+            display.show(&Progress { stage: "free drives", done, total, line: String::new() });
+            let drive = scenario.free_drive(done as u64, FRAMES_PER_TIMESTAMP, seed)?;
+            let frame = scenario.free_frame(&drive, drive.decisive_frame())?;
+            Ok((frame.image, drive.kind()))
+        })
+        .collect()
 }
 
 /// The folder with the run's metrics: the one named, or where `carff train` puts it.

@@ -13,7 +13,7 @@ pub mod svm;
 
 pub use birds_eye::{BirdsEye, birds_eye};
 pub use pairs::{PairMeans, pair_means};
-pub use planning::{Count, PlanningTable, SAMPLE_COUNTS, Trial, TrialOutcome, count, planning_table, trials};
+pub use planning::{Count, PlanningTable, SAMPLE_COUNTS, Trial, TrialOutcome, count, planning_table, trial, trials};
 pub use samples::{Input, SampleAccuracy, sample_accuracy};
 
 use carff_belief::Probe;

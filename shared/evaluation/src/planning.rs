@@ -2,7 +2,7 @@
 
 use carff_belief::{Plan, Probe, decision, hazard_probability, look_ahead_with};
 use carff_dataset::{
-    Dataset, DatasetError,
+    Dataset, DatasetError, Image,
     drives::{DriveKind, EligibleInput},
     sensor::{SensorNoise, apply_noise_into},
 };
@@ -73,29 +73,30 @@ pub fn trials(
             continue;
         };
         let image = dataset.load_image(index)?;
-        let mut noisy = vec![0_u8; image.rgb.len()];
         for repeat in 0..repeats {
             // Frames are numbered by picture and repeat, so that no two trials share their random draws.
-            let frame = (index * 1000 + repeat) as u64;
-            let key = Key { seed, frame, step: 0, sample: 0 };
-            if apply_noise_into(&image.rgb, &mut noisy, noise, key).is_err() {
-                noisy.copy_from_slice(&image.rgb);
-            }
-            let picture = pictures_from_bytes(&Tensor::from_slice(&noisy).view([
-                1,
-                i64::from(image.height_px),
-                i64::from(image.width_px),
-                3,
-            ]));
-            trials.extend(encoder.encode(&picture).into_iter().map(|posterior| Trial {
-                posterior,
-                kind: input.kind,
-                frame,
-                seed,
-            }));
+            trials.extend(trial(encoder, &image, input.kind, noise, seed, (index * 1000 + repeat) as u64));
         }
     }
     Ok(trials)
+}
+
+/// Takes one picture, with sensor noise, through the encoder. `frame` names its random draws.
+pub fn trial(
+    encoder: &Encoder,
+    image: &Image,
+    kind: DriveKind,
+    noise: &SensorNoise,
+    seed: u64,
+    frame: u64,
+) -> Option<Trial> {
+    let mut noisy = vec![0_u8; image.rgb.len()];
+    if apply_noise_into(&image.rgb, &mut noisy, noise, Key { seed, frame, step: 0, sample: 0 }).is_err() {
+        noisy.copy_from_slice(&image.rgb);
+    }
+    let sides = [1, i64::from(image.height_px), i64::from(image.width_px), 3];
+    let posterior = encoder.encode(&pictures_from_bytes(&Tensor::from_slice(&noisy).view(sides))).into_iter().next()?;
+    Some(Trial { posterior, kind, frame, seed })
 }
 
 /// What was found in one trial.

@@ -7,7 +7,7 @@ use carff_dataset::{
     PoseRole,
     drives::{DriveKind, EligibleInput, eligible_inputs},
 };
-use carff_evaluation::{PlanningTable, Trial, planning_table, trials};
+use carff_evaluation::{PlanningTable, Trial, planning_table, trial, trials};
 use carff_metrics::{Reliability, reliability};
 use carff_models::mixture::Sampling;
 use carff_planning::Rule;
@@ -26,6 +26,8 @@ const TRIALS: usize = 300;
 /// Most times that one picture of another part of the poses is taken: pictures that differ in sensor noise alone are no
 /// new cases.
 const MOST_REPEATS: usize = 5;
+/// Free drives are numbered from here, so that they share no random draws with pictures of the data set.
+const FIRST_FREE: u64 = 1 << 40;
 /// Bins of the reliability diagram.
 const BINS: usize = 10;
 
@@ -49,7 +51,7 @@ pub struct PlanningResults {
     pub calibration_views: PlanningTable,
     /// Every eligible picture of poses never trained on.
     pub unseen_views: PlanningTable,
-    /// Drives from poses that no training saw. Filled by whoever renders them.
+    /// Drives from poses that no training saw, one picture each; absent where nobody rendered them.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub free_drives: Option<PlanningTable>,
     /// Pictures behind each table of views.
@@ -135,6 +137,17 @@ pub fn planning(subject: &Subject, on_progress: &dyn Fn(&Progress)) -> Result<Fo
             PoseRole::Calibration => results.calibration_views = table,
             PoseRole::Unseen => results.unseen_views = table,
         }
+    }
+    if !subject.free_drives.is_empty() {
+        tell(4, "free_drives");
+        let (seed, noise) = (subject.options.seed, subject.noise());
+        let taken: Vec<Trial> = subject
+            .free_drives
+            .iter()
+            .enumerate()
+            .filter_map(|(i, (image, kind))| trial(&subject.encoder, image, *kind, &noise, seed, FIRST_FREE + i as u64))
+            .collect();
+        results.free_drives = Some(decide(subject, &taken, &rules, Sampling::Stratified));
     }
     tell(4, "reliability");
     let reliability = hazard_reliability(subject)?;

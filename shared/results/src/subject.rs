@@ -6,6 +6,7 @@ use carff_checkpoint::{CheckpointError, Manifest, ScenarioIdentity, load_decoder
 use carff_config::CheckpointPlanning;
 use carff_dataset::{
     Image, PoseRole,
+    drives::DriveKind,
     sensor::{SensorNoise, apply_noise_into},
 };
 use carff_models::{
@@ -50,6 +51,9 @@ pub struct Subject {
     pub threshold: Option<f64>,
     /// Folder of the training run, where it is at hand: its curves are drawn.
     pub run_dir: Option<PathBuf>,
+    /// Of each free drive the picture whose decision counts, as it is, and what is right: whoever can render them fills
+    /// them in.
+    pub free_drives: Vec<(Image, DriveKind)>,
     /// How to evaluate.
     pub options: EvalOptions,
 }
@@ -81,6 +85,7 @@ impl Subject {
             encoder,
             pictures,
             run_dir: None,
+            free_drives: Vec::new(),
             options,
         };
         let total = subject.pictures.images.len();
