@@ -125,6 +125,11 @@ fn pictures(page: &mut String, table: &PictureTable) {
         );
         matrix(page, &table.states, predicted);
         means(page, predicted, table.mean_picture_db);
+    } else if table.toggled.is_some() {
+        let _ = writeln!(
+            page,
+            "No forecast states: there is no forecast, or no picture of a state with a next step tells that state alone.\n"
+        );
     }
     if !table.novel_views.is_empty() {
         let _ = writeln!(
