@@ -23,10 +23,12 @@ TARGET = "x86_64-unknown-linux-gnu"
 
 # The only modules with `unsafe`, and what for.
 UNSAFE_MODULES = {
+    "fuzz/targets/messages.rs": "makes messages out of arbitrary bytes",
     "shared/field/src/dispatch.rs": "calls kernels compiled for an instruction set that was found at run time",
     "shared/messages/src/tests.rs": "makes messages out of arbitrary bytes",
     "shared/models/src/allocator.rs": "mallopt",
     "shared/models/src/borrow.rs": "tensors that borrow shared memory",
+    "shared/stage/src/realtime.rs": "sched_setscheduler",
     "shared/transport/src/descriptors.rs": "file descriptors of iceoryx2's listeners",
 }
 

@@ -3,6 +3,7 @@
 
 pub mod dataset;
 mod filmstrip;
+pub mod health;
 pub mod launch;
 pub mod lock;
 pub mod monitor;
@@ -10,6 +11,7 @@ pub mod planning;
 mod process;
 pub mod report;
 pub mod run_record;
+pub mod soak;
 pub mod supervise;
 pub mod terminal;
 pub mod train;
