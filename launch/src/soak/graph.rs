@@ -1,11 +1,12 @@
 //! The graph under fire: its launcher's process, its folder, and what it holds of the system.
 
 use super::config::SoakConfig;
+use super::patience::Patience;
 use crate::run_record::RunRecord;
 use anyhow::{Context, bail, ensure};
 use carff_config::{GraphConfig, LogLevel, RestartPolicy};
 use carff_messages::Stage;
-use carff_transport::{Run, living_processes, monotonic_now_ns, runtime_dir};
+use carff_transport::{Run, living_processes, runtime_dir};
 use rustix::process::{Pid, PidfdFlags, Signal, pidfd_open, pidfd_send_signal};
 use std::collections::BTreeMap;
 use std::os::fd::OwnedFd;
@@ -51,9 +52,7 @@ impl Graph {
         checkpoint: Option<&Path>,
         seed: u64,
     ) -> anyhow::Result<Self> {
-        let file =
-            if soak.graph.exists() { soak.graph.clone() } else { PathBuf::from("configs/graphs").join(&soak.graph) };
-        let mut config = GraphConfig::load(&file)?;
+        let mut config = GraphConfig::load(&soak.graph)?;
         let dataset = config.resolve(dataset.unwrap_or(&config.run.dataset));
         ensure!(
             dataset.is_dir(),
@@ -127,7 +126,7 @@ impl Graph {
             .stderr(log)
             .spawn()
             .context("cannot start the launcher")?;
-        let patience_ns = monotonic_now_ns() + self.config.launcher.start_timeout_ms * 1_000_000;
+        let mut patience = Patience::of_ms(self.config.launcher.start_timeout_ms);
         let named = Run::new(&self.name, 0)?;
         loop {
             if let Some(status) = child.try_wait()? {
@@ -142,7 +141,7 @@ impl Graph {
                 self.launcher = Some(child);
                 return Ok(Run::new(&self.name, record.run_id)?);
             }
-            if monotonic_now_ns() > patience_ns {
+            if patience.ran_out() {
                 let _ = child.kill();
                 let _ = child.wait();
                 bail!("the launcher was not up within {} ms", self.config.launcher.start_timeout_ms);
@@ -159,13 +158,13 @@ impl Graph {
         }
     }
 
-    /// Ends the launcher by a signal and waits for it, `limit` at most; then for its stages too.
-    pub(super) fn end(&mut self, signal: Signal, limit: Duration) -> anyhow::Result<Option<ExitStatus>> {
+    /// Ends the launcher by a signal and waits for it, `limit_ms` at most; then for its stages too.
+    pub(super) fn end(&mut self, signal: Signal, limit_ms: u64) -> anyhow::Result<Option<ExitStatus>> {
         let Some(mut launcher) = self.launcher.take() else { return Ok(None) };
         if let Some(pid) = Pid::from_raw(launcher.id() as i32) {
             let _ = rustix::process::kill_process(pid, signal);
         }
-        let deadline_ns = monotonic_now_ns() + limit.as_nanos() as u64;
+        let mut patience = Patience::of_ms(limit_ms);
         let mut status = None;
         let run = Run::new(&self.name, 0)?;
         loop {
@@ -174,7 +173,7 @@ impl Graph {
             if status.is_some() && alone {
                 return Ok(status);
             }
-            if monotonic_now_ns() > deadline_ns {
+            if patience.ran_out() {
                 let _ = launcher.kill();
                 let _ = launcher.wait();
                 return Ok(None);
@@ -209,7 +208,7 @@ impl Graph {
 
 impl Drop for Graph {
     fn drop(&mut self) {
-        let _ = self.end(Signal::TERM, Duration::from_secs(5));
+        let _ = self.end(Signal::TERM, 5000);
         if let Ok(run) = Run::new(&self.name, 0) {
             let _ = carff_transport::remove_run_leftovers(&run);
         }

@@ -8,8 +8,10 @@ use rand::Rng;
 use rustix::process::{Signal, set_parent_process_death_signal};
 use std::time::Duration;
 
-/// How long it listens for frames before it gives up, nanoseconds.
-const PATIENCE_NS: u64 = 5_000_000_000;
+/// Longest sleep between two looks, nanoseconds.
+const LOOK_NS: u64 = 100_000_000;
+/// How often it looks for frames before it gives up: looks, as time may pass without it.
+const LOOKS: usize = 300;
 /// Frames in a burst, for each one that is asked for.
 const BURST: u32 = 12;
 /// How late a late frame comes.
@@ -56,7 +58,7 @@ fn probe(node: &Node, count: u32) -> anyhow::Result<()> {
     let mut actions = node.receiver(&topics::ACTION)?;
     println!("ready");
     for _ in 0..count {
-        if waiter.wait_until(&[&frames, &beliefs, &actions], monotonic_now_ns() + PATIENCE_NS)? == Woken::Stopped {
+        if waiter.wait_until(&[&frames, &beliefs, &actions], monotonic_now_ns() + LOOK_NS)? == Woken::Stopped {
             return Ok(());
         }
         (frames.newest()?, beliefs.newest()?, actions.newest()?);
@@ -126,13 +128,15 @@ fn frames(node: &Node, args: &InjectArgs) -> anyhow::Result<()> {
     let mut input = node.picture_receiver(&topics::FRAME)?;
     let waiter = Waiter::new(Stop::on_signals()?);
     let mut seen: Vec<(FrameMeta, Vec<u8>)> = Vec::new();
-    let patience_ns = monotonic_now_ns() + PATIENCE_NS;
-    while seen.len() < 3 {
-        ensure!(waiter.wait_until(&[&input], patience_ns)? == Woken::Input, "no frames to send again");
+    for _ in 0..LOOKS {
+        if seen.len() >= 3 || waiter.wait_until(&[&input], monotonic_now_ns() + LOOK_NS)? == Woken::Stopped {
+            break;
+        }
         while let Some(frame) = input.next()? {
             seen.push((*frame.meta(), frame.bytes().to_vec()));
         }
     }
+    ensure!(!seen.is_empty(), "no frames to send again");
     let most = seen.iter().map(|(_, bytes)| bytes.len()).max().unwrap_or(0);
     let mut output = node.picture_publisher(&topics::FRAME, most)?;
     let newest = seen.len() - 1;

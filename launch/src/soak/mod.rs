@@ -9,6 +9,7 @@
 mod config;
 mod graph;
 mod inject;
+mod patience;
 mod report;
 mod schedule;
 mod watch;
@@ -21,6 +22,7 @@ use anyhow::{Context, ensure};
 use carff_messages::Stage;
 use carff_transport::{Node, Run, SHARED_MEMORY_DIR, Stop, Waiter, monotonic_now_ns};
 use graph::{Graph, Holdings, Victim, resident_bytes};
+use patience::Patience;
 use report::{Lives, Outcome};
 use rustix::process::Signal;
 use std::collections::BTreeMap;
@@ -28,7 +30,6 @@ use std::io::{BufRead, BufReader, Read};
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitCode, Stdio};
-use std::time::Duration;
 use watch::{Notes, Terms, Watcher};
 
 const NS_PER_MS: u64 = 1_000_000;
@@ -41,8 +42,10 @@ const SLOW_MS: (u64, u64) = (40, 20);
 const DROPPED_FRAMES: f64 = 4.0;
 /// Time between two looks at the processes' memory.
 const MEMORY_PERIOD_NS: u64 = 5 * NS_PER_S;
+/// After a recovery the times of actions count again from so much later on.
+const SETTLE_NS: u64 = 200_000_000;
 /// Longest time that an injector may take.
-const INJECTOR_NS: u64 = 60 * NS_PER_S;
+const INJECTOR_MS: u64 = 60_000;
 
 /// Soak a graph.
 #[derive(Clone, Debug, clap::Args)]
@@ -95,7 +98,7 @@ pub fn run(args: &SoakArgs) -> anyhow::Result<ExitCode> {
     };
     let result = soak.drive();
     soak.watcher = None;
-    let stalled = soak.graph.end(Signal::TERM, Duration::from_millis(config.contract.stop_ms))?.is_none();
+    let stalled = soak.graph.end(Signal::TERM, config.contract.stop_ms)?.is_none();
     let interrupted = soak.waiter.stop().is_stopped();
     if stalled && !interrupted && soak.notes.violation.is_none() && result.is_ok() {
         soak.notes.violation = Some("the graph did not end when it was asked to".to_owned());
@@ -247,13 +250,12 @@ impl Soak<'_> {
         limit_ms: u64,
         mut holds: impl FnMut(&mut Self) -> anyhow::Result<bool>,
     ) -> anyhow::Result<bool> {
-        let (begun_ns, stalled_ns) = (monotonic_now_ns(), self.watcher()?.stalled_ns);
+        let mut patience = Patience::of_ms(limit_ms);
         loop {
             if holds(self)? {
                 return Ok(true);
             }
-            let stalled_ns = self.watcher()?.stalled_ns - stalled_ns;
-            if monotonic_now_ns() - begun_ns > limit_ms * NS_PER_MS + stalled_ns || self.waiter.stop().is_stopped() {
+            if patience.ran_out() || self.waiter.stop().is_stopped() {
                 return Ok(false);
             }
             self.look()?;
@@ -307,7 +309,8 @@ impl Soak<'_> {
                 self.recover(None)?;
             }
             Kind::Drop => {
-                let victim = Victim::new(pids[&Stage::Camera])?;
+                let camera = Fault { target: Some(Stage::Camera), ..*fault };
+                let victim = Victim::new(self.pid_of(&camera, &pids)?)?;
                 victim.signal(Signal::STOP);
                 self.look_for((DROPPED_FRAMES * 1000.0 / self.graph.config.run.frame_rate_hz) as u64)?;
                 victim.signal(Signal::CONT);
@@ -389,6 +392,7 @@ impl Soak<'_> {
             self.violated(format!("not recovered within {limit_ms} ms: {}", states.join("\n")));
         }
         self.outcome.recoveries_ms.push(took_ns as f64 / 1e6);
+        self.notes.judge.excuse_no_more(monotonic_now_ns() + SETTLE_NS);
         // What is left of the dead is gone soon after.
         let Some(baseline) = self.baseline.clone() else { return Ok(()) };
         let mut found = Holdings::default();
@@ -444,12 +448,12 @@ impl Soak<'_> {
     /// Lets an injector do its work; returns what it printed.
     fn injector(&mut self, what: &str, fault: &Fault) -> anyhow::Result<String> {
         let mut child = self.helper(what, fault.count, fault.seed)?;
-        let patience_ns = monotonic_now_ns() + INJECTOR_NS;
+        let mut patience = Patience::of_ms(INJECTOR_MS);
         let status = loop {
             if let Some(status) = child.try_wait()? {
                 break status;
             }
-            if monotonic_now_ns() > patience_ns {
+            if patience.ran_out() {
                 child.kill()?;
             }
             self.look()?;
@@ -467,10 +471,13 @@ impl Soak<'_> {
         for i in 0..fault.count.min(4) {
             let mut probe = self.helper("probe", i, 0)?;
             let mut ready = String::new();
-            let stdout = probe.stdout.take().context("the probe has no output")?;
-            BufReader::new(stdout).read_line(&mut ready)?;
-            self.look()?;
-            ensure!(ready == "ready\n", "a probe could not attach");
+            let mut stdout = BufReader::new(probe.stdout.take().context("the probe has no output")?);
+            let said = std::thread::spawn(move || stdout.read_line(&mut ready).map(|_| ready));
+            while !said.is_finished() {
+                self.look()?;
+            }
+            let ready = said.join().ok().and_then(Result::ok);
+            ensure!(ready.as_deref() == Some("ready\n"), "a probe could not attach");
             probes.push(probe);
         }
         self.look_for(fault.hold_ms)?;
@@ -504,7 +511,7 @@ impl Soak<'_> {
         let limit_ms = self.config.contract.stop_ms;
         // What the watcher itself has open is none of the graph's.
         self.watcher = None;
-        let status = self.graph.end(signal, Duration::from_millis(limit_ms))?;
+        let status = self.graph.end(signal, limit_ms)?;
         match (signal, status.and_then(|s| s.code())) {
             _ if status.is_none() => self.violated(format!("the graph did not end within {limit_ms} ms")),
             (Signal::INT, Some(130)) => {

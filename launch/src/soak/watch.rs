@@ -93,6 +93,11 @@ impl Judge {
         self.excused_until_ns = self.excused_until_ns.max(until_ns);
     }
 
+    /// Leaves no time after this out of account.
+    pub(super) fn excuse_no_more(&mut self, from_ns: u64) {
+        self.excused_until_ns = self.excused_until_ns.min(from_ns);
+    }
+
     /// The controller is another process: it remembers nothing, and nor does its judge.
     pub(super) fn restarted(&mut self, now_ns: u64) {
         (self.decision, self.last) = (None, None);
@@ -113,6 +118,10 @@ impl Judge {
             return wrong(format!("an action that is not valid ({error})"));
         }
         let (published_ns, excused_ns) = (action.header.publish_time_ns, self.excused_until_ns);
+        // What was not seen proves nothing.
+        if self.last.is_some_and(|last| action.header.sequence != last.header.sequence.wrapping_add(1)) {
+            (self.last, self.decision) = (None, None);
+        }
         if let Some(last) = self.last.replace(*action)
             && last.header.publish_time_ns >= excused_ns
         {
@@ -372,6 +381,14 @@ mod tests {
         }
     }
 
+    impl Judge {
+        /// The next action in the controller's sequence.
+        fn next(&mut self, mut action: Action) -> Result<(), String> {
+            action.header.sequence = self.last.map_or(0, |last| last.header.sequence + 1);
+            self.acted(&action)
+        }
+    }
+
     /// A safe action.
     fn halt(at_ms: u64) -> Action {
         Action { reason: Reason::StaleBelief.code(), is_decision: 0, ..action(0, ActionCode::Halt, at_ms) }
@@ -389,15 +406,15 @@ mod tests {
             let mut judge = judge();
             judge.given(&belief(1, 1, 0.0));
             judge.given(&belief(1, 2, hazard));
-            let said = judge.acted(&action(1, code, 120));
+            let said = judge.next(action(1, code, 120));
             assert_eq!(said.is_ok(), right, "{said:?}");
             assert_eq!(judge.judged, 1);
             let again = Action { is_decision: 0, ..action(1, code, 120) };
-            assert!(judge.acted(&again).is_ok());
+            assert!(judge.next(again).is_ok());
         }
         let mut judge = judge();
         judge.given(&belief(1, 2, 0.0));
-        assert!(judge.acted(&action(1, ActionCode::Advance, 120)).is_ok(), "a belief that was not seen proves nothing");
+        assert!(judge.next(action(1, ActionCode::Advance, 120)).is_ok(), "a belief that was not seen proves nothing");
         assert_eq!((judge.judged, judge.unjudged), (0, 1));
     }
 
@@ -407,19 +424,19 @@ mod tests {
     fn what_no_controller_may_do() {
         let decided = || {
             let mut judge = judge();
-            judge.acted(&action(2, ActionCode::Advance, 210)).unwrap();
+            judge.next(action(2, ActionCode::Advance, 210)).unwrap();
             judge
         };
-        assert!(decided().acted(&action(2, ActionCode::Advance, 220)).unwrap_err().contains("twice"));
-        assert!(decided().acted(&action(1, ActionCode::Advance, 230)).unwrap_err().contains("out of order"));
+        assert!(decided().next(action(2, ActionCode::Advance, 220)).unwrap_err().contains("twice"));
+        assert!(decided().next(action(1, ActionCode::Advance, 230)).unwrap_err().contains("out of order"));
         let stale = Action { latency_ns: 151 * MS, ..action(3, ActionCode::Advance, 230 + 100) };
-        assert!(judge().acted(&stale).unwrap_err().contains("stale"));
+        assert!(judge().next(stale).unwrap_err().contains("stale"));
         let long = Action { valid_until_ns: 999 * MS, ..action(3, ActionCode::Advance, 310) };
-        assert!(judge().acted(&long).unwrap_err().contains("deadline"));
+        assert!(judge().next(long).unwrap_err().contains("deadline"));
         let blind = Action { action: ActionCode::Advance.code(), ..halt(220) };
-        assert!(decided().acted(&blind).unwrap_err().contains("without a belief"));
+        assert!(decided().next(blind).unwrap_err().contains("without a belief"));
         let other = Action { is_decision: 0, ..action(1, ActionCode::Advance, 220) };
-        assert!(decided().acted(&other).unwrap_err().contains("repeats"));
+        assert!(decided().next(other).unwrap_err().contains("repeats"));
     }
 
     /// The safe action has to follow a decision's expiry within the slack, and actions each other within period and
@@ -428,19 +445,24 @@ mod tests {
     fn safe_actions_and_the_rate_are_timed() {
         let stands = |until: &[u64]| {
             let mut judge = judge();
-            judge.acted(&action(2, ActionCode::Advance, 210)).unwrap();
+            judge.next(action(2, ActionCode::Advance, 210)).unwrap();
             for &at_ms in until {
                 let repeat = Action { is_decision: 0, ..action(2, ActionCode::Advance, 210) };
                 let header = Header { publish_time_ns: at_ms * MS, ..repeat.header };
-                judge.acted(&Action { header, ..repeat }).unwrap();
+                judge.next(Action { header, ..repeat }).unwrap();
             }
             judge
         };
-        assert!(stands(&[260, 310, 350]).acted(&halt(361)).is_ok());
-        assert!(stands(&[260, 310, 350, 400]).acted(&halt(411)).unwrap_err().contains("late"));
-        assert!(stands(&[260]).acted(&halt(361)).unwrap_err().contains("no action"));
+        assert!(stands(&[260, 310, 350]).next(halt(361)).is_ok());
+        assert!(stands(&[260, 310, 350, 400]).next(halt(411)).unwrap_err().contains("late"));
+        assert!(stands(&[260]).next(halt(361)).unwrap_err().contains("no action"));
         let mut excused = stands(&[260, 310]);
         excused.excuse(5000 * MS);
-        assert!(excused.acted(&halt(4990)).is_ok());
+        assert!(excused.next(halt(4990)).is_ok());
+        // Nor are actions that were missed held against anybody.
+        let mut missed = stands(&[260]);
+        let mut late = halt(999);
+        late.header.sequence = 77;
+        assert!(missed.acted(&late).is_ok());
     }
 }
