@@ -17,10 +17,7 @@ else ifneq ($(CARGO_TARGET_DIR),)
 export LD_LIBRARY_PATH := $(CURDIR)/.libtorch/lib$(if $(LD_LIBRARY_PATH),:$(LD_LIBRARY_PATH))
 endif
 
-FUZZ_RUNS ?= 100000
-FUZZ_TARGETS := graph_config planning messages dataset_json png
-
-.PHONY: help run build test soak fuzz bench-peer lint sanitize fmt libtorch
+.PHONY: help run build test soak bench-peer lint sanitize fmt libtorch
 
 help: ## List the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -50,18 +47,6 @@ sanitize: libtorch ## Run the tests around `unsafe` under the address sanitizer 
 
 soak: build ## Soak the shipped graph for MINUTES (default 10) with SEED (default 1) under every kind of fault
 	$(TARGET)/release/carff soak configs/soak/all.toml --minutes $(or $(MINUTES),10) --seed $(or $(SEED),1) --json reports/soak.json
-
-fuzz: ## Fuzz each reader for FUZZ_RUNS runs (needs a nightly toolchain); cases that fail are kept in fuzz/found
-	RUSTFLAGS="-Cpasses=sancov-module -Cllvm-args=-sanitizer-coverage-level=4 \
-		-Cllvm-args=-sanitizer-coverage-inline-8bit-counters -Cllvm-args=-sanitizer-coverage-pc-table \
-		-Cllvm-args=-sanitizer-coverage-trace-compares -Zsanitizer=address --cfg fuzzing" \
-		cargo +nightly build --release --locked --manifest-path fuzz/Cargo.toml --target x86_64-unknown-linux-gnu \
-		--target-dir $(TARGET)/fuzz
-	mkdir -p fuzz/found $(addprefix $(TARGET)/fuzz/grown/,$(FUZZ_TARGETS))
-	for target in $(FUZZ_TARGETS); do \
-		$(TARGET)/fuzz/x86_64-unknown-linux-gnu/release/$$target -runs=$(FUZZ_RUNS) -rss_limit_mb=1024 \
-			-artifact_prefix=fuzz/found/$$target- $(TARGET)/fuzz/grown/$$target fuzz/corpus/$$target || exit 1; \
-	done
 
 fmt: ## Format
 	cargo fmt --all

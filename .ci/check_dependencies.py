@@ -23,7 +23,6 @@ TARGET = "x86_64-unknown-linux-gnu"
 
 # The only modules with `unsafe`, and what for.
 UNSAFE_MODULES = {
-    "fuzz/targets/messages.rs": "makes messages out of arbitrary bytes",
     "shared/field/src/dispatch.rs": "calls kernels compiled for an instruction set that was found at run time",
     "shared/messages/src/tests.rs": "makes messages out of arbitrary bytes",
     "shared/models/src/allocator.rs": "mallopt",
