@@ -17,7 +17,7 @@ else ifneq ($(CARGO_TARGET_DIR),)
 export LD_LIBRARY_PATH := $(CURDIR)/.libtorch/lib$(if $(LD_LIBRARY_PATH),:$(LD_LIBRARY_PATH))
 endif
 
-.PHONY: help run build test bench-peer lint sanitize fmt libtorch
+.PHONY: help run build test soak bench-peer lint sanitize fmt libtorch
 
 help: ## List the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -44,6 +44,9 @@ sanitize: libtorch ## Run the tests around `unsafe` under the address sanitizer 
 	RUSTFLAGS=-Zsanitizer=address LD_LIBRARY_PATH=$(CURDIR)/.libtorch/lib cargo +nightly test --locked --lib --tests \
 		--target x86_64-unknown-linux-gnu --target-dir $(TARGET)/sanitize \
 		-p carff-field -p carff-messages -p carff-models -p carff-transport
+
+soak: build ## Soak the shipped graph for MINUTES (default 10) with SEED (default 1) under every kind of fault
+	$(TARGET)/release/carff soak configs/soak/all.toml --minutes $(or $(MINUTES),10) --seed $(or $(SEED),1) --json reports/soak.json
 
 fmt: ## Format
 	cargo fmt --all

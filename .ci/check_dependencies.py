@@ -27,6 +27,7 @@ UNSAFE_MODULES = {
     "shared/messages/src/tests.rs": "makes messages out of arbitrary bytes",
     "shared/models/src/allocator.rs": "mallopt",
     "shared/models/src/borrow.rs": "tensors that borrow shared memory",
+    "shared/stage/src/realtime.rs": "sched_setscheduler",
     "shared/transport/src/descriptors.rs": "file descriptors of iceoryx2's listeners",
 }
 

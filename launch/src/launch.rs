@@ -1,5 +1,6 @@
 //! `carff launch`: starts a graph, watches it, shows its decisions, ends it, and reports.
 
+use crate::health::{Ailment, Limits, StageHealth};
 use crate::lock::RunLock;
 use crate::monitor::{FrameRecord, Monitor};
 use crate::planning::{self, Planning};
@@ -10,9 +11,9 @@ use crate::supervise::{RestartBudget, Verdict};
 use crate::terminal::Terminal;
 use anyhow::{Context, anyhow, bail, ensure};
 use carff_checkpoint::{Manifest, ScenarioIdentity};
-use carff_config::{CameraSource, GraphConfig, RestartPolicy};
+use carff_config::{CameraSource, GraphConfig, RestartPolicy, WhenLost};
 use carff_dataset::Dataset;
-use carff_messages::{ActionCode, HealthState, Stage};
+use carff_messages::{ActionCode, Stage};
 use carff_scenes::{Extras, Scenario};
 use carff_stage::StageArgs;
 use carff_transport::{
@@ -31,6 +32,14 @@ const START_ORDER: [Stage; 6] =
     [Stage::Controller, Stage::Renderer, Stage::Prober, Stage::Forecaster, Stage::Encoder, Stage::Camera];
 /// How often messages and children are looked at: before the smallest buffer (8 pictures) fills up at 400 a second.
 const WATCH_NS: u64 = 20_000_000;
+/// How often what dead processes left is looked for: probes come and go, and the launcher starts none of them.
+const CLEANUP_NS: u64 = 1_000_000_000;
+/// A pause of the launcher's own that is longer than this is held against nobody.
+const OWN_PAUSE_NS: u64 = 300_000_000;
+/// A stage's loop may stand still for so many times its own deadline.
+const STANDSTILL_DEADLINES: u64 = 10;
+/// A stage's topic may be quiet for so many frames.
+const QUIET_FRAMES: f64 = 3.0;
 /// How long processes of an earlier, killed launch may take to end.
 const ORPHAN_PATIENCE_NS: u64 = 2_000_000_000;
 /// Exit code after Ctrl-C, as shells have it: 128 and the signal's number.
@@ -107,7 +116,7 @@ pub fn run(args: &LaunchArgs) -> anyhow::Result<ExitCode> {
     let result = {
         let node = Node::open(&run, "launcher")?;
         let mut launcher = Launcher {
-            monitor: Monitor::open(&node)?,
+            monitor: Monitor::open(&node, &graph)?,
             waiter: Waiter::new(stop.clone()),
             node: &node,
             graph: &graph,
@@ -116,6 +125,9 @@ pub fn run(args: &LaunchArgs) -> anyhow::Result<ExitCode> {
             folder,
             drives: args.drives.unwrap_or(graph.camera.drives),
             terminal: terminal.clone(),
+            watched_ns: monotonic_now_ns(),
+            cleanup_ns: monotonic_now_ns(),
+            lost: None,
         };
         let result = launcher.drive();
         terminal.status(String::new());
@@ -196,9 +208,7 @@ struct Watched {
     stage: Stage,
     process: Option<StageProcess>,
     budget: RestartBudget,
-    /// Whether any of its processes has ever been ready.
-    was_ready: bool,
-    started_ns: u64,
+    health: StageHealth,
     restart_at_ns: Option<u64>,
 }
 
@@ -212,6 +222,12 @@ struct Launcher<'a> {
     folder: PathBuf,
     drives: u32,
     terminal: Arc<Terminal>,
+    /// When the stages were last looked at.
+    watched_ns: u64,
+    /// When what the dead left is looked for next.
+    cleanup_ns: u64,
+    /// The stage without which the run goes on at a halt, and why.
+    lost: Option<String>,
 }
 
 impl Launcher<'_> {
@@ -227,7 +243,10 @@ impl Launcher<'_> {
         self.start(*camera)?;
         loop {
             if self.step()? == Woken::Stopped {
-                return Ok(Ended::Interrupted);
+                return match self.lost.take() {
+                    Some(lost) => Err(anyhow!(lost)),
+                    None => Ok(Ended::Interrupted),
+                };
             }
             if self.watch()? {
                 self.collect()?;
@@ -238,23 +257,49 @@ impl Launcher<'_> {
     }
 
     fn start(&mut self, stage: Stage) -> anyhow::Result<()> {
-        let process = StageProcess::start(stage, &self.folder, &self.stage_args, &self.terminal)?;
-        let started_ns = monotonic_now_ns();
+        // A camera that is started again goes on after its last frame.
+        let first_frame = if stage == Stage::Camera { self.monitor.records.frame_count() } else { 0 };
+        let args = StageArgs { first_frame, ..self.stage_args.clone() };
+        let process = StageProcess::start(stage, &self.folder, &args, &self.terminal)?;
+        let (pid, now_ns) = (process.pid(), monotonic_now_ns());
         match self.stages.iter_mut().find(|w| w.stage == stage) {
             Some(watched) => {
-                watched.process = Some(process);
-                (watched.started_ns, watched.restart_at_ns) = (started_ns, None);
+                (watched.process, watched.restart_at_ns) = (Some(process), None);
+                watched.health.restarted(pid, now_ns);
             }
             None => self.stages.push(Watched {
                 stage,
                 process: Some(process),
                 budget: RestartBudget::new(self.policy(stage)),
-                was_ready: false,
-                started_ns,
+                health: StageHealth::started(self.limits(stage), pid, now_ns),
                 restart_at_ns: None,
             }),
         }
         Ok(())
+    }
+
+    fn limits(&self, stage: Stage) -> Limits {
+        const NS_PER_MS: u64 = 1_000_000;
+        let (graph, launcher) = (self.graph, &self.graph.launcher);
+        let hang_ns = launcher.hang_timeout_ms * NS_PER_MS;
+        let frame_ns = 1e9 / graph.run.frame_rate_hz;
+        let (topic, deadline_ns) = match stage {
+            Stage::Camera => (topics::FRAME.deadline, frame_ns as u64),
+            Stage::Encoder => (topics::POSTERIOR.deadline, graph.encoder.deadline_ms * NS_PER_MS),
+            Stage::Forecaster => (topics::FORECAST.deadline, graph.forecaster.deadline_ms * NS_PER_MS),
+            Stage::Prober => (topics::BELIEF.deadline, graph.prober.deadline_ms * NS_PER_MS),
+            Stage::Renderer => (topics::VIEW.deadline, graph.renderer.deadline_ms * NS_PER_MS),
+            Stage::Controller => (topics::ACTION.deadline, graph.controller.deadline_ms * NS_PER_MS),
+        };
+        // The controller has a rate of its own.
+        let frames_ns = if stage == Stage::Controller { 0.0 } else { QUIET_FRAMES * frame_ns };
+        Limits {
+            start_ns: launcher.start_timeout_ms * NS_PER_MS,
+            silence_ns: topics::health(stage).deadline.as_nanos() as u64,
+            hang_ns,
+            standstill_ns: hang_ns.max(STANDSTILL_DEADLINES * deadline_ns),
+            quiet_ns: (topic.as_nanos() as u64).max(frames_ns as u64),
+        }
     }
 
     fn policy(&self, stage: Stage) -> RestartPolicy {
@@ -278,7 +323,7 @@ impl Launcher<'_> {
             let waiting: Vec<&str> = self
                 .stages
                 .iter()
-                .filter(|w| stages.contains(&w.stage) && !w.was_ready)
+                .filter(|w| stages.contains(&w.stage) && !w.health.was_ready())
                 .map(|w| w.stage.name())
                 .collect();
             if waiting.is_empty() {
@@ -300,10 +345,13 @@ impl Launcher<'_> {
         Ok(self.monitor.drain(|frame| terminal.line(&decision_line(frame, graph, drives, terminal)))?)
     }
 
-    /// Looks at the children: notes who is ready, restarts who died, by policy. True when the camera is done.
+    /// Looks at the stages: kills who hangs, restarts who died, by policy. True when the camera is done.
     fn watch(&mut self) -> anyhow::Result<bool> {
         let now_ns = monotonic_now_ns();
-        let mut restart = Vec::new();
+        let pause_ns = now_ns.saturating_sub(std::mem::replace(&mut self.watched_ns, now_ns));
+        if pause_ns > OWN_PAUSE_NS {
+            self.stages.iter_mut().for_each(|w| w.health.forgive(pause_ns));
+        }
         let mut ended = BTreeMap::new();
         for watched in &mut self.stages {
             if let Some(status) = watched.process.as_mut().map(StageProcess::ended).transpose()?.flatten() {
@@ -315,74 +363,86 @@ impl Launcher<'_> {
             self.collect()?;
         }
         for watched in &mut self.stages {
-            if watched.restart_at_ns.is_some_and(|at| now_ns >= at) {
-                restart.push(watched.stage);
-                continue;
+            let records = &self.monitor.records;
+            if let Some(health) = records.stages.get(&watched.stage).and_then(|s| s.last) {
+                watched.health.heard(&health, now_ns);
             }
-            let Some(process) = &mut watched.process else { continue };
-            let health = self.monitor.records.stages.get(&watched.stage).and_then(|s| s.last);
-            let ready = |state| !matches!(state, HealthState::Starting | HealthState::Faulty);
-            if health.is_some_and(|h| h.pid == process.pid() && h.state().is_ok_and(ready)) {
-                watched.was_ready = true;
+            if let Some(&at_ns) = records.spoke_ns.get(&watched.stage) {
+                watched.health.spoke(at_ns);
             }
-            let stage = watched.stage;
-            let Some(&status) = ended.get(&stage) else {
-                let limit_ms = self.graph.launcher.start_timeout_ms;
-                let late = now_ns.saturating_sub(watched.started_ns) > limit_ms * 1_000_000;
-                ensure!(
-                    watched.was_ready || !late,
-                    "stage `{stage}` was not ready within {limit_ms} ms: see its log, or raise \
-                     `launcher.start_timeout_ms`"
-                );
-                continue;
-            };
-            let cause = process.last_error().unwrap_or_else(|| how(status));
-            watched.process = None;
-            if stage == Stage::Camera && status.success() {
-                return Ok(true);
-            }
-            if !watched.was_ready {
-                bail!("stage `{stage}` did not start: {cause}");
-            }
-            match watched.budget.died(now_ns) {
-                Verdict::RestartAt(at_ns) => {
-                    watched.restart_at_ns = Some(at_ns);
-                    self.terminal.log(&format!(
-                        "[launcher] stage {stage} died ({cause}): restart {} in {} ms",
-                        watched.budget.restarts(),
-                        (at_ns - now_ns) / 1_000_000
-                    ));
-                }
-                Verdict::Lost => match watched.budget.restarts() {
-                    0 => bail!("stage `{stage}` is lost: {cause}"),
-                    n => bail!("stage `{stage}` is lost after {n} restarts: {cause}"),
-                },
-            }
-            // The dead one has been waited for: its ports can be freed for its successor.
-            self.node.cleanup_dead();
         }
-        for stage in restart {
-            self.start(stage)?;
+        for i in 0..self.stages.len() {
+            let watched = &mut self.stages[i];
+            let stage = watched.stage;
+            if let Some(status) = ended.get(&stage) {
+                if stage == Stage::Camera && status.success() {
+                    watched.health.done();
+                    return Ok(true);
+                }
+                let cause = watched.process.take().and_then(|p| p.last_error()).unwrap_or_else(|| how(*status));
+                self.judge(i, &cause, now_ns)?;
+            } else if let Some(ailment) = watched.health.ailment(now_ns) {
+                if let Some(mut process) = watched.process.take() {
+                    process.kill();
+                }
+                let advice = match ailment {
+                    Ailment::NotReady { .. } => ": see its log, or raise `launcher.start_timeout_ms`",
+                    _ => "",
+                };
+                self.judge(i, &format!("{ailment}{advice}"), now_ns)?;
+            } else if watched.restart_at_ns.is_some_and(|at_ns| now_ns >= at_ns)
+                && let Err(error) = self.start(stage)
+            {
+                self.judge(i, &carff_stage::describe(&error), now_ns)?;
+            }
+        }
+        if now_ns >= self.cleanup_ns {
+            self.cleanup_ns = now_ns + CLEANUP_NS;
+            self.node.cleanup_dead();
         }
         Ok(false)
     }
 
+    /// Decides what comes after a stage's end: a restart by its policy, or a run without it, or none at all.
+    fn judge(&mut self, index: usize, cause: &str, now_ns: u64) -> anyhow::Result<()> {
+        // The dead one has been waited for: its ports can be freed for its successor.
+        self.node.cleanup_dead();
+        let watched = &mut self.stages[index];
+        let stage = watched.stage;
+        ensure!(watched.health.was_ready(), "stage `{stage}` did not start: {cause}");
+        if let Verdict::RestartAt(at_ns) = watched.budget.died(now_ns) {
+            watched.restart_at_ns = Some(at_ns);
+            watched.health.died();
+            self.terminal.log(&format!(
+                "[launcher] stage {stage} died ({cause}): restart {} in {} ms",
+                watched.budget.restarts(),
+                (at_ns - now_ns) / 1_000_000
+            ));
+            return Ok(());
+        }
+        watched.restart_at_ns = None;
+        watched.health.lost();
+        let lost = match watched.budget.restarts() {
+            0 => format!("stage `{stage}` is lost: {cause}"),
+            n => format!("stage `{stage}` is lost after {n} restarts: {cause}"),
+        };
+        match (stage, self.graph.launcher.when_lost) {
+            // Nothing that is decided rests on it.
+            (Stage::Renderer, _) => self.terminal.log(&format!("[launcher] {lost}: going on without views")),
+            (Stage::Controller, _) | (_, WhenLost::End) => bail!(lost),
+            (_, WhenLost::Halt) => {
+                self.terminal.log(&format!("[launcher] {lost}: the safe action stands until the run is stopped"));
+                self.lost = Some(lost);
+            }
+        }
+        Ok(())
+    }
+
     fn show_status(&self) {
-        let records = &self.monitor.records;
+        let (records, now_ns) = (&self.monitor.records, monotonic_now_ns());
         let restarts: u32 = self.stages.iter().map(|s| s.budget.restarts()).sum();
-        let stages: Vec<String> = self
-            .stages
-            .iter()
-            .map(|w| {
-                let summary = records.stages.get(&w.stage);
-                let state = match (&w.process, summary) {
-                    (None, _) => HealthState::Restarting,
-                    (_, Some(summary)) => summary.state(),
-                    _ => HealthState::Starting,
-                };
-                format!("{} {state}", w.stage)
-            })
-            .collect();
+        let stages: Vec<String> =
+            self.stages.iter().map(|w| format!("{} {}", w.stage, w.health.state(now_ns))).collect();
         self.terminal.status(format!(
             "frames {} skipped {} restarts {restarts} | {}",
             records.frame_count(),

@@ -4,6 +4,7 @@ use carff::ablate::AblateArgs;
 use carff::dataset::DatasetCommand;
 use carff::eval::EvalArgs;
 use carff::launch::LaunchArgs;
+use carff::soak::{InjectArgs, SoakArgs};
 use carff::train::TrainArgs;
 use carff_bench::BenchCommand;
 use clap::{Parser, Subcommand};
@@ -33,6 +34,11 @@ enum Command {
     /// Measure the program's parts, and the whole loop, on this machine.
     #[command(subcommand)]
     Bench(BenchCommand),
+    /// Run a graph under a seeded schedule of faults, and hold it to its contract.
+    Soak(SoakArgs),
+    /// One fault from outside, for a soak.
+    #[command(hide = true)]
+    SoakInject(InjectArgs),
 }
 
 fn main() -> ExitCode {
@@ -42,6 +48,8 @@ fn main() -> ExitCode {
         Command::Eval(args) => carff::eval::run(&args),
         Command::Ablate(args) => carff::ablate::run(&args),
         Command::Bench(command) => carff_bench::run(command),
+        Command::Soak(args) => carff::soak::run(&args),
+        Command::SoakInject(args) => carff::soak::inject(&args).map(|()| ExitCode::SUCCESS),
         Command::Dataset(command) => carff::dataset::run(command).map(|()| ExitCode::SUCCESS),
     };
     match result {

@@ -1,11 +1,12 @@
 //! Listens to all topics of a run and writes down what happened, frame by frame.
 
+use carff_config::GraphConfig;
 use carff_messages::{
     Action, ActionCode, Belief, FrameMeta, Gaussian, Health, HealthState, Observability, Posterior, Reason, Stage,
     ViewMeta,
 };
 use carff_transport::{Node, OpenError, PictureReceiver, ReceiveError, Receiver, topics};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
 
 /// Everything known about one camera frame. What is from the data set is -1 or `Unknown` where there is none.
 #[derive(Clone, Debug)]
@@ -30,8 +31,6 @@ pub struct FrameRecord {
     pub capture_time_ns: u64,
     /// What the encoder saw.
     pub posterior: Option<Gaussian>,
-    /// The beliefs of its steps, in the order of their arrival.
-    pub beliefs: Vec<Belief>,
     /// The decision that rests on it.
     pub action: Option<ActionCode>,
     /// Why (the decision's reason); also set when a belief on it was refused.
@@ -79,25 +78,41 @@ impl StageSummary {
     }
 }
 
-/// All that was recorded of a run.
+/// All that was recorded of a run: of frames and times the newest, as many as were asked for.
 #[derive(Clone, Debug, Default)]
 pub struct Records {
+    /// What the graph file asks for, and how much is kept.
+    wanted: Wanted,
     /// By frame number.
     pub frames: BTreeMap<u64, FrameRecord>,
     /// Actions published, decisions and ticks alike.
     pub actions: u64,
     /// Safe actions by reason.
     pub safe_actions: BTreeMap<&'static str, u64>,
+    /// What was given up under overload: beliefs with fewer samples, frames with fewer steps, views with fewer pixels
+    /// than the graph file asks for.
+    pub given_up: BTreeMap<&'static str, u64>,
     /// Time that each forecast step took, nanoseconds.
-    pub forecaster_ns: Vec<u64>,
+    pub forecaster_ns: VecDeque<u64>,
     /// Time that each probing step took, nanoseconds.
-    pub prober_ns: Vec<u64>,
+    pub prober_ns: VecDeque<u64>,
     /// Time that each frame's encoding took, nanoseconds.
-    pub encoder_ns: Vec<u64>,
+    pub encoder_ns: VecDeque<u64>,
     /// Time that each view took, nanoseconds.
-    pub renderer_ns: Vec<u64>,
+    pub renderer_ns: VecDeque<u64>,
     /// What the stages said of themselves.
     pub stages: BTreeMap<Stage, StageSummary>,
+    /// When each stage's latest message was published: monotonic clock, nanoseconds.
+    pub spoke_ns: BTreeMap<Stage, u64>,
+}
+
+/// What the graph file asks for.
+#[derive(Clone, Copy, Debug, Default)]
+struct Wanted {
+    keep: usize,
+    samples: u32,
+    horizon: u32,
+    width_px: u32,
 }
 
 impl Records {
@@ -120,7 +135,19 @@ impl Records {
             .sum()
     }
 
+    fn note_time(times_ns: &mut VecDeque<u64>, time_ns: u64, keep: usize) {
+        if times_ns.len() >= keep {
+            times_ns.pop_front();
+        }
+        times_ns.push_back(time_ns);
+    }
+
+    fn give_up(&mut self, what: &'static str, given_up: bool) {
+        *self.given_up.entry(what).or_default() += u64::from(given_up);
+    }
+
     fn take_frame(&mut self, meta: &FrameMeta) {
+        self.spoke_ns.insert(Stage::Camera, meta.header.publish_time_ns);
         let view = &meta.dataset_view;
         let record = FrameRecord {
             frame_id: meta.header.frame_id,
@@ -133,7 +160,6 @@ impl Records {
             observability: Observability::try_from(view.observability).unwrap_or(Observability::Unknown),
             capture_time_ns: meta.header.capture_time_ns,
             posterior: None,
-            beliefs: Vec::new(),
             action: None,
             reason: None,
             hazard_probability: 0.0,
@@ -141,26 +167,40 @@ impl Records {
             latency_ns: 0,
         };
         self.frames.insert(record.frame_id, record);
+        while self.frames.len() > self.wanted.keep {
+            self.frames.pop_first();
+        }
     }
 
     fn take_posterior(&mut self, posterior: &Posterior) {
-        self.encoder_ns.push(posterior.stage_latency_ns);
+        self.spoke_ns.insert(Stage::Encoder, posterior.header.publish_time_ns);
+        Self::note_time(&mut self.encoder_ns, posterior.stage_latency_ns, self.wanted.keep);
         if let Some(frame) = self.frames.get_mut(&posterior.header.frame_id) {
             frame.posterior = Some(posterior.gaussian);
         }
     }
 
     fn take_belief(&mut self, belief: &Belief) {
-        self.forecaster_ns.push(belief.forecaster_ns);
-        self.prober_ns.push(belief.stage_latency_ns);
-        if let Some(frame) = self.frames.get_mut(&belief.header.frame_id) {
-            frame.beliefs.push(*belief);
+        // A belief rests on a forecast: both have spoken.
+        for stage in [Stage::Forecaster, Stage::Prober] {
+            self.spoke_ns.insert(stage, belief.header.publish_time_ns);
         }
+        Self::note_time(&mut self.forecaster_ns, belief.forecaster_ns, self.wanted.keep);
+        Self::note_time(&mut self.prober_ns, belief.stage_latency_ns, self.wanted.keep);
+        self.give_up("samples", belief.sample_count < self.wanted.samples);
+        self.give_up("horizon", belief.header.step == 1 && belief.horizon < self.wanted.horizon);
+    }
+
+    fn take_view(&mut self, view: &ViewMeta) {
+        self.spoke_ns.insert(Stage::Renderer, view.header.publish_time_ns);
+        Self::note_time(&mut self.renderer_ns, view.stage_latency_ns, self.wanted.keep);
+        self.give_up("resolution", view.width_px < self.wanted.width_px);
     }
 
     /// Returns the frame that was decided on, if the action is a decision.
     fn take_action(&mut self, action: &Action) -> Option<u64> {
         self.actions += 1;
+        self.spoke_ns.insert(Stage::Controller, action.header.publish_time_ns);
         let reason = action.reason().ok()?;
         if reason != Reason::Belief {
             *self.safe_actions.entry(reason.name()).or_default() += 1;
@@ -193,7 +233,13 @@ pub struct Monitor {
 
 impl Monitor {
     /// Subscribes, without being woken by messages: that would take a core from the stages at each hand-over.
-    pub fn open(node: &Node) -> Result<Self, OpenError> {
+    pub fn open(node: &Node, graph: &GraphConfig) -> Result<Self, OpenError> {
+        let wanted = Wanted {
+            keep: graph.launcher.keep_frames as usize,
+            samples: graph.run.samples,
+            horizon: graph.run.horizon,
+            width_px: graph.renderer.width_px,
+        };
         let healths = Stage::ALL.iter().map(|&stage| Ok(node.receiver(&topics::health(stage))?.polled()));
         Ok(Self {
             frames: node.picture_receiver(&topics::FRAME)?.polled(),
@@ -202,7 +248,7 @@ impl Monitor {
             actions: node.receiver(&topics::ACTION)?.polled(),
             views: node.picture_receiver(&topics::VIEW)?.polled(),
             healths: healths.collect::<Result<_, _>>()?,
-            records: Records::default(),
+            records: Records { wanted, ..Records::default() },
         })
     }
 
@@ -224,7 +270,7 @@ impl Monitor {
             }
         }
         while let Some(view) = self.views.next()? {
-            self.records.renderer_ns.push(view.meta().stage_latency_ns);
+            self.records.take_view(view.meta());
         }
         for receiver in &mut self.healths {
             while let Some(health) = receiver.next()? {

@@ -301,7 +301,6 @@ pub(crate) mod tests {
             observability: Observability::None,
             capture_time_ns: 0,
             posterior: None,
-            beliefs: Vec::new(),
             action: Some(ActionCode::Halt),
             reason: None,
             hazard_probability: 0.5,

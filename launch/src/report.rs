@@ -27,8 +27,8 @@ pub struct RunOutcome {
 }
 
 /// p50, p99 and max of times in nanoseconds, in milliseconds; null where there are none.
-pub fn quantiles_ms(times_ns: &[u64]) -> Value {
-    let mut sorted = times_ns.to_vec();
+pub fn quantiles_ms<'a>(times_ns: impl IntoIterator<Item = &'a u64>) -> Value {
+    let mut sorted: Vec<u64> = times_ns.into_iter().copied().collect();
     sorted.sort_unstable();
     // The smallest time that at least this share of all times does not exceed.
     let at = |share: f64| {
@@ -59,6 +59,7 @@ pub fn json(outcome: &RunOutcome, tables: Map<String, Value>) -> Value {
         "skipped_by_stage": by_stage(&|s| Some(stage(s)?.skipped.into())),
         "invalid_by_stage": by_stage(&|s| Some(stage(s)?.invalid.into())),
         "errors_by_stage": by_stage(&|s| Some(stage(s)?.errors.into())),
+        "given_up": records.given_up,
         "restarts": outcome.restarts.values().sum::<u32>(),
         "restarts_by_stage": by_stage(&|s| Some((*outcome.restarts.get(&s)?).into())),
         "latency_ms": {

@@ -7,12 +7,15 @@ use carff_tests::{Process, TestGraph, eventually};
 use carff_transport::{Node, Publisher, Receiver, monotonic_now_ns, topics};
 use rustix::process::Signal;
 use std::path::Path;
+use std::sync::OnceLock;
 
 const HORIZON: u32 = 2;
 
-/// A belief of two states that holds.
+/// A belief of two states that holds. All steps of a frame have one time of capture, and a later frame has a later one.
 fn belief(run_id: u64, frame_id: u64, step: u32, hazard: f32) -> Belief {
-    let mut header = Header::of_frame(frame_id, monotonic_now_ns(), 1).at_step(step);
+    static START_NS: OnceLock<u64> = OnceLock::new();
+    let captured_ns = START_NS.get_or_init(|| monotonic_now_ns() - 1_000_000) + frame_id;
+    let mut header = Header::of_frame(frame_id, captured_ns, 1).at_step(step);
     header.run_id = run_id;
     let mut belief = Belief::empty(header, HORIZON);
     (belief.state_count, belief.place_count, belief.component_count, belief.sample_count) = (2, 1, 1, 1);

@@ -111,10 +111,14 @@ fn killed_stages_are_started_again() {
     graph.assert_nothing_left();
 }
 
-/// The camera is not started again, as its drives would count twice: when it dies, the run ends with one sentence.
+/// A camera that shall not be started again ends the run with one sentence when it dies.
 #[test]
 fn a_lost_camera_ends_the_run() {
-    let graph = TestGraph::new(&scenario_set(), &shipped_checkpoint(), &format!("{PATIENT}[camera]\nrepeat = true\n"));
+    let graph = TestGraph::new(
+        &scenario_set(),
+        &shipped_checkpoint(),
+        &format!("{PATIENT}[camera]\nrepeat = true\n[launcher.restart]\ncamera = \"never\"\n"),
+    );
     let mut launcher = Process::start(&mut graph.launch(&graph.file(), &[]));
     launcher.wait_for("decision", |text| decisions(text) >= 1);
     let camera = graph.stage_pid(Stage::Camera).unwrap();

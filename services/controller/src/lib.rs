@@ -22,17 +22,38 @@ pub struct Settings {
     pub seed: u64,
 }
 
-/// What one step of a frame's belief says.
-#[derive(Clone, Copy, Debug)]
+/// What one step of a frame's belief says. A step that comes twice must say the same twice.
+#[derive(Clone, Copy, Debug, PartialEq)]
 struct Step {
+    hazard_probability: f32,
+    path_probability: f32,
+    sample_count: u32,
+    resolved_state: i32,
+    is_final: u32,
+}
+
+impl Step {
+    fn of(belief: &Belief) -> Self {
+        Self {
+            hazard_probability: belief.hazard_probability,
+            path_probability: belief.path_probability,
+            sample_count: belief.sample_count,
+            resolved_state: belief.resolved_state,
+            is_final: belief.is_final,
+        }
+    }
+
     /// Lower bound on the probability that the hazard is met at this step: the path's times the step's.
-    hazard_probability: f64,
+    fn met_probability(&self) -> f64 {
+        f64::from(self.path_probability) * f64::from(self.hazard_probability)
+    }
 }
 
 /// The frame whose steps are arriving.
 #[derive(Clone, Copy, Debug)]
 struct Pending {
     header: Header,
+    horizon: u32,
     steps: [Option<Step>; MAX_HORIZON as usize],
     sample_count: usize,
     states: [Option<usize>; MAX_SAMPLES],
@@ -47,13 +68,16 @@ struct Standing {
 }
 
 /// Decides on beliefs as they come, and says at each tick what stands.
+///
+/// Frames are ordered by their time of capture: the clock is one for all, and no message can be ahead of it, so whatever
+/// once arrived, a later frame is newer.
 #[derive(Clone, Debug)]
 pub struct Controller {
     settings: Settings,
     pending: Option<Pending>,
     standing: Option<Standing>,
-    /// The newest frame that was decided on.
-    decided_frame: Option<u64>,
+    /// Capture time and number of the newest frame that was decided on or refused.
+    settled: Option<(u64, u64)>,
     /// Why the last belief was not acted on, until one is.
     refused: Option<Reason>,
 }
@@ -61,47 +85,47 @@ pub struct Controller {
 impl Controller {
     /// One that has seen nothing yet: its ticks say halt.
     pub fn new(settings: Settings) -> Self {
-        Self { settings, pending: None, standing: None, decided_frame: None, refused: None }
+        Self { settings, pending: None, standing: None, settled: None, refused: None }
     }
 
     /// Takes in a belief. Acts at once when it is the frame's last one: by the rule when all steps are there and fresh,
-    /// else by halting. A belief of a frame that is decided or passed over is ignored, so none is acted on twice.
+    /// else by halting. A belief of a frame that is settled or passed over is ignored, so none is acted on twice. One
+    /// that contradicts its frame's other steps settles the frame by halting; one from the future is dropped.
     pub fn on_belief(&mut self, belief: &Belief, now_ns: u64) -> Option<Action> {
         if belief.validate().is_err() {
             self.on_invalid();
             return None;
         }
-        let frame_id = belief.header.frame_id;
-        let newest = self.pending.map(|p| p.header.frame_id).max(self.decided_frame);
-        if self.decided_frame == Some(frame_id) || newest.is_some_and(|newest| frame_id < newest) {
+        let captured_ns = belief.header.capture_time_ns;
+        if captured_ns > now_ns {
+            self.refused = Some(Reason::ContradictoryBelief);
+            return None;
+        }
+        let newest_ns = self.pending.map(|p| p.header.capture_time_ns).max(self.settled.map(|(at_ns, _)| at_ns));
+        let is_settled = self.settled.is_some_and(|(at_ns, _)| at_ns == captured_ns);
+        if is_settled || newest_ns.is_some_and(|newest_ns| captured_ns < newest_ns) {
             return None;
         }
         let pending = match &mut self.pending {
-            Some(pending) if pending.header.frame_id == frame_id => pending,
-            slot => slot.insert(Pending {
-                header: belief.header,
-                steps: [None; MAX_HORIZON as usize],
-                sample_count: 0,
-                states: [None; MAX_SAMPLES],
-                shows_hazard: [false; MAX_SAMPLES],
-            }),
+            Some(pending) if pending.header.capture_time_ns == captured_ns => pending,
+            slot => slot.insert(Pending::begin(belief)),
         };
-        pending.take(belief);
+        if !pending.take(belief) {
+            return Some(self.refuse(&belief.header, Reason::ContradictoryBelief, now_ns));
+        }
         if belief.is_final == 0 {
             return None;
         }
         let pending = self.pending.take()?;
-        self.decided_frame = Some(frame_id);
-        let age_ns = now_ns.saturating_sub(belief.header.capture_time_ns);
-        let last_step = belief.header.step as usize;
-        if pending.steps[..last_step].iter().any(Option::is_none) {
-            return Some(self.refuse(Reason::IncompleteBelief, now_ns));
+        let age_ns = now_ns.saturating_sub(captured_ns);
+        let steps = &pending.steps[..belief.header.step as usize];
+        if steps.iter().any(Option::is_none) {
+            return Some(self.refuse(&belief.header, Reason::IncompleteBelief, now_ns));
         }
         if age_ns > self.settings.deadline_ns {
-            return Some(self.refuse(Reason::StaleBelief, now_ns));
+            return Some(self.refuse(&belief.header, Reason::StaleBelief, now_ns));
         }
-        let hazard_probability =
-            pending.steps[..last_step].iter().flatten().map(|s| s.hazard_probability).fold(0.0, f64::max);
+        let hazard_probability = steps.iter().flatten().map(Step::met_probability).fold(0.0, f64::max);
         let evidence = Evidence {
             states: &pending.states[..pending.sample_count],
             shows_hazard: &pending.shows_hazard[..pending.sample_count],
@@ -109,6 +133,7 @@ impl Controller {
         };
         let decision = decide(self.settings.rule, &evidence);
         let action = self.act(&pending, decision, hazard_probability, now_ns);
+        self.settled = Some((captured_ns, belief.header.frame_id));
         self.standing = Some(Standing { action, decided_ns: now_ns });
         self.refused = None;
         Some(action)
@@ -121,20 +146,33 @@ impl Controller {
 
     /// What stands now: the last decision while it is fresh, else the safe action with its reason.
     pub fn on_tick(&mut self, now_ns: u64) -> Action {
+        if now_ns >= self.expires_ns() {
+            self.standing = None;
+        }
         match &self.standing {
-            Some(standing) if now_ns.saturating_sub(standing.decided_ns) <= self.settings.deadline_ns => {
-                Action { is_decision: 0, ..standing.action }
-            }
-            standing => {
-                let quiet = if standing.is_some() { Reason::StaleBelief } else { Reason::NoBeliefYet };
+            Some(standing) => Action { is_decision: 0, ..standing.action },
+            None => {
+                let quiet = if self.settled.is_some() { Reason::StaleBelief } else { Reason::NoBeliefYet };
                 self.safe_action(self.refused.unwrap_or(quiet), now_ns)
             }
         }
     }
 
-    fn refuse(&mut self, reason: Reason, now_ns: u64) -> Action {
-        self.refused = Some(reason);
-        self.standing = None;
+    /// The last word: the safe action.
+    pub fn on_stop(&self, now_ns: u64) -> Action {
+        self.safe_action(Reason::Stopping, now_ns)
+    }
+
+    /// When what stands stops to stand, nanoseconds: from then on a tick says the safe action. `u64::MAX` when nothing
+    /// stands.
+    pub fn expires_ns(&self) -> u64 {
+        self.standing.map_or(u64::MAX, |s| s.decided_ns.saturating_add(self.settings.deadline_ns + 1))
+    }
+
+    /// Settles a frame by halting.
+    fn refuse(&mut self, header: &Header, reason: Reason, now_ns: u64) -> Action {
+        self.settled = Some((header.capture_time_ns, header.frame_id));
+        (self.pending, self.standing, self.refused) = (None, None, Some(reason));
         self.safe_action(reason, now_ns)
     }
 
@@ -158,7 +196,7 @@ impl Controller {
 
     fn safe_action(&self, reason: Reason, now_ns: u64) -> Action {
         Action {
-            header: Header::of_frame(self.decided_frame.unwrap_or(0), now_ns, self.settings.seed),
+            header: Header::of_frame(self.settled.map_or(0, |(_, id)| id), now_ns, self.settings.seed),
             action: ActionCode::Halt.code(),
             reason: reason.code(),
             rule: rule_code(self.settings.rule).code(),
@@ -175,10 +213,29 @@ impl Controller {
 }
 
 impl Pending {
-    fn take(&mut self, belief: &Belief) {
+    fn begin(belief: &Belief) -> Self {
+        Self {
+            header: belief.header,
+            horizon: belief.horizon,
+            steps: [None; MAX_HORIZON as usize],
+            sample_count: 0,
+            states: [None; MAX_SAMPLES],
+            shows_hazard: [false; MAX_SAMPLES],
+        }
+    }
+
+    /// Takes in a step. False when it contradicts what the frame's other messages said.
+    fn take(&mut self, belief: &Belief) -> bool {
         let index = belief.header.step as usize - 1;
-        let hazard_probability = f64::from(belief.path_probability) * f64::from(belief.hazard_probability);
-        self.steps[index] = Some(Step { hazard_probability });
+        let (own, step) = (&self.header, Step::of(belief));
+        let same_frame = own.frame_id == belief.header.frame_id
+            && own.seed == belief.header.seed
+            && self.horizon == belief.horizon
+            && self.steps[index].is_none_or(|there| there == step);
+        if !same_frame {
+            return false;
+        }
+        self.steps[index] = Some(step);
         let samples = belief.samples();
         if index == 0 {
             self.sample_count = samples.len();
@@ -189,6 +246,7 @@ impl Pending {
             }
             self.shows_hazard[i] |= sample.hazard_likelihood >= SHOWS_HAZARD;
         }
+        true
     }
 }
 

@@ -8,6 +8,9 @@ use carff_planning::Rule;
 use carff_stage::StageContext;
 use carff_transport::{Woken, monotonic_now_ns, topics};
 
+/// Beliefs taken in before the clock is looked at again: a flood of them holds up no tick.
+const MOST_AT_ONCE: usize = 16;
+
 fn main() -> std::process::ExitCode {
     carff_stage::main(Stage::Controller, run)
 }
@@ -22,10 +25,13 @@ fn run(stage: &mut StageContext) -> anyhow::Result<()> {
     let mut invalid = 0;
     let mut tick_ns = monotonic_now_ns();
     loop {
-        if stage.wait_until(&[&beliefs], tick_ns)? == Woken::Stopped {
-            return Ok(());
+        // A decision that expires is answered at once, not at the next tick.
+        let wake_ns = tick_ns.min(controller.expires_ns());
+        if stage.wait_until(&[&beliefs], wake_ns)? == Woken::Stopped {
+            return Ok(actions.send(controller.on_stop(monotonic_now_ns()))?);
         }
-        while let Some(belief) = beliefs.next()? {
+        for _ in 0..MOST_AT_ONCE {
+            let Some(belief) = beliefs.next()? else { break };
             let started_ns = monotonic_now_ns();
             if let Some(action) = controller.on_belief(&belief, started_ns) {
                 actions.send(action)?;
@@ -38,9 +44,12 @@ fn run(stage: &mut StageContext) -> anyhow::Result<()> {
             controller.on_invalid();
         }
         // Ticks keep their rate whatever arrives.
-        if monotonic_now_ns() >= tick_ns {
-            actions.send(controller.on_tick(monotonic_now_ns()))?;
-            tick_ns = (tick_ns + settings.period_ns).max(monotonic_now_ns());
+        let now_ns = monotonic_now_ns();
+        if now_ns >= tick_ns.min(controller.expires_ns()) {
+            actions.send(controller.on_tick(now_ns))?;
+            if now_ns >= tick_ns {
+                tick_ns = (tick_ns + settings.period_ns).max(now_ns);
+            }
         }
     }
 }

@@ -152,3 +152,63 @@ fn every_rule_is_wired() {
     assert_eq!(run(Rule::Underconfident, 0), ActionCode::Halt);
     assert_eq!(run(Rule::Overconfident, 10), ActionCode::Advance);
 }
+
+/// Two messages for one step of one frame that differ, steps that disagree on the horizon, and two frames captured at one
+/// instant, each settle the frame by halting at once; the next frame is decided on.
+#[test]
+fn contradictory_beliefs_halt() {
+    let contradict: [fn(&mut Belief); 3] =
+        [|b| b.hazard_probability = 0.2, |b| b.horizon = 3, |b| b.header.frame_id += 1];
+    for change in contradict {
+        let mut controller = calibrated();
+        controller.on_belief(&belief(1, 1, 0.0, 0), 110 * MS);
+        assert!(controller.on_belief(&belief(1, 1, 0.0, 0), 112 * MS).is_none(), "the same twice is no contradiction");
+        let mut other = belief(1, 1, 0.0, 0);
+        change(&mut other);
+        let action = controller.on_belief(&other, 115 * MS).unwrap();
+        action.validate().unwrap();
+        assert_eq!(told(&action), (ActionCode::Halt, Reason::ContradictoryBelief));
+        assert!(controller.on_belief(&belief(1, 2, 0.0, 0), 120 * MS).is_none(), "the frame is settled");
+        assert_eq!(told(&controller.on_tick(130 * MS)), (ActionCode::Halt, Reason::ContradictoryBelief));
+        controller.on_belief(&belief(2, 1, 0.0, 0), 210 * MS);
+        assert_eq!(told(&controller.on_belief(&belief(2, 2, 0.0, 0), 220 * MS).unwrap()).0, ActionCode::Advance);
+    }
+}
+
+/// A belief on a frame that the clock has not reached is never acted on and shuts nothing out: what stands goes on to
+/// stand, and later frames are decided on. The same holds for frame numbers beyond all others.
+#[test]
+fn no_belief_poisons_the_future() {
+    let mut controller = calibrated();
+    controller.on_belief(&belief(1, 1, 0.0, 0), 110 * MS);
+    controller.on_belief(&belief(1, 2, 0.0, 0), 120 * MS).unwrap();
+    for step in 1..=2 {
+        assert!(controller.on_belief(&belief(50, step, 0.0, 0), 130 * MS).is_none());
+    }
+    assert_eq!(told(&controller.on_tick(140 * MS)), (ActionCode::Advance, Reason::Belief));
+    assert_eq!(told(&controller.on_tick(300 * MS)), (ActionCode::Halt, Reason::ContradictoryBelief));
+
+    for step in 1..=2 {
+        let mut last_of_all = belief(3, step, 0.0, 0);
+        last_of_all.header.frame_id = u64::MAX;
+        controller.on_belief(&last_of_all, 310 * MS);
+    }
+    controller.on_belief(&belief(4, 1, 0.9, 9), 410 * MS);
+    let action = controller.on_belief(&belief(4, 2, 0.0, 0), 420 * MS).unwrap();
+    assert_eq!((told(&action), action.based_on_frame), ((ActionCode::Halt, Reason::Belief), 4));
+}
+
+/// What stands says until when, and a tick at that time halts; when nothing stands there is nothing to wake for. The
+/// last word is the safe action.
+#[test]
+fn a_decision_expires_on_time() {
+    let mut controller = calibrated();
+    assert_eq!(controller.expires_ns(), u64::MAX);
+    controller.on_belief(&belief(1, 1, 0.0, 0), 110 * MS);
+    let action = controller.on_belief(&belief(1, 2, 0.0, 0), 120 * MS).unwrap();
+    assert_eq!(controller.expires_ns(), action.valid_until_ns + 1);
+    assert_eq!(told(&controller.on_tick(controller.expires_ns() - 1)).0, ActionCode::Advance);
+    assert_eq!(told(&controller.on_tick(action.valid_until_ns + 1)), (ActionCode::Halt, Reason::StaleBelief));
+    assert_eq!(controller.expires_ns(), u64::MAX);
+    assert_eq!(told(&controller.on_stop(300 * MS)), (ActionCode::Halt, Reason::Stopping));
+}

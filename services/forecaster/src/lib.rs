@@ -36,6 +36,11 @@ impl Forecaster {
         Ok(Self { net, samples, sampling, horizon })
     }
 
+    /// How many latents to draw from now on, and how many steps to look ahead for frames that begin from now on.
+    pub fn set_quality(&mut self, samples: usize, horizon: u32) {
+        (self.samples, self.horizon) = (samples, horizon);
+    }
+
     /// The forecast of an observed posterior: step 1.
     pub fn from_observation(&self, posterior: &Posterior) -> Forecast {
         let mut forecast = Forecast::empty(posterior.header.at_step(1), ForecastSource::Observed, self.horizon);
@@ -46,12 +51,12 @@ impl Forecaster {
 
     /// The forecast of a probed belief's resolved state: the next step. `None` when the belief was the frame's last.
     pub fn from_feedback(&self, belief: &Belief) -> Option<Forecast> {
-        if belief.is_final == 1 || belief.header.step >= self.horizon {
+        if belief.is_final == 1 || belief.header.step >= belief.horizon {
             return None;
         }
         let state = usize::try_from(belief.resolved_state).ok()?;
         let header: Header = belief.header.at_step(belief.header.step + 1);
-        let mut forecast = Forecast::empty(header, ForecastSource::Probed, self.horizon);
+        let mut forecast = Forecast::empty(header, ForecastSource::Probed, belief.horizon);
         forecast.encoder_ns = belief.encoder_ns;
         forecast.resolved_state = belief.resolved_state;
         forecast.path_probability = (belief.path_probability * belief.state_probability[state]).clamp(0.0, 1.0);

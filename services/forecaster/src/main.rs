@@ -3,7 +3,7 @@
 use carff_forecaster::Forecaster;
 use carff_messages::Stage;
 use carff_models::mixture::Sampling;
-use carff_stage::StageContext;
+use carff_stage::{Overload, StageContext};
 use carff_transport::{monotonic_now_ns, topics};
 
 fn main() -> std::process::ExitCode {
@@ -19,7 +19,8 @@ fn run(stage: &mut StageContext) -> anyhow::Result<()> {
         carff_config::Sampling::Stratified => Sampling::Stratified,
         carff_config::Sampling::Independent => Sampling::Independent,
     };
-    let forecaster =
+    let mut overload = Overload::new(&stage.graph);
+    let mut forecaster =
         Forecaster::load(&stage.checkpoint, stage.threads, settings.samples as usize, sampling, settings.horizon)?;
     let mut newest_frame = 0;
     stage.ready();
@@ -34,6 +35,10 @@ fn run(stage: &mut StageContext) -> anyhow::Result<()> {
         while let Some(belief) = beliefs.next()? {
             // A belief on a frame that a newer one has overtaken is not looked ahead from.
             let started_ns = monotonic_now_ns();
+            if overload.observe(&belief) {
+                let quality = overload.quality();
+                forecaster.set_quality(quality.samples as usize, quality.horizon);
+            }
             if belief.header.frame_id < newest_frame {
                 continue;
             }

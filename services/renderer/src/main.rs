@@ -4,8 +4,11 @@ use anyhow::Context;
 use carff_field::HypothesisBuffer;
 use carff_messages::Stage;
 use carff_renderer::{camera, hypotheses, load, meta, render, write};
-use carff_stage::StageContext;
+use carff_stage::{Overload, StageContext};
 use carff_transport::{Woken, monotonic_now_ns, topics};
+
+/// Smallest side of a view, however little room there is, pixels.
+const MIN_SIDE_PX: u32 = 16;
 
 fn main() -> std::process::ExitCode {
     carff_stage::main(Stage::Renderer, run)
@@ -22,6 +25,7 @@ fn run(stage: &mut StageContext) -> anyhow::Result<()> {
     let mut buffer = HypothesisBuffer::default();
     let period_ns = (1e9 / settings.max_rate_hz) as u64;
     let mut next_ns = 0;
+    let mut overload = Overload::new(&stage.graph);
     stage.ready();
     loop {
         // Views, then a rest: the rate stays below its limit, and only the newest belief is looked at.
@@ -37,7 +41,10 @@ fn run(stage: &mut StageContext) -> anyhow::Result<()> {
         while let Some(forecast) = forecasts.next()? {
             pair = Some(*forecast);
         }
-        let Some(belief) = beliefs.newest()? else { continue };
+        let newest = beliefs.newest_of(|belief| {
+            overload.observe(belief);
+        })?;
+        let Some(belief) = newest else { continue };
         let belief = *belief;
         let Some(forecast) =
             pair.filter(|f| f.header.frame_id == belief.header.frame_id && f.header.step == belief.header.step)
@@ -45,12 +52,16 @@ fn run(stage: &mut StageContext) -> anyhow::Result<()> {
             continue;
         };
         let hypotheses = hypotheses(&forecast, &belief, settings.hypotheses as usize);
+        let divisor = overload.quality().resolution_divisor;
+        let [width_px, height_px] =
+            [settings.width_px, settings.height_px].map(|side| (side / divisor).max(MIN_SIDE_PX));
+        let bytes = width_px as usize * height_px as usize * 3;
         for &choice in &settings.views {
             if stage.is_stopped() {
                 return Ok(());
             }
             let started_ns = monotonic_now_ns();
-            let camera = camera(&field, choice, settings.width_px, settings.height_px);
+            let camera = camera(&field, choice, width_px, height_px);
             render(&field, &camera, &hypotheses, stage.threads, &mut buffer);
             let own_ns = (monotonic_now_ns() - started_ns) / hypotheses.len().max(1) as u64;
             for (hypothesis, picture) in hypotheses.iter().zip(&buffer.pictures) {

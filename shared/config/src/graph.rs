@@ -40,6 +40,12 @@ pub struct GraphConfig {
     /// The launcher.
     #[serde(default)]
     pub launcher: LauncherConfig,
+    /// What is given up under overload.
+    #[serde(default)]
+    pub overload: OverloadConfig,
+    /// How the system treats each stage's process.
+    #[serde(default)]
+    pub realtime: RealtimeConfig,
     /// The folder that relative paths fall back to.
     #[serde(skip)]
     project_root: PathBuf,
@@ -379,18 +385,21 @@ pub enum RestartPolicy {
     OnFailure {
         /// Pause before the first restart, milliseconds, 0 to 60000; it doubles with each further one, up to 16 times.
         backoff_ms: u64,
-        /// Restarts before it counts as lost, 1 to 1000.
+        /// Restarts within `within_s` before it counts as lost, 1 to 1000.
         max_restarts: u32,
+        /// How long a restart counts, seconds, 1 to 86400. Default 60.
+        #[serde(default = "sixty")]
+        within_s: u64,
     },
 }
 
-const FEW_RESTARTS: RestartPolicy = RestartPolicy::OnFailure { backoff_ms: 100, max_restarts: 5 };
+const FEW_RESTARTS: RestartPolicy = RestartPolicy::OnFailure { backoff_ms: 100, max_restarts: 5, within_s: 60 };
 
-/// Restart policy of each stage: `"never"`, or `{ on-failure = { backoff_ms = 100, max_restarts = 5 } }`.
+/// Restart policy of each stage: `"never"`, or `{ on-failure = { backoff_ms = 100, max_restarts = 5, within_s = 60 } }`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RestartConfig {
-    /// Camera. Default `never`: begun again, its drives would be counted twice.
+    /// Camera. Default on-failure, 100 ms, 5; it goes on with the frame after its last one.
     pub camera: RestartPolicy,
     /// Encoder. Default on-failure, 100 ms, 5.
     pub encoder: RestartPolicy,
@@ -407,7 +416,7 @@ pub struct RestartConfig {
 impl Default for RestartConfig {
     fn default() -> Self {
         Self {
-            camera: RestartPolicy::Never,
+            camera: FEW_RESTARTS,
             encoder: FEW_RESTARTS,
             forecaster: FEW_RESTARTS,
             prober: FEW_RESTARTS,
@@ -425,14 +434,112 @@ pub struct LauncherConfig {
     pub start_timeout_ms: u64,
     /// Time that a stage has to end before it is killed, milliseconds, 50 to 60000. Default 1000.
     pub stop_timeout_ms: u64,
+    /// A stage without a heartbeat for this long, or whose loop stands still for this long (and for ten times its own
+    /// deadline), hangs: it is killed and started again. Milliseconds, 500 to 600000. Default 2000.
+    pub hang_timeout_ms: u64,
+    /// What happens when a stage that decisions need is lost. Default `end`.
+    pub when_lost: WhenLost,
+    /// Frames that the launcher remembers for the report, the newest, 100 to 10000000. Default 100000.
+    pub keep_frames: u64,
     /// What happens when a stage dies.
     pub restart: RestartConfig,
 }
 
 impl Default for LauncherConfig {
     fn default() -> Self {
-        Self { start_timeout_ms: 30_000, stop_timeout_ms: 1000, restart: RestartConfig::default() }
+        Self {
+            start_timeout_ms: 30_000,
+            stop_timeout_ms: 1000,
+            hang_timeout_ms: 2000,
+            when_lost: WhenLost::End,
+            keep_frames: 100_000,
+            restart: RestartConfig::default(),
+        }
     }
+}
+
+/// What happens when a stage that decisions need is lost. A lost renderer ends nothing.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum WhenLost {
+    /// The run ends with an error; the controller's last action is the safe one.
+    #[default]
+    End,
+    /// The controller goes on with the safe action until somebody stops the run, which then ends with the error. A lost
+    /// controller ends the run in any case: its last action expires.
+    Halt,
+}
+
+/// Something that can be given up under overload.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Quality {
+    /// Width and height of the rendered views: halved, then quartered.
+    Resolution,
+    /// Latents drawn from each mixture: halved down to `min_samples`.
+    Samples,
+    /// Steps looked ahead: one fewer at a time, down to 1.
+    Horizon,
+}
+
+/// What is given up when the machine cannot keep up, beyond frames that are skipped, and got back when there is room.
+/// Decisions then depend on the machine's pace; each message says how many samples and steps it rests on.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct OverloadConfig {
+    /// In which order: of `resolution`, `samples`, `horizon`, each at most once. Default none: only frames are skipped.
+    pub order: Vec<Quality>,
+    /// A frame whose belief took longer than this share of `controller.deadline_ms`, or that came after a skipped one,
+    /// is a sign of overload; 0.05 to 1. Default 0.8.
+    pub latency_share: f64,
+    /// Fewest latents drawn, 1 to 64. Default 4.
+    pub min_samples: u32,
+    /// Frames that are looked at before something is given up, 2 to 1000: half of them with a sign. Default 10.
+    pub window: u32,
+    /// Frames without a sign before something is got back, 2 to 100000. Twice as many after each time that it had to be
+    /// given up again at once, up to 16 times. Default 50.
+    pub patience: u32,
+}
+
+impl Default for OverloadConfig {
+    fn default() -> Self {
+        Self { order: Vec::new(), latency_share: 0.8, min_samples: 4, window: 10, patience: 50 }
+    }
+}
+
+/// How the system treats one process. What it refuses is a warning, and the stage goes on without.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct StageRealtime {
+    /// Processors that it may run on, by number from 0. Default: all.
+    pub cpus: Vec<u32>,
+    /// Niceness, -20 to 19; below 0 needs a privilege. Default: as inherited.
+    pub nice: Option<i32>,
+    /// Priority under `SCHED_FIFO`, 1 to 99; needs a privilege. Default: the ordinary scheduler.
+    pub fifo_priority: Option<u32>,
+    /// Keep all its memory resident (`mlockall`), once its models are loaded; needs a privilege or a high limit.
+    /// Default false.
+    pub lock_memory: bool,
+    /// Heap that is touched before the first frame, so that no page fault comes later, MiB, 0 to 4096. Default 0.
+    pub prefault_mb: u32,
+}
+
+/// How the system treats each stage's process.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct RealtimeConfig {
+    /// Camera.
+    pub camera: StageRealtime,
+    /// Encoder.
+    pub encoder: StageRealtime,
+    /// Forecaster.
+    pub forecaster: StageRealtime,
+    /// Prober.
+    pub prober: StageRealtime,
+    /// Renderer; `renderer.nice` is added to this one's.
+    pub renderer: StageRealtime,
+    /// Controller.
+    pub controller: StageRealtime,
 }
 
 fn one() -> u64 {
@@ -440,6 +547,9 @@ fn one() -> u64 {
 }
 fn two() -> u32 {
     2
+}
+fn sixty() -> u64 {
+    60
 }
 fn ten() -> u32 {
     10
@@ -565,6 +675,38 @@ impl GraphConfig {
         let launcher = &self.launcher;
         within(source, "launcher.start_timeout_ms", launcher.start_timeout_ms, 100..=600_000)?;
         within(source, "launcher.stop_timeout_ms", launcher.stop_timeout_ms, 50..=60_000)?;
+        within(source, "launcher.hang_timeout_ms", launcher.hang_timeout_ms, 500..=600_000)?;
+        within(source, "launcher.keep_frames", launcher.keep_frames, 100..=10_000_000)?;
+        let overload = &self.overload;
+        within(source, "overload.latency_share", overload.latency_share, 0.05..=1.0)?;
+        within(source, "overload.min_samples", overload.min_samples, 1..=64)?;
+        within(source, "overload.window", overload.window, 2..=1000)?;
+        within(source, "overload.patience", overload.patience, 2..=100_000)?;
+        if (1..overload.order.len()).any(|i| overload.order[..i].contains(&overload.order[i])) {
+            let allowed = "`resolution`, `samples`, `horizon`, each at most once".to_owned();
+            return Err(source.range("overload.order", format!("{:?}", overload.order), allowed));
+        }
+        let realtime = &self.realtime;
+        for (stage, settings) in [
+            ("camera", &realtime.camera),
+            ("encoder", &realtime.encoder),
+            ("forecaster", &realtime.forecaster),
+            ("prober", &realtime.prober),
+            ("renderer", &realtime.renderer),
+            ("controller", &realtime.controller),
+        ] {
+            let key = |name: &str| format!("realtime.{stage}.{name}");
+            for &cpu in &settings.cpus {
+                within(source, &key("cpus"), cpu, 0..=1023)?;
+            }
+            if let Some(nice) = settings.nice {
+                within(source, &key("nice"), nice, -20..=19)?;
+            }
+            if let Some(priority) = settings.fifo_priority {
+                within(source, &key("fifo_priority"), priority, 1..=99)?;
+            }
+            within(source, &key("prefault_mb"), settings.prefault_mb, 0..=4096)?;
+        }
         let restart = &launcher.restart;
         for (stage, policy) in [
             ("camera", restart.camera),
@@ -574,10 +716,11 @@ impl GraphConfig {
             ("renderer", restart.renderer),
             ("controller", restart.controller),
         ] {
-            if let RestartPolicy::OnFailure { backoff_ms, max_restarts } = policy {
+            if let RestartPolicy::OnFailure { backoff_ms, max_restarts, within_s } = policy {
                 let key = |name: &str| format!("launcher.restart.{stage}.on-failure.{name}");
                 within(source, &key("backoff_ms"), backoff_ms, 0..=60_000)?;
                 within(source, &key("max_restarts"), max_restarts, 1..=1000)?;
+                within(source, &key("within_s"), within_s, 1..=86_400)?;
             }
         }
         Ok(())

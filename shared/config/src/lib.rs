@@ -30,6 +30,7 @@ pub use checkpoint::{CheckpointPlanning, CheckpointPlanningError};
 pub use error::ConfigError;
 pub use graph::{
     CameraConfig, CameraSource, ControllerConfig, EncoderConfig, ForecasterConfig, GraphConfig, LauncherConfig,
-    LogConfig, LogLevel, NoiseConfig, PoseChoice, ProberConfig, RendererConfig, RestartConfig, RestartPolicy, Rule,
-    RunConfig, Sampling, ThreadsConfig, ViewChoice,
+    LogConfig, LogLevel, NoiseConfig, OverloadConfig, PoseChoice, ProberConfig, Quality, RealtimeConfig,
+    RendererConfig, RestartConfig, RestartPolicy, Rule, RunConfig, Sampling, StageRealtime, ThreadsConfig, ViewChoice,
+    WhenLost,
 };

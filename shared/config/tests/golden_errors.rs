@@ -44,6 +44,15 @@ fn wrong_files_have_golden_messages() {
             "graph.toml:6: `launcher.restart.prober.on-failure.max_restarts` is 0; allowed: 1 to 1000",
         ),
         (
+            format!("{HEAD}[overload]\norder = [\"samples\", \"samples\"]\n"),
+            "graph.toml:6: `overload.order` is [Samples, Samples]; allowed: `resolution`, `samples`, `horizon`, each at \
+             most once",
+        ),
+        (
+            format!("{HEAD}[realtime.prober]\nfifo_priority = 100\n"),
+            "graph.toml:6: `realtime.prober.fifo_priority` is 100; allowed: 1 to 99",
+        ),
+        (
             "[run]\nname = \"two words\"\ndataset = \"d\"\ncheckpoint = \"c\"\n".to_owned(),
             "graph.toml:2: `run.name` is \"two words\"; allowed: 1 to 24 characters out of a-z, A-Z, 0-9, `-` and `_`",
         ),
@@ -51,7 +60,8 @@ fn wrong_files_have_golden_messages() {
         (
             format!("{HEAD}[cameras]\n"),
             "graph.toml:5: `cameras`: unknown field `cameras`, expected one of `run`, \
-             `threads`, `log`, `camera`, `encoder`, `forecaster`, `prober`, `renderer`, `controller`, `launcher`",
+             `threads`, `log`, `camera`, `encoder`, `forecaster`, `prober`, `renderer`, `controller`, `launcher`, \
+             `overload`, `realtime`",
         ),
         (
             format!("{HEAD}[renderer]\nviews = []\n"),
@@ -88,7 +98,10 @@ fn the_shipped_graph_is_valid() {
     assert_eq!(graph.warnings(), Vec::<String>::new());
     assert_eq!((graph.run.samples, graph.run.horizon, graph.camera.drives), (10, 2, 60));
     assert_eq!(graph.renderer.views, [ViewChoice::BirdsEye, ViewChoice::Free]);
-    assert_eq!(graph.launcher.restart.camera, RestartPolicy::Never);
+    assert_eq!(
+        graph.launcher.restart.camera,
+        RestartPolicy::OnFailure { backoff_ms: 100, max_restarts: 5, within_s: 60 }
+    );
     assert!(graph.scenario_path().unwrap().is_file());
     // Paths fall back to the project's root, wherever the program runs.
     assert!(graph.resolve(Path::new("configs/graphs")).is_dir());

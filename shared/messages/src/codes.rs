@@ -82,6 +82,10 @@ codes! {
         InvalidBelief = 3 "invalid belief",
         /// Steps of the frame's belief are missing.
         IncompleteBelief = 4 "incomplete belief",
+        /// Beliefs contradict each other or the clock.
+        ContradictoryBelief = 5 "contradictory belief",
+        /// The controller ends.
+        Stopping = 6 "stopping",
     }
 }
 

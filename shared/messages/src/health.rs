@@ -32,7 +32,7 @@ pub struct Health {
     pub last_latency_ns: u64,
     /// Longest time that an output took, nanoseconds.
     pub max_latency_ns: u64,
-    /// When its main loop last went round: monotonic clock, nanoseconds.
+    /// When its main loop last went round, or now while it waits for input: monotonic clock, nanoseconds.
     pub last_progress_ns: u64,
     /// Resident memory, bytes.
     pub rss_bytes: u64,

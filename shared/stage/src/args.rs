@@ -29,6 +29,9 @@ pub struct StageArgs {
     /// Camera: stop after so many frames.
     #[arg(long)]
     pub frames: Option<u64>,
+    /// Camera: number of the first frame; it goes on as if it had shown those before.
+    #[arg(long, default_value_t = 0)]
+    pub first_frame: u64,
     /// End when this process, the parent, ends.
     #[arg(long)]
     pub parent_pid: Option<u32>,
@@ -45,6 +48,7 @@ impl StageArgs {
             checkpoint: None,
             drives: None,
             frames: None,
+            first_frame: 0,
             parent_pid: None,
         }
     }
@@ -63,6 +67,7 @@ impl StageArgs {
         add("--checkpoint", self.checkpoint.as_ref().map(Into::into));
         add("--drives", self.drives.map(|n| n.to_string().into()));
         add("--frames", self.frames.map(|n| n.to_string().into()));
+        add("--first-frame", (self.first_frame > 0).then(|| self.first_frame.to_string().into()));
         add("--parent-pid", self.parent_pid.map(|n| n.to_string().into()));
         line
     }
@@ -82,6 +87,7 @@ mod tests {
             args.dataset = Some("data".into());
             args.checkpoint = Some("checkpoint".into());
             (args.drives, args.frames, args.parent_pid) = (Some(2), Some(30), Some(1));
+            args.first_frame = 17;
         }
     }
 }

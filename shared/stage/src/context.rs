@@ -2,8 +2,9 @@
 
 use crate::StageArgs;
 use crate::health::{Heartbeat, Vitals};
+use crate::realtime;
 use anyhow::Context;
-use carff_config::{GraphConfig, LogLevel};
+use carff_config::{GraphConfig, LogLevel, StageRealtime};
 use carff_messages::{Header, Health, HealthState, Message, PictureMeta, Stage};
 use carff_transport::{
     Input, Node, PicturePublisher, PictureReceiver, PictureTopic, Publisher, Receiver, Run, Stop, Topic, Waiter, Woken,
@@ -78,6 +79,8 @@ pub struct StageContext {
 impl StageContext {
     /// Joins the run and starts the heartbeat. [`main`] does this; tests call it in their own process.
     pub fn new(stage: Stage, args: StageArgs, graph: GraphConfig) -> anyhow::Result<Self> {
+        // First of all, so that all threads inherit it.
+        realtime::schedule(settings(&graph, stage));
         let stop = Stop::on_signals().context("cannot handle signals")?;
         let run = Run::new(args.run.as_deref().unwrap_or(&graph.run.name), args.run_id)?;
         let node = Node::open(&run, stage.name())?;
@@ -158,6 +161,11 @@ impl StageContext {
 
     /// Says that all topics are open and all models loaded, before any work is done. The launcher waits for it.
     pub fn ready(&mut self) {
+        // Before the first message is written: shared memory that runs full later then harms nobody who is ready.
+        if let Err(error) = self.node.run().reserve_shared_memory() {
+            tracing::warn!(%error, "shared memory cannot be reserved; should it run full, a stage may be killed");
+        }
+        realtime::settle(settings(&self.graph, self.stage));
         self.vitals.set_state(HealthState::Ok);
         self.vitals.progress();
         if let Some(heartbeat) = &self.heartbeat {
@@ -182,8 +190,10 @@ impl StageContext {
 
     /// Sleeps until an input has a message, a time on the monotonic clock (nanoseconds), or a stop.
     pub fn wait_until(&mut self, inputs: &[&dyn Input], deadline_ns: u64) -> anyhow::Result<Woken> {
-        self.vitals.progress();
-        Ok(self.waiter.wait_until(inputs, deadline_ns)?)
+        self.vitals.set_waiting(true);
+        let woken = self.waiter.wait_until(inputs, deadline_ns);
+        self.vitals.set_waiting(false);
+        Ok(woken?)
     }
 
     /// Whether the stage shall end: for loops that compute for long without waiting.
@@ -229,6 +239,18 @@ fn die_with_parent(parent_pid: Option<u32>) -> anyhow::Result<()> {
     let parent = getppid().map_or(0, |pid| pid.as_raw_nonzero().get() as u32);
     anyhow::ensure!(parent == expected, "the launcher (process {expected}) has ended");
     Ok(())
+}
+
+fn settings(graph: &GraphConfig, stage: Stage) -> &StageRealtime {
+    let realtime = &graph.realtime;
+    match stage {
+        Stage::Camera => &realtime.camera,
+        Stage::Encoder => &realtime.encoder,
+        Stage::Forecaster => &realtime.forecaster,
+        Stage::Prober => &realtime.prober,
+        Stage::Renderer => &realtime.renderer,
+        Stage::Controller => &realtime.controller,
+    }
 }
 
 fn level(graph: &GraphConfig, stage: Stage) -> LogLevel {

@@ -4,7 +4,7 @@ use carff_messages::{Header, Health, HealthState, Stage};
 use carff_transport::{Counters, Publisher, monotonic_now_ns};
 use crossbeam::channel::{RecvTimeoutError, Sender, bounded, unbounded};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU32, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
@@ -23,6 +23,8 @@ pub(crate) struct Vitals {
     last_latency_ns: AtomicU64,
     max_latency_ns: AtomicU64,
     last_progress_ns: AtomicU64,
+    /// Sleeping until something comes is no standstill.
+    waiting: AtomicBool,
 }
 
 impl Vitals {
@@ -34,6 +36,7 @@ impl Vitals {
             last_latency_ns: AtomicU64::new(0),
             max_latency_ns: AtomicU64::new(0),
             last_progress_ns: AtomicU64::new(monotonic_now_ns()),
+            waiting: AtomicBool::new(false),
         }
     }
 
@@ -45,6 +48,12 @@ impl Vitals {
         self.last_progress_ns.store(monotonic_now_ns(), Ordering::Relaxed);
     }
 
+    /// Notes that the loop goes to sleep, or wakes.
+    pub(crate) fn set_waiting(&self, waiting: bool) {
+        self.progress();
+        self.waiting.store(waiting, Ordering::Relaxed);
+    }
+
     pub(crate) fn count_error(&self) {
         self.errors.fetch_add(1, Ordering::Relaxed);
     }
@@ -53,6 +62,7 @@ impl Vitals {
         self.frame_id.store(header.frame_id, Ordering::Relaxed);
         self.last_latency_ns.store(latency_ns, Ordering::Relaxed);
         self.max_latency_ns.fetch_max(latency_ns, Ordering::Relaxed);
+        self.progress();
     }
 }
 
@@ -122,6 +132,11 @@ impl Drop for Heartbeat {
 }
 
 fn snapshot(stage: Stage, seed: u64, vitals: &Vitals, counters: &Counters) -> Health {
+    let last_progress_ns = if vitals.waiting.load(Ordering::Relaxed) {
+        monotonic_now_ns()
+    } else {
+        vitals.last_progress_ns.load(Ordering::Relaxed)
+    };
     Health {
         header: Header::of_frame(vitals.frame_id.load(Ordering::Relaxed), 0, seed),
         stage: stage.code(),
@@ -135,7 +150,7 @@ fn snapshot(stage: Stage, seed: u64, vitals: &Vitals, counters: &Counters) -> He
         errors: vitals.errors.load(Ordering::Relaxed),
         last_latency_ns: vitals.last_latency_ns.load(Ordering::Relaxed),
         max_latency_ns: vitals.max_latency_ns.load(Ordering::Relaxed),
-        last_progress_ns: vitals.last_progress_ns.load(Ordering::Relaxed),
+        last_progress_ns,
         rss_bytes: resident_bytes().unwrap_or(0),
     }
 }

@@ -34,6 +34,9 @@
 mod args;
 mod context;
 mod health;
+mod overload;
+mod realtime;
 
 pub use args::StageArgs;
 pub use context::{StageContext, describe, main, run_with};
+pub use overload::{Overload, Quality};

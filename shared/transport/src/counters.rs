@@ -44,7 +44,8 @@ impl Counters {
         self.skipped.fetch_add(1, Ordering::Relaxed);
     }
 
-    pub(crate) fn count_invalid(&self) {
-        self.invalid.fetch_add(1, Ordering::Relaxed);
+    /// Returns how many there are now.
+    pub(crate) fn count_invalid(&self) -> u64 {
+        self.invalid.fetch_add(1, Ordering::Relaxed) + 1
     }
 }

@@ -11,6 +11,9 @@ use std::os::fd::BorrowedFd;
 use std::sync::Arc;
 use std::time::Duration;
 
+/// Most invalid messages that one look drops: a flood of them must not keep a stage from its other work.
+const MAX_DROPS: usize = 64;
+
 /// What both kinds of receiver share.
 #[derive(Debug)]
 struct Source {
@@ -41,8 +44,12 @@ impl Source {
                 true
             }
             Err(error) => {
-                self.counters.count_invalid();
-                tracing::warn!(topic = self.topic, publisher = format_args!("{publisher:x}"), %error, "dropped an invalid message");
+                // Each is counted; a flood is told of ever more seldom.
+                let count = self.counters.count_invalid();
+                if count <= 8 || count.is_power_of_two() {
+                    let publisher = format_args!("{publisher:x}");
+                    tracing::warn!(topic = self.topic, publisher, count, %error, "dropped an invalid message");
+                }
                 false
             }
         }
@@ -90,10 +97,12 @@ impl<M: Message + ZeroCopySend + Debug + 'static> Receiver<M> {
         self
     }
 
-    /// The oldest valid message that waits, if any.
+    /// The oldest valid message that waits, if any. Also `None` after many invalid ones: then the input still has
+    /// something waiting, and a wait for it ends at once.
     #[allow(clippy::should_implement_trait, reason = "an iterator would borrow the receiver for a whole loop")]
     pub fn next(&mut self) -> Result<Option<Sample<M>>, ReceiveError> {
-        while let Some(sample) = self.port.receive().map_err(|e| self.source.failed(&e))? {
+        for _ in 0..MAX_DROPS {
+            let Some(sample) = self.port.receive().map_err(|e| self.source.failed(&e))? else { break };
             if self.source.accepts(sample.payload(), Ok(()), sample.origin().value()) {
                 return Ok(Some(Sample(sample)));
             }
@@ -103,8 +112,15 @@ impl<M: Message + ZeroCopySend + Debug + 'static> Receiver<M> {
 
     /// The newest valid message that waits, if any. Older ones are counted as skipped.
     pub fn newest(&mut self) -> Result<Option<Sample<M>>, ReceiveError> {
+        self.newest_of(|_| ())
+    }
+
+    /// The same, with a look at each valid message, older ones first.
+    pub fn newest_of(&mut self, mut each: impl FnMut(&M)) -> Result<Option<Sample<M>>, ReceiveError> {
         let mut newest = None;
-        while let Some(sample) = self.next()? {
+        for _ in 0..MAX_DROPS {
+            let Some(sample) = self.next()? else { break };
+            each(&sample);
             if newest.replace(sample).is_some() {
                 self.source.counters.count_skipped();
             }
@@ -172,10 +188,12 @@ impl<M: PictureMeta + ZeroCopySend + Debug + 'static> PictureReceiver<M> {
         self
     }
 
-    /// The oldest valid picture that waits, if any.
+    /// The oldest valid picture that waits, if any. Also `None` after many invalid ones: then the input still has
+    /// something waiting, and a wait for it ends at once.
     #[allow(clippy::should_implement_trait, reason = "an iterator would borrow the receiver for a whole loop")]
     pub fn next(&mut self) -> Result<Option<Picture<M>>, ReceiveError> {
-        while let Some(sample) = self.port.receive().map_err(|e| self.source.failed(&e))? {
+        for _ in 0..MAX_DROPS {
+            let Some(sample) = self.port.receive().map_err(|e| self.source.failed(&e))? else { break };
             let meta = sample.user_header();
             // The size that it claims is only meaningful, and only looked at, once the description is valid.
             let size = meta.validate().and_then(|()| {
@@ -196,7 +214,8 @@ impl<M: PictureMeta + ZeroCopySend + Debug + 'static> PictureReceiver<M> {
     /// The newest valid picture that waits, if any. Older ones are counted as skipped.
     pub fn newest(&mut self) -> Result<Option<Picture<M>>, ReceiveError> {
         let mut newest = None;
-        while let Some(picture) = self.next()? {
+        for _ in 0..MAX_DROPS {
+            let Some(picture) = self.next()? else { break };
             if newest.replace(picture).is_some() {
                 self.source.counters.count_skipped();
             }

@@ -61,6 +61,20 @@ impl Run {
         Ok(files)
     }
 
+    /// Sets memory aside for all of the run's files in shared memory, as large as they are. The system otherwise gives
+    /// each page when it is first written, and ends the writer (SIGBUS) when none is left by then.
+    pub fn reserve_shared_memory(&self) -> std::io::Result<()> {
+        for path in self.shared_memory_files()? {
+            // One that has gone meanwhile needs none, and one that may not be written is another's to care for.
+            let Ok(file) = std::fs::OpenOptions::new().read(true).write(true).open(&path) else { continue };
+            let bytes = file.metadata()?.len();
+            if bytes > 0 {
+                rustix::fs::fallocate(&file, rustix::fs::FallocateFlags::empty(), 0, bytes)?;
+            }
+        }
+        Ok(())
+    }
+
     pub(crate) fn config(&self) -> Result<Config, String> {
         let mut config = Config::default();
         config.global.prefix =

@@ -1,0 +1,180 @@
+//! The soak file: which faults, how often, and what is asked of the graph in between.
+
+use anyhow::{Context, ensure};
+use serde::{Deserialize, Serialize};
+use std::path::{Path, PathBuf};
+
+/// A soak: a graph, the faults that are done to it, and its contract.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SoakConfig {
+    /// The graph file.
+    pub graph: PathBuf,
+    /// How often each kind of fault comes, relative to the others, 0 to 1000. Those left out never come.
+    pub faults: Weights,
+    /// When.
+    #[serde(default)]
+    pub pace: Pace,
+    /// What is asked of the graph.
+    #[serde(default)]
+    pub contract: Contract,
+}
+
+macro_rules! weights {
+    ($($(#[$doc:meta])* $field:ident => $kind:ident),+ $(,)?) => {
+        /// How often each kind of fault comes, relative to the others.
+        #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+        #[serde(deny_unknown_fields, default)]
+        pub struct Weights { $($(#[$doc])* pub $field: u32),+ }
+
+        /// Kinds of faults.
+        #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+        pub enum Kind { $($(#[$doc])* $kind),+ }
+
+        impl Kind {
+            /// All of them.
+            pub const ALL: &[Self] = &[$(Self::$kind),+];
+
+            /// The name in soak files and reports.
+            pub const fn name(self) -> &'static str {
+                match self { $(Self::$kind => stringify!($field)),+ }
+            }
+        }
+
+        impl Weights {
+            /// The weight of a kind.
+            pub fn of(&self, kind: Kind) -> u32 {
+                match kind { $(Kind::$kind => self.$field),+ }
+            }
+        }
+    };
+}
+
+weights! {
+    /// SIGKILL of a stage.
+    kill => Kill,
+    /// SIGSTOP of a stage or of the launcher, SIGCONT later.
+    stop => Stop,
+    /// A stage that gets a fraction of its time: stopped and continued in turn.
+    slow => Slow,
+    /// Tens of frames at once.
+    burst => Burst,
+    /// A frame that comes again when it is old.
+    late => Late,
+    /// A frame that comes twice.
+    duplicate => Duplicate,
+    /// Frames in the wrong order.
+    reorder => Reorder,
+    /// Frames that never come: the camera stands still for some.
+    drop => Drop,
+    /// Messages with a NaN.
+    nan => Nan,
+    /// Messages of random bits.
+    garbage => Garbage,
+    /// Messages of another schema version.
+    schema => Schema,
+    /// Messages of another run.
+    foreign_run => ForeignRun,
+    /// Shared memory without a free byte, for a while.
+    full_memory => FullMemory,
+    /// Frames from a clock that has jumped, forward or back.
+    clock_jump => ClockJump,
+    /// Subscribers that come, go and are killed.
+    probe_storm => ProbeStorm,
+    /// The graph is interrupted and started again.
+    start_stop => StartStop,
+    /// SIGKILL of the launcher; the graph is started again.
+    kill_launcher => KillLauncher,
+    /// Weights are damaged and their stage killed; they are put right later.
+    checkpoint => Checkpoint,
+}
+
+/// When faults come.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Pace {
+    /// Shortest pause between a recovery and the next fault, milliseconds, 0 to 600000. Default 300.
+    pub min_pause_ms: u64,
+    /// Longest one. Default 1500.
+    pub max_pause_ms: u64,
+    /// Longest time that a process is stopped or slowed, or that memory is full, milliseconds, 50 to 60000.
+    /// Default 3000.
+    pub max_hold_ms: u64,
+}
+
+impl Default for Pace {
+    fn default() -> Self {
+        Self { min_pause_ms: 300, max_pause_ms: 1500, max_hold_ms: 3000 }
+    }
+}
+
+/// What is asked of the graph. Times in which the soak itself got no processor are left out of account.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Contract {
+    /// From the end of a fault until all stages are well and a decision has been made, milliseconds, 100 to 600000.
+    /// Default 5000.
+    pub recovery_ms: u64,
+    /// From an interrupt to the end of everything, milliseconds, 100 to 600000. Default 5000.
+    pub stop_ms: u64,
+    /// From the expiry of a decision to the safe action, and beyond the period of actions, milliseconds, 1 to 60000.
+    /// Default 150.
+    pub slack_ms: u64,
+    /// Growth of a process's memory, percent an hour, over lives of at least `memory_span_s` after `warm_up_s`.
+    /// Default 1.
+    pub memory_growth_percent_per_hour: f64,
+    /// Age from which on a process's memory counts, seconds. Default 120.
+    pub warm_up_s: u64,
+    /// Shortest time over which its growth is judged, seconds. Default 1800.
+    pub memory_span_s: u64,
+    /// The 99th percentile of the time from camera to action may grow by so much from the first to the last
+    /// `p99_frames` undisturbed frames, percent. Default 20.
+    pub p99_drift_percent: f64,
+    /// Frames in each; with fewer than twice as many, drift is not judged. Default 1000.
+    pub p99_frames: usize,
+}
+
+impl Default for Contract {
+    fn default() -> Self {
+        Self {
+            recovery_ms: 5000,
+            stop_ms: 5000,
+            slack_ms: 150,
+            memory_growth_percent_per_hour: 1.0,
+            warm_up_s: 120,
+            memory_span_s: 1800,
+            p99_drift_percent: 20.0,
+            p99_frames: 1000,
+        }
+    }
+}
+
+impl SoakConfig {
+    /// Reads and checks a soak file.
+    pub fn load(path: &Path) -> anyhow::Result<Self> {
+        let text =
+            std::fs::read_to_string(path).with_context(|| format!("cannot read the soak file {}", path.display()))?;
+        Self::parse(&text).with_context(|| format!("wrong soak file {}", path.display()))
+    }
+
+    /// The same for a text.
+    pub fn parse(text: &str) -> anyhow::Result<Self> {
+        let config: Self = toml::from_str(text)?;
+        let (pace, contract) = (&config.pace, &config.contract);
+        let sum: u64 = Kind::ALL.iter().map(|&kind| u64::from(config.faults.of(kind))).sum();
+        ensure!(sum > 0, "`faults` has no weight above 0: nothing would be tried");
+        for &kind in Kind::ALL {
+            ensure!(config.faults.of(kind) <= 1000, "`faults.{}` is above 1000", kind.name());
+        }
+        for (key, value, min, max) in [
+            ("pace.max_pause_ms", pace.max_pause_ms, pace.min_pause_ms, 600_000),
+            ("pace.max_hold_ms", pace.max_hold_ms, 50, 60_000),
+            ("contract.recovery_ms", contract.recovery_ms, 100, 600_000),
+            ("contract.stop_ms", contract.stop_ms, 100, 600_000),
+            ("contract.slack_ms", contract.slack_ms, 1, 60_000),
+        ] {
+            ensure!((min..=max).contains(&value), "`{key}` is {value}; allowed: {min} to {max}");
+        }
+        Ok(config)
+    }
+}

@@ -1,0 +1,169 @@
+//! The liars of a soak, in processes of their own: a rogue publisher, and probes that come and go. No stage knows them.
+
+use anyhow::{Context, ensure};
+use carff_messages::{Belief, Forecast, FrameMeta, Header, Posterior};
+use carff_random::{Key, stream};
+use carff_transport::{Node, PicturePublisher, Run, Stop, Waiter, Woken, monotonic_now_ns, topics};
+use rand::Rng;
+use rustix::process::{Signal, set_parent_process_death_signal};
+use std::time::Duration;
+
+/// Longest sleep between two looks, nanoseconds.
+const LOOK_NS: u64 = 100_000_000;
+/// How often it looks for frames before it gives up: looks, as time may pass without it.
+const LOOKS: usize = 300;
+/// Frames in a burst, for each one that is asked for.
+const BURST: u32 = 12;
+/// How late a late frame comes.
+const LATE: Duration = Duration::from_millis(400);
+/// Time between two rogue messages: slow enough that each is seen by whoever counts.
+const BETWEEN: Duration = Duration::from_millis(5);
+
+/// One fault from outside. Prints how many rogue beliefs it sent.
+#[derive(Clone, Debug, clap::Args)]
+pub struct InjectArgs {
+    /// The run's name.
+    run: String,
+    /// The run's id.
+    run_id: u64,
+    /// What: `probe`, or a kind of the soak file.
+    what: String,
+    /// How many.
+    count: u32,
+    /// Seed.
+    seed: u64,
+}
+
+/// Does it.
+pub fn run(args: &InjectArgs) -> anyhow::Result<()> {
+    set_parent_process_death_signal(Some(Signal::KILL)).context("cannot watch the parent process")?;
+    let node = Node::open(&Run::new(&args.run, args.run_id)?, "injector")?;
+    let beliefs = match args.what.as_str() {
+        "probe" => return probe(&node, args.count),
+        "nan" | "garbage" | "schema" | "foreign_run" => rogue(&node, args)?,
+        _ => {
+            frames(&node, args)?;
+            0
+        }
+    };
+    println!("{beliefs}");
+    Ok(())
+}
+
+/// Subscribes to everything, says so, reads a little, and then waits to be stopped or killed.
+fn probe(node: &Node, count: u32) -> anyhow::Result<()> {
+    let waiter = Waiter::new(Stop::on_signals()?);
+    let mut frames = node.picture_receiver(&topics::FRAME)?;
+    let mut beliefs = node.receiver(&topics::BELIEF)?;
+    let mut actions = node.receiver(&topics::ACTION)?;
+    println!("ready");
+    for _ in 0..count {
+        if waiter.wait_until(&[&frames, &beliefs, &actions], monotonic_now_ns() + LOOK_NS)? == Woken::Stopped {
+            return Ok(());
+        }
+        (frames.newest()?, beliefs.newest()?, actions.newest()?);
+    }
+    let held = frames.newest()?;
+    while waiter.wait_until(&[], u64::MAX)? != Woken::Stopped {}
+    drop(held);
+    Ok(())
+}
+
+/// Messages that no receiver may accept, on every topic of the decision path. Returns how many beliefs were among them.
+fn rogue(node: &Node, args: &InjectArgs) -> anyhow::Result<u32> {
+    let mut posteriors = node.publisher(&topics::POSTERIOR)?;
+    let mut forecasts = node.publisher(&topics::FORECAST)?;
+    let mut beliefs = node.publisher(&topics::BELIEF)?;
+    let mut random = stream(Key { seed: args.seed, frame: 0, step: 0, sample: 0 });
+    for i in 0..args.count {
+        let mut header = Header::of_frame(random.random_range(0..1_000_000), monotonic_now_ns(), 1);
+        header.run_id = args.run_id;
+        match args.what.as_str() {
+            "schema" => header.schema_version = header.schema_version.wrapping_add(1 + i),
+            "foreign_run" => header.run_id = header.run_id.wrapping_add(1),
+            _ => {}
+        }
+        let mut posterior = Posterior { header, gaussian: carff_messages::Gaussian::standard(), stage_latency_ns: 0 };
+        let mut forecast = Forecast::empty(header.at_step(1), carff_messages::ForecastSource::Observed, 2);
+        (forecast.component_count, forecast.sample_count, forecast.weights[0]) = (1, 1, 1.0);
+        let mut belief = Belief::empty(header.at_step(2), 2);
+        (belief.state_count, belief.place_count, belief.component_count, belief.sample_count) = (6, 1, 1, 1);
+        belief.component_weights[0] = 1.0;
+        match args.what.as_str() {
+            "nan" => {
+                posterior.gaussian.mean[i as usize % 8] = f32::NAN;
+                forecast.samples[0][i as usize % 8] = f32::NAN;
+                [&mut belief.hazard_probability, &mut belief.path_probability, &mut belief.component_weights[0]]
+                    [i as usize % 3]
+                    .clone_from(&f32::NAN);
+            }
+            "garbage" => {
+                let mut float = || f32::from_bits(random.random());
+                posterior.gaussian.mean = std::array::from_fn(|_| float());
+                posterior.gaussian.log_variance = std::array::from_fn(|_| float());
+                forecast.weights = std::array::from_fn(|_| float());
+                forecast.samples[0] = std::array::from_fn(|_| float());
+                belief.state_probability = std::array::from_fn(|_| float());
+                belief.hazard_probability = float();
+                let mut word = || random.random::<u32>();
+                belief.samples[0].state = word() as i32;
+                (posterior.header.step, forecast.sample_count) = (word() | 16, word() | 128);
+                (belief.sample_count, belief.state_count, belief.horizon) = (word() | 128, word(), word());
+                belief.header.step = word();
+            }
+            _ => {}
+        }
+        posteriors.send_unchecked(posterior)?;
+        forecasts.send_unchecked(forecast)?;
+        beliefs.send_unchecked(belief)?;
+        std::thread::sleep(BETWEEN);
+    }
+    // Whoever reads maps this process's memory when it first reads; it must still be there then.
+    std::thread::sleep(Duration::from_millis(300));
+    Ok(args.count)
+}
+
+/// Frames that were seen before, sent again as they should not be.
+fn frames(node: &Node, args: &InjectArgs) -> anyhow::Result<()> {
+    let mut input = node.picture_receiver(&topics::FRAME)?;
+    let waiter = Waiter::new(Stop::on_signals()?);
+    let mut seen: Vec<(FrameMeta, Vec<u8>)> = Vec::new();
+    for _ in 0..LOOKS {
+        if seen.len() >= 3 || waiter.wait_until(&[&input], monotonic_now_ns() + LOOK_NS)? == Woken::Stopped {
+            break;
+        }
+        while let Some(frame) = input.next()? {
+            seen.push((*frame.meta(), frame.bytes().to_vec()));
+        }
+    }
+    ensure!(!seen.is_empty(), "no frames to send again");
+    let most = seen.iter().map(|(_, bytes)| bytes.len()).max().unwrap_or(0);
+    let mut output = node.picture_publisher(&topics::FRAME, most)?;
+    let newest = seen.len() - 1;
+    match args.what.as_str() {
+        "late" => {
+            std::thread::sleep(LATE);
+            send(&mut output, &seen[newest], 0)?;
+        }
+        "duplicate" => (0..args.count).try_for_each(|_| send(&mut output, &seen[newest], 0))?,
+        "reorder" => seen.iter().rev().try_for_each(|frame| send(&mut output, frame, 0))?,
+        "burst" => (0..args.count * BURST).try_for_each(|_| send(&mut output, &seen[newest], 0))?,
+        "clock_jump" => {
+            // Up to a minute forward or back.
+            let jump_ns = (args.seed % 60_000_000_000) as i64;
+            let jump_ns = if args.seed & (1 << 60) == 0 { jump_ns } else { -jump_ns };
+            (0..args.count).try_for_each(|_| send(&mut output, &seen[newest], jump_ns))?;
+        }
+        other => anyhow::bail!("`{other}` is no fault from outside"),
+    }
+    std::thread::sleep(Duration::from_millis(300));
+    Ok(())
+}
+
+fn send(output: &mut PicturePublisher<FrameMeta>, frame: &(FrameMeta, Vec<u8>), jump_ns: i64) -> anyhow::Result<()> {
+    let (mut meta, bytes) = (frame.0, &frame.1);
+    meta.header.capture_time_ns = meta.header.capture_time_ns.saturating_add_signed(jump_ns);
+    let mut loan = output.loan(bytes.len())?;
+    loan.bytes_mut().copy_from_slice(bytes);
+    Ok(output.send_unchecked(loan, meta)?)
+}

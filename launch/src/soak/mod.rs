@@ -1,0 +1,585 @@
+//! `carff soak`: the real graph in real processes under a seeded schedule of faults; after each, its contract is checked.
+//!
+//! ```text
+//! soak --starts--> carff launch --starts--> stages         signals: SIGKILL, SIGSTOP, SIGCONT, SIGINT
+//!  | \--starts--> injector, probes --lies--> topics
+//!  \<------------- beliefs, actions, heartbeats --------- topics
+//! ```
+
+mod config;
+mod graph;
+mod inject;
+mod patience;
+mod report;
+mod schedule;
+mod watch;
+
+pub use config::{Contract, Kind, Pace, SoakConfig, Weights};
+pub use inject::{InjectArgs, run as inject};
+pub use schedule::{Fault, fault};
+
+use anyhow::{Context, ensure};
+use carff_messages::Stage;
+use carff_transport::{Node, Run, SHARED_MEMORY_DIR, Stop, Waiter, monotonic_now_ns};
+use graph::{Graph, Holdings, Victim, resident_bytes};
+use patience::Patience;
+use report::{Lives, Outcome};
+use rustix::process::Signal;
+use std::collections::BTreeMap;
+use std::io::{BufRead, BufReader, Read};
+use std::os::unix::process::CommandExt;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, ExitCode, Stdio};
+use watch::{Notes, Terms, Watcher};
+
+const NS_PER_MS: u64 = 1_000_000;
+const NS_PER_S: u64 = 1_000_000_000;
+/// Shared memory of a soak's own, so that filling it harms nobody else: its size.
+const MEMORY_SIZE: &str = "size=256m";
+/// How a slowed process is stopped and continued in turn, milliseconds.
+const SLOW_MS: (u64, u64) = (40, 20);
+/// How long the camera stands still so that frames are dropped, in frames.
+const DROPPED_FRAMES: f64 = 4.0;
+/// Time between two looks at the processes' memory.
+const MEMORY_PERIOD_NS: u64 = 5 * NS_PER_S;
+/// After a recovery the times of actions count again from so much later on.
+const SETTLE_NS: u64 = 200_000_000;
+/// Longest time that an injector may take.
+const INJECTOR_MS: u64 = 60_000;
+
+/// Soak a graph.
+#[derive(Clone, Debug, clap::Args)]
+pub struct SoakArgs {
+    /// The soak file, as in configs/soak.
+    pub config: PathBuf,
+    /// How long, minutes.
+    #[arg(long, default_value_t = 2.0)]
+    pub minutes: f64,
+    /// The schedule's seed.
+    #[arg(long, default_value_t = 1)]
+    pub seed: u64,
+    /// Write the result here, as JSON; evidence of a violation goes into a folder beside it.
+    #[arg(long)]
+    pub json: Option<PathBuf>,
+    /// Data set folder, in place of the graph file's.
+    #[arg(long)]
+    pub dataset: Option<PathBuf>,
+    /// Checkpoint folder, in place of the graph file's.
+    #[arg(long)]
+    pub checkpoint: Option<PathBuf>,
+    /// Set by the program itself once shared memory is its own.
+    #[arg(long, hide = true)]
+    pub own_memory: bool,
+}
+
+/// Soaks; exit code 0 when the contract held all the time, 1 at the first violation, 130 on Ctrl-C.
+pub fn run(args: &SoakArgs) -> anyhow::Result<ExitCode> {
+    let config = SoakConfig::load(&args.config)?;
+    ensure!(args.minutes > 0.0 && args.minutes.is_finite(), "--minutes is {}; it must be above 0", args.minutes);
+    if !args.own_memory && config.faults.full_memory > 0 {
+        with_own_memory();
+        eprintln!("this system lets its users mount nothing: full shared memory is not tried");
+    }
+    let stop = Stop::on_signals().context("cannot handle signals")?;
+    let graph = Graph::new(&config, args.dataset.as_deref(), args.checkpoint.as_deref(), args.seed)?;
+    let terms = Terms::new(&graph.config, &graph.checkpoint, &config.contract)?;
+    let mut soak = Soak {
+        args,
+        config: &config,
+        graph,
+        waiter: Waiter::new(stop),
+        run: Run::new("unnamed", 0)?,
+        watcher: None,
+        notes: Notes::new(terms),
+        baseline: None,
+        outcome: Outcome::default(),
+        lives: Lives::default(),
+        memory_ns: 0,
+    };
+    let result = soak.drive();
+    soak.watcher = None;
+    let stalled = soak.graph.end(Signal::TERM, config.contract.stop_ms)?.is_none();
+    let interrupted = soak.waiter.stop().is_stopped();
+    if stalled && !interrupted && soak.notes.violation.is_none() && result.is_ok() {
+        soak.notes.violation = Some("the graph did not end when it was asked to".to_owned());
+    }
+    result?;
+    soak.outcome.finish(&soak.notes, &soak.lives, &config.contract);
+    if let Some(violation) = soak.notes.violation.take() {
+        soak.outcome.violation = Some(violation);
+        soak.keep_evidence()?;
+    }
+    let json = soak.outcome.json(args, &soak.notes);
+    let text = serde_json::to_string_pretty(&json)? + "\n";
+    match &args.json {
+        Some(path) => {
+            if let Some(folder) = path.parent().filter(|f| !f.as_os_str().is_empty()) {
+                std::fs::create_dir_all(folder)?;
+            }
+            std::fs::write(path, &text).with_context(|| format!("cannot write {}", path.display()))?;
+            println!("{}\nJSON: {}", soak.outcome.summary(), path.display());
+        }
+        None => print!("{text}"),
+    }
+    Ok(match (&soak.outcome.violation, interrupted) {
+        (Some(_), _) => ExitCode::FAILURE,
+        (None, true) => ExitCode::from(130),
+        (None, false) => ExitCode::SUCCESS,
+    })
+}
+
+/// Goes on as a process whose shared memory nobody else sees. Returns where the system allows none.
+fn with_own_memory() {
+    let user = rustix::process::getuid();
+    let enter = |command: &mut Command, what: &str| {
+        command
+            .arg("--mount")
+            .args(["sh", "-c"])
+            .arg(format!("mount -t tmpfs -o {MEMORY_SIZE} tmpfs {SHARED_MEMORY_DIR} && {what}"));
+    };
+    let new = |what: &str| {
+        let mut command = Command::new("unshare");
+        if !user.is_root() {
+            command.args(["--user", "--map-root-user"]);
+        }
+        enter(&mut command, what);
+        command
+    };
+    let possible = new("true").stdout(Stdio::null()).stderr(Stdio::null()).status().is_ok_and(|s| s.success());
+    let Ok(program) = std::env::current_exe() else { return };
+    if possible {
+        // Back to this user inside: the run's folder is named after them.
+        let back = if user.is_root() { String::new() } else { format!("unshare --user --map-user={} ", user.as_raw()) };
+        let error = new(&format!("exec {back}\"$@\""))
+            .arg("sh")
+            .arg(program)
+            .args(std::env::args_os().skip(1))
+            .arg("--own-memory")
+            .exec();
+        eprintln!("cannot enter a mount of one's own: {error}");
+    }
+}
+
+/// A soak in progress.
+struct Soak<'a> {
+    args: &'a SoakArgs,
+    config: &'a SoakConfig,
+    graph: Graph,
+    waiter: Waiter,
+    run: Run,
+    watcher: Option<Watcher>,
+    notes: Notes,
+    /// What the undisturbed graph holds of the system.
+    baseline: Option<Holdings>,
+    outcome: Outcome,
+    lives: Lives,
+    memory_ns: u64,
+}
+
+impl Soak<'_> {
+    /// Starts the graph and does faults to it until the time is over, the first violation, or an interrupt.
+    fn drive(&mut self) -> anyhow::Result<()> {
+        self.start_graph()?;
+        let begun_ns = monotonic_now_ns();
+        let end_ns = begun_ns + (self.args.minutes * 60e9) as u64;
+        let mut number = 0;
+        while monotonic_now_ns() < end_ns && self.goes_on()? {
+            let fault = fault(self.config, self.args.seed, number);
+            number += 1;
+            self.notes.calm = true;
+            self.look_for(fault.pause_ms)?;
+            self.notes.calm = false;
+            if !self.goes_on()? || monotonic_now_ns() >= end_ns {
+                break;
+            }
+            self.notes.note(fault.to_string());
+            self.outcome.schedule.push(fault.to_string());
+            if self.inflict(&fault)? {
+                *self.outcome.faults.entry(fault.kind.name()).or_default() += 1;
+            } else {
+                *self.outcome.not_tried.entry(fault.kind.name()).or_default() += 1;
+            }
+        }
+        self.outcome.seconds = (monotonic_now_ns() - begun_ns) as f64 / 1e9;
+        Ok(())
+    }
+
+    /// Whether nothing has been violated, nobody interrupts, and the launcher lives.
+    fn goes_on(&mut self) -> anyhow::Result<bool> {
+        if let Some(status) = self.graph.ended()? {
+            self.violated(format!("the launcher ended by itself: {status}"));
+        }
+        Ok(self.notes.violation.is_none() && !self.waiter.stop().is_stopped())
+    }
+
+    fn violated(&mut self, what: String) {
+        self.notes.violation.get_or_insert(what);
+    }
+
+    fn watcher(&mut self) -> anyhow::Result<&mut Watcher> {
+        self.watcher.as_mut().context("nobody watches")
+    }
+
+    fn look(&mut self) -> anyhow::Result<()> {
+        let watcher = self.watcher.as_mut().context("nobody watches")?;
+        watcher.look(&mut self.notes)?;
+        let now_ns = monotonic_now_ns();
+        if now_ns >= self.memory_ns {
+            self.memory_ns = now_ns + MEMORY_PERIOD_NS;
+            let pids = watcher.health.iter().map(|(stage, health)| (stage.name(), health.pid));
+            for (name, pid) in pids.chain(self.graph.pid().map(|pid| ("launcher", pid))) {
+                if let Some(bytes) = resident_bytes(pid) {
+                    self.lives.note(name, pid, now_ns, bytes);
+                }
+            }
+        }
+        Ok(())
+    }
+
+    fn look_for(&mut self, ms: u64) -> anyhow::Result<()> {
+        let until_ns = monotonic_now_ns() + ms * NS_PER_MS;
+        while monotonic_now_ns() < until_ns && self.notes.violation.is_none() && !self.waiter.stop().is_stopped() {
+            self.look()?;
+        }
+        Ok(())
+    }
+
+    /// Looks until something holds; false when it does not within `limit_ms`, times without a processor left out.
+    fn look_until(
+        &mut self,
+        limit_ms: u64,
+        mut holds: impl FnMut(&mut Self) -> anyhow::Result<bool>,
+    ) -> anyhow::Result<bool> {
+        let mut patience = Patience::of_ms(limit_ms);
+        loop {
+            if holds(self)? {
+                return Ok(true);
+            }
+            if patience.ran_out() || self.waiter.stop().is_stopped() {
+                return Ok(false);
+            }
+            self.look()?;
+        }
+    }
+
+    fn start_graph(&mut self) -> anyhow::Result<()> {
+        self.run = self.graph.start()?;
+        let node = Node::open(&self.run, "soak")?;
+        self.watcher = Some(Watcher::open(node, self.waiter.clone())?);
+        self.notes.judge.restarted(monotonic_now_ns() + NS_PER_S);
+        let start_ms = self.graph.config.launcher.start_timeout_ms;
+        let up = self.look_until(start_ms, |soak| {
+            let watcher = soak.watcher()?;
+            Ok(watcher.all_well(0, None) && watcher.decided_ns > 0 || soak.graph.ended()?.is_some())
+        })?;
+        if !up && !self.waiter.stop().is_stopped() {
+            self.violated(format!("the graph was not up within {start_ms} ms of its start"));
+        }
+        if self.baseline.is_none() && self.goes_on()? {
+            // The renderer's first views, and whatever else comes late.
+            self.look_for(3000)?;
+            self.baseline = Some(self.holdings()?);
+        }
+        Ok(())
+    }
+
+    fn pids(&self) -> BTreeMap<Stage, u32> {
+        self.watcher.iter().flat_map(|w| &w.health).map(|(stage, health)| (*stage, health.pid)).collect()
+    }
+
+    fn holdings(&self) -> anyhow::Result<Holdings> {
+        self.graph.holdings(&self.run, &self.pids())
+    }
+
+    /// Does one fault and checks what has to hold after it. False when it cannot be done here.
+    fn inflict(&mut self, fault: &Fault) -> anyhow::Result<bool> {
+        let pids = self.pids();
+        match fault.kind {
+            Kind::Kill => {
+                let pid = self.pid_of(fault, &pids)?;
+                self.kill(fault.target, pid)?;
+                self.recover(Some(pid))?;
+            }
+            Kind::Stop => {
+                let victim = Victim::new(self.pid_of(fault, &pids)?)?;
+                self.excuse(fault.target, fault.hold_ms);
+                victim.signal(Signal::STOP);
+                self.look_for(fault.hold_ms)?;
+                victim.signal(Signal::CONT);
+                self.recover(None)?;
+            }
+            Kind::Drop => {
+                let camera = Fault { target: Some(Stage::Camera), ..*fault };
+                let victim = Victim::new(self.pid_of(&camera, &pids)?)?;
+                victim.signal(Signal::STOP);
+                self.look_for((DROPPED_FRAMES * 1000.0 / self.graph.config.run.frame_rate_hz) as u64)?;
+                victim.signal(Signal::CONT);
+                self.recover(None)?;
+            }
+            Kind::Slow => {
+                let victim = Victim::new(self.pid_of(fault, &pids)?)?;
+                self.excuse(fault.target, fault.hold_ms);
+                for _ in 0..fault.hold_ms.div_ceil(SLOW_MS.0 + SLOW_MS.1) {
+                    victim.signal(Signal::STOP);
+                    self.look_for(SLOW_MS.0)?;
+                    victim.signal(Signal::CONT);
+                    self.look_for(SLOW_MS.1)?;
+                }
+                self.recover(None)?;
+            }
+            Kind::Nan | Kind::Garbage | Kind::Schema | Kind::ForeignRun => self.lie(fault)?,
+            Kind::Burst | Kind::Late | Kind::Duplicate | Kind::Reorder | Kind::ClockJump => {
+                self.injector(fault.kind.name(), fault)?;
+                self.recover(None)?;
+            }
+            Kind::ProbeStorm => self.storm(fault)?,
+            Kind::FullMemory => {
+                if !self.args.own_memory {
+                    return Ok(false);
+                }
+                let filler = Filler::fill()?;
+                self.look_for(fault.hold_ms)?;
+                drop(filler);
+                self.recover(None)?;
+            }
+            Kind::Checkpoint => self.damage_checkpoint(fault, &pids)?,
+            Kind::StartStop => self.cycle(Signal::INT)?,
+            Kind::KillLauncher => self.cycle(Signal::KILL)?,
+        }
+        Ok(true)
+    }
+
+    fn pid_of(&self, fault: &Fault, pids: &BTreeMap<Stage, u32>) -> anyhow::Result<u32> {
+        match fault.target {
+            Some(stage) => pids.get(&stage).copied().with_context(|| format!("stage {stage} was never heard")),
+            None => self.graph.pid().context("the launcher does not run"),
+        }
+    }
+
+    fn kill(&mut self, target: Option<Stage>, pid: u32) -> anyhow::Result<()> {
+        self.excuse(target, self.config.contract.recovery_ms);
+        if Victim::new(pid).is_ok_and(|victim| victim.signal(Signal::KILL)) {
+            self.outcome.kills += 1;
+        }
+        Ok(())
+    }
+
+    /// What is done to the controller itself is not held against its actions' times.
+    fn excuse(&mut self, target: Option<Stage>, ms: u64) {
+        if target == Some(Stage::Controller) {
+            self.notes.judge.excuse(monotonic_now_ns() + (ms + 1000) * NS_PER_MS);
+        }
+    }
+
+    /// Waits until all stages are well, a decision has been made since, and nothing more is held of the system than
+    /// before the fault.
+    fn recover(&mut self, killed: Option<u32>) -> anyhow::Result<()> {
+        let limit_ms = self.config.contract.recovery_ms;
+        let begun_ns = monotonic_now_ns();
+        let stalled_ns = self.watcher()?.stalled_ns;
+        let mut well_ns = None;
+        let recovered = self.look_until(limit_ms, |soak| {
+            let watcher = soak.watcher()?;
+            if well_ns.is_none() && watcher.all_well(begun_ns, killed) {
+                well_ns = Some(monotonic_now_ns());
+            }
+            Ok(well_ns.is_some_and(|at_ns| watcher.decided_ns > at_ns) || soak.notes.violation.is_some())
+        })?;
+        let took_ns = monotonic_now_ns() - begun_ns;
+        let took_ns = took_ns.saturating_sub(self.watcher()?.stalled_ns - stalled_ns);
+        if !recovered && !self.waiter.stop().is_stopped() {
+            let states: Vec<String> = self.watcher()?.health.values().map(|h| format!("{h:?}")).collect();
+            self.violated(format!("not recovered within {limit_ms} ms: {}", states.join("\n")));
+        }
+        self.outcome.recoveries_ms.push(took_ns as f64 / 1e6);
+        self.notes.judge.excuse_no_more(monotonic_now_ns() + SETTLE_NS);
+        // What is left of the dead is gone soon after.
+        let Some(baseline) = self.baseline.clone() else { return Ok(()) };
+        let mut found = Holdings::default();
+        let back = self.look_until(limit_ms, |soak| {
+            // A process may end between two looks; the next one tells.
+            found = soak.holdings().unwrap_or_default();
+            Ok(!found.descriptors.is_empty() && found.excess(&baseline) == 0 || soak.notes.violation.is_some())
+        })?;
+        if !back && !self.waiter.stop().is_stopped() {
+            self.outcome.leaked_files = found.excess(&baseline);
+            self.violated(format!("more is held of the system than before: {found:?}, at first {baseline:?}"));
+        }
+        Ok(())
+    }
+
+    /// Rogue messages: none may reach an action, and the controller has to count each belief among them.
+    fn lie(&mut self, fault: &Fault) -> anyhow::Result<()> {
+        let controller = |soak: &mut Self| -> anyhow::Result<(u32, u64)> {
+            let health = soak.watcher()?.health.get(&Stage::Controller).context("the controller was never heard")?;
+            Ok((health.pid, health.invalid))
+        };
+        let (pid, before) = controller(self)?;
+        let sent: u64 =
+            self.injector(fault.kind.name(), fault)?.trim().parse().context("the injector said no count")?;
+        let mut counted = (pid, before);
+        let all = self.look_until(self.config.contract.recovery_ms, |soak| {
+            counted = controller(soak)?;
+            Ok(counted.0 != pid || counted.1 >= before + sent || soak.notes.violation.is_some())
+        })?;
+        if counted.0 == pid && (!all || counted.1 != before + sent) && self.notes.violation.is_none() {
+            let found = counted.1 - before;
+            self.violated(format!("the controller counted {found} invalid beliefs of {sent} that were sent"));
+        }
+        self.recover(None)
+    }
+
+    fn helper(&self, what: &str, count: u32, seed: u64) -> anyhow::Result<Child> {
+        Command::new(std::env::current_exe()?)
+            .args([
+                "soak-inject",
+                self.run.name(),
+                &self.run.id().to_string(),
+                what,
+                &count.to_string(),
+                &seed.to_string(),
+            ])
+            .stdin(Stdio::null())
+            .stdout(Stdio::piped())
+            .spawn()
+            .context("cannot start an injector")
+    }
+
+    /// Lets an injector do its work; returns what it printed.
+    fn injector(&mut self, what: &str, fault: &Fault) -> anyhow::Result<String> {
+        let mut child = self.helper(what, fault.count, fault.seed)?;
+        let mut patience = Patience::of_ms(INJECTOR_MS);
+        let status = loop {
+            if let Some(status) = child.try_wait()? {
+                break status;
+            }
+            if patience.ran_out() {
+                child.kill()?;
+            }
+            self.look()?;
+        };
+        ensure!(status.success(), "the injector of `{what}` failed: {status}");
+        let mut said = String::new();
+        child.stdout.take().context("the injector has no output")?.read_to_string(&mut said)?;
+        Ok(said)
+    }
+
+    /// Probes attach; half of them detach, the others are killed, holding a frame.
+    fn storm(&mut self, fault: &Fault) -> anyhow::Result<()> {
+        let mut probes = Vec::new();
+        // As many as there is room for beside the graph's own subscribers.
+        for i in 0..fault.count.min(4) {
+            let mut probe = self.helper("probe", i, 0)?;
+            let mut ready = String::new();
+            let mut stdout = BufReader::new(probe.stdout.take().context("the probe has no output")?);
+            let said = std::thread::spawn(move || stdout.read_line(&mut ready).map(|_| ready));
+            while !said.is_finished() {
+                self.look()?;
+            }
+            let ready = said.join().ok().and_then(Result::ok);
+            ensure!(ready.as_deref() == Some("ready\n"), "a probe could not attach");
+            probes.push(probe);
+        }
+        self.look_for(fault.hold_ms)?;
+        for (i, probe) in probes.iter_mut().enumerate() {
+            let signal = if i % 2 == 0 { Signal::KILL } else { Signal::TERM };
+            Victim::new(probe.id())?.signal(signal);
+            probe.wait()?;
+        }
+        self.recover(None)
+    }
+
+    /// Cuts a stage's weights in half and kills it: it cannot come back until they are put right.
+    fn damage_checkpoint(&mut self, fault: &Fault, pids: &BTreeMap<Stage, u32>) -> anyhow::Result<()> {
+        let (stage, file) = match fault.seed % 3 {
+            0 => (Stage::Encoder, carff_checkpoint::files::ENCODER),
+            1 => (Stage::Forecaster, carff_checkpoint::files::MIXTURE),
+            _ => (Stage::Prober, carff_checkpoint::files::FIELD),
+        };
+        let path = self.graph.checkpoint.join(file);
+        let good = std::fs::read(&path)?;
+        write_whole(&path, &good[..good.len() / 2])?;
+        let pid = pids.get(&stage).copied().context("the stage was never heard")?;
+        self.kill(Some(stage), pid)?;
+        self.look_for(fault.hold_ms)?;
+        write_whole(&path, &good)?;
+        self.recover(Some(pid))
+    }
+
+    /// Ends the graph and starts it again: nothing may be left of it in between.
+    fn cycle(&mut self, signal: Signal) -> anyhow::Result<()> {
+        let limit_ms = self.config.contract.stop_ms;
+        // What the watcher itself has open is none of the graph's.
+        self.watcher = None;
+        let status = self.graph.end(signal, limit_ms)?;
+        match (signal, status.and_then(|s| s.code())) {
+            _ if status.is_none() => self.violated(format!("the graph did not end within {limit_ms} ms")),
+            (Signal::INT, Some(130)) => {
+                let left = self.graph.leftovers()?;
+                if !left.is_empty() {
+                    self.outcome.leaked_files += left.len();
+                    self.violated(format!("a stopped graph has left {left:?}"));
+                }
+            }
+            (Signal::INT, code) => self.violated(format!("an interrupted graph ended with exit code {code:?}")),
+            // What a killed launcher leaves, the next one removes.
+            _ => {}
+        }
+        if self.notes.violation.is_some() || self.waiter.stop().is_stopped() {
+            return Ok(());
+        }
+        let begun_ns = monotonic_now_ns();
+        self.start_graph()?;
+        self.outcome.cycles += 1;
+        self.outcome.worst_start_ms = self.outcome.worst_start_ms.max((monotonic_now_ns() - begun_ns) as f64 / 1e6);
+        self.recover(None)
+    }
+
+    /// Log, latest messages and schedule, in a folder beside the JSON file.
+    fn keep_evidence(&mut self) -> anyhow::Result<()> {
+        let folder = self.args.json.as_deref().unwrap_or(Path::new("soak.json")).with_extension("evidence");
+        std::fs::create_dir_all(&folder)?;
+        let text =
+            |lines: &mut dyn Iterator<Item = &String>| lines.fold(String::new(), |text, line| text + line + "\n");
+        std::fs::write(folder.join("messages.txt"), text(&mut self.notes.evidence.iter()))?;
+        std::fs::write(folder.join("schedule.txt"), text(&mut self.outcome.schedule.iter()))?;
+        std::fs::copy(self.graph.log(), folder.join("launcher.log"))?;
+        self.outcome.evidence = Some(folder.display().to_string());
+        Ok(())
+    }
+}
+
+/// Replaces a file at once: nobody ever reads a part of it.
+fn write_whole(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
+    let partial = path.with_extension("partial");
+    std::fs::write(&partial, bytes)?;
+    Ok(std::fs::rename(&partial, path)?)
+}
+
+/// Takes all free shared memory, until it is dropped.
+struct Filler {
+    path: PathBuf,
+}
+
+impl Filler {
+    fn fill() -> anyhow::Result<Self> {
+        let filler = Self { path: Path::new(SHARED_MEMORY_DIR).join("soak-filler") };
+        let file = std::fs::File::create(&filler.path)?;
+        let stat = rustix::fs::statvfs(SHARED_MEMORY_DIR)?;
+        let (mut bytes, mut chunk) = (0, stat.f_bavail * stat.f_frsize);
+        while chunk >= stat.f_frsize {
+            match rustix::fs::fallocate(&file, rustix::fs::FallocateFlags::empty(), bytes, chunk) {
+                Ok(()) => bytes += chunk,
+                // Somebody else took some meanwhile.
+                Err(_) => chunk /= 2,
+            }
+        }
+        Ok(filler)
+    }
+}
+
+impl Drop for Filler {
+    fn drop(&mut self) {
+        let _ = std::fs::remove_file(&self.path);
+    }
+}

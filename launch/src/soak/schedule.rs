@@ -1,0 +1,118 @@
+//! Which fault comes when: a pure function of the soak file and the seed.
+
+use super::config::{Kind, SoakConfig};
+use carff_messages::Stage;
+use carff_random::{Key, stream};
+use rand::Rng;
+use std::fmt;
+
+/// Names the schedule's random streams among all others of the program.
+const STREAM: u32 = 0x50a4;
+/// Shortest time that a process is stopped or slowed, milliseconds.
+const MIN_HOLD_MS: u64 = 50;
+
+/// One fault.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Fault {
+    /// Its number in the schedule, from 0.
+    pub number: u64,
+    /// Time to wait before it, milliseconds.
+    pub pause_ms: u64,
+    /// What.
+    pub kind: Kind,
+    /// To whom, where it is done to a stage; `None` is the launcher.
+    pub target: Option<Stage>,
+    /// For how long, where it lasts, milliseconds.
+    pub hold_ms: u64,
+    /// How many, where there are several: messages, probes.
+    pub count: u32,
+    /// Seed of whatever else it draws.
+    pub seed: u64,
+}
+
+impl fmt::Display for Fault {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let target = self.target.map_or("launcher", Stage::name);
+        write!(
+            f,
+            "fault {}: {} ({target}, {} ms, count {}) after {} ms",
+            self.number,
+            self.kind.name(),
+            self.hold_ms,
+            self.count,
+            self.pause_ms
+        )
+    }
+}
+
+/// The fault of a number.
+pub fn fault(config: &SoakConfig, seed: u64, number: u64) -> Fault {
+    let mut random = stream(Key { seed, frame: number, step: STREAM, sample: 0 });
+    let sum: u32 = Kind::ALL.iter().map(|&kind| config.faults.of(kind)).sum();
+    let mut at = random.random_range(0..sum);
+    let drawn = Kind::ALL.iter().copied().find(|&kind| {
+        let weight = config.faults.of(kind);
+        let here = at < weight;
+        at = at.saturating_sub(weight);
+        here
+    });
+    // The weights' sum is above 0, so one of them was met.
+    let kind = drawn.unwrap_or(Kind::Kill);
+    let pause_ms = random.random_range(config.pace.min_pause_ms..=config.pace.max_pause_ms);
+    // The launcher can be stopped as well.
+    let targets = Stage::ALL.len() + usize::from(kind == Kind::Stop);
+    let target = Stage::ALL.get(random.random_range(0..targets)).copied();
+    let hold_ms = random.random_range(MIN_HOLD_MS..=config.pace.max_hold_ms);
+    Fault { number, pause_ms, kind, target, hold_ms, count: random.random_range(1..=8), seed: random.random() }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn config(faults: &str) -> SoakConfig {
+        SoakConfig::parse(&format!("graph = \"g.toml\"\n[faults]\n{faults}")).unwrap()
+    }
+
+    fn first(config: &SoakConfig, seed: u64, count: u64) -> Vec<Fault> {
+        (0..count).map(|number| fault(config, seed, number)).collect()
+    }
+
+    /// The same file and seed give the same schedule, whatever was asked before; another seed gives another one.
+    #[test]
+    fn a_seed_is_a_schedule() {
+        let config = config("kill = 3\nstop = 1\nnan = 2\n");
+        assert_eq!(first(&config, 7, 200), first(&config, 7, 200));
+        assert_eq!(fault(&config, 7, 150), first(&config, 7, 200)[150]);
+        assert_ne!(first(&config, 7, 200), first(&config, 8, 200));
+    }
+
+    /// Kinds come as often as their weights say, those without one never; times stay within their limits; every stage
+    /// is met, and the launcher by stops alone.
+    #[test]
+    fn weights_and_limits_hold() {
+        let config = config("kill = 30\nstop = 10\n");
+        let faults = first(&config, 1, 4000);
+        let kills = faults.iter().filter(|f| f.kind == Kind::Kill).count();
+        assert!(faults.iter().all(|f| matches!(f.kind, Kind::Kill | Kind::Stop)));
+        assert!((2850..3150).contains(&kills), "{kills}");
+        for f in &faults {
+            assert!((config.pace.min_pause_ms..=config.pace.max_pause_ms).contains(&f.pause_ms));
+            assert!((MIN_HOLD_MS..=config.pace.max_hold_ms).contains(&f.hold_ms));
+            assert!(f.target.is_some() || f.kind == Kind::Stop);
+        }
+        for stage in Stage::ALL {
+            assert!(faults.iter().any(|f| f.target == Some(*stage)));
+        }
+        assert!(faults.iter().any(|f| f.target.is_none()));
+    }
+
+    /// Wrong soak files are named by key.
+    #[test]
+    fn wrong_files_are_refused() {
+        let wrong = |text: &str| format!("{:#}", SoakConfig::parse(text).unwrap_err());
+        assert!(wrong("graph = \"g\"\n[faults]\n").contains("no weight"));
+        assert!(wrong("graph = \"g\"\n[faults]\nkil = 1\n").contains("kil"));
+        assert!(wrong("graph = \"g\"\n[faults]\nkill = 1\n[pace]\nmax_hold_ms = 1\n").contains("pace.max_hold_ms"));
+    }
+}

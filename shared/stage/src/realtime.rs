@@ -1,0 +1,103 @@
+//! What the graph file asks of the system for one process: processors, priority, resident memory.
+//! Whatever the system refuses is a warning; the stage goes on without.
+
+use carff_config::StageRealtime;
+use rustix::process::{Resource, getrlimit};
+use std::io;
+
+/// Bytes between two touched places: no page is smaller.
+const PAGE_BYTES: usize = 4096;
+
+/// Sets processors, niceness and scheduling policy of the calling thread; threads that it starts inherit them.
+pub(crate) fn schedule(settings: &StageRealtime) {
+    if !settings.cpus.is_empty() {
+        warn_if_refused("cpus", pin(&settings.cpus));
+    }
+    if let Some(nice) = settings.nice {
+        warn_if_refused("nice", rustix::process::setpriority_process(None, nice).map_err(Into::into));
+    }
+    if let Some(priority) = settings.fifo_priority {
+        warn_if_refused("fifo_priority", use_fifo(priority));
+    }
+}
+
+/// Touches heap and locks memory, once all that lasts has been loaded.
+pub(crate) fn settle(settings: &StageRealtime) {
+    if settings.prefault_mb > 0 {
+        prefault(settings.prefault_mb as usize * (1 << 20));
+    }
+    if settings.lock_memory {
+        warn_if_refused("lock_memory", lock_memory());
+    }
+}
+
+fn warn_if_refused(what: &str, result: io::Result<()>) {
+    if let Err(error) = result {
+        tracing::warn!(%error, "the system refuses `realtime` setting `{what}`: going on without");
+    }
+}
+
+fn pin(cpus: &[u32]) -> io::Result<()> {
+    let mut set = rustix::thread::CpuSet::new();
+    for &cpu in cpus {
+        set.set(cpu as usize);
+    }
+    Ok(rustix::thread::sched_setaffinity(None, &set)?)
+}
+
+fn use_fifo(priority: u32) -> io::Result<()> {
+    // SAFETY: a plain struct of integers, for which all zeros is a value.
+    let mut parameters: libc::sched_param = unsafe { std::mem::zeroed() };
+    parameters.sched_priority = priority as libc::c_int;
+    // SAFETY: the pointer is to a live struct that the call only reads; 0 names the calling thread.
+    let result = unsafe { libc::sched_setscheduler(0, libc::SCHED_FIFO, &raw const parameters) };
+    if result == 0 { Ok(()) } else { Err(io::Error::last_os_error()) }
+}
+
+/// What is mapped now; what comes later too, unless a limit stands: beyond one, a later allocation would fail.
+fn lock_memory() -> io::Result<()> {
+    use rustix::mm::MlockAllFlags;
+    let unlimited = getrlimit(Resource::Memlock).current.is_none();
+    let later = if unlimited { MlockAllFlags::FUTURE } else { MlockAllFlags::empty() };
+    Ok(rustix::mm::mlockall(MlockAllFlags::CURRENT | later)?)
+}
+
+/// Takes heap, touches it, and gives it back to the allocator, which keeps blocks of this size for what is asked next.
+fn prefault(bytes: usize) {
+    /// Blocks that the allocator takes from its heap; larger ones it would map, and unmap again.
+    const BLOCK_BYTES: usize = 64 << 10;
+    let mut blocks: Vec<Vec<u8>> = Vec::with_capacity(bytes / BLOCK_BYTES + 1);
+    for _ in 0..bytes.div_ceil(BLOCK_BYTES) {
+        let mut block = vec![0_u8; BLOCK_BYTES];
+        for place in (0..BLOCK_BYTES).step_by(PAGE_BYTES) {
+            block[place] = std::hint::black_box(1);
+        }
+        blocks.push(block);
+    }
+    drop(blocks);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Settings that can be had are in force afterwards; those that cannot are warned of and change nothing.
+    #[test]
+    fn what_is_asked_for_is_in_force_or_warned_of() {
+        // A thread of its own: the settings are a thread's.
+        std::thread::spawn(|| {
+            let all = rustix::thread::sched_getaffinity(None).unwrap();
+            let first = (0..1024).find(|&cpu| all.is_set(cpu)).unwrap();
+            schedule(&StageRealtime { cpus: vec![first as u32], nice: Some(19), ..StageRealtime::default() });
+            let pinned = rustix::thread::sched_getaffinity(None).unwrap();
+            assert_eq!((pinned.count(), pinned.is_set(first)), (1, true));
+            assert_eq!(rustix::process::getpriority_process(None).unwrap(), 19);
+            // No machine has this processor.
+            schedule(&StageRealtime { cpus: vec![1023], fifo_priority: Some(99), ..StageRealtime::default() });
+            assert!(rustix::thread::sched_getaffinity(None).unwrap().is_set(first));
+            settle(&StageRealtime { prefault_mb: 2, ..StageRealtime::default() });
+        })
+        .join()
+        .unwrap();
+    }
+}

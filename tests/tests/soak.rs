@@ -1,0 +1,39 @@
+//! Two minutes of `carff soak` on the shipped graph and checkpoint.
+
+#![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
+
+use carff_tests::{Process, program, project_root, scenario_set, shipped_checkpoint};
+use serde_json::Value;
+use std::process::Command;
+
+/// Under every kind of fault that the time allows the contract holds: no wrong action, every recovery, counters right,
+/// nothing left over. The result has every promised key.
+#[test]
+fn the_graph_survives() {
+    let folder = tempfile::tempdir().unwrap();
+    let json = folder.path().join("soak.json");
+    let mut command = Command::new(program("carff"));
+    command.arg("soak").arg(project_root().join("configs/soak/test.toml"));
+    command.args(["--minutes", "2", "--seed", "1", "--json"]).arg(&json);
+    command.arg("--dataset").arg(scenario_set()).arg("--checkpoint").arg(shipped_checkpoint());
+    let finished = Process::start(command.current_dir(project_root())).end();
+    let evidence = std::fs::read_to_string(folder.path().join("soak.evidence/launcher.log")).unwrap_or_default();
+    assert!(finished.status.success(), "{}:\n{}\n{evidence}", finished.status, finished.text);
+    let result: Value = serde_json::from_str(&std::fs::read_to_string(&json).unwrap()).unwrap();
+    assert_eq!((&result["violations"], &result["leaked_files"]), (&0.into(), &0.into()), "{result:#}");
+    assert!(result["faults_total"].as_u64().unwrap() > 0, "{result:#}");
+    for key in ["kills", "cycles", "worst_recovery_ms", "decisions_judged"] {
+        assert!(result[key].is_number(), "{key}:\n{result:#}");
+    }
+    assert!(result["faults"].is_object() && result.get("rss_growth_percent_per_hour").is_some(), "{result:#}");
+}
+
+/// A wrong soak file is one error that names the file and the key.
+#[test]
+fn a_wrong_soak_file_is_named() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("wrong.toml");
+    std::fs::write(&file, "graph = \"x.toml\"\n[faults]\nkil = 1\n").unwrap();
+    let mut command = Command::new(program("carff"));
+    Process::start(command.arg("soak").arg(&file)).end().assert_one_error(&["wrong.toml", "kil"]);
+}
