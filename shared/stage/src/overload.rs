@@ -259,8 +259,9 @@ mod tests {
     fn what_was_not_seen_was_not_skipped() {
         let mut overload = overload(ALL);
         for frame in 0..40 {
-            overload.last_sequence = overload.last_sequence.map(|last| last + 7);
-            assert_eq!(show(&mut overload, frame * 5, 1, 20), 0);
+            let mut header = Header::of_frame(frame * 5, frame * 500 * MS, 1).at_step(2);
+            header.sequence = frame * 7;
+            assert!(!overload.observe(&Belief::empty(header, 2)));
         }
     }
 
