@@ -286,7 +286,6 @@ fn share(count: &Value) -> String {
 #[cfg(test)]
 pub(crate) mod tests {
     use super::*;
-    use crate::monitor::Records;
 
     /// A decided frame of the first timestamp of a drive, that shows nothing of the place that matters.
     pub(crate) fn frame() -> FrameRecord {
@@ -311,7 +310,9 @@ pub(crate) mod tests {
 
     fn outcome(frames: impl IntoIterator<Item = FrameRecord>) -> RunOutcome {
         let frames = frames.into_iter().enumerate().map(|(i, f)| (i as u64, FrameRecord { frame_id: i as u64, ..f }));
-        RunOutcome { records: Records { frames: frames.collect(), ..Records::default() }, ..RunOutcome::default() }
+        let mut outcome = RunOutcome::default();
+        outcome.records.frames = frames.collect();
+        outcome
     }
 
     /// A run without drives, or of which no posterior was recorded, has no tables, and no model is looked for.

@@ -61,7 +61,9 @@ fn probe(node: &Node, count: u32) -> anyhow::Result<()> {
         if waiter.wait_until(&[&frames, &beliefs, &actions], monotonic_now_ns() + LOOK_NS)? == Woken::Stopped {
             return Ok(());
         }
-        (frames.newest()?, beliefs.newest()?, actions.newest()?);
+        frames.newest()?;
+        beliefs.newest()?;
+        actions.newest()?;
     }
     let held = frames.newest()?;
     while waiter.wait_until(&[], u64::MAX)? != Woken::Stopped {}

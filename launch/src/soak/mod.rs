@@ -297,7 +297,7 @@ impl Soak<'_> {
         match fault.kind {
             Kind::Kill => {
                 let pid = self.pid_of(fault, &pids)?;
-                self.kill(fault.target, pid)?;
+                self.kill(fault.target, pid);
                 self.recover(Some(pid))?;
             }
             Kind::Stop => {
@@ -356,12 +356,11 @@ impl Soak<'_> {
         }
     }
 
-    fn kill(&mut self, target: Option<Stage>, pid: u32) -> anyhow::Result<()> {
+    fn kill(&mut self, target: Option<Stage>, pid: u32) {
         self.excuse(target, self.config.contract.recovery_ms);
         if Victim::new(pid).is_ok_and(|victim| victim.signal(Signal::KILL)) {
             self.outcome.kills += 1;
         }
-        Ok(())
     }
 
     /// What is done to the controller itself is not held against its actions' times.
@@ -500,7 +499,7 @@ impl Soak<'_> {
         let good = std::fs::read(&path)?;
         write_whole(&path, &good[..good.len() / 2])?;
         let pid = pids.get(&stage).copied().context("the stage was never heard")?;
-        self.kill(Some(stage), pid)?;
+        self.kill(Some(stage), pid);
         self.look_for(fault.hold_ms)?;
         write_whole(&path, &good)?;
         self.recover(Some(pid))

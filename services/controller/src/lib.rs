@@ -149,13 +149,11 @@ impl Controller {
         if now_ns >= self.expires_ns() {
             self.standing = None;
         }
-        match &self.standing {
-            Some(standing) => Action { is_decision: 0, ..standing.action },
-            None => {
-                let quiet = if self.settled.is_some() { Reason::StaleBelief } else { Reason::NoBeliefYet };
-                self.safe_action(self.refused.unwrap_or(quiet), now_ns)
-            }
+        if let Some(standing) = &self.standing {
+            return Action { is_decision: 0, ..standing.action };
         }
+        let quiet = if self.settled.is_some() { Reason::StaleBelief } else { Reason::NoBeliefYet };
+        self.safe_action(self.refused.unwrap_or(quiet), now_ns)
     }
 
     /// The last word: the safe action.
