@@ -1,6 +1,6 @@
 //! The soak file: which faults, how often, and what is asked of the graph in between.
 
-use anyhow::{Context, ensure};
+use anyhow::{Context, anyhow, ensure};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 
@@ -159,7 +159,10 @@ impl SoakConfig {
 
     /// The same for a text.
     pub fn parse(text: &str) -> anyhow::Result<Self> {
-        let config: Self = toml::from_str(text)?;
+        let config: Self = toml::from_str(text).map_err(|error| {
+            let before = error.span().and_then(|span| text.get(..span.start)).unwrap_or_default();
+            anyhow!("line {}: {}", before.matches('\n').count() + 1, error.message())
+        })?;
         let (pace, contract) = (&config.pace, &config.contract);
         let sum: u64 = Kind::ALL.iter().map(|&kind| u64::from(config.faults.of(kind))).sum();
         ensure!(sum > 0, "`faults` has no weight above 0: nothing would be tried");
