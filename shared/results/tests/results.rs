@@ -16,72 +16,7 @@ use std::sync::atomic::AtomicBool;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
 /// A block drives along a road, or does not; twelve cameras look down on it, eight stand behind a wall.
-const SCENARIO: &str = r##"
-name = "small"
-bounds_m = [[-4.0, -3.0, 0.0], [4.0, 3.0, 2.0]]
-timestamps = 2
-branches = ["with", "without"]
-hazard_branches = ["with"]
-bev_view = 0
-
-[picture]
-width_px = 64
-height_px = 64
-fov_deg = 50.0
-
-[sun]
-azimuth_deg = 90.0
-elevation_deg = 80.0
-
-[[road]]
-from = [-20.0, 0.0]
-to = [20.0, 0.0]
-width_m = 5.0
-
-[[building]]
-name = "wall"
-min = [-7.0, -3.6]
-max = [1.0, -3.2]
-height_m = 4.0
-walls = "plaster"
-colour = "#a0a0a0"
-
-[[vehicle]]
-name = "ego"
-role = "ego"
-kind = "block"
-colour = "#2030ff"
-size_m = [1.6, 1.0, 1.0]
-
-[[vehicle.course]]
-branches = ["with", "without"]
-poses = [[2.5, -2.0, 0.0], [2.5, 2.0, 0.0]]
-
-[[vehicle]]
-name = "block"
-role = "actor"
-kind = "block"
-colour = "#ff2000"
-size_m = [2.0, 1.2, 1.2]
-dynamic = true
-
-[[vehicle.course]]
-branches = ["with"]
-poses = [[-2.5, 1.0, 0.0], [-0.5, -1.0, 0.0]]
-
-[[overhead]]
-view_kind = "bev"
-count = 12
-center = [0.0, 0.0]
-height_m = 9.0
-spread_m = 2.0
-
-[[street]]
-view_kind = "street"
-count = 8
-region = [[-4.0, -6.5, 0.7], [-1.5, -5.0, 1.4]]
-look_at = [[-2.5, 0.0, 0.5], [-1.5, 1.0, 0.7]]
-"##;
+const SCENARIO: &str = include_str!("../../../tests/data/small-scenario.toml");
 
 /// Nets so small that they are trained in seconds, and a little.
 const TRAINING: &str = r#"

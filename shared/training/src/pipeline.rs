@@ -69,25 +69,7 @@ pub fn train(
     };
     let mut metrics = json!({"vae": vae::evaluate(config, &pictures, &vae, &posteriors[0], true)?});
     let clouds = Clouds::new(&pictures, &posteriors[0])?;
-    let mut manifest = Manifest {
-        format_version: FORMAT_VERSION,
-        scenario: ScenarioIdentity::of(&pictures.scenario, pictures.dataset.view_count()),
-        seed: config.seed,
-        split: SplitRecord {
-            seed: config.split_seed,
-            unseen: pictures.split.views(PoseRole::Unseen),
-            calibration: pictures.split.views(PoseRole::Calibration),
-        },
-        encoder: config.encoder.clone(),
-        decoder: config.decoder.clone(),
-        mixture: config.mixture.clone(),
-        field: None,
-        states: clouds.states(),
-        places: places(&pictures),
-        probing: None,
-        training: serde_json::to_value(config).unwrap_or(Value::Null),
-        metrics: Value::Null,
-    };
+    let mut manifest = Manifest { places: places(&pictures), ..begun(config, &pictures, clouds.states()) };
     write_vae(config, &vae, out)?;
 
     // The mixture density network before the field: it is quick, and needs the posteriors alone.
@@ -179,23 +161,9 @@ fn field_alone(
     }
     write_strip(run, "views.png", &strip)?;
     let manifest = Manifest {
-        format_version: FORMAT_VERSION,
-        scenario: ScenarioIdentity::of(&pictures.scenario, pictures.dataset.view_count()),
-        seed: config.seed,
-        split: SplitRecord {
-            seed: config.split_seed,
-            unseen: pictures.split.views(PoseRole::Unseen),
-            calibration: pictures.split.views(PoseRole::Calibration),
-        },
-        encoder: config.encoder.clone(),
-        decoder: config.decoder.clone(),
-        mixture: config.mixture.clone(),
         field: Some(field.config().clone()),
-        states: vec![only],
-        places: Vec::new(),
-        probing: None,
-        training: serde_json::to_value(config).unwrap_or(Value::Null),
         metrics: json!({"views": metrics}),
+        ..begun(config, pictures, vec![only])
     };
     manifest.save(out)?;
     run.metric(&json!({"stage": "done", "metrics": manifest.metrics}))?;
@@ -233,6 +201,29 @@ fn finished(
             Err(TrainingError::Unfit(format!("stage {stage} stopped at {done} of {total}: finish it first")))
         }
         None => Err(TrainingError::Unfit(format!("stage {stage} is not trained yet: run it first"))),
+    }
+}
+
+/// What the manifest says before anything is trained but the states' latents.
+fn begun(config: &TrainingConfig, pictures: &Pictures, states: Vec<LatentGaussian>) -> Manifest {
+    Manifest {
+        format_version: FORMAT_VERSION,
+        scenario: ScenarioIdentity::of(&pictures.scenario, pictures.dataset.view_count()),
+        seed: config.seed,
+        split: SplitRecord {
+            seed: config.split_seed,
+            unseen: pictures.split.views(PoseRole::Unseen),
+            calibration: pictures.split.views(PoseRole::Calibration),
+        },
+        encoder: config.encoder.clone(),
+        decoder: config.decoder.clone(),
+        mixture: config.mixture.clone(),
+        field: None,
+        states,
+        places: Vec::new(),
+        probing: None,
+        training: serde_json::to_value(config).unwrap_or(Value::Null),
+        metrics: Value::Null,
     }
 }
 
