@@ -30,7 +30,10 @@ pub struct AblateArgs {
 
 fn variant(name: &str) -> Result<Variant, String> {
     let names = || Variant::ALL.map(Variant::name).join(", ");
-    Variant::ALL.into_iter().find(|v| v.name() == name).ok_or_else(|| format!("one of {} is wanted", names()))
+    Variant::ALL.into_iter().find(|v| v.name() == name).ok_or_else(|| {
+        let hint = carff_nearest::hint(name, Variant::ALL.map(Variant::name));
+        format!("one of {} is wanted{hint}", names())
+    })
 }
 
 /// Runs the command.

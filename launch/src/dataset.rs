@@ -12,6 +12,8 @@ use indicatif::{ProgressBar, ProgressStyle};
 #[derive(Debug, clap::Subcommand)]
 pub enum DatasetCommand {
     /// Render a scenario into a posed data set.
+    #[command(after_help = "Example: freely drawn cameras
+  carff dataset render approaching-intersection --free-poses 50 --seed 3 --out data/free")]
     Render {
         /// A scenario file, or the name of one in configs/scenarios.
         scenario: PathBuf,
@@ -29,6 +31,8 @@ pub enum DatasetCommand {
         seed: u64,
     },
     /// Turn a plain set, as nerfstudio and instant-ngp write them, into a set of one state.
+    #[command(after_help = "Example: a set whose middle metres matter
+  carff dataset import path/to/set --out data/mine --bounds -2,-2,0,2,2,2")]
     Import {
         /// Folder of the set: one `transforms.json` or three (`transforms_train.json` and so on), and PNG or JPEG pictures.
         dir: PathBuf,
@@ -43,6 +47,8 @@ pub enum DatasetCommand {
         bounds: Option<[[f64; 3]; 2]>,
     },
     /// Check a data set and print its statistics.
+    #[command(after_help = "Example: with a picture of all its pictures
+  carff dataset check data/approaching-intersection --contact-sheet reports/contact.png")]
     Check {
         /// Folder of the set.
         dir: PathBuf,
@@ -111,7 +117,8 @@ fn find_scenario(scenario: &Path) -> anyhow::Result<PathBuf> {
     if named.is_file() {
         return Ok(named);
     }
-    bail!("no scenario {}: there is no such file, nor {}", scenario.display(), named.display());
+    let hint = carff_nearest::beside(&named);
+    bail!("no scenario {}: there is no such file, nor {}{hint}", scenario.display(), named.display());
 }
 
 /// Renders a set, with a progress bar. Returns the number of pictures.

@@ -6,7 +6,6 @@ use crate::monitor::{FrameRecord, Monitor};
 use crate::planning::{self, Planning};
 use crate::process::StageProcess;
 use crate::report::{self, RunOutcome};
-use crate::run_record::RunRecord;
 use crate::supervise::{RestartBudget, Verdict};
 use crate::terminal::Terminal;
 use anyhow::{Context, anyhow, bail, ensure};
@@ -14,6 +13,7 @@ use carff_checkpoint::{Manifest, ScenarioIdentity};
 use carff_config::{CameraSource, GraphConfig, RestartPolicy, WhenLost};
 use carff_dataset::Dataset;
 use carff_messages::{ActionCode, Stage};
+use carff_observe::RunRecord;
 use carff_scenes::{Extras, Scenario};
 use carff_stage::StageArgs;
 use carff_transport::{
@@ -21,10 +21,11 @@ use carff_transport::{
     runtime_dir, topics,
 };
 use serde_json::Value;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::process::{ExitCode, ExitStatus};
 use std::sync::Arc;
+use std::thread::JoinHandle;
 use std::time::{Duration, SystemTime};
 
 /// Stages in the order of their start: those that listen before those that speak, the camera last.
@@ -43,9 +44,9 @@ const QUIET_FRAMES: f64 = 3.0;
 /// How long processes of an earlier, killed launch may take to end.
 const ORPHAN_PATIENCE_NS: u64 = 2_000_000_000;
 /// Exit code after Ctrl-C, as shells have it: 128 and the signal's number.
-const INTERRUPTED: u8 = 130;
+pub(crate) const INTERRUPTED: u8 = 130;
 /// Bytes of a frame that are reckoned with when shared memory is checked, before the pictures are known.
-const FRAME_BYTES: usize = 1 << 17;
+pub(crate) const FRAME_BYTES: usize = 1 << 17;
 
 /// Start a graph.
 #[derive(Clone, Debug, clap::Args)]
@@ -75,29 +76,84 @@ pub struct LaunchArgs {
     pub stages: Option<PathBuf>,
 }
 
+/// Something that takes the camera's place.
+pub(crate) struct Feed {
+    /// Stages that are not started, the camera among them: what they would send comes from the feed.
+    pub(crate) without: BTreeSet<Stage>,
+    /// Called on a thread of its own once all others are ready; the run ends when it returns.
+    pub(crate) run: FeedRun,
+}
+
+/// What a feed does in a run, until it is done or told to stop.
+pub(crate) type FeedRun = Box<dyn FnOnce(&Run, &Stop) -> anyhow::Result<()> + Send>;
+
 /// Launches, and ends when the camera has done its work (exit code 0), on Ctrl-C (130), or with an error when a stage
 /// is lost.
 pub fn run(args: &LaunchArgs) -> anyhow::Result<ExitCode> {
-    let graph = GraphConfig::load(&args.graph)?;
     let terminal = Arc::new(Terminal::new());
+    let (ended, outcome) = run_graph(args, None, &terminal)?;
+    if ended == Ended::Interrupted {
+        terminal.log("interrupted: all stages have ended");
+        return Ok(ExitCode::from(INTERRUPTED));
+    }
+    report(args, &Arc::new(outcome), &terminal)
+}
+
+/// The report of a run that came to its end.
+fn report(args: &LaunchArgs, outcome: &Arc<RunOutcome>, terminal: &Terminal) -> anyhow::Result<ExitCode> {
+    let stop = Stop::on_signals().context("cannot handle signals")?;
+    let planning = evaluate(outcome, &stop, terminal)?;
+    if stop.is_stopped() {
+        return Ok(ExitCode::from(INTERRUPTED));
+    }
+    let report = report::json(outcome, planning.as_ref().map(Planning::tables).unwrap_or_default());
+    let text = format!("{}\n{}", summary(&report), planning::text(&report));
+    terminal.line(&text);
+    if let Some(path) = &args.report {
+        write(path, &(serde_json::to_string_pretty(&report)? + "\n"))?;
+        let page = path.with_extension("txt");
+        write(&page, &text)?;
+        terminal.line(&format!("report: {}\nJSON: {}", page.display(), path.display()));
+        if let Some(planning) = &planning {
+            let strip = path.with_extension("png");
+            planning.write_filmstrip(&strip)?;
+            terminal.line(&format!("filmstrip: {}", strip.display()));
+        }
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+/// Starts a graph, and watches it to its end.
+pub(crate) fn run_graph(
+    args: &LaunchArgs,
+    feed: Option<Feed>,
+    terminal: &Arc<Terminal>,
+) -> anyhow::Result<(Ended, RunOutcome)> {
+    let graph = GraphConfig::load(&args.graph)?;
     for warning in graph.warnings() {
         terminal.log(&format!("warning: {}: {warning}", args.graph.display()));
     }
     let name = args.run.clone().unwrap_or_else(|| graph.run.name.clone());
     let run = Run::new(&name, run_id_of(&name, monotonic_now_ns()))?;
+    let dataset = graph.resolve(args.dataset.as_ref().unwrap_or(&graph.run.dataset));
+    let checkpoint = graph.resolve(args.checkpoint.as_ref().unwrap_or(&graph.run.checkpoint));
+    let absolute = |path: &Path| std::path::absolute(path).map(|p| p.display().to_string());
     let record = RunRecord {
         pid: std::process::id(),
         run_id: run.id(),
-        graph: args.graph.display().to_string(),
+        graph: absolute(&args.graph)?,
+        dataset: absolute(&dataset)?,
+        checkpoint: absolute(&checkpoint)?,
         started_unix_s: SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default().as_secs(),
     };
     let _lock = RunLock::take(&runtime_dir(), &name, &record)?;
     sweep(&run)?;
 
-    let dataset = graph.resolve(args.dataset.as_ref().unwrap_or(&graph.run.dataset));
-    let checkpoint = graph.resolve(args.checkpoint.as_ref().unwrap_or(&graph.run.checkpoint));
-    provide_dataset(&graph, args, &dataset)?;
-    refuse_another_scenario(&graph, &dataset, &checkpoint)?;
+    // A feed brings its own pictures.
+    if feed.is_none() {
+        provide_dataset(&graph, args, &dataset)?;
+        refuse_another_scenario(&graph, &dataset, &checkpoint)?;
+    }
     // From here on Ctrl-C is an orderly end; until here it may simply end the process, as no stage runs yet.
     let stop = Stop::on_signals().context("cannot handle signals")?;
     let view_bytes = (graph.renderer.width_px * graph.renderer.height_px * 3) as usize;
@@ -125,11 +181,12 @@ pub fn run(args: &LaunchArgs) -> anyhow::Result<ExitCode> {
             folder,
             drives: args.drives.unwrap_or(graph.camera.drives),
             terminal: terminal.clone(),
+            feed: None,
             watched_ns: monotonic_now_ns(),
             cleanup_ns: monotonic_now_ns(),
             lost: None,
         };
-        let result = launcher.drive();
+        let result = launcher.drive(&run, &stop, feed);
         terminal.status(String::new());
         launcher.shut_down();
         result.map(|ended| {
@@ -148,31 +205,7 @@ pub fn run(args: &LaunchArgs) -> anyhow::Result<ExitCode> {
     };
     // All stages are dead and reaped, and the lock is held: whatever is left is nobody's.
     remove_run_leftovers(&run)?;
-    let (ended, outcome) = result?;
-    if ended == Ended::Interrupted {
-        terminal.log("interrupted: all stages have ended");
-        return Ok(ExitCode::from(INTERRUPTED));
-    }
-    let outcome = Arc::new(outcome);
-    let planning = evaluate(&outcome, &stop, &terminal)?;
-    if stop.is_stopped() {
-        return Ok(ExitCode::from(INTERRUPTED));
-    }
-    let report = report::json(&outcome, planning.as_ref().map(Planning::tables).unwrap_or_default());
-    let text = format!("{}\n{}", summary(&report), planning::text(&report));
-    terminal.line(&text);
-    if let Some(path) = &args.report {
-        write(path, &(serde_json::to_string_pretty(&report)? + "\n"))?;
-        let page = path.with_extension("txt");
-        write(&page, &text)?;
-        terminal.line(&format!("report: {}\nJSON: {}", page.display(), path.display()));
-        if let Some(planning) = &planning {
-            let strip = path.with_extension("png");
-            planning.write_filmstrip(&strip)?;
-            terminal.line(&format!("filmstrip: {}", strip.display()));
-        }
-    }
-    Ok(ExitCode::SUCCESS)
+    result
 }
 
 /// The planning tables (none for a run without drives), computed on a thread of their own, so that Ctrl-C still ends the
@@ -195,8 +228,8 @@ fn evaluate(outcome: &Arc<RunOutcome>, stop: &Stop, terminal: &Terminal) -> anyh
 
 /// How a run ended that did not fail.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Ended {
-    /// The camera has shown everything.
+pub(crate) enum Ended {
+    /// The camera, or what takes its place, has shown everything.
     Done,
     /// Somebody asked for it.
     Interrupted,
@@ -222,6 +255,8 @@ struct Launcher<'a> {
     folder: PathBuf,
     drives: u32,
     terminal: Arc<Terminal>,
+    /// What takes the camera's place, once it has begun.
+    feed: Option<JoinHandle<anyhow::Result<()>>>,
     /// When the stages were last looked at.
     watched_ns: u64,
     /// When what the dead left is looked for next.
@@ -232,15 +267,24 @@ struct Launcher<'a> {
 
 impl Launcher<'_> {
     /// Starts everything and watches it to its end.
-    fn drive(&mut self) -> anyhow::Result<Ended> {
+    fn drive(&mut self, run: &Run, stop: &Stop, feed: Option<Feed>) -> anyhow::Result<Ended> {
         let (camera, listeners) = START_ORDER.split_last().context("there are stages")?;
-        for &stage in listeners {
+        let wanted = |stage: &Stage| feed.as_ref().is_none_or(|feed| !feed.without.contains(stage));
+        let listeners: Vec<Stage> = listeners.iter().copied().filter(wanted).collect();
+        for &stage in &listeners {
             self.start(stage)?;
         }
-        if self.until_ready(listeners)? == Ended::Interrupted {
+        if self.until_ready(&listeners)? == Ended::Interrupted {
             return Ok(Ended::Interrupted);
         }
-        self.start(*camera)?;
+        match feed {
+            None => self.start(*camera)?,
+            Some(feed) => {
+                let (run, stop) = (run.clone(), stop.clone());
+                let thread = std::thread::Builder::new().name("feed".into());
+                self.feed = Some(thread.spawn(move || (feed.run)(&run, &stop)).context("cannot start the feed")?);
+            }
+        }
         loop {
             if self.step()? == Woken::Stopped {
                 return match self.lost.take() {
@@ -248,11 +292,22 @@ impl Launcher<'_> {
                     None => Ok(Ended::Interrupted),
                 };
             }
-            if self.watch()? {
+            if self.watch()? || self.is_fed()? {
                 self.collect()?;
                 return Ok(Ended::Done);
             }
             self.show_status();
+        }
+    }
+
+    /// Whether what takes the camera's place has come to its end.
+    fn is_fed(&mut self) -> anyhow::Result<bool> {
+        match self.feed.take_if(|feed| feed.is_finished()) {
+            None => Ok(false),
+            Some(feed) => {
+                feed.join().map_err(|_| anyhow!("the feed broke off"))??;
+                Ok(true)
+            }
         }
     }
 
@@ -453,6 +508,13 @@ impl Launcher<'_> {
 
     /// Ends the stages, the camera first, each within the time limit; kills what does not end.
     fn shut_down(&mut self) {
+        // Whatever ended the run, the feed is told by the same stop; it leaves the run before the stages do.
+        if let Some(feed) = self.feed.take() {
+            self.waiter.stop().stop();
+            if let Ok(Err(error)) = feed.join() {
+                self.terminal.log(&format!("[launcher] {}", carff_stage::describe(&error)));
+            }
+        }
         let limit = Duration::from_millis(self.graph.launcher.stop_timeout_ms);
         let deadline_ns = monotonic_now_ns() + limit.as_nanos() as u64;
         // In the order of the data's way: who speaks before who listens.
@@ -518,8 +580,9 @@ fn provide_dataset(graph: &GraphConfig, args: &LaunchArgs, dataset: &Path) -> an
             crate::dataset::render(&Scenario::load(&scenario)?, dataset, Extras::None).map(drop)
         }
         _ => bail!(
-            "data set {} is missing: give --dataset, or name its scenario in the graph file (`run.scenario`)",
-            dataset.display()
+            "data set {} is missing: give --dataset, or name its scenario in the graph file (`run.scenario`){}",
+            dataset.display(),
+            carff_nearest::beside(dataset)
         ),
     }
 }

@@ -2,18 +2,29 @@
 //! What the stages compute lives in the stages.
 
 pub mod ablate;
+pub mod bridge;
 pub mod dataset;
+pub mod doctor;
 pub mod eval;
+pub mod export;
 mod filmstrip;
 pub mod health;
 pub mod launch;
 pub mod lock;
+pub mod metrics;
 pub mod monitor;
 pub mod planning;
+pub mod probe;
 mod process;
+pub mod record;
+pub mod replay;
 pub mod report;
-pub mod run_record;
+pub mod schema;
+pub mod shell;
 pub mod soak;
+mod spans;
 pub mod supervise;
 pub mod terminal;
 pub mod train;
+pub mod view;
+mod vitals;

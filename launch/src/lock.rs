@@ -1,7 +1,7 @@
 //! One launcher for a run: a locked file that says who.
 
-use crate::run_record::RunRecord;
 use anyhow::{Context, bail};
+use carff_observe::RunRecord;
 use rustix::fs::{FlockOperation, flock};
 use std::fs::{File, OpenOptions};
 use std::io::Write;
@@ -24,7 +24,7 @@ impl RunLock {
                 .create(folder)
                 .with_context(|| format!("cannot make the folder {}", folder.display()))?;
         }
-        let path = folder.join(format!("{run}.run"));
+        let path = RunRecord::path(folder, run);
         loop {
             let mut file = OpenOptions::new()
                 .read(true)
@@ -72,7 +72,14 @@ mod tests {
     #[test]
     fn one_launcher_for_a_run() {
         let folder = tempfile::tempdir().unwrap();
-        let record = RunRecord { pid: 4711, run_id: 1, graph: "g.toml".into(), started_unix_s: 0 };
+        let record = RunRecord {
+            pid: 4711,
+            run_id: 1,
+            graph: "g.toml".into(),
+            dataset: "d".into(),
+            checkpoint: "c".into(),
+            started_unix_s: 0,
+        };
         let held = RunLock::take(folder.path(), "a", &record).unwrap();
         let error = RunLock::take(folder.path(), "a", &record).unwrap_err().to_string();
         assert!(

@@ -1,18 +1,44 @@
 //! The `carff` command.
 
 use carff::ablate::AblateArgs;
+use carff::bridge::BridgeArgs;
 use carff::dataset::DatasetCommand;
+use carff::doctor::DoctorArgs;
 use carff::eval::EvalArgs;
+use carff::export::ExportArgs;
 use carff::launch::LaunchArgs;
+use carff::metrics::MetricsArgs;
+use carff::probe::ProbeCommand;
+use carff::record::RecordArgs;
+use carff::replay::ReplayArgs;
+use carff::schema::SchemaArgs;
+use carff::shell::{CompletionsArgs, ManArgs};
 use carff::soak::{InjectArgs, SoakArgs};
 use carff::train::TrainArgs;
+use carff::view::ViewArgs;
 use carff_bench::BenchCommand;
-use clap::{Parser, Subcommand};
+use clap::{CommandFactory, Parser, Subcommand};
 use std::process::ExitCode;
+
+/// What every command has in common.
+const ENDS: &str = "\
+Example: what is in the way of a graph, then start it
+  carff doctor configs/graphs/approaching-intersection.toml
+  carff launch configs/graphs/approaching-intersection.toml
+
+Exit codes:
+    0  done
+    1  an error, told in one sentence
+       (doctor: something keeps a graph from running; soak: the contract was broken)
+    2  wrong arguments
+  130  interrupted (Ctrl-C)
+
+Environment:
+  NO_COLOR  no colours, wherever the output goes";
 
 /// CARFF: from a camera image to a driving decision, in separate processes.
 #[derive(Debug, Parser)]
-#[command(version)]
+#[command(version, after_help = ENDS)]
 struct Cli {
     #[command(subcommand)]
     command: Command,
@@ -21,35 +47,130 @@ struct Cli {
 #[derive(Debug, Subcommand)]
 enum Command {
     /// Start a graph, show its decisions, and end with a report.
+    #[command(after_help = "Example: two drives, with a report
+  carff launch configs/graphs/approaching-intersection.toml --drives 2 --report reports/run.json")]
     Launch(LaunchArgs),
+    /// Look at a running graph from another terminal.
+    #[command(
+        subcommand,
+        after_help = "Example: what runs, and how each stage does
+  carff probe list
+  carff probe top"
+    )]
+    Probe(ProbeCommand),
+    /// Open the live window: each hypothesis from any camera.
+    #[command(after_help = "Example: on the run that lives, or on a checkpoint alone
+  carff view
+  carff view --checkpoint configs/checkpoints/approaching-intersection")]
+    View(ViewArgs),
+    /// Record a running graph into an MCAP file.
+    #[command(
+        after_help = "Example: a minute of everything; actions and beliefs alone, in files of 10 minutes of which 6 are kept
+  carff record -o run.mcap --seconds 60
+  carff record belief action -o drive.mcap --file-seconds 600 --keep 6"
+    )]
+    Record(RecordArgs),
+    /// Send a recording through a graph again, and compare.
+    #[command(after_help = "Example: is everything still decided as it was? And at half the speed, to look at
+  carff replay run.mcap --verify
+  carff replay run.mcap --rate 0.5
+
+Exit code: 1 when --verify finds a difference.")]
+    Replay(ReplayArgs),
+    /// Make pictures, tables, a film, or a trace of a recording.
+    #[command(after_help = "Example:
+  carff export run.mcap --png pictures --csv tables --trace trace.json")]
+    Export(ExportArgs),
+    /// Serve a run's topics over the Foxglove WebSocket protocol, read-only, on this machine alone.
+    #[command(
+        after_help = "Example: on the vehicle, and through a tunnel to the desk, where Foxglove opens ws://localhost:8765
+  carff bridge
+  ssh -L 8765:localhost:8765 vehicle"
+    )]
+    Bridge(BridgeArgs),
+    /// Serve a run's numbers over HTTP, for Prometheus, on this machine alone.
+    #[command(after_help = "Example:
+  carff metrics --listen 127.0.0.1:9464
+  curl http://127.0.0.1:9464/metrics
+  carff metrics --once")]
+    Metrics(MetricsArgs),
     /// Render and check data sets.
-    #[command(subcommand)]
+    #[command(
+        subcommand,
+        after_help = "Example: pictures of a scenario, and a look at them
+  carff dataset render approaching-intersection --out data/approaching-intersection
+  carff dataset check data/approaching-intersection --contact-sheet reports/contact.png"
+    )]
     Dataset(DatasetCommand),
     /// Train a scenario's models; goes on where an earlier run stopped.
+    #[command(after_help = "Example: the models that ship, into a folder of your own
+  carff train configs/training/approaching-intersection.toml --out runs/mine/checkpoint --run-dir runs/mine")]
     Train(TrainArgs),
     /// Judge a checkpoint: every table and picture, as JSON and one page.
+    #[command(after_help = "Example: the planning table alone
+  carff eval configs/checkpoints/approaching-intersection --only planning --out reports/results")]
     Eval(EvalArgs),
     /// Train the encoder with one thing changed at a time, and tabulate; goes on where an earlier run stopped.
+    #[command(after_help = "Example: two of the variants
+  carff ablate configs/training/approaching-intersection-ablation.toml --only full --only stem --out reports/ablation")]
     Ablate(AblateArgs),
     /// Measure the program's parts, and the whole loop, on this machine.
-    #[command(subcommand)]
+    #[command(
+        subcommand,
+        after_help = "Example: from camera to action, in a minute
+  carff bench loop --quick"
+    )]
     Bench(BenchCommand),
     /// Run a graph under a seeded schedule of faults, and hold it to its contract.
+    #[command(after_help = "Example: ten minutes of every kind of fault
+  carff soak configs/soak/all.toml --minutes 10 --seed 7 --json reports/soak.json")]
     Soak(SoakArgs),
     /// One fault from outside, for a soak.
     #[command(hide = true)]
     SoakInject(InjectArgs),
+    /// Look at the machine, and at a graph: what will go wrong, what it means, and what to do.
+    #[command(after_help = "Example: the machine, and all that a graph needs
+  carff doctor configs/graphs/approaching-intersection.toml
+  carff doctor --json
+
+Exit code: 1 when there is an error among the findings, else 0.")]
+    Doctor(DoctorArgs),
+    /// Print the JSON Schema of a kind of file, for editors.
+    #[command(after_help = "Example: as it lies in configs/schemas
+  carff schema graph > graph.schema.json
+
+A TOML file names its schema in its first line, for editors that know taplo: #:schema ../schemas/graph.schema.json")]
+    Schema(SchemaArgs),
+    /// Print a shell's completions of this command.
+    #[command(after_help = "Example: for bash, from the next login on
+  carff completions bash > ~/.local/share/bash-completion/completions/carff")]
+    Completions(CompletionsArgs),
+    /// Write this command's man pages.
+    #[command(after_help = "Example: where man finds them
+  carff man ~/.local/share/man/man1")]
+    Man(ManArgs),
 }
 
 fn main() -> ExitCode {
     let result = match Cli::parse().command {
         Command::Launch(args) => carff::launch::run(&args),
+        Command::Probe(command) => carff::probe::run(&command),
+        Command::View(args) => carff::view::run(&args),
+        Command::Record(args) => carff::record::run(&args),
+        Command::Replay(args) => carff::replay::run(&args),
+        Command::Export(args) => carff::export::run(&args),
+        Command::Bridge(args) => carff::bridge::run(&args),
+        Command::Metrics(args) => carff::metrics::run(&args),
         Command::Train(args) => carff::train::run(&args),
         Command::Eval(args) => carff::eval::run(&args),
         Command::Ablate(args) => carff::ablate::run(&args),
         Command::Bench(command) => carff_bench::run(command),
         Command::Soak(args) => carff::soak::run(&args),
         Command::SoakInject(args) => carff::soak::inject(&args).map(|()| ExitCode::SUCCESS),
+        Command::Doctor(args) => carff::doctor::run(&args),
+        Command::Schema(args) => carff::schema::run(&args).map(|()| ExitCode::SUCCESS),
+        Command::Completions(args) => carff::shell::completions(&args, Cli::command()).map(|()| ExitCode::SUCCESS),
+        Command::Man(args) => carff::shell::man(&args, Cli::command()).map(|()| ExitCode::SUCCESS),
         Command::Dataset(command) => carff::dataset::run(command).map(|()| ExitCode::SUCCESS),
     };
     match result {
@@ -58,5 +179,92 @@ fn main() -> ExitCode {
             eprintln!("error: {}", carff_stage::describe(&error));
             ExitCode::FAILURE
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// All commands that a user sees, with those below them.
+    fn all(command: &clap::Command, found: &mut Vec<clap::Command>) {
+        found.push(command.clone());
+        command.get_subcommands().filter(|c| !c.is_hide_set() && c.get_name() != "help").for_each(|c| all(c, found));
+    }
+
+    /// Each command's help ends with an example, each line of which is a command line that is understood.
+    #[test]
+    fn every_help_has_examples_that_parse() {
+        let mut commands = Vec::new();
+        all(&Cli::command(), &mut commands);
+        assert!(commands.len() > 15, "{}", commands.len());
+        for command in commands {
+            let help = command.get_after_help().map(ToString::to_string).unwrap_or_default();
+            assert!(help.starts_with("Example"), "`{}` has no example", command.get_name());
+            let mut lines = 0;
+            for line in help.lines().filter(|line| line.starts_with("  carff ")) {
+                let words = line.split_whitespace().take_while(|word| !["|", ">"].contains(word));
+                let parsed = Cli::try_parse_from(words);
+                assert!(parsed.is_ok(), "{line}: {}", parsed.err().map(|e| e.to_string()).unwrap_or_default());
+                lines += 1;
+            }
+            assert!(lines > 0, "no example of `{}` is a command line", command.get_name());
+        }
+    }
+
+    /// Every command line in a block of the book and the other pages is understood.
+    #[test]
+    fn commands_in_the_book_parse() {
+        let root = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
+        let mut lines = 0;
+        for folder in ["", "docs", "docs/book/src"] {
+            for entry in std::fs::read_dir(root.join(folder)).unwrap() {
+                let path = entry.unwrap().path();
+                if path.extension().is_none_or(|e| e != "md") {
+                    continue;
+                }
+                let text = std::fs::read_to_string(&path).unwrap();
+                for line in text.split("```").skip(1).step_by(2).flat_map(str::lines) {
+                    let line = line.trim_start_matches("target/release/").trim_start_matches("bin/");
+                    if !line.starts_with("carff ") {
+                        continue;
+                    }
+                    // A second terminal's column stands far to the right.
+                    let line = line.split("     ").next().unwrap_or(line);
+                    let words = line.split_whitespace().take_while(|word| !["|", ">", "&", "#"].contains(word));
+                    let shown = |e: &clap::Error| e.kind() == clap::error::ErrorKind::DisplayHelp;
+                    if let Err(error) = Cli::try_parse_from(words)
+                        && !shown(&error)
+                    {
+                        panic!("{}: {line}: {error}", path.display());
+                    }
+                    lines += 1;
+                }
+            }
+        }
+        assert!(lines > 30, "{lines}");
+    }
+
+    /// The graph file that the book deploys is valid, without a warning.
+    #[test]
+    fn the_graph_in_the_book_is_valid() {
+        let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../docs/book/src/vehicle.toml");
+        let graph = carff_config::GraphConfig::load(&path).unwrap();
+        assert_eq!(graph.warnings(), Vec::<String>::new());
+    }
+
+    /// The description is sound (names and shortcuts do not clash), and its completions and pages can be made.
+    #[test]
+    fn completions_and_pages() {
+        Cli::command().debug_assert();
+        for shell in <clap_complete::Shell as clap::ValueEnum>::value_variants() {
+            let mut script = Vec::new();
+            clap_complete::generate(*shell, &mut Cli::command(), "carff", &mut script);
+            assert!(String::from_utf8_lossy(&script).contains("doctor"), "{shell}");
+        }
+        let folder = tempfile::tempdir().unwrap();
+        carff::shell::man(&ManArgs { dir: folder.path().join("man1") }, Cli::command()).unwrap();
+        let page = std::fs::read_to_string(folder.path().join("man1/carff-launch.1")).unwrap();
+        assert!(page.contains("carff launch configs/graphs"), "{page}");
     }
 }

@@ -1,11 +1,12 @@
 //! The soak file: which faults, how often, and what is asked of the graph in between.
 
 use anyhow::{Context, anyhow, ensure};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 
 /// A soak: a graph, the faults that are done to it, and its contract.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct SoakConfig {
     /// The graph file.
@@ -23,7 +24,7 @@ pub struct SoakConfig {
 macro_rules! weights {
     ($($(#[$doc:meta])* $field:ident => $kind:ident),+ $(,)?) => {
         /// How often each kind of fault comes, relative to the others.
-        #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+        #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
         #[serde(deny_unknown_fields, default)]
         pub struct Weights { $($(#[$doc])* pub $field: u32),+ }
 
@@ -90,7 +91,7 @@ weights! {
 }
 
 /// When faults come.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Pace {
     /// Shortest pause between a recovery and the next fault, milliseconds, 0 to 600000. Default 300.
@@ -109,7 +110,7 @@ impl Default for Pace {
 }
 
 /// What is asked of the graph. Times in which the soak itself got no processor are left out of account.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Contract {
     /// From the end of a fault until all stages are well and a decision has been made, milliseconds, 100 to 600000.
@@ -152,8 +153,9 @@ impl Default for Contract {
 impl SoakConfig {
     /// Reads and checks a soak file.
     pub fn load(path: &Path) -> anyhow::Result<Self> {
-        let text =
-            std::fs::read_to_string(path).with_context(|| format!("cannot read the soak file {}", path.display()))?;
+        let text = std::fs::read_to_string(path).map_err(|error| {
+            anyhow!("cannot read the soak file {}: {error}{}", path.display(), carff_nearest::beside(path))
+        })?;
         Self::parse(&text).with_context(|| format!("wrong soak file {}", path.display()))
     }
 
@@ -161,7 +163,8 @@ impl SoakConfig {
     pub fn parse(text: &str) -> anyhow::Result<Self> {
         let config: Self = toml::from_str(text).map_err(|error| {
             let before = error.span().and_then(|span| text.get(..span.start)).unwrap_or_default();
-            anyhow!("line {}: {}", before.matches('\n').count() + 1, error.message())
+            let message = carff_nearest::explained(error.message());
+            anyhow!("line {}: {message}", before.matches('\n').count() + 1)
         })?;
         let (pace, contract) = (&config.pace, &config.contract);
         let sum: u64 = Kind::ALL.iter().map(|&kind| u64::from(config.faults.of(kind))).sum();

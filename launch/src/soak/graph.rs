@@ -2,10 +2,10 @@
 
 use super::config::SoakConfig;
 use super::patience::Patience;
-use crate::run_record::RunRecord;
 use anyhow::{Context, bail, ensure};
 use carff_config::{GraphConfig, LogLevel, RestartPolicy};
 use carff_messages::Stage;
+use carff_observe::RunRecord;
 use carff_transport::{Run, living_processes, runtime_dir};
 use rustix::process::{Pid, PidfdFlags, Signal, pidfd_open, pidfd_send_signal};
 use std::collections::BTreeMap;

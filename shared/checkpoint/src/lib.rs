@@ -26,7 +26,10 @@ const MAX_MANIFEST_BYTES: u64 = 16 << 20;
 #[derive(Debug, thiserror::Error)]
 pub enum CheckpointError {
     /// A file could not be read or written.
-    #[error("checkpoint {path}: {source}; train it with `carff train`, or name another with --checkpoint")]
+    #[error(
+        "checkpoint {path}: {source}; train it with `carff train`, or name another with --checkpoint{}",
+        carff_nearest::beside(path)
+    )]
     File {
         /// Which file.
         path: PathBuf,

@@ -7,7 +7,7 @@ use toml::de::{DeTable, DeValue};
 #[derive(Debug, thiserror::Error)]
 pub enum ConfigError {
     /// The file cannot be read.
-    #[error("cannot read the graph file {path}: {source}")]
+    #[error("cannot read the graph file {path}: {source}{}", carff_nearest::beside(path))]
     Read {
         /// Which file.
         path: PathBuf,
@@ -52,7 +52,7 @@ impl Source<'_> {
     pub(crate) fn syntax(&self, error: &toml::de::Error) -> ConfigError {
         let offset = error.span().map_or(0, |span| span.start);
         // The message's first line says what; the rest repeats the place, which is said in front already.
-        let message = error.message().lines().collect::<Vec<_>>().join(", ");
+        let message = carff_nearest::explained(&error.message().lines().collect::<Vec<_>>().join(", "));
         ConfigError::Syntax { path: self.path.into(), line: self.line(offset), key: self.key_at(offset), message }
     }
 

@@ -2,13 +2,14 @@
 
 use crate::ConfigError;
 use crate::error::Source;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::fmt::Display;
 use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 
 /// A whole graph: what runs, on which data and models, and how.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct GraphConfig {
     /// What the run is about.
@@ -52,7 +53,7 @@ pub struct GraphConfig {
 }
 
 /// What the run is about.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct RunConfig {
     /// Names the run's folder and shared memory: 1 to 24 characters out of a-z, A-Z, 0-9, `-` and `_`.
@@ -86,7 +87,7 @@ pub struct RunConfig {
 }
 
 /// How latents are drawn from a mixture.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum Sampling {
     /// As many from each component as its weight says, rounded as in systematic resampling.
@@ -97,7 +98,7 @@ pub enum Sampling {
 }
 
 /// Threads that each stage may use, 1 to 256 each. Their sum should not be above `total`.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct ThreadsConfig {
     /// The machine's budget. Default 4: encoder, forecaster and prober take turns on a frame, so that with one thread
@@ -120,7 +121,7 @@ impl Default for ThreadsConfig {
 }
 
 /// How much a stage logs.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum LogLevel {
     /// What stops a stage.
@@ -150,7 +151,7 @@ impl LogLevel {
 }
 
 /// Log level of each stage: `error`, `warn`, `info`, `debug` or `trace`. Default `info`.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct LogConfig {
     /// Camera.
@@ -168,7 +169,7 @@ pub struct LogConfig {
 }
 
 /// Where pictures come from.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum CameraSource {
     /// Drives through a data set.
@@ -182,7 +183,7 @@ pub enum CameraSource {
 }
 
 /// Which poses drives are taken from.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum PoseChoice {
     /// Poses that were trained on and chose no threshold.
@@ -193,7 +194,7 @@ pub enum PoseChoice {
 }
 
 /// The noise of the camera's sensor. All zero: pictures pass unchanged.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct NoiseConfig {
     /// Read noise of each pixel and channel, standard deviation in units of 1/255, 0 to 64. Default 2.
@@ -213,7 +214,7 @@ impl Default for NoiseConfig {
 }
 
 /// The camera stage.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct CameraConfig {
     /// `drives` through the data set, `free-drives` through the scenario, or the pictures of a `folder`. Default
@@ -254,7 +255,7 @@ impl Default for CameraConfig {
 }
 
 /// The encoder stage.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct EncoderConfig {
     /// It calls itself slow when a frame takes longer, milliseconds, 1 to 60000. Default 60.
@@ -268,7 +269,7 @@ impl Default for EncoderConfig {
 }
 
 /// The forecaster stage.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct ForecasterConfig {
     /// It calls itself slow when a step takes longer, milliseconds, 1 to 60000. Default 20.
@@ -282,7 +283,7 @@ impl Default for ForecasterConfig {
 }
 
 /// The prober stage.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct ProberConfig {
     /// It calls itself slow when a step takes longer, milliseconds, 1 to 60000. Default 30.
@@ -296,7 +297,7 @@ impl Default for ProberConfig {
 }
 
 /// A camera of the renderer.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum ViewChoice {
     /// Straight from above.
@@ -306,7 +307,7 @@ pub enum ViewChoice {
 }
 
 /// The renderer stage.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct RendererConfig {
     /// Width of a view, pixels, 16 to 1024. Default 64.
@@ -340,7 +341,7 @@ impl Default for RendererConfig {
 }
 
 /// A decision rule.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum Rule {
     /// Halt when the hazard probability is above the checkpoint's calibrated threshold.
@@ -355,7 +356,7 @@ pub enum Rule {
 }
 
 /// The controller stage.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct ControllerConfig {
     /// `calibrated`, `paper`, `underconfident` or `overconfident`. Default `calibrated`.
@@ -376,7 +377,7 @@ impl Default for ControllerConfig {
 }
 
 /// What happens when a stage dies.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case", rename_all_fields = "snake_case", deny_unknown_fields)]
 pub enum RestartPolicy {
     /// The run ends with an error.
@@ -396,7 +397,7 @@ pub enum RestartPolicy {
 const FEW_RESTARTS: RestartPolicy = RestartPolicy::OnFailure { backoff_ms: 100, max_restarts: 5, within_s: 60 };
 
 /// Restart policy of each stage: `"never"`, or `{ on-failure = { backoff_ms = 100, max_restarts = 5, within_s = 60 } }`.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct RestartConfig {
     /// Camera. Default on-failure, 100 ms, 5; it goes on with the frame after its last one.
@@ -427,7 +428,7 @@ impl Default for RestartConfig {
 }
 
 /// The launcher.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct LauncherConfig {
     /// Longest time that a stage may take to be ready, milliseconds, 100 to 600000. Default 30000.
@@ -459,7 +460,7 @@ impl Default for LauncherConfig {
 }
 
 /// What happens when a stage that decisions need is lost. A lost renderer ends nothing.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum WhenLost {
     /// The run ends with an error; the controller's last action is the safe one.
@@ -471,7 +472,7 @@ pub enum WhenLost {
 }
 
 /// Something that can be given up under overload.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum Quality {
     /// Width and height of the rendered views: halved, then quartered.
@@ -484,7 +485,7 @@ pub enum Quality {
 
 /// What is given up when the machine cannot keep up, beyond frames that are skipped, and got back when there is room.
 /// Decisions then depend on the machine's pace; each message says how many samples and steps it rests on.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct OverloadConfig {
     /// In which order: of `resolution`, `samples`, `horizon`, each at most once. Default none: only frames are skipped.
@@ -508,7 +509,7 @@ impl Default for OverloadConfig {
 }
 
 /// How the system treats one process. What it refuses is a warning, and the stage goes on without.
-#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct StageRealtime {
     /// Processors that it may run on, by number from 0. Default: all.
@@ -525,7 +526,7 @@ pub struct StageRealtime {
 }
 
 /// How the system treats each stage's process.
-#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct RealtimeConfig {
     /// Camera.

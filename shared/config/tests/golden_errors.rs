@@ -18,7 +18,7 @@ fn wrong_files_have_golden_messages() {
         (
             format!("{HEAD}horizn = 2\n"),
             "graph.toml:5: `run.horizn`: unknown field `horizn`, expected one of `name`, `seed`, `dataset`, `scenario`, \
-             `checkpoint`, `horizon`, `samples`, `sampling`, `frame_rate_hz`, `busy_polling`",
+             `checkpoint`, `horizon`, `samples`, `sampling`, `frame_rate_hz`, `busy_polling`; did you mean `horizon`?",
         ),
         (
             format!("{HEAD}[camera]\nsource = \"free-drives\"\n"),
@@ -61,7 +61,7 @@ fn wrong_files_have_golden_messages() {
             format!("{HEAD}[cameras]\n"),
             "graph.toml:5: `cameras`: unknown field `cameras`, expected one of `run`, \
              `threads`, `log`, `camera`, `encoder`, `forecaster`, `prober`, `renderer`, `controller`, `launcher`, \
-             `overload`, `realtime`",
+             `overload`, `realtime`; did you mean `camera`?",
         ),
         (
             format!("{HEAD}[renderer]\nviews = []\n"),

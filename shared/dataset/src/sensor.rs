@@ -6,10 +6,11 @@
 use carff_random::Key;
 use rand::Rng;
 use rand_distr::StandardNormal;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// How noisy the sensor is. All zero: the picture passes unchanged.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct SensorNoise {
     /// Standard deviation of the read noise, per pixel and channel, in units of 1/255. 0 to 64.

@@ -1,5 +1,6 @@
 //! The field's structure and the options of its use: one documented struct each, which is also the file format.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// Numbers in one scene latent.
@@ -32,7 +33,7 @@ pub enum FieldError {
 }
 
 /// Structure of a field. Two fields with equal configurations have tensors of equal names and shapes.
-#[derive(Serialize, Deserialize, Clone, PartialEq, Debug)]
+#[derive(Serialize, Deserialize, JsonSchema, Clone, PartialEq, Debug)]
 #[serde(deny_unknown_fields, default)]
 pub struct FieldConfig {
     /// The box that matters, [[x0, y0, z0], [x1, y1, z1]], metres, world space. It maps to the inner half of the
@@ -198,7 +199,7 @@ impl Default for RenderOptions {
 }
 
 /// How a field is trained.
-#[derive(Serialize, Deserialize, Clone, PartialEq, Debug)]
+#[derive(Serialize, Deserialize, JsonSchema, Clone, PartialEq, Debug)]
 #[serde(deny_unknown_fields, default)]
 pub struct TrainerConfig {
     /// Names every random draw of the training.

@@ -1,4 +1,4 @@
-//! The checks that all messages share.
+//! The checks that all messages share; each error names the field.
 
 /// Why a message was refused. Always names the field.
 #[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
@@ -41,15 +41,18 @@ pub enum Invalid {
     },
 }
 
-pub(crate) fn finite<'a>(field: &'static str, values: impl IntoIterator<Item = &'a f32>) -> Result<(), Invalid> {
+/// All are finite.
+pub fn finite<'a>(field: &'static str, values: impl IntoIterator<Item = &'a f32>) -> Result<(), Invalid> {
     if values.into_iter().all(|v| v.is_finite()) { Ok(()) } else { Err(Invalid::NotFinite { field }) }
 }
 
-pub(crate) fn finite_f64<'a>(field: &'static str, values: impl IntoIterator<Item = &'a f64>) -> Result<(), Invalid> {
+/// All are finite.
+pub fn finite_f64<'a>(field: &'static str, values: impl IntoIterator<Item = &'a f64>) -> Result<(), Invalid> {
     if values.into_iter().all(|v| v.is_finite()) { Ok(()) } else { Err(Invalid::NotFinite { field }) }
 }
 
-pub(crate) fn within<'a>(
+/// All are finite and in `min..=max`.
+pub fn within<'a>(
     field: &'static str,
     values: impl IntoIterator<Item = &'a f32>,
     min: f32,
@@ -66,11 +69,13 @@ pub(crate) fn within<'a>(
     Ok(())
 }
 
-pub(crate) fn probability(field: &'static str, value: f32) -> Result<(), Invalid> {
+/// In 0..=1.
+pub fn probability(field: &'static str, value: f32) -> Result<(), Invalid> {
     within(field, [&value], 0.0, 1.0)
 }
 
-pub(crate) fn in_range(field: &'static str, value: i64, min: i64, max: i64) -> Result<(), Invalid> {
+/// In `min..=max`.
+pub fn in_range(field: &'static str, value: i64, min: i64, max: i64) -> Result<(), Invalid> {
     if (min..=max).contains(&value) {
         Ok(())
     } else {
@@ -78,7 +83,8 @@ pub(crate) fn in_range(field: &'static str, value: i64, min: i64, max: i64) -> R
     }
 }
 
-pub(crate) fn at_most(field: &'static str, value: u64, max: u64) -> Result<(), Invalid> {
+/// In `0..=max`.
+pub fn at_most(field: &'static str, value: u64, max: u64) -> Result<(), Invalid> {
     if value <= max {
         Ok(())
     } else {
@@ -86,12 +92,13 @@ pub(crate) fn at_most(field: &'static str, value: u64, max: u64) -> Result<(), I
     }
 }
 
-pub(crate) fn equals(field: &'static str, found: u64, expected: u64) -> Result<(), Invalid> {
+/// The same.
+pub fn equals(field: &'static str, found: u64, expected: u64) -> Result<(), Invalid> {
     if found == expected { Ok(()) } else { Err(Invalid::Mismatch { field, found, expected }) }
 }
 
 /// Weights that sum to 1 within 1e-3.
-pub(crate) fn distribution(field: &'static str, values: &[f32]) -> Result<(), Invalid> {
+pub fn distribution(field: &'static str, values: &[f32]) -> Result<(), Invalid> {
     within(field, values, 0.0, 1.0)?;
     let sum: f32 = values.iter().sum();
     if (sum - 1.0).abs() <= 1e-3 {

@@ -12,8 +12,10 @@
 //! posterior.gaussian.mean[3] = f32::NAN;
 //! assert!(posterior.validate().unwrap_err().to_string().contains("gaussian.mean"));
 //! ```
+//!
+//! Stages of other crates have messages of their own: see [`message!`].
 
-mod check;
+pub mod check;
 mod codes;
 mod decision;
 mod frame;
@@ -27,8 +29,10 @@ pub use frame::{DatasetView, FrameMeta, Intrinsics, ViewMeta};
 pub use health::Health;
 pub use latent::{Belief, Forecast, Gaussian, Posterior, ProbeResult};
 
+/// Says that a type may lie in shared memory, and under which name. Derive it with `#[repr(C)]` and `#[type_name(..)]`.
+pub use iceoryx2::prelude::ZeroCopySend;
+
 use check::{at_most, equals};
-use iceoryx2::prelude::ZeroCopySend;
 
 /// Version of all layouts in this crate. A process drops what carries another one.
 pub const SCHEMA_VERSION: u32 = 1;
@@ -117,22 +121,49 @@ pub trait PictureMeta: Message + Default {
     fn picture_bytes(&self) -> usize;
 }
 
+/// Makes a type a [`Message`]: it has a field `header: Header`, and a method `check(&self) -> Result<(), Invalid>`. Of a
+/// type, `#[type_name]` says name and version: processes that disagree about its layout must disagree about it too.
+///
+/// ```
+/// use carff_messages::{Header, Invalid, Message, ZeroCopySend, check, message};
+///
+/// /// How fast the car may go.
+/// #[repr(C)]
+/// #[derive(Clone, Copy, Debug, ZeroCopySend)]
+/// #[type_name("example.SpeedLimit.v1")]
+/// struct SpeedLimit {
+///     header: Header,
+///     limit_m_s: f64,
+/// }
+///
+/// impl SpeedLimit {
+///     fn check(&self) -> Result<(), Invalid> {
+///         self.header.validate()?;
+///         check::finite_f64("limit_m_s", [&self.limit_m_s])
+///     }
+/// }
+///
+/// message!(SpeedLimit);
+///
+/// let limit = SpeedLimit { header: Header::of_frame(7, 1_000, 42), limit_m_s: f64::NAN };
+/// assert!(limit.validate().unwrap_err().to_string().contains("limit_m_s"));
+/// ```
+#[macro_export]
 macro_rules! message {
     ($type:ty) => {
-        impl crate::Message for $type {
-            fn header(&self) -> &crate::Header {
+        impl $crate::Message for $type {
+            fn header(&self) -> &$crate::Header {
                 &self.header
             }
-            fn header_mut(&mut self) -> &mut crate::Header {
+            fn header_mut(&mut self) -> &mut $crate::Header {
                 &mut self.header
             }
-            fn validate(&self) -> Result<(), crate::Invalid> {
+            fn validate(&self) -> Result<(), $crate::Invalid> {
                 self.check()
             }
         }
     };
 }
-pub(crate) use message;
 
 #[cfg(test)]
 mod tests;

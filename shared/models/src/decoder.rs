@@ -1,11 +1,12 @@
 //! The pose-conditional VAE's decoder: from a scene latent and a pose's number to that pose's picture (section 3.2).
 
 use crate::LATENT_DIM;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use tch::{Tensor, nn, nn::Module};
 
 /// Shape of the decoder.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct DecoderConfig {
     /// Width of the hidden layer that joins latent and pose.

@@ -4,12 +4,13 @@ use crate::{
     LATENT_DIM, LatentGaussian, ModelError,
     backbone::{self, Backbone, BackboneConfig},
 };
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 use tch::{Kind, Tensor, nn, nn::Module};
 
 /// Shape of the encoder.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct EncoderConfig {
     /// The image backbone.

@@ -2,11 +2,12 @@
 
 use crate::{LATENT_DIM, LatentGaussian, ModelError, encoder::gaussians};
 use carff_random::Key;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use tch::{Kind, Tensor, nn, nn::Module};
 
 /// Shape of the network.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct MixtureConfig {
     /// Number of mixture components K, 1 to 4 (paper: 2).

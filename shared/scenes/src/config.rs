@@ -1,12 +1,14 @@
 //! The scenario file: what stands where, who drives where, and which cameras look. All lengths are metres, all angles
 //! degrees, +Z is up, and the ground is z = 0. Unknown keys and values out of range are errors.
 
+use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::de::Error as _;
 use serde::{Deserialize, Deserializer};
+use std::borrow::Cow;
 use toml::Spanned;
 
 /// A whole scenario file.
-#[derive(Clone, Debug, Deserialize)]
+#[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ScenarioConfig {
     /// Name of the scenario, as it appears in data sets and checkpoints.
@@ -21,8 +23,10 @@ pub struct ScenarioConfig {
     pub branches: Vec<String>,
     /// Names of the branches in which the hazard action is right.
     #[serde(default)]
+    #[schemars(with = "Vec<String>")]
     pub hazard_branches: Vec<Spanned<String>>,
     /// Index of the camera pose that looks straight down.
+    #[schemars(with = "Option<usize>")]
     pub bev_view: Option<Spanned<usize>>,
     /// What the actions are called.
     #[serde(default)]
@@ -35,6 +39,7 @@ pub struct ScenarioConfig {
     pub sun: SunConfig,
     /// Colour of the open ground, `#rrggbb`.
     #[serde(default = "default_ground", deserialize_with = "colour")]
+    #[schemars(with = "Colour", extend("default" = "#5d8a3c"))]
     pub ground_colour: [f32; 3],
     /// What the open ground is: `grass` or `plain`.
     #[serde(default)]
@@ -84,7 +89,7 @@ pub struct ScenarioConfig {
 }
 
 /// Names of the actions.
-#[derive(Clone, Debug, Deserialize)]
+#[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct ActionsConfig {
     /// What to do in a hazard branch.
@@ -100,7 +105,7 @@ impl Default for ActionsConfig {
 }
 
 /// Size and field of view of all pictures.
-#[derive(Clone, Debug, Deserialize)]
+#[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct PictureConfig {
     /// Width, pixels, 8 to 4096.
@@ -121,7 +126,7 @@ impl Default for PictureConfig {
 }
 
 /// The sun.
-#[derive(Clone, Debug, Deserialize)]
+#[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct SunConfig {
     /// Direction to the sun, from +X towards +Y.
@@ -142,7 +147,7 @@ impl Default for SunConfig {
 }
 
 /// A straight strip of asphalt.
-#[derive(Clone, Debug, Deserialize)]
+#[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct RoadConfig {
     /// Start of its centre line (x, y).
@@ -157,7 +162,7 @@ pub struct RoadConfig {
 }
 
 /// A straight strip of paint: solid, dashed, or a zebra crossing (wide, with short dashes).
-#[derive(Clone, Debug, Deserialize)]
+#[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct MarkingConfig {
     /// Start of its centre line (x, y).
@@ -177,11 +182,12 @@ pub struct MarkingConfig {
     pub gap_m: f64,
     /// Its colour, `#rrggbb`.
     #[serde(default = "default_marking", deserialize_with = "colour")]
+    #[schemars(with = "Colour", extend("default" = "#e4e4de"))]
     pub colour: [f32; 3],
 }
 
 /// What the open ground is.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum GroundSurface {
     /// Grass.
@@ -192,7 +198,7 @@ pub enum GroundSurface {
 }
 
 /// What a slab is covered with.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum SlabSurface {
     /// Concrete slabs.
@@ -202,7 +208,7 @@ pub enum SlabSurface {
 }
 
 /// A raised slab, along the axes.
-#[derive(Clone, Debug, Deserialize)]
+#[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct SlabConfig {
     /// Lower corner (x, y).
@@ -219,7 +225,7 @@ pub struct SlabConfig {
 }
 
 /// What walls are made of.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Walls {
     /// Courses of brick.
@@ -229,7 +235,7 @@ pub enum Walls {
 }
 
 /// The form of a roof.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Roof {
     /// Flat, with a parapet.
@@ -239,7 +245,7 @@ pub enum Roof {
 }
 
 /// Which wall a door is in.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Side {
     /// The +X wall.
@@ -253,7 +259,7 @@ pub enum Side {
 }
 
 /// A building, along the axes.
-#[derive(Clone, Debug, Deserialize)]
+#[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct BuildingConfig {
     /// Its name, as it appears among the static boxes.
@@ -274,9 +280,11 @@ pub struct BuildingConfig {
     pub walls: Walls,
     /// Colour of the walls, `#rrggbb`.
     #[serde(deserialize_with = "colour")]
+    #[schemars(with = "Colour")]
     pub colour: [f32; 3],
     /// Colour of frames and edges, `#rrggbb`.
     #[serde(default = "default_trim", deserialize_with = "colour")]
+    #[schemars(with = "Colour", extend("default" = "#d8d2c4"))]
     pub trim: [f32; 3],
     /// `flat` or `gable`.
     #[serde(default = "flat")]
@@ -287,7 +295,7 @@ pub struct BuildingConfig {
 }
 
 /// Kinds of trees.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum TreeKind {
     /// A trunk under a crown.
@@ -299,7 +307,7 @@ pub enum TreeKind {
 }
 
 /// A tree.
-#[derive(Clone, Debug, Deserialize)]
+#[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct TreeConfig {
     /// Where it stands (x, y).
@@ -313,7 +321,7 @@ pub struct TreeConfig {
 }
 
 /// Kinds of street furniture.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum PropKind {
     /// A lamp post, 5 m; its arm points along its yaw.
@@ -331,7 +339,7 @@ pub enum PropKind {
 }
 
 /// A piece of street furniture.
-#[derive(Clone, Debug, Deserialize)]
+#[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct PropConfig {
     /// `lamp`, `bench`, `bin`, `hydrant`, `cone` or `stop`.
@@ -345,7 +353,7 @@ pub struct PropConfig {
 }
 
 /// Kinds of vehicles.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum VehicleKind {
     /// An open bed behind a cabin.
@@ -359,7 +367,7 @@ pub enum VehicleKind {
 }
 
 /// A vehicle and its courses.
-#[derive(Clone, Debug, Deserialize)]
+#[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct VehicleConfig {
     /// Its name, as it appears among the boxes.
@@ -370,6 +378,7 @@ pub struct VehicleConfig {
     pub kind: VehicleKind,
     /// Colour of the body, `#rrggbb`.
     #[serde(deserialize_with = "colour")]
+    #[schemars(with = "Colour")]
     pub colour: [f32; 3],
     /// Length, width, height.
     #[serde(deserialize_with = "size3")]
@@ -382,17 +391,19 @@ pub struct VehicleConfig {
 }
 
 /// Where a vehicle is in some branches.
-#[derive(Clone, Debug, Deserialize)]
+#[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct CourseConfig {
     /// Names of the branches.
+    #[schemars(with = "Vec<String>")]
     pub branches: Vec<Spanned<String>>,
     /// One [x, y, yaw in degrees] per timestamp.
+    #[schemars(with = "Vec<[f64; 3]>")]
     pub poses: Spanned<Vec<[f64; 3]>>,
 }
 
 /// A thing made of simple forms. Their places are in the thing's own axes: +X ahead, +Y left, +Z up.
-#[derive(Clone, Debug, Deserialize)]
+#[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ObjectConfig {
     /// Its name, as it appears among the boxes.
@@ -403,6 +414,7 @@ pub struct ObjectConfig {
     #[serde(default)]
     pub dynamic: bool,
     /// Name of the dynamic object, if this one is there and gone with it, as an arm with its hand.
+    #[schemars(with = "Option<String>")]
     pub follows: Option<Spanned<String>>,
     /// Where it always is, when it has no course: x, y, z, yaw in degrees.
     #[serde(default, deserialize_with = "pose4")]
@@ -425,7 +437,7 @@ pub struct ObjectConfig {
 }
 
 /// A cuboid.
-#[derive(Clone, Debug, Deserialize)]
+#[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct BoxConfig {
     /// Its middle.
@@ -439,6 +451,7 @@ pub struct BoxConfig {
     pub turn_deg: [f64; 3],
     /// Its colour, `#rrggbb`; with `faces`, that of the joints.
     #[serde(deserialize_with = "colour")]
+    #[schemars(with = "Colour")]
     pub colour: [f32; 3],
     /// A second colour, in squares.
     pub checks: Option<ChecksConfig>,
@@ -450,11 +463,12 @@ pub struct BoxConfig {
 }
 
 /// Squares of a second colour.
-#[derive(Clone, Copy, Debug, Deserialize)]
+#[derive(Clone, Copy, Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ChecksConfig {
     /// The second colour, `#rrggbb`.
     #[serde(deserialize_with = "colour")]
+    #[schemars(with = "Colour")]
     pub colour: [f32; 3],
     /// Edge of a square.
     #[serde(deserialize_with = "positive")]
@@ -462,11 +476,12 @@ pub struct ChecksConfig {
 }
 
 /// Colours of the six sides of a cuboid.
-#[derive(Clone, Debug, Deserialize)]
+#[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct FacesConfig {
     /// +X, -X, +Y, -Y, +Z, -Z, each `#rrggbb`.
     #[serde(deserialize_with = "six_colours")]
+    #[schemars(with = "[Colour; 6]")]
     pub colours: [[f32; 3]; 6],
     /// Squares along each edge, 1 to 64.
     #[serde(default = "one", deserialize_with = "count")]
@@ -474,7 +489,7 @@ pub struct FacesConfig {
 }
 
 /// An ellipsoid.
-#[derive(Clone, Debug, Deserialize)]
+#[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct EllipsoidConfig {
     /// Its middle.
@@ -488,6 +503,7 @@ pub struct EllipsoidConfig {
     pub turn_deg: [f64; 3],
     /// Its colour, `#rrggbb`.
     #[serde(deserialize_with = "colour")]
+    #[schemars(with = "Colour")]
     pub colour: [f32; 3],
     /// Variants of the object that have this part. Default: all.
     #[serde(default)]
@@ -495,7 +511,7 @@ pub struct EllipsoidConfig {
 }
 
 /// A cylinder or capsule.
-#[derive(Clone, Debug, Deserialize)]
+#[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct RodConfig {
     /// Start of its axis. A capsule's round end begins there.
@@ -509,6 +525,7 @@ pub struct RodConfig {
     pub radius_m: f64,
     /// Its colour, `#rrggbb`.
     #[serde(deserialize_with = "colour")]
+    #[schemars(with = "Colour")]
     pub colour: [f32; 3],
     /// Variants of the object that have this part. Default: all.
     #[serde(default)]
@@ -516,19 +533,22 @@ pub struct RodConfig {
 }
 
 /// Where an object is in some branches.
-#[derive(Clone, Debug, Deserialize)]
+#[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ObjectCourseConfig {
     /// Names of the branches.
+    #[schemars(with = "Vec<String>")]
     pub branches: Vec<Spanned<String>>,
     /// One [x, y, z, yaw in degrees] per timestamp.
+    #[schemars(with = "Vec<[f64; 4]>")]
     pub poses: Spanned<Vec<[f64; 4]>>,
     /// One variant per timestamp: which parts it has then. Default: those that name no variant.
+    #[schemars(with = "Option<Vec<String>>")]
     pub variants: Option<Spanned<Vec<String>>>,
 }
 
 /// Cameras on a dome, spread by the golden angle.
-#[derive(Clone, Debug, Deserialize)]
+#[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct OrbitConfig {
     /// Kind of these views, as it appears in data sets.
@@ -548,7 +568,7 @@ pub struct OrbitConfig {
 }
 
 /// Cameras high above that look down. The first looks straight down from the middle; the picture's up is +Y.
-#[derive(Clone, Debug, Deserialize)]
+#[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct OverheadConfig {
     /// Kind of these views, as it appears in data sets.
@@ -568,12 +588,13 @@ pub struct OverheadConfig {
 }
 
 /// Cameras above a vehicle's roof.
-#[derive(Clone, Debug, Deserialize)]
+#[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct DashConfig {
     /// Kind of these views, as it appears in data sets.
     pub view_kind: String,
     /// Name of the vehicle.
+    #[schemars(with = "String")]
     pub vehicle: Spanned<String>,
     /// How many at each of its places, 1 to 10000.
     #[serde(deserialize_with = "many")]
@@ -593,7 +614,7 @@ pub struct DashConfig {
 }
 
 /// Cameras spread over a region that look at another region.
-#[derive(Clone, Debug, Deserialize)]
+#[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct StreetConfig {
     /// Kind of these views, as it appears in data sets.
@@ -607,6 +628,23 @@ pub struct StreetConfig {
     /// Where they look: lower and upper corner.
     #[serde(deserialize_with = "box3")]
     pub look_at: [[f64; 3]; 2],
+}
+
+/// How colours are written, for the schema.
+enum Colour {}
+
+impl JsonSchema for Colour {
+    fn schema_name() -> Cow<'static, str> {
+        "Colour".into()
+    }
+
+    fn inline_schema() -> bool {
+        true
+    }
+
+    fn json_schema(_: &mut SchemaGenerator) -> Schema {
+        json_schema!({ "type": "string", "pattern": "^#[0-9a-fA-F]{6}$" })
+    }
 }
 
 fn default_ground() -> [f32; 3] {

@@ -8,7 +8,7 @@ use carff_dataset::DatasetError;
 #[derive(Debug, thiserror::Error)]
 pub enum ScenarioError {
     /// The file cannot be read.
-    #[error("{}: {source}", path.display())]
+    #[error("{}: {source}{}", path.display(), carff_nearest::beside(path))]
     Io {
         /// The scenario file.
         path: PathBuf,
@@ -16,7 +16,7 @@ pub enum ScenarioError {
         source: std::io::Error,
     },
     /// A key that is unknown, missing, of the wrong type or out of range. Names line and column and shows the line.
-    #[error("{}: {}", path.display(), .source.to_string().trim_end())]
+    #[error("{}: {}", path.display(), carff_nearest::explained(&.source.to_string()))]
     Toml {
         /// The scenario file.
         path: PathBuf,

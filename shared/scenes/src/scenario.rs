@@ -624,7 +624,8 @@ fn place(
             }
             for (variant, name) in variants.iter_mut().zip(names.get_ref()) {
                 let Some(index) = known.iter().position(|k| k == name) else {
-                    let problem = format!("no part has the variant `{name}`; there are {known:?}");
+                    let hint = carff_nearest::hint(name, known.iter().copied());
+                    let problem = format!("no part has the variant `{name}`; there are {known:?}{hint}");
                     return Err(source.error_at(names, "variants", problem));
                 };
                 *variant = Some(index);
@@ -662,7 +663,9 @@ fn check(source: &Source, config: &ScenarioConfig) -> Result<Checked, ScenarioEr
     let known = || config.branches.iter().map(|b| format!("`{b}`")).collect::<Vec<_>>().join(", ");
     let branch_index = |name: &Spanned<String>, key: &str| {
         config.branches.iter().position(|b| b == name.get_ref()).ok_or_else(|| {
-            source.error_at(name, key, format!("there is no branch `{}`; there are {}", name.get_ref(), known()))
+            let hint = carff_nearest::hint(name.get_ref(), config.branches.iter().map(String::as_str));
+            let problem = format!("there is no branch `{}`; there are {}{hint}", name.get_ref(), known());
+            source.error_at(name, key, problem)
         })
     };
     let hazard_branches =
@@ -697,7 +700,8 @@ fn check(source: &Source, config: &ScenarioConfig) -> Result<Checked, ScenarioEr
         let Some(leader) = mover.follows() else { continue };
         let is_leader = |d: usize| movers(config).nth(d).is_some_and(|l| l.name() == leader.get_ref()) && d != m;
         if !dynamic.is_some_and(is_leader) {
-            let problem = format!("`{}` is no other, dynamic vehicle or object", leader.get_ref());
+            let hint = carff_nearest::hint(leader.get_ref(), movers(config).filter(Mover::dynamic).map(|m| m.name()));
+            let problem = format!("`{}` is no other, dynamic vehicle or object{hint}", leader.get_ref());
             return Err(source.error_at(leader, "follows", problem));
         }
         followers.push(m);
@@ -705,11 +709,9 @@ fn check(source: &Source, config: &ScenarioConfig) -> Result<Checked, ScenarioEr
     let actor = dynamic.map(|dynamic| Actor { dynamic, followers });
     for group in &config.dash {
         if !config.vehicle.iter().any(|v| v.name == *group.vehicle.get_ref()) {
-            return Err(source.error_at(
-                &group.vehicle,
-                "vehicle",
-                format!("there is no vehicle `{}`", group.vehicle.get_ref()),
-            ));
+            let hint = carff_nearest::hint(group.vehicle.get_ref(), config.vehicle.iter().map(|v| v.name.as_str()));
+            let problem = format!("there is no vehicle `{}`{hint}", group.vehicle.get_ref());
+            return Err(source.error_at(&group.vehicle, "vehicle", problem));
         }
     }
     Ok((placements, actor, hazard_branches))

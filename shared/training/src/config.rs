@@ -3,11 +3,12 @@
 use crate::{TrainingError, field::FieldTraining};
 use carff_dataset::sensor::SensorNoise;
 use carff_models::{decoder::DecoderConfig, encoder::EncoderConfig, mixture::MixtureConfig};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 
 /// One training, from pictures to a checkpoint.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct TrainingConfig {
     /// The data set's folder, relative to the working directory; `--dataset` wins.
@@ -60,7 +61,7 @@ pub struct TrainingConfig {
 }
 
 /// How the calibrated rule's threshold is chosen, on the calibration poses alone.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct CalibrationConfig {
     /// Times that each picture is taken, with fresh sensor noise.
@@ -82,7 +83,7 @@ impl Default for CalibrationConfig {
 /// Poses besides those of the data set, drawn at random from the ranges of the scenario's cameras. Encoder and
 /// forecaster train on them too, so that they do not know poses by heart; decoder, field and all figures do not. They
 /// are only there for a data set that the scenario has made.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct FreePoses {
     /// How many; 0 leaves them out.
@@ -96,7 +97,7 @@ fn two() -> i32 {
 }
 
 /// What the pictures go through before the encoder sees them in training. The decoder's target is always the clean one.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Augmentation {
     /// Altered copies of each picture, besides one with sensor noise alone. With a frozen backbone their features are
@@ -125,7 +126,7 @@ impl Default for Augmentation {
 }
 
 /// Training of the pose-conditional VAE (paper section 3.2, with the terms that keep its latent alive).
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct VaeTraining {
     /// Passes over the training pictures.
@@ -185,7 +186,7 @@ impl Default for VaeTraining {
 }
 
 /// Training of the mixture density network (paper section 3.4).
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct MdnTraining {
     /// Optimiser steps.
@@ -208,8 +209,10 @@ impl TrainingConfig {
     /// Reads a training file; the error shows file, line and key.
     pub fn load(path: &Path) -> Result<Self, TrainingError> {
         let text = std::fs::read_to_string(path).map_err(|source| TrainingError::File { path: path.into(), source })?;
-        let config: Self =
-            toml::from_str(&text).map_err(|e| TrainingError::Format { path: path.into(), what: e.to_string() })?;
+        let config: Self = toml::from_str(&text).map_err(|e| {
+            let what = carff_nearest::explained(&e.to_string());
+            TrainingError::Format { path: path.into(), what }
+        })?;
         config.validate().map_err(|what| TrainingError::Format { path: path.into(), what })?;
         Ok(config)
     }

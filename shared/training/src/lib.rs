@@ -38,7 +38,7 @@ pub enum TrainingError {
     #[error("libtorch: {0}")]
     Torch(#[from] tch::TchError),
     /// A file could not be read or written.
-    #[error("{path}: {source}")]
+    #[error("{path}: {source}{}", carff_nearest::beside(path))]
     File {
         /// Which file.
         path: std::path::PathBuf,

@@ -32,6 +32,7 @@
 mod counters;
 mod descriptors;
 mod error;
+mod in_use;
 mod node;
 mod publisher;
 mod receiver;
@@ -42,6 +43,7 @@ mod wait;
 
 pub use counters::Counters;
 pub use error::{CleanupError, OpenError, ReceiveError, RunNameError, SendError, WaitError};
+pub use in_use::{Member, OpenTopic, Ports};
 pub use node::Node;
 pub use publisher::{PictureLoan, PicturePublisher, Publisher};
 pub use receiver::{Picture, PictureReceiver, Receiver, Sample};

@@ -71,6 +71,10 @@ impl Node {
         Ok(Self { inner, run: run.clone(), counters: Arc::default() })
     }
 
+    pub(crate) fn inner(&self) -> &iceoryx2::node::Node<Service> {
+        &self.inner
+    }
+
     /// The run.
     pub fn run(&self) -> &Run {
         &self.run
@@ -209,7 +213,7 @@ fn check_segment(topic: &str, limits: Limits, message_bytes: usize) -> Result<()
     check_space(Path::new(SHARED_MEMORY_DIR), &format!("topic `{topic}`"), needed)
 }
 
-fn service_name(topic: &str) -> Result<ServiceName, String> {
+pub(crate) fn service_name(topic: &str) -> Result<ServiceName, String> {
     ServiceName::new(topic).map_err(|e| format!("name: {e:?}"))
 }
 

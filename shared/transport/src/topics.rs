@@ -2,6 +2,15 @@
 //!
 //! Each topic has a publish-subscribe service and an event service of the same name for wake-up. Safe overflow is on
 //! everywhere: a full buffer loses its oldest message, and no subscriber can delay a publisher.
+//!
+//! A stage of another crate has topics of its own, of messages made with [`carff_messages::message!`]:
+//!
+//! ```
+//! use carff_messages::Posterior;
+//! use carff_transport::{Topic, topics};
+//! /// A second opinion on each frame.
+//! pub const OPINION: Topic<Posterior> = Topic::new("second-encoder/posterior", topics::MESSAGES, 500);
+//! ```
 
 use carff_messages::{Action, Belief, Forecast, FrameMeta, Health, Posterior, Stage, ViewMeta};
 use std::marker::PhantomData;
@@ -58,13 +67,13 @@ pub struct PictureTopic<M> {
 }
 
 /// Small messages of which some readers want every one.
-const MESSAGES: Limits =
+pub const MESSAGES: Limits =
     Limits { max_subscribers: 10, max_publishers: 2, max_nodes: 14, history: 0, buffer: 16, borrowed: 3, loaned: 2 };
 /// Pictures: fewer wait, as they are large and only the newest counts.
-const PICTURES: Limits =
+pub const PICTURES: Limits =
     Limits { max_subscribers: 8, max_publishers: 2, max_nodes: 12, history: 0, buffer: 8, borrowed: 2, loaned: 2 };
 /// The latest of these tells a late reader how things stand.
-const STATUS: Limits = Limits { history: 1, ..MESSAGES };
+pub const STATUS: Limits = Limits { history: 1, ..MESSAGES };
 
 macro_rules! table {
     ($($(#[$doc:meta])* $const:ident: $kind:ident<$message:ty> = $name:literal, $limits:expr, $deadline_ms:literal;)+) => {
@@ -101,13 +110,15 @@ pub const fn health(stage: Stage) -> Topic<Health> {
 }
 
 impl<M> Topic<M> {
-    const fn new(name: &'static str, limits: Limits, deadline_ms: u64) -> Self {
+    /// A topic; whoever opens it first fixes its limits, and all others must have the same.
+    pub const fn new(name: &'static str, limits: Limits, deadline_ms: u64) -> Self {
         Self { name, limits, deadline: Duration::from_millis(deadline_ms), message: PhantomData }
     }
 }
 
 impl<M> PictureTopic<M> {
-    const fn new(name: &'static str, limits: Limits, deadline_ms: u64) -> Self {
+    /// A topic; whoever opens it first fixes its limits, and all others must have the same.
+    pub const fn new(name: &'static str, limits: Limits, deadline_ms: u64) -> Self {
         Self { name, limits, deadline: Duration::from_millis(deadline_ms), meta: PhantomData }
     }
 }

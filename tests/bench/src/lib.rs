@@ -25,17 +25,27 @@ use std::process::ExitCode;
 #[derive(Debug, clap::Subcommand)]
 pub enum BenchCommand {
     /// The field's kernels against the same model in tensor operations and against the machine's limits.
+    #[command(after_help = "Example: on one thread, compared with an earlier run
+  carff bench field --threads 1 --baseline docs/performance.json")]
     Field(field::FieldArgs),
     /// Encoder and forecaster, one frame at a time.
+    #[command(after_help = "Example: the shipped networks alone
+  carff bench encoder --no-vit --json reports/performance.json")]
     Encoder(encoder::EncoderArgs),
     /// From one process to another: this program's topics, bare iceoryx2, Unix sockets, zenoh.
+    #[command(after_help = "Example: with the figures as JSON
+  carff bench ipc --json reports/performance.json")]
     Ipc(ipc::IpcArgs),
     /// The other process of `ipc`.
     #[command(hide = true)]
     IpcPeer(ipc::PeerArgs),
     /// Camera to action, with all stages alive.
+    #[command(after_help = "Example: in a minute
+  carff bench loop --quick")]
     Loop(graph_loop::LoopArgs),
     /// How cost grows with samples, horizon, resolution, candidates, stages and probes.
+    #[command(after_help = "Example: in a few minutes, with plots
+  carff bench scale --quick --plots reports/scale")]
     Scale(scale::ScaleArgs),
     /// A process of `scale`'s chain of stages.
     #[command(hide = true)]

@@ -9,6 +9,7 @@ pub use efficientnet::EfficientNetLite0;
 pub use vit::{VisionTransformer, VitConfig};
 
 use crate::{ModelError, weights};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 use tch::{Tensor, nn};
@@ -24,7 +25,7 @@ pub trait Backbone: Send {
 }
 
 /// Which backbone, and whether it learns.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct BackboneConfig {
     /// Which network.
@@ -55,7 +56,7 @@ impl Default for BackboneConfig {
 }
 
 /// The backbones there are.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum BackboneKind {
     /// EfficientNet-Lite0 up to its 112-channel stage (stride 16), pretrained on ImageNet-1k.

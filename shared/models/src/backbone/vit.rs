@@ -2,11 +2,12 @@
 
 use super::{Backbone, resize};
 use crate::{ModelError, weights::Tensors};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use tch::{Kind, Tensor, nn, nn::Module};
 
 /// Size of a vision transformer. The default is ViT-L/16, the paper's.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct VitConfig {
     /// Patch side, pixels.

@@ -1,0 +1,93 @@
+//! An example of a stage of a user's own: how fast the car may go, from the action and from how much of the scene is
+//! known. It uses the public crates alone, and joins whatever graph runs. The book's chapter "Write a stage" leads
+//! through it.
+
+use carff_messages::{Action, ActionCode, Belief, Header, Invalid, ZeroCopySend, check, message};
+use carff_transport::{Topic, topics};
+
+/// The limit when all is known and nothing speaks against going on, metres a second.
+pub const FREE_M_S: f32 = 8.0;
+
+/// How fast the car may go.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, ZeroCopySend)]
+#[type_name("speed-gate.SpeedLimit.v1")]
+pub struct SpeedLimit {
+    /// Header of the action's frame.
+    pub header: Header,
+    /// Metres a second, 0 to [`FREE_M_S`].
+    pub limit_m_s: f32,
+    /// Probability of all known states together, 0 to 1; what is missing is a scene that the models do not know.
+    pub known: f32,
+}
+
+/// Where limits are published.
+pub const SPEED_LIMIT: Topic<SpeedLimit> = Topic::new("speed-gate/limit", topics::MESSAGES, 500);
+
+impl SpeedLimit {
+    /// Standstill while the action is to halt; else the slower, the less of the scene is known.
+    pub fn of(action: &Action, belief: Option<&Belief>) -> Self {
+        let states = |b: &Belief| b.state_probability.iter().take(b.state_count as usize).sum::<f32>();
+        let known = belief.map_or(0.0, states).clamp(0.0, 1.0);
+        let advance = action.code() == Ok(ActionCode::Advance);
+        Self { header: action.header, limit_m_s: if advance { FREE_M_S * known } else { 0.0 }, known }
+    }
+
+    fn check(&self) -> Result<(), Invalid> {
+        self.header.validate()?;
+        check::within("limit_m_s", [&self.limit_m_s], 0.0, FREE_M_S)?;
+        check::probability("known", self.known)
+    }
+}
+
+message!(SpeedLimit);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use carff_messages::{Message, Reason, RuleCode};
+
+    fn action(code: ActionCode) -> Action {
+        Action {
+            header: Header::of_frame(7, 1_000, 42),
+            action: code.code(),
+            reason: Reason::Belief.code(),
+            rule: RuleCode::Calibrated.code(),
+            sample_count: 1,
+            confidence: 1.0,
+            hazard_probability: 0.0,
+            is_decision: 1,
+            reserved: 0,
+            valid_until_ns: 0,
+            based_on_frame: 7,
+            latency_ns: 0,
+        }
+    }
+
+    fn belief(states: [f32; 2]) -> Belief {
+        let mut belief = Belief::empty(Header::of_frame(7, 1_000, 42).at_step(1), 1);
+        belief.state_count = 2;
+        belief.state_probability[..2].copy_from_slice(&states);
+        belief
+    }
+
+    /// Halt is standstill; otherwise what is not known takes its share of the speed, and without a belief nothing is.
+    #[test]
+    fn limits() {
+        let limit = |code, belief: Option<Belief>| SpeedLimit::of(&action(code), belief.as_ref()).limit_m_s;
+        assert_eq!(limit(ActionCode::Halt, Some(belief([0.5, 0.5]))), 0.0);
+        assert_eq!(limit(ActionCode::Advance, Some(belief([0.5, 0.5]))), FREE_M_S);
+        assert_eq!(limit(ActionCode::Advance, Some(belief([0.25, 0.25]))), FREE_M_S / 2.0);
+        assert_eq!(limit(ActionCode::Advance, None), 0.0);
+    }
+
+    /// What is sent is valid and keeps the frame; a limit out of range or not finite is refused.
+    #[test]
+    fn validation() {
+        let limit = SpeedLimit::of(&action(ActionCode::Advance), Some(&belief([1.0, 0.0])));
+        assert_eq!((limit.validate(), limit.header.frame_id), (Ok(()), 7));
+        for wrong in [-1.0, f32::NAN, FREE_M_S * 2.0] {
+            assert!(SpeedLimit { limit_m_s: wrong, ..limit }.validate().is_err(), "{wrong}");
+        }
+    }
+}

@@ -1,0 +1,76 @@
+//! `carff bridge`: the run's topics over the Foxglove WebSocket protocol, for headless vehicles. Read-only.
+
+use crate::probe::session::{Session, SessionArgs};
+use anyhow::Context;
+use carff_checkpoint::Manifest;
+use carff_observe::TopicId;
+use carff_recording::{channels, encode};
+use carff_transport::monotonic_now_ns;
+use clap::Args;
+use foxglove::{ChannelBuilder, PartialMetadata, RawChannel, WebSocketServer};
+use std::collections::BTreeMap;
+use std::net::SocketAddr;
+use std::process::ExitCode;
+use std::sync::Arc;
+use std::time::SystemTime;
+
+/// Serve a run's topics.
+#[derive(Clone, Debug, Args)]
+pub struct BridgeArgs {
+    /// Address and port to listen at: of this machine alone, unless --remote is given. Port 0: any that is free.
+    #[arg(long, default_value = "127.0.0.1:8765")]
+    pub listen: SocketAddr,
+    /// Allow an address that other machines reach: whoever reaches it sees what the camera sees.
+    #[arg(long)]
+    pub remote: bool,
+    /// Topics; all when none is named.
+    pub topics: Vec<TopicId>,
+    /// Which run, and for how long.
+    #[command(flatten)]
+    pub session: SessionArgs,
+}
+
+/// Serves until it is told to stop, the time is over, or the run ends.
+pub fn run(args: &BridgeArgs) -> anyhow::Result<ExitCode> {
+    crate::metrics::refuse_remote(args.listen, args.remote)?;
+    let mut session = Session::open(&args.session, "bridge")?;
+    let topics: Vec<TopicId> = if args.topics.is_empty() { TopicId::all().collect() } else { args.topics.clone() };
+    session.listen(topics)?;
+    let live = session.attached.live.clone();
+    let places = Manifest::load(&live.checkpoint).map(|m| m.places).unwrap_or_default();
+    // No capabilities are announced: clients can look, and nothing else.
+    let server = WebSocketServer::new()
+        .name(format!("carff run {}", live.name))
+        .bind(args.listen.ip().to_string(), args.listen.port())
+        .capabilities([])
+        .start_blocking()
+        .with_context(|| format!("cannot listen at {}", args.listen))?;
+    println!("ws://{}:{}", args.listen.ip(), server.port());
+    let mut open: BTreeMap<&'static str, Arc<RawChannel>> = BTreeMap::new();
+    for channel in channels() {
+        let built =
+            ChannelBuilder::new(channel.name).schema(channel.schema).message_encoding(channel.encoding).build_raw();
+        open.insert(channel.name, built.with_context(|| format!("cannot open the channel `{}`", channel.name))?);
+    }
+    let wall_ns = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default().as_nanos() as u64;
+    let offset_ns = wall_ns.saturating_sub(monotonic_now_ns());
+    let going = session.follow(
+        |topic, message| {
+            // Nothing is encoded while nobody looks.
+            if server.client_count() > 0 {
+                let message = message.message();
+                let at_ns = message.header().publish_time_ns.saturating_add(offset_ns);
+                for (name, bytes) in encode(topic, message, &places, at_ns)? {
+                    if let Some(channel) = open.get(name).filter(|c| c.has_sinks()) {
+                        channel.log_with_meta(&bytes, PartialMetadata { log_time: Some(at_ns) });
+                    }
+                }
+            }
+            Ok(true)
+        },
+        || Ok(()),
+    )?;
+    server.stop().wait_blocking();
+    session.say_end(going);
+    Ok(ExitCode::SUCCESS)
+}

@@ -1,0 +1,764 @@
+//! From what was found on the machine to findings. Nothing here looks at the machine.
+
+use super::finding::{Area, Finding};
+use carff_config::{RealtimeConfig, StageRealtime, ThreadsConfig};
+use std::path::{Path, PathBuf};
+
+/// The version that the programs are built for.
+pub const LIBTORCH: &str = "2.11.0";
+/// What the six processes of a graph take together, and some room.
+const GRAPH_BYTES: u64 = 1 << 30;
+/// Clock sources that cost a microsecond and more a reading.
+const SLOW_CLOCKS: [&str; 4] = ["hpet", "acpi_pm", "jiffies", "refined-jiffies"];
+/// Governors that keep the processor slow until load has been there for a while.
+const SLOW_GOVERNORS: [&str; 2] = ["powersave", "conservative"];
+/// Free disk below which recordings and data sets soon have no room, and below which nothing has.
+const DISK_BYTES: (u64, u64) = (2 << 30, 64 << 20);
+/// Below it, memory cannot be locked for a stage.
+const LOCKED_BYTES: u64 = 1 << 30;
+/// Open files that a process of a graph with all its probes may need.
+const OPEN_FILES: u64 = 1024;
+/// Users below this are the system's own: logind leaves their files alone.
+const FIRST_PERSON: u32 = 1000;
+
+/// A size for people.
+pub fn size(bytes: u64) -> String {
+    const UNITS: [(&str, u64); 3] = [("GiB", 1 << 30), ("MiB", 1 << 20), ("KiB", 1 << 10)];
+    match UNITS.iter().find(|(_, unit)| bytes >= *unit) {
+        Some((name, unit)) => format!("{:.1} {name}", bytes as f64 / *unit as f64),
+        None => format!("{bytes} bytes"),
+    }
+}
+
+/// The processor's name and its features, in the system's spelling.
+pub fn processor(name: &str, features: &[&str]) -> Finding {
+    let has = |all: &[&str]| all.iter().all(|f| features.contains(f));
+    if !has(&["avx2", "fma"]) {
+        return Finding::warning(
+            Area::Machine,
+            "processor",
+            format!("{name}, without AVX2 and FMA"),
+            "the field is computed by portable kernels, several times slower",
+            "take an x86-64 processor of 2013 or later; in a virtual machine, hand the host's processor through \
+             (QEMU: -cpu host)",
+        );
+    }
+    let wide = if has(&["avx512f", "avx512vl"]) { ", AVX-512" } else { "" };
+    Finding::ok(Area::Machine, "processor", format!("{name}, with AVX2 and FMA{wide}"))
+}
+
+/// Cores against the threads of a graph: encoder, forecaster and prober take turns on a frame, the renderer works beside
+/// them.
+pub fn cores(cores: usize, threads: &ThreadsConfig) -> Finding {
+    let path = threads.encoder.max(threads.forecaster).max(threads.prober);
+    let wanted = (path + threads.renderer) as usize;
+    if cores >= wanted {
+        return Finding::ok(Area::Machine, "cores", format!("{cores}, for {wanted} threads that work at a time"));
+    }
+    Finding::warning(
+        Area::Machine,
+        "cores",
+        format!(
+            "{cores}, for {wanted} threads that work at a time ({path} on the frame, {} rendering)",
+            threads.renderer
+        ),
+        "stages wait for each other: frames are skipped, and actions come late",
+        "lower `threads` in the graph file, or give the machine (or container) more cores",
+    )
+}
+
+/// Memory that programs can have now.
+pub fn memory(available_bytes: u64) -> Finding {
+    if available_bytes >= GRAPH_BYTES {
+        return Finding::ok(Area::Machine, "memory", format!("{} available", size(available_bytes)));
+    }
+    Finding::warning(
+        Area::Machine,
+        "memory",
+        format!("{} available, and a graph takes about {}", size(available_bytes), size(GRAPH_BYTES)),
+        "the system may swap, or kill a stage",
+        "end other programs, or give the machine (or container) more memory",
+    )
+}
+
+/// How the monotonic clock behaved when it was read many times.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Clock {
+    /// What it reads, as the system names it.
+    pub source: Option<String>,
+    /// Readings that were below the one before.
+    pub steps_back: u32,
+    /// Time of a reading, nanoseconds.
+    pub reading_ns: f64,
+}
+
+/// The clock that orders all messages.
+pub fn clock(clock: &Clock) -> Finding {
+    let name = clock.source.as_deref().unwrap_or("of an unknown source");
+    let found = format!("{name}, {:.0} ns a reading", clock.reading_ns);
+    if clock.steps_back > 0 {
+        return Finding::error(
+            Area::Machine,
+            "clock",
+            format!("{found}; it went back {} times", clock.steps_back),
+            "messages are ordered by this clock: frames would be taken for old ones",
+            "choose another clock source (/sys/devices/system/clocksource/clocksource0), and report it to the maker of \
+             the machine",
+        );
+    }
+    if SLOW_CLOCKS.contains(&name) {
+        return Finding::warning(
+            Area::Machine,
+            "clock",
+            found,
+            "every message reads it several times, and each reading is a system call and more",
+            "boot with tsc=reliable where the processor's counter is sound; in a virtual machine, choose the host's \
+             clock (kvm-clock)",
+        );
+    }
+    Finding::ok(Area::Machine, "clock", found)
+}
+
+/// The governors of the cores' clock rates; none where somebody else governs them.
+pub fn governor(governors: &[String]) -> Finding {
+    let slow = governors.iter().filter(|g| SLOW_GOVERNORS.contains(&g.as_str())).count();
+    if let Some(name) = governors.iter().find(|g| SLOW_GOVERNORS.contains(&g.as_str())) {
+        return Finding::warning(
+            Area::Machine,
+            "governor",
+            format!("{name} on {slow} of {} cores", governors.len()),
+            "between two frames cores fall back to a low clock rate: each frame takes longer",
+            "sudo cpupower frequency-set -g performance",
+        );
+    }
+    let mut names = governors.to_vec();
+    names.sort();
+    names.dedup();
+    let found =
+        if names.is_empty() { "none here (virtual machine, or fixed rate)".to_owned() } else { names.join(", ") };
+    Finding::ok(Area::Machine, "governor", found)
+}
+
+/// Free space where this is started: data sets, reports and recordings go below it.
+pub fn disk(folder: &Path, free_bytes: u64) -> Finding {
+    let found = format!("{} free in {}", size(free_bytes), folder.display());
+    let advice = "free some, or start in another folder";
+    if free_bytes < DISK_BYTES.1 {
+        return Finding::error(Area::Machine, "disk", found, "no data set, report or recording can be written", advice);
+    }
+    if free_bytes < DISK_BYTES.0 {
+        return Finding::warning(Area::Machine, "disk", found, "a recording of some minutes fills it", advice);
+    }
+    Finding::ok(Area::Machine, "disk", found)
+}
+
+/// Where shared memory lies.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct SharedMemory {
+    /// The folder.
+    pub folder: PathBuf,
+    /// Kind of its file system; none when it is not mounted.
+    pub file_system: Option<String>,
+    /// Whether files can be made in it.
+    pub writable: bool,
+    /// Its size, bytes.
+    pub size_bytes: u64,
+    /// Free in it, bytes.
+    pub free_bytes: u64,
+}
+
+/// Shared memory against what a graph needs.
+pub fn shared_memory(memory: &SharedMemory, needed_bytes: u64) -> Vec<Finding> {
+    let folder = memory.folder.display();
+    let area = Area::SharedMemory;
+    let Some(file_system) = &memory.file_system else {
+        return vec![Finding::error(
+            area,
+            "folder",
+            format!("{folder} is not there"),
+            "no process can hand a picture to another",
+            format!("sudo mount -t tmpfs -o size=512m,mode=1777 tmpfs {folder}"),
+        )];
+    };
+    let mut findings = Vec::new();
+    findings.push(if !memory.writable {
+        Finding::error(
+            area,
+            "rights",
+            format!("{folder} cannot be written by this user"),
+            "no process can hand a picture to another",
+            format!("sudo chmod 1777 {folder}"),
+        )
+    } else if file_system == "tmpfs" {
+        Finding::ok(area, "rights", format!("{folder} can be written, and is tmpfs"))
+    } else {
+        Finding::warning(
+            area,
+            "rights",
+            format!("{folder} is {file_system}, not tmpfs"),
+            "pictures go to a disk: the loop stands still whenever it is busy",
+            format!("sudo mount -t tmpfs -o size=512m,mode=1777 tmpfs {folder}"),
+        )
+    });
+    let found = format!(
+        "{} free of {}; a graph takes up to {}",
+        size(memory.free_bytes),
+        size(memory.size_bytes),
+        size(needed_bytes)
+    );
+    let advice = format!(
+        "sudo mount -o remount,size={}m {folder}; a container has 64 MB by default: start it with --shm-size=512m",
+        (2 * needed_bytes).next_power_of_two().max(512 << 20) >> 20
+    );
+    findings.push(if memory.free_bytes < needed_bytes {
+        Finding::error(area, "size", found, "`carff launch` refuses to start, since full shared memory kills", advice)
+    } else if memory.free_bytes < 2 * needed_bytes {
+        Finding::warning(area, "size", found, "a second graph, or a viewer, may find no room", advice)
+    } else {
+        Finding::ok(area, "size", found)
+    });
+    findings
+}
+
+/// What there is of a run.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct RunFiles {
+    /// Its name.
+    pub name: String,
+    /// Its launcher, if it lives.
+    pub launcher: Option<u32>,
+    /// Its processes that live.
+    pub living: Vec<u32>,
+    /// Its small files: a folder, a record.
+    pub small: Vec<PathBuf>,
+    /// Its files in shared memory.
+    pub segments: Vec<PathBuf>,
+    /// Size of those, bytes.
+    pub segment_bytes: u64,
+}
+
+/// Runs that live, and what dead ones left. `strays` are files in shared memory that belong to no run of this user.
+pub fn leftovers(runs: &[RunFiles], strays: &[PathBuf]) -> Vec<Finding> {
+    let area = Area::SharedMemory;
+    let list = |pids: &[u32]| pids.iter().map(u32::to_string).collect::<Vec<_>>().join(" ");
+    let mut findings: Vec<Finding> = runs
+        .iter()
+        .map(|run| match (run.launcher, run.living.as_slice()) {
+            (Some(pid), living) => {
+                Finding::ok(area, "run", format!("`{}` runs: launcher {pid}, {} processes", run.name, living.len()))
+            }
+            (None, []) if run.segments.is_empty() => Finding::ok(
+                area,
+                "leftovers",
+                format!("run `{}` was killed; its next start removes the small files that it left", run.name),
+            ),
+            (None, []) => Finding::warning(
+                area,
+                "leftovers",
+                format!(
+                    "run `{}` was killed and left {} files in shared memory ({})",
+                    run.name,
+                    run.segments.len(),
+                    size(run.segment_bytes)
+                ),
+                "they take room until the run is started again, which removes them",
+                format!("rm -r {}", removal(run)),
+            ),
+            (None, living) => Finding::warning(
+                area,
+                "orphans",
+                format!("run `{}` has no launcher, but processes {}", run.name, list(living)),
+                "it cannot be started again while they live; stages end by themselves within seconds",
+                format!("kill {}", list(living)),
+            ),
+        })
+        .collect();
+    if !strays.is_empty() {
+        findings.push(Finding::warning(
+            area,
+            "strays",
+            format!("{} files in shared memory belong to no run that is known here", strays.len()),
+            "they take room until somebody removes them",
+            format!("if no graph runs: rm {}", words(strays.iter().map(PathBuf::as_path))),
+        ));
+    }
+    if findings.is_empty() {
+        findings.push(Finding::ok(area, "leftovers", "none, and nothing runs"));
+    }
+    findings
+}
+
+fn removal(run: &RunFiles) -> String {
+    words(run.small.iter().chain(&run.segments).map(PathBuf::as_path))
+}
+
+/// Paths on a command line; many are named by what they begin with.
+fn words<'a>(paths: impl Iterator<Item = &'a Path>) -> String {
+    let mut words: Vec<String> = paths
+        .map(|path| {
+            let text = path.display().to_string();
+            // A segment's name is its run's prefix, an underscore, and more.
+            match path.file_name().and_then(|n| n.to_str()).and_then(|n| n.split_once('_')) {
+                Some((prefix, _)) if prefix.starts_with("carff") => {
+                    path.with_file_name(format!("{prefix}_*")).display().to_string()
+                }
+                _ => text,
+            }
+        })
+        .collect();
+    words.sort();
+    words.dedup();
+    words.join(" ")
+}
+
+/// What the system allows a process of this user. None is no limit.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Allowed {
+    /// Memory that can be locked, bytes.
+    pub locked_bytes: Option<u64>,
+    /// Highest real-time priority.
+    pub realtime_priority: Option<u64>,
+    /// `RLIMIT_NICE`: 20 less the lowest niceness.
+    pub nice: Option<u64>,
+    /// Open files.
+    pub open_files: Option<u64>,
+    /// Whether it may lock memory without a limit (`CAP_IPC_LOCK`).
+    pub may_lock: bool,
+    /// Whether it may take any priority (`CAP_SYS_NICE`).
+    pub may_schedule: bool,
+}
+
+/// Limits against what a graph asks for.
+pub fn limits(allowed: &Allowed, realtime: &RealtimeConfig) -> Vec<Finding> {
+    let area = Area::Limits;
+    let without = "the stage says so in its log, and goes on without";
+    let raise = |line: &str, unit: &str| {
+        format!("write `USER - {line}` to /etc/security/limits.d/carff.conf and log in anew; in a systemd unit: {unit}")
+    };
+    let show = |limit: Option<u64>, show: &dyn Fn(u64) -> String| limit.map_or_else(|| "no limit".to_owned(), show);
+    let stages = stages(realtime);
+    let asking = |asks: &dyn Fn(&StageRealtime) -> bool| {
+        stages.iter().filter(|(_, s)| asks(s)).map(|(name, _)| *name).collect::<Vec<_>>().join(", ")
+    };
+
+    let locking = asking(&|s| s.lock_memory);
+    let locked = show(allowed.locked_bytes, &size);
+    let may_lock = allowed.may_lock || allowed.locked_bytes.is_none_or(|bytes| bytes >= LOCKED_BYTES);
+    let memlock = if locking.is_empty() || may_lock {
+        let privilege = if allowed.may_lock { ", and the privilege to lock more" } else { "" };
+        Finding::ok(area, "memlock", format!("{locked}{privilege}"))
+    } else {
+        Finding::warning(
+            area,
+            "memlock",
+            format!("{locked}, and the graph locks the memory of: {locking}"),
+            without,
+            raise("memlock unlimited", "LimitMEMLOCK=infinity"),
+        )
+    };
+
+    let highest = stages.iter().filter_map(|(_, s)| s.fifo_priority).max().unwrap_or(0);
+    let priority = show(allowed.realtime_priority, &|p| p.to_string());
+    let may_rise = allowed.may_schedule || allowed.realtime_priority.is_none_or(|p| p >= u64::from(highest));
+    let rtprio = if may_rise {
+        let privilege = if allowed.may_schedule { ", and the privilege to take any" } else { "" };
+        Finding::ok(area, "rtprio", format!("{priority}{privilege}"))
+    } else {
+        Finding::warning(
+            area,
+            "rtprio",
+            format!("{priority}, and the graph asks for {highest}"),
+            without,
+            raise("rtprio 99", "LimitRTPRIO=99"),
+        )
+    };
+
+    let lowest = stages.iter().filter_map(|(_, s)| s.nice).min().unwrap_or(0);
+    let floor = allowed.nice.map_or(-20, |limit| 20 - limit.min(40) as i64);
+    let mut findings = vec![memlock, rtprio];
+    if lowest < 0 {
+        let found = format!("niceness down to {floor}; the graph asks for {lowest}");
+        findings.push(if allowed.may_schedule || i64::from(lowest) >= floor {
+            Finding::ok(area, "nice", found)
+        } else {
+            let (line, unit) = (format!("nice {lowest}"), format!("LimitNICE={lowest}"));
+            Finding::warning(area, "nice", found, without, raise(&line, &unit))
+        });
+    }
+    let files = show(allowed.open_files, &|n| n.to_string());
+    findings.push(if allowed.open_files.is_none_or(|n| n >= OPEN_FILES) {
+        Finding::ok(area, "open files", files)
+    } else {
+        Finding::warning(
+            area,
+            "open files",
+            format!("{files}, where {OPEN_FILES} are usual"),
+            "probes and viewers may fail to attach",
+            raise("nofile 4096", "LimitNOFILE=4096"),
+        )
+    });
+    findings
+}
+
+fn stages(realtime: &RealtimeConfig) -> [(&'static str, &StageRealtime); 6] {
+    [
+        ("camera", &realtime.camera),
+        ("encoder", &realtime.encoder),
+        ("forecaster", &realtime.forecaster),
+        ("prober", &realtime.prober),
+        ("renderer", &realtime.renderer),
+        ("controller", &realtime.controller),
+    ]
+}
+
+/// Processors that a graph binds stages to, and that are not there.
+pub fn bound_cores(online: &[u32], realtime: &RealtimeConfig) -> Option<Finding> {
+    let missing: Vec<String> = stages(realtime)
+        .iter()
+        .flat_map(|(name, s)| {
+            s.cpus.iter().filter(|cpu| !online.contains(cpu)).map(move |cpu| format!("{name}: {cpu}"))
+        })
+        .collect();
+    (!missing.is_empty()).then(|| {
+        Finding::warning(
+            Area::Limits,
+            "cores",
+            format!("the graph binds stages to processors that are not there ({})", missing.join(", ")),
+            "the stage says so in its log, and runs anywhere",
+            "change `realtime.*.cpus` in the graph file",
+        )
+    })
+}
+
+/// What decides whether logind removes shared memory when the user logs out.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Logind {
+    /// Whether it runs.
+    pub runs: bool,
+    /// `RemoveIPC` where it is set, and in which file.
+    pub setting: Option<(bool, PathBuf)>,
+    /// This user.
+    pub uid: u32,
+    /// Whether the user's services go on after the log-out.
+    pub lingers: bool,
+}
+
+/// The last `RemoveIPC` of logind's configuration files, in the order in which it reads them.
+pub fn remove_ipc_setting(files: &[(PathBuf, String)]) -> Option<(bool, PathBuf)> {
+    let mut setting = None;
+    for (path, text) in files {
+        for line in text.lines() {
+            if let Some((key, value)) = line.split_once('=')
+                && key.trim() == "RemoveIPC"
+            {
+                let on = matches!(value.trim().to_ascii_lowercase().as_str(), "yes" | "true" | "on" | "1" | "y" | "t");
+                setting = Some((on, path.clone()));
+            }
+        }
+    }
+    setting
+}
+
+/// Whether a log-out takes shared memory away from a graph that runs.
+pub fn remove_ipc(logind: &Logind) -> Finding {
+    let ok = |found: String| Finding::ok(Area::Limits, "RemoveIPC", found);
+    if !logind.runs {
+        return ok("logind does not run here".to_owned());
+    }
+    if logind.uid < FIRST_PERSON {
+        return ok(format!("not for user {}, which is one of the system's", logind.uid));
+    }
+    let found = match &logind.setting {
+        Some((false, path)) => return ok(format!("no ({})", path.display())),
+        Some((true, path)) => format!("yes ({})", path.display()),
+        None => "not set, which is yes".to_owned(),
+    };
+    if logind.lingers {
+        return ok(format!("{found}, but this user lingers"));
+    }
+    Finding::warning(
+        Area::Limits,
+        "RemoveIPC",
+        found,
+        "when you log out, logind removes the shared memory of graphs that still run: they break",
+        "write `[Login]` and `RemoveIPC=no` to /etc/systemd/logind.conf.d/carff.conf and restart systemd-logind; or \
+         loginctl enable-linger; or run the graph as a service of a system user",
+    )
+}
+
+/// The libtorch that this process has loaded, and what it says its version is.
+pub fn libtorch(library: Option<&Path>, version: Option<&str>) -> Finding {
+    let area = Area::Programs;
+    let advice = "make libtorch, or give one of your own: make build LIBTORCH=/path/to/libtorch, and \
+                  LD_LIBRARY_PATH=/path/to/libtorch/lib where it runs";
+    let Some(library) = library else {
+        return Finding::error(area, "libtorch", "it is not loaded", "no model runs", advice);
+    };
+    match version {
+        Some(version) if version == LIBTORCH || version.starts_with(&format!("{LIBTORCH}+")) => {
+            Finding::ok(area, "libtorch", format!("{version} ({})", library.display()))
+        }
+        Some(version) => Finding::error(
+            area,
+            "libtorch",
+            format!("{version} ({}); the programs are built for {LIBTORCH}", library.display()),
+            "programs may crash, or compute something else",
+            advice,
+        ),
+        None => Finding::warning(
+            area,
+            "libtorch",
+            format!("{}, which has no file `build-version` beside it", library.display()),
+            format!("it cannot be told whether it is {LIBTORCH}"),
+            advice,
+        ),
+    }
+}
+
+/// The stages' programs that are not in a folder.
+pub fn programs(folder: &Path, missing: &[String]) -> Finding {
+    if missing.is_empty() {
+        return Finding::ok(Area::Programs, "stages", format!("all in {}", folder.display()));
+    }
+    Finding::error(
+        Area::Programs,
+        "stages",
+        format!("{} not in {}", missing.join(", "), folder.display()),
+        "`carff launch` cannot start them",
+        "make build; programs that are installed elsewhere must lie together",
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::finding::Level;
+    use super::*;
+
+    const MIB: u64 = 1 << 20;
+
+    fn realtime(prober: StageRealtime) -> RealtimeConfig {
+        RealtimeConfig { prober, ..RealtimeConfig::default() }
+    }
+
+    fn levels(findings: &[Finding]) -> Vec<(&'static str, Level)> {
+        findings.iter().map(|f| (f.subject, f.level)).collect()
+    }
+
+    /// What is not well says what it means and what to do; what is well says neither.
+    #[track_caller]
+    fn assert_level(finding: &Finding, level: Level) {
+        assert_eq!(finding.level, level, "{finding:?}");
+        assert_eq!(finding.means.is_empty(), level == Level::Ok, "{finding:?}");
+        assert_eq!(finding.advice.is_empty(), level == Level::Ok, "{finding:?}");
+    }
+
+    /// Kernels want AVX2 and FMA; AVX-512 is mentioned where it is.
+    #[test]
+    fn processors() {
+        assert_level(&processor("old", &["sse4_2"]), Level::Warning);
+        assert_level(&processor("half", &["avx2"]), Level::Warning);
+        assert_level(&processor("new", &["avx2", "fma"]), Level::Ok);
+        assert!(processor("newer", &["avx2", "fma", "avx512f", "avx512vl"]).found.ends_with("AVX-512"));
+    }
+
+    /// A frame's stages take turns, the renderer works beside them: their most and its own are what cores are for.
+    #[test]
+    fn cores_against_threads() {
+        let threads = ThreadsConfig { total: 8, encoder: 3, forecaster: 1, prober: 2, renderer: 1 };
+        assert_level(&cores(4, &threads), Level::Ok);
+        assert_level(&cores(3, &threads), Level::Warning);
+        assert_level(&cores(2, &ThreadsConfig::default()), Level::Ok);
+        assert_level(&cores(1, &ThreadsConfig::default()), Level::Warning);
+    }
+
+    /// A clock that goes back is an error, a slow one a warning, any other is well.
+    #[test]
+    fn clocks() {
+        let with = |source: Option<&str>, steps_back| {
+            clock(&Clock { source: source.map(str::to_owned), steps_back, reading_ns: 20.0 })
+        };
+        assert_level(&with(Some("tsc"), 0), Level::Ok);
+        assert_level(&with(None, 0), Level::Ok);
+        assert_level(&with(Some("hpet"), 0), Level::Warning);
+        assert_level(&with(Some("tsc"), 1), Level::Error);
+    }
+
+    /// One slow governor is enough; no governor at all is none to worry about.
+    #[test]
+    fn governors() {
+        let with = |names: &[&str]| governor(&names.iter().map(|&n| n.to_owned()).collect::<Vec<_>>());
+        assert_level(&with(&["performance", "performance"]), Level::Ok);
+        assert_level(&with(&[]), Level::Ok);
+        let slow = with(&["performance", "powersave"]);
+        assert_level(&slow, Level::Warning);
+        assert!(slow.found.contains("powersave on 1 of 2"), "{slow:?}");
+    }
+
+    /// Memory and disk have their limits, disk two of them.
+    #[test]
+    fn room() {
+        assert_level(&memory(4 << 30), Level::Ok);
+        assert_level(&memory(100 * MIB), Level::Warning);
+        assert_level(&disk(Path::new("here"), 100 << 30), Level::Ok);
+        assert_level(&disk(Path::new("here"), 500 * MIB), Level::Warning);
+        assert_level(&disk(Path::new("here"), MIB), Level::Error);
+    }
+
+    /// Shared memory must be there, writable, in memory, and have room for the graph; what mends it is a command.
+    #[test]
+    fn shared_memory_in_every_state() {
+        let good = SharedMemory {
+            folder: "/dev/shm".into(),
+            file_system: Some("tmpfs".to_owned()),
+            writable: true,
+            size_bytes: 1024 * MIB,
+            free_bytes: 1024 * MIB,
+        };
+        let check = |memory: &SharedMemory| levels(&shared_memory(memory, 50 * MIB));
+        assert_eq!(check(&good), [("rights", Level::Ok), ("size", Level::Ok)]);
+        let missing = SharedMemory { file_system: None, ..good.clone() };
+        assert_eq!(check(&missing), [("folder", Level::Error)]);
+        let foreign = SharedMemory { writable: false, ..good.clone() };
+        assert_eq!(check(&foreign)[0], ("rights", Level::Error));
+        let disk = SharedMemory { file_system: Some("ext4".to_owned()), ..good.clone() };
+        assert_eq!(check(&disk)[0], ("rights", Level::Warning));
+        for (free, level) in [(40, Level::Error), (60, Level::Warning), (100, Level::Ok)] {
+            let findings = shared_memory(&SharedMemory { free_bytes: free * MIB, ..good.clone() }, 50 * MIB);
+            assert_level(&findings[1], level);
+        }
+        let small = shared_memory(&SharedMemory { free_bytes: 0, ..good }, 600 * MIB);
+        assert!(small[1].advice.contains("size=2048m") && small[1].advice.contains("--shm-size"), "{small:?}");
+    }
+
+    /// A run that runs is well; a dead one's files, processes without a launcher and strays are warnings with the command
+    /// that removes them.
+    #[test]
+    fn what_runs_left() {
+        let segments: Vec<PathBuf> =
+            ["/dev/shm/carff0123abcd_a", "/dev/shm/carff0123abcd_b"].iter().map(PathBuf::from).collect();
+        let dead = RunFiles {
+            name: "dead".to_owned(),
+            small: vec!["/var/carff-1/dead".into(), "/var/carff-1/dead.run".into()],
+            segments: segments.clone(),
+            segment_bytes: 3 * MIB,
+            ..RunFiles::default()
+        };
+        let small = RunFiles { name: "small".to_owned(), small: vec!["x.run".into()], ..RunFiles::default() };
+        assert_level(&leftovers(&[small], &[])[0], Level::Ok);
+        let alive = RunFiles { name: "alive".to_owned(), launcher: Some(7), living: vec![7, 8], ..RunFiles::default() };
+        let orphan = RunFiles { name: "orphan".to_owned(), living: vec![9, 10], ..RunFiles::default() };
+        let findings = leftovers(&[dead, alive, orphan], &segments);
+        assert_eq!(
+            levels(&findings),
+            [
+                ("leftovers", Level::Warning),
+                ("run", Level::Ok),
+                ("orphans", Level::Warning),
+                ("strays", Level::Warning)
+            ]
+        );
+        assert!(findings[0].found.contains("`dead`") && findings[0].found.contains("3.0 MiB"), "{findings:?}");
+        assert_eq!(findings[0].advice, "rm -r /dev/shm/carff0123abcd_* /var/carff-1/dead /var/carff-1/dead.run");
+        assert_eq!(findings[2].advice, "kill 9 10");
+        assert!(findings[3].advice.ends_with("rm /dev/shm/carff0123abcd_*"), "{findings:?}");
+        assert_eq!(levels(&leftovers(&[], &[])), [("leftovers", Level::Ok)]);
+    }
+
+    /// Limits only matter where the graph asks for more, and privileges lift them.
+    #[test]
+    fn limits_against_what_is_asked() {
+        let low = Allowed {
+            locked_bytes: Some(8 * MIB),
+            realtime_priority: Some(0),
+            nice: Some(0),
+            open_files: Some(20_000),
+            ..Allowed::default()
+        };
+        let greedy = realtime(StageRealtime {
+            lock_memory: true,
+            fifo_priority: Some(50),
+            nice: Some(-5),
+            ..StageRealtime::default()
+        });
+        let all = |level| [("memlock", level), ("rtprio", level), ("nice", level), ("open files", Level::Ok)];
+        let findings = limits(&low, &greedy);
+        assert_eq!(levels(&findings), all(Level::Warning));
+        assert!(findings[0].found.contains("prober") && findings[1].found.contains("50"), "{findings:?}");
+        assert!(findings.iter().all(|f| f.level == Level::Ok || f.advice.contains("limits.d")), "{findings:?}");
+        let modest = limits(&low, &RealtimeConfig::default());
+        assert!(modest.iter().all(|f| f.level == Level::Ok), "{modest:?}");
+        let privileged = Allowed { may_lock: true, may_schedule: true, ..low };
+        assert_eq!(levels(&limits(&privileged, &greedy)), all(Level::Ok));
+        let raised = Allowed { locked_bytes: None, realtime_priority: Some(99), nice: Some(25), ..low };
+        assert_eq!(levels(&limits(&raised, &greedy)), all(Level::Ok));
+        let few = Allowed { open_files: Some(256), ..low };
+        assert_eq!(limits(&few, &RealtimeConfig::default()).last().map(|f| f.level), Some(Level::Warning));
+    }
+
+    /// Stages bound to processors that are not there are named with them.
+    #[test]
+    fn processors_that_are_not_there() {
+        let bound = realtime(StageRealtime { cpus: vec![1, 9], ..StageRealtime::default() });
+        assert_eq!(bound_cores(&[0, 1, 9], &bound), None);
+        let finding = bound_cores(&[0, 1], &bound).unwrap();
+        assert_level(&finding, Level::Warning);
+        assert!(finding.found.contains("(prober: 9)"), "{finding:?}");
+    }
+
+    /// The last file that sets it wins; comments set nothing.
+    #[test]
+    fn settings_of_logind() {
+        let file = |name: &str, text: &str| (PathBuf::from(name), text.to_owned());
+        let files =
+            [file("a", "[Login]\n#RemoveIPC=no\n"), file("b", "RemoveIPC = yes\n"), file("c", "RemoveIPC=no\n")];
+        assert_eq!(remove_ipc_setting(&files[..1]), None);
+        assert_eq!(remove_ipc_setting(&files[..2]), Some((true, "b".into())));
+        assert_eq!(remove_ipc_setting(&files), Some((false, "c".into())));
+    }
+
+    /// Only a person's files go, at a log-out that logind sees, unless it is told not to or the person lingers.
+    #[test]
+    fn log_outs() {
+        let person = Logind { runs: true, setting: None, uid: 1000, lingers: false };
+        assert_level(&remove_ipc(&person), Level::Warning);
+        assert_level(&remove_ipc(&Logind { setting: Some((true, "x".into())), ..person.clone() }), Level::Warning);
+        for well in [
+            Logind { runs: false, ..person.clone() },
+            Logind { uid: 999, ..person.clone() },
+            Logind { lingers: true, ..person.clone() },
+            Logind { setting: Some((false, "x".into())), ..person },
+        ] {
+            assert_level(&remove_ipc(&well), Level::Ok);
+        }
+    }
+
+    /// The version must be the one that the programs are built for, with any build's suffix.
+    #[test]
+    fn versions_of_libtorch() {
+        let library = Some(Path::new("lib/libtorch_cpu.so"));
+        assert_level(&libtorch(library, Some("2.11.0")), Level::Ok);
+        assert_level(&libtorch(library, Some("2.11.0+cu130")), Level::Ok);
+        assert_level(&libtorch(library, Some("2.11.01")), Level::Error);
+        assert_level(&libtorch(library, Some("2.13.0")), Level::Error);
+        assert_level(&libtorch(library, None), Level::Warning);
+        assert_level(&libtorch(None, None), Level::Error);
+    }
+
+    /// Missing programs are named.
+    #[test]
+    fn missing_programs() {
+        assert_level(&programs(Path::new("bin"), &[]), Level::Ok);
+        let finding = programs(Path::new("bin"), &["carff-prober".to_owned()]);
+        assert_level(&finding, Level::Error);
+        assert!(finding.found.contains("carff-prober not in bin"), "{finding:?}");
+    }
+
+    /// Sizes are shown in the largest unit that they fill.
+    #[test]
+    fn sizes() {
+        assert_eq!(size(0), "0 bytes");
+        assert_eq!(size(1536), "1.5 KiB");
+        assert_eq!(size(8 * MIB), "8.0 MiB");
+        assert_eq!(size(3 << 30), "3.0 GiB");
+    }
+}

@@ -1,0 +1,263 @@
+//! Looks at the machine. What is found means nothing yet.
+
+use super::checks::{Allowed, Clock, Logind, RunFiles, SharedMemory};
+use carff_messages::Stage;
+use carff_transport::{Run, SHARED_MEMORY_DIR, living_processes, monotonic_now_ns, runtime_dir};
+use rustix::process::{Resource, getrlimit};
+use std::collections::{BTreeMap, BTreeSet};
+use std::os::unix::fs::{MetadataExt, PermissionsExt};
+use std::path::{Path, PathBuf};
+
+/// Readings of the clock.
+const READINGS: u32 = 10_000;
+/// Bits of the effective capabilities: locking memory, choosing priorities.
+const CAP_IPC_LOCK: u32 = 14;
+const CAP_SYS_NICE: u32 = 23;
+/// Where logind's settings lie, in the order in which a later one wins.
+const LOGIND_FOLDERS: [&str; 3] =
+    ["/usr/lib/systemd/logind.conf.d", "/run/systemd/logind.conf.d", "/etc/systemd/logind.conf.d"];
+
+fn read(path: impl AsRef<Path>) -> Option<String> {
+    std::fs::read_to_string(path).ok().map(|text| text.trim().to_owned())
+}
+
+/// The processor's name and features.
+pub fn processor() -> (String, Vec<String>) {
+    let text = read("/proc/cpuinfo").unwrap_or_default();
+    let field = |wanted: &str| {
+        text.lines()
+            .find_map(|line| line.split_once(':').filter(|(key, _)| key.trim() == wanted).map(|(_, v)| v.trim()))
+    };
+    let features = field("flags").or_else(|| field("Features")).unwrap_or_default();
+    let name = field("model name").unwrap_or("unknown processor").to_owned();
+    (name, features.split_whitespace().map(str::to_owned).collect())
+}
+
+/// Memory that programs can have now, bytes.
+pub fn available_memory() -> Option<u64> {
+    let text = read("/proc/meminfo")?;
+    let line = text.lines().find_map(|line| line.strip_prefix("MemAvailable:"))?;
+    Some(line.split_whitespace().next()?.parse::<u64>().ok()? * 1024)
+}
+
+/// How the monotonic clock behaves.
+pub fn clock() -> Clock {
+    let (first_ns, mut last_ns, mut steps_back) = (monotonic_now_ns(), 0, 0);
+    for _ in 0..READINGS {
+        let now_ns = monotonic_now_ns();
+        steps_back += u32::from(now_ns < last_ns);
+        last_ns = now_ns;
+    }
+    Clock {
+        source: read("/sys/devices/system/clocksource/clocksource0/current_clocksource"),
+        steps_back,
+        reading_ns: last_ns.saturating_sub(first_ns) as f64 / f64::from(READINGS),
+    }
+}
+
+/// The governor of each core's clock rate.
+pub fn governors() -> Vec<String> {
+    let Ok(cores) = std::fs::read_dir("/sys/devices/system/cpu") else { return Vec::new() };
+    cores.flatten().filter_map(|core| read(core.path().join("cpufreq/scaling_governor"))).collect()
+}
+
+/// The processors that are there, by number.
+pub fn online() -> Vec<u32> {
+    numbers(&read("/sys/devices/system/cpu/online").unwrap_or_default())
+}
+
+/// "0-2,5" as numbers.
+fn numbers(ranges: &str) -> Vec<u32> {
+    ranges
+        .split(',')
+        .filter_map(|range| {
+            let (first, last) = range.split_once('-').unwrap_or((range, range));
+            Some(first.trim().parse::<u32>().ok()?..=last.trim().parse::<u32>().ok()?)
+        })
+        .flatten()
+        .collect()
+}
+
+/// Free bytes where a folder lies.
+pub fn free_bytes(folder: &Path) -> Option<u64> {
+    let stat = rustix::fs::statvfs(folder).ok()?;
+    Some(stat.f_bavail.saturating_mul(stat.f_frsize))
+}
+
+/// The folder of shared memory.
+pub fn shared_memory() -> SharedMemory {
+    let folder = Path::new(SHARED_MEMORY_DIR);
+    let stat = rustix::fs::statvfs(folder).ok();
+    let stat = stat.as_ref();
+    SharedMemory {
+        folder: folder.to_owned(),
+        file_system: stat.map(|_| file_system(&read("/proc/mounts").unwrap_or_default(), folder)),
+        writable: rustix::fs::access(folder, rustix::fs::Access::WRITE_OK).is_ok(),
+        size_bytes: stat.map_or(0, |s| s.f_blocks.saturating_mul(s.f_frsize)),
+        free_bytes: stat.map_or(0, |s| s.f_bavail.saturating_mul(s.f_frsize)),
+    }
+}
+
+/// The kind of the file system that is mounted at a folder, or of the nearest one above it.
+fn file_system(mounts: &str, folder: &Path) -> String {
+    mounts
+        .lines()
+        .filter_map(|line| {
+            let mut words = line.split_whitespace().skip(1);
+            let (place, kind) = (Path::new(words.next()?), words.next()?);
+            folder.starts_with(place).then(|| (place.components().count(), kind.to_owned()))
+        })
+        // Of several mounts at one place, the last is on top.
+        .max_by_key(|(depth, _)| *depth)
+        .map_or_else(|| "of an unknown kind".to_owned(), |(_, kind)| kind)
+}
+
+/// This user's runs, and the files in shared memory that look like a run's but are none's.
+pub fn runs() -> anyhow::Result<(Vec<RunFiles>, Vec<PathBuf>)> {
+    let folder = runtime_dir();
+    let launchers: BTreeMap<String, u32> = carff_observe::runs()?.into_iter().map(|run| (run.name, run.pid)).collect();
+    let mut small: BTreeMap<String, Vec<PathBuf>> = BTreeMap::new();
+    for entry in std::fs::read_dir(&folder).into_iter().flatten().flatten() {
+        if let Some(name) = entry.file_name().to_str() {
+            small.entry(name.strip_suffix(".run").unwrap_or(name).to_owned()).or_default().push(entry.path());
+        }
+    }
+    let mut runs = Vec::new();
+    let mut known = BTreeSet::new();
+    for (name, small) in small {
+        // What no run can be called is somebody else's.
+        let Ok(run) = Run::new(&name, 0) else { continue };
+        let segments = run.shared_memory_files().unwrap_or_default();
+        known.insert(run.shared_memory_prefix());
+        runs.push(RunFiles {
+            launcher: launchers.get(&name).copied(),
+            living: if run.folder().is_dir() { living_processes(&run)? } else { Vec::new() },
+            segment_bytes: segments.iter().filter_map(|path| std::fs::metadata(path).ok()).map(|m| m.len()).sum(),
+            name,
+            small,
+            segments,
+        });
+    }
+    let uid = rustix::process::getuid().as_raw();
+    let mut strays: Vec<PathBuf> = std::fs::read_dir(SHARED_MEMORY_DIR)
+        .into_iter()
+        .flatten()
+        .flatten()
+        .filter(|entry| {
+            let name = entry.file_name();
+            let name = name.to_string_lossy();
+            is_segment(&name)
+                && !known.iter().any(|prefix| name.starts_with(prefix.as_str()))
+                && entry.metadata().is_ok_and(|m| m.uid() == uid)
+        })
+        .map(|entry| entry.path())
+        .collect();
+    strays.sort();
+    Ok((runs, strays))
+}
+
+/// Whether a file's name is that of a run's shared memory: `carff`, eight digits, an underscore.
+fn is_segment(name: &str) -> bool {
+    name.strip_prefix("carff")
+        .and_then(|rest| rest.split_once('_'))
+        .is_some_and(|(hash, _)| hash.len() == 8 && hash.bytes().all(|b| b.is_ascii_hexdigit()))
+}
+
+/// What the system allows.
+pub fn allowed() -> Allowed {
+    let status = read("/proc/self/status").unwrap_or_default();
+    let effective = status.lines().find_map(|line| line.strip_prefix("CapEff:"));
+    let capabilities = effective.and_then(|v| u64::from_str_radix(v.trim(), 16).ok()).unwrap_or(0);
+    Allowed {
+        locked_bytes: getrlimit(Resource::Memlock).current,
+        realtime_priority: getrlimit(Resource::Rtprio).current,
+        nice: getrlimit(Resource::Nice).current,
+        open_files: getrlimit(Resource::Nofile).current,
+        may_lock: capabilities >> CAP_IPC_LOCK & 1 == 1,
+        may_schedule: capabilities >> CAP_SYS_NICE & 1 == 1,
+    }
+}
+
+/// What logind does at this user's log-out.
+pub fn logind() -> Logind {
+    let mut paths = vec![PathBuf::from("/usr/lib/systemd/logind.conf"), PathBuf::from("/etc/systemd/logind.conf")];
+    let mut additions: Vec<PathBuf> = LOGIND_FOLDERS
+        .iter()
+        .flat_map(|folder| std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path()))
+        .filter(|path| path.extension().is_some_and(|e| e == "conf"))
+        .collect();
+    // By name, whichever folder they lie in.
+    additions.sort_by(|a, b| a.file_name().cmp(&b.file_name()));
+    paths.extend(additions);
+    let files: Vec<(PathBuf, String)> =
+        paths.into_iter().filter_map(|path| read(&path).map(|text| (path, text))).collect();
+    let user = std::env::var("USER").unwrap_or_default();
+    Logind {
+        runs: Path::new("/run/systemd/seats").is_dir(),
+        setting: super::checks::remove_ipc_setting(&files),
+        uid: rustix::process::getuid().as_raw(),
+        lingers: !user.is_empty() && Path::new("/var/lib/systemd/linger").join(user).exists(),
+    }
+}
+
+/// The libtorch that this process has loaded, and the version that a file beside it says.
+pub fn libtorch() -> (Option<PathBuf>, Option<String>) {
+    let maps = read("/proc/self/maps").unwrap_or_default();
+    let library = maps
+        .lines()
+        .find(|line| line.contains("libtorch_cpu.so"))
+        .and_then(|line| line.find('/').map(|at| PathBuf::from(&line[at..])));
+    let version = library.as_deref().and_then(Path::parent).and_then(Path::parent);
+    let version = version.and_then(|root| read(root.join("build-version")));
+    (library, version)
+}
+
+/// The stages' programs that are not in a folder, or cannot be started.
+pub fn missing_programs(folder: &Path) -> Vec<String> {
+    let is_program = |path: &Path| path.metadata().is_ok_and(|m| m.is_file() && m.permissions().mode() & 0o111 != 0);
+    Stage::ALL.iter().map(|stage| format!("carff-{stage}")).filter(|name| !is_program(&folder.join(name))).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Ranges of processors, as the system writes them.
+    #[test]
+    fn ranges_of_processors() {
+        assert_eq!(numbers("0-2,5"), [0, 1, 2, 5]);
+        assert_eq!(numbers("0"), [0]);
+        assert_eq!(numbers(""), Vec::<u32>::new());
+        assert_eq!(numbers("x-2,3"), [3]);
+    }
+
+    /// The deepest mount counts, and of two at one place the later.
+    #[test]
+    fn the_mount_on_top_counts() {
+        let mounts =
+            "overlay / overlay rw 0 0\ntmpfs /dev tmpfs rw 0 0\nshm /dev/shm ext4 rw 0 0\nshm /dev/shm tmpfs rw 0 0";
+        assert_eq!(file_system(mounts, Path::new("/dev/shm")), "tmpfs");
+        assert_eq!(file_system(mounts, Path::new("/data")), "overlay");
+        assert_eq!(file_system("", Path::new("/data")), "of an unknown kind");
+    }
+
+    /// Only names that the transport gives are taken for a run's.
+    #[test]
+    fn names_of_segments() {
+        assert!(is_segment("carff0123abcd_service_x"));
+        for other in ["carff0123abcd", "carff0123abc_x", "carffxyzxyzxy_x", "psm_1234_x", "iox2_1_x", ""] {
+            assert!(!is_segment(other), "{other}");
+        }
+    }
+
+    /// What this machine really has can be read: it has a processor, a clock that does not go back, and limits.
+    #[test]
+    fn this_machine_can_be_read() {
+        assert!(!processor().1.is_empty());
+        assert!(available_memory().is_some_and(|bytes| bytes > 0));
+        assert_eq!(clock().steps_back, 0);
+        assert!(online().contains(&0) || online().is_empty());
+        assert!(libtorch().0.is_some_and(|path| path.is_file()));
+        assert!(runs().is_ok());
+    }
+}

@@ -1,0 +1,264 @@
+//! A graph file, and whether what it names is there and fits together.
+
+use super::finding::{Area, Finding};
+use carff_checkpoint::{Manifest, ScenarioIdentity};
+use carff_config::{CameraSource, CheckpointPlanning, ConfigError, GraphConfig};
+use carff_dataset::Dataset;
+use carff_scenes::Scenario;
+use std::fmt::Display;
+use std::path::Path;
+
+/// Nothing but this refuses a launch.
+const NO_LAUNCH: &str = "`carff launch` refuses it";
+
+/// Everything about a graph, its data set and checkpoint possibly replaced.
+pub fn check(path: &Path, graph: &GraphConfig, dataset: Option<&Path>, checkpoint: Option<&Path>) -> Vec<Finding> {
+    let mut findings = vec![Finding::ok(Area::Graph, "file", path.display().to_string())];
+    for warning in graph.warnings() {
+        findings.push(Finding::warning(
+            Area::Graph,
+            "settings",
+            warning,
+            "it runs, but not as you may expect",
+            format!("change {}", path.display()),
+        ));
+    }
+    let dataset = graph.resolve(dataset.unwrap_or(&graph.run.dataset));
+    let checkpoint = graph.resolve(checkpoint.unwrap_or(&graph.run.checkpoint));
+    let renders = graph.camera.source == CameraSource::FreeDrives || !dataset.exists();
+    let scenario = scenario(graph, renders, &mut findings);
+    let shown = pictures(graph, &dataset, scenario.as_ref(), &mut findings);
+    models(&checkpoint, shown.as_ref(), &mut findings);
+    findings
+}
+
+/// A graph file that cannot be read.
+pub fn wrong(error: &ConfigError) -> Finding {
+    let advice = match error {
+        ConfigError::Read { .. } => "give the path of a graph file, as in configs/graphs",
+        _ => "change the file as the error says",
+    };
+    Finding::error(Area::Graph, "file", error.to_string(), NO_LAUNCH, advice)
+}
+
+/// The scenario, if one is named; a wrong one only matters where the graph renders it.
+fn scenario(graph: &GraphConfig, renders: bool, findings: &mut Vec<Finding>) -> Option<Scenario> {
+    let path = graph.scenario_path()?;
+    match Scenario::load(&path) {
+        Ok(scenario) => {
+            findings.push(Finding::ok(Area::Graph, "scenario", path.display().to_string()));
+            Some(scenario)
+        }
+        Err(error) => {
+            let finding = if renders { Finding::error } else { Finding::warning };
+            findings.push(finding(
+                Area::Graph,
+                "scenario",
+                error.to_string().as_str(),
+                "free drives and a missing data set cannot be rendered",
+                "correct `run.scenario` in the graph file, or the scenario file",
+            ));
+            None
+        }
+    }
+}
+
+/// The pictures' source. Returns what scenario it shows.
+fn pictures(
+    graph: &GraphConfig,
+    dataset: &Path,
+    scenario: Option<&Scenario>,
+    findings: &mut Vec<Finding>,
+) -> Option<ScenarioIdentity> {
+    let subject = "data set";
+    if graph.camera.source == CameraSource::Folder {
+        let folder = graph.camera.folder.as_ref().map_or_else(|| dataset.join("images"), |f| graph.resolve(f));
+        findings.push(if folder.is_dir() {
+            Finding::ok(Area::Graph, "pictures", folder.display().to_string())
+        } else {
+            Finding::error(
+                Area::Graph,
+                "pictures",
+                format!("{} is no folder{}", folder.display(), carff_nearest::beside(&folder)),
+                "the camera has nothing to show",
+                "correct `camera.folder` in the graph file",
+            )
+        });
+        return None;
+    }
+    let rendered = scenario.map(|s| ScenarioIdentity::of(s.info(), s.cameras().len()));
+    if !dataset.exists() {
+        findings.push(match &rendered {
+            Some(_) => Finding::ok(
+                Area::Graph,
+                subject,
+                format!("{} is not there yet: `carff launch` renders it", dataset.display()),
+            ),
+            None => Finding::error(
+                Area::Graph,
+                subject,
+                format!("{} is not there{}", dataset.display(), carff_nearest::beside(dataset)),
+                NO_LAUNCH,
+                "give --dataset, or name the scenario that it is rendered from in the graph file (`run.scenario`)",
+            ),
+        });
+        return rendered;
+    }
+    match Dataset::open(dataset) {
+        Ok(set) => {
+            for warning in set.warnings() {
+                findings.push(Finding::warning(
+                    Area::Graph,
+                    subject,
+                    warning.clone(),
+                    "the set can be used, but not all of it",
+                    format!("carff dataset check {}", dataset.display()),
+                ));
+            }
+            let found = format!("{}: {} pictures", dataset.display(), set.frames().len());
+            findings.push(Finding::ok(Area::Graph, subject, found));
+            set.scenario().map(|s| ScenarioIdentity::of(s, set.view_count()))
+        }
+        Err(error) => {
+            findings.push(Finding::error(
+                Area::Graph,
+                subject,
+                error.to_string(),
+                NO_LAUNCH,
+                format!("carff dataset check {} says all that is wrong; or render it again", dataset.display()),
+            ));
+            None
+        }
+    }
+}
+
+/// The checkpoint's parts, each read as the stages read it.
+fn models(checkpoint: &Path, shown: Option<&ScenarioIdentity>, findings: &mut Vec<Finding>) {
+    let bad = |error: &dyn Display, advice: &str| {
+        Finding::error(Area::Graph, "checkpoint", error.to_string(), NO_LAUNCH, advice)
+    };
+    let manifest = match Manifest::load(checkpoint) {
+        Ok(manifest) => manifest,
+        Err(error) => {
+            let advice = "train the scenario (carff train configs/training/NAME.toml), or give --checkpoint";
+            return findings.push(bad(&error, advice));
+        }
+    };
+    let parts = [
+        carff_checkpoint::load_encoder(checkpoint, &manifest).map(drop).map_err(|e| e.to_string()),
+        carff_checkpoint::load_mixture(checkpoint, &manifest).map(drop).map_err(|e| e.to_string()),
+        carff_checkpoint::load_field(checkpoint, &manifest).map(drop).map_err(|e| e.to_string()),
+        carff_checkpoint::load_probing(checkpoint, &manifest).map(drop).map_err(|e| e.to_string()),
+        CheckpointPlanning::load(checkpoint).map(drop).map_err(|e| e.to_string()),
+    ];
+    let whole = parts.iter().all(Result::is_ok);
+    let again = "train it again, or copy the folder again from where it is whole";
+    findings.extend(parts.iter().filter_map(|part| part.as_ref().err()).map(|error| bad(error, again)));
+    match shown.map(|shown| manifest.check_scenario(checkpoint, shown)) {
+        Some(Err(error)) => findings.push(bad(
+            &error,
+            "take the data set and the scenario that the checkpoint was trained on, or another checkpoint",
+        )),
+        _ if whole => {
+            let found = format!("{}, of {}", checkpoint.display(), manifest.scenario.name);
+            findings.push(Finding::ok(Area::Graph, "checkpoint", found));
+        }
+        _ => {}
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::finding::Level;
+    use super::*;
+    use std::path::PathBuf;
+
+    fn root() -> PathBuf {
+        Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap().to_owned()
+    }
+
+    fn shipped() -> (PathBuf, GraphConfig) {
+        let path = root().join("configs/graphs/approaching-intersection.toml");
+        let graph = GraphConfig::load(&path).unwrap();
+        (path, graph)
+    }
+
+    fn errors(findings: &[Finding]) -> Vec<(&'static str, &str)> {
+        findings.iter().filter(|f| f.level == Level::Error).map(|f| (f.subject, f.found.as_str())).collect()
+    }
+
+    /// The shipped graph with its checkpoint is well, whether its data set has been rendered or not.
+    #[test]
+    fn the_shipped_graph_is_well() {
+        let (path, graph) = shipped();
+        let missing = root().join("nowhere/at-all");
+        let findings = check(&path, &graph, Some(&missing), None);
+        assert_eq!(errors(&findings), []);
+        let set = findings.iter().find(|f| f.subject == "data set").unwrap();
+        assert!(set.found.contains("renders it"), "{set:?}");
+        assert!(findings.iter().any(|f| f.subject == "checkpoint" && f.level == Level::Ok));
+    }
+
+    /// A data set that cannot be made, a checkpoint that is not there or damaged, and one of another scenario are errors,
+    /// each with what to do.
+    #[test]
+    fn what_is_wrong_is_said() {
+        let (path, graph) = shipped();
+        let mut without = graph.clone();
+        without.run.scenario = None;
+        let nowhere = root().join("nowhere");
+        let findings =
+            check(&path, &without, Some(&nowhere), Some(&root().join("configs/checkpoints/aproaching-intersection")));
+        let found = errors(&findings);
+        assert_eq!(found.iter().map(|(subject, _)| *subject).collect::<Vec<_>>(), ["data set", "checkpoint"]);
+        assert!(found[1].1.contains("did you mean") && found[1].1.contains("approaching-intersection"), "{found:?}");
+        assert!(
+            findings.iter().filter(|f| f.level == Level::Error).all(|f| !f.means.is_empty() && !f.advice.is_empty())
+        );
+
+        let folder = tempfile::tempdir().unwrap();
+        for entry in std::fs::read_dir(graph.resolve(&graph.run.checkpoint)).unwrap().flatten() {
+            std::fs::copy(entry.path(), folder.path().join(entry.file_name())).unwrap();
+        }
+        let damaged = std::fs::read(folder.path().join("mixture.safetensors")).unwrap();
+        std::fs::write(folder.path().join("mixture.safetensors"), &damaged[..damaged.len() / 2]).unwrap();
+        std::fs::remove_file(folder.path().join("planning.json")).unwrap();
+        let mut other = graph.clone();
+        other.run.scenario = Some("two-lane-merge".to_owned());
+        let findings = check(&path, &other, Some(&nowhere), Some(folder.path()));
+        let found = errors(&findings);
+        assert_eq!(found.len(), 3, "{found:?}");
+        assert!(found.iter().all(|(subject, _)| *subject == "checkpoint"), "{found:?}");
+        assert!(found[1].1.contains("planning.json") && found[2].1.contains("scenario.name"), "{found:?}");
+    }
+
+    /// A scenario that cannot be read is an error where it would be rendered, else a warning; both name the nearest.
+    #[test]
+    fn a_wrong_scenario_matters_where_it_is_rendered() {
+        let (path, mut graph) = shipped();
+        graph.run.scenario = Some("aproaching-intersection".to_owned());
+        let folder = tempfile::tempdir().unwrap();
+        for (dataset, level) in [(folder.path().join("none"), Level::Error), (folder.path().to_owned(), Level::Warning)]
+        {
+            let findings = check(&path, &graph, Some(&dataset), None);
+            let finding = findings.iter().find(|f| f.subject == "scenario").unwrap();
+            assert_eq!(finding.level, level, "{finding:?}");
+            assert!(
+                finding.found.contains("did you mean") && finding.found.contains("/approaching-inter"),
+                "{finding:?}"
+            );
+        }
+    }
+
+    /// A wrong graph file is one error, with the line.
+    #[test]
+    fn a_wrong_file_is_one_error() {
+        let error = GraphConfig::parse("[run]\nname = \"x\"\nhorizn = 2\n", Path::new("x.toml")).unwrap_err();
+        let finding = wrong(&error);
+        assert_eq!(finding.level, Level::Error);
+        assert!(
+            finding.found.starts_with("x.toml:3: ") && finding.found.ends_with("did you mean `horizon`?"),
+            "{finding:?}"
+        );
+    }
+}

@@ -1,0 +1,88 @@
+//! `carff doctor`: looks at the machine and at a graph, and says what will go wrong, what it means and what to do.
+//! `gather` looks, `checks` judges, `finding` shows.
+
+mod checks;
+mod finding;
+mod gather;
+mod graph;
+
+pub use finding::{Area, Finding, Level};
+
+use anyhow::Context;
+use carff_config::{GraphConfig, RealtimeConfig, RendererConfig, ThreadsConfig};
+use carff_transport::topics;
+use std::io::IsTerminal;
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+/// Look at the machine.
+#[derive(Clone, Debug, clap::Args)]
+pub struct DoctorArgs {
+    /// A graph file, as in configs/graphs: what it asks of the machine, and whether what it names is there and fits.
+    pub graph: Option<PathBuf>,
+    /// Data set folder, in place of the graph file's.
+    #[arg(long, requires = "graph")]
+    pub dataset: Option<PathBuf>,
+    /// Checkpoint folder, in place of the graph file's.
+    #[arg(long, requires = "graph")]
+    pub checkpoint: Option<PathBuf>,
+    /// Print the findings as JSON.
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// Prints what it finds; exit code 1 when something keeps a graph from running.
+pub fn run(args: &DoctorArgs) -> anyhow::Result<ExitCode> {
+    let findings = examine(args)?;
+    let text = if args.json {
+        serde_json::to_string_pretty(&finding::json(&findings))? + "\n"
+    } else {
+        let colours = std::env::var_os("NO_COLOR").is_none_or(|v| v.is_empty());
+        finding::text(&findings, colours && std::io::stdout().is_terminal())
+    };
+    crate::shell::print(text.as_bytes())?;
+    let failed = findings.iter().any(|f| f.level == Level::Error);
+    Ok(if failed { ExitCode::FAILURE } else { ExitCode::SUCCESS })
+}
+
+/// All findings.
+pub fn examine(args: &DoctorArgs) -> anyhow::Result<Vec<Finding>> {
+    let graph = args.graph.as_deref().map(GraphConfig::load);
+    let config = graph.as_ref().and_then(|g| g.as_ref().ok());
+    let threads = config.map_or_else(ThreadsConfig::default, |g| g.threads);
+    let renderer = config.map_or_else(RendererConfig::default, |g| g.renderer.clone());
+    let realtime = config.map_or_else(RealtimeConfig::default, |g| g.realtime.clone());
+
+    let (name, features) = gather::processor();
+    let features: Vec<&str> = features.iter().map(String::as_str).collect();
+    let cores = std::thread::available_parallelism().map_or(1, usize::from);
+    let mut findings = vec![checks::processor(&name, &features), checks::cores(cores, &threads)];
+    findings.extend(gather::available_memory().map(checks::memory));
+    findings.extend([checks::clock(&gather::clock()), checks::governor(&gather::governors())]);
+    let here = std::env::current_dir().context("the current folder is gone")?;
+    findings.extend(gather::free_bytes(&here).map(|bytes| checks::disk(&here, bytes)));
+
+    let view_bytes = (renderer.width_px * renderer.height_px * 3) as usize;
+    let needed_bytes = topics::graph_bytes(crate::launch::FRAME_BYTES, view_bytes);
+    findings.extend(checks::shared_memory(&gather::shared_memory(), needed_bytes));
+    let (runs, strays) = gather::runs()?;
+    findings.extend(checks::leftovers(&runs, &strays));
+
+    findings.extend(checks::limits(&gather::allowed(), &realtime));
+    findings.extend(checks::bound_cores(&gather::online(), &realtime));
+    findings.push(checks::remove_ipc(&gather::logind()));
+
+    let (library, version) = gather::libtorch();
+    findings.push(checks::libtorch(library.as_deref(), version.as_deref()));
+    let folder = std::env::current_exe()?.parent().context("this program has no folder")?.to_owned();
+    findings.push(checks::programs(&folder, &gather::missing_programs(&folder)));
+
+    match (&args.graph, graph) {
+        (Some(path), Some(Ok(config))) => {
+            findings.extend(graph::check(path, &config, args.dataset.as_deref(), args.checkpoint.as_deref()));
+        }
+        (_, Some(Err(error))) => findings.push(graph::wrong(&error)),
+        _ => {}
+    }
+    Ok(findings)
+}

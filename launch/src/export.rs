@@ -1,0 +1,272 @@
+//! `carff export`: a recording as pictures, tables, a film, or a trace.
+
+use crate::probe::image::view_name;
+use crate::spans::{Span, trace_events};
+use anyhow::{Context, bail, ensure};
+use carff_observe::TopicId;
+use carff_recording::{OwnedMessage, Reader};
+use clap::Args;
+use serde_json::Value;
+use std::collections::{BTreeMap, BTreeSet};
+use std::io::Write;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, ExitCode, Stdio};
+
+/// Rate of a film whose recording holds one frame alone, frames a second.
+const LONE_FRAME_HZ: f64 = 10.0;
+
+/// Export a recording.
+#[derive(Clone, Debug, Args)]
+#[group(required = true, multiple = true)]
+pub struct Outputs {
+    /// Camera frames and rendered views as PNG files in this folder.
+    #[arg(long, value_name = "DIR")]
+    pub png: Option<PathBuf>,
+    /// A table for each topic as a CSV file in this folder, with a column for each field.
+    #[arg(long, value_name = "DIR")]
+    pub csv: Option<PathBuf>,
+    /// The camera's frames as a film, at the recorded rate; needs the program ffmpeg.
+    #[arg(long, value_name = "FILE")]
+    pub mp4: Option<PathBuf>,
+    /// When each stage worked on which frame, in the trace event format that ui.perfetto.dev opens.
+    #[arg(long, value_name = "FILE")]
+    pub trace: Option<PathBuf>,
+}
+
+/// Export a recording.
+#[derive(Clone, Debug, Args)]
+pub struct ExportArgs {
+    /// The recording.
+    pub recording: PathBuf,
+    /// What to make of it.
+    #[command(flatten)]
+    pub outputs: Outputs,
+}
+
+/// Exports.
+pub fn run(args: &ExportArgs) -> anyhow::Result<ExitCode> {
+    let Outputs { png, csv, mp4, trace } = &args.outputs;
+    let path = &args.recording;
+    if let Some(folder) = png {
+        println!("{}: {} pictures", folder.display(), pictures(path, folder)?);
+    }
+    if let Some(folder) = csv {
+        for (file, rows) in tables(path, folder)? {
+            println!("{}: {rows} rows", file.display());
+        }
+    }
+    if let Some(file) = mp4 {
+        println!("{}: {} frames", file.display(), film(path, file)?);
+    }
+    if let Some(file) = trace {
+        println!("{}: {} spans; open it at ui.perfetto.dev or chrome://tracing", file.display(), spans(path, file)?);
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+fn make_folder(folder: &Path) -> anyhow::Result<()> {
+    std::fs::create_dir_all(folder).with_context(|| format!("cannot make the folder {}", folder.display()))
+}
+
+fn pictures(recording: &Path, folder: &Path) -> anyhow::Result<u64> {
+    make_folder(folder)?;
+    let mut reader = Reader::open(recording)?;
+    let mut count = 0;
+    while let Some(entry) = reader.next()? {
+        let (name, width_px, height_px, rgb) = match &entry.message {
+            OwnedMessage::Frame(m, rgb) => (format!("frame-{:06}", m.header.frame_id), m.width_px, m.height_px, rgb),
+            OwnedMessage::View(m, rgb) => (view_name(m), m.width_px, m.height_px, rgb),
+            _ => continue,
+        };
+        let path = folder.join(format!("{name}.png"));
+        image::save_buffer(&path, rgb, width_px, height_px, image::ColorType::Rgb8)
+            .with_context(|| format!("cannot write {}", path.display()))?;
+        count += 1;
+    }
+    Ok(count)
+}
+
+/// A JSON value as cells, each named by its path.
+fn flatten(path: &str, value: &Value, cells: &mut BTreeMap<String, String>) {
+    let below = |key: &str| if path.is_empty() { key.to_owned() } else { format!("{path}.{key}") };
+    match value {
+        Value::Object(map) => map.iter().for_each(|(key, value)| flatten(&below(key), value, cells)),
+        Value::Array(list) => {
+            list.iter().enumerate().for_each(|(i, value)| flatten(&below(&i.to_string()), value, cells));
+        }
+        Value::Null => drop(cells.insert(path.to_owned(), String::new())),
+        Value::String(text) => drop(cells.insert(path.to_owned(), text.clone())),
+        value => drop(cells.insert(path.to_owned(), value.to_string())),
+    }
+}
+
+/// `a.10` after `a.9`.
+fn natural(column: &str) -> Vec<(bool, u64, String)> {
+    column
+        .split('.')
+        .map(|part| part.parse().map_or((true, 0, part.to_owned()), |n| (false, n, String::new())))
+        .collect()
+}
+
+fn tables(recording: &Path, folder: &Path) -> anyhow::Result<Vec<(PathBuf, u64)>> {
+    make_folder(folder)?;
+    let mut columns: BTreeMap<TopicId, BTreeSet<String>> = BTreeMap::new();
+    let cells_of = |each: &mut dyn FnMut(TopicId, BTreeMap<String, String>) -> anyhow::Result<()>| {
+        let mut reader = Reader::open(recording)?;
+        while let Some(entry) = reader.next()? {
+            let mut cells = BTreeMap::new();
+            flatten("", &entry.message.as_message().to_json()?, &mut cells);
+            each(entry.topic, cells)?;
+        }
+        Ok::<(), anyhow::Error>(())
+    };
+    cells_of(&mut |topic, cells| {
+        columns.entry(topic).or_default().extend(cells.into_keys());
+        Ok(())
+    })?;
+    let mut files = BTreeMap::new();
+    for (topic, columns) in columns {
+        let mut columns: Vec<String> = columns.into_iter().collect();
+        columns.sort_by_key(|c| natural(c));
+        let path = folder.join(format!("{}.csv", topic.name().replace('/', "-")));
+        let mut file = csv::Writer::from_path(&path).with_context(|| format!("cannot write {}", path.display()))?;
+        file.write_record(&columns)?;
+        files.insert(topic, (path, columns, file, 0));
+    }
+    cells_of(&mut |topic, cells| {
+        if let Some((path, columns, file, rows)) = files.get_mut(&topic) {
+            let row = columns.iter().map(|c| cells.get(c).map_or("", String::as_str));
+            file.write_record(row).with_context(|| format!("cannot write {}", path.display()))?;
+            *rows += 1;
+        }
+        Ok(())
+    })?;
+    let mut written = Vec::new();
+    for (path, _, mut file, rows) in files.into_values() {
+        file.flush().with_context(|| format!("cannot write {}", path.display()))?;
+        written.push((path, rows));
+    }
+    Ok(written)
+}
+
+/// Frames a second, from the median time between them.
+fn frame_rate_hz(recording: &Path) -> anyhow::Result<f64> {
+    let mut reader = Reader::open(recording)?;
+    let (mut before_ns, mut between) = (None, Vec::new());
+    while let Some(entry) = reader.next()? {
+        if let OwnedMessage::Frame(m, _) = &entry.message {
+            let at_ns = m.header.capture_time_ns;
+            if let Some(before_ns) = before_ns.replace(at_ns) {
+                between.push(at_ns.saturating_sub(before_ns) as f64);
+            }
+        }
+    }
+    let median_ns = carff_metrics::percentile(&between, 0.5).filter(|&ns| ns > 0.0);
+    Ok(median_ns.map_or(LONE_FRAME_HZ, |ns| 1e9 / ns))
+}
+
+fn film(recording: &Path, file: &Path) -> anyhow::Result<u64> {
+    let rate_hz = frame_rate_hz(recording)?;
+    let mut reader = Reader::open(recording)?;
+    let mut encoder: Option<(Child, [u32; 2])> = None;
+    let mut count = 0;
+    let result = loop {
+        let Some(entry) = reader.next()? else { break Ok(()) };
+        let OwnedMessage::Frame(m, rgb) = &entry.message else { continue };
+        let size = [m.width_px, m.height_px];
+        let (child, first) = match &mut encoder {
+            Some(encoder) => encoder,
+            None => encoder.insert((ffmpeg(file, size, rate_hz)?, size)),
+        };
+        if *first != size {
+            break Err(anyhow::anyhow!("frame {} has another size than the first", m.header.frame_id));
+        }
+        // What ffmpeg has to say is on standard error.
+        match child.stdin.as_mut().map(|input| input.write_all(rgb)) {
+            Some(Ok(())) => count += 1,
+            _ => break Ok(()),
+        }
+    };
+    let Some((mut child, _)) = encoder else { bail!("{} holds no camera frame", recording.display()) };
+    drop(child.stdin.take());
+    let status = child.wait().context("cannot wait for ffmpeg")?;
+    result?;
+    ensure!(status.success(), "ffmpeg could not write {} ({status})", file.display());
+    Ok(count)
+}
+
+fn ffmpeg(file: &Path, [width_px, height_px]: [u32; 2], rate_hz: f64) -> anyhow::Result<Child> {
+    Command::new("ffmpeg")
+        .args(["-y", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24"])
+        .args(["-s", &format!("{width_px}x{height_px}"), "-r", &format!("{rate_hz:.6}"), "-i", "-"])
+        // Players want even sizes and this colour space.
+        .args(["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-c:v", "libx264", "-crf", "16", "-pix_fmt", "yuv420p"])
+        .arg(file)
+        .stdin(Stdio::piped())
+        .stdout(Stdio::null())
+        .spawn()
+        .context("cannot start ffmpeg: install it, or export PNG files with --png")
+}
+
+fn spans(recording: &Path, file: &Path) -> anyhow::Result<usize> {
+    let mut reader = Reader::open(recording)?;
+    let mut spans = Vec::new();
+    while let Some(entry) = reader.next()? {
+        spans.extend(Span::of(entry.message.as_message()));
+    }
+    let trace = serde_json::to_string(&trace_events(&reader.about().run, &spans))?;
+    std::fs::write(file, trace).with_context(|| format!("cannot write {}", file.display()))?;
+    Ok(spans.len())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use carff_messages::{FrameMeta, Gaussian, Header, Posterior};
+    use carff_readable::AnyMessage;
+    use carff_recording::{About, Writer};
+
+    fn recording(path: &Path) {
+        let mut writer = Writer::create(path, &About::default(), &[]).unwrap();
+        for frame in 0..3_u64 {
+            let at_ns = frame * 50_000_000;
+            let header = Header { publish_time_ns: at_ns + 1, ..Header::of_frame(frame, at_ns, 1) };
+            let mut meta = FrameMeta { header, width_px: 2, height_px: 1, ..FrameMeta::default() };
+            (meta.intrinsics.fl_x_px, meta.intrinsics.fl_y_px) = (1.0, 1.0);
+            writer.write(TopicId::Frame, AnyMessage::Frame(&meta, &[frame as u8; 6])).unwrap();
+            let posterior = Posterior { header, gaussian: Gaussian::standard(), stage_latency_ns: frame };
+            writer.write(TopicId::Posterior, AnyMessage::Posterior(&posterior)).unwrap();
+        }
+        writer.finish().unwrap();
+    }
+
+    /// Pictures have their bytes, tables a row for each message and a column for each field, traces a span each.
+    #[test]
+    fn recordings_become_files() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("r.mcap");
+        recording(&path);
+        assert_eq!(pictures(&path, &folder.path().join("png")).unwrap(), 3);
+        let picture = image::open(folder.path().join("png/frame-000002.png")).unwrap().into_rgb8();
+        assert_eq!((picture.dimensions(), picture.as_raw().as_slice()), ((2, 1), [2; 6].as_slice()));
+
+        let tables = tables(&path, &folder.path().join("csv")).unwrap();
+        assert_eq!(tables.len(), 2);
+        let text = std::fs::read_to_string(folder.path().join("csv/encoder-posterior.csv")).unwrap();
+        let head: Vec<&str> = text.lines().next().unwrap().split(',').collect();
+        let column = head.iter().position(|&c| c == "stage_latency_ns").unwrap();
+        assert_eq!(text.lines().nth(3).unwrap().split(',').nth(column), Some("2"));
+        assert!(head.contains(&"gaussian.mean.7") && head.contains(&"header.frame_id"), "{head:?}");
+
+        assert_eq!(spans(&path, &folder.path().join("trace.json")).unwrap(), 6);
+        assert!((frame_rate_hz(&path).unwrap() - 20.0).abs() < 1e-9);
+    }
+
+    /// Columns of lists are in the order of their numbers.
+    #[test]
+    fn columns_are_in_natural_order() {
+        let mut columns = ["a.10.x", "a.9.x", "b", "a.9.b"];
+        columns.sort_by_key(|c| natural(c));
+        assert_eq!(columns, ["a.9.b", "a.9.x", "a.10.x", "b"]);
+    }
+}

@@ -1,0 +1,145 @@
+//! `carff probe belief`: the belief over states as bars.
+
+use super::session::{Session, SessionArgs, colours};
+use carff_checkpoint::Manifest;
+use carff_messages::{ActionCode, Belief};
+use carff_observe::{Received, TopicId};
+use clap::Args;
+use std::fmt::Write as _;
+use std::io::{IsTerminal, Write as _};
+
+/// Width of a full bar, characters.
+const BAR: usize = 40;
+
+/// Show the belief over states.
+#[derive(Clone, Debug, Args)]
+pub struct BeliefArgs {
+    /// Stop after so many frames.
+    #[arg(long)]
+    pub count: Option<u64>,
+    /// Which run, and for how long.
+    #[command(flatten)]
+    pub session: SessionArgs,
+}
+
+pub(super) fn run(args: &BeliefArgs) -> anyhow::Result<()> {
+    let mut session = Session::open(&args.session, "probe-belief")?;
+    session.listen([TopicId::Belief, TopicId::Action])?;
+    let names = names(Manifest::load(&session.attached.live.checkpoint).ok().as_ref());
+    let live = std::io::stdout().is_terminal();
+    let colour = colours();
+    let (mut steps, mut decided, mut shown): (Vec<Belief>, String, u64) = (Vec::new(), String::new(), 0);
+    let going = session.follow(
+        |_, message| {
+            match message {
+                Received::Action(action) => {
+                    decided = match action.code() {
+                        Ok(ActionCode::Advance) => "advance".to_owned(),
+                        _ => format!("HALT ({})", action.reason().map_or("unknown", carff_messages::Reason::name)),
+                    };
+                }
+                Received::Belief(belief) => {
+                    if steps.first().is_some_and(|b| b.header.frame_id != belief.header.frame_id) {
+                        steps.clear();
+                    }
+                    steps.push(**belief);
+                    if belief.is_final == 1 {
+                        let text = picture(&steps, &names, &decided, colour);
+                        // On a terminal the picture stays in place.
+                        let begin = if live { "\x1b[H\x1b[J" } else { "" };
+                        let mut out = std::io::stdout().lock();
+                        let written = writeln!(out, "{begin}{text}").and_then(|()| out.flush());
+                        shown += 1;
+                        return Ok(written.is_ok() && args.count.is_none_or(|count| shown < count));
+                    }
+                }
+                _ => {}
+            }
+            Ok(true)
+        },
+        || Ok(()),
+    )?;
+    session.say_end(going);
+    Ok(())
+}
+
+/// The names of the states; none without a manifest.
+pub(crate) fn names(manifest: Option<&Manifest>) -> Vec<String> {
+    let Some(scenario) = manifest.map(|m| &m.scenario) else { return Vec::new() };
+    scenario.branches.iter().flat_map(|b| (0..scenario.timestamps).map(move |t| format!("{b}, t{t}"))).collect()
+}
+
+fn bar(probability: f32) -> String {
+    let eighths = (probability.clamp(0.0, 1.0) * (BAR * 8) as f32).round() as usize;
+    let part = ["", "\u{258f}", "\u{258e}", "\u{258d}", "\u{258c}", "\u{258b}", "\u{258a}", "\u{2589}"][eighths % 8];
+    format!("{}{part}", "\u{2588}".repeat(eighths / 8))
+}
+
+/// A frame's beliefs, step by step.
+fn picture(steps: &[Belief], names: &[String], decided: &str, colour: bool) -> String {
+    let paint = |text: &str, code: &str| if colour { format!("\x1b[{code}m{text}\x1b[0m") } else { text.to_owned() };
+    let mut text = String::new();
+    if let Some(first) = steps.first() {
+        let _ = writeln!(text, "frame {}   controller: {decided}", first.header.frame_id);
+    }
+    for belief in steps {
+        let _ = writeln!(
+            text,
+            "\nstep {} of {}   hazard {:.3}   path {:.3}   {} samples",
+            belief.header.step, belief.horizon, belief.hazard_probability, belief.path_probability, belief.sample_count
+        );
+        let states = &belief.state_probability[..(belief.state_count as usize).min(belief.state_probability.len())];
+        let count = |state: i32| belief.samples().iter().filter(|s| s.state == state).count();
+        let name_of = |state: usize| names.get(state).cloned().unwrap_or_else(|| format!("state {state}"));
+        let width = (0..states.len()).map(|s| name_of(s).chars().count()).max().unwrap_or(0).max(7);
+        let rest = (1.0 - states.iter().sum::<f32>()).max(0.0);
+        let rows = states.iter().enumerate().map(|(s, &p)| (name_of(s), p, s as i32));
+        for (name, probability, state) in rows.chain([("unknown".to_owned(), rest, -1)]) {
+            let resolved = if state == belief.resolved_state && state >= 0 { ">" } else { " " };
+            let likely = belief.samples().iter().find(|s| s.state == state).map_or(0.0, |s| s.hazard_likelihood);
+            let code = if likely >= 0.5 { "31" } else { "32" };
+            let padded = bar(probability);
+            let blank = " ".repeat(BAR.saturating_sub(padded.chars().count()));
+            let _ = writeln!(
+                text,
+                "{resolved} {name:<width$} {:>6.3} {}{blank} {}",
+                probability,
+                paint(&padded, code),
+                "\u{2022}".repeat(count(state))
+            );
+        }
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use carff_messages::{Header, ProbeResult};
+
+    /// Each state has its name, probability and a dot for each of its samples; what is missing to 1 is unknown.
+    #[test]
+    fn beliefs_are_drawn() {
+        let mut belief = Belief::empty(Header::of_frame(12, 1, 1).at_step(1), 1);
+        (belief.state_count, belief.sample_count, belief.component_count) = (2, 4, 1);
+        belief.state_probability[..2].copy_from_slice(&[0.5, 0.25]);
+        for (sample, state) in belief.samples.iter_mut().zip([0, 0, 1, -1]) {
+            *sample = ProbeResult { state, ..ProbeResult::NONE };
+        }
+        belief.resolved_state = 0;
+        let text = picture(&[belief], &["truck, t0".to_owned(), "nobody, t0".to_owned()], "advance", false);
+        let line = |name: &str| text.lines().find(|l| l.contains(name)).unwrap_or_default().to_owned();
+        assert!(line("truck").starts_with("> truck, t0") && line("truck").ends_with("\u{2022}\u{2022}"), "{text}");
+        assert!(line("truck").contains(&"\u{2588}".repeat(20)) && line("nobody").contains("0.250"), "{text}");
+        assert!(line("unknown").contains("0.250") && line("frame 12").contains("advance"), "{text}");
+    }
+
+    /// A bar is as long as its probability, to an eighth of a character.
+    #[test]
+    fn bars_are_to_scale() {
+        assert_eq!(bar(0.0), "");
+        assert_eq!(bar(1.0).chars().count(), BAR);
+        assert_eq!(bar(0.5 / BAR as f32), "\u{258c}");
+        assert_eq!(bar(7.0).chars().count(), BAR);
+    }
+}

@@ -1,0 +1,49 @@
+//! `carff probe echo`: messages as text or JSON lines.
+
+use super::session::{Session, SessionArgs};
+use carff_observe::TopicId;
+use carff_readable::as_text;
+use clap::Args;
+use std::io::Write;
+
+/// Show a topic's messages.
+#[derive(Clone, Debug, Args)]
+pub struct EchoArgs {
+    /// The topic: `prober/belief`, or `belief` for short. Of pictures, what describes them is shown.
+    pub topic: TopicId,
+    /// One line of JSON for each message.
+    #[arg(long)]
+    pub json: bool,
+    /// Every N-th message alone.
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..))]
+    pub every: u64,
+    /// Stop after so many messages shown.
+    #[arg(long)]
+    pub count: Option<u64>,
+    /// Which run, and for how long.
+    #[command(flatten)]
+    pub session: SessionArgs,
+}
+
+pub(super) fn run(args: &EchoArgs) -> anyhow::Result<()> {
+    let mut session = Session::open(&args.session, "probe-echo")?;
+    session.listen([args.topic])?;
+    let (mut seen, mut shown) = (0, 0);
+    let mut out = std::io::stdout().lock();
+    let going = session.follow(
+        |_, message| {
+            seen += 1;
+            if (seen - 1) % args.every != 0 {
+                return Ok(true);
+            }
+            let value = message.message().to_json()?;
+            // A reader that has gone (`| head`) is an end, not an error.
+            let written = if args.json { writeln!(out, "{value}") } else { writeln!(out, "{}---", as_text(&value)) };
+            shown += 1;
+            Ok(written.and_then(|()| out.flush()).is_ok() && args.count.is_none_or(|count| shown < count))
+        },
+        || Ok(()),
+    )?;
+    session.say_end(going);
+    Ok(())
+}

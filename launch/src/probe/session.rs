@@ -1,0 +1,158 @@
+//! What all probes share: joining, looking now and then, and knowing when it is over.
+
+use anyhow::Context;
+use carff_messages::Header;
+use carff_observe::{AnyReceiver, Attached, Received, TopicId, attach};
+use carff_transport::{Stop, Waiter, monotonic_now_ns};
+use clap::Args;
+
+/// Time between two looks: short enough that no buffer (8 pictures) overflows at 400 messages a second.
+const LOOK_NS: u64 = 10_000_000;
+/// Time between two looks at whether the run lives.
+const ALIVE_NS: u64 = 200_000_000;
+
+/// Which run, and how long.
+#[derive(Clone, Debug, Default, Args)]
+pub struct SessionArgs {
+    /// The run's name; not needed when only one runs.
+    #[arg(long)]
+    pub run: Option<String>,
+    /// Stop after so many seconds.
+    #[arg(long, value_parser = positive)]
+    pub seconds: Option<f64>,
+}
+
+fn positive(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(seconds) if seconds.is_finite() && seconds > 0.0 => Ok(seconds),
+        _ => Err("it must be a number above 0".to_owned()),
+    }
+}
+
+/// Whether to look on.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Going {
+    /// Look again.
+    On,
+    /// Told to stop, or the time is over.
+    Done,
+    /// The run has ended.
+    RunEnded,
+}
+
+/// A probe that has joined a run.
+#[derive(Debug)]
+pub(crate) struct Session {
+    // Dropped in this order: ports before the node.
+    receivers: Vec<(TopicId, AnyReceiver)>,
+    pub(crate) attached: Attached,
+    stop: Stop,
+    waiter: Waiter,
+    until_ns: Option<u64>,
+    alive_ns: u64,
+}
+
+impl Session {
+    /// Joins a run, as something that is told by `name`.
+    pub(crate) fn open(args: &SessionArgs, name: &str) -> anyhow::Result<Self> {
+        let attached = attach(args.run.as_deref(), name)?;
+        let stop = Stop::on_signals().context("cannot handle signals")?;
+        let now_ns = monotonic_now_ns();
+        Ok(Self {
+            receivers: Vec::new(),
+            attached,
+            waiter: Waiter::new(stop.clone()),
+            stop,
+            until_ns: args.seconds.map(|s| now_ns + (s * 1e9) as u64),
+            alive_ns: now_ns + ALIVE_NS,
+        })
+    }
+
+    /// Opens topics, to be looked at now and then.
+    pub(crate) fn listen(&mut self, topics: impl IntoIterator<Item = TopicId>) -> anyhow::Result<()> {
+        for topic in topics {
+            self.receivers.push((topic, AnyReceiver::open(&self.attached.node, topic)?));
+        }
+        Ok(())
+    }
+
+    /// Opens a topic whose messages wake this process.
+    pub(crate) fn listen_woken(&mut self, topic: TopicId) -> anyhow::Result<()> {
+        self.receivers.push((topic, AnyReceiver::open_woken(&self.attached.node, topic)?));
+        Ok(())
+    }
+
+    /// What has arrived since the last look, topic by topic, oldest first.
+    pub(crate) fn take(
+        &mut self,
+        mut each: impl FnMut(TopicId, &Received) -> anyhow::Result<()>,
+    ) -> anyhow::Result<()> {
+        for (topic, receiver) in &mut self.receivers {
+            while let Some(message) = receiver.next()? {
+                each(*topic, &message)?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Sleeps until it is time for another look, or a message of a woken topic is there.
+    pub(crate) fn pause(&mut self) -> anyhow::Result<Going> {
+        let woken = self.receivers.iter().map(|(_, r)| r.as_input()).filter(|i| i.descriptor().is_some());
+        let inputs: Vec<_> = woken.collect();
+        self.waiter.wait_until(&inputs, monotonic_now_ns() + LOOK_NS)?;
+        let now_ns = monotonic_now_ns();
+        if self.stop.is_stopped() || self.until_ns.is_some_and(|until_ns| now_ns >= until_ns) {
+            return Ok(Going::Done);
+        }
+        if now_ns >= self.alive_ns {
+            self.alive_ns = now_ns + ALIVE_NS;
+            if !self.attached.live.is_alive() {
+                return Ok(Going::RunEnded);
+            }
+        }
+        Ok(Going::On)
+    }
+
+    /// Looks until it is over, or `each` says false.
+    pub(crate) fn follow(
+        &mut self,
+        mut each: impl FnMut(TopicId, &Received) -> anyhow::Result<bool>,
+        mut after: impl FnMut() -> anyhow::Result<()>,
+    ) -> anyhow::Result<Going> {
+        loop {
+            let mut enough = false;
+            self.take(|topic, message| {
+                if !enough {
+                    enough = !each(topic, message)?;
+                }
+                Ok(())
+            })?;
+            after()?;
+            if enough {
+                return Ok(Going::Done);
+            }
+            match self.pause()? {
+                Going::On => {}
+                over => return Ok(over),
+            }
+        }
+    }
+
+    /// Says on standard error that the run has ended, if it has.
+    pub(crate) fn say_end(&self, going: Going) {
+        if going == Going::RunEnded {
+            eprintln!("run `{}` has ended", self.attached.live.name);
+        }
+    }
+}
+
+/// Time since a header's capture, at another time, milliseconds.
+pub(crate) fn since_capture_ms(header: &Header, at_ns: u64) -> f64 {
+    at_ns.saturating_sub(header.capture_time_ns) as f64 / 1e6
+}
+
+/// Whether standard output takes colours: a terminal, and no `NO_COLOR`.
+pub(crate) fn colours() -> bool {
+    use std::io::IsTerminal;
+    std::io::stdout().is_terminal() && std::env::var_os("NO_COLOR").is_none_or(|v| v.is_empty())
+}

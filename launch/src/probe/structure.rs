@@ -1,0 +1,257 @@
+//! `carff probe list` and `graph`: which topics there are, and who uses them.
+
+use super::session::{Going, Session, SessionArgs};
+use anyhow::Context;
+use carff_messages::SCHEMA_VERSION;
+use carff_observe::{Received, TopicId};
+use carff_transport::{Member, monotonic_now_ns};
+use serde_json::{Value, json};
+use std::collections::{BTreeMap, BTreeSet};
+use std::fmt::Write;
+
+/// How long rates are counted when nothing else is asked for, seconds.
+const COUNT_S: f64 = 2.0;
+
+/// How a graph is written.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
+pub enum GraphFormat {
+    /// Lines for people.
+    #[default]
+    Text,
+    /// Graphviz.
+    Dot,
+    /// Mermaid, as Markdown viewers draw it.
+    Mermaid,
+}
+
+/// A topic of a run, as it is used now.
+#[derive(Clone, Debug, PartialEq)]
+struct TopicInUse {
+    name: String,
+    message: String,
+    publishers: Vec<String>,
+    subscribers: Vec<String>,
+    /// Members whose direction is not known: those of topics that are not the graph's own.
+    users: Vec<String>,
+    /// Messages a second; none where nobody counted.
+    rate_hz: Option<f64>,
+}
+
+pub(super) fn list(args: &SessionArgs, as_json: bool) -> anyhow::Result<()> {
+    let seconds = args.seconds.unwrap_or(COUNT_S);
+    let mut session = Session::open(&SessionArgs { seconds: Some(seconds), ..args.clone() }, PROBE)?;
+    let mut topics = in_use(&session)?;
+    let ours: Vec<TopicId> = topics.iter().filter_map(|t| t.name.parse().ok()).collect();
+    session.listen(ours)?;
+    // What was waiting for late comers is not part of the rate.
+    session.take(|_, _| Ok(()))?;
+    let started_ns = monotonic_now_ns();
+    let mut counts: BTreeMap<TopicId, u64> = BTreeMap::new();
+    let going = session.follow(
+        |topic, _: &Received| {
+            *counts.entry(topic).or_default() += 1;
+            Ok(true)
+        },
+        || Ok(()),
+    )?;
+    let counted_s = (monotonic_now_ns() - started_ns) as f64 / 1e9;
+    for topic in &mut topics {
+        topic.rate_hz =
+            topic.name.parse().ok().map(|id: TopicId| counts.get(&id).copied().unwrap_or(0) as f64 / counted_s);
+    }
+    if as_json {
+        println!("{}", serde_json::to_string_pretty(&topics.iter().map(TopicInUse::json).collect::<Value>())?);
+    } else {
+        print!("{}", table(&topics));
+    }
+    session.say_end(if going == Going::RunEnded { going } else { Going::Done });
+    Ok(())
+}
+
+pub(super) fn graph(args: &SessionArgs, format: GraphFormat) -> anyhow::Result<()> {
+    let session = Session::open(args, PROBE)?;
+    let topics = in_use(&session)?;
+    print!(
+        "{}",
+        match format {
+            GraphFormat::Text => text(&session.attached.live.name, &topics),
+            GraphFormat::Dot => dot(&topics),
+            GraphFormat::Mermaid => mermaid(&topics),
+        }
+    );
+    Ok(())
+}
+
+/// The name under which these commands join: they leave themselves out of what they show.
+const PROBE: &str = "probe-list";
+
+fn in_use(session: &Session) -> anyhow::Result<Vec<TopicInUse>> {
+    let node = &session.attached.node;
+    let here = std::process::id();
+    let names = |members: &[Member]| -> Vec<String> {
+        members.iter().filter(|m| m.pid != here).map(|m| m.name.clone()).collect()
+    };
+    let mut topics = Vec::new();
+    for topic in node.open_topics().context("cannot list the topics")? {
+        let mut found = TopicInUse {
+            message: topic.message,
+            publishers: Vec::new(),
+            subscribers: Vec::new(),
+            users: Vec::new(),
+            rate_hz: None,
+            name: topic.name,
+        };
+        match found.name.parse::<TopicId>() {
+            Ok(id) => {
+                let ports = id.ports(node)?;
+                (found.publishers, found.subscribers) = (names(&ports.publishers), names(&ports.subscribers));
+            }
+            Err(_) => found.users = names(&topic.members),
+        }
+        topics.push(found);
+    }
+    // The data's way first, in its order.
+    topics.sort_by_key(|t| t.name.parse::<TopicId>().ok().map_or((1, TopicId::Frame), |id| (0, id)));
+    Ok(topics)
+}
+
+impl TopicInUse {
+    fn json(&self) -> Value {
+        json!({
+            "topic": self.name,
+            "type": self.message,
+            "schema_version": SCHEMA_VERSION,
+            "publishers": self.publishers,
+            "subscribers": self.subscribers,
+            "users": self.users,
+            "rate_hz": self.rate_hz,
+        })
+    }
+}
+
+/// Rows with columns as wide as their widest entry.
+pub(super) fn columns(rows: &[Vec<String>]) -> String {
+    let count = rows.iter().map(Vec::len).max().unwrap_or(0);
+    let widths: Vec<usize> = (0..count)
+        .map(|i| rows.iter().filter_map(|r| r.get(i)).map(|c| c.chars().count()).max().unwrap_or(0))
+        .collect();
+    let mut text = String::new();
+    for row in rows {
+        let cells = row.iter().zip(&widths).map(|(cell, &width)| format!("{cell:<width$}"));
+        text += cells.collect::<Vec<_>>().join("  ").trim_end();
+        text.push('\n');
+    }
+    text
+}
+
+fn table(topics: &[TopicInUse]) -> String {
+    let head = ["topic", "type", "schema", "from", "to", "rate"].map(str::to_owned).to_vec();
+    let rows = topics.iter().map(|t| {
+        let list = |names: &[String]| if names.is_empty() { "-".to_owned() } else { names.join(" ") };
+        let to = if t.users.is_empty() { list(&t.subscribers) } else { format!("? {}", t.users.join(" ")) };
+        let rate = t.rate_hz.map_or("-".to_owned(), |hz| format!("{hz:.1} Hz"));
+        vec![t.name.clone(), t.message.clone(), SCHEMA_VERSION.to_string(), list(&t.publishers), to, rate]
+    });
+    columns(&std::iter::once(head).chain(rows).collect::<Vec<_>>())
+}
+
+fn text(run: &str, topics: &[TopicInUse]) -> String {
+    let mut text = format!("run {run}\n");
+    for topic in topics {
+        let _ = writeln!(text, "{} ({})", topic.name, topic.message);
+        for (arrow, names) in [("<-", &topic.publishers), ("->", &topic.subscribers), ("--", &topic.users)] {
+            for name in names {
+                let _ = writeln!(text, "  {arrow} {name}");
+            }
+        }
+    }
+    text
+}
+
+fn processes(topics: &[TopicInUse]) -> BTreeSet<&String> {
+    topics.iter().flat_map(|t| t.publishers.iter().chain(&t.subscribers).chain(&t.users)).collect()
+}
+
+fn dot(topics: &[TopicInUse]) -> String {
+    let mut text = "digraph carff {\n  rankdir=LR;\n  node [shape=box, style=rounded];\n".to_owned();
+    for process in processes(topics) {
+        let _ = writeln!(text, "  {process:?};");
+    }
+    for topic in topics {
+        let _ = writeln!(text, "  {:?} [shape=ellipse, style=solid];", topic.name);
+        for name in &topic.publishers {
+            let _ = writeln!(text, "  {name:?} -> {:?};", topic.name);
+        }
+        for name in &topic.subscribers {
+            let _ = writeln!(text, "  {:?} -> {name:?};", topic.name);
+        }
+        for name in &topic.users {
+            let _ = writeln!(text, "  {:?} -> {name:?} [dir=none];", topic.name);
+        }
+    }
+    text + "}\n"
+}
+
+fn mermaid(topics: &[TopicInUse]) -> String {
+    let id = |name: &str| name.chars().map(|c| if c.is_ascii_alphanumeric() { c } else { '_' }).collect::<String>();
+    let mut text = "flowchart LR\n".to_owned();
+    for process in processes(topics) {
+        let _ = writeln!(text, "  p_{}[{process}]", id(process));
+    }
+    for topic in topics {
+        let name = id(&topic.name);
+        let _ = writeln!(text, "  t_{name}([{}])", topic.name);
+        for process in &topic.publishers {
+            let _ = writeln!(text, "  p_{} --> t_{name}", id(process));
+        }
+        for process in &topic.subscribers {
+            let _ = writeln!(text, "  t_{name} --> p_{}", id(process));
+        }
+        for process in &topic.users {
+            let _ = writeln!(text, "  t_{name} --- p_{}", id(process));
+        }
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn two() -> Vec<TopicInUse> {
+        let topic = |name: &str, publishers: &[&str], subscribers: &[&str], users: &[&str]| TopicInUse {
+            name: name.to_owned(),
+            message: "carff.X.v1".to_owned(),
+            publishers: publishers.iter().map(|&s| s.to_owned()).collect(),
+            subscribers: subscribers.iter().map(|&s| s.to_owned()).collect(),
+            users: users.iter().map(|&s| s.to_owned()).collect(),
+            rate_hz: Some(10.0),
+        };
+        vec![
+            topic("camera/frame", &["camera"], &["encoder", "probe-image"], &[]),
+            topic("my/topic", &[], &[], &["gate"]),
+        ]
+    }
+
+    /// Each form names every process and topic, with arrows from sender to topic to receiver.
+    #[test]
+    fn graphs_show_who_sends_to_whom() {
+        let dot = dot(&two());
+        assert!(
+            dot.contains(r#""camera" -> "camera/frame";"#) && dot.contains(r#""camera/frame" -> "encoder";"#),
+            "{dot}"
+        );
+        let mermaid = mermaid(&two());
+        assert!(
+            mermaid.contains("p_camera --> t_camera_frame") && mermaid.contains("t_my_topic --- p_gate"),
+            "{mermaid}"
+        );
+        let text = text("r", &two());
+        assert!(text.contains("<- camera") && text.contains("-> probe-image") && text.contains("-- gate"), "{text}");
+        let table = table(&two());
+        assert!(
+            table.lines().nth(1).is_some_and(|l| l.contains("encoder probe-image") && l.contains("10.0 Hz")),
+            "{table}"
+        );
+    }
+}

@@ -1,0 +1,171 @@
+//! `carff probe trace`: one frame's way through the stages.
+
+use super::session::{Session, SessionArgs};
+use super::structure::columns;
+use crate::spans::{Span, trace_events};
+use anyhow::{Context, ensure};
+use carff_messages::Stage;
+use carff_observe::TopicId;
+use carff_transport::monotonic_now_ns;
+use clap::Args;
+use std::path::PathBuf;
+use std::str::FromStr;
+
+/// How long to wait for a frame's views once it has been decided on, nanoseconds.
+const AFTER_DECISION_NS: u64 = 300_000_000;
+/// Width of the drawing of a frame's way, characters.
+const WIDTH: usize = 50;
+
+/// Which frame.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Frame {
+    /// The next one.
+    Next,
+    /// The one of this number.
+    Number(u64),
+}
+
+impl FromStr for Frame {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        match text {
+            "next" => Ok(Self::Next),
+            number => number.parse().map(Self::Number).map_err(|_| "give a frame's number, or `next`".to_owned()),
+        }
+    }
+}
+
+/// Show one frame's way.
+#[derive(Clone, Debug, Args)]
+pub struct TraceArgs {
+    /// The frame's number, or `next`.
+    #[arg(default_value = "next")]
+    pub frame: Frame,
+    /// Write all frames' spans here, in the trace event format that ui.perfetto.dev opens.
+    #[arg(long)]
+    pub perfetto: Option<PathBuf>,
+    /// Which run, and for how long.
+    #[command(flatten)]
+    pub session: SessionArgs,
+}
+
+pub(super) fn run(args: &TraceArgs) -> anyhow::Result<()> {
+    let mut session = Session::open(&args.session, "probe-trace")?;
+    session.listen(TopicId::FLOW)?;
+    session.take(|_, _| Ok(()))?;
+    let wanted = std::cell::Cell::new(match args.frame {
+        Frame::Next => None,
+        Frame::Number(number) => Some(number),
+    });
+    let (mut all, mut missed): (Vec<Span>, Option<u64>) = (Vec::new(), None);
+    let mut decided_ns: Option<u64> = None;
+    let to_file = args.perfetto.is_some();
+    let going = session.follow(
+        |_, message| {
+            let Some(span) = Span::of(message.message()) else { return Ok(true) };
+            if wanted.get().is_none() && span.stage == Stage::Camera {
+                wanted.set(Some(span.frame_id));
+            }
+            if let Some(frame) = wanted.get() {
+                let mine = span.frame_id == frame;
+                // A decision on a later frame: this one was passed over, and comes no more.
+                if span.stage == Stage::Controller && span.frame_id >= frame {
+                    decided_ns.get_or_insert_with(monotonic_now_ns);
+                }
+                // Frames are taken in order: one that has not come before a later one comes no more.
+                let is_mine_seen = mine || all.iter().any(|s| s.frame_id == frame);
+                if span.stage == Stage::Camera && span.frame_id > frame && !is_mine_seen {
+                    missed = Some(span.frame_id);
+                    return Ok(to_file);
+                }
+                if mine || to_file {
+                    all.push(span);
+                }
+            }
+            // With a file the time that was asked for goes on; without one the frame is enough.
+            let waited = decided_ns.is_some_and(|at_ns| monotonic_now_ns() > at_ns + AFTER_DECISION_NS);
+            Ok(!waited || (to_file && args.session.seconds.is_some()))
+        },
+        || Ok(()),
+    )?;
+    if let Some(path) = &args.perfetto {
+        let trace = serde_json::to_string(&trace_events(&session.attached.live.name, &all))?;
+        std::fs::write(path, trace).with_context(|| format!("cannot write {}", path.display()))?;
+        println!("{}: {} spans; open it at ui.perfetto.dev or chrome://tracing", path.display(), all.len());
+    }
+    let frame = wanted.get().context("no frame came by: is the camera running? See `carff probe list`")?;
+    let mut spans: Vec<Span> = all.into_iter().filter(|s| s.frame_id == frame).collect();
+    session.say_end(going);
+    if let (Some(later), true) = (missed, spans.is_empty()) {
+        ensure!(to_file, "frame {frame} has passed: the camera is at {later} already; name a later one, or `next`");
+    }
+    ensure!(!spans.is_empty(), "frame {frame} did not come by");
+    spans.sort_by_key(|s| (s.end_ns, s.stage));
+    print!("{}", way(frame, &spans));
+    if !spans.iter().any(|s| s.stage == Stage::Controller) {
+        println!("nothing was decided on it: a later frame was there before it was worked on");
+    }
+    Ok(())
+}
+
+/// A frame's way as a table with a drawing, milliseconds since capture.
+fn way(frame: u64, spans: &[Span]) -> String {
+    let capture_ns = spans.iter().map(|s| s.capture_ns).min().unwrap_or(0);
+    let ms = |at_ns: u64| at_ns.saturating_sub(capture_ns) as f64 / 1e6;
+    let end_ms = spans.iter().map(|s| ms(s.end_ns)).fold(1e-3, f64::max);
+    let mut rows = vec![["stage", "step", "in, ms", "out, ms", "took, ms", "", "what"].map(str::to_owned).to_vec()];
+    for span in spans {
+        let (begin, end) = (ms(span.begin_ns), ms(span.end_ns));
+        let at = |ms: f64| ((ms / end_ms * WIDTH as f64) as usize).min(WIDTH - 1);
+        let drawn: String =
+            (0..WIDTH).map(|i| if (at(begin)..=at(end)).contains(&i) { '\u{2501}' } else { '\u{00b7}' }).collect();
+        rows.push(vec![
+            span.stage.name().to_owned(),
+            span.step.to_string(),
+            format!("{begin:>7.2}"),
+            format!("{end:>7.2}"),
+            format!("{:>7.2}", end - begin),
+            drawn,
+            span.what.clone(),
+        ]);
+    }
+    format!("frame {frame}, milliseconds since its capture\n{}", columns(&rows))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The table holds each stage's times since the capture, in order, and the decision.
+    #[test]
+    fn a_way_is_drawn_in_order() {
+        let span = |stage, begin_ms: u64, end_ms: u64, what: &str| Span {
+            stage,
+            frame_id: 3,
+            step: 0,
+            capture_ns: 100_000_000,
+            begin_ns: 100_000_000 + begin_ms * 1_000_000,
+            end_ns: 100_000_000 + end_ms * 1_000_000,
+            what: what.to_owned(),
+        };
+        let text = way(
+            3,
+            &[span(Stage::Camera, 0, 1, ""), span(Stage::Encoder, 1, 16, ""), span(Stage::Controller, 20, 20, "halt")],
+        );
+        let line = |stage: &str| text.lines().find(|l| l.starts_with(stage)).unwrap_or_default().to_owned();
+        assert!(
+            line("encoder").contains("1.00") && line("encoder").contains("16.00") && line("encoder").contains("15.00"),
+            "{text}"
+        );
+        assert!(line("controller").ends_with("halt"), "{text}");
+    }
+
+    /// A frame is a number or the next one.
+    #[test]
+    fn frames_are_numbers_or_next() {
+        assert_eq!("next".parse(), Ok(Frame::Next));
+        assert_eq!("17".parse(), Ok(Frame::Number(17)));
+        assert!("x".parse::<Frame>().is_err());
+    }
+}

@@ -1,0 +1,105 @@
+//! `carff record`: a running graph into an MCAP file.
+
+use crate::probe::session::{Session, SessionArgs};
+use crate::terminal::Terminal;
+use anyhow::Context;
+use carff_checkpoint::Manifest;
+use carff_observe::{LiveRun, TopicId};
+use carff_recording::{About, Limits, RecordingQueue, RotatingWriter};
+use carff_transport::monotonic_now_ns;
+use clap::Args;
+use std::path::PathBuf;
+use std::process::ExitCode;
+use std::time::SystemTime;
+
+/// Time between two status lines, nanoseconds.
+const STATUS_NS: u64 = 1_000_000_000;
+
+/// Record a run.
+#[derive(Clone, Debug, Args)]
+pub struct RecordArgs {
+    /// Topics; all when none is named.
+    pub topics: Vec<TopicId>,
+    /// The file; it must not exist.
+    #[arg(short, long)]
+    pub out: PathBuf,
+    /// Begin another file when one is as large as this, megabytes.
+    #[arg(long, value_parser = clap::value_parser!(u64).range(1..))]
+    pub file_mb: Option<u64>,
+    /// Begin another file after so many seconds.
+    #[arg(long, value_parser = clap::value_parser!(u64).range(1..))]
+    pub file_seconds: Option<u64>,
+    /// Keep so many files: the oldest is removed.
+    #[arg(long, value_parser = clap::value_parser!(u64).range(1..))]
+    pub keep: Option<u64>,
+    /// Memory for what a slow disk has not taken yet, megabytes; when it is full, whole messages are dropped and counted.
+    #[arg(long, default_value_t = 64, value_parser = clap::value_parser!(u64).range(1..))]
+    pub queue_mb: u64,
+    /// Which run, and for how long.
+    #[command(flatten)]
+    pub session: SessionArgs,
+}
+
+/// Records until it is told to stop, the time is over, or the run ends.
+pub fn run(args: &RecordArgs) -> anyhow::Result<ExitCode> {
+    let mut session = Session::open(&args.session, "recorder")?;
+    let topics: Vec<TopicId> = if args.topics.is_empty() { TopicId::all().collect() } else { args.topics.clone() };
+    session.listen(topics)?;
+    let live = &session.attached.live;
+    let places = match Manifest::load(&live.checkpoint) {
+        Ok(manifest) => manifest.places,
+        Err(error) => {
+            eprintln!("warning: no boxes are recorded: {error}");
+            Vec::new()
+        }
+    };
+    let limits = Limits {
+        file_bytes: args.file_mb.map(|mb| mb * 1_000_000),
+        file_ns: args.file_seconds.map(|s| s * 1_000_000_000),
+        files: args.keep.map(|n| n as usize),
+    };
+    let writer = RotatingWriter::create(&args.out, about(live)?, places, limits)?;
+    let queue = RecordingQueue::start(writer, args.queue_mb * 1_000_000).context("cannot start the writer")?;
+    let terminal = Terminal::new();
+    let name = live.name.clone();
+    let (mut status_ns, mut told) = (0, 0);
+    let going = session.follow(
+        // A writer that has failed ends it; what it failed of is told below.
+        |topic, message| Ok(queue.push(topic, message.message().into())),
+        || {
+            let now_ns = monotonic_now_ns();
+            if now_ns >= status_ns {
+                status_ns = now_ns + STATUS_NS;
+                let counts = queue.counts();
+                terminal.status(format!("recording {name}: {} messages, {} dropped", counts.written, counts.dropped));
+                if counts.dropped > told {
+                    terminal.log(&format!(
+                        "the disk is too slow: {} messages dropped so far (--queue-mb gives it more time)",
+                        counts.dropped
+                    ));
+                    told = counts.dropped;
+                }
+            }
+            Ok(())
+        },
+    )?;
+    terminal.status(String::new());
+    let counts = queue.finish()?;
+    println!("{}: {} messages of run {name}, {} dropped", args.out.display(), counts.written, counts.dropped);
+    session.say_end(going);
+    Ok(ExitCode::SUCCESS)
+}
+
+fn about(live: &LiveRun) -> anyhow::Result<About> {
+    let wall_ns = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default().as_nanos() as u64;
+    Ok(About {
+        run: live.name.clone(),
+        run_id: live.run_id,
+        graph: live.graph.display().to_string(),
+        graph_text: std::fs::read_to_string(&live.graph)
+            .with_context(|| format!("cannot read the graph file {}", live.graph.display()))?,
+        dataset: live.dataset.display().to_string(),
+        checkpoint: live.checkpoint.display().to_string(),
+        wall_offset_ns: wall_ns.saturating_sub(monotonic_now_ns()),
+    })
+}

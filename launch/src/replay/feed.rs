@@ -1,0 +1,302 @@
+//! Sending recorded messages in place of the stages that sent them.
+
+use super::compare::Replayed;
+use crate::terminal::Terminal;
+use anyhow::{Context, ensure};
+use carff_messages::{Action, Belief, Forecast, FrameMeta, Header, MAX_PICTURE_BYTES, Posterior, ViewMeta};
+use carff_observe::{AnyReceiver, Received, TopicId};
+use carff_recording::{Entry, OwnedMessage, Reader};
+use carff_transport::{Node, PicturePublisher, Publisher, Run, Stop, Waiter, Woken, monotonic_now_ns, topics};
+use std::collections::{BTreeMap, BTreeSet};
+use std::io::BufRead;
+use std::path::PathBuf;
+use std::sync::mpsc::{Receiver, TryRecvError, channel};
+use std::sync::{Arc, Mutex};
+
+/// Frames whose new time of capture is remembered.
+const FRAMES: usize = 256;
+/// How long a frame's decision is waited for, nanoseconds.
+const PATIENCE_NS: u64 = 3_000_000_000;
+/// How long the last frame is given, nanoseconds.
+const LINGER_NS: u64 = 500_000_000;
+/// Time between two looks at what comes back, nanoseconds.
+const LOOK_NS: u64 = 2_000_000;
+
+/// When the next message goes out.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) enum Pace {
+    /// At its recorded time, so many times as fast.
+    Rate(f64),
+    /// Frames: when Enter is pressed.
+    OnEnter,
+    /// Frames: when the one before has been decided on.
+    AfterEachDecision,
+}
+
+/// Plays a recording.
+pub(super) struct Player {
+    pub(super) recording: PathBuf,
+    pub(super) topics: BTreeSet<TopicId>,
+    pub(super) pace: Pace,
+    /// The part that is played, nanoseconds after the recording's first message.
+    pub(super) from_ns: u64,
+    pub(super) to_ns: u64,
+    pub(super) terminal: Arc<Terminal>,
+    /// Takes what the graph makes of it.
+    pub(super) replayed: Option<Arc<Mutex<Replayed>>>,
+}
+
+/// A publisher for each topic that is played.
+#[derive(Default)]
+struct Publishers {
+    frame: Option<PicturePublisher<FrameMeta>>,
+    posterior: Option<Publisher<Posterior>>,
+    forecast: Option<Publisher<Forecast>>,
+    belief: Option<Publisher<Belief>>,
+    view: Option<PicturePublisher<ViewMeta>>,
+    action: Option<Publisher<Action>>,
+}
+
+impl Publishers {
+    fn open(node: &Node, wanted: &BTreeSet<TopicId>, largest_bytes: [usize; 2]) -> anyhow::Result<Self> {
+        let mut all = Self::default();
+        for topic in wanted {
+            match topic {
+                TopicId::Frame => all.frame = Some(node.picture_publisher(&topics::FRAME, largest_bytes[0])?),
+                TopicId::Posterior => all.posterior = Some(node.publisher(&topics::POSTERIOR)?),
+                TopicId::Forecast => all.forecast = Some(node.publisher(&topics::FORECAST)?),
+                TopicId::Belief => all.belief = Some(node.publisher(&topics::BELIEF)?),
+                TopicId::View => all.view = Some(node.picture_publisher(&topics::VIEW, largest_bytes[1])?),
+                TopicId::Action => all.action = Some(node.publisher(&topics::ACTION)?),
+                TopicId::Health(_) => {}
+            }
+        }
+        Ok(all)
+    }
+
+    fn send(&mut self, message: OwnedMessage, times: &mut Times) -> anyhow::Result<()> {
+        match message {
+            OwnedMessage::Frame(mut m, bytes) => {
+                times.renew(&mut m.header);
+                if let Some(p) = &mut self.frame {
+                    p.send_bytes(&bytes, m)?;
+                }
+            }
+            OwnedMessage::Posterior(mut m) => {
+                times.renew(&mut m.header);
+                if let Some(p) = &mut self.posterior {
+                    p.send(m)?;
+                }
+            }
+            OwnedMessage::Forecast(mut m) => {
+                times.renew(&mut m.header);
+                if let Some(p) = &mut self.forecast {
+                    p.send(*m)?;
+                }
+            }
+            OwnedMessage::Belief(mut m) => {
+                times.renew(&mut m.header);
+                if let Some(p) = &mut self.belief {
+                    p.send(*m)?;
+                }
+            }
+            OwnedMessage::View(mut m, bytes) => {
+                times.renew(&mut m.header);
+                if let Some(p) = &mut self.view {
+                    p.send_bytes(&bytes, m)?;
+                }
+            }
+            OwnedMessage::Action(mut m) => {
+                let stands_ns = m.valid_until_ns.saturating_sub(m.header.publish_time_ns);
+                times.renew(&mut m.header);
+                m.valid_until_ns = monotonic_now_ns() + stands_ns;
+                if let Some(p) = &mut self.action {
+                    p.send(m)?;
+                }
+            }
+            OwnedMessage::Health(_) => {}
+        }
+        Ok(())
+    }
+}
+
+/// The new times of capture: the same for all messages of a frame, as old now as it was then.
+#[derive(Default)]
+struct Times(BTreeMap<u64, u64>);
+
+impl Times {
+    fn renew(&mut self, header: &mut Header) {
+        let age_ns = header.publish_time_ns.saturating_sub(header.capture_time_ns);
+        let capture_ns = *self.0.entry(header.frame_id).or_insert_with(|| monotonic_now_ns().saturating_sub(age_ns));
+        header.capture_time_ns = capture_ns;
+        while self.0.len() > FRAMES {
+            self.0.pop_first();
+        }
+    }
+}
+
+impl Player {
+    /// Plays to the end, or to a stop.
+    pub(super) fn play(self, run: &Run, stop: &Stop) -> anyhow::Result<()> {
+        let node = Node::open(run, "replay")?;
+        let waiter = Waiter::new(stop.clone());
+        let largest_bytes = self.largest_pictures()?;
+        let mut publishers = Publishers::open(&node, &self.topics, largest_bytes)?;
+        let mut back = Vec::new();
+        for topic in [TopicId::Belief, TopicId::Action] {
+            if !self.topics.contains(&topic) {
+                back.push(AnyReceiver::open(&node, topic)?);
+            }
+        }
+        let keys = (self.pace == Pace::OnEnter).then(keys);
+        let mut reader = Reader::open(&self.recording)?;
+        let mut times = Times::default();
+        let (mut first_ns, mut begun_ns, mut frames) = (None, 0, 0_u64);
+        while let Some(Entry { topic, message }) = reader.next()? {
+            let header = *message.as_message().header();
+            let at_ns = header.publish_time_ns.saturating_sub(*first_ns.get_or_insert(header.publish_time_ns));
+            if at_ns < self.from_ns || at_ns > self.to_ns || !self.topics.contains(&topic) {
+                continue;
+            }
+            let is_frame = topic == TopicId::Frame;
+            let go_on = match self.pace {
+                Pace::Rate(rate) => {
+                    if begun_ns == 0 {
+                        begun_ns = monotonic_now_ns();
+                        self.terminal.log(&format!(
+                            "replaying {} from {:.1} s on",
+                            self.recording.display(),
+                            at_ns as f64 / 1e9
+                        ));
+                    }
+                    // At rate 0 everything goes out at once.
+                    let due_ns = begun_ns + ((at_ns - self.from_ns.min(at_ns)) as f64 / rate.max(1e-9)) as u64;
+                    let due_ns = if rate > 0.0 { due_ns } else { 0 };
+                    self.look_until(&waiter, &mut back, due_ns, |_| false)?
+                }
+                Pace::OnEnter if is_frame => {
+                    self.terminal.log(&format!("frame {}: press Enter", header.frame_id));
+                    self.wait_for_key(&waiter, &mut back, keys.as_ref())?
+                }
+                Pace::OnEnter | Pace::AfterEachDecision => true,
+            };
+            if !go_on {
+                return Ok(());
+            }
+            publishers.send(message, &mut times)?;
+            frames += u64::from(is_frame);
+            if is_frame && self.pace == Pace::AfterEachDecision {
+                let frame = header.frame_id;
+                let until_ns = monotonic_now_ns() + PATIENCE_NS;
+                let decided =
+                    |m: &Received| matches!(m, Received::Action(a) if a.is_decision == 1 && a.based_on_frame == frame);
+                if !self.look_until(&waiter, &mut back, until_ns, decided)? {
+                    return Ok(());
+                }
+                self.terminal.status(format!("replayed {frames} frames"));
+            }
+        }
+        self.terminal.status(String::new());
+        ensure!(first_ns.is_some(), "{} holds no message", self.recording.display());
+        if reader.is_cut_off() {
+            self.terminal.log("the recording ends in the middle: it was replayed up to there");
+        }
+        // What the last frame leads to is still on its way.
+        self.look_until(&waiter, &mut back, monotonic_now_ns() + LINGER_NS, |_| false)?;
+        Ok(())
+    }
+
+    /// Looks at what comes back until a time, or until `enough`; false on a stop.
+    fn look_until(
+        &self,
+        waiter: &Waiter,
+        back: &mut [AnyReceiver],
+        until_ns: u64,
+        enough: impl Fn(&Received) -> bool,
+    ) -> anyhow::Result<bool> {
+        loop {
+            let mut is_enough = false;
+            for receiver in back.iter_mut() {
+                while let Some(message) = receiver.next()? {
+                    is_enough |= enough(&message);
+                    if let Some(replayed) = &self.replayed {
+                        let mut replayed = replayed.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+                        replayed.take(message.message());
+                    }
+                }
+            }
+            let now_ns = monotonic_now_ns();
+            if is_enough || now_ns >= until_ns {
+                return Ok(!waiter.stop().is_stopped());
+            }
+            if waiter.wait_until(&[], (now_ns + LOOK_NS).min(until_ns))? == Woken::Stopped {
+                return Ok(false);
+            }
+        }
+    }
+
+    fn wait_for_key(
+        &self,
+        waiter: &Waiter,
+        back: &mut [AnyReceiver],
+        keys: Option<&Receiver<()>>,
+    ) -> anyhow::Result<bool> {
+        let Some(keys) = keys else { return Ok(true) };
+        loop {
+            match keys.try_recv() {
+                Ok(()) => return Ok(true),
+                // The end of the input is the end of the replay.
+                Err(TryRecvError::Disconnected) => return Ok(false),
+                Err(TryRecvError::Empty) => {}
+            }
+            if !self.look_until(waiter, back, monotonic_now_ns() + 10 * LOOK_NS, |_| false)? {
+                return Ok(false);
+            }
+        }
+    }
+
+    /// Bytes of the largest frame and the largest view.
+    fn largest_pictures(&self) -> anyhow::Result<[usize; 2]> {
+        let mut largest = [1; 2];
+        let mut reader = Reader::open(&self.recording)?;
+        while let Some(entry) = reader.next().context("the recording cannot be replayed")? {
+            match &entry.message {
+                OwnedMessage::Frame(_, bytes) => largest[0] = largest[0].max(bytes.len()),
+                OwnedMessage::View(_, bytes) => largest[1] = largest[1].max(bytes.len()),
+                _ => {}
+            }
+        }
+        Ok(largest.map(|bytes| bytes.min(MAX_PICTURE_BYTES)))
+    }
+}
+
+/// A message for each line of standard input, from a thread: reading it cannot be broken off.
+fn keys() -> Receiver<()> {
+    let (sender, receiver) = channel();
+    std::thread::spawn(move || {
+        for line in std::io::stdin().lock().lines() {
+            if line.is_err() || sender.send(()).is_err() {
+                return;
+            }
+        }
+    });
+    receiver
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// All messages of a frame get one time of capture, as old as it was.
+    #[test]
+    fn a_frame_is_captured_once() {
+        let mut times = Times::default();
+        let recorded = Header { publish_time_ns: 1_000_500, ..Header::of_frame(3, 1_000_000, 1) };
+        let (mut first, mut second) = (recorded, Header { publish_time_ns: 9_000_000, ..recorded });
+        let before_ns = monotonic_now_ns();
+        times.renew(&mut first);
+        times.renew(&mut second);
+        assert_eq!(first.capture_time_ns, second.capture_time_ns);
+        assert!(first.capture_time_ns + 500 >= before_ns);
+    }
+}

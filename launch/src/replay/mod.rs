@@ -1,0 +1,170 @@
+//! `carff replay`: a recording through a graph again.
+
+mod compare;
+mod feed;
+
+use crate::launch::{Ended, Feed, LaunchArgs, run_graph};
+use crate::terminal::Terminal;
+use anyhow::{Context, ensure};
+use carff_messages::Stage;
+use carff_observe::TopicId;
+use carff_recording::Reader;
+use clap::Args;
+use compare::Replayed;
+use feed::{Pace, Player};
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::sync::{Arc, Mutex};
+
+/// Replay a recording.
+#[derive(Clone, Debug, Args)]
+pub struct ReplayArgs {
+    /// The recording.
+    pub recording: PathBuf,
+    /// How many times as fast as it was.
+    #[arg(long, value_parser = positive, conflicts_with = "step")]
+    pub rate: Option<f64>,
+    /// One frame for each press of Enter.
+    #[arg(long)]
+    pub step: bool,
+    /// Begin so many seconds after its begin.
+    #[arg(long, value_parser = positive)]
+    pub from: Option<f64>,
+    /// End so many seconds after its begin.
+    #[arg(long, value_parser = positive)]
+    pub to: Option<f64>,
+    /// Topics that come from the recording, separated by commas, in place of `camera/frame` alone: the stages that send
+    /// them, and those before, are not started. `all`: no stage is.
+    #[arg(long, value_parser = only)]
+    pub only: Option<Only>,
+    /// One frame after another, each waited for; then compare every belief and decision with the recorded ones.
+    #[arg(long, conflicts_with_all = ["rate", "step", "only"])]
+    pub verify: bool,
+    /// Run name, in place of the recorded one's.
+    #[arg(long)]
+    pub run: Option<String>,
+    /// Graph file, in place of the recorded one.
+    #[arg(long)]
+    pub graph: Option<PathBuf>,
+    /// Data set folder, in place of the recorded one's.
+    #[arg(long)]
+    pub dataset: Option<PathBuf>,
+    /// Checkpoint folder, in place of the recorded one's.
+    #[arg(long)]
+    pub checkpoint: Option<PathBuf>,
+    /// Folder of the stages' programs, in place of this program's own.
+    #[arg(long, hide = true)]
+    pub stages: Option<PathBuf>,
+}
+
+/// The topics that come from the recording.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Only(pub BTreeSet<TopicId>);
+
+fn only(text: &str) -> Result<Only, String> {
+    if text == "all" {
+        return Ok(Only(TopicId::FLOW.into()));
+    }
+    let topics = text.split(',').map(|name| name.trim().parse::<TopicId>().map_err(|e| e.to_string()));
+    let topics = topics.collect::<Result<BTreeSet<_>, _>>()?;
+    if topics.iter().any(|t| matches!(t, TopicId::Health(_))) {
+        return Err("heartbeats are not replayed".to_owned());
+    }
+    Ok(Only(topics))
+}
+
+fn positive(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(value) if value.is_finite() && value >= 0.0 => Ok(value),
+        _ => Err("it must be a number, at least 0".to_owned()),
+    }
+}
+
+/// The stages in the order of the data's way; the renderer hangs beside it.
+const WAY: [Stage; 5] = [Stage::Camera, Stage::Encoder, Stage::Forecaster, Stage::Prober, Stage::Controller];
+
+/// The stages that are not started when these topics come from the recording: those that send them, and those before.
+fn replaced(topics: &BTreeSet<TopicId>) -> BTreeSet<Stage> {
+    let last = WAY.iter().rposition(|&stage| topics.contains(&TopicId::of_stage(stage))).unwrap_or(0);
+    let mut stages: BTreeSet<Stage> = WAY[..=last].iter().copied().collect();
+    if topics.contains(&TopicId::View) {
+        stages.insert(Stage::Renderer);
+    }
+    stages
+}
+
+/// Replays. Exit code 1 when a comparison found a difference.
+pub fn run(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
+    let about = Reader::open(&args.recording)?.about().clone();
+    let folder = tempfile::tempdir().context("cannot make a temporary folder")?;
+    // The recorded file, unless the one it came from is still the same: then messages name that one.
+    let graph = match &args.graph {
+        Some(graph) => graph.clone(),
+        None if std::fs::read_to_string(&about.graph).is_ok_and(|text| text == about.graph_text) => about.graph.into(),
+        None => write_graph(folder.path(), &about.graph_text)?,
+    };
+    let topics = args.only.clone().map_or_else(|| [TopicId::Frame].into(), |only| only.0);
+    ensure!(!topics.is_empty(), "name at least one topic with --only");
+    let launch = LaunchArgs {
+        graph,
+        dataset: Some(args.dataset.clone().unwrap_or_else(|| about.dataset.into())),
+        checkpoint: Some(args.checkpoint.clone().unwrap_or_else(|| about.checkpoint.into())),
+        frames: None,
+        drives: None,
+        report: None,
+        run: Some(args.run.clone().unwrap_or(about.run)),
+        stages: args.stages.clone(),
+    };
+    let pace = match (args.verify, args.step, args.rate) {
+        (true, ..) => Pace::AfterEachDecision,
+        (_, true, _) => Pace::OnEnter,
+        (.., rate) => Pace::Rate(rate.unwrap_or(1.0)),
+    };
+    let terminal = Arc::new(Terminal::new());
+    let replayed = Arc::new(Mutex::new(Replayed::default()));
+    let player = Player {
+        recording: args.recording.clone(),
+        topics: topics.clone(),
+        pace,
+        from_ns: args.from.map_or(0, |s| (s * 1e9) as u64),
+        to_ns: args.to.map_or(u64::MAX, |s| (s * 1e9) as u64),
+        terminal: terminal.clone(),
+        replayed: args.verify.then(|| replayed.clone()),
+    };
+    let feed = Feed { without: replaced(&topics), run: Box::new(move |run, stop| player.play(run, stop)) };
+    let (ended, _) = run_graph(&launch, Some(feed), &terminal)?;
+    if ended == Ended::Interrupted {
+        terminal.log("interrupted: all stages have ended");
+        return Ok(ExitCode::from(crate::launch::INTERRUPTED));
+    }
+    if !args.verify {
+        return Ok(ExitCode::SUCCESS);
+    }
+    let replayed = std::mem::take(&mut *replayed.lock().unwrap_or_else(std::sync::PoisonError::into_inner));
+    let comparison = replayed.compare(&args.recording)?;
+    println!("{comparison}");
+    Ok(if comparison.is_same() { ExitCode::SUCCESS } else { ExitCode::FAILURE })
+}
+
+fn write_graph(folder: &Path, text: &str) -> anyhow::Result<PathBuf> {
+    let path = folder.join("graph.toml");
+    std::fs::write(&path, text).with_context(|| format!("cannot write {}", path.display()))?;
+    Ok(path)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Whoever sends what comes from the recording is not started, nor is anybody before.
+    #[test]
+    fn senders_are_replaced() {
+        let of = |text: &str| replaced(&only(text).unwrap().0);
+        assert_eq!(of("camera/frame"), [Stage::Camera].into());
+        assert_eq!(of("prober/belief"), [Stage::Camera, Stage::Encoder, Stage::Forecaster, Stage::Prober].into());
+        assert_eq!(of("view"), [Stage::Camera, Stage::Renderer].into());
+        assert_eq!(of("all").len(), Stage::ALL.len());
+        assert!(only("prober/beleif").is_err() && only("health/camera").is_err());
+    }
+}

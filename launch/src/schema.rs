@@ -1,0 +1,130 @@
+//! `carff schema`: the JSON Schema of each kind of file, made from the structures that read it, so that editors
+//! complete and check. What lies in `configs/schemas` is this.
+
+use crate::soak::SoakConfig;
+use carff_config::GraphConfig;
+use carff_scenes::config::ScenarioConfig;
+use carff_training::config::TrainingConfig;
+use schemars::generate::SchemaSettings;
+use serde_json::Value;
+
+/// Print the schema of a kind of file.
+#[derive(Clone, Debug, clap::Args)]
+pub struct SchemaArgs {
+    /// Which kind of file.
+    pub kind: FileKind,
+}
+
+/// A kind of file that a user writes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+pub enum FileKind {
+    /// What a graph runs, as in configs/graphs.
+    Graph,
+    /// A world to render, as in configs/scenarios.
+    Scenario,
+    /// How models are trained, as in configs/training.
+    Training,
+    /// Faults and what is asked of a graph under them, as in configs/soak.
+    Soak,
+}
+
+impl FileKind {
+    /// All kinds.
+    pub const ALL: [Self; 4] = [Self::Graph, Self::Scenario, Self::Training, Self::Soak];
+
+    /// The folder of the shipped files, below `configs`.
+    pub fn folder(self) -> &'static str {
+        match self {
+            Self::Graph => "graphs",
+            Self::Scenario => "scenarios",
+            Self::Training => "training",
+            Self::Soak => "soak",
+        }
+    }
+
+    /// The schema's file, below `configs/schemas`.
+    pub fn file(self) -> &'static str {
+        match self {
+            Self::Graph => "graph.schema.json",
+            Self::Scenario => "scenario.schema.json",
+            Self::Training => "training.schema.json",
+            Self::Soak => "soak.schema.json",
+        }
+    }
+
+    fn title(self) -> &'static str {
+        match self {
+            Self::Graph => "CARFF graph file",
+            Self::Scenario => "CARFF scenario file",
+            Self::Training => "CARFF training file",
+            Self::Soak => "CARFF soak file",
+        }
+    }
+}
+
+/// The schema of a kind of file: draft 7, which editors know best.
+pub fn schema(kind: FileKind) -> Value {
+    let generator = SchemaSettings::draft07().into_generator();
+    let mut schema = match kind {
+        FileKind::Graph => generator.into_root_schema_for::<GraphConfig>(),
+        FileKind::Scenario => generator.into_root_schema_for::<ScenarioConfig>(),
+        FileKind::Training => generator.into_root_schema_for::<TrainingConfig>(),
+        FileKind::Soak => generator.into_root_schema_for::<SoakConfig>(),
+    };
+    schema.insert("title".to_owned(), kind.title().into());
+    let mut schema = schema.to_value();
+    tidy(&mut schema);
+    schema
+}
+
+/// Prints it.
+pub fn run(args: &SchemaArgs) -> anyhow::Result<()> {
+    let text = serde_json::to_string_pretty(&schema(args.kind))? + "\n";
+    Ok(crate::shell::print(text.as_bytes())?)
+}
+
+/// Descriptions on one line, and defaults in single precision as they are written (0.02, not 0.019999999552965164).
+fn tidy(value: &mut Value) {
+    match value {
+        Value::Object(map) => {
+            for (key, inner) in map {
+                match inner {
+                    Value::String(text) if key == "description" => *text = text.replace('\n', " "),
+                    _ => tidy(inner),
+                }
+            }
+        }
+        Value::Array(items) => items.iter_mut().for_each(tidy),
+        Value::Number(number) => {
+            if let Some(exact) = number.as_f64().filter(|v| number.is_f64() && f64::from(*v as f32) == *v)
+                && let Ok(short) = (exact as f32).to_string().parse::<f64>()
+            {
+                *value = short.into();
+            }
+        }
+        _ => {}
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A file's keys are in its schema with their meaning, nothing else is allowed, and defaults read as they are written.
+    #[test]
+    fn schemas_say_what_keys_mean() {
+        let graph = schema(FileKind::Graph);
+        assert_eq!(graph["title"], "CARFF graph file");
+        assert_eq!(graph["additionalProperties"], false);
+        assert_eq!(graph["required"], serde_json::json!(["run"]));
+        let horizon = &graph["definitions"]["RunConfig"]["properties"]["horizon"];
+        assert!(horizon["description"].as_str().is_some_and(|d| d.contains("1 to 8")), "{horizon}");
+        assert_eq!(horizon["default"], 2);
+        let gain = &graph["definitions"]["NoiseConfig"]["properties"]["gain_sigma"];
+        assert_eq!(gain["default"], 0.02, "{gain}");
+        let scenario = schema(FileKind::Scenario);
+        let ground = &scenario["properties"]["ground_colour"];
+        assert_eq!((&ground["type"], &ground["default"]), (&"string".into(), &"#5d8a3c".into()), "{ground}");
+        assert!(scenario["properties"]["branches"]["items"]["type"] == "string", "{scenario}");
+    }
+}

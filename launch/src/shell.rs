@@ -1,0 +1,44 @@
+//! `carff completions` and `carff man`: what shells and `man` show of this command, made from its own description.
+
+use anyhow::Context;
+use std::io::Write;
+use std::path::PathBuf;
+
+/// Print a shell's completions.
+#[derive(Clone, Debug, clap::Args)]
+pub struct CompletionsArgs {
+    /// The shell.
+    pub shell: clap_complete::Shell,
+}
+
+/// Write man pages.
+#[derive(Clone, Debug, clap::Args)]
+pub struct ManArgs {
+    /// Folder for the pages, one for each command; it is made if it is missing.
+    pub dir: PathBuf,
+}
+
+/// Prints the completions of a command.
+pub fn completions(args: &CompletionsArgs, mut command: clap::Command) -> anyhow::Result<()> {
+    let name = command.get_name().to_owned();
+    let mut script = Vec::new();
+    clap_complete::generate(args.shell, &mut command, name, &mut script);
+    Ok(print(&script)?)
+}
+
+/// Writes to standard output. A reader that has seen enough (`| head`) is no error.
+pub fn print(bytes: &[u8]) -> std::io::Result<()> {
+    match std::io::stdout().write_all(bytes) {
+        Err(error) if error.kind() != std::io::ErrorKind::BrokenPipe => Err(error),
+        _ => Ok(()),
+    }
+}
+
+/// Writes the man pages of a command and of those below it.
+pub fn man(args: &ManArgs, command: clap::Command) -> anyhow::Result<()> {
+    let dir = args.dir.display();
+    std::fs::create_dir_all(&args.dir).with_context(|| format!("cannot make {dir}"))?;
+    clap_mangen::generate_to(command, &args.dir).with_context(|| format!("cannot write into {dir}"))?;
+    println!("man pages in {dir}: man {dir}/carff.1");
+    Ok(())
+}

@@ -1,0 +1,108 @@
+//! When each stage worked on which frame, out of its messages; as lines, and as a trace file that Perfetto and Chrome
+//! open.
+
+use carff_messages::{ActionCode, Reason, Stage};
+use carff_readable::AnyMessage;
+use serde_json::{Value, json};
+
+/// A stage's work on a frame.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct Span {
+    pub(crate) stage: Stage,
+    pub(crate) frame_id: u64,
+    pub(crate) step: u32,
+    /// When the frame was taken.
+    pub(crate) capture_ns: u64,
+    /// When its input had arrived; of the controller, and of stages that do not say, when it was done.
+    pub(crate) begin_ns: u64,
+    /// When its output was published.
+    pub(crate) end_ns: u64,
+    /// What came of it.
+    pub(crate) what: String,
+}
+
+impl Span {
+    /// The work behind a message; none for heartbeats and for actions that are no decision.
+    pub(crate) fn of(message: AnyMessage<'_>) -> Option<Self> {
+        let header = message.header();
+        let (stage, took_ns, what) = match message {
+            AnyMessage::Frame(m, _) => (
+                Stage::Camera,
+                header.publish_time_ns.saturating_sub(header.capture_time_ns),
+                format!("{} x {} pixels", m.width_px, m.height_px),
+            ),
+            AnyMessage::Posterior(m) => (Stage::Encoder, m.stage_latency_ns, "posterior".to_owned()),
+            AnyMessage::Forecast(m) => (
+                Stage::Forecaster,
+                m.stage_latency_ns,
+                format!("{} samples of {} components", m.sample_count, m.component_count),
+            ),
+            AnyMessage::Belief(m) => (Stage::Prober, m.stage_latency_ns, format!("hazard {:.3}", m.hazard_probability)),
+            AnyMessage::View(m, _) => {
+                (Stage::Renderer, m.stage_latency_ns, format!("view of hypothesis {}", m.hypothesis))
+            }
+            AnyMessage::Action(m) if m.is_decision == 1 => {
+                let action = m.code().map_or("?", ActionCode::name);
+                let reason = m.reason().map_or("?", Reason::name);
+                (Stage::Controller, 0, format!("{action} ({reason}), hazard {:.3}", m.hazard_probability))
+            }
+            AnyMessage::Action(_) | AnyMessage::Health(_) => return None,
+        };
+        let end_ns = header.publish_time_ns;
+        Some(Self {
+            stage,
+            frame_id: header.frame_id,
+            step: header.step,
+            capture_ns: header.capture_time_ns,
+            begin_ns: end_ns.saturating_sub(took_ns),
+            end_ns,
+            what,
+        })
+    }
+}
+
+/// Spans in the trace event format: one row a stage, times in microseconds.
+pub(crate) fn trace_events(run: &str, spans: &[Span]) -> Value {
+    let names = Stage::ALL.iter().map(|stage| {
+        json!({ "name": "thread_name", "ph": "M", "pid": 1, "tid": stage.code(), "args": { "name": stage.name() } })
+    });
+    let process =
+        json!({ "name": "process_name", "ph": "M", "pid": 1, "args": { "name": format!("carff run {run}") } });
+    let events = spans.iter().map(|span| {
+        json!({
+            "name": format!("{} frame {}", span.stage, span.frame_id),
+            "cat": span.stage.name(),
+            "ph": "X",
+            "pid": 1,
+            "tid": span.stage.code(),
+            "ts": span.begin_ns as f64 / 1e3,
+            // What took no time is still to be seen.
+            "dur": (span.end_ns - span.begin_ns).max(1_000) as f64 / 1e3,
+            "args": { "frame": span.frame_id, "step": span.step, "what": span.what },
+        })
+    });
+    json!({ "traceEvents": std::iter::once(process).chain(names).chain(events).collect::<Vec<_>>() })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use carff_messages::{Gaussian, Header, Posterior};
+
+    /// A span ends when its message was published and is as long as the stage says; a trace has one event for each.
+    #[test]
+    fn spans_are_where_the_messages_say() {
+        let header = Header { publish_time_ns: 30_000_000, ..Header::of_frame(4, 10_000_000, 1) };
+        let posterior = Posterior { header, gaussian: Gaussian::standard(), stage_latency_ns: 15_000_000 };
+        let span = Span::of(AnyMessage::Posterior(&posterior)).unwrap();
+        assert_eq!(
+            (span.stage, span.frame_id, span.begin_ns, span.end_ns),
+            (Stage::Encoder, 4, 15_000_000, 30_000_000)
+        );
+        let trace = trace_events("r", &[span]);
+        let events = trace["traceEvents"].as_array().unwrap();
+        let event = events.iter().find(|e| e["ph"] == "X").unwrap();
+        assert_eq!((event["ts"].as_f64(), event["dur"].as_f64()), (Some(15_000.0), Some(15_000.0)));
+        assert_eq!(events.iter().filter(|e| e["ph"] == "M").count(), 1 + Stage::ALL.len());
+    }
+}

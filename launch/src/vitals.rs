@@ -1,0 +1,237 @@
+//! What the stages of a run say and use, gathered over time: for the full-screen view and the metrics.
+
+use carff_messages::{ActionCode, HealthState, Reason, Stage};
+use carff_observe::TopicId;
+use carff_readable::AnyMessage;
+use carff_transport::monotonic_now_ns;
+use std::collections::{BTreeMap, VecDeque};
+
+/// Latencies that are remembered of each stage, and of the whole loop.
+const REMEMBERED: usize = 240;
+/// Time over which rates are counted, nanoseconds.
+const RATE_NS: u64 = 3_000_000_000;
+
+/// A stage.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct StageVitals {
+    /// Its state, as it last said.
+    pub(crate) state: Option<HealthState>,
+    /// Process id; 0 before the first heartbeat.
+    pub(crate) pid: u32,
+    /// When it last spoke: monotonic clock, nanoseconds.
+    pub(crate) heard_ns: u64,
+    /// Messages on its topic.
+    pub(crate) messages: u64,
+    /// When its latest messages were published.
+    published_ns: VecDeque<u64>,
+    /// What its latest outputs took, milliseconds.
+    pub(crate) latency_ms: VecDeque<f64>,
+    /// Longest time that an output took, milliseconds.
+    pub(crate) max_latency_ms: f64,
+    /// Resident memory, bytes.
+    pub(crate) rss_bytes: u64,
+    /// Inputs skipped, invalid inputs, errors: since its start.
+    pub(crate) counts: [u64; 3],
+    /// New processes seen since this was begun.
+    pub(crate) restarts: u64,
+    /// Heartbeats that said `slow` or `stale`.
+    pub(crate) late: u64,
+    /// Share of a core, 0 to the number of cores.
+    pub(crate) cpu: f64,
+    cpu_seen: Option<(u64, u64)>,
+}
+
+impl StageVitals {
+    /// Messages a second, lately.
+    pub(crate) fn rate_hz(&self, now_ns: u64) -> f64 {
+        let from_ns = now_ns.saturating_sub(RATE_NS);
+        let recent = self.published_ns.iter().filter(|&&at| at >= from_ns).count();
+        recent as f64 / (RATE_NS as f64 / 1e9)
+    }
+
+    /// Its state, with silence taken into account.
+    pub(crate) fn state_name(&self, now_ns: u64) -> &'static str {
+        match self.state {
+            None => "unknown",
+            Some(HealthState::Done) => HealthState::Done.name(),
+            Some(_) if now_ns.saturating_sub(self.heard_ns) > RATE_NS => "silent",
+            Some(state) => state.name(),
+        }
+    }
+}
+
+/// A run.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct RunVitals {
+    pub(crate) stages: BTreeMap<Stage, StageVitals>,
+    /// Frames taken by the camera: the latest number, and one.
+    pub(crate) frames: u64,
+    /// Actions by name.
+    pub(crate) actions: BTreeMap<&'static str, u64>,
+    /// Safe actions by reason.
+    pub(crate) safe_actions: BTreeMap<&'static str, u64>,
+    /// Decisions on a frame.
+    pub(crate) decisions: u64,
+    /// Camera to action, of the latest decisions, milliseconds.
+    pub(crate) decided_ms: VecDeque<f64>,
+    /// Hazard probability of the latest action.
+    pub(crate) hazard_probability: f32,
+    /// The latest action and its reason.
+    pub(crate) last_action: Option<(&'static str, &'static str)>,
+}
+
+fn remember<T>(values: &mut VecDeque<T>, value: T) {
+    if values.len() >= REMEMBERED {
+        values.pop_front();
+    }
+    values.push_back(value);
+}
+
+impl RunVitals {
+    /// The topics that it is made of.
+    pub(crate) fn topics() -> impl Iterator<Item = TopicId> {
+        TopicId::all()
+    }
+
+    /// Takes a message in.
+    pub(crate) fn take(&mut self, message: AnyMessage<'_>) {
+        let header = message.header();
+        let (stage, latency_ns) = match message {
+            AnyMessage::Frame(..) => {
+                self.frames = self.frames.max(header.frame_id + 1);
+                (Stage::Camera, header.publish_time_ns.saturating_sub(header.capture_time_ns))
+            }
+            AnyMessage::Posterior(m) => (Stage::Encoder, m.stage_latency_ns),
+            AnyMessage::Forecast(m) => (Stage::Forecaster, m.stage_latency_ns),
+            AnyMessage::Belief(m) => (Stage::Prober, m.stage_latency_ns),
+            AnyMessage::View(m, _) => (Stage::Renderer, m.stage_latency_ns),
+            AnyMessage::Action(m) => {
+                let (action, reason) = (m.code().map_or("?", ActionCode::name), m.reason().map_or("?", Reason::name));
+                *self.actions.entry(action).or_default() += 1;
+                if m.reason() != Ok(Reason::Belief) {
+                    *self.safe_actions.entry(reason).or_default() += 1;
+                }
+                if m.is_decision == 1 {
+                    self.decisions += 1;
+                    remember(&mut self.decided_ms, m.latency_ns as f64 / 1e6);
+                }
+                (self.hazard_probability, self.last_action) = (m.hazard_probability, Some((action, reason)));
+                (Stage::Controller, m.latency_ns)
+            }
+            AnyMessage::Health(m) => {
+                let Ok(stage) = m.stage() else { return };
+                let vitals = self.stages.entry(stage).or_default();
+                if vitals.pid != 0 && vitals.pid != m.pid {
+                    vitals.restarts += 1;
+                    vitals.cpu_seen = None;
+                }
+                vitals.state = m.state().ok();
+                vitals.late += u64::from(matches!(vitals.state, Some(HealthState::Slow | HealthState::Stale)));
+                (vitals.pid, vitals.rss_bytes, vitals.heard_ns) = (m.pid, m.rss_bytes, header.publish_time_ns);
+                vitals.counts = [m.skipped, m.invalid, m.errors];
+                vitals.max_latency_ms = m.max_latency_ns as f64 / 1e6;
+                return;
+            }
+        };
+        let vitals = self.stages.entry(stage).or_default();
+        vitals.messages += 1;
+        remember(&mut vitals.published_ns, header.publish_time_ns);
+        remember(&mut vitals.latency_ms, latency_ns as f64 / 1e6);
+    }
+
+    /// Looks at what each process has used of the processor since the last look.
+    pub(crate) fn look_at_processors(&mut self) {
+        let now_ns = monotonic_now_ns();
+        for vitals in self.stages.values_mut().filter(|v| v.pid != 0) {
+            let Some(used_ns) =
+                std::fs::read_to_string(format!("/proc/{}/stat", vitals.pid)).ok().and_then(|s| used_ns(&s))
+            else {
+                continue;
+            };
+            if let Some((before_ns, at_ns)) = vitals.cpu_seen.replace((used_ns, now_ns)) {
+                vitals.cpu = used_ns.saturating_sub(before_ns) as f64 / now_ns.saturating_sub(at_ns).max(1) as f64;
+            }
+        }
+    }
+}
+
+/// Processor time out of a process's `stat` file, nanoseconds.
+fn used_ns(stat: &str) -> Option<u64> {
+    // The name, in brackets, may hold anything.
+    let fields: Vec<&str> = stat.rsplit_once(')')?.1.split_whitespace().collect();
+    let ticks: u64 = fields.get(11)?.parse::<u64>().ok()? + fields.get(12)?.parse::<u64>().ok()?;
+    Some(ticks * (1_000_000_000 / rustix::param::clock_ticks_per_second().max(1)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use carff_messages::{Action, Header, Health};
+
+    fn health(pid: u32, state: HealthState) -> Health {
+        Health {
+            header: Header { publish_time_ns: 1_000, ..Header::of_frame(0, 1, 1) },
+            stage: Stage::Prober.code(),
+            state: state.code(),
+            pid,
+            reserved: 0,
+            received: 0,
+            published: 0,
+            skipped: 3,
+            invalid: 2,
+            errors: 1,
+            last_latency_ns: 0,
+            max_latency_ns: 5_000_000,
+            last_progress_ns: 0,
+            rss_bytes: 1 << 20,
+        }
+    }
+
+    /// A new process is a restart, slow and stale heartbeats are late ones, and silence is told.
+    #[test]
+    fn heartbeats_are_gathered() {
+        let mut run = RunVitals::default();
+        for (pid, state) in
+            [(5, HealthState::Ok), (5, HealthState::Slow), (6, HealthState::Stale), (6, HealthState::Ok)]
+        {
+            run.take(AnyMessage::Health(&health(pid, state)));
+        }
+        let prober = &run.stages[&Stage::Prober];
+        assert_eq!((prober.restarts, prober.late, prober.counts, prober.max_latency_ms), (1, 2, [3, 2, 1], 5.0));
+        assert_eq!((prober.state_name(2_000), prober.state_name(1_000 + 2 * RATE_NS)), ("ok", "silent"));
+    }
+
+    /// Decisions count once, safe actions by their reason.
+    #[test]
+    fn actions_are_counted() {
+        let mut run = RunVitals::default();
+        let mut action = Action {
+            header: Header::of_frame(7, 1, 1),
+            action: ActionCode::Advance.code(),
+            reason: Reason::Belief.code(),
+            rule: 3,
+            sample_count: 10,
+            confidence: 1.0,
+            hazard_probability: 0.1,
+            is_decision: 1,
+            reserved: 0,
+            valid_until_ns: 1,
+            based_on_frame: 7,
+            latency_ns: 20_000_000,
+        };
+        run.take(AnyMessage::Action(&action));
+        (action.is_decision, action.action, action.reason) = (0, ActionCode::Halt.code(), Reason::StaleBelief.code());
+        run.take(AnyMessage::Action(&action));
+        assert_eq!((run.decisions, run.decided_ms.len()), (1, 1));
+        assert_eq!((run.actions["advance"], run.actions["halt"], run.safe_actions["stale belief"]), (1, 1, 1));
+        assert_eq!(run.last_action, Some(("halt", "stale belief")));
+    }
+
+    /// Processor time is read whatever the process is called.
+    #[test]
+    fn processor_time_is_read() {
+        let stat = "12 (a ) b) S 1 12 12 0 -1 4194560 100 0 0 0 30 20 0 0 20 0 1 0 5 1 1";
+        assert_eq!(used_ns(stat), Some(50 * (1_000_000_000 / rustix::param::clock_ticks_per_second())));
+        assert_eq!(used_ns("nothing"), None);
+    }
+}

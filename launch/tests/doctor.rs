@@ -1,0 +1,44 @@
+//! `carff doctor` and exit codes, as scripts see them.
+
+#![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
+
+use serde_json::Value;
+use std::path::Path;
+use std::process::{Command, Output};
+
+fn carff(args: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_carff")).args(args).output().unwrap()
+}
+
+/// The JSON is whole, its counts are those of its findings, and the exit code is 1 exactly when an error is among them.
+#[test]
+fn findings_as_json() {
+    let folder = tempfile::tempdir().unwrap();
+    let wrong = folder.path().join("wrong.toml");
+    std::fs::write(&wrong, "[run]\nname = \"x\"\nhorizn = 2\n").unwrap();
+    let shipped = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/graphs/approaching-intersection.toml");
+    for (graph, expected) in [(&wrong, "did you mean `horizon`?"), (&shipped, "approaching-intersection")] {
+        let output = carff(&["doctor", "--json", graph.to_str().unwrap()]);
+        let json: Value = serde_json::from_slice(&output.stdout).unwrap();
+        let findings = json["findings"].as_array().unwrap();
+        let count = |level: &str| findings.iter().filter(|f| f["level"] == level).count() as u64;
+        assert_eq!(json["errors"], count("error"), "{json:#}");
+        assert_eq!(json["warnings"], count("warning"), "{json:#}");
+        assert_eq!(output.status.code(), Some(i32::from(count("error") > 0)), "{json:#}");
+        let about_graph = |f: &&Value| f["area"] == "graph" && f["found"].as_str().unwrap().contains(expected);
+        assert!(findings.iter().any(|f| about_graph(&f)), "{json:#}");
+    }
+}
+
+/// Without a terminal there are no colours; wrong arguments end with 2, errors with 1, help with 0.
+#[test]
+fn exit_codes() {
+    let plain = carff(&["doctor"]);
+    assert!(!plain.stdout.contains(&0x1b) && plain.stdout.starts_with(b"Machine"), "{plain:?}");
+    assert_eq!(carff(&["doctr"]).status.code(), Some(2));
+    assert!(String::from_utf8_lossy(&carff(&["doctr"]).stderr).contains("doctor"));
+    assert_eq!(carff(&["launch", "no-such-file.toml"]).status.code(), Some(1));
+    let help = carff(&["--help"]);
+    assert_eq!(help.status.code(), Some(0));
+    assert!(String::from_utf8_lossy(&help.stdout).contains("Exit codes:"));
+}

@@ -1,0 +1,50 @@
+//! The help that lies over the window: what can be pressed, and what the mouse does.
+
+use super::{Command, theme};
+use eframe::egui::{Align2, Context, Grid, Window};
+
+const MOUSE: [(&str, &str); 4] = [
+    ("drag", "turn about the scene"),
+    ("right drag, Shift+drag", "move along the picture"),
+    ("wheel, pinch", "nearer, farther"),
+    ("drop a PNG file", "toggle that picture"),
+];
+
+/// Shows it; `is_open` becomes false when it is closed.
+pub fn show(ctx: &Context, is_open: &mut bool) {
+    let palette = theme::palette(ctx);
+    Window::new("Keys and mouse")
+        .open(is_open)
+        .collapsible(false)
+        .resizable(false)
+        .anchor(Align2::CENTER_CENTER, [0.0, 0.0])
+        .show(ctx, |ui| {
+            ui.spacing_mut().interact_size.y = 16.0;
+            ui.horizontal_top(|ui| {
+                let (left, right) = Command::ALL.split_at(Command::ALL.len() / 2);
+                for (column, topics) in [left, right].into_iter().enumerate() {
+                    Grid::new(("keys", column)).num_columns(2).spacing([18.0, 4.0]).show(ui, |ui| {
+                        for (topic, commands) in topics {
+                            ui.label(theme::strong(*topic).color(palette.accent));
+                            ui.end_row();
+                            for (_, modifiers, key, what) in *commands {
+                                ui.monospace(Command::key_name(*modifiers, *key));
+                                ui.label(*what);
+                                ui.end_row();
+                            }
+                        }
+                    });
+                    ui.add_space(24.0);
+                }
+            });
+            ui.label(theme::strong("Mouse").color(palette.accent));
+            Grid::new("mouse").num_columns(2).spacing([18.0, 4.0]).show(ui, |ui| {
+                for (what, does) in MOUSE {
+                    ui.monospace(what);
+                    ui.label(does);
+                    ui.end_row();
+                }
+            });
+            ui.weak("Enter does as N. Nothing of this disturbs a running graph: the window only listens.");
+        });
+}

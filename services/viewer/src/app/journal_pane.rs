@@ -1,0 +1,130 @@
+//! The pane at the bottom: what was decided, and how long things took.
+
+use super::{Viewer, theme};
+use crate::journal::{Decision, Journal};
+use eframe::egui::{Align, Color32, Grid, Layout, ScrollArea, Ui, vec2};
+use egui_plot::{GridMark, Line, Plot, PlotPoints};
+
+/// Width of the decisions, as a share of the pane's.
+const DECISIONS: f32 = 0.5;
+/// What took less is drawn as if it took this long: the axis is logarithmic.
+const LEAST_MS: f64 = 0.01;
+
+impl Viewer {
+    pub(super) fn journal_pane(&mut self, ui: &mut Ui) {
+        // A running graph's, while one is watched; else the window's own.
+        let watched = self.live.as_ref().map(|live| live.watched().journal.clone());
+        let journal = watched.as_ref().unwrap_or(&self.session.journal);
+        let (width, height) = (ui.available_width(), ui.available_height());
+        ui.horizontal_top(|ui| {
+            ui.allocate_ui_with_layout(vec2(width * DECISIONS, height), Layout::top_down(Align::Min), |ui| {
+                ui.set_min_width(width * DECISIONS);
+                ui.horizontal(|ui| {
+                    ui.label(theme::heading("Decisions"));
+                    let rule = self.session.models().rule.name();
+                    ui.weak(if watched.is_some() {
+                        "of the running graph".to_owned()
+                    } else {
+                        format!("rule: {rule}")
+                    });
+                });
+                decisions(ui, journal);
+            });
+            ui.separator();
+            ui.allocate_ui_with_layout(vec2(ui.available_width(), height), Layout::top_down(Align::Min), |ui| {
+                ui.horizontal(|ui| {
+                    ui.label(theme::heading("Latency"));
+                    ui.weak(if watched.is_some() { "ms by frame" } else { "ms, of this window" });
+                });
+                latency(ui, journal);
+            });
+        });
+    }
+}
+
+fn decisions(ui: &mut Ui, journal: &Journal) {
+    let palette = theme::palette(ui.ctx());
+    if journal.decisions().len() == 0 {
+        ui.weak("none yet: a decision is taken whenever a forecast is probed");
+        return;
+    }
+    ScrollArea::vertical().auto_shrink(false).id_salt("decisions").show(ui, |ui| {
+        Grid::new("decisions").num_columns(5).striped(true).spacing([14.0, 3.0]).show(ui, |ui| {
+            for name in ["", "hazard", "rests on", "by", "latency"] {
+                ui.label(theme::small(name).color(palette.weak));
+            }
+            ui.end_row();
+            for Decision { rests_on, halt, confidence, hazard_probability, reason, latency_ms } in
+                journal.decisions().rev()
+            {
+                let (name, color) = if *halt { ("halt", palette.hazard) } else { ("advance", palette.clear) };
+                let sure = format!("{:.0} % sure", 100.0 * confidence);
+                ui.label(theme::strong(name).color(color)).on_hover_text(sure);
+                ui.monospace(format!("{:>5.1} %", 100.0 * hazard_probability));
+                ui.label(rests_on);
+                ui.weak(reason);
+                ui.monospace(latency_ms.map_or_else(|| "-".to_owned(), |ms| format!("{ms:.1} ms")));
+                ui.end_row();
+            }
+        });
+    });
+}
+
+/// The powers of ten that the axis shows.
+fn decades((low, high): (f64, f64)) -> Vec<GridMark> {
+    let shown = low..=high;
+    let all = (-2..=6).map(|decade| GridMark { value: f64::from(decade), step_size: 1.0 });
+    all.filter(|mark| shown.contains(&mark.value)).collect()
+}
+
+/// The label of a place on the logarithmic axis.
+fn milliseconds(log10_ms: f64) -> String {
+    let ms = 10_f64.powf(log10_ms);
+    if ms < 10.0 {
+        format!("{ms:.2}").trim_end_matches('0').trim_end_matches('.').to_owned()
+    } else {
+        format!("{ms:.0}")
+    }
+}
+
+fn latency(ui: &mut Ui, journal: &Journal) {
+    let palette = theme::palette(ui.ctx());
+    let color = |i: usize| -> Color32 { palette.lines[i % palette.lines.len()] };
+    ui.horizontal_top(|ui| {
+        let plot_width = (ui.available_width() - 236.0).max(120.0);
+        Plot::new("latency")
+            .width(plot_width)
+            .height(ui.available_height())
+            .y_grid_spacer(|input| decades(input.bounds))
+            .y_axis_formatter(|mark, _| milliseconds(mark.value))
+            .show_background(false)
+            .allow_scroll(false)
+            .allow_zoom(false)
+            .allow_drag(false)
+            .allow_boxed_zoom(false)
+            .y_axis_min_width(28.0)
+            .set_margin_fraction(vec2(0.02, 0.08))
+            .label_formatter(|name, point| format!("{name}\n{} ms", milliseconds(point.y)))
+            .show(ui, |plot| {
+                for (i, times) in journal.times().iter().enumerate() {
+                    let points: PlotPoints<'_> =
+                        times.values.iter().map(|[at, ms]| [*at, ms.max(LEAST_MS).log10()]).collect();
+                    plot.line(Line::new(times.name, points).color(color(i)).width(1.5));
+                }
+            });
+        Grid::new("latency").num_columns(4).spacing([10.0, 3.0]).show(ui, |ui| {
+            for name in ["", "p50", "p99", "max"] {
+                ui.label(theme::small(name).color(palette.weak));
+            }
+            ui.end_row();
+            for (i, times) in journal.times().iter().enumerate() {
+                let Some(spread) = times.spread() else { continue };
+                ui.label(theme::small(format!("● {}", times.name)).color(color(i)));
+                for value in [spread.p50, spread.p99, spread.max] {
+                    ui.label(theme::small(format!("{value:.1}")));
+                }
+                ui.end_row();
+            }
+        });
+    });
+}

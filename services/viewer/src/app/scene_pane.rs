@@ -1,0 +1,178 @@
+//! The pane in the middle: the shown scene from the camera that a hand moves, with what probing found in it.
+
+use super::{Command, Viewer, theme};
+use crate::camera::{FOV_DEG, edges, project_segment};
+use carff_geometry::PinholeCamera;
+use eframe::egui::{
+    Align2, Button, Color32, DragValue, FontId, Painter, PointerButton, Rect, Response, Sense, Slider, Stroke,
+    TextStyle, Ui, UiBuilder, pos2, vec2,
+};
+use std::time::Instant;
+
+/// A place is taken from this occupancy on.
+pub const TAKEN: f32 = 0.5;
+/// Points zoomed by one notch of the wheel double the nearness in so many.
+const SCROLL_PER_DOUBLING: f32 = 240.0;
+/// A point is drawn when so much light is stopped by this length of what is there, metres.
+const LEAST_STOPPED: f32 = 0.04;
+const POINT_LENGTH_M: f32 = 0.25;
+/// Least and most that the finest picture's longest side can be set to, pixels.
+const FINEST_PX: [u32; 2] = [96, 1536];
+
+impl Viewer {
+    pub(super) fn scene_pane(&mut self, ui: &mut Ui, commands: &mut Vec<Command>) {
+        let rect = ui.available_rect_before_wrap();
+        let response = ui.allocate_rect(rect, Sense::click_and_drag());
+        self.move_camera(ui, &response);
+        let scale = ui.ctx().pixels_per_point();
+        let longest = (rect.width().max(rect.height()) * scale).max(1.0);
+        let shrink = scale * (self.finest_px as f32 / longest).min(1.0);
+        self.view_px = [rect.width(), rect.height()].map(|side| ((side * shrink) as u32).max(8));
+
+        let palette = theme::palette(ui.ctx());
+        let painter = ui.painter_at(rect);
+        painter.rect_filled(rect, 0.0, palette.ground);
+        if let Some(view) = self.textures.view().filter(|_| self.session.moment().is_some()) {
+            let whole = Rect::from_min_max(pos2(0.0, 0.0), pos2(1.0, 1.0));
+            painter.image(view, rect, whole, Color32::WHITE);
+            let camera = self.camera.pinhole(rect.width() as u32, rect.height() as u32);
+            self.overlay(&painter, rect, &camera);
+        } else {
+            let text = "Toggle a picture to see the scene that it may stand for";
+            painter.text(rect.center(), Align2::CENTER_CENTER, text, FontId::proportional(14.0), palette.weak);
+        }
+        self.captions(ui, rect);
+        let bar = Rect::from_min_size(rect.min + vec2(10.0, rect.height() - 44.0), vec2(rect.width() - 20.0, 34.0));
+        let mut inner = ui.new_child(UiBuilder::new().max_rect(bar));
+        self.view_bar(&mut inner, commands);
+    }
+
+    fn move_camera(&mut self, ui: &Ui, response: &Response) {
+        let size = [f64::from(response.rect.width()), f64::from(response.rect.height())];
+        let drag = response.drag_delta();
+        let drag_px = [f64::from(drag.x), f64::from(drag.y)];
+        let before = self.camera;
+        let shift = ui.input(|i| i.modifiers.shift);
+        if response.dragged_by(PointerButton::Primary) && !shift {
+            self.camera.orbit(drag_px, size);
+        } else if response.dragged_by(PointerButton::Secondary)
+            || response.dragged_by(PointerButton::Middle)
+            || response.dragged_by(PointerButton::Primary)
+        {
+            self.camera.pan(drag_px, size);
+        }
+        if response.hovered() {
+            let (scroll, pinch) = ui.input(|i| (i.smooth_scroll_delta.y, i.zoom_delta()));
+            self.camera.zoom(f64::from((scroll / SCROLL_PER_DOUBLING).exp2() * pinch));
+        }
+        if self.camera != before {
+            self.moved = Some(Instant::now());
+        }
+    }
+
+    /// Boxes and densities.
+    fn overlay(&self, painter: &Painter, rect: Rect, camera: &PinholeCamera) {
+        let palette = theme::on_pictures();
+        let at = |p: [f64; 2]| rect.min + vec2(p[0] as f32, p[1] as f32);
+        let found = self.recent(&self.drawn.view).and_then(|recent| recent.found.as_ref());
+        let prober = self.session.models().probe.prober();
+        if let (Some(found), true) = (found, self.overlays.densities) {
+            for (point, density) in prober.points().iter().zip(&found.densities) {
+                let stopped = 1.0 - (-density.max(0.0) * POINT_LENGTH_M).exp();
+                if stopped < LEAST_STOPPED {
+                    continue;
+                }
+                if let Some((pixel, depth_m)) = camera.project(point.map(f64::from)) {
+                    let radius = (60.0 / depth_m as f32).clamp(0.8, 2.6);
+                    let color = Color32::from_rgb(255, 250, 215).gamma_multiply(0.25 + 0.7 * stopped);
+                    painter.circle_filled(at(pixel), radius, color);
+                }
+            }
+        }
+        if !self.overlays.boxes {
+            return;
+        }
+        for (i, place) in prober.places().iter().enumerate() {
+            let occupancy = found.and_then(|f| f.probed.occupancies.get(i).copied());
+            let color = palette.of_place(&place.name);
+            let stroke = match occupancy {
+                Some(o) if o >= TAKEN => Stroke::new(2.0, color),
+                Some(_) => Stroke::new(1.0, Color32::from_white_alpha(70)),
+                None => Stroke::new(1.0, Color32::from_white_alpha(110)),
+            };
+            for [a, b] in edges(&place.oriented_box) {
+                if let Some([a, b]) = project_segment(camera, a, b) {
+                    painter.line_segment([at(a), at(b)], stroke);
+                }
+            }
+            if let Some(o) = occupancy.filter(|o| *o >= TAKEN) {
+                let top = place.oriented_box.point([0.0, 0.0, 1.6]);
+                if let Some((pixel, _)) = camera.project(top) {
+                    label(painter, at(pixel), &format!("{} {:.0} %", place.name, 100.0 * o), color);
+                }
+            }
+        }
+    }
+
+    /// What is shown, and how fine.
+    fn captions(&self, ui: &Ui, rect: Rect) {
+        let Some(scene) = self.recent(&self.drawn.view).map(|recent| &recent.scene) else { return };
+        let painter = ui.painter_at(rect);
+        let mut text = scene.name.clone();
+        let mut color = Color32::WHITE;
+        if let Some(probed) = &scene.probed {
+            let state = probed.reading.state;
+            let name = self.session.models().state_name(state);
+            text = format!("{text}  shows {name} ({:.0} %)", 100.0 * probed.reading.confidence);
+            let is_hazard = state.is_some_and(|s| self.session.models().is_hazard(s));
+            color = if is_hazard { theme::on_pictures().hazard } else { Color32::WHITE };
+        }
+        caption(&painter, rect.left_top() + vec2(12.0, 12.0), Align2::LEFT_TOP, &text, color, 13.0);
+        if let Some((image, took_ms)) = &self.view {
+            let text = format!("{} x {}, {took_ms:.0} ms", image.width_px, image.height_px);
+            caption(&painter, rect.right_top() + vec2(-12.0, 12.0), Align2::RIGHT_TOP, &text, Color32::WHITE, 10.5);
+        }
+    }
+
+    fn view_bar(&mut self, ui: &mut Ui, commands: &mut Vec<Command>) {
+        let palette = theme::palette(ui.ctx());
+        let frame = theme::pane(palette).fill(palette.pane.gamma_multiply(0.86)).corner_radius(8);
+        frame.inner_margin(eframe::egui::Margin::symmetric(8, 4)).show(ui, |ui| {
+            ui.horizontal(|ui| {
+                for (command, name) in [
+                    (Command::CameraCorner, "Corner"),
+                    (Command::CameraAbove, "Above"),
+                    (Command::CameraPicture, "As pictured"),
+                ] {
+                    self.command_button(ui, command, Button::new(name), commands);
+                }
+                ui.separator();
+                let mut fov_deg = self.camera.fov_deg;
+                ui.spacing_mut().slider_width = 64.0;
+                let slider = Slider::new(&mut fov_deg, FOV_DEG[0]..=FOV_DEG[1]).suffix("°").fixed_decimals(0);
+                if ui.add(slider).on_hover_text("Field of view across the shorter side").changed() {
+                    self.camera.set_fov(fov_deg);
+                    self.moved = Some(Instant::now());
+                }
+                ui.add(DragValue::new(&mut self.finest_px).range(FINEST_PX[0]..=FINEST_PX[1]).suffix(" px").speed(4))
+                    .on_hover_text("Longest side of the finest picture (drag): coarser ones come first");
+                ui.separator();
+                ui.checkbox(&mut self.overlays.boxes, "boxes");
+                ui.checkbox(&mut self.overlays.densities, "densities");
+            });
+        });
+    }
+}
+
+/// Text with a dark ground, readable on any picture.
+fn caption(painter: &Painter, at: eframe::egui::Pos2, align: Align2, text: &str, color: Color32, size: f32) {
+    let galley = painter.layout_no_wrap(text.to_owned(), FontId::proportional(size), color);
+    let rect = align.anchor_size(at, galley.size());
+    painter.rect_filled(rect.expand2(vec2(7.0, 4.0)), 6.0, Color32::from_black_alpha(150));
+    painter.galley(rect.min, galley, color);
+}
+
+fn label(painter: &Painter, at: eframe::egui::Pos2, text: &str, color: Color32) {
+    let size = TextStyle::Small.resolve(&painter.ctx().style()).size + 0.5;
+    caption(painter, at, Align2::CENTER_BOTTOM, text, color, size);
+}

@@ -1,0 +1,149 @@
+//! The bar at the top: the three functions, the history, where pictures come from.
+
+use super::{Command, Viewer, theme};
+use crate::live::LiveFeed;
+use crate::session::steps_ahead;
+use eframe::egui::{Align, Button, ComboBox, Layout, RichText, Theme, Ui, vec2};
+
+/// Entries of the history that are shown.
+const CRUMBS: usize = 7;
+
+impl Viewer {
+    pub(super) fn top_bar(&mut self, ui: &mut Ui, commands: &mut Vec<Command>) {
+        ui.horizontal(|ui| {
+            let palette = theme::palette(ui.ctx());
+            ui.label(theme::heading("CARFF").color(palette.accent));
+            ui.add_space(10.0);
+            for (command, name) in [
+                (Command::Toggle, "Toggle"),
+                (Command::Predict, "Predict"),
+                (Command::Probe, "Probe"),
+                (Command::ProbeAndPredict, "Probe and predict"),
+            ] {
+                let is_main = command == Command::ProbeAndPredict;
+                let text = if is_main { theme::strong(name).color(palette.on_accent) } else { RichText::new(name) };
+                let mut button = Button::new(text).min_size(vec2(72.0, 28.0));
+                if is_main {
+                    button = button.fill(palette.accent);
+                }
+                self.command_button(ui, command, button, commands);
+            }
+            ui.add_space(10.0);
+            self.command_button(ui, Command::Back, Button::new("◀").min_size(vec2(28.0, 28.0)), commands);
+            self.crumbs(ui);
+            self.command_button(ui, Command::Forward, Button::new("▶").min_size(vec2(28.0, 28.0)), commands);
+            ui.with_layout(Layout::right_to_left(Align::Center), |ui| {
+                let theme_sign = if ui.ctx().theme() == Theme::Dark { "☀" } else { "☾" };
+                for (command, sign) in
+                    [(Command::Help, "?"), (Command::Theme, theme_sign), (Command::Screenshot, "PNG")]
+                {
+                    self.command_button(ui, command, Button::new(sign).min_size(vec2(28.0, 28.0)), commands);
+                }
+                self.source(ui, commands);
+            });
+        });
+    }
+
+    /// A button that is dead, and says why, while its command would do nothing.
+    pub(super) fn command_button(
+        &self,
+        ui: &mut Ui,
+        command: Command,
+        button: Button<'_>,
+        commands: &mut Vec<Command>,
+    ) {
+        let can = self.can(command);
+        let mut all = Command::ALL.iter().flat_map(|(_, commands)| *commands);
+        let (key, what) = all
+            .find(|(c, ..)| *c == command)
+            .map_or_else(Default::default, |(_, modifiers, key, what)| (Command::key_name(*modifiers, *key), *what));
+        let response = ui.add_enabled(can.is_ok(), button).on_hover_text(format!("{what}  [{key}]"));
+        let response = match can {
+            Ok(()) => response,
+            Err(why) => response.on_disabled_hover_text(why),
+        };
+        if response.clicked() {
+            commands.push(command);
+        }
+    }
+
+    /// The newest part of the history up to a little after what is shown.
+    fn crumbs(&mut self, ui: &mut Ui) {
+        let history = self.session.history();
+        let (place, len) = (history.place(), history.entries().len());
+        let last = (place + 3).min(len).max(len.min(CRUMBS));
+        let mut chosen = None;
+        for i in last.saturating_sub(CRUMBS)..last {
+            let moment = &history.entries()[i];
+            let name = if moment.step == 0 { "now".to_owned() } else { format!("+{}", moment.step) };
+            let hover = format!("{}, {}", moment.input.title, steps_ahead(moment.step));
+            if ui.selectable_label(i == place, name).on_hover_text(hover).clicked() {
+                chosen = Some(i);
+            }
+        }
+        if let Some(place) = chosen {
+            self.is_following = false;
+            self.session.go_to(place);
+        }
+    }
+
+    /// Where pictures come from: files, or a running graph.
+    fn source(&mut self, ui: &mut Ui, commands: &mut Vec<Command>) {
+        let palette = theme::palette(ui.ctx());
+        let live = self.live.as_ref().map(|live| {
+            let watched = live.watched();
+            (watched.run.name.clone(), watched.joined.is_ok())
+        });
+        let shown = live.as_ref().map_or_else(|| "files".to_owned(), |(name, _)| name.clone());
+        let mut wanted = None;
+        ComboBox::from_id_salt("source").selected_text(shown).width(110.0).show_ui(ui, |ui| {
+            if ui.selectable_label(live.is_none(), "files").clicked() {
+                wanted = Some(None);
+            }
+            match carff_observe::runs() {
+                Ok(runs) if runs.is_empty() => drop(ui.weak("no graph runs here")),
+                Ok(runs) => {
+                    for run in runs {
+                        let is_this = live.as_ref().is_some_and(|(name, _)| *name == run.name);
+                        let hover = format!("process {}, {}", run.pid, run.graph.display());
+                        if ui.selectable_label(is_this, &run.name).on_hover_text(hover).clicked() {
+                            wanted = Some(Some(run.name));
+                        }
+                    }
+                }
+                Err(error) => drop(ui.colored_label(palette.error, error.to_string())),
+            }
+        });
+        ui.weak("source");
+        if let Some((_, is_joined)) = live {
+            let (sign, color) = match (is_joined, self.is_following) {
+                (false, _) => ("● ended", palette.error),
+                (true, true) => ("● live", palette.clear),
+                (true, false) => ("● held", palette.hazard),
+            };
+            let button = Button::new(theme::strong(sign).color(color)).min_size(vec2(64.0, 28.0));
+            self.command_button(ui, Command::Follow, button, commands);
+        }
+        match wanted {
+            Some(Some(run)) => self.attach(run),
+            Some(None) => {
+                self.live = None;
+                self.is_following = false;
+            }
+            None => {}
+        }
+    }
+
+    /// Watches a run in place of the one before.
+    fn attach(&mut self, run: String) {
+        let waker = self.waker.clone();
+        match LiveFeed::attach(Some(run), move || waker.wake_soon()) {
+            Ok(feed) => {
+                self.other_checkpoint = super::other_checkpoint(&feed, &self.session);
+                self.live = Some(feed);
+                self.is_following = true;
+            }
+            Err(error) => self.say(error.to_string(), true),
+        }
+    }
+}

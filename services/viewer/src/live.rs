@@ -1,0 +1,558 @@
+//! What a running graph does, frame by frame: attached as a probe is, so that nobody waits for this window.
+
+use crate::input::{Input, Truth};
+use crate::journal::{Decision, Journal};
+use crate::session::{Forecast, Moment};
+use carff_belief::{Probed, Step};
+use carff_dataset::{Image, Observability};
+use carff_geometry::PinholeCamera;
+use carff_messages::{
+    Action, ActionCode, Belief, FrameMeta, Gaussian, Health, MAX_COMPONENTS, Posterior, ProbeResult, Reason, RuleCode,
+    Stage,
+};
+use carff_models::{
+    LatentGaussian,
+    mixture::{Draw, Mixture},
+};
+use carff_observe::{AttachError, Attached, LiveRun, attach};
+use carff_probing::{Reading, Resolved};
+use carff_transport::{OpenError, PictureReceiver, ReceiveError, Receiver, topics};
+use std::collections::BTreeMap;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, mpsc};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+/// How often the topics are looked at.
+const LOOK: Duration = Duration::from_millis(20);
+/// How often the run is looked for, whether it still lives or has come back.
+const LOOK_FOR_RUN: Duration = Duration::from_secs(1);
+/// Frames whose messages are put together at a time; the oldest are given up.
+const MOST_FRAMES: usize = 32;
+
+/// Why a run cannot be watched.
+#[derive(Debug, thiserror::Error)]
+pub enum LiveError {
+    /// It cannot be joined.
+    #[error(transparent)]
+    Attach(#[from] AttachError),
+    /// One of its topics cannot be opened.
+    #[error(transparent)]
+    Open(#[from] OpenError),
+    /// One of its topics can no longer be read.
+    #[error(transparent)]
+    Receive(#[from] ReceiveError),
+    /// No thread can be had.
+    #[error("no thread to watch the run with: {0}")]
+    Thread(std::io::Error),
+}
+
+/// What is known of a run.
+#[derive(Clone, Debug)]
+pub struct Watched {
+    /// The run, as it was last joined.
+    pub run: LiveRun,
+    /// Whether it is joined now, or why not; it is tried again every second.
+    pub joined: Result<(), String>,
+    /// Frames seen.
+    pub frames: u64,
+    /// Decisions, and times by frame.
+    pub journal: Journal,
+    /// What the stages last said of themselves.
+    pub health: BTreeMap<Stage, Health>,
+    /// What the graph made of the newest frame whose belief is complete, until it is taken.
+    newest: Option<Vec<Moment>>,
+}
+
+/// Watches a run on a thread of its own, until it is dropped.
+pub struct LiveFeed {
+    watched: Arc<Mutex<Watched>>,
+    stopped: Arc<AtomicBool>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl LiveFeed {
+    /// Joins a run: the one that is named, or the only one that lives. `wake` is called when something is new.
+    pub fn attach(run: Option<String>, wake: impl Fn() + Send + 'static) -> Result<Self, LiveError> {
+        let stopped = Arc::new(AtomicBool::new(false));
+        let theirs = stopped.clone();
+        // The thread joins, so that all that belongs to the run stays in it; its first answer is waited for.
+        let (answer, answered) = mpsc::sync_channel(1);
+        let thread = std::thread::Builder::new()
+            .name("live".into())
+            .spawn(move || match Watcher::join(run.as_deref()) {
+                Err(error) => drop(answer.send(Err(error))),
+                Ok(watcher) => {
+                    let watched = Arc::new(Mutex::new(Watched::of(watcher.attached.live.clone())));
+                    if answer.send(Ok(watched.clone())).is_ok() {
+                        watch(watcher, &watched, &theirs, &wake);
+                    }
+                }
+            })
+            .map_err(LiveError::Thread)?;
+        let gone = |_| LiveError::Thread(std::io::Error::other("it ended at once"));
+        let watched = answered.recv().map_err(gone)??;
+        Ok(Self { watched, stopped, thread: Some(thread) })
+    }
+
+    /// What is known now.
+    pub fn watched(&self) -> MutexGuard<'_, Watched> {
+        locked(&self.watched)
+    }
+
+    /// What the graph made of its newest frame, if that is news.
+    pub fn take_newest(&self) -> Option<Vec<Moment>> {
+        self.watched().newest.take()
+    }
+}
+
+impl Drop for LiveFeed {
+    fn drop(&mut self) {
+        self.stopped.store(true, Ordering::Relaxed);
+        if let Some(thread) = self.thread.take() {
+            // It ends by a panic only, which has been reported by then.
+            let _ = thread.join();
+        }
+    }
+}
+
+/// What is known, also when a thread died with the lock: it is whole at any time.
+fn locked(watched: &Mutex<Watched>) -> MutexGuard<'_, Watched> {
+    watched.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+impl Watched {
+    fn of(run: LiveRun) -> Self {
+        Self { run, joined: Ok(()), frames: 0, journal: Journal::default(), health: BTreeMap::new(), newest: None }
+    }
+}
+
+/// Watches until it is stopped, and joins again when the run ends and comes back.
+fn watch(first: Watcher, watched: &Mutex<Watched>, stopped: &AtomicBool, wake: &dyn Fn()) {
+    let name = first.attached.live.name.clone();
+    let mut watcher = Some(first);
+    let mut looked = Instant::now();
+    while !stopped.load(Ordering::Relaxed) {
+        let mut lost = None;
+        if let Some(joined) = &mut watcher {
+            match joined.drain(watched) {
+                Ok(true) => wake(),
+                Ok(false) => {}
+                Err(error) => lost = Some(error.to_string()),
+            }
+        }
+        if looked.elapsed() >= LOOK_FOR_RUN || lost.is_some() {
+            looked = Instant::now();
+            match &watcher {
+                Some(joined) if lost.is_none() && joined.attached.live.is_alive() => {}
+                Some(_) => {
+                    watcher = None;
+                    let why = lost.unwrap_or_else(|| format!("run `{name}` has ended"));
+                    locked(watched).joined = Err(why);
+                    wake();
+                }
+                None => match Watcher::join(Some(&name)) {
+                    Ok(joined) => {
+                        *locked(watched) = Watched::of(joined.attached.live.clone());
+                        watcher = Some(joined);
+                        wake();
+                    }
+                    Err(LiveError::Attach(AttachError::NoRun | AttachError::NoSuchRun { .. })) => {}
+                    Err(error) => locked(watched).joined = Err(error.to_string()),
+                },
+            }
+        }
+        std::thread::sleep(LOOK);
+    }
+}
+
+/// Subscribed to a run's topics.
+struct Watcher {
+    attached: Attached,
+    frames: PictureReceiver<FrameMeta>,
+    posteriors: Receiver<Posterior>,
+    forecasts: Receiver<carff_messages::Forecast>,
+    beliefs: Receiver<Belief>,
+    actions: Receiver<Action>,
+    healths: Vec<Receiver<Health>>,
+    assembly: Assembly,
+    /// The last action that was no decision, so that only what changes is written down.
+    last_safe: Option<(ActionCode, Reason)>,
+}
+
+impl Watcher {
+    fn join(run: Option<&str>) -> Result<Self, LiveError> {
+        let attached = attach(run, "viewer")?;
+        let node = &attached.node;
+        let healths = Stage::ALL.iter().map(|&stage| Ok(node.receiver(&topics::health(stage))?.polled()));
+        Ok(Self {
+            frames: node.picture_receiver(&topics::FRAME)?.polled(),
+            posteriors: node.receiver(&topics::POSTERIOR)?.polled(),
+            forecasts: node.receiver(&topics::FORECAST)?.polled(),
+            beliefs: node.receiver(&topics::BELIEF)?.polled(),
+            actions: node.receiver(&topics::ACTION)?.polled(),
+            healths: healths.collect::<Result<_, OpenError>>()?,
+            assembly: Assembly::default(),
+            last_safe: None,
+            attached,
+        })
+    }
+
+    /// Takes in all that waits; whether the window has something new to show.
+    fn drain(&mut self, watched: &Mutex<Watched>) -> Result<bool, ReceiveError> {
+        let mut is_new = false;
+        // In the order of the data's way, so that what belongs to a frame finds it.
+        while let Some(frame) = self.frames.next()? {
+            let meta = frame.meta();
+            locked(watched).frames = meta.header.frame_id + 1;
+            self.assembly.frame(meta.header.frame_id, input(meta, frame.bytes()));
+        }
+        while let Some(posterior) = self.posteriors.next()? {
+            let (frame, took_ns) = (posterior.header.frame_id, posterior.stage_latency_ns);
+            locked(watched).journal.took("encoder", frame as f64, took_ns as f64 * 1e-6);
+            self.assembly.posterior(&posterior);
+        }
+        while let Some(forecast) = self.forecasts.next()? {
+            self.assembly.forecast(&forecast);
+        }
+        while let Some(belief) = self.beliefs.next()? {
+            let frame = belief.header.frame_id as f64;
+            let mut now = locked(watched);
+            now.journal.took("forecaster", frame, belief.forecaster_ns as f64 * 1e-6);
+            now.journal.took("prober", frame, belief.stage_latency_ns as f64 * 1e-6);
+            if let Some(moments) = self.assembly.belief(&belief) {
+                now.newest = Some(moments);
+                is_new = true;
+            }
+        }
+        while let Some(action) = self.actions.next()? {
+            let mut now = locked(watched);
+            if let Some(decision) = decision(&action, &mut self.last_safe) {
+                if let Some(ms) = decision.latency_ms {
+                    now.journal.took("camera to action", action.based_on_frame as f64, ms);
+                }
+                now.journal.decided(decision);
+                is_new = true;
+            }
+        }
+        for receiver in &mut self.healths {
+            while let Some(health) = receiver.next()? {
+                if let Ok(stage) = health.stage() {
+                    locked(watched).health.insert(stage, *health);
+                }
+            }
+        }
+        Ok(is_new)
+    }
+}
+
+/// A decision to write down: the first action on a frame, or a safe action that is not the one before.
+fn decision(action: &Action, last_safe: &mut Option<(ActionCode, Reason)>) -> Option<Decision> {
+    let (code, reason) = (action.code().ok()?, action.reason().ok()?);
+    let decided = action.is_decision == 1;
+    if reason == Reason::Belief {
+        *last_safe = None;
+        if !decided {
+            return None;
+        }
+    } else if last_safe.replace((code, reason)) == Some((code, reason)) {
+        return None;
+    }
+    let rule = RuleCode::try_from(action.rule).ok()?;
+    let rests_on = match action.based_on_frame {
+        u64::MAX => "no frame".to_owned(),
+        frame => format!("frame {frame}"),
+    };
+    Some(Decision {
+        rests_on,
+        halt: code == ActionCode::Halt,
+        confidence: action.confidence,
+        hazard_probability: action.hazard_probability,
+        reason: if reason == Reason::Belief { rule.name() } else { reason.name() }.to_owned(),
+        latency_ms: (decided && action.latency_ns > 0).then_some(action.latency_ns as f64 * 1e-6),
+    })
+}
+
+/// Puts the messages of each frame together.
+#[derive(Default)]
+struct Assembly {
+    frames: BTreeMap<u64, Parts>,
+}
+
+struct Parts {
+    input: Arc<Input>,
+    forecasts: BTreeMap<u32, carff_messages::Forecast>,
+    moments: Vec<Moment>,
+    /// What the last of them resolved to, and its posterior: what the next step is forecast from.
+    fed_back: Option<(LatentGaussian, usize)>,
+}
+
+impl Assembly {
+    fn frame(&mut self, frame_id: u64, input: Input) {
+        let (forecasts, moments) = (BTreeMap::new(), Vec::new());
+        self.frames.insert(frame_id, Parts { input: Arc::new(input), forecasts, moments, fed_back: None });
+        while self.frames.len() > MOST_FRAMES {
+            self.frames.pop_first();
+        }
+    }
+
+    fn posterior(&mut self, posterior: &Posterior) {
+        if let Some(parts) = self.frames.get_mut(&posterior.header.frame_id) {
+            parts.moments = vec![Moment::of_posterior(parts.input.clone(), latent_gaussian(&posterior.gaussian))];
+        }
+    }
+
+    fn forecast(&mut self, forecast: &carff_messages::Forecast) {
+        if let Some(parts) = self.frames.get_mut(&forecast.header.frame_id) {
+            parts.forecasts.insert(forecast.header.step, *forecast);
+        }
+    }
+
+    /// All moments of a frame, once its last belief is there.
+    fn belief(&mut self, belief: &Belief) -> Option<Vec<Moment>> {
+        let frame_id = belief.header.frame_id;
+        let parts = self.frames.get_mut(&frame_id)?;
+        let forecast = parts.forecasts.get(&belief.header.step)?;
+        // A step without the one before it (this window came in between) cannot be followed.
+        let before = parts.moments.last().filter(|m| m.step + 1 == belief.header.step)?;
+        let moment = moment(before, parts.fed_back, forecast, belief);
+        parts.moments.push(moment);
+        let state = usize::try_from(belief.resolved_state).ok();
+        parts.fed_back = state.map(|state| (latent_gaussian(&belief.resolved), state));
+        if belief.is_final == 0 {
+            return None;
+        }
+        let whole = self.frames.remove(&frame_id)?.moments;
+        // What is older will not be looked at any more.
+        self.frames.retain(|id, _| *id > frame_id);
+        Some(whole)
+    }
+}
+
+/// The picture of a frame.
+fn input(meta: &FrameMeta, bytes: &[u8]) -> Input {
+    let view = &meta.dataset_view;
+    let (i, m) = (&meta.intrinsics, &meta.world_from_camera);
+    let observability = match carff_messages::Observability::try_from(view.observability) {
+        Ok(carff_messages::Observability::Full) => Some(Observability::Full),
+        Ok(carff_messages::Observability::Partial) => Some(Observability::Partial),
+        Ok(carff_messages::Observability::None) => Some(Observability::None),
+        _ => None,
+    };
+    let index = |value: i32| usize::try_from(value).ok();
+    let truth = match (index(view.branch), index(view.timestamp), index(view.view)) {
+        (Some(branch), Some(timestamp), Some(view)) => Some(Truth { branch, timestamp, view, observability }),
+        _ => None,
+    };
+    Input {
+        title: format!("frame {}", meta.header.frame_id),
+        image: Image { width_px: meta.width_px, height_px: meta.height_px, rgb: bytes.to_vec() },
+        camera: Some(PinholeCamera {
+            width_px: meta.width_px,
+            height_px: meta.height_px,
+            fl_x_px: i.fl_x_px,
+            fl_y_px: i.fl_y_px,
+            cx_px: i.cx_px,
+            cy_px: i.cy_px,
+            world_from_camera: std::array::from_fn(|row| std::array::from_fn(|column| m[row * 4 + column])),
+        }),
+        truth: truth.filter(|_| view.known == 1),
+        frame: meta.header.frame_id,
+        seed: Some(meta.header.seed),
+    }
+}
+
+fn latent_gaussian(gaussian: &Gaussian) -> LatentGaussian {
+    LatentGaussian { mean: gaussian.mean, log_variance: gaussian.log_variance }
+}
+
+/// A step of a frame, as the graph's messages say it. `fed_back` is the state that the step before resolved to.
+fn moment(
+    before: &Moment,
+    fed_back: Option<(LatentGaussian, usize)>,
+    forecast: &carff_messages::Forecast,
+    belief: &Belief,
+) -> Moment {
+    let components = (forecast.component_count as usize).min(MAX_COMPONENTS);
+    let mixture = Mixture {
+        weights: forecast.weights[..components].to_vec(),
+        components: forecast.components[..components].iter().map(latent_gaussian).collect(),
+    };
+    let draws: Vec<Draw> = forecast
+        .samples()
+        .iter()
+        .zip(&forecast.sample_component)
+        .map(|(latent, component)| Draw { latent: *latent, component: usize::from(*component) })
+        .collect();
+    let places = belief.place_count as usize;
+    let probed = |result: &ProbeResult| probed(result, places);
+    let step = Step {
+        mixture: mixture.clone(),
+        draws: draws.clone(),
+        components: belief.components[..components].iter().map(probed).collect(),
+        samples: belief.samples().iter().map(probed).collect(),
+        resolved: Resolved {
+            state_probabilities: belief.state_probability[..belief.state_count as usize].to_vec(),
+            hazard_probability: belief.hazard_probability,
+            // No state has the largest number: nothing can be gone on from.
+            state: usize::try_from(belief.resolved_state).unwrap_or(usize::MAX),
+        },
+        path_probability: belief.path_probability,
+    };
+    let (source, source_state) = match fed_back {
+        Some((gaussian, state)) => (gaussian, Some(state)),
+        None => (before.source, before.source_state),
+    };
+    let path = before.steps().cloned().collect();
+    let path_probability = forecast.path_probability;
+    let before = Moment { source, source_state, path_probability, path, ..before.clone() };
+    Moment { belief: Some(step), ..Moment::of_forecast(&before, forecast.header.step, Forecast { mixture, draws }) }
+}
+
+fn probed(result: &ProbeResult, places: usize) -> Probed {
+    Probed {
+        occupancies: result.densities[..places].to_vec(),
+        reading: Reading {
+            state: usize::try_from(result.state).ok(),
+            confidence: result.confidence,
+            hazard_likelihood: result.hazard_likelihood,
+            // Messages carry the best state alone.
+            state_probabilities: Vec::new(),
+        },
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use carff_messages::{ForecastSource, Header};
+
+    fn meta(frame_id: u64) -> FrameMeta {
+        let dataset_view = carff_messages::DatasetView {
+            known: 1,
+            view: 7,
+            branch: 1,
+            timestamp: 2,
+            observability: carff_messages::Observability::None.code(),
+            ..carff_messages::DatasetView::UNKNOWN
+        };
+        FrameMeta {
+            header: Header::of_frame(frame_id, 5, 77),
+            width_px: 2,
+            height_px: 1,
+            dataset_view,
+            ..FrameMeta::default()
+        }
+    }
+
+    fn posterior(frame_id: u64) -> Posterior {
+        let header = Header::of_frame(frame_id, 5, 77);
+        Posterior { header, gaussian: Gaussian { mean: [0.5; 8], ..Gaussian::standard() }, stage_latency_ns: 0 }
+    }
+
+    fn forecast(frame_id: u64, step: u32) -> carff_messages::Forecast {
+        let header = Header::of_frame(frame_id, 5, 77).at_step(step);
+        let mut forecast = carff_messages::Forecast::empty(header, ForecastSource::Observed, 2);
+        (forecast.component_count, forecast.sample_count) = (2, 3);
+        forecast.weights[..2].copy_from_slice(&[0.25, 0.75]);
+        forecast.samples[2] = [step as f32; 8];
+        forecast.sample_component[2] = 1;
+        forecast.path_probability = 1.0 / step as f32;
+        forecast
+    }
+
+    fn belief(frame_id: u64, step: u32) -> Belief {
+        let mut belief = Belief::empty(Header::of_frame(frame_id, 5, 77).at_step(step), 2);
+        (belief.state_count, belief.place_count, belief.component_count, belief.sample_count) = (4, 2, 2, 3);
+        belief.state_probability[..4].copy_from_slice(&[0.1, 0.6, 0.2, 0.1]);
+        belief.samples[2].state = 1;
+        belief.samples[2].densities[1] = 0.875;
+        belief.resolved_state = 1;
+        belief.resolved.mean = [9.0; 8];
+        belief.path_probability = 1.0 / step as f32;
+        belief
+    }
+
+    /// A frame's messages become its moments: posterior, and each step with its belief, the second one from the state
+    /// that the first resolved to. Nothing is shown before the last belief.
+    #[test]
+    fn messages_become_moments() {
+        let mut assembly = Assembly::default();
+        assembly.frame(3, input(&meta(3), &[1, 2, 3, 4, 5, 6]));
+        assembly.posterior(&posterior(3));
+        for step in [1, 2] {
+            assembly.forecast(&forecast(3, step));
+        }
+        assert!(assembly.belief(&belief(3, 1)).is_none());
+        let moments = assembly.belief(&belief(3, 2)).unwrap();
+        assert_eq!(moments.iter().map(|m| m.step).collect::<Vec<_>>(), [0, 1, 2]);
+        let input = &moments[0].input;
+        assert_eq!((input.image.rgb.as_slice(), input.seed), ([1, 2, 3, 4, 5, 6].as_slice(), Some(77)));
+        let truth = input.truth.unwrap();
+        assert_eq!(
+            (truth.branch, truth.timestamp, truth.view, truth.observability),
+            (1, 2, 7, Some(Observability::None))
+        );
+        assert_eq!((moments[1].source.mean, moments[1].source_state), ([0.5; 8], None));
+        assert_eq!((moments[2].source.mean, moments[2].source_state), ([9.0; 8], Some(1)));
+        let last = &moments[2];
+        assert_eq!((last.path_probability, last.path.len()), (0.5, 1));
+        let step = last.belief.as_ref().unwrap();
+        assert_eq!(step.resolved.state_probabilities, [0.1, 0.6, 0.2, 0.1]);
+        assert_eq!((step.samples[2].reading.state, step.samples[1].reading.state), (Some(1), None));
+        assert_eq!(step.samples[2].occupancies, [0.0, 0.875]);
+        assert_eq!(last.forecast.as_ref().unwrap().draws[2], Draw { latent: [2.0; 8], component: 1 });
+        assert_eq!(last.selection, crate::session::Selection::Component(1));
+    }
+
+    /// Messages of frames that were not seen from their beginning, or whose step before is missing, make no moment; and
+    /// however many frames stay unfinished, a bounded number is kept.
+    #[test]
+    fn what_is_incomplete_is_left_out() {
+        let mut assembly = Assembly::default();
+        assembly.posterior(&posterior(1));
+        assembly.forecast(&forecast(1, 2));
+        assert!(assembly.belief(&belief(1, 2)).is_none());
+        assembly.frame(2, input(&meta(2), &[0; 6]));
+        assembly.posterior(&posterior(2));
+        assembly.forecast(&forecast(2, 2));
+        assert!(assembly.belief(&belief(2, 2)).is_none());
+        for frame_id in 3..200 {
+            assembly.frame(frame_id, input(&meta(frame_id), &[0; 6]));
+        }
+        assert_eq!(assembly.frames.len(), MOST_FRAMES);
+    }
+
+    /// Each frame's decision is written down once; a safe action when it begins, and again when its reason changes.
+    #[test]
+    fn decisions_are_written_down_once() {
+        let action = |reason: Reason, is_decision| Action {
+            header: Header::of_frame(4, 5, 77),
+            action: ActionCode::Halt.code(),
+            reason: reason.code(),
+            rule: RuleCode::Calibrated.code(),
+            sample_count: 10,
+            confidence: 0.5,
+            hazard_probability: 0.5,
+            is_decision,
+            reserved: 0,
+            valid_until_ns: 0,
+            based_on_frame: 4,
+            latency_ns: 2_500_000,
+        };
+        let mut last = None;
+        let stream = [
+            (Reason::NoBeliefYet, 0, true),
+            (Reason::NoBeliefYet, 0, false),
+            (Reason::Belief, 1, true),
+            (Reason::Belief, 0, false),
+            (Reason::StaleBelief, 0, true),
+            (Reason::NoBeliefYet, 0, true),
+        ];
+        for (reason, is_decision, written) in stream {
+            assert_eq!(decision(&action(reason, is_decision), &mut last).is_some(), written, "{reason}");
+        }
+        let decided = decision(&action(Reason::Belief, 1), &mut last).unwrap();
+        assert_eq!((decided.latency_ms, decided.reason.as_str(), decided.halt), (Some(2.5), "calibrated", true));
+    }
+}

@@ -1,0 +1,189 @@
+//! `carff-viewer`: the live window.
+
+use anyhow::{Context, bail};
+use carff_viewer::app::{Command, Options, Viewer, Waker, icon};
+use carff_viewer::input::{Album, Input};
+use carff_viewer::live::LiveFeed;
+use carff_viewer::models::Models;
+use carff_viewer::session::Session;
+use clap::{Parser, ValueEnum};
+use eframe::egui::{ThemePreference, ViewportBuilder};
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::time::Duration;
+
+/// The checkpoint that ships.
+const SHIPPED: &str = "configs/checkpoints/approaching-intersection";
+
+/// Threads for encoding and forecasting: as many as graphs give their stages.
+const MODEL_THREADS: usize = 1;
+/// How much a window that watches a graph gives way to others.
+const NICE: i32 = 5;
+
+/// A window on what a picture may mean: the scenes that it may stand for, forecast, probed, and seen from anywhere.
+/// From files, or from a running graph, which it does not disturb.
+#[derive(Debug, Parser)]
+#[command(
+    version,
+    after_help = "Examples:\n  carff-viewer --dataset data/approaching-intersection\n  carff-viewer --run\n  \
+                  carff-viewer --picture frame.png --do predict --do probe --screenshot scene.png"
+)]
+struct Args {
+    /// Folder of the trained models. Default: those of the run, or the shipped ones.
+    #[arg(long)]
+    checkpoint: Option<PathBuf>,
+    /// Folder of the data set to choose pictures from. Default: the one that the models were trained on, if it is
+    /// there.
+    #[arg(long)]
+    dataset: Option<PathBuf>,
+    /// Watches a running graph: the one of this name, or, without a name, the only one.
+    #[arg(long, num_args = 0..=1, default_missing_value = "", value_name = "NAME")]
+    run: Option<String>,
+    /// A PNG picture to begin with.
+    #[arg(long, value_name = "FILE", conflicts_with = "run")]
+    picture: Option<PathBuf>,
+    /// What to do first; can be given several times.
+    #[arg(long = "do", value_name = "WHAT")]
+    first: Vec<First>,
+    /// Threads for drawing. Default: as many as the machine has; one while a run is watched.
+    #[arg(long)]
+    threads: Option<usize>,
+    /// How the window looks. Default: as the system says.
+    #[arg(long)]
+    theme: Option<Look>,
+    /// Folder for screenshots.
+    #[arg(long, default_value = ".")]
+    folder: PathBuf,
+    /// Saves the window as this PNG file once all is drawn, and ends.
+    #[arg(long, value_name = "FILE")]
+    screenshot: Option<PathBuf>,
+    /// With --screenshot: not before so many seconds.
+    #[arg(long, default_value_t = 0.0, requires = "screenshot")]
+    after: f32,
+    /// Size of the window, points.
+    #[arg(long, num_args = 2, value_names = ["WIDTH", "HEIGHT"], default_values_t = [1440.0, 900.0])]
+    size: Vec<f32>,
+}
+
+/// What to do first.
+#[derive(Clone, Copy, Debug, ValueEnum)]
+enum First {
+    Toggle,
+    Predict,
+    Probe,
+    ProbeAndPredict,
+}
+
+#[derive(Clone, Copy, Debug, ValueEnum)]
+enum Look {
+    Dark,
+    Light,
+}
+
+fn main() -> ExitCode {
+    // What the transport says of messages that it drops. It fails only when a log is set up already, which then stays.
+    let _ = tracing_subscriber::fmt()
+        .with_env_filter("off,carff_transport=warn")
+        .with_writer(std::io::stderr)
+        .with_ansi(false)
+        .with_target(false)
+        .without_time()
+        .try_init();
+    match run(Args::parse()) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("error: {}", carff_stage::describe(&error));
+            ExitCode::FAILURE
+        }
+    }
+}
+
+fn run(args: Args) -> anyhow::Result<()> {
+    let waker = Waker::default();
+    let live = match args.run {
+        Some(name) => {
+            // Whatever this window draws, it gives way to the graph. Without it, it works all the same.
+            let _ = rustix::process::nice(NICE);
+            let waker = waker.clone();
+            Some(LiveFeed::attach(Some(name).filter(|n| !n.is_empty()), move || waker.wake_soon())?)
+        }
+        None => None,
+    };
+    let watched = live.as_ref().map(|live| live.watched().run.clone());
+    let cores = std::thread::available_parallelism().map_or(1, usize::from);
+    let threads = args.threads.unwrap_or(if live.is_some() { 1 } else { cores }).max(1);
+    let checkpoint = args.checkpoint.or_else(|| watched.as_ref().map(|run| run.checkpoint.clone()));
+    let models = Models::load(&checkpoint.unwrap_or_else(|| SHIPPED.into()), MODEL_THREADS)?;
+    let album = album(args.dataset.as_deref(), watched.map(|run| run.dataset), &models)?;
+    let picture = args.picture.as_deref().map(Input::load_png).transpose()?;
+    let after = Duration::try_from_secs_f32(args.after).context("--after: give seconds, 0 or more")?;
+    let options = Options {
+        threads,
+        folder: args.folder,
+        theme: match args.theme {
+            None => ThemePreference::System,
+            Some(Look::Dark) => ThemePreference::Dark,
+            Some(Look::Light) => ThemePreference::Light,
+        },
+        one_shot: args.screenshot.clone().map(|path| (path, after)),
+    };
+    let is_live = live.is_some();
+    let mut viewer =
+        Viewer::new(Session::new(models), album, live, options, waker).context("no thread to draw with")?;
+    if let Some(input) = picture {
+        viewer.toggle_input(input).map_err(anyhow::Error::msg)?;
+    } else if !is_live {
+        viewer.begin();
+    }
+    let first: Vec<Command> = args
+        .first
+        .into_iter()
+        .map(|first| match first {
+            First::Toggle => Command::Toggle,
+            First::Predict => Command::Predict,
+            First::Probe => Command::Probe,
+            First::ProbeAndPredict => Command::ProbeAndPredict,
+        })
+        .collect();
+    let title = format!("CARFF viewer: {}", viewer.session.models().manifest.scenario.name);
+    let size = [args.size.first().copied().unwrap_or(1440.0), args.size.get(1).copied().unwrap_or(900.0)];
+    let viewport = ViewportBuilder::default()
+        .with_title(&title)
+        .with_app_id("carff-viewer")
+        .with_icon(icon())
+        .with_inner_size(size)
+        .with_min_inner_size([900.0, 600.0]);
+    let native = eframe::NativeOptions { viewport, ..eframe::NativeOptions::default() };
+    let create: eframe::AppCreator<'_> = Box::new(move |creation| {
+        for command in first {
+            viewer.run(command, &creation.egui_ctx);
+        }
+        Ok(Box::new(viewer))
+    });
+    eframe::run_native(&title, native, create)
+        .map_err(|e| anyhow::anyhow!("cannot open a window: {e}; is there a display (DISPLAY or WAYLAND_DISPLAY)?"))?;
+    match args.screenshot {
+        Some(path) if !path.is_file() => bail!("the window ended before {} was saved", path.display()),
+        _ => Ok(()),
+    }
+}
+
+/// The data set to choose pictures from; within, why there is none: the window opens all the same, unless one was asked
+/// for.
+fn album(asked: Option<&Path>, of_run: Option<PathBuf>, models: &Models) -> anyhow::Result<Result<Album, String>> {
+    if let Some(dir) = asked {
+        return Ok(Ok(Album::open(dir, models)?));
+    }
+    let Some(dir) = of_run.or_else(|| models.trained_on()) else {
+        return Ok(Err("No data set: give one with --dataset, or drop a PNG picture here.".into()));
+    };
+    if !dir.is_dir() {
+        let name = &models.manifest.scenario.name;
+        let dir = dir.display();
+        return Ok(Err(format!(
+            "Data set {dir} is not here yet. Render it with\n\ncarff dataset render {name} --out {dir}\n\nand start \
+             again, or drop a PNG picture here."
+        )));
+    }
+    Ok(Album::open(&dir, models).map_err(|e| e.to_string()))
+}

@@ -1,0 +1,44 @@
+//! How dense a scene is at a height, as a picture from above.
+
+use carff_dataset::Image;
+use carff_field::{Field, LATENT_DIM};
+
+/// A surface is as opaque as this length of it is, metres: the field's surfaces are thin.
+const DEPTH_M: f32 = 0.25;
+
+/// The share of light that 0.25 m of what lies at a height stops: black none, white all. +X to the right, +Y up, over
+/// the region that matters; `longest_px` points along its longer side.
+pub fn density_slice(field: &Field, latent: &[f32; LATENT_DIM], height_m: f32, longest_px: u32) -> Image {
+    let [low, high] = field.config().bounds_m;
+    let extent_m = [high[0] - low[0], high[1] - low[1]];
+    let pixel_m = extent_m[0].max(extent_m[1]) / longest_px.max(1) as f32;
+    let [width_px, height_px] = extent_m.map(|e| ((e / pixel_m).round() as u32).max(1));
+    let points: Vec<[f32; 3]> = (0..height_px)
+        .flat_map(|y| (0..width_px).map(move |x| (x, y)))
+        .map(|(x, y)| [low[0] + (x as f32 + 0.5) * pixel_m, high[1] - (y as f32 + 0.5) * pixel_m, height_m])
+        .collect();
+    let mut densities = vec![0.0; points.len()];
+    field.density(&points, latent, &mut densities);
+    let rgb = densities.iter().flat_map(|d| [(255.0 * (1.0 - (-d.max(0.0) * DEPTH_M).exp())) as u8; 3]).collect();
+    Image { width_px, height_px, rgb }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use carff_field::FieldConfig;
+
+    /// The picture has the region's shape, and each pixel is what the field says at its middle.
+    #[test]
+    fn pixels_are_the_fields_densities() {
+        let bounds_m = [[-4.0, -2.0, 0.0], [4.0, 2.0, 3.0]];
+        let field = Field::new(FieldConfig { bounds_m, log2_table_size: 8, ..FieldConfig::default() }, 5).unwrap();
+        let latent = [0.4; LATENT_DIM];
+        let image = density_slice(&field, &latent, 1.5, 16);
+        assert_eq!((image.width_px, image.height_px), (16, 8));
+        let mut density = [0.0];
+        field.density(&[[-4.0 + 0.5 * 3.5, 2.0 - 0.5 * 1.5, 1.5]], &latent, &mut density);
+        let expected = (255.0 * (1.0 - (-density[0].max(0.0) * DEPTH_M).exp())) as u8;
+        assert_eq!(image.pixel(3, 1), Some([expected; 3]));
+    }
+}

@@ -1,0 +1,51 @@
+//! What the viewer's tests share: the shipped checkpoint, and true pictures of its scenario.
+#![allow(dead_code, reason = "each test program uses a part")]
+#![allow(clippy::unwrap_used, reason = "what fails here fails a test")]
+
+use carff_scenes::{RenderOptions, Scenario};
+use carff_viewer::input::Input;
+use carff_viewer::models::Models;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+/// A view that hides the truck's place at the first step, and one straight from above.
+pub const HIDING_VIEW: usize = 2;
+pub const ABOVE_VIEW: usize = 50;
+
+fn root() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../..")
+}
+
+pub fn checkpoint() -> PathBuf {
+    root().join("configs/checkpoints/approaching-intersection")
+}
+
+pub fn models() -> Models {
+    Models::load(&checkpoint(), 1).unwrap()
+}
+
+pub fn scenario() -> Scenario {
+    Scenario::load(&root().join("configs/scenarios/approaching-intersection.toml")).unwrap()
+}
+
+/// What a camera of the scenario sees in a state.
+pub fn picture(branch: usize, timestamp: usize, view: usize) -> Arc<Input> {
+    let scenario = scenario();
+    let camera = scenario.cameras()[view].camera;
+    let image = scenario.render(branch, timestamp, &camera, &RenderOptions::default()).unwrap().image;
+    let input = Input::of_picture(format!("b{branch} t{timestamp} v{view}"), image);
+    Arc::new(Input { camera: Some(camera), frame: view as u64, ..(*input).clone() })
+}
+
+/// A copy of the shipped checkpoint: all files but those that are named, the large ones linked.
+pub fn copy_without(files: &[&str]) -> tempfile::TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    for entry in std::fs::read_dir(checkpoint()).unwrap() {
+        let path = entry.unwrap().path().canonicalize().unwrap();
+        let name = path.file_name().unwrap();
+        if !files.iter().any(|f| name == *f) {
+            std::os::unix::fs::symlink(&path, folder.path().join(name)).unwrap();
+        }
+    }
+    folder
+}

@@ -1,0 +1,188 @@
+//! The window, without a screen: what is pressed is found by its label, and what it does is seen in the session.
+
+#![allow(clippy::unwrap_used, reason = "also in what the tests share")]
+
+mod common;
+
+use carff_viewer::app::{Options, Viewer, Waker};
+use carff_viewer::session::{Selection, Session};
+use common::{HIDING_VIEW, models, picture};
+use eframe::egui::{Event, Key, Modifiers, MouseWheelUnit, Theme, ThemePreference, Vec2, pos2, vec2};
+use egui_kittest::Harness;
+use egui_kittest::kittest::{NodeT, Queryable};
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+/// Longest wait for a picture: no limit on how long drawing may take, but on a test that hangs.
+const PATIENCE: Duration = Duration::from_secs(300);
+
+/// A window with small pictures; `None`: no picture yet.
+fn window(view: Option<usize>, folder: &Path) -> Harness<'static, Viewer> {
+    let options = Options { threads: 1, folder: folder.to_owned(), theme: ThemePreference::Dark, one_shot: None };
+    let none = Err("No data set: drop a PNG picture here.".to_owned());
+    let mut viewer = Viewer::new(Session::new(models()), none, None, options, Waker::default()).unwrap();
+    viewer.finest_px = 96;
+    if let Some(view) = view {
+        viewer.toggle_input(picture(0, 0, view)).unwrap();
+    }
+    let mut harness = Harness::builder()
+        .with_size(vec2(1440.0, 900.0))
+        .build_state(|ctx, viewer: &mut Viewer| viewer.show(ctx), viewer);
+    harness.run_steps(3);
+    harness
+}
+
+fn click(harness: &mut Harness<'static, Viewer>, label: &str) {
+    harness.get_by_label(label).click();
+    harness.run_steps(2);
+}
+
+fn press(harness: &mut Harness<'static, Viewer>, modifiers: Modifiers, key: Key) {
+    harness.key_press_modifiers(modifiers, key);
+    harness.run_steps(2);
+}
+
+fn step(harness: &Harness<'static, Viewer>) -> u32 {
+    harness.state().session.moment().unwrap().step
+}
+
+fn wait_until_drawn(harness: &mut Harness<'static, Viewer>) {
+    let since = Instant::now();
+    while !harness.state().is_drawn() {
+        assert!(since.elapsed() < PATIENCE, "the scene is not drawn");
+        std::thread::sleep(Duration::from_millis(10));
+        harness.run_steps(1);
+    }
+}
+
+/// The three functions and the way back and forward, by their buttons; one that would do nothing cannot be pressed.
+#[test]
+fn buttons_look_ahead() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut harness = window(Some(HIDING_VIEW), folder.path());
+    assert_eq!(step(&harness), 0);
+    click(&mut harness, "Predict");
+    assert_eq!(step(&harness), 1);
+    assert!(harness.state().session.moment().unwrap().belief.is_none());
+    click(&mut harness, "Probe");
+    let belief = harness.state().session.moment().unwrap().belief.clone().unwrap();
+    assert_eq!(belief.samples.len(), 10);
+    assert!(harness.query_by_label("halt").is_some(), "what a rule decides is in the log");
+    click(&mut harness, "Probe and predict");
+    assert_eq!(step(&harness), 2);
+    assert!(harness.get_by_label("Probe and predict").accesskit_node().is_disabled());
+    assert!(harness.get_by_label("▶").accesskit_node().is_disabled());
+    click(&mut harness, "◀");
+    assert_eq!(step(&harness), 1);
+    click(&mut harness, "▶");
+    assert_eq!(step(&harness), 2);
+    click(&mut harness, "Toggle");
+    assert_eq!(step(&harness), 0);
+    assert!(harness.state().session.moment().unwrap().forecast.is_none());
+}
+
+/// A small picture that is pressed shows its scene; so does a state of the belief; marks follow what is shown.
+#[test]
+fn scenes_are_chosen() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut harness = window(Some(HIDING_VIEW), folder.path());
+    click(&mut harness, "Predict");
+    click(&mut harness, "component 2");
+    assert_eq!(harness.state().session.moment().unwrap().selection, Selection::Component(1));
+    click(&mut harness, "Probe");
+    click(&mut harness, "component 1");
+    let moment = harness.state().session.moment().unwrap().clone();
+    assert_eq!(moment.selection, Selection::Component(0));
+    assert_eq!(moment.found.unwrap().probed, moment.belief.unwrap().components[0]);
+    click(&mut harness, "no-actor t1");
+    assert_eq!(harness.state().session.moment().unwrap().selection, Selection::State(4));
+}
+
+/// Every function has its key; the help lists them, and Escape is not needed to go on.
+#[test]
+fn keys_do_the_same() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut harness = window(Some(HIDING_VIEW), folder.path());
+    for (key, wanted) in [
+        (Key::P, 1),
+        (Key::Enter, 2),
+        (Key::OpenBracket, 1),
+        (Key::OpenBracket, 0),
+        (Key::CloseBracket, 1),
+        (Key::T, 0),
+        (Key::N, 1),
+    ] {
+        press(&mut harness, Modifiers::NONE, key);
+        assert_eq!(step(&harness), wanted, "{key:?}");
+    }
+    let before = harness.state().session.moment().unwrap().selection;
+    press(&mut harness, Modifiers::NONE, Key::ArrowRight);
+    assert_ne!(harness.state().session.moment().unwrap().selection, before);
+    press(&mut harness, Modifiers::NONE, Key::ArrowLeft);
+    assert_eq!(harness.state().session.moment().unwrap().selection, before);
+    press(&mut harness, Modifiers::NONE, Key::O);
+    assert!(harness.state().session.moment().unwrap().found.is_some());
+    press(&mut harness, Modifiers::NONE, Key::F1);
+    assert!(harness.query_by_label("Probe: what stands where, and the belief").is_some());
+    press(&mut harness, Modifiers::NONE, Key::F1);
+    assert!(harness.query_by_label("Probe: what stands where, and the belief").is_none());
+    press(&mut harness, Modifiers::NONE, Key::L);
+    assert_eq!(harness.ctx.theme(), Theme::Light);
+    press(&mut harness, Modifiers::NONE, Key::B);
+    press(&mut harness, Modifiers::NONE, Key::D);
+    assert!(!harness.state().overlays.boxes && !harness.state().overlays.densities);
+}
+
+/// Dragging turns the camera, with the other button it moves, the wheel goes nearer; keys set it.
+#[test]
+fn the_mouse_moves_the_camera() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut harness = window(Some(HIDING_VIEW), folder.path());
+    let before = harness.state().camera;
+    let (from, to) = (pos2(700.0, 250.0), pos2(760.0, 290.0));
+    harness.drag_at(from);
+    harness.run_steps(1);
+    harness.event(Event::PointerMoved(to));
+    harness.run_steps(1);
+    harness.drop_at(to);
+    harness.run_steps(1);
+    let turned = harness.state().camera;
+    assert_ne!((turned.azimuth_deg, turned.elevation_deg), (before.azimuth_deg, before.elevation_deg));
+    assert_eq!((turned.target_m, turned.distance_m), (before.target_m, before.distance_m));
+    harness.hover_at(to);
+    harness.event(Event::MouseWheel {
+        unit: MouseWheelUnit::Point,
+        delta: Vec2::new(0.0, 120.0),
+        modifiers: Modifiers::NONE,
+    });
+    harness.run_steps(30);
+    assert!(harness.state().camera.distance_m < before.distance_m);
+    press(&mut harness, Modifiers::NONE, Key::Num2);
+    assert_eq!(harness.state().camera.elevation_deg, 90.0);
+    press(&mut harness, Modifiers::NONE, Key::Num3);
+    let eye_m = harness.state().camera.eye_m();
+    let taken_m = picture(0, 0, HIDING_VIEW).camera.unwrap().position_m();
+    assert!((0..3).all(|i| (eye_m[i] - taken_m[i]).abs() < 1e-6));
+    press(&mut harness, Modifiers::NONE, Key::Num1);
+    assert_eq!(harness.state().camera, before);
+}
+
+/// The scene is drawn in the end, and can be saved; a window with no picture says what to do, and its functions wait.
+#[test]
+fn scenes_are_drawn_and_saved() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut harness = window(Some(HIDING_VIEW), folder.path());
+    click(&mut harness, "Predict");
+    wait_until_drawn(&mut harness);
+    press(&mut harness, Modifiers::SHIFT, Key::S);
+    let saved = carff_dataset::Image::load_png(&folder.path().join("carff-scene-0001.png")).unwrap();
+    assert_eq!(saved.width_px.max(saved.height_px), 96);
+    assert!(harness.state().message().unwrap().contains("carff-scene-0001.png"));
+
+    let harness = window(None, folder.path());
+    assert!(harness.state().is_drawn(), "nothing is missing");
+    for label in ["Toggle", "Predict", "Probe", "Probe and predict"] {
+        assert!(harness.get_by_label(label).accesskit_node().is_disabled(), "{label}");
+    }
+    assert!(harness.query_by_label("No data set: drop a PNG picture here.").is_some());
+}

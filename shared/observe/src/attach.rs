@@ -1,0 +1,159 @@
+//! The runs that live, and joining one of them.
+
+use crate::RunRecord;
+use carff_transport::{Node, OpenError, Run, RunNameError, runtime_dir};
+use std::path::{Path, PathBuf};
+
+/// A run whose launcher lives.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct LiveRun {
+    /// Its name.
+    pub name: String,
+    /// Its id, which is in every header.
+    pub run_id: u64,
+    /// The launcher's process id.
+    pub pid: u32,
+    /// The graph file.
+    pub graph: PathBuf,
+    /// Folder of the data set.
+    pub dataset: PathBuf,
+    /// Folder of the trained models.
+    pub checkpoint: PathBuf,
+    /// When it was started: seconds since 1970.
+    pub started_unix_s: u64,
+}
+
+impl LiveRun {
+    /// Whether its launcher lives and still runs this very run.
+    pub fn is_alive(&self) -> bool {
+        living(&runtime_dir(), &self.name).is_some_and(|run| run.run_id == self.run_id)
+    }
+}
+
+/// Why a run cannot be joined.
+#[derive(Debug, thiserror::Error)]
+pub enum AttachError {
+    /// Nothing runs.
+    #[error("no graph runs here: start one with `carff launch` (as the same user: runs of others are not seen)")]
+    NoRun,
+    /// Nothing of this name runs.
+    #[error("no run `{name}` lives; there {}", there_are(.living))]
+    NoSuchRun {
+        /// What was asked for.
+        name: String,
+        /// The names of those that live.
+        living: Vec<String>,
+    },
+    /// Several run, and none was named.
+    #[error("several graphs run ({}): name one with --run", .living.join(", "))]
+    Several {
+        /// Their names.
+        living: Vec<String>,
+    },
+    /// No run can have this name.
+    #[error(transparent)]
+    Name(#[from] RunNameError),
+    /// The folder of all runs cannot be read.
+    #[error("cannot read {path}: {source}")]
+    Folder {
+        /// The folder.
+        path: PathBuf,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// The transport could not join.
+    #[error(transparent)]
+    Open(#[from] OpenError),
+}
+
+fn there_are(names: &[String]) -> String {
+    match names {
+        [] => "is none".to_owned(),
+        [one] => format!("is `{one}`"),
+        many => format!("are {}", many.join(", ")),
+    }
+}
+
+/// A run that has been joined. It is left when this is dropped.
+#[derive(Debug)]
+pub struct Attached {
+    /// The membership: topics are opened by it.
+    pub node: Node,
+    /// The run.
+    pub live: LiveRun,
+}
+
+/// The runs of this user that live, by name.
+pub fn runs() -> Result<Vec<LiveRun>, AttachError> {
+    let folder = runtime_dir();
+    let entries = match std::fs::read_dir(&folder) {
+        Ok(entries) => entries,
+        Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Ok(Vec::new()),
+        Err(source) => return Err(AttachError::Folder { path: folder, source }),
+    };
+    let mut runs: Vec<LiveRun> = entries
+        .flatten()
+        .filter_map(|entry| living(&folder, entry.file_name().to_str()?.strip_suffix(".run")?))
+        .collect();
+    runs.sort_by(|a, b| a.name.cmp(&b.name));
+    Ok(runs)
+}
+
+/// Joins a run as `node_name`: the one that is named, or the only one that lives.
+pub fn attach(run: Option<&str>, node_name: &str) -> Result<Attached, AttachError> {
+    let mut living = runs()?;
+    let names = || living.iter().map(|r| r.name.clone()).collect();
+    let index = match (run, living.len()) {
+        (Some(name), _) => living
+            .iter()
+            .position(|r| r.name == name)
+            .ok_or_else(|| AttachError::NoSuchRun { name: name.to_owned(), living: names() })?,
+        (None, 0) => return Err(AttachError::NoRun),
+        (None, 1) => 0,
+        (None, _) => return Err(AttachError::Several { living: names() }),
+    };
+    let live = living.swap_remove(index);
+    let node = Node::open(&Run::new(&live.name, live.run_id)?, node_name)?;
+    Ok(Attached { node, live })
+}
+
+/// The run of this name, if its launcher lives: the record that a killed one left names a process that is no more, or
+/// that is not a launcher.
+fn living(folder: &Path, name: &str) -> Option<LiveRun> {
+    let record = RunRecord::from_bytes(&std::fs::read(RunRecord::path(folder, name)).ok()?)?;
+    let started = Path::new("/proc").join(record.pid.to_string());
+    started.exists().then(|| LiveRun {
+        name: name.to_owned(),
+        run_id: record.run_id,
+        pid: record.pid,
+        graph: record.graph.into(),
+        dataset: record.dataset.into(),
+        checkpoint: record.checkpoint.into(),
+        started_unix_s: record.started_unix_s,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn record(pid: u32) -> RunRecord {
+        let (graph, dataset, checkpoint) = ("g.toml".to_owned(), "d".to_owned(), "c".to_owned());
+        RunRecord { pid, run_id: 9, graph, dataset, checkpoint, started_unix_s: 5 }
+    }
+
+    /// A record of a process that lives is a run; one of a process that has ended, and garbage, are none.
+    #[test]
+    fn only_living_launchers_count() {
+        let folder = tempfile::tempdir().unwrap();
+        let write = |name: &str, bytes: &[u8]| std::fs::write(RunRecord::path(folder.path(), name), bytes).unwrap();
+        write("lives", &record(std::process::id()).to_bytes().unwrap());
+        // No process has the largest number.
+        write("killed", &record(u32::MAX).to_bytes().unwrap());
+        write("garbage", b"?");
+        assert_eq!(living(folder.path(), "lives").map(|r| r.run_id), Some(9));
+        for name in ["killed", "garbage", "missing"] {
+            assert_eq!(living(folder.path(), name), None, "{name}");
+        }
+    }
+}

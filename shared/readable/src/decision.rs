@@ -1,0 +1,75 @@
+//! Actions.
+
+use crate::{FormError, HeaderForm, code_of, name_of};
+use carff_messages::{Action, ActionCode, Message, Reason, RuleCode};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+/// What the car does until the next action, and why.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct ActionForm {
+    /// Header of the frame that it rests on.
+    pub header: HeaderForm,
+    /// `halt` or `advance`.
+    pub action: String,
+    /// Why.
+    pub reason: String,
+    /// The decision rule in force.
+    pub rule: String,
+    /// Samples that the belief rested on.
+    pub sample_count: u32,
+    /// How sure, 0..=1.
+    pub confidence: f32,
+    /// Probability that the hazard is met at any step looked ahead, 0..=1.
+    pub hazard_probability: f32,
+    /// Whether it is the first action that rests on its frame.
+    pub is_decision: bool,
+    /// Until when it stands: monotonic clock, nanoseconds.
+    pub valid_until_ns: u64,
+    /// The frame that it rests on, if any.
+    pub based_on_frame: Option<u64>,
+    /// Time from capture to the decision, nanoseconds; 0 when it rests on no frame.
+    pub latency_ns: u64,
+}
+
+impl From<&Action> for ActionForm {
+    fn from(action: &Action) -> Self {
+        Self {
+            header: (&action.header).into(),
+            action: name_of!(ActionCode, action.action),
+            reason: name_of!(Reason, action.reason),
+            rule: name_of!(RuleCode, action.rule),
+            sample_count: action.sample_count,
+            confidence: action.confidence,
+            hazard_probability: action.hazard_probability,
+            is_decision: action.is_decision == 1,
+            valid_until_ns: action.valid_until_ns,
+            based_on_frame: (action.based_on_frame != u64::MAX).then_some(action.based_on_frame),
+            latency_ns: action.latency_ns,
+        }
+    }
+}
+
+impl TryFrom<&ActionForm> for Action {
+    type Error = FormError;
+
+    fn try_from(form: &ActionForm) -> Result<Self, FormError> {
+        let action = Self {
+            header: (&form.header).try_into()?,
+            action: code_of!(ActionCode, "action", form.action)?,
+            reason: code_of!(Reason, "reason", form.reason)?,
+            rule: code_of!(RuleCode, "rule", form.rule)?,
+            sample_count: form.sample_count,
+            confidence: form.confidence,
+            hazard_probability: form.hazard_probability,
+            is_decision: form.is_decision.into(),
+            reserved: 0,
+            valid_until_ns: form.valid_until_ns,
+            based_on_frame: form.based_on_frame.unwrap_or(u64::MAX),
+            latency_ns: form.latency_ns,
+        };
+        action.validate()?;
+        Ok(action)
+    }
+}

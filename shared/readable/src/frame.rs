@@ -1,0 +1,190 @@
+//! What describes pictures.
+
+use crate::{FormError, HeaderForm, array, code_of, index, name_of, signed};
+use carff_messages::{DatasetView, FrameMeta, Intrinsics, Message, Observability, ViewKind, ViewMeta};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+/// An ideal pinhole camera's intrinsics, pixels.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct IntrinsicsForm {
+    /// Focal length along x.
+    pub fl_x_px: f64,
+    /// Focal length along y.
+    pub fl_y_px: f64,
+    /// Principal point, x.
+    pub cx_px: f64,
+    /// Principal point, y.
+    pub cy_px: f64,
+}
+
+impl From<&Intrinsics> for IntrinsicsForm {
+    fn from(i: &Intrinsics) -> Self {
+        Self { fl_x_px: i.fl_x_px, fl_y_px: i.fl_y_px, cx_px: i.cx_px, cy_px: i.cy_px }
+    }
+}
+
+impl From<&IntrinsicsForm> for Intrinsics {
+    fn from(i: &IntrinsicsForm) -> Self {
+        Self { fl_x_px: i.fl_x_px, fl_y_px: i.fl_y_px, cx_px: i.cx_px, cy_px: i.cy_px }
+    }
+}
+
+/// Where in a data set a frame comes from.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct DatasetViewForm {
+    /// Index of the camera pose.
+    pub view: Option<u32>,
+    /// The hidden course of events.
+    pub branch: Option<u32>,
+    /// Step of it.
+    pub timestamp: Option<u32>,
+    /// Number of the drive in this run.
+    pub drive: Option<u32>,
+    /// Frames of this drive before this one.
+    pub frame_in_drive: Option<u32>,
+    /// How much of the actor or its place it shows: `unknown`, `none`, `partial` or `full`.
+    pub observability: String,
+    /// Whether it is the last frame of a timestamp, when a decision on it is counted.
+    pub last_of_timestamp: bool,
+}
+
+/// Describes a camera frame.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct FrameForm {
+    /// Header, at step 0.
+    pub header: HeaderForm,
+    /// Pixels in a row.
+    pub width_px: u32,
+    /// Rows.
+    pub height_px: u32,
+    /// Intrinsics for this width and height.
+    pub intrinsics: IntrinsicsForm,
+    /// Row-major 4x4: camera space (OpenGL axes) to world space (metres).
+    pub world_from_camera: Vec<f64>,
+    /// Where in a data set it comes from, if known.
+    pub dataset_view: Option<DatasetViewForm>,
+}
+
+impl From<&FrameMeta> for FrameForm {
+    fn from(meta: &FrameMeta) -> Self {
+        let view = &meta.dataset_view;
+        Self {
+            header: (&meta.header).into(),
+            width_px: meta.width_px,
+            height_px: meta.height_px,
+            intrinsics: (&meta.intrinsics).into(),
+            world_from_camera: meta.world_from_camera.to_vec(),
+            dataset_view: (view.known == 1).then(|| DatasetViewForm {
+                view: index(view.view),
+                branch: index(view.branch),
+                timestamp: index(view.timestamp),
+                drive: index(view.drive),
+                frame_in_drive: index(view.frame_in_drive),
+                observability: name_of!(Observability, view.observability),
+                last_of_timestamp: view.last_of_timestamp == 1,
+            }),
+        }
+    }
+}
+
+impl TryFrom<&FrameForm> for FrameMeta {
+    type Error = FormError;
+
+    fn try_from(form: &FrameForm) -> Result<Self, FormError> {
+        let dataset_view = match &form.dataset_view {
+            None => DatasetView::UNKNOWN,
+            Some(view) => DatasetView {
+                known: 1,
+                view: signed(view.view),
+                branch: signed(view.branch),
+                timestamp: signed(view.timestamp),
+                drive: signed(view.drive),
+                frame_in_drive: signed(view.frame_in_drive),
+                observability: code_of!(Observability, "dataset_view.observability", view.observability)?,
+                last_of_timestamp: view.last_of_timestamp.into(),
+            },
+        };
+        let meta = Self {
+            header: (&form.header).try_into()?,
+            width_px: form.width_px,
+            height_px: form.height_px,
+            intrinsics: (&form.intrinsics).into(),
+            world_from_camera: array("world_from_camera", &form.world_from_camera)?,
+            dataset_view,
+        };
+        meta.validate()?;
+        Ok(meta)
+    }
+}
+
+/// Describes a rendered view.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct ViewForm {
+    /// Header, at the step of the hypothesis.
+    pub header: HeaderForm,
+    /// Which sample or component it shows.
+    pub hypothesis: u32,
+    /// `birds-eye` or `free`.
+    pub kind: String,
+    /// The state that probing found in it, if it is a known one.
+    pub state: Option<u32>,
+    /// Pixels in a row.
+    pub width_px: u32,
+    /// Rows.
+    pub height_px: u32,
+    /// Probability of this hypothesis.
+    pub probability: f32,
+    /// The latent that it was rendered from.
+    pub latent: Vec<f32>,
+    /// Intrinsics for this width and height.
+    pub intrinsics: IntrinsicsForm,
+    /// Row-major 4x4: camera space (OpenGL axes) to world space (metres).
+    pub world_from_camera: Vec<f64>,
+    /// Time that the rendering took, nanoseconds.
+    pub stage_latency_ns: u64,
+}
+
+impl From<&ViewMeta> for ViewForm {
+    fn from(meta: &ViewMeta) -> Self {
+        Self {
+            header: (&meta.header).into(),
+            hypothesis: meta.hypothesis,
+            kind: name_of!(ViewKind, meta.kind),
+            state: index(meta.state),
+            width_px: meta.width_px,
+            height_px: meta.height_px,
+            probability: meta.probability,
+            latent: meta.latent.to_vec(),
+            intrinsics: (&meta.intrinsics).into(),
+            world_from_camera: meta.world_from_camera.to_vec(),
+            stage_latency_ns: meta.stage_latency_ns,
+        }
+    }
+}
+
+impl TryFrom<&ViewForm> for ViewMeta {
+    type Error = FormError;
+
+    fn try_from(form: &ViewForm) -> Result<Self, FormError> {
+        let meta = Self {
+            header: (&form.header).try_into()?,
+            hypothesis: form.hypothesis,
+            kind: code_of!(ViewKind, "kind", form.kind)?,
+            state: signed(form.state),
+            width_px: form.width_px,
+            height_px: form.height_px,
+            probability: form.probability,
+            latent: array("latent", &form.latent)?,
+            intrinsics: (&form.intrinsics).into(),
+            world_from_camera: array("world_from_camera", &form.world_from_camera)?,
+            stage_latency_ns: form.stage_latency_ns,
+        };
+        meta.validate()?;
+        Ok(meta)
+    }
+}

@@ -1,0 +1,313 @@
+//! Posteriors, forecasts, beliefs.
+
+use crate::{FormError, HeaderForm, array, begin, code_of, index, name_of, signed};
+use carff_messages::{
+    Belief, Forecast, ForecastSource, Gaussian, LATENT_DIM, MAX_COMPONENTS, MAX_PLACES, MAX_SAMPLES, Message,
+    Posterior, ProbeResult,
+};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+/// A Gaussian over the scene latent, independent in each dimension.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct GaussianForm {
+    /// Mean.
+    pub mean: Vec<f32>,
+    /// Natural logarithm of the variance.
+    pub log_variance: Vec<f32>,
+}
+
+impl From<&Gaussian> for GaussianForm {
+    fn from(gaussian: &Gaussian) -> Self {
+        Self { mean: gaussian.mean.to_vec(), log_variance: gaussian.log_variance.to_vec() }
+    }
+}
+
+impl TryFrom<&GaussianForm> for Gaussian {
+    type Error = FormError;
+
+    fn try_from(form: &GaussianForm) -> Result<Self, FormError> {
+        Ok(Self {
+            mean: array("gaussian.mean", &form.mean)?,
+            log_variance: array("gaussian.log_variance", &form.log_variance)?,
+        })
+    }
+}
+
+/// What the encoder sees in a frame.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct PosteriorForm {
+    /// Header, at step 0.
+    pub header: HeaderForm,
+    /// The latent's distribution.
+    pub gaussian: GaussianForm,
+    /// Time from the arrival of the frame to sending, nanoseconds.
+    pub stage_latency_ns: u64,
+}
+
+impl From<&Posterior> for PosteriorForm {
+    fn from(posterior: &Posterior) -> Self {
+        Self {
+            header: (&posterior.header).into(),
+            gaussian: (&posterior.gaussian).into(),
+            stage_latency_ns: posterior.stage_latency_ns,
+        }
+    }
+}
+
+impl TryFrom<&PosteriorForm> for Posterior {
+    type Error = FormError;
+
+    fn try_from(form: &PosteriorForm) -> Result<Self, FormError> {
+        let posterior = Self {
+            header: (&form.header).try_into()?,
+            gaussian: (&form.gaussian).try_into()?,
+            stage_latency_ns: form.stage_latency_ns,
+        };
+        posterior.validate()?;
+        Ok(posterior)
+    }
+}
+
+/// A component of a mixture.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct ComponentForm {
+    /// Its weight.
+    pub weight: f32,
+    /// Its distribution.
+    pub gaussian: GaussianForm,
+}
+
+/// A latent drawn from a mixture.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct DrawForm {
+    /// Which component it was drawn from.
+    pub component: u8,
+    /// The latent.
+    pub latent: Vec<f32>,
+}
+
+/// A mixture over the latent at the next step, with latents drawn from it.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct ForecastForm {
+    /// Header, at step 1 or more.
+    pub header: HeaderForm,
+    /// `observed` or `probed`: what it was made from.
+    pub source: String,
+    /// Steps that this frame is looked ahead.
+    pub horizon: u32,
+    /// The state that the previous step resolved to, if any.
+    pub resolved_state: Option<u32>,
+    /// Probability of the path followed up to the input.
+    pub path_probability: f32,
+    /// The mixture.
+    pub components: Vec<ComponentForm>,
+    /// The drawn latents.
+    pub samples: Vec<DrawForm>,
+    /// Time that the encoder took for this frame, nanoseconds.
+    pub encoder_ns: u64,
+    /// Time from the arrival of the input to sending, nanoseconds.
+    pub stage_latency_ns: u64,
+}
+
+impl From<&Forecast> for ForecastForm {
+    fn from(f: &Forecast) -> Self {
+        let components = (f.component_count as usize).min(MAX_COMPONENTS);
+        Self {
+            header: (&f.header).into(),
+            source: name_of!(ForecastSource, f.source),
+            horizon: f.horizon,
+            resolved_state: index(f.resolved_state),
+            path_probability: f.path_probability,
+            components: f.weights[..components]
+                .iter()
+                .zip(&f.components)
+                .map(|(&weight, gaussian)| ComponentForm { weight, gaussian: gaussian.into() })
+                .collect(),
+            samples: f
+                .samples()
+                .iter()
+                .zip(f.sample_component)
+                .map(|(latent, component)| DrawForm { component, latent: latent.to_vec() })
+                .collect(),
+            encoder_ns: f.encoder_ns,
+            stage_latency_ns: f.stage_latency_ns,
+        }
+    }
+}
+
+impl TryFrom<&ForecastForm> for Forecast {
+    type Error = FormError;
+
+    fn try_from(form: &ForecastForm) -> Result<Self, FormError> {
+        let weights: Vec<f32> = form.components.iter().map(|c| c.weight).collect();
+        let components =
+            form.components.iter().map(|c| Gaussian::try_from(&c.gaussian)).collect::<Result<Vec<_>, _>>()?;
+        let latents = form
+            .samples
+            .iter()
+            .map(|s| array::<f32, LATENT_DIM>("samples.latent", &s.latent))
+            .collect::<Result<Vec<_>, _>>()?;
+        let drawn_from: Vec<u8> = form.samples.iter().map(|s| s.component).collect();
+        let forecast = Self {
+            header: (&form.header).try_into()?,
+            source: code_of!(ForecastSource, "source", form.source)?,
+            component_count: components.len() as u32,
+            sample_count: latents.len() as u32,
+            horizon: form.horizon,
+            resolved_state: signed(form.resolved_state),
+            path_probability: form.path_probability,
+            weights: begin("components", &weights, 0.0)?,
+            components: begin("components", &components, Gaussian::standard())?,
+            samples: begin("samples", &latents, [0.0; LATENT_DIM])?,
+            sample_component: begin("samples", &drawn_from, 0)?,
+            encoder_ns: form.encoder_ns,
+            stage_latency_ns: form.stage_latency_ns,
+        };
+        forecast.validate()?;
+        Ok(forecast)
+    }
+}
+
+/// What probing found in one latent.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct ProbeForm {
+    /// Which component the latent was drawn from; of a component, itself.
+    pub component: u8,
+    /// The component's weight; `null` for a sample.
+    pub weight: Option<f32>,
+    /// The state that it shows, if it is a known one.
+    pub state: Option<u32>,
+    /// How sure.
+    pub confidence: f32,
+    /// Probability that the scene holds the hazard.
+    pub hazard_likelihood: f32,
+    /// Density found at each place, 1/metre.
+    pub densities: Vec<f32>,
+}
+
+impl ProbeForm {
+    fn of(result: &ProbeResult, component: u8, weight: Option<f32>, places: usize) -> Self {
+        Self {
+            component,
+            weight,
+            state: index(result.state),
+            confidence: result.confidence,
+            hazard_likelihood: result.hazard_likelihood,
+            densities: result.densities[..places].to_vec(),
+        }
+    }
+
+    fn result(&self) -> Result<ProbeResult, FormError> {
+        Ok(ProbeResult {
+            state: signed(self.state),
+            confidence: self.confidence,
+            hazard_likelihood: self.hazard_likelihood,
+            densities: begin("densities", &self.densities, 0.0)?,
+        })
+    }
+}
+
+/// What the prober makes of a forecast.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct BeliefForm {
+    /// Header, at the step of the forecast.
+    pub header: HeaderForm,
+    /// Steps that this frame is looked ahead.
+    pub horizon: u32,
+    /// Whether this is the frame's last step.
+    pub is_final: bool,
+    /// Places probed.
+    pub place_count: u32,
+    /// Probability of each known state; what is missing to 1 is "none of the known states".
+    pub state_probability: Vec<f32>,
+    /// Probability that the hazard is there at this step.
+    pub hazard_probability: f32,
+    /// Probability of the path followed up to this step's input.
+    pub path_probability: f32,
+    /// Result for each component's mean.
+    pub components: Vec<ProbeForm>,
+    /// Result for each sample.
+    pub samples: Vec<ProbeForm>,
+    /// The most probable state, fed back as the next step's input, if it is a known one.
+    pub resolved_state: Option<u32>,
+    /// That state's stored posterior.
+    pub resolved: GaussianForm,
+    /// Time that the encoder took for this frame, nanoseconds.
+    pub encoder_ns: u64,
+    /// Time that the forecaster took for this step, nanoseconds.
+    pub forecaster_ns: u64,
+    /// Time from the arrival of the forecast to sending, nanoseconds.
+    pub stage_latency_ns: u64,
+}
+
+impl From<&Belief> for BeliefForm {
+    fn from(b: &Belief) -> Self {
+        let places = (b.place_count as usize).min(MAX_PLACES);
+        let components = (b.component_count as usize).min(MAX_COMPONENTS);
+        Self {
+            header: (&b.header).into(),
+            horizon: b.horizon,
+            is_final: b.is_final == 1,
+            place_count: b.place_count,
+            state_probability: b.state_probability.iter().take(b.state_count as usize).copied().collect(),
+            hazard_probability: b.hazard_probability,
+            path_probability: b.path_probability,
+            components: b.components[..components]
+                .iter()
+                .zip(b.component_weights)
+                .enumerate()
+                .map(|(i, (result, weight))| ProbeForm::of(result, i as u8, Some(weight), places))
+                .collect(),
+            samples: b
+                .samples()
+                .iter()
+                .zip(b.sample_component)
+                .map(|(result, component)| ProbeForm::of(result, component, None, places))
+                .collect(),
+            resolved_state: index(b.resolved_state),
+            resolved: (&b.resolved).into(),
+            encoder_ns: b.encoder_ns,
+            forecaster_ns: b.forecaster_ns,
+            stage_latency_ns: b.stage_latency_ns,
+        }
+    }
+}
+
+impl TryFrom<&BeliefForm> for Belief {
+    type Error = FormError;
+
+    fn try_from(form: &BeliefForm) -> Result<Self, FormError> {
+        let results = |forms: &[ProbeForm]| forms.iter().map(ProbeForm::result).collect::<Result<Vec<_>, _>>();
+        let (components, samples) = (results(&form.components)?, results(&form.samples)?);
+        let weights: Vec<f32> = form.components.iter().map(|c| c.weight.unwrap_or(0.0)).collect();
+        let drawn_from: Vec<u8> = form.samples.iter().map(|s| s.component).collect();
+        let mut belief = Self::empty((&form.header).try_into()?, form.horizon);
+        belief.is_final = form.is_final.into();
+        belief.state_count = form.state_probability.len() as u32;
+        belief.place_count = form.place_count;
+        belief.component_count = components.len() as u32;
+        belief.sample_count = samples.len() as u32;
+        belief.state_probability = begin("state_probability", &form.state_probability, 0.0)?;
+        belief.hazard_probability = form.hazard_probability;
+        belief.path_probability = form.path_probability;
+        belief.component_weights = begin::<_, MAX_COMPONENTS>("components", &weights, 0.0)?;
+        belief.components = begin("components", &components, ProbeResult::NONE)?;
+        belief.samples = begin::<_, MAX_SAMPLES>("samples", &samples, ProbeResult::NONE)?;
+        belief.sample_component = begin("samples", &drawn_from, 0)?;
+        belief.resolved_state = signed(form.resolved_state);
+        belief.resolved = (&form.resolved).try_into()?;
+        belief.encoder_ns = form.encoder_ns;
+        belief.forecaster_ns = form.forecaster_ns;
+        belief.stage_latency_ns = form.stage_latency_ns;
+        belief.validate()?;
+        Ok(belief)
+    }
+}

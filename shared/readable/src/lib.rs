@@ -1,0 +1,123 @@
+//! Messages as JSON, and back: what people read, what recordings hold, and what other tools understand.
+//!
+//! Each message has a form of its own: codes are names, arrays end where their counts say, and "none" is `null`. A form
+//! made of a message and turned back gives the same message, bit for bit, where it means something; what lies beyond the
+//! counts is zero. [`schema`] describes a form as JSON Schema.
+//!
+//! ```
+//! use carff_messages::{Gaussian, Header, Posterior};
+//! use carff_readable::PosteriorForm;
+//! let header = Header::of_frame(7, 1_000, 42);
+//! let posterior = Posterior { header, gaussian: Gaussian::standard(), stage_latency_ns: 5 };
+//! let text = serde_json::to_string(&PosteriorForm::from(&posterior))?;
+//! assert!(text.contains(r#""frame_id":7"#));
+//! let back = Posterior::try_from(&serde_json::from_str::<PosteriorForm>(&text)?)?;
+//! assert_eq!(back, posterior);
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
+
+mod any;
+mod decision;
+mod frame;
+mod header;
+mod health;
+mod latent;
+mod text;
+
+pub use any::AnyMessage;
+pub use decision::ActionForm;
+pub use frame::{DatasetViewForm, FrameForm, IntrinsicsForm, ViewForm};
+pub use header::HeaderForm;
+pub use health::HealthForm;
+pub use latent::{BeliefForm, ComponentForm, DrawForm, ForecastForm, GaussianForm, PosteriorForm, ProbeForm};
+pub use text::as_text;
+
+use carff_messages::Invalid;
+use schemars::JsonSchema;
+
+/// Why a form is no message.
+#[derive(Debug, thiserror::Error)]
+pub enum FormError {
+    /// A name that stands for nothing.
+    #[error("`{field}` is `{found}`, must be one of: {known}")]
+    UnknownName {
+        /// Which field.
+        field: &'static str,
+        /// What was found.
+        found: String,
+        /// What there is.
+        known: String,
+    },
+    /// A list of the wrong length.
+    #[error("`{field}` has {found} entries, must have {expected}")]
+    Length {
+        /// Which field.
+        field: &'static str,
+        /// What was found.
+        found: usize,
+        /// What there may be.
+        expected: String,
+    },
+    /// A number that is not written as it should be.
+    #[error("`{field}` is `{found}`: it must be 16 hexadecimal digits")]
+    Number {
+        /// Which field.
+        field: &'static str,
+        /// What was found.
+        found: String,
+    },
+    /// The message that it makes is not valid.
+    #[error(transparent)]
+    Invalid(#[from] Invalid),
+}
+
+/// A form's JSON Schema.
+pub fn schema<T: JsonSchema>() -> serde_json::Value {
+    schemars::schema_for!(T).to_value()
+}
+
+/// The name of a code; `unknown` for one that stands for nothing.
+macro_rules! name_of {
+    ($kind:ty, $code:expr) => {
+        <$kind>::try_from($code).map_or("unknown", <$kind>::name).to_owned()
+    };
+}
+/// The code of a name.
+macro_rules! code_of {
+    ($kind:ty, $field:literal, $name:expr) => {
+        <$kind>::ALL.iter().find(|c| c.name() == $name).map(|c| c.code()).ok_or_else(|| crate::FormError::UnknownName {
+            field: $field,
+            found: $name.clone(),
+            known: <$kind>::ALL.iter().map(|c| c.name()).collect::<Vec<_>>().join(", "),
+        })
+    };
+}
+use {code_of, name_of};
+
+/// A list as an array of the same length.
+fn array<T: Copy, const N: usize>(field: &'static str, list: &[T]) -> Result<[T; N], FormError> {
+    list.try_into().map_err(|_| FormError::Length { field, found: list.len(), expected: N.to_string() })
+}
+
+/// A list as the begin of an array.
+fn begin<T: Copy, const N: usize>(field: &'static str, list: &[T], rest: T) -> Result<[T; N], FormError> {
+    if list.len() > N {
+        return Err(FormError::Length { field, found: list.len(), expected: format!("at most {N}") });
+    }
+    let mut array = [rest; N];
+    array[..list.len()].copy_from_slice(list);
+    Ok(array)
+}
+
+/// An index of which -1 stands for none.
+fn index(value: i32) -> Option<u32> {
+    u32::try_from(value).ok()
+}
+
+/// The way back; what does not fit is refused by the message's validation.
+fn signed(value: Option<u32>) -> i32 {
+    value.map_or(-1, |v| i32::try_from(v).unwrap_or(i32::MAX))
+}
+
+#[cfg(test)]
+mod tests;

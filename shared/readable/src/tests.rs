@@ -1,0 +1,191 @@
+use super::*;
+use carff_messages::{
+    Action, Belief, DatasetView, Forecast, ForecastSource, FrameMeta, Gaussian, Header, Health, Intrinsics, Posterior,
+    ProbeResult, ViewMeta,
+};
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+use std::fmt::Debug;
+
+/// Plain arithmetic in place of a generator: bit patterns all over the range of finite numbers.
+fn numbers() -> impl FnMut() -> f32 {
+    let mut state = 0x9e37_79b9_7f4a_7c15_u64;
+    move || {
+        loop {
+            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            let value = f32::from_bits((state >> 32) as u32);
+            if value.is_finite() {
+                return value;
+            }
+        }
+    }
+}
+
+/// Probabilities, as precise as can be.
+fn probability(next: &mut impl FnMut() -> f32) -> f32 {
+    (next().to_bits() >> 8) as f32 / (1 << 24) as f32
+}
+
+fn header() -> Header {
+    Header {
+        run_id: u64::MAX - 3,
+        sequence: 5,
+        publish_time_ns: (1 << 53) - 1,
+        ..Header::of_frame(u64::from(u32::MAX), 123_456_789_012_345, 42)
+    }
+}
+
+fn gaussian(next: &mut impl FnMut() -> f32) -> Gaussian {
+    Gaussian { mean: std::array::from_fn(|_| next()), log_variance: std::array::from_fn(|_| probability(next) * -9.7) }
+}
+
+fn there_and_back<M, F>(message: &M) -> M
+where
+    F: for<'a> From<&'a M> + Serialize + DeserializeOwned + JsonSchema,
+    M: for<'a> TryFrom<&'a F, Error = FormError> + Debug,
+{
+    let text = serde_json::to_string(&F::from(message)).unwrap();
+    M::try_from(&serde_json::from_str::<F>(&text).unwrap()).unwrap()
+}
+
+fn belief(next: &mut impl FnMut() -> f32) -> Belief {
+    let mut belief = Belief::empty(header().at_step(1), 2);
+    (belief.state_count, belief.place_count, belief.component_count, belief.sample_count) = (6, 3, 2, 7);
+    belief.state_probability[..6].fill_with(|| probability(next) / 6.0);
+    belief.component_weights[..2].copy_from_slice(&[0.300_000_01, 0.7]);
+    let mut probe = |state| {
+        let mut densities = ProbeResult::NONE.densities;
+        densities[..3].fill_with(|| next().abs());
+        ProbeResult { state, confidence: probability(next), hazard_likelihood: probability(next), densities }
+    };
+    for i in 0..7 {
+        belief.samples[i] = probe(i as i32 - 1);
+        belief.sample_component[i] = (i % 2) as u8;
+    }
+    belief.components[..2].fill_with(|| probe(-1));
+    belief.resolved_state = 5;
+    belief.resolved = gaussian(next);
+    (belief.encoder_ns, belief.forecaster_ns, belief.stage_latency_ns) = (1, 2, 3);
+    belief
+}
+
+/// Every message survives the way to JSON text and back bit for bit, whatever finite numbers it holds.
+#[test]
+fn messages_survive_their_forms() {
+    let mut next = numbers();
+    for _ in 0..200 {
+        let posterior = Posterior { header: header(), gaussian: gaussian(&mut next), stage_latency_ns: 7 };
+        assert_eq!(there_and_back::<_, PosteriorForm>(&posterior), posterior);
+
+        let belief = belief(&mut next);
+        assert_eq!(there_and_back::<_, BeliefForm>(&belief), belief);
+
+        let mut forecast = Forecast::empty(header().at_step(2), ForecastSource::Probed, 3);
+        (forecast.component_count, forecast.sample_count, forecast.resolved_state) = (2, 5, 4);
+        forecast.weights[..2].copy_from_slice(&[0.25, 0.75]);
+        forecast.components[..2].fill_with(|| gaussian(&mut next));
+        for i in 0..5 {
+            forecast.samples[i].fill_with(&mut next);
+            forecast.sample_component[i] = (i % 2) as u8;
+        }
+        assert_eq!(there_and_back::<_, ForecastForm>(&forecast), forecast);
+
+        let frame = FrameMeta {
+            header: header(),
+            width_px: 128,
+            height_px: 96,
+            intrinsics: Intrinsics { fl_x_px: 100.1, fl_y_px: 1.0 / 3.0, cx_px: 64.0, cy_px: f64::MIN_POSITIVE },
+            world_from_camera: std::array::from_fn(|_| f64::from(next()) / 3.0),
+            dataset_view: DatasetView { known: 1, view: 3, observability: 2, ..DatasetView::UNKNOWN },
+        };
+        assert_eq!(there_and_back::<_, FrameForm>(&frame), frame);
+        let nowhere = FrameMeta { dataset_view: DatasetView::UNKNOWN, ..frame };
+        assert_eq!(there_and_back::<_, FrameForm>(&nowhere), nowhere);
+
+        let view = ViewMeta {
+            header: header().at_step(1),
+            hypothesis: 3,
+            kind: 1,
+            state: -1,
+            width_px: 64,
+            height_px: 64,
+            probability: probability(&mut next),
+            latent: std::array::from_fn(|_| next()),
+            intrinsics: frame.intrinsics,
+            world_from_camera: frame.world_from_camera,
+            stage_latency_ns: 9,
+        };
+        assert_eq!(there_and_back::<_, ViewForm>(&view), view);
+
+        let action = Action {
+            header: header(),
+            action: 1,
+            reason: 2,
+            rule: 3,
+            sample_count: 10,
+            confidence: probability(&mut next),
+            hazard_probability: probability(&mut next),
+            is_decision: 1,
+            reserved: 0,
+            valid_until_ns: 99,
+            based_on_frame: u64::MAX,
+            latency_ns: 0,
+        };
+        assert_eq!(there_and_back::<_, ActionForm>(&action), action);
+    }
+    let health = Health {
+        header: header(),
+        stage: 4,
+        state: 2,
+        pid: 77,
+        reserved: 0,
+        received: 1,
+        published: 2,
+        skipped: 3,
+        invalid: 4,
+        errors: 5,
+        last_latency_ns: 6,
+        max_latency_ns: 7,
+        last_progress_ns: 8,
+        rss_bytes: 9,
+    };
+    assert_eq!(there_and_back::<_, HealthForm>(&health), health);
+}
+
+/// A form that is no message is refused with its field's name: unknown names, lists too long, invalid numbers.
+#[test]
+fn what_is_no_message_is_refused() {
+    let mut form = BeliefForm::from(&belief(&mut numbers()));
+    form.samples[0].densities = vec![0.0; 40];
+    assert!(Belief::try_from(&form).unwrap_err().to_string().contains("densities"));
+    form.samples[0].densities = vec![0.0; 3];
+    form.hazard_probability = 2.0;
+    assert!(Belief::try_from(&form).unwrap_err().to_string().contains("hazard_probability"));
+
+    let posterior = Posterior { header: header(), gaussian: Gaussian::standard(), stage_latency_ns: 0 };
+    let mut form = PosteriorForm::from(&posterior);
+    form.gaussian.mean.pop();
+    assert!(Posterior::try_from(&form).unwrap_err().to_string().contains("gaussian.mean"));
+
+    let mut form = ForecastForm::from(&Forecast::empty(header().at_step(1), ForecastSource::Observed, 1));
+    form.source = "guessed".to_owned();
+    let error = Forecast::try_from(&form).unwrap_err().to_string();
+    assert!(error.contains("source") && error.contains("observed, probed"), "{error}");
+}
+
+/// Every field of a form is described by its schema.
+#[test]
+fn schemas_name_the_fields() {
+    let schema = schema::<BeliefForm>();
+    let form = serde_json::to_value(BeliefForm::from(&belief(&mut numbers()))).unwrap();
+    for key in form.as_object().unwrap().keys() {
+        assert!(schema["properties"][key].is_object(), "{key}");
+    }
+}
+
+/// Text has a line for each plain value, and no braces.
+#[test]
+fn text_is_indented() {
+    let value = serde_json::json!({"a": 1, "b": {"c": null, "d": [1, 2]}, "e": [{"f": true, "g": "x"}]});
+    assert_eq!(as_text(&value), "a: 1\nb:\n  c: none\n  d: [1, 2]\ne:\n  - f: yes\n    g: x\n");
+}

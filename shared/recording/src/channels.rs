@@ -1,0 +1,83 @@
+//! The channels that recordings and the live bridge have in common: names, schemas, and what a message is on each.
+
+use crate::{StandardMessage, standard_messages};
+use carff_observe::TopicId;
+use carff_probing::Place;
+use carff_readable::{
+    ActionForm, AnyMessage, BeliefForm, ForecastForm, FrameForm, HealthForm, PosteriorForm, ViewForm, schema,
+};
+use foxglove::messages::{CameraCalibration, FrameTransform, RawImage, SceneUpdate};
+use foxglove::{Encode, Schema};
+
+/// A channel: messages of one schema under one name.
+#[derive(Clone, Debug)]
+pub struct Channel {
+    /// Its name: a topic's, or one for other tools.
+    pub name: &'static str,
+    /// How messages are encoded: `json` or `protobuf`.
+    pub encoding: String,
+    /// What they look like.
+    pub schema: Option<Schema>,
+}
+
+/// All channels.
+pub fn channels() -> Vec<Channel> {
+    let mut channels: Vec<Channel> = TopicId::all()
+        .map(|topic| {
+            let (name, schema) = match topic {
+                TopicId::Frame => ("carff.Frame", schema::<FrameForm>()),
+                TopicId::Posterior => ("carff.Posterior", schema::<PosteriorForm>()),
+                TopicId::Forecast => ("carff.Forecast", schema::<ForecastForm>()),
+                TopicId::Belief => ("carff.Belief", schema::<BeliefForm>()),
+                TopicId::View => ("carff.View", schema::<ViewForm>()),
+                TopicId::Action => ("carff.Action", schema::<ActionForm>()),
+                TopicId::Health(_) => ("carff.Health", schema::<HealthForm>()),
+            };
+            let schema = Schema::new(name, "jsonschema", schema.to_string().into_bytes());
+            Channel { name: topic.name(), encoding: "json".to_owned(), schema: Some(schema) }
+        })
+        .collect();
+    channels.extend([
+        standard::<RawImage>("camera/image"),
+        standard::<CameraCalibration>("camera/calibration"),
+        standard::<FrameTransform>("camera/pose"),
+        standard::<RawImage>("renderer/image"),
+        standard::<SceneUpdate>("prober/boxes"),
+    ]);
+    channels
+}
+
+fn standard<M: Encode>(name: &'static str) -> Channel {
+    Channel { name, encoding: M::get_message_encoding(), schema: M::get_schema() }
+}
+
+/// A message on each channel that it is part of, encoded. Pictures come before what describes them: a reader that meets
+/// the description has the picture. `wall_ns` is its time of publication, nanoseconds since 1970.
+pub fn encode(
+    topic: TopicId,
+    message: AnyMessage<'_>,
+    places: &[Place],
+    wall_ns: u64,
+) -> Result<Vec<(&'static str, Vec<u8>)>, serde_json::Error> {
+    let mut encoded: Vec<(&'static str, Vec<u8>)> = standard_messages(message, places, wall_ns)
+        .iter()
+        .map(|(name, standard)| {
+            let bytes = match standard {
+                StandardMessage::Image(m) => bytes(m),
+                StandardMessage::Calibration(m) => bytes(m),
+                StandardMessage::Pose(m) => bytes(m),
+                StandardMessage::Boxes(m) => bytes(m),
+            };
+            (*name, bytes)
+        })
+        .collect();
+    encoded.push((topic.name(), serde_json::to_vec(&message.to_json()?)?));
+    Ok(encoded)
+}
+
+fn bytes<M: Encode>(message: &M) -> Vec<u8> {
+    let mut bytes = Vec::with_capacity(message.encoded_len().unwrap_or(0));
+    // It fails only when a buffer is full, and a vector grows.
+    let _ = message.encode(&mut bytes);
+    bytes
+}

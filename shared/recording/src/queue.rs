@@ -1,0 +1,125 @@
+//! A queue before the disk: whoever listens to the graph never waits for it.
+
+use crate::{OwnedMessage, RecordingError, RotatingWriter};
+use carff_observe::TopicId;
+use crossbeam::channel::{Receiver, RecvTimeoutError, Sender, TrySendError, bounded};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+/// Most messages that wait.
+const MESSAGES: usize = 1 << 16;
+/// Longest time that a written message is not safe yet.
+const FLUSH_EVERY: Duration = Duration::from_secs(1);
+
+/// How many messages went which way.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct QueueCounts {
+    /// Written to the file.
+    pub written: u64,
+    /// Dropped whole, because the disk was too slow.
+    pub dropped: u64,
+}
+
+#[derive(Debug, Default)]
+struct Shared {
+    waiting_bytes: AtomicU64,
+    written: AtomicU64,
+    dropped: AtomicU64,
+}
+
+/// Writes a recording on a thread of its own, out of a queue with a limit.
+#[derive(Debug)]
+pub struct RecordingQueue {
+    sender: Option<Sender<(TopicId, OwnedMessage)>>,
+    shared: Arc<Shared>,
+    limit_bytes: u64,
+    thread: Option<JoinHandle<Result<(), RecordingError>>>,
+}
+
+impl RecordingQueue {
+    /// Begins to write; at most `limit_bytes` wait.
+    pub fn start(writer: RotatingWriter, limit_bytes: u64) -> std::io::Result<Self> {
+        let (sender, receiver) = bounded(MESSAGES);
+        let shared = Arc::<Shared>::default();
+        let theirs = shared.clone();
+        let thread =
+            std::thread::Builder::new().name("recording".into()).spawn(move || drain(writer, &receiver, &theirs))?;
+        Ok(Self { sender: Some(sender), shared, limit_bytes, thread: Some(thread) })
+    }
+
+    /// Queues a message, or drops and counts it when too much waits. False when the writer has failed: then
+    /// [`RecordingQueue::finish`] says why.
+    pub fn push(&self, topic: TopicId, message: OwnedMessage) -> bool {
+        let Some(sender) = &self.sender else { return false };
+        let bytes = message.as_message().size_bytes() as u64;
+        if self.shared.waiting_bytes.load(Ordering::Relaxed) + bytes > self.limit_bytes {
+            self.shared.dropped.fetch_add(1, Ordering::Relaxed);
+            return true;
+        }
+        self.shared.waiting_bytes.fetch_add(bytes, Ordering::Relaxed);
+        match sender.try_send((topic, message)) {
+            Ok(()) => true,
+            Err(TrySendError::Full(_)) => {
+                self.shared.waiting_bytes.fetch_sub(bytes, Ordering::Relaxed);
+                self.shared.dropped.fetch_add(1, Ordering::Relaxed);
+                true
+            }
+            Err(TrySendError::Disconnected(_)) => false,
+        }
+    }
+
+    /// The counts so far.
+    pub fn counts(&self) -> QueueCounts {
+        QueueCounts {
+            written: self.shared.written.load(Ordering::Relaxed),
+            dropped: self.shared.dropped.load(Ordering::Relaxed),
+        }
+    }
+
+    /// Writes what waits, and the index.
+    pub fn finish(mut self) -> Result<QueueCounts, RecordingError> {
+        self.close()?;
+        Ok(self.counts())
+    }
+
+    fn close(&mut self) -> Result<(), RecordingError> {
+        drop(self.sender.take());
+        match self.thread.take().map(JoinHandle::join) {
+            Some(Ok(result)) => result,
+            // A panic has been told of on standard error.
+            Some(Err(_)) | None => Ok(()),
+        }
+    }
+}
+
+impl Drop for RecordingQueue {
+    fn drop(&mut self) {
+        // Whoever wants to know calls `finish`.
+        let _ = self.close();
+    }
+}
+
+fn drain(
+    mut writer: RotatingWriter,
+    receiver: &Receiver<(TopicId, OwnedMessage)>,
+    shared: &Shared,
+) -> Result<(), RecordingError> {
+    let mut flushed = Instant::now();
+    loop {
+        match receiver.recv_timeout(FLUSH_EVERY) {
+            Ok((topic, message)) => {
+                writer.write(topic, message.as_message())?;
+                shared.waiting_bytes.fetch_sub(message.as_message().size_bytes() as u64, Ordering::Relaxed);
+                shared.written.fetch_add(1, Ordering::Relaxed);
+            }
+            Err(RecvTimeoutError::Timeout) => {}
+            Err(RecvTimeoutError::Disconnected) => return writer.finish(),
+        }
+        if flushed.elapsed() >= FLUSH_EVERY {
+            writer.flush()?;
+            flushed = Instant::now();
+        }
+    }
+}

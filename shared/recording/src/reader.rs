@@ -1,0 +1,267 @@
+//! Reading a recording back, message by message, in the order in which they were written.
+
+use crate::about::METADATA;
+use crate::{About, MessageError, RecordingError};
+use carff_messages::{
+    Action, Belief, Forecast, FrameMeta, Health, MAX_PICTURE_BYTES, PictureMeta, Posterior, ViewMeta,
+};
+use carff_observe::TopicId;
+use carff_readable::{
+    ActionForm, AnyMessage, BeliefForm, ForecastForm, FrameForm, HealthForm, PosteriorForm, ViewForm,
+};
+use foxglove::Decode;
+use foxglove::messages::RawImage;
+use mcap::records::Record;
+use mcap::sans_io::linear_reader::{LinearReadEvent, LinearReader, LinearReaderOptions};
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::Read;
+use std::path::{Path, PathBuf};
+
+/// Longest record that is read, bytes: a chunk with a picture of the largest size fits in.
+const MAX_RECORD_BYTES: usize = 4 * MAX_PICTURE_BYTES;
+/// Most channels that are remembered.
+const MAX_CHANNELS: usize = 4096;
+
+/// A message out of a recording.
+#[derive(Clone, Debug)]
+pub enum OwnedMessage {
+    /// A camera frame.
+    Frame(FrameMeta, Vec<u8>),
+    /// A posterior.
+    Posterior(Posterior),
+    /// A forecast.
+    Forecast(Box<Forecast>),
+    /// A belief.
+    Belief(Box<Belief>),
+    /// A rendered view.
+    View(ViewMeta, Vec<u8>),
+    /// An action.
+    Action(Action),
+    /// A heartbeat.
+    Health(Health),
+}
+
+impl OwnedMessage {
+    /// The message.
+    pub fn as_message(&self) -> AnyMessage<'_> {
+        match self {
+            Self::Frame(m, bytes) => AnyMessage::Frame(m, bytes),
+            Self::Posterior(m) => AnyMessage::Posterior(m),
+            Self::Forecast(m) => AnyMessage::Forecast(m),
+            Self::Belief(m) => AnyMessage::Belief(m),
+            Self::View(m, bytes) => AnyMessage::View(m, bytes),
+            Self::Action(m) => AnyMessage::Action(m),
+            Self::Health(m) => AnyMessage::Health(m),
+        }
+    }
+}
+
+impl From<AnyMessage<'_>> for OwnedMessage {
+    fn from(message: AnyMessage<'_>) -> Self {
+        match message {
+            AnyMessage::Frame(m, bytes) => Self::Frame(*m, bytes.to_vec()),
+            AnyMessage::Posterior(m) => Self::Posterior(*m),
+            AnyMessage::Forecast(m) => Self::Forecast(Box::new(*m)),
+            AnyMessage::Belief(m) => Self::Belief(Box::new(*m)),
+            AnyMessage::View(m, bytes) => Self::View(*m, bytes.to_vec()),
+            AnyMessage::Action(m) => Self::Action(*m),
+            AnyMessage::Health(m) => Self::Health(*m),
+        }
+    }
+}
+
+/// A message with its place.
+#[derive(Clone, Debug)]
+pub struct Entry {
+    /// The topic.
+    pub topic: TopicId,
+    /// The message, validated.
+    pub message: OwnedMessage,
+}
+
+/// Reads a recording from its begin.
+pub struct Reader {
+    path: PathBuf,
+    file: File,
+    inner: Box<LinearReader>,
+    about: About,
+    channels: BTreeMap<u16, String>,
+    /// The latest picture of each image channel, with its number.
+    pictures: BTreeMap<&'static str, (u32, Vec<u8>)>,
+    has_footer: bool,
+    is_cut_off: bool,
+    ended: bool,
+}
+
+impl std::fmt::Debug for Reader {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Reader").field("path", &self.path).finish_non_exhaustive()
+    }
+}
+
+impl Reader {
+    /// Opens a recording, and reads what it says of its run.
+    pub fn open(path: &Path) -> Result<Self, RecordingError> {
+        let file = File::open(path).map_err(|source| RecordingError::Io { path: path.to_owned(), source })?;
+        let options = LinearReaderOptions::default()
+            .with_record_length_limit(MAX_RECORD_BYTES)
+            .with_validate_chunk_crcs(true)
+            .with_skip_end_magic(true);
+        let mut reader = Self {
+            path: path.to_owned(),
+            file,
+            inner: Box::new(LinearReader::new_with_options(options)),
+            about: About::default(),
+            channels: BTreeMap::new(),
+            pictures: BTreeMap::new(),
+            has_footer: false,
+            is_cut_off: false,
+            ended: false,
+        };
+        // The metadata is the first record after the header.
+        loop {
+            match reader.next_record()? {
+                Some(Owned::About(about)) => {
+                    reader.about = about;
+                    return Ok(reader);
+                }
+                Some(Owned::Message { .. }) | None => return Err(RecordingError::Foreign { path: path.to_owned() }),
+                Some(_) => {}
+            }
+        }
+    }
+
+    /// The run that was recorded.
+    pub fn about(&self) -> &About {
+        &self.about
+    }
+
+    /// Whether the file ends in the middle, as when its writer was killed. Known at the end.
+    pub fn is_cut_off(&self) -> bool {
+        self.is_cut_off
+    }
+
+    /// The next message; `None` at the end.
+    #[allow(clippy::should_implement_trait, reason = "errors do not end it: the next message may be whole")]
+    pub fn next(&mut self) -> Result<Option<Entry>, RecordingError> {
+        while let Some(record) = self.next_record()? {
+            let Owned::Message { channel_id, sequence, data } = record else { continue };
+            let Some(channel) = self.channels.get(&channel_id).cloned() else { continue };
+            let entry = self.entry(&channel, sequence, &data).map_err(|MessageError(cause)| {
+                RecordingError::Message { path: self.path.clone(), channel, sequence, cause }
+            })?;
+            if entry.is_some() {
+                return Ok(entry);
+            }
+        }
+        Ok(None)
+    }
+
+    /// A message of a topic; `None` for what other channels hold.
+    fn entry(&mut self, channel: &str, sequence: u32, data: &[u8]) -> Result<Option<Entry>, MessageError> {
+        for image in ["camera/image", "renderer/image"] {
+            if channel == image {
+                let picture = RawImage::decode(data).map_err(|e| MessageError(e.to_string()))?;
+                self.pictures.insert(image, (sequence, picture.data.to_vec()));
+                return Ok(None);
+            }
+        }
+        let Some(topic) = TopicId::all().find(|t| t.name() == channel) else { return Ok(None) };
+        let message = match topic {
+            TopicId::Frame => {
+                let meta = FrameMeta::try_from(&serde_json::from_slice::<FrameForm>(data)?)?;
+                let bytes = self.picture("camera/image", sequence, &meta)?;
+                OwnedMessage::Frame(meta, bytes)
+            }
+            TopicId::View => {
+                let meta = ViewMeta::try_from(&serde_json::from_slice::<ViewForm>(data)?)?;
+                let bytes = self.picture("renderer/image", sequence, &meta)?;
+                OwnedMessage::View(meta, bytes)
+            }
+            TopicId::Posterior => {
+                OwnedMessage::Posterior((&serde_json::from_slice::<PosteriorForm>(data)?).try_into()?)
+            }
+            TopicId::Forecast => {
+                OwnedMessage::Forecast(Box::new((&serde_json::from_slice::<ForecastForm>(data)?).try_into()?))
+            }
+            TopicId::Belief => {
+                OwnedMessage::Belief(Box::new((&serde_json::from_slice::<BeliefForm>(data)?).try_into()?))
+            }
+            TopicId::Action => OwnedMessage::Action((&serde_json::from_slice::<ActionForm>(data)?).try_into()?),
+            TopicId::Health(_) => OwnedMessage::Health((&serde_json::from_slice::<HealthForm>(data)?).try_into()?),
+        };
+        Ok(Some(Entry { topic, message }))
+    }
+
+    /// The picture that a description goes with.
+    fn picture(
+        &mut self,
+        channel: &'static str,
+        sequence: u32,
+        meta: &impl PictureMeta,
+    ) -> Result<Vec<u8>, MessageError> {
+        match self.pictures.remove(channel) {
+            Some((number, bytes)) if number == sequence && bytes.len() == meta.picture_bytes() => Ok(bytes),
+            Some((number, bytes)) if number == sequence => Err(MessageError(format!(
+                "its picture on `{channel}` has {} bytes, must have {}",
+                bytes.len(),
+                meta.picture_bytes()
+            ))),
+            _ => Err(MessageError(format!("its picture is missing on `{channel}`"))),
+        }
+    }
+
+    fn next_record(&mut self) -> Result<Option<Owned>, RecordingError> {
+        let path = self.path.clone();
+        while !self.ended {
+            match self.inner.next_event() {
+                None => (self.is_cut_off, self.ended) = (!self.has_footer, true),
+                Some(Ok(LinearReadEvent::ReadRequest(bytes))) => {
+                    // No more at a time than a record may have, whatever is asked for.
+                    let bytes = bytes.min(MAX_RECORD_BYTES);
+                    let read = self
+                        .file
+                        .read(self.inner.insert(bytes))
+                        .map_err(|source| RecordingError::Io { path: path.clone(), source })?;
+                    self.inner.notify_read(read);
+                }
+                Some(Ok(LinearReadEvent::Record { data, opcode })) => {
+                    let record = mcap::parse_record(opcode, data).map_err(|e| RecordingError::mcap(&path, e))?;
+                    match record {
+                        Record::Channel(channel) if self.channels.len() < MAX_CHANNELS => {
+                            self.channels.insert(channel.id, channel.topic);
+                        }
+                        Record::Metadata(metadata) if metadata.name == METADATA => {
+                            let about = About::from_metadata(&metadata.metadata)
+                                .ok_or(RecordingError::Foreign { path: path.clone() })?;
+                            return Ok(Some(Owned::About(about)));
+                        }
+                        Record::Message { header, data } => {
+                            return Ok(Some(Owned::Message {
+                                channel_id: header.channel_id,
+                                sequence: header.sequence,
+                                data: data.into_owned(),
+                            }));
+                        }
+                        Record::Footer(_) => self.has_footer = true,
+                        _ => return Ok(Some(Owned::Other)),
+                    }
+                }
+                Some(Err(mcap::McapError::UnexpectedEof)) => (self.is_cut_off, self.ended) = (true, true),
+                Some(Err(error)) => {
+                    self.ended = true;
+                    return Err(RecordingError::mcap(&path, error));
+                }
+            }
+        }
+        Ok(None)
+    }
+}
+
+/// A record that is of use.
+enum Owned {
+    About(About),
+    Message { channel_id: u16, sequence: u32, data: Vec<u8> },
+    Other,
+}

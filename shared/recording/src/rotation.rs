@@ -1,0 +1,94 @@
+//! A recording as one file after another, each within limits.
+
+use crate::{About, RecordingError, Writer};
+use carff_observe::TopicId;
+use carff_probing::Place;
+use carff_readable::AnyMessage;
+use std::collections::VecDeque;
+use std::path::{Path, PathBuf};
+
+/// When the next file is begun. A limit of `None` is none.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Limits {
+    /// Bytes of a file.
+    pub file_bytes: Option<u64>,
+    /// Time that a file covers, nanoseconds.
+    pub file_ns: Option<u64>,
+    /// Files that are kept: the oldest goes when there is one more.
+    pub files: Option<usize>,
+}
+
+/// Writes one file after another.
+#[derive(Debug)]
+pub struct RotatingWriter {
+    first: PathBuf,
+    about: About,
+    places: Vec<Place>,
+    limits: Limits,
+    writer: Writer,
+    /// When the first message of this file was published.
+    begun_ns: Option<u64>,
+    written: VecDeque<PathBuf>,
+    files: usize,
+}
+
+impl RotatingWriter {
+    /// Begins with the file `first`; those after it have a number before the extension.
+    pub fn create(first: &Path, about: About, places: Vec<Place>, limits: Limits) -> Result<Self, RecordingError> {
+        let writer = Writer::create(first, &about, &places)?;
+        let written = VecDeque::from([first.to_owned()]);
+        Ok(Self { first: first.to_owned(), about, places, limits, writer, begun_ns: None, written, files: 1 })
+    }
+
+    /// The file that is written now.
+    pub fn path(&self) -> &Path {
+        self.writer.path()
+    }
+
+    /// Files so far.
+    pub fn files(&self) -> usize {
+        self.files
+    }
+
+    /// Writes a message, into the next file when this one is full.
+    pub fn write(&mut self, topic: TopicId, message: AnyMessage<'_>) -> Result<(), RecordingError> {
+        let now_ns = message.header().publish_time_ns;
+        let begun_ns = *self.begun_ns.get_or_insert(now_ns);
+        if self.limits.file_ns.is_some_and(|limit_ns| now_ns.saturating_sub(begun_ns) >= limit_ns) {
+            self.next_file()?;
+            self.begun_ns = Some(now_ns);
+        }
+        self.writer.write(topic, message)
+    }
+
+    /// Makes what was written safe, and begins the next file when this one is too large.
+    pub fn flush(&mut self) -> Result<(), RecordingError> {
+        self.writer.flush()?;
+        match self.limits.file_bytes {
+            Some(limit) if self.writer.written_bytes() >= limit => self.next_file(),
+            _ => Ok(()),
+        }
+    }
+
+    /// Writes the last index.
+    pub fn finish(self) -> Result<(), RecordingError> {
+        self.writer.finish()
+    }
+
+    fn next_file(&mut self) -> Result<(), RecordingError> {
+        let stem = self.first.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+        let extension = self.first.extension().unwrap_or_default().to_string_lossy().into_owned();
+        let path = self.first.with_file_name(format!("{stem}-{:04}.{extension}", self.files));
+        let next = Writer::create(&path, &self.about, &self.places)?;
+        std::mem::replace(&mut self.writer, next).finish()?;
+        self.files += 1;
+        self.begun_ns = None;
+        self.written.push_back(path);
+        while self.limits.files.is_some_and(|keep| self.written.len() > keep.max(1)) {
+            if let Some(oldest) = self.written.pop_front() {
+                std::fs::remove_file(&oldest).map_err(|source| RecordingError::Io { path: oldest, source })?;
+            }
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,199 @@
+//! The well-known robotics schemas: pictures, calibrations, poses, boxes. Shared by recordings and the live bridge.
+
+use carff_messages::{FrameMeta, Intrinsics};
+use carff_probing::Place;
+use carff_readable::AnyMessage;
+use foxglove::messages::{
+    CameraCalibration, Color, CubePrimitive, FrameTransform, Pose, Quaternion, RawImage, SceneEntity, SceneUpdate,
+    Timestamp, Vector3,
+};
+
+/// Name of the fixed coordinate frame.
+const WORLD: &str = "world";
+
+/// A message as other tools know it.
+#[derive(Clone, Debug, PartialEq)]
+pub enum StandardMessage {
+    /// A picture.
+    Image(RawImage),
+    /// A camera's intrinsics.
+    Calibration(CameraCalibration),
+    /// Where a camera is. Its axes are those of computer vision: x right, y down, z forward.
+    Pose(FrameTransform),
+    /// The places that are probed, coloured by the probability that they are taken.
+    Boxes(SceneUpdate),
+}
+
+/// What other tools are told of a message: topics and messages. `wall_ns` is its time of publication, nanoseconds since
+/// 1970. `places` are those of the checkpoint.
+pub fn standard_messages(
+    message: AnyMessage<'_>,
+    places: &[Place],
+    wall_ns: u64,
+) -> Vec<(&'static str, StandardMessage)> {
+    let at = Some(Timestamp::new((wall_ns / 1_000_000_000) as u32, (wall_ns % 1_000_000_000) as u32));
+    match message {
+        AnyMessage::Frame(meta, bytes) => vec![
+            ("camera/image", StandardMessage::Image(image(at, "camera", meta.width_px, meta.height_px, bytes))),
+            ("camera/calibration", StandardMessage::Calibration(calibration(at, meta))),
+            ("camera/pose", StandardMessage::Pose(pose(at, &meta.world_from_camera))),
+        ],
+        AnyMessage::View(meta, bytes) => {
+            vec![(
+                "renderer/image",
+                StandardMessage::Image(image(at, "renderer", meta.width_px, meta.height_px, bytes)),
+            )]
+        }
+        AnyMessage::Belief(belief) if !places.is_empty() => {
+            let states = belief.state_probability.iter().take(belief.state_count as usize);
+            let entities = places
+                .iter()
+                .map(|place| {
+                    let taken: f32 =
+                        states.clone().zip(&place.occupied_in).filter(|(_, taken)| **taken).map(|(p, _)| p).sum();
+                    entity(at, place, f64::from(taken.clamp(0.0, 1.0)))
+                })
+                .collect();
+            vec![("prober/boxes", StandardMessage::Boxes(SceneUpdate { deletions: Vec::new(), entities }))]
+        }
+        _ => Vec::new(),
+    }
+}
+
+fn image(at: Option<Timestamp>, frame: &str, width: u32, height: u32, bytes: &[u8]) -> RawImage {
+    RawImage {
+        timestamp: at,
+        frame_id: frame.to_owned(),
+        width,
+        height,
+        encoding: "rgb8".to_owned(),
+        step: width * 3,
+        data: bytes.to_vec().into(),
+    }
+}
+
+fn calibration(at: Option<Timestamp>, meta: &FrameMeta) -> CameraCalibration {
+    let Intrinsics { fl_x_px, fl_y_px, cx_px, cy_px } = meta.intrinsics;
+    CameraCalibration {
+        timestamp: at,
+        frame_id: "camera".to_owned(),
+        width: meta.width_px,
+        height: meta.height_px,
+        // An ideal pinhole: no distortion.
+        distortion_model: String::new(),
+        d: Vec::new(),
+        k: vec![fl_x_px, 0.0, cx_px, 0.0, fl_y_px, cy_px, 0.0, 0.0, 1.0],
+        r: vec![1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
+        p: vec![fl_x_px, 0.0, cx_px, 0.0, 0.0, fl_y_px, cy_px, 0.0, 0.0, 0.0, 1.0, 0.0],
+    }
+}
+
+fn pose(at: Option<Timestamp>, world_from_camera: &[f64; 16]) -> FrameTransform {
+    let m = world_from_camera;
+    // OpenGL's camera looks along -z with y up: y and z change sign.
+    let rotation = [[m[0], -m[1], -m[2]], [m[4], -m[5], -m[6]], [m[8], -m[9], -m[10]]];
+    FrameTransform {
+        timestamp: at,
+        parent_frame_id: WORLD.to_owned(),
+        child_frame_id: "camera".to_owned(),
+        translation: Some(Vector3 { x: m[3], y: m[7], z: m[11] }),
+        rotation: Some(quaternion(&rotation)),
+    }
+}
+
+/// The unit quaternion of a rotation matrix: the largest of the four is computed first, so that nothing is divided by a
+/// small number.
+fn quaternion(r: &[[f64; 3]; 3]) -> Quaternion {
+    let [xx, yy, zz] = [r[0][0], r[1][1], r[2][2]];
+    let squares = [1.0 + xx + yy + zz, 1.0 + xx - yy - zz, 1.0 - xx + yy - zz, 1.0 - xx - yy + zz];
+    let (zy, xz, yx) = (r[2][1] - r[1][2], r[0][2] - r[2][0], r[1][0] - r[0][1]);
+    let (xy, xz_sum, yz) = (r[0][1] + r[1][0], r[0][2] + r[2][0], r[1][2] + r[2][1]);
+    let largest = (0..4).max_by(|&a, &b| squares[a].total_cmp(&squares[b])).unwrap_or(0);
+    let [w, x, y, z] = match largest {
+        0 => [squares[0], zy, xz, yx],
+        1 => [zy, squares[1], xy, xz_sum],
+        2 => [xz, xy, squares[2], yz],
+        _ => [yx, xz_sum, yz, squares[3]],
+    };
+    let length = (w * w + x * x + y * y + z * z).sqrt();
+    // A matrix that is no rotation at all has none.
+    if length > 0.0 && length.is_finite() {
+        Quaternion { x: x / length, y: y / length, z: z / length, w: w / length }
+    } else {
+        Quaternion { x: 0.0, y: 0.0, z: 0.0, w: 1.0 }
+    }
+}
+
+fn entity(at: Option<Timestamp>, place: &Place, taken: f64) -> SceneEntity {
+    let oriented = &place.oriented_box;
+    let half_yaw = oriented.yaw / 2.0;
+    let [x, y, z] = oriented.center;
+    let size = oriented.half_size.map(|half| half * 2.0);
+    SceneEntity {
+        timestamp: at,
+        frame_id: WORLD.to_owned(),
+        id: place.name.clone(),
+        cubes: vec![CubePrimitive {
+            pose: Some(Pose {
+                position: Some(Vector3 { x, y, z }),
+                orientation: Some(Quaternion { x: 0.0, y: 0.0, z: half_yaw.sin(), w: half_yaw.cos() }),
+            }),
+            size: Some(Vector3 { x: size[0], y: size[1], z: size[2] }),
+            // From green to red, and the more to be seen the more likely.
+            color: Some(Color { r: taken, g: 1.0 - taken, b: 0.1, a: 0.15 + 0.7 * taken }),
+        }],
+        ..SceneEntity::default()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn rotate(q: &Quaternion, v: [f64; 3]) -> [f64; 3] {
+        let (w, u) = (q.w, [q.x, q.y, q.z]);
+        let cross = |a: [f64; 3], b: [f64; 3]| {
+            [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+        };
+        let t = cross(u, v).map(|c| 2.0 * c);
+        let c = cross(u, t);
+        std::array::from_fn(|i| v[i] + w * t[i] + c[i])
+    }
+
+    /// The quaternion turns vectors as the matrix does, also for half turns, where a naive formula divides by zero.
+    #[test]
+    fn quaternions_turn_as_their_matrices() {
+        let turn = |axis: usize, angle: f64| {
+            let (s, c) = angle.sin_cos();
+            let (i, j) = ((axis + 1) % 3, (axis + 2) % 3);
+            let mut m = [[0.0; 3]; 3];
+            m[axis][axis] = 1.0;
+            (m[i][i], m[i][j], m[j][i], m[j][j]) = (c, -s, s, c);
+            m
+        };
+        for axis in 0..3 {
+            for angle in [0.0, 0.3, 2.0, std::f64::consts::PI, -1.2] {
+                let m = turn(axis, angle);
+                let q = quaternion(&m);
+                for v in [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.2, -0.5, 0.9]] {
+                    let expected: [f64; 3] = std::array::from_fn(|i| (0..3).map(|k| m[i][k] * v[k]).sum());
+                    let found = rotate(&q, v);
+                    assert!((0..3).all(|i| (expected[i] - found[i]).abs() < 1e-12), "{axis} {angle}: {found:?}");
+                }
+            }
+        }
+        assert_eq!(quaternion(&[[f64::NAN; 3]; 3]).w, 1.0);
+    }
+
+    /// A camera that looks along +x, z up, has its forward axis (z of computer vision) along +x.
+    #[test]
+    fn cameras_look_forward() {
+        // Columns: right (-y), up (z), back (-x).
+        let m = [0.0, 0.0, -1.0, 5.0, -1.0, 0.0, 0.0, 6.0, 0.0, 1.0, 0.0, 7.0, 0.0, 0.0, 0.0, 1.0];
+        let pose = pose(None, &m);
+        let forward = rotate(&pose.rotation.unwrap(), [0.0, 0.0, 1.0]);
+        let down = rotate(&pose.rotation.unwrap(), [0.0, 1.0, 0.0]);
+        assert!((forward[0] - 1.0).abs() < 1e-12 && (down[2] + 1.0).abs() < 1e-12, "{forward:?} {down:?}");
+        assert_eq!(pose.translation, Some(Vector3 { x: 5.0, y: 6.0, z: 7.0 }));
+    }
+}

@@ -1,0 +1,117 @@
+//! Writing one file.
+
+use crate::about::METADATA;
+use crate::{About, RecordingError, channels, encode};
+use carff_observe::TopicId;
+use carff_probing::Place;
+use carff_readable::AnyMessage;
+use mcap::records::{MessageHeader, Metadata};
+use mcap::write::NoSeek;
+use mcap::{Compression, WriteOptions};
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::BufWriter;
+use std::path::{Path, PathBuf};
+
+/// Bytes of a chunk before compression.
+const CHUNK_BYTES: u64 = 1 << 20;
+
+/// Writes one recording. What is not finished is readable up to the last [`Writer::flush`].
+pub struct Writer {
+    path: PathBuf,
+    inner: mcap::Writer<NoSeek<BufWriter<File>>>,
+    channels: BTreeMap<&'static str, u16>,
+    places: Vec<Place>,
+    wall_offset_ns: u64,
+}
+
+impl std::fmt::Debug for Writer {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Writer").field("path", &self.path).finish_non_exhaustive()
+    }
+}
+
+impl Writer {
+    /// Makes the file, which must not exist. `places` are those of the checkpoint: their boxes are recorded with each
+    /// belief.
+    pub fn create(path: &Path, about: &About, places: &[Place]) -> Result<Self, RecordingError> {
+        let file = File::create_new(path).map_err(|source| match source.kind() {
+            std::io::ErrorKind::AlreadyExists => RecordingError::Exists { path: path.to_owned() },
+            _ => RecordingError::Io { path: path.to_owned(), source },
+        })?;
+        let failed = |e| RecordingError::mcap(path, e);
+        let mut inner = WriteOptions::new()
+            .compression(Some(Compression::Zstd))
+            .compression_level(1)
+            .chunk_size(Some(CHUNK_BYTES))
+            .library("carff")
+            // Chunks are written whole, once they are full: what a killed process leaves behind is not half a chunk whose
+            // length is not known yet.
+            .disable_seeking(true)
+            .create(NoSeek::new(BufWriter::new(file)))
+            .map_err(failed)?;
+        inner.write_metadata(&Metadata { name: METADATA.to_owned(), metadata: about.to_metadata() }).map_err(failed)?;
+        // All channels at once, so that a reader sees what there can be.
+        let mut ids = BTreeMap::new();
+        for channel in channels() {
+            let schema = match &channel.schema {
+                Some(schema) => inner.add_schema(&schema.name, &schema.encoding, &schema.data).map_err(failed)?,
+                None => 0,
+            };
+            let id = inner.add_channel(schema, channel.name, &channel.encoding, &BTreeMap::new()).map_err(failed)?;
+            ids.insert(channel.name, id);
+        }
+        let mut writer = Self {
+            path: path.to_owned(),
+            inner,
+            channels: ids,
+            places: places.to_vec(),
+            wall_offset_ns: about.wall_offset_ns,
+        };
+        writer.flush()?;
+        Ok(writer)
+    }
+
+    /// Where it writes.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Bytes written so far, without what waits for its chunk to be full.
+    pub fn written_bytes(&self) -> u64 {
+        std::fs::metadata(&self.path).map_or(0, |m| m.len())
+    }
+
+    /// Writes a message, with all that other tools are told of it.
+    pub fn write(&mut self, topic: TopicId, message: AnyMessage<'_>) -> Result<(), RecordingError> {
+        let header = message.header();
+        let wall_ns = header.publish_time_ns.saturating_add(self.wall_offset_ns);
+        let failed = |e: serde_json::Error| RecordingError::Message {
+            path: self.path.clone(),
+            channel: topic.name().to_owned(),
+            sequence: header.sequence as u32,
+            cause: e.to_string(),
+        };
+        for (name, data) in encode(topic, message, &self.places, wall_ns).map_err(failed)? {
+            let Some(&channel_id) = self.channels.get(name) else { continue };
+            let header = MessageHeader {
+                channel_id,
+                sequence: header.sequence as u32,
+                log_time: wall_ns,
+                publish_time: wall_ns,
+            };
+            self.inner.write_to_known_channel(&header, &data).map_err(|e| RecordingError::mcap(&self.path, e))?;
+        }
+        Ok(())
+    }
+
+    /// Ends the chunk and hands it to the system: from now on a killed process leaves it readable.
+    pub fn flush(&mut self) -> Result<(), RecordingError> {
+        self.inner.flush().map_err(|e| RecordingError::mcap(&self.path, e))
+    }
+
+    /// Writes the index and closes the file.
+    pub fn finish(mut self) -> Result<(), RecordingError> {
+        self.inner.finish().map(|_| ()).map_err(|e| RecordingError::mcap(&self.path, e))
+    }
+}

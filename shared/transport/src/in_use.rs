@@ -1,0 +1,129 @@
+//! Who uses which topic now, as the transport knows it.
+
+use crate::node::service_name;
+use crate::{Node, OpenError, PictureTopic, Service, Topic};
+use carff_messages::{Message, PictureMeta};
+use iceoryx2::node::{NodeState, NodeView};
+use iceoryx2::prelude::{CallbackProgression, PortFactory, ZeroCopySend};
+use iceoryx2::service::Service as _;
+use iceoryx2::service::dynamic_config::publish_subscribe::DynamicConfig;
+use iceoryx2::service::static_config::messaging_pattern::MessagingPattern;
+use std::collections::BTreeMap;
+use std::fmt::Debug;
+
+/// A process that has joined the run.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Member {
+    /// The name that it joined under.
+    pub name: String,
+    /// Its process id.
+    pub pid: u32,
+}
+
+/// A topic that some process has open.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct OpenTopic {
+    /// Name within the run.
+    pub name: String,
+    /// Name of the message's type; for pictures, of what describes them.
+    pub message: String,
+    /// Who has it open.
+    pub members: Vec<Member>,
+}
+
+/// The ports on a topic.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Ports {
+    /// Who sends.
+    pub publishers: Vec<Member>,
+    /// Who receives.
+    pub subscribers: Vec<Member>,
+}
+
+/// By the number that ports name their node with.
+type Members = BTreeMap<u128, Member>;
+
+impl Node {
+    /// The living processes of the run, this one among them.
+    pub fn members(&self) -> Result<Vec<Member>, OpenError> {
+        Ok(self.members_by_id()?.into_values().collect())
+    }
+
+    fn members_by_id(&self) -> Result<Members, OpenError> {
+        let failed =
+            |cause: String| OpenError::Node { run: self.run().name().to_owned(), path: self.run().folder(), cause };
+        let mut members = Members::new();
+        iceoryx2::node::Node::<Service>::list(self.inner().config(), |node| {
+            if let NodeState::Alive(node) = node
+                && let Some(details) = node.details()
+            {
+                let member = Member { name: details.name().to_string(), pid: details.process_id().value() as u32 };
+                members.insert(node.id().value(), member);
+            }
+            CallbackProgression::Continue
+        })
+        .map_err(|e| failed(e.to_string()))?;
+        Ok(members)
+    }
+
+    /// All topics that are open in the run, whatever their messages are, by name.
+    pub fn open_topics(&self) -> Result<Vec<OpenTopic>, OpenError> {
+        let members = self.members_by_id()?;
+        let mut topics = Vec::new();
+        Service::list(self.inner().config(), |service| {
+            let details = &service.static_details;
+            if let MessagingPattern::PublishSubscribe(topic) = details.messaging_pattern() {
+                let types = topic.message_type_details();
+                let header = types.user_header.type_name().to_string();
+                let message = if header == "()" { types.payload.type_name().to_string() } else { header };
+                let nodes = service.dynamic_details.iter().flat_map(|d| &d.nodes);
+                let members = nodes.filter_map(|n| members.get(&n.node_id().value()).cloned()).collect();
+                topics.push(OpenTopic { name: details.name().to_string(), message, members });
+            }
+            CallbackProgression::Continue
+        })
+        .map_err(|e| OpenError::Topic { topic: "*".to_owned(), cause: e.to_string() })?;
+        topics.sort_by(|a, b| a.name.cmp(&b.name));
+        Ok(topics)
+    }
+
+    /// The ports on a topic; none when nobody has it open.
+    pub fn ports<M>(&self, topic: &Topic<M>) -> Result<Ports, OpenError>
+    where
+        M: Message + ZeroCopySend + Debug + 'static,
+    {
+        let members = self.members_by_id()?;
+        let name = service_name(topic.name).map_err(|cause| unnamed(topic.name, cause))?;
+        // It fails when nobody has it open.
+        let opened = self.inner().service_builder(&name).publish_subscribe::<M>().open();
+        Ok(opened.map(|service| list(service.dynamic_config(), &members)).unwrap_or_default())
+    }
+
+    /// The ports on a topic of pictures; none when nobody has it open.
+    pub fn picture_ports<M>(&self, topic: &PictureTopic<M>) -> Result<Ports, OpenError>
+    where
+        M: PictureMeta + ZeroCopySend + Debug + 'static,
+    {
+        let members = self.members_by_id()?;
+        let name = service_name(topic.name).map_err(|cause| unnamed(topic.name, cause))?;
+        let opened = self.inner().service_builder(&name).publish_subscribe::<[u8]>().user_header::<M>().open();
+        Ok(opened.map(|service| list(service.dynamic_config(), &members)).unwrap_or_default())
+    }
+}
+
+fn unnamed(topic: &str, cause: String) -> OpenError {
+    OpenError::Topic { topic: topic.to_owned(), cause }
+}
+
+fn list(config: &DynamicConfig<<Service as iceoryx2::service::Service>::Bag>, members: &Members) -> Ports {
+    let mut ports = Ports::default();
+    config.list_publishers(|port| {
+        ports.publishers.extend(members.get(&port.node_id.value()).cloned());
+        CallbackProgression::Continue
+    });
+    config.list_subscribers(|port| {
+        ports.subscribers.extend(members.get(&port.node_id.value()).cloned());
+        CallbackProgression::Continue
+    });
+    ports
+}

@@ -1,0 +1,68 @@
+//! A stage of a user's own, `examples/speed-gate`, beside the shipped programs.
+
+use carff_messages::Message;
+use carff_observe::attach;
+use carff_tests::{Process, TestGraph, eventually, program, scenario_set, shipped_checkpoint};
+use carff_transport::topics;
+use rustix::process::Signal;
+use speed_gate::{FREE_M_S, SPEED_LIMIT, SpeedLimit};
+use std::process::Command;
+
+/// Nothing is stale on a machine that is busy with something else, and drives go on until somebody stops them.
+const PATIENT: &str = "[camera]\nrepeat = true\n[controller]\nrate_hz = 4.0\ndeadline_ms = 60000\n[launcher]\n\
+                       start_timeout_ms = 600000\nstop_timeout_ms = 30000\n";
+
+/// It joins the shipped graph by its name alone and publishes its own messages: valid ones, each on the frame of an
+/// action. It leaves when it is asked to and the graph goes on; another one ends by itself when the graph does. Nothing
+/// is left.
+#[test]
+fn a_stage_of_its_own_joins_and_leaves() {
+    let graph = TestGraph::new(&scenario_set(), &shipped_checkpoint(), PATIENT);
+    let mut launcher = Process::start(&mut graph.launch(&graph.file(), &[]));
+    let decisions = |text: &str| text.lines().filter(|line| line.contains("hazard ")).count();
+    launcher.wait_for("decision", |text| decisions(text) >= 1);
+    let gate = || {
+        let mut gate = Process::start(Command::new(program("speed-gate")).arg(graph.run().name()));
+        gate.wait_for("word that it has joined", |text| text.contains("joined run"));
+        gate
+    };
+
+    let first = gate();
+    {
+        let seen = attach(Some(graph.run().name()), "test").unwrap();
+        let mut limits = seen.node.receiver(&SPEED_LIMIT).unwrap();
+        let mut actions = seen.node.receiver(&topics::ACTION).unwrap();
+        let (mut found, mut frames): (Vec<SpeedLimit>, Vec<u64>) = (Vec::new(), Vec::new());
+        let enough = eventually(|| {
+            while let Some(action) = actions.next().unwrap() {
+                frames.push(action.header.frame_id);
+            }
+            while let Some(limit) = limits.next().unwrap() {
+                found.push(*limit);
+            }
+            found.len() >= 20
+        });
+        assert!(enough, "{} limits\n{}\n{}", found.len(), first.text(), launcher.text());
+        assert_eq!(seen.node.counters().invalid(), 0);
+        for limit in &found {
+            assert_eq!(limit.validate(), Ok(()));
+            assert!((0.0..=FREE_M_S).contains(&limit.limit_m_s), "{limit:?}");
+        }
+        assert!(found.windows(2).all(|pair| pair[0].header.sequence + 1 == pair[1].header.sequence), "{found:?}");
+        let both = found.iter().filter(|l| frames.contains(&l.header.frame_id)).count();
+        assert!(both > 0, "no limit rests on the frame of an action that was seen: {found:?}");
+    }
+    first.signal(Signal::TERM);
+    let finished = first.end();
+    finished.assert_success();
+    assert!(finished.text.contains("left run"), "{}", finished.text);
+    let before = decisions(&launcher.text());
+    launcher.wait_for("further decisions", |text| decisions(text) >= before + 3);
+
+    let second = gate();
+    launcher.signal(Signal::INT);
+    let ended = launcher.end();
+    assert_eq!(ended.status.code(), Some(130), "{}", ended.text);
+    second.end().assert_success();
+    graph.assert_nothing_left();
+}
