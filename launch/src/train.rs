@@ -10,6 +10,7 @@ use carff_training::{
     run::{Progress, Run},
 };
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use serde_json::Value;
 use std::{
     collections::BTreeMap,
     io::IsTerminal,
@@ -141,24 +142,42 @@ fn free_poses(config: &TrainingConfig, given: Option<&Path>) -> anyhow::Result<O
 /// A run folder belongs to one configuration and one data set: going on with another would mix them.
 pub fn refuse_another_configuration(dir: &Path, config: &TrainingConfig, dataset: &Path) -> anyhow::Result<()> {
     let path = dir.join("configuration.json");
-    let mut mine = serde_json::to_value(config)?;
-    mine["dataset"] = serde_json::to_value(dataset)?;
-    // These change how fast and where to, not what is learnt.
-    for key in ["threads", "out"] {
-        if let Some(map) = mine.as_object_mut() {
-            map.remove(key);
-        }
-    }
-    let text = serde_json::to_string_pretty(&mine)?;
+    let mine = what_is_learnt(config, dataset)?;
     match std::fs::read_to_string(&path) {
-        Ok(there) if there != text => bail!(
+        // Read and written again: keys that an earlier version did not have yet take their defaults.
+        Ok(text) if serde_json::from_str::<Value>(&text).is_ok_and(|there| completed(there) == mine) => Ok(()),
+        Ok(_) => bail!(
             "{} holds states of another training configuration or data set; remove the folder, or name another with \
              --run-dir",
             dir.display()
         ),
-        Ok(_) => Ok(()),
-        Err(_) => std::fs::write(&path, text).with_context(|| format!("cannot write {}", path.display())),
+        Err(_) => std::fs::write(&path, serde_json::to_string_pretty(&mine)?)
+            .with_context(|| format!("cannot write {}", path.display())),
     }
+}
+
+/// Keys that change how fast it goes and where to, not what is learnt.
+const OTHER_KEYS: [&str; 2] = ["threads", "out"];
+
+fn what_is_learnt(config: &TrainingConfig, dataset: &Path) -> anyhow::Result<Value> {
+    let mut value = serde_json::to_value(config)?;
+    value["dataset"] = serde_json::to_value(dataset)?;
+    if let Some(map) = value.as_object_mut() {
+        OTHER_KEYS.iter().for_each(|key| drop(map.remove(*key)));
+    }
+    Ok(value)
+}
+
+/// A saved configuration with the defaults of the keys that it lacks; as it is when it is none.
+fn completed(there: Value) -> Value {
+    let read = || {
+        let mut whole = there.clone();
+        // Where it goes has no default, and is not saved.
+        whole.as_object_mut()?.insert("out".to_owned(), Value::from(""));
+        let config: TrainingConfig = serde_json::from_value(whole).ok()?;
+        what_is_learnt(&config, &config.dataset).ok()
+    };
+    read().unwrap_or(there)
 }
 
 /// One bar a stage on a terminal; a line now and then elsewhere.
@@ -208,5 +227,34 @@ impl Display {
                 }
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A folder is gone on with under the same configuration, also when it was saved before some key existed; another
+    /// setting or another data set is refused.
+    #[test]
+    fn a_run_folder_belongs_to_one_configuration() {
+        let folder = tempfile::tempdir().unwrap();
+        let saved = folder.path().join("configuration.json");
+        let text = include_str!("../../configs/training/approaching-intersection.toml");
+        let config: TrainingConfig = toml::from_str(text).unwrap();
+        let refused = |dataset: &str| refuse_another_configuration(folder.path(), &config, Path::new(dataset)).is_err();
+        assert!(!refused("data/x") && saved.is_file());
+        assert!(!refused("data/x"));
+        assert!(refused("data/y"));
+
+        let mut value: Value = serde_json::from_str(&std::fs::read_to_string(&saved).unwrap()).unwrap();
+        assert!(value["decoder"].as_object_mut().unwrap().remove("pose_condition").is_some());
+        std::fs::write(&saved, value.to_string()).unwrap();
+        assert!(!refused("data/x"));
+        value["decoder"]["pose_condition"] = Value::from(false);
+        std::fs::write(&saved, value.to_string()).unwrap();
+        assert!(refused("data/x"));
+        std::fs::write(&saved, "garbage").unwrap();
+        assert!(refused("data/x"));
     }
 }
