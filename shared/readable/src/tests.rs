@@ -52,7 +52,7 @@ fn belief(next: &mut impl FnMut() -> f32) -> Belief {
     let mut belief = Belief::empty(header().at_step(1), 2);
     (belief.state_count, belief.place_count, belief.component_count, belief.sample_count) = (6, 3, 2, 7);
     belief.state_probability[..6].fill_with(|| probability(next) / 6.0);
-    belief.component_weights[..2].copy_from_slice(&[0.300_000_01, 0.7]);
+    belief.component_weights[..2].copy_from_slice(&[0.3, 0.7]);
     let mut probe = |state| {
         let mut densities = ProbeResult::NONE.densities;
         densities[..3].fill_with(|| next().abs());
