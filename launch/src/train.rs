@@ -163,7 +163,9 @@ fn what_is_learnt(config: &TrainingConfig, dataset: &Path) -> anyhow::Result<Val
     let mut value = serde_json::to_value(config)?;
     value["dataset"] = serde_json::to_value(dataset)?;
     if let Some(map) = value.as_object_mut() {
-        OTHER_KEYS.iter().for_each(|key| drop(map.remove(*key)));
+        for key in OTHER_KEYS {
+            map.remove(key);
+        }
     }
     Ok(value)
 }
