@@ -1,6 +1,6 @@
 //! `carff metrics`: a run's numbers over HTTP, for Prometheus and for scripts. Nothing listens unless this is started.
 
-use crate::probe::session::{Going, Session, SessionArgs};
+use crate::probe::session::{Session, SessionArgs};
 use crate::vitals::{RunVitals, StageVitals};
 use anyhow::{Context, anyhow, ensure};
 use carff_messages::Stage;
@@ -12,9 +12,6 @@ use std::fmt::{Display, Write};
 use std::net::SocketAddr;
 use std::process::ExitCode;
 use tiny_http::{Header, Method, Response, Server};
-
-/// Time between two looks at the processors, nanoseconds.
-const CPU_NS: u64 = 1_000_000_000;
 
 /// Serve a run's numbers.
 #[derive(Clone, Debug, Args)]
@@ -51,19 +48,9 @@ pub fn run(args: &MetricsArgs) -> anyhow::Result<ExitCode> {
     };
     let name = session.attached.live.name.clone();
     let mut vitals = RunVitals::default();
-    let mut cpu_ns = 0;
-    let going = loop {
-        session.take(|_, message| {
-            vitals.take(message.message());
-            Ok(())
-        })?;
-        let now_ns = monotonic_now_ns();
-        if now_ns >= cpu_ns {
-            cpu_ns = now_ns + CPU_NS;
-            vitals.look_at_processors();
-        }
+    let going = vitals.gather(&mut session, |vitals| {
         while let Some(request) = server.as_ref().map(Server::try_recv).transpose().context("cannot serve")?.flatten() {
-            let (status, kind, body) = answer(request.method(), request.url(), &name, &vitals);
+            let (status, kind, body) = answer(request.method(), request.url(), &name, vitals);
             let mut response = Response::from_string(body).with_status_code(status);
             if let Ok(header) = Header::from_bytes("Content-Type", kind) {
                 response = response.with_header(header);
@@ -71,11 +58,8 @@ pub fn run(args: &MetricsArgs) -> anyhow::Result<ExitCode> {
             // Whoever asked may have gone.
             let _ = request.respond(response);
         }
-        match session.pause()? {
-            Going::On => {}
-            over => break over,
-        }
-    };
+        Ok(true)
+    })?;
     if args.once {
         println!("{}", serde_json::to_string_pretty(&status(&name, &vitals))?);
     }

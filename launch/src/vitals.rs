@@ -1,5 +1,6 @@
 //! What the stages of a run say and use, gathered over time: for the full-screen view and the metrics.
 
+use crate::probe::session::{Going, Session};
 use carff_messages::{ActionCode, HealthState, Reason, Stage};
 use carff_observe::TopicId;
 use carff_readable::AnyMessage;
@@ -10,6 +11,8 @@ use std::collections::{BTreeMap, VecDeque};
 const REMEMBERED: usize = 240;
 /// Time over which rates are counted, nanoseconds.
 const RATE_NS: u64 = 3_000_000_000;
+/// Time between two looks at the processors, nanoseconds.
+const PROCESSORS_NS: u64 = 1_000_000_000;
 
 /// A stage.
 #[derive(Clone, Debug, Default)]
@@ -139,8 +142,35 @@ impl RunVitals {
         remember(&mut vitals.latency_ms, latency_ns as f64 / 1e6);
     }
 
+    /// Takes in what a run says until it is over, or `after`, called at each look, says false.
+    pub(crate) fn gather(
+        &mut self,
+        session: &mut Session,
+        mut after: impl FnMut(&Self) -> anyhow::Result<bool>,
+    ) -> anyhow::Result<Going> {
+        let mut processors_ns = 0;
+        loop {
+            session.take(|_, message| {
+                self.take(message.message());
+                Ok(())
+            })?;
+            let now_ns = monotonic_now_ns();
+            if now_ns >= processors_ns {
+                processors_ns = now_ns + PROCESSORS_NS;
+                self.look_at_processors();
+            }
+            if !after(self)? {
+                return Ok(Going::Done);
+            }
+            match session.pause()? {
+                Going::On => {}
+                over => return Ok(over),
+            }
+        }
+    }
+
     /// Looks at what each process has used of the processor since the last look.
-    pub(crate) fn look_at_processors(&mut self) {
+    fn look_at_processors(&mut self) {
         let now_ns = monotonic_now_ns();
         for vitals in self.stages.values_mut().filter(|v| v.pid != 0) {
             let Some(used_ns) =

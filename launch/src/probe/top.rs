@@ -1,6 +1,6 @@
 //! `carff probe top`: the stages, full screen.
 
-use super::session::{Going, Session, SessionArgs};
+use super::session::{Session, SessionArgs};
 use super::structure::columns;
 use crate::vitals::{RunVitals, StageVitals};
 use anyhow::{Context, ensure};
@@ -21,8 +21,6 @@ use std::time::Duration;
 
 /// Time between two pictures, nanoseconds.
 const DRAW_NS: u64 = 250_000_000;
-/// Time between two looks at the processors, nanoseconds.
-const CPU_NS: u64 = 1_000_000_000;
 /// How long `--once` listens, seconds.
 const ONCE_S: f64 = 3.0;
 /// Latencies in a sparkline.
@@ -65,7 +63,7 @@ pub(super) fn run(args: &TopArgs) -> anyhow::Result<()> {
     session.listen(RunVitals::topics())?;
     let mut vitals = RunVitals::default();
     if args.once {
-        let going = look(&mut session, &mut vitals, |_| Ok(true))?;
+        let going = vitals.gather(&mut session, |_| Ok(true))?;
         let live = &session.attached.live;
         print!("{}\n{}", summary(live, &vitals), columns(&rows(&vitals)));
         session.say_end(going);
@@ -74,7 +72,7 @@ pub(super) fn run(args: &TopArgs) -> anyhow::Result<()> {
     let mut terminal = ratatui::try_init().context("cannot take over the terminal")?;
     let live = session.attached.live.clone();
     let mut draw_ns = 0;
-    let result = look(&mut session, &mut vitals, |vitals| {
+    let result = vitals.gather(&mut session, |vitals| {
         let now_ns = monotonic_now_ns();
         if now_ns >= draw_ns {
             draw_ns = now_ns + DRAW_NS;
@@ -85,33 +83,6 @@ pub(super) fn run(args: &TopArgs) -> anyhow::Result<()> {
     ratatui::restore();
     session.say_end(result?);
     Ok(())
-}
-
-/// Gathers until it is over, or `after` says false.
-fn look(
-    session: &mut Session,
-    vitals: &mut RunVitals,
-    mut after: impl FnMut(&RunVitals) -> anyhow::Result<bool>,
-) -> anyhow::Result<Going> {
-    let mut cpu_ns = 0;
-    loop {
-        session.take(|_, message| {
-            vitals.take(message.message());
-            Ok(())
-        })?;
-        let now_ns = monotonic_now_ns();
-        if now_ns >= cpu_ns {
-            cpu_ns = now_ns + CPU_NS;
-            vitals.look_at_processors();
-        }
-        if !after(vitals)? {
-            return Ok(Going::Done);
-        }
-        match session.pause()? {
-            Going::On => {}
-            over => return Ok(over),
-        }
-    }
 }
 
 /// Whether a key says so.
