@@ -17,7 +17,7 @@ else ifneq ($(CARGO_TARGET_DIR),)
 export LD_LIBRARY_PATH := $(CURDIR)/.libtorch/lib$(if $(LD_LIBRARY_PATH),:$(LD_LIBRARY_PATH))
 endif
 
-.PHONY: help run build test soak bench-peer lint sanitize fmt libtorch
+.PHONY: help run build deb check-deb test soak fuzz bench-peer lint sanitize fmt libtorch
 
 help: ## List the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -30,6 +30,12 @@ build: libtorch ## Build all programs
 
 test: build ## Run all tests, whole graphs of processes among them
 	cargo test --release --locked --workspace
+
+deb: build ## Build a Debian package: programs, checkpoints, configs, systemd units
+	$(PYTHON) launch/build_deb.py $(TARGET)
+
+check-deb: deb ## Install that package here, drive, look at it as another user, purge it (as root)
+	$(PYTHON) tests/check_deb.py $(TARGET)/carff_*.deb
 
 bench-peer: ## Build the program by which `carff bench ipc` measures zenoh as well (300 crates more; nothing else needs it)
 	cargo build --release --locked --manifest-path tests/zenoh-peer/Cargo.toml --target-dir $(TARGET)/zenoh-peer
@@ -44,6 +50,26 @@ sanitize: libtorch ## Run the tests around `unsafe` under the address sanitizer 
 	RUSTFLAGS=-Zsanitizer=address LD_LIBRARY_PATH=$(CURDIR)/.libtorch/lib cargo +nightly test --locked --lib --tests \
 		--target x86_64-unknown-linux-gnu --target-dir $(TARGET)/sanitize \
 		-p carff-field -p carff-messages -p carff-models -p carff-transport
+
+# Instrumentation as libFuzzer wants it.
+FUZZ_FLAGS := --cfg fuzzing -Ccodegen-units=1 -Cpasses=sancov-module -Cllvm-args=-sanitizer-coverage-level=4 \
+	-Cllvm-args=-sanitizer-coverage-inline-8bit-counters -Cllvm-args=-sanitizer-coverage-pc-table \
+	-Cllvm-args=-sanitizer-coverage-trace-compares
+READERS := messages graph scenario training dataset import png planning manifest weights recording run-record
+FUZZ := $(TARGET)/fuzz
+
+fuzz: libtorch ## Feed each of READERS (default: all) with RUNS inputs (default 1000000), guided by coverage (nightly)
+	RUSTFLAGS="$(FUZZ_FLAGS)" cargo +nightly build --release --locked --manifest-path tests/fuzz/Cargo.toml \
+		--target x86_64-unknown-linux-gnu --target-dir $(FUZZ)
+	for reader in $(READERS); do \
+		mkdir -p $(FUZZ)/corpus/$$reader $(FUZZ)/seeds/$$reader $(FUZZ)/found/$$reader tests/readers/corpus/$$reader && \
+		CARFF_READER=$$reader CARFF_SEEDS=$(FUZZ)/seeds/$$reader TMPDIR=/dev/shm \
+			LD_LIBRARY_PATH=$(CURDIR)/.libtorch/lib $(FUZZ)/x86_64-unknown-linux-gnu/release/carff-fuzz \
+			-runs=$(or $(RUNS),1000000) -max_len=65536 -timeout=20 -rss_limit_mb=4096 -malloc_limit_mb=1024 \
+			-print_final_stats=1 -artifact_prefix=$(FUZZ)/found/$$reader/ \
+			$(FUZZ)/corpus/$$reader $(FUZZ)/seeds/$$reader tests/readers/corpus/$$reader \
+			2> $(FUZZ)/$$reader.log || { tail -40 $(FUZZ)/$$reader.log; exit 1; }; \
+		printf '%-11s' $$reader; grep -h "stat::number_of_executed_units" $(FUZZ)/$$reader.log; done
 
 soak: build ## Soak the shipped graph for MINUTES (default 10) with SEED (default 1) under every kind of fault
 	$(TARGET)/release/carff soak configs/soak/all.toml --minutes $(or $(MINUTES),10) --seed $(or $(SEED),1) --json reports/soak.json

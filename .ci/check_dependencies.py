@@ -28,6 +28,7 @@ UNSAFE_MODULES = {
     "shared/models/src/allocator.rs": "mallopt",
     "shared/models/src/borrow.rs": "tensors that borrow shared memory",
     "shared/stage/src/realtime.rs": "sched_setscheduler",
+    "tests/readers/src/raw.rs": "overwrites bytes of messages",
     "shared/transport/src/descriptors.rs": "file descriptors of iceoryx2's listeners",
 }
 

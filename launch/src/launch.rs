@@ -6,6 +6,7 @@ use crate::monitor::{FrameRecord, Monitor};
 use crate::planning::{self, Planning};
 use crate::process::StageProcess;
 use crate::report::{self, RunOutcome};
+use crate::service_manager::{self, Watchdog};
 use crate::supervise::{RestartBudget, Verdict};
 use crate::terminal::Terminal;
 use anyhow::{Context, anyhow, bail, ensure};
@@ -45,6 +46,9 @@ const QUIET_FRAMES: f64 = 3.0;
 const ORPHAN_PATIENCE_NS: u64 = 2_000_000_000;
 /// Exit code after Ctrl-C, as shells have it: 128 and the signal's number.
 pub(crate) const INTERRUPTED: u8 = 130;
+
+/// Source of the launcher's own lines in the log.
+pub(crate) const LAUNCHER: &str = "launcher";
 /// Bytes of a frame that are reckoned with when shared memory is checked, before the pictures are known.
 pub(crate) const FRAME_BYTES: usize = 1 << 17;
 
@@ -93,7 +97,7 @@ pub fn run(args: &LaunchArgs) -> anyhow::Result<ExitCode> {
     let terminal = Arc::new(Terminal::new());
     let (ended, outcome) = run_graph(args, None, &terminal)?;
     if ended == Ended::Interrupted {
-        terminal.log("interrupted: all stages have ended");
+        terminal.log(LAUNCHER, "INFO interrupted: all stages have ended");
         return Ok(ExitCode::from(INTERRUPTED));
     }
     report(args, &Arc::new(outcome), &terminal)
@@ -130,8 +134,9 @@ pub(crate) fn run_graph(
     terminal: &Arc<Terminal>,
 ) -> anyhow::Result<(Ended, RunOutcome)> {
     let graph = GraphConfig::load(&args.graph)?;
+    terminal.set_log_format(graph.log.format);
     for warning in graph.warnings() {
-        terminal.log(&format!("warning: {}: {warning}", args.graph.display()));
+        terminal.log(LAUNCHER, &format!("WARN {}: {warning}", args.graph.display()));
     }
     let name = args.run.clone().unwrap_or_else(|| graph.run.name.clone());
     let run = Run::new(&name, run_id_of(&name, monotonic_now_ns()))?;
@@ -181,6 +186,7 @@ pub(crate) fn run_graph(
             folder,
             drives: args.drives.unwrap_or(graph.camera.drives),
             terminal: terminal.clone(),
+            watchdog: Watchdog::from_environment(),
             feed: None,
             watched_ns: monotonic_now_ns(),
             cleanup_ns: monotonic_now_ns(),
@@ -255,6 +261,7 @@ struct Launcher<'a> {
     folder: PathBuf,
     drives: u32,
     terminal: Arc<Terminal>,
+    watchdog: Watchdog,
     /// What takes the camera's place, once it has begun.
     feed: Option<JoinHandle<anyhow::Result<()>>>,
     /// When the stages were last looked at.
@@ -285,6 +292,7 @@ impl Launcher<'_> {
                 self.feed = Some(thread.spawn(move || (feed.run)(&run, &stop)).context("cannot start the feed")?);
             }
         }
+        service_manager::ready();
         loop {
             if self.step()? == Woken::Stopped {
                 return match self.lost.take() {
@@ -392,6 +400,7 @@ impl Launcher<'_> {
     fn step(&mut self) -> anyhow::Result<Woken> {
         let woken = self.waiter.wait_until(&[], monotonic_now_ns() + WATCH_NS)?;
         self.collect()?;
+        self.watchdog.alive();
         Ok(woken)
     }
 
@@ -468,11 +477,14 @@ impl Launcher<'_> {
         if let Verdict::RestartAt(at_ns) = watched.budget.died(now_ns) {
             watched.restart_at_ns = Some(at_ns);
             watched.health.died();
-            self.terminal.log(&format!(
-                "[launcher] stage {stage} died ({cause}): restart {} in {} ms",
-                watched.budget.restarts(),
-                (at_ns - now_ns) / 1_000_000
-            ));
+            self.terminal.log(
+                LAUNCHER,
+                &format!(
+                    "WARN stage {stage} died ({cause}): restart {} in {} ms",
+                    watched.budget.restarts(),
+                    (at_ns - now_ns) / 1_000_000
+                ),
+            );
             return Ok(());
         }
         watched.restart_at_ns = None;
@@ -483,10 +495,10 @@ impl Launcher<'_> {
         };
         match (stage, self.graph.launcher.when_lost) {
             // Nothing that is decided rests on it.
-            (Stage::Renderer, _) => self.terminal.log(&format!("[launcher] {lost}: going on without views")),
+            (Stage::Renderer, _) => self.terminal.log(LAUNCHER, &format!("ERROR {lost}: going on without views")),
             (Stage::Controller, _) | (_, WhenLost::End) => bail!(lost),
             (_, WhenLost::Halt) => {
-                self.terminal.log(&format!("[launcher] {lost}: the safe action stands until the run is stopped"));
+                self.terminal.log(LAUNCHER, &format!("ERROR {lost}: the safe action stands until the run is stopped"));
                 self.lost = Some(lost);
             }
         }
@@ -508,11 +520,12 @@ impl Launcher<'_> {
 
     /// Ends the stages, the camera first, each within the time limit; kills what does not end.
     fn shut_down(&mut self) {
+        service_manager::stopping();
         // Whatever ended the run, the feed is told by the same stop; it leaves the run before the stages do.
         if let Some(feed) = self.feed.take() {
             self.waiter.stop().stop();
             if let Ok(Err(error)) = feed.join() {
-                self.terminal.log(&format!("[launcher] {}", carff_stage::describe(&error)));
+                self.terminal.log(LAUNCHER, &format!("ERROR {}", carff_stage::describe(&error)));
             }
         }
         let limit = Duration::from_millis(self.graph.launcher.stop_timeout_ms);
@@ -526,7 +539,7 @@ impl Launcher<'_> {
             let Some(mut process) = watched.process.take() else { continue };
             while matches!(process.ended(), Ok(None)) {
                 if monotonic_now_ns() >= deadline_ns {
-                    self.terminal.log(&format!("[launcher] stage {} did not end in time: killed", watched.stage));
+                    self.terminal.log(LAUNCHER, &format!("WARN stage {} did not end in time: killed", watched.stage));
                     process.kill();
                     break;
                 }
@@ -535,7 +548,7 @@ impl Launcher<'_> {
         }
         // Their last heartbeats hold the final counts. A failure here has nothing left to stop.
         if let Err(error) = self.collect() {
-            self.terminal.log(&format!("[launcher] {}", carff_stage::describe(&error)));
+            self.terminal.log(LAUNCHER, &format!("ERROR {}", carff_stage::describe(&error)));
         }
     }
 }

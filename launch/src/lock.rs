@@ -2,10 +2,11 @@
 
 use anyhow::{Context, bail};
 use carff_observe::RunRecord;
-use rustix::fs::{FlockOperation, flock};
+use carff_transport::make_private_dir;
+use rustix::fs::{FlockOperation, OFlags, flock};
 use std::fs::{File, OpenOptions};
 use std::io::Write;
-use std::os::unix::fs::{DirBuilderExt, MetadataExt};
+use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 
 /// Held while a run runs. The system frees it when the process ends, however it ends.
@@ -18,12 +19,7 @@ pub struct RunLock {
 impl RunLock {
     /// Takes the lock of a run in a folder, or says who holds it.
     pub fn take(folder: &Path, run: &str, record: &RunRecord) -> anyhow::Result<Self> {
-        if !folder.is_dir() {
-            std::fs::DirBuilder::new()
-                .mode(0o700)
-                .create(folder)
-                .with_context(|| format!("cannot make the folder {}", folder.display()))?;
-        }
+        make_private_dir(folder)?;
         let path = RunRecord::path(folder, run);
         loop {
             let mut file = OpenOptions::new()
@@ -31,6 +27,8 @@ impl RunLock {
                 .write(true)
                 .create(true)
                 .truncate(false)
+                .mode(0o600)
+                .custom_flags(OFlags::NOFOLLOW.bits() as i32)
                 .open(&path)
                 .with_context(|| format!("cannot open {}", path.display()))?;
             if flock(&file, FlockOperation::NonBlockingLockExclusive).is_err() {

@@ -1,5 +1,6 @@
 //! One child process of the launcher.
 
+use crate::log_line;
 use crate::terminal::Terminal;
 use anyhow::Context;
 use carff_messages::Stage;
@@ -47,11 +48,11 @@ impl StageProcess {
         let (terminal, noted) = (terminal.clone(), last_error.clone());
         let relay = std::thread::Builder::new().name(format!("log-{stage}")).spawn(move || {
             relay_lines(BufReader::new(stderr), |line| {
-                let is_error = line.trim_start().starts_with("ERROR") || line.contains("panicked at");
-                if is_error && let Ok(mut noted) = noted.lock() {
-                    *noted = Some(line.trim().trim_start_matches("ERROR").trim().to_owned());
+                let line = line.trim_end();
+                if let (Some(error), Ok(mut noted)) = (log_line::error_in(line), noted.lock()) {
+                    *noted = Some(error);
                 }
-                terminal.log(&format!("[{stage}] {}", line.trim_end()));
+                terminal.log(stage.name(), line);
             });
         })?;
         Ok(Self { child, relay: Some(relay), last_error })

@@ -73,7 +73,7 @@ pub fn run(args: &RecordArgs) -> anyhow::Result<ExitCode> {
                 let counts = queue.counts();
                 terminal.status(format!("recording {name}: {} messages, {} dropped", counts.written, counts.dropped));
                 if counts.dropped > told {
-                    terminal.log(&format!(
+                    terminal.note(&format!(
                         "the disk is too slow: {} messages dropped so far (--queue-mb gives it more time)",
                         counts.dropped
                     ));

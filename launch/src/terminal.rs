@@ -1,7 +1,9 @@
 //! Lines and one status line on the terminal; plain lines alone where it is none.
 
+use crate::log_line;
+use carff_config::LogFormat;
 use std::io::{IsTerminal, Write};
-use std::sync::Mutex;
+use std::sync::{Mutex, OnceLock};
 
 /// The terminal. Lines may come from several threads.
 #[derive(Debug)]
@@ -9,6 +11,8 @@ pub struct Terminal {
     live: bool,
     colour: bool,
     status: Mutex<String>,
+    /// Of the log; text until it is set.
+    format: OnceLock<LogFormat>,
 }
 
 impl Terminal {
@@ -16,7 +20,7 @@ impl Terminal {
     pub fn new() -> Self {
         let live = std::io::stdout().is_terminal() && std::io::stderr().is_terminal();
         let colour = live && std::env::var_os("NO_COLOR").is_none_or(|v| v.is_empty());
-        Self { live, colour, status: Mutex::default() }
+        Self { live, colour, status: Mutex::default(), format: OnceLock::new() }
     }
 
     /// A line on standard output.
@@ -28,8 +32,21 @@ impl Terminal {
         self.draw(&status);
     }
 
-    /// A line on standard error.
-    pub fn log(&self, text: &str) {
+    /// Chooses how the log looks, once.
+    pub fn set_log_format(&self, format: LogFormat) {
+        // A second choice would be another graph's; there is one graph a process.
+        let _ = self.format.set(format);
+    }
+
+    /// A line of the log, on standard error: who said it (a stage, or `launcher`), and what, with its level in front or as
+    /// a JSON object.
+    pub fn log(&self, source: &str, said: &str) {
+        let format = self.format.get().copied().unwrap_or_default();
+        self.note(&log_line::formatted(format, &jiff::Timestamp::now().to_string(), source, said));
+    }
+
+    /// A line on standard error that is no part of the log.
+    pub fn note(&self, text: &str) {
         let status = self.lock();
         self.clear();
         let _ = writeln!(std::io::stderr(), "{text}");

@@ -4,9 +4,12 @@
 
 use carff_dataset::Image;
 use carff_messages::Stage;
-use carff_tests::{Process, TestGraph, copy_checkpoint, eventually, project_root, scenario_set, shipped_checkpoint};
+use carff_tests::{
+    Process, TestGraph, WATCHDOG, copy_checkpoint, eventually, project_root, scenario_set, shipped_checkpoint,
+};
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
+use std::os::unix::net::UnixDatagram;
 
 /// Decisions shown so far: each is one line.
 fn decisions(text: &str) -> usize {
@@ -86,6 +89,64 @@ fn an_interrupt_leaves_nothing() {
     let finished = launcher.end();
     assert_eq!(finished.status.code(), Some(130), "{}", finished.text);
     graph.assert_nothing_left();
+}
+
+/// With `log.format = "json"` every line of the log is an object that says when, who, how grave and what, the launcher's
+/// own lines among them.
+#[test]
+fn logs_are_json_where_asked_for() {
+    let more = format!("{PATIENT}[camera]\nrepeat = true\n[log]\nformat = \"json\"\n");
+    let graph = TestGraph::new(&scenario_set(), &shipped_checkpoint(), &more);
+    let mut launcher = Process::start(&mut graph.launch(&graph.file(), &[]));
+    launcher.wait_for("decision", |text| decisions(text) >= 1);
+    launcher.signal(Signal::INT);
+    let text = launcher.end().text;
+    let lines: Vec<Value> = text.lines().filter_map(|line| serde_json::from_str(line).ok()).collect();
+    assert!(!text.lines().any(|line| line.starts_with('[')), "{text}");
+    let said = |source: &str, message: &str| {
+        lines.iter().any(|line| {
+            let holds = |key: &str, wanted: &str| line[key].as_str().is_some_and(|found| found.contains(wanted));
+            holds("source", source) && holds("level", "INFO") && holds("message", message) && holds("time", "T")
+        })
+    };
+    for stage in Stage::ALL {
+        assert!(said(stage.name(), "ready"), "stage {stage}:\n{text}");
+    }
+    assert!(said("launcher", "interrupted"), "{text}");
+}
+
+/// A service manager hears that the graph is ready (after all stages are), that it lives for as long as it does, and
+/// that it stops.
+#[test]
+fn a_service_manager_is_told() {
+    let graph = TestGraph::new(&scenario_set(), &shipped_checkpoint(), &format!("{PATIENT}[camera]\nrepeat = true\n"));
+    let socket = UnixDatagram::bind(graph.path("notify")).unwrap();
+    socket.set_read_timeout(Some(WATCHDOG)).unwrap();
+    let hear = || {
+        let mut bytes = [0; 256];
+        let count = socket.recv(&mut bytes).unwrap();
+        String::from_utf8_lossy(&bytes[..count]).trim().to_owned()
+    };
+    let mut command = graph.launch(&graph.file(), &[]);
+    command.env("NOTIFY_SOCKET", graph.path("notify")).env("WATCHDOG_USEC", "200000").env_remove("WATCHDOG_PID");
+    let launcher = Process::start(&mut command);
+    let mut before_ready = Vec::new();
+    loop {
+        match hear().as_str() {
+            "READY=1" => break,
+            other => before_ready.push(other.to_owned()),
+        }
+    }
+    assert!(before_ready.iter().all(|word| word == "WATCHDOG=1"), "{before_ready:?}");
+    for stage in Stage::ALL {
+        assert!(graph.stage_pid(*stage).is_some(), "stage {stage} does not run");
+    }
+    for _ in 0..3 {
+        assert_eq!(hear(), "WATCHDOG=1");
+    }
+    launcher.signal(Signal::INT);
+    while hear() != "STOPPING=1" {}
+    assert_eq!(launcher.end().status.code(), Some(130));
 }
 
 /// Each stage but the camera may be killed outright: the launcher starts it again, and decisions go on.

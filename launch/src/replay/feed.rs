@@ -163,7 +163,7 @@ impl Player {
                 Pace::Rate(rate) => {
                     if begun_ns == 0 {
                         begun_ns = monotonic_now_ns();
-                        self.terminal.log(&format!(
+                        self.terminal.note(&format!(
                             "replaying {} from {:.1} s on",
                             self.recording.display(),
                             at_ns as f64 / 1e9
@@ -175,7 +175,7 @@ impl Player {
                     self.look_until(&waiter, &mut back, due_ns, |_| false)?
                 }
                 Pace::OnEnter if is_frame => {
-                    self.terminal.log(&format!("frame {}: press Enter", header.frame_id));
+                    self.terminal.note(&format!("frame {}: press Enter", header.frame_id));
                     self.wait_for_key(&waiter, &mut back, keys.as_ref())?
                 }
                 Pace::OnEnter | Pace::AfterEachDecision => true,
@@ -199,7 +199,7 @@ impl Player {
         self.terminal.status(String::new());
         ensure!(first_ns.is_some(), "{} holds no message", self.recording.display());
         if reader.is_cut_off() {
-            self.terminal.log("the recording ends in the middle: it was replayed up to there");
+            self.terminal.note("the recording ends in the middle: it was replayed up to there");
         }
         // What the last frame leads to is still on its way.
         self.look_until(&waiter, &mut back, monotonic_now_ns() + LINGER_NS, |_| false)?;

@@ -135,7 +135,7 @@ pub fn run(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
     let feed = Feed { without: replaced(&topics), run: Box::new(move |run, stop| player.play(run, stop)) };
     let (ended, _) = run_graph(&launch, Some(feed), &terminal)?;
     if ended == Ended::Interrupted {
-        terminal.log("interrupted: all stages have ended");
+        terminal.log(crate::launch::LAUNCHER, "INFO interrupted: all stages have ended");
         return Ok(ExitCode::from(crate::launch::INTERRUPTED));
     }
     if !args.verify {

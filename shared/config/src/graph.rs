@@ -150,10 +150,24 @@ impl LogLevel {
     }
 }
 
+/// How the lines of the log look.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+pub enum LogFormat {
+    /// `[stage] LEVEL message field=value`.
+    #[default]
+    Text,
+    /// A JSON object a line, with `time` (RFC 3339, UTC), `source` (the stage, or `launcher`), `level`, `message` and the
+    /// fields.
+    Json,
+}
+
 /// Log level of each stage: `error`, `warn`, `info`, `debug` or `trace`. Default `info`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct LogConfig {
+    /// How the lines look: `text` or `json`. Default `text`.
+    pub format: LogFormat,
     /// Camera.
     pub camera: LogLevel,
     /// Encoder.

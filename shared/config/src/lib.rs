@@ -30,7 +30,7 @@ pub use checkpoint::{CheckpointPlanning, CheckpointPlanningError};
 pub use error::ConfigError;
 pub use graph::{
     CameraConfig, CameraSource, ControllerConfig, EncoderConfig, ForecasterConfig, GraphConfig, LauncherConfig,
-    LogConfig, LogLevel, NoiseConfig, OverloadConfig, PoseChoice, ProberConfig, Quality, RealtimeConfig,
+    LogConfig, LogFormat, LogLevel, NoiseConfig, OverloadConfig, PoseChoice, ProberConfig, Quality, RealtimeConfig,
     RendererConfig, RestartConfig, RestartPolicy, Rule, RunConfig, Sampling, StageRealtime, ThreadsConfig, ViewChoice,
     WhenLost,
 };

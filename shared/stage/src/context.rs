@@ -4,7 +4,7 @@ use crate::StageArgs;
 use crate::health::{Heartbeat, Vitals};
 use crate::realtime;
 use anyhow::Context;
-use carff_config::{GraphConfig, LogLevel, StageRealtime};
+use carff_config::{GraphConfig, LogFormat, LogLevel, StageRealtime};
 use carff_messages::{Header, Health, HealthState, Message, PictureMeta, Stage};
 use carff_transport::{
     Input, Node, PicturePublisher, PictureReceiver, PictureTopic, Publisher, Receiver, Run, Stop, Topic, Waiter, Woken,
@@ -49,7 +49,7 @@ pub fn describe(error: &anyhow::Error) -> String {
 fn start(stage: Stage, args: StageArgs) -> anyhow::Result<StageContext> {
     die_with_parent(args.parent_pid)?;
     let graph = GraphConfig::load(&args.graph)?;
-    init_log(level(&graph, stage));
+    init_log(level(&graph, stage), graph.log.format);
     StageContext::new(stage, args, graph)
 }
 
@@ -265,17 +265,21 @@ fn level(graph: &GraphConfig, stage: Stage) -> LogLevel {
     }
 }
 
-/// One line for each event on standard error, `LEVEL message fields`; the launcher puts time and stage in front.
-fn init_log(level: LogLevel) {
-    let level = level.name().parse().unwrap_or(tracing::Level::INFO);
-    // It fails only when a log is set up already, which then stays.
-    let _ = tracing_subscriber::fmt()
+/// One line for each event on standard error, `LEVEL message fields` or a JSON object of them; the launcher adds time and
+/// stage.
+fn init_log(level: LogLevel, format: LogFormat) {
+    let level: tracing::Level = level.name().parse().unwrap_or(tracing::Level::INFO);
+    let log = tracing_subscriber::fmt()
         .with_max_level(level)
         .with_writer(std::io::stderr)
         .with_ansi(false)
         .with_target(false)
-        .without_time()
-        .try_init();
+        .without_time();
+    // It fails only when a log is set up already, which then stays.
+    let _ = match format {
+        LogFormat::Text => log.try_init(),
+        LogFormat::Json => log.json().flatten_event(true).with_current_span(false).with_span_list(false).try_init(),
+    };
 }
 
 #[cfg(test)]

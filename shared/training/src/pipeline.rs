@@ -348,7 +348,13 @@ fn calibrate_threshold(
             "the calibration poses allow no trial of one kind (hazard or clear): choose another `split_seed`".into(),
         )
     })?;
-    run.metric(&json!({"stage": "threshold", "threshold": threshold, "trials": found.len()}))?;
+    let probabilities = |halt: bool| -> Vec<f64> {
+        found.iter().filter(|t| t.halt_is_right == halt).map(|t| t.hazard_probability).collect()
+    };
+    run.metric(&json!({
+        "stage": "threshold", "threshold": threshold, "trials": found.len(),
+        "hazard": probabilities(true), "clear": probabilities(false),
+    }))?;
     CheckpointPlanning::new(config.split_seed, threshold).save(out).map_err(|e| unfit(&e))
 }
 

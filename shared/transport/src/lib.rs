@@ -44,7 +44,7 @@ mod wait;
 pub use counters::Counters;
 pub use error::{CleanupError, OpenError, ReceiveError, RunNameError, SendError, WaitError};
 pub use in_use::{Member, OpenTopic, Ports};
-pub use node::Node;
+pub use node::{Node, make_private_dir};
 pub use publisher::{PictureLoan, PicturePublisher, Publisher};
 pub use receiver::{Picture, PictureReceiver, Receiver, Sample};
 pub use run::{Run, cleanup_dead, living_processes, remove_run_leftovers, run_id_of, runtime_dir};

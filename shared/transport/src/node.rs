@@ -15,7 +15,8 @@ use iceoryx2::prelude::{
 };
 use iceoryx2::service::port_factory::event::PortFactory as EventFactory;
 use std::fmt::Debug;
-use std::os::unix::fs::{DirBuilderExt, MetadataExt};
+use std::fs::Permissions;
+use std::os::unix::fs::{DirBuilderExt, MetadataExt, PermissionsExt};
 use std::path::Path;
 use std::sync::{Arc, Once};
 use std::time::{Duration, Instant};
@@ -57,8 +58,8 @@ impl Node {
     /// Joins a run under a name that others see, and cleans up what dead processes of this run left.
     pub fn open(run: &Run, name: &str) -> Result<Self, OpenError> {
         quiet();
-        create_private_dir(&crate::runtime_dir())?;
-        create_private_dir(&run.folder())?;
+        make_private_dir(&crate::runtime_dir())?;
+        make_private_dir(&run.folder())?;
         check_space(Path::new(SHARED_MEMORY_DIR), "joining the run", MANAGEMENT_BYTES)?;
         let failed = |cause: String| OpenError::Node { run: run.name().to_owned(), path: run.folder(), cause };
         let config = run.config().map_err(failed)?;
@@ -247,19 +248,50 @@ fn port_error(topic: &str, what: &'static str, max: usize, error: &dyn std::erro
     }
 }
 
-/// Makes a folder that only this user can enter, or checks that it is this user's.
-fn create_private_dir(path: &Path) -> Result<(), OpenError> {
+/// Makes a folder that only this user can enter, or checks that it is one: a folder (no link to one) of this user, which
+/// nobody else may enter from then on. In a folder that all may write to, somebody else may have made one of that name.
+pub fn make_private_dir(path: &Path) -> Result<(), OpenError> {
     let not_writable = |source| OpenError::NotWritable { path: path.to_owned(), source };
     match std::fs::DirBuilder::new().mode(0o700).create(path) {
         Ok(()) => Ok(()),
         Err(e) if e.kind() == std::io::ErrorKind::AlreadyExists => {
-            let owner = std::fs::symlink_metadata(path).map_err(not_writable)?;
-            if owner.is_dir() && owner.uid() == rustix::process::getuid().as_raw() {
-                Ok(())
-            } else {
-                Err(not_writable(std::io::Error::other("it is not a folder of this user")))
+            let found = std::fs::symlink_metadata(path).map_err(not_writable)?;
+            if !found.is_dir() || found.uid() != rustix::process::getuid().as_raw() {
+                return Err(not_writable(std::io::Error::other("it is not a folder of this user")));
             }
+            if matches!(found.mode() & 0o077, 0) {
+                return Ok(());
+            }
+            std::fs::set_permissions(path, Permissions::from_mode(0o700)).map_err(not_writable)
         }
         Err(e) => Err(not_writable(e)),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A private folder is made, or taken over from this user and closed to others; a link to one is refused, and so is
+    /// another user's, where this test may make one.
+    #[test]
+    fn private_folders_are_this_users() {
+        let base = std::env::temp_dir().join(format!("carff-private-{}", std::process::id()));
+        let mode = |path: &Path| path.metadata().unwrap().mode() & 0o777;
+        make_private_dir(&base).unwrap();
+        assert_eq!(mode(&base), 0o700);
+        let (open, link, foreign) = (base.join("open"), base.join("link"), base.join("foreign"));
+        std::fs::create_dir(&open).unwrap();
+        std::fs::set_permissions(&open, Permissions::from_mode(0o777)).unwrap();
+        make_private_dir(&open).unwrap();
+        assert_eq!(mode(&open), 0o700);
+        std::os::unix::fs::symlink(&open, &link).unwrap();
+        assert!(make_private_dir(&link).unwrap_err().to_string().contains("not a folder of this user"));
+        if rustix::process::getuid().is_root() {
+            std::fs::create_dir(&foreign).unwrap();
+            std::os::unix::fs::chown(&foreign, Some(65534), Some(65534)).unwrap();
+            assert!(make_private_dir(&foreign).unwrap_err().to_string().contains("not a folder of this user"));
+        }
+        std::fs::remove_dir_all(&base).unwrap();
     }
 }

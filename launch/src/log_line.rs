@@ -1,0 +1,86 @@
+//! One line of the log: what a stage or the launcher says, as text or as JSON.
+
+use carff_config::LogFormat;
+use serde_json::{Map, Value};
+
+/// Levels as stages write them, in text and in JSON.
+const LEVELS: [&str; 5] = ["ERROR", "WARN", "INFO", "DEBUG", "TRACE"];
+
+/// A line as it goes out. `source` is a stage's name or `launcher`; `said` is what it wrote: a JSON object, or text that
+/// may begin with a level. `time` is written in JSON alone.
+pub(crate) fn formatted(format: LogFormat, time: &str, source: &str, said: &str) -> String {
+    match format {
+        LogFormat::Text => format!("[{source}] {said}"),
+        LogFormat::Json => {
+            let mut object = fields(said);
+            object.insert("time".into(), time.into());
+            object.insert("source".into(), source.into());
+            Value::Object(object).to_string()
+        }
+    }
+}
+
+/// What went wrong, if that is what the line says.
+pub(crate) fn error_in(said: &str) -> Option<String> {
+    let fields = fields(said);
+    let text = |key: &str| fields.get(key).and_then(Value::as_str).unwrap_or_default();
+    (text("level") == "ERROR" || text("message").contains("panicked at")).then(|| text("message").to_owned())
+}
+
+/// Level, message and fields of a line. What has no level, such as a panic or the words of a library, is a warning.
+fn fields(said: &str) -> Map<String, Value> {
+    if let Ok(Value::Object(fields)) = serde_json::from_str(said) {
+        return fields;
+    }
+    let said = said.trim();
+    let (level, message) = match said.split_once(' ') {
+        Some((word, rest)) if LEVELS.contains(&word) => (word, rest.trim()),
+        _ => ("WARN", said),
+    };
+    Map::from_iter([("level".to_owned(), level.into()), ("message".to_owned(), message.into())])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn json(said: &str) -> Value {
+        serde_json::from_str(&formatted(LogFormat::Json, "2026-01-01T00:00:00Z", "encoder", said)).unwrap()
+    }
+
+    /// Text is passed on as it is; in JSON every line is an object with time, source, level and message, whatever was
+    /// said, and a stage's own fields stay.
+    #[test]
+    fn every_line_has_its_form() {
+        assert_eq!(
+            formatted(LogFormat::Text, "", "encoder", " INFO ready threads=1"),
+            "[encoder]  INFO ready threads=1"
+        );
+        let ready = json(r#"{"level":"INFO","message":"ready","threads":1}"#);
+        assert_eq!(
+            (&ready["source"], &ready["message"], &ready["threads"]),
+            (&"encoder".into(), &"ready".into(), &1.into())
+        );
+        assert_eq!(ready["time"], "2026-01-01T00:00:00Z");
+        for (said, level, message) in [
+            ("ERROR no weights: gone", "ERROR", "no weights: gone"),
+            (" WARN late", "WARN", "late"),
+            ("thread 'main' panicked at x.rs:1", "WARN", "thread 'main' panicked at x.rs:1"),
+            ("[1, 2]", "WARN", "[1, 2]"),
+            ("", "WARN", ""),
+        ] {
+            let line = json(said);
+            assert_eq!((line["level"].as_str(), line["message"].as_str()), (Some(level), Some(message)), "{said}");
+        }
+    }
+
+    /// Errors are found in both forms, and nothing else is one.
+    #[test]
+    fn errors_are_found_in_both_forms() {
+        assert_eq!(error_in("ERROR no weights"), Some("no weights".into()));
+        assert_eq!(error_in(r#"{"level":"ERROR","message":"no weights"}"#), Some("no weights".into()));
+        assert!(error_in("thread 'main' panicked at x.rs:1").is_some());
+        assert_eq!(error_in(" INFO ready"), None);
+        assert_eq!(error_in(r#"{"level":"INFO","message":"no ERROR"}"#), None);
+    }
+}
