@@ -292,7 +292,7 @@ impl Launcher<'_> {
                 self.feed = Some(thread.spawn(move || (feed.run)(&run, &stop)).context("cannot start the feed")?);
             }
         }
-        service_manager::ready();
+        let mut is_ready = false;
         loop {
             if self.step()? == Woken::Stopped {
                 return match self.lost.take() {
@@ -303,6 +303,10 @@ impl Launcher<'_> {
             if self.watch()? || self.is_fed()? {
                 self.collect()?;
                 return Ok(Ended::Done);
+            }
+            if !is_ready && self.stages.iter().all(|w| w.health.was_ready()) {
+                is_ready = true;
+                service_manager::ready();
             }
             self.show_status();
         }

@@ -69,6 +69,7 @@ impl Node {
             .signal_handling_mode(SignalHandlingMode::Disabled)
             .create::<Service>()
             .map_err(|e| failed(e.to_string()))?;
+        close_to_others(run).map_err(|e| failed(e.to_string()))?;
         Ok(Self { inner, run: run.clone(), counters: Arc::default() })
     }
 
@@ -246,6 +247,22 @@ fn port_error(topic: &str, what: &'static str, max: usize, error: &dyn std::erro
     } else {
         OpenError::Topic { topic, cause }
     }
+}
+
+/// Takes away what iceoryx2 (0.10) leaves open to all users in shared memory: the counter of a run's nodes. All else it
+/// makes for this user alone.
+fn close_to_others(run: &Run) -> std::io::Result<()> {
+    for path in run.shared_memory_files()? {
+        // What has gone meanwhile is open to nobody.
+        let Ok(found) = std::fs::symlink_metadata(&path) else { continue };
+        if found.is_file() && found.uid() == rustix::process::getuid().as_raw() && !matches!(found.mode() & 0o077, 0) {
+            match std::fs::set_permissions(&path, Permissions::from_mode(0o600)) {
+                Err(error) if error.kind() != std::io::ErrorKind::NotFound => return Err(error),
+                _ => {}
+            }
+        }
+    }
+    Ok(())
 }
 
 /// Makes a folder that only this user can enter, or checks that it is one: a folder (no link to one) of this user, which
