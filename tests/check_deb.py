@@ -13,6 +13,7 @@ import os
 import pwd
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -36,7 +37,7 @@ def run(*command: str, user: str | None = None, check: bool = True) -> subproces
 def run_files(uid: int) -> list[Path]:
     """All that a run keeps: shared memory, and small files with sockets among them."""
     shared = [p for p in Path("/dev/shm").iterdir() if p.name.startswith("carff") and p.lstat().st_uid == uid]
-    folder = Path(f"/tmp/carff-{uid}")
+    folder = Path("/tmp") / f"carff-{uid}"
     return shared + ([folder, *folder.rglob("*")] if folder.exists() else [])
 
 
@@ -53,7 +54,7 @@ def look_as_nobody(files: list[Path]) -> None:
 
 
 def main() -> None:
-    package = sys.argv[1] if len(sys.argv) == 2 else sys.exit(__doc__)
+    package = str(Path(sys.argv[1]).resolve()) if len(sys.argv) == 2 else sys.exit(__doc__)
     if os.geteuid() != 0 or any(os.path.lexists(home) for home in HOMES):
         sys.exit("this must be root, on a machine where carff is not installed")
     try:
@@ -69,7 +70,7 @@ def main() -> None:
         report = "/var/lib/carff/report.json"
         launch = ["runuser", "-u", "carff", "--", "carff", "launch", "/etc/carff/vehicle.toml", "--frames", "100",
                   "--report", report]
-        with open("/tmp/check-deb.log", "w+", encoding="utf-8") as log:
+        with tempfile.NamedTemporaryFile("w", suffix=".log", encoding="utf-8") as log:
             launcher = subprocess.Popen(launch, stdout=log, stderr=log, cwd="/var/lib/carff")
             # The first launch renders the data set.
             while launcher.poll() is None and "hazard " not in Path(log.name).read_text(encoding="utf-8"):

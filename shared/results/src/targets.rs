@@ -92,11 +92,15 @@ impl List {
             Kind::Merge => "88.33 %",
             Kind::Hand | Kind::Other => "",
         };
-        let svm = table.svm.trained;
         let percent = (100.0, " %");
-        let of_ceiling = (svm.ceiling > 0.0).then(|| svm.accuracy / svm.ceiling);
-        let what = format!("SVM accuracy, {:.1} % of a ceiling of {:.1} %", 100.0 * svm.accuracy, 100.0 * svm.ceiling);
-        self.at_least(&what, paper, of_ceiling, 0.97, (100.0, " % of it"));
+        // In folds by picture the doubles of what is left out stay in under other names; only by pose can the ceiling be
+        // reached.
+        for (folds, paper, svm) in [("picture", paper, table.svm.trained), ("pose", "", table.svm.trained_by_pose)] {
+            let of_ceiling = (svm.ceiling > 0.0).then(|| svm.accuracy / svm.ceiling);
+            let (found, ceiling) = (100.0 * svm.accuracy, 100.0 * svm.ceiling);
+            let what = format!("SVM accuracy, 10 folds by {folds}, {found:.1} % of a ceiling of {ceiling:.1} %");
+            self.at_least(&what, paper, of_ceiling, 0.97, (100.0, " % of it"));
+        }
         for (part, least) in [("trained", 0.99), ("unseen", 0.9)] {
             let full = table.state_accuracy.get(part).map(|a| a.full).filter(|s| s.trials > 0);
             let what = format!("state accuracy, place fully visible, {part} poses");

@@ -2,7 +2,7 @@
 
 use crate::{
     TrainingError,
-    config::TrainingConfig,
+    config::{Augmentation, TrainingConfig},
     field::{self, Clouds},
     mixture::{self, Mdn},
     pictures::Pictures,
@@ -12,7 +12,7 @@ use crate::{
 use carff_checkpoint::{FORMAT_VERSION, Manifest, ScenarioIdentity, SplitRecord, files, save_field, save_weights};
 use carff_config::CheckpointPlanning;
 use carff_dataset::{Observability, PoseRole, drives::eligible_inputs};
-use carff_evaluation::{Input, Models, birds_eye, planning_table, sample_accuracy, trials};
+use carff_evaluation::{Input, Models, Trial, birds_eye, planning_table, sample_accuracy, trials};
 use carff_field::{Field, RenderBuffer, RenderOptions};
 use carff_models::{LATENT_DIM, LatentGaussian, mixture::Sampling};
 use carff_planning::{CalibrationTrial, Rule, choose_threshold};
@@ -227,13 +227,24 @@ fn begun(config: &TrainingConfig, pictures: &Pictures, states: Vec<LatentGaussia
     }
 }
 
+/// Copies a file, whole or not at all. One that is there already under this name stays: copied onto itself it would be
+/// emptied.
+fn copy(from: &Path, to: &Path) -> std::io::Result<()> {
+    if to.exists() && from.canonicalize()? == to.canonicalize()? {
+        return Ok(());
+    }
+    let partial = to.with_extension("partial");
+    std::fs::copy(from, &partial)?;
+    std::fs::rename(&partial, to)
+}
+
 fn write_vae(config: &TrainingConfig, vae: &Vae, out: &Path) -> Result<(), TrainingError> {
     let (mut encoder, decoder, backbone) = vae.weights();
     match (&config.pretrained_backbone, config.encoder.backbone.frozen) {
         (Some(file), true) => {
             let target = out.join(files::BACKBONE);
             std::fs::create_dir_all(out)
-                .and_then(|()| std::fs::copy(file, &target))
+                .and_then(|()| copy(file, &target))
                 .map_err(|source| TrainingError::File { path: target, source })?;
         }
         _ => encoder.extend(backbone),
@@ -309,6 +320,9 @@ fn calibrate_probing(
     Ok((prober, calibration))
 }
 
+/// Names this use of the seed, so that no picture is altered just as it was in training.
+const CALIBRATION_STREAM: u64 = 0x6361_6c69_6272_6174;
+
 /// Chooses the calibrated rule's threshold on the calibration poses, and writes it beside the manifest.
 fn calibrate_threshold(
     config: &TrainingConfig,
@@ -325,7 +339,21 @@ fn calibrate_threshold(
     }
     let inputs =
         eligible_inputs(&pictures.dataset, &pictures.split.views(PoseRole::Calibration)).map_err(|e| unfit(&e))?;
-    let trials = trials(&models.encoder, &pictures.dataset, &inputs, settings.repeats, &settings.sensor, config.seed)?;
+    // Altered as in training: a threshold that was chosen on pictures just as they were learned would be too sharp for
+    // others.
+    let altered = Augmentation { sensor: settings.sensor, ..config.augmentation.clone() };
+    let mut trials = Vec::with_capacity(inputs.len() * settings.repeats);
+    for input in &inputs {
+        let state = input.branch * pictures.scenario.timestamps + input.timestamp;
+        let Some(index) = pictures.dataset.frame_index(state, input.view) else { continue };
+        for repeat in 0..settings.repeats {
+            let picture = pictures.inputs(&[index], repeat, &altered, config.seed ^ CALIBRATION_STREAM);
+            let frame = (index * 1000 + repeat) as u64;
+            let (kind, seed) = (input.kind, config.seed);
+            let posteriors = models.encoder.encode(&picture);
+            trials.extend(posteriors.into_iter().map(|posterior| Trial { posterior, kind, frame, seed }));
+        }
+    }
     let mut found = Vec::with_capacity(trials.len());
     for trial in &trials {
         let plan = carff_belief::Plan {
@@ -494,4 +522,26 @@ pub fn summary(metrics: &Value) -> String {
         ],
     );
     lines.join("\n")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A copy is whole and takes the place of what was there; onto itself, through a link too, it changes nothing.
+    #[test]
+    fn a_file_survives_its_own_copy() {
+        let folder = tempfile::tempdir().unwrap();
+        let [from, link, to] = ["from", "link", "to"].map(|name| folder.path().join(name));
+        std::fs::write(&from, "weights").unwrap();
+        std::os::unix::fs::symlink(&from, &link).unwrap();
+        std::fs::write(&to, "older and longer").unwrap();
+        copy(&from, &to).unwrap();
+        copy(&link, &from).unwrap();
+        copy(&from, &from).unwrap();
+        for path in [&from, &to] {
+            assert_eq!(std::fs::read_to_string(path).unwrap(), "weights");
+        }
+        assert!(copy(&folder.path().join("none"), &to).is_err());
+    }
 }
