@@ -86,6 +86,8 @@ def main() -> None:
         say(f"{found['frames']} frames, {found['actions']} actions, {found['restarts']} restarts, "
             f"camera to action p50 {found['latency_ms']['camera_to_action']['p50']:.1f} ms")
     finally:
+        # After a failure its processes may still run, and their user could not be removed.
+        run("pkill", "-KILL", "-u", "carff", check=False)
         run("dpkg", "--purge", "carff", check=False)
     left = [home for home in HOMES if os.path.lexists(home)] + run_files(uid)
     left += [entry.pw_name for entry in pwd.getpwall() if entry.pw_name == "carff"]

@@ -46,7 +46,6 @@ const QUIET_FRAMES: f64 = 3.0;
 const ORPHAN_PATIENCE_NS: u64 = 2_000_000_000;
 /// Exit code after Ctrl-C, as shells have it: 128 and the signal's number.
 pub(crate) const INTERRUPTED: u8 = 130;
-
 /// Source of the launcher's own lines in the log.
 pub(crate) const LAUNCHER: &str = "launcher";
 /// Bytes of a frame that are reckoned with when shared memory is checked, before the pictures are known.
@@ -156,7 +155,7 @@ pub(crate) fn run_graph(
 
     // A feed brings its own pictures.
     if feed.is_none() {
-        provide_dataset(&graph, args, &dataset)?;
+        provide_dataset(&graph, args, &dataset, terminal)?;
         refuse_another_scenario(&graph, &dataset, &checkpoint)?;
     }
     // From here on Ctrl-C is an orderly end; until here it may simply end the process, as no stage runs yet.
@@ -580,7 +579,7 @@ fn sweep(run: &Run) -> anyhow::Result<()> {
 }
 
 /// Renders the data set when it is missing and the graph says from which scenario.
-fn provide_dataset(graph: &GraphConfig, args: &LaunchArgs, dataset: &Path) -> anyhow::Result<()> {
+fn provide_dataset(graph: &GraphConfig, args: &LaunchArgs, dataset: &Path, terminal: &Terminal) -> anyhow::Result<()> {
     let complete = std::fs::read_dir(dataset)
         .is_ok_and(|entries| entries.flatten().any(|e| e.file_name().to_string_lossy().starts_with("transforms")));
     if complete || graph.camera.source == CameraSource::Folder {
@@ -593,7 +592,8 @@ fn provide_dataset(graph: &GraphConfig, args: &LaunchArgs, dataset: &Path) -> an
     );
     match graph.scenario_path() {
         Some(scenario) if args.dataset.is_none() => {
-            eprintln!("{} is missing: rendering it from {}", dataset.display(), scenario.display());
+            let (missing, from) = (dataset.display(), scenario.display());
+            terminal.log(LAUNCHER, &format!("INFO {missing} is missing: rendering it from {from}"));
             crate::dataset::render(&Scenario::load(&scenario)?, dataset, Extras::None).map(drop)
         }
         _ => bail!(

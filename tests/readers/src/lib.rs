@@ -6,7 +6,6 @@ mod valid;
 
 use carff_checkpoint::Manifest;
 use carff_config::{CheckpointPlanning, GraphConfig};
-
 use carff_dataset::{Dataset, Image, ImportOptions, import};
 use carff_field::FieldConfig;
 use carff_messages::{
