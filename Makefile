@@ -55,7 +55,7 @@ sanitize: libtorch ## Run the tests around `unsafe` under the address sanitizer 
 FUZZ_FLAGS := --cfg fuzzing -Ccodegen-units=1 -Cpasses=sancov-module -Cllvm-args=-sanitizer-coverage-level=4 \
 	-Cllvm-args=-sanitizer-coverage-inline-8bit-counters -Cllvm-args=-sanitizer-coverage-pc-table \
 	-Cllvm-args=-sanitizer-coverage-trace-compares
-READERS := messages graph scenario training dataset import png planning manifest weights recording run-record
+READERS := messages graph scenario soak training dataset import png planning manifest weights recording run-record
 FUZZ := $(TARGET)/fuzz
 
 fuzz: libtorch ## Feed each of READERS (default: all) with RUNS inputs (default 1000000), guided by coverage (nightly)

@@ -20,7 +20,7 @@ pub struct AblateArgs {
     /// These variants alone, by the name of their folder: full, stem, conv-net, unfrozen, transformer, no-pose.
     #[arg(long, value_parser = variant)]
     only: Vec<Variant>,
-    /// Where scoring computes: `auto`, `cpu` or `cuda:N`.
+    /// Where training and scoring compute: `auto`, `cpu` or `cuda:N`.
     #[arg(long, default_value = "auto")]
     device: String,
     /// Folder for ablation.json, README.md, and a folder for each variant. The same command goes on where it stopped.

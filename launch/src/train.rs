@@ -37,6 +37,10 @@ pub struct TrainArgs {
     /// Train one model alone; those before it must be there.
     #[arg(long, value_enum)]
     stage: Option<StageName>,
+    /// Where the VAE and the mixture density network are trained: `auto`, `cpu` or `cuda:N`. The field has kernels of its
+    /// own, for the processor.
+    #[arg(long, default_value = "auto")]
+    device: String,
     /// Folder for saved states, metrics and curves.
     #[arg(long)]
     run_dir: Option<PathBuf>,
@@ -66,6 +70,7 @@ pub fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
     std::fs::create_dir_all(&dir).with_context(|| format!("cannot make {}", dir.display()))?;
     refuse_another_configuration(&dir, &config, &dataset)?;
 
+    let device = carff_models::device::parse(&args.device)?;
     let stop = stop_on_signals()?;
     let display = Display::default();
     let report = |progress: &Progress| display.show(progress);
@@ -76,7 +81,7 @@ pub fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
         Some(StageName::Nerf) => Stage::Nerf,
         Some(StageName::Mdn) => Stage::Mdn,
     };
-    let result = pipeline::train(&config, &dataset, free.as_deref(), &out, stage, &run);
+    let result = pipeline::train(&config, &dataset, free.as_deref(), &out, stage, device, &run);
     display.finish();
     match result {
         Ok(metrics) => {

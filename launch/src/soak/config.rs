@@ -78,6 +78,8 @@ weights! {
     foreign_run => ForeignRun,
     /// Shared memory without a free byte, for a while.
     full_memory => FullMemory,
+    /// A disk that fills under a recorder.
+    full_disk => FullDisk,
     /// Frames from a clock that has jumped, forward or back.
     clock_jump => ClockJump,
     /// Subscribers that come, go and are killed.
@@ -121,17 +123,17 @@ pub struct Contract {
     /// From the expiry of a decision to the safe action, and beyond the period of actions, milliseconds, 1 to 60000.
     /// Default 150.
     pub slack_ms: u64,
-    /// Growth of a process's memory, percent an hour, over lives of at least `memory_span_s` after `warm_up_s`.
-    /// Default 1.
+    /// Growth of a process's memory, percent an hour, over lives of at least `memory_span_s` after `warm_up_s`, 0 to
+    /// 1000. Default 1.
     pub memory_growth_percent_per_hour: f64,
-    /// Age from which on a process's memory counts, seconds. Default 120.
+    /// Age from which on a process's memory counts, seconds, 0 to 86400. Default 120.
     pub warm_up_s: u64,
-    /// Shortest time over which its growth is judged, seconds. Default 1800.
+    /// Shortest time over which its growth is judged, seconds, 1 to 604800. Default 1800.
     pub memory_span_s: u64,
     /// The 99th percentile of the time from camera to action may grow by so much from the first to the last
-    /// `p99_frames` undisturbed frames, percent. Default 20.
+    /// `p99_frames` undisturbed frames, percent, 0 to 1000. Default 20.
     pub p99_drift_percent: f64,
-    /// Frames in each; with fewer than twice as many, drift is not judged. Default 1000.
+    /// Frames in each, 100 to 1000000; with fewer than twice as many, drift is not judged. Default 1000.
     pub p99_frames: usize,
 }
 
@@ -178,6 +180,19 @@ impl SoakConfig {
             ("contract.recovery_ms", contract.recovery_ms, 100, 600_000),
             ("contract.stop_ms", contract.stop_ms, 100, 600_000),
             ("contract.slack_ms", contract.slack_ms, 1, 60_000),
+        ] {
+            ensure!((min..=max).contains(&value), "`{key}` is {value}; allowed: {min} to {max}");
+        }
+        for (key, value) in [
+            ("contract.memory_growth_percent_per_hour", contract.memory_growth_percent_per_hour),
+            ("contract.p99_drift_percent", contract.p99_drift_percent),
+        ] {
+            ensure!((0.0..=1000.0).contains(&value), "`{key}` is {value}; allowed: 0 to 1000");
+        }
+        for (key, value, min, max) in [
+            ("contract.warm_up_s", contract.warm_up_s, 0, 86_400),
+            ("contract.memory_span_s", contract.memory_span_s, 1, 604_800),
+            ("contract.p99_frames", contract.p99_frames as u64, 100, 1_000_000),
         ] {
             ensure!((min..=max).contains(&value), "`{key}` is {value}; allowed: {min} to {max}");
         }

@@ -2,7 +2,7 @@
 //!
 //! ```text
 //! soak --starts--> carff launch --starts--> stages         signals: SIGKILL, SIGSTOP, SIGCONT, SIGINT
-//!  | \--starts--> injector, probes --lies--> topics
+//!  | \--starts--> injector --lies--> topics; probes; a recorder
 //!  \<------------- beliefs, actions, heartbeats --------- topics
 //! ```
 
@@ -10,6 +10,7 @@ mod config;
 mod graph;
 mod inject;
 mod patience;
+mod recorder;
 mod report;
 mod schedule;
 mod watch;
@@ -23,6 +24,7 @@ use carff_messages::Stage;
 use carff_transport::{Node, Run, SHARED_MEMORY_DIR, Stop, Waiter, monotonic_now_ns};
 use graph::{Graph, Holdings, Victim, resident_bytes};
 use patience::Patience;
+use recorder::{Cramped, FlightRecorder, small_disk};
 use report::{Lives, Outcome};
 use rustix::process::Signal;
 use std::collections::BTreeMap;
@@ -36,6 +38,8 @@ const NS_PER_MS: u64 = 1_000_000;
 const NS_PER_S: u64 = 1_000_000_000;
 /// Shared memory of a soak's own, so that filling it harms nobody else: its size.
 const MEMORY_SIZE: &str = "size=256m";
+/// Size of the disk that fills under a recorder.
+const DISK_SIZE: &str = "size=4m";
 /// How a slowed process is stopped and continued in turn, milliseconds.
 const SLOW_MS: (u64, u64) = (40, 20);
 /// How long the camera stands still so that frames are dropped, in frames.
@@ -76,9 +80,9 @@ pub struct SoakArgs {
 pub fn run(args: &SoakArgs) -> anyhow::Result<ExitCode> {
     let config = SoakConfig::load(&args.config)?;
     ensure!(args.minutes > 0.0 && args.minutes.is_finite(), "--minutes is {}; it must be above 0", args.minutes);
-    if !args.own_memory && config.faults.full_memory > 0 {
+    if !args.own_memory && (config.faults.full_memory > 0 || config.faults.full_disk > 0) {
         with_own_memory();
-        eprintln!("this system lets its users mount nothing: full shared memory is not tried");
+        eprintln!("this system lets its users mount nothing: full shared memory and full disks are not tried");
     }
     let stop = Stop::on_signals().context("cannot handle signals")?;
     let graph = Graph::new(&config, args.dataset.as_deref(), args.checkpoint.as_deref(), args.seed)?;
@@ -90,6 +94,7 @@ pub fn run(args: &SoakArgs) -> anyhow::Result<ExitCode> {
         waiter: Waiter::new(stop),
         run: Run::new("unnamed", 0)?,
         watcher: None,
+        recorder: FlightRecorder::new()?,
         notes: Notes::new(terms),
         baseline: None,
         outcome: Outcome::default(),
@@ -98,6 +103,7 @@ pub fn run(args: &SoakArgs) -> anyhow::Result<ExitCode> {
     };
     let result = soak.drive();
     soak.watcher = None;
+    soak.recorder.end()?;
     let stalled = soak.graph.end(Signal::TERM, config.contract.stop_ms)?.is_none();
     let interrupted = soak.waiter.stop().is_stopped();
     if stalled && !interrupted && soak.notes.violation.is_none() && result.is_ok() {
@@ -132,10 +138,11 @@ pub fn run(args: &SoakArgs) -> anyhow::Result<ExitCode> {
 fn with_own_memory() {
     let user = rustix::process::getuid();
     let enter = |command: &mut Command, what: &str| {
-        command
-            .arg("--mount")
-            .args(["sh", "-c"])
-            .arg(format!("mount -t tmpfs -o {MEMORY_SIZE} tmpfs {SHARED_MEMORY_DIR} && {what}"));
+        command.arg("--mount").args(["sh", "-c"]).arg(format!(
+            "mount -t tmpfs -o {MEMORY_SIZE} tmpfs {SHARED_MEMORY_DIR} && mkdir {disk} && \
+                 mount -t tmpfs -o {DISK_SIZE} tmpfs {disk} && {what}",
+            disk = small_disk().display()
+        ));
     };
     let new = |what: &str| {
         let mut command = Command::new("unshare");
@@ -168,6 +175,7 @@ struct Soak<'a> {
     waiter: Waiter,
     run: Run,
     watcher: Option<Watcher>,
+    recorder: FlightRecorder,
     notes: Notes,
     /// What the undisturbed graph holds of the system.
     baseline: Option<Holdings>,
@@ -186,6 +194,7 @@ impl Soak<'_> {
         while monotonic_now_ns() < end_ns && self.goes_on()? {
             let fault = fault(self.config, self.args.seed, number);
             number += 1;
+            self.recorder.keep_on(&self.run)?;
             self.notes.calm = true;
             self.look_for(fault.pause_ms)?;
             self.notes.calm = false;
@@ -275,6 +284,9 @@ impl Soak<'_> {
         if !up && !self.waiter.stop().is_stopped() {
             self.violated(format!("the graph was not up within {start_ms} ms of its start"));
         }
+        if self.goes_on()? {
+            self.recorder.keep_on(&self.run)?;
+        }
         if self.baseline.is_none() && self.goes_on()? {
             // The renderer's first views, and whatever else comes late.
             self.look_for(3000)?;
@@ -341,6 +353,12 @@ impl Soak<'_> {
                 self.look_for(fault.hold_ms)?;
                 drop(filler);
                 self.recover(None)?;
+            }
+            Kind::FullDisk => {
+                if !self.args.own_memory {
+                    return Ok(false);
+                }
+                self.fill_disk()?;
             }
             Kind::Checkpoint => self.damage_checkpoint(fault, &pids)?,
             Kind::StartStop => self.cycle(Signal::INT)?,
@@ -467,7 +485,7 @@ impl Soak<'_> {
     fn storm(&mut self, fault: &Fault) -> anyhow::Result<()> {
         let mut probes = Vec::new();
         // As many as there is room for beside the graph's own subscribers.
-        for i in 0..fault.count.min(4) {
+        for i in 0..fault.count.min(3) {
             let mut probe = self.helper("probe", i, 0)?;
             let mut ready = String::new();
             let mut stdout = BufReader::new(probe.stdout.take().context("the probe has no output")?);
@@ -485,6 +503,29 @@ impl Soak<'_> {
             Victim::new(probe.id())?.signal(signal);
             probe.wait()?;
         }
+        self.recover(None)
+    }
+
+    /// A second recorder's disk fills: it says so and keeps what it has, and nobody else notices.
+    fn fill_disk(&mut self) -> anyhow::Result<()> {
+        let mut cramped = Cramped::start(&self.run)?;
+        let mut status = None;
+        let full = self.look_until(INJECTOR_MS, |soak| {
+            status = cramped.ended()?;
+            Ok(status.is_some() || soak.notes.violation.is_some())
+        })?;
+        match status {
+            Some(status) => {
+                if let Some(complaint) = cramped.complaint(status)? {
+                    self.violated(complaint);
+                }
+            }
+            None if !full && !self.waiter.stop().is_stopped() => {
+                self.violated(format!("a recorder did not fill a disk of {DISK_SIZE} within {INJECTOR_MS} ms"));
+            }
+            None => {}
+        }
+        drop(cramped);
         self.recover(None)
     }
 
@@ -508,8 +549,9 @@ impl Soak<'_> {
     /// Ends the graph and starts it again: nothing may be left of it in between.
     fn cycle(&mut self, signal: Signal) -> anyhow::Result<()> {
         let limit_ms = self.config.contract.stop_ms;
-        // What the watcher itself has open is none of the graph's.
+        // What the watcher and the recorder have open is none of the graph's.
         self.watcher = None;
+        self.recorder.end()?;
         let status = self.graph.end(signal, limit_ms)?;
         match (signal, status.and_then(|s| s.code())) {
             _ if status.is_none() => self.violated(format!("the graph did not end within {limit_ms} ms")),
@@ -534,7 +576,7 @@ impl Soak<'_> {
         self.recover(None)
     }
 
-    /// Log, latest messages and schedule, in a folder beside the JSON file.
+    /// Log, latest messages, recording and schedule, in a folder beside the JSON file.
     fn keep_evidence(&mut self) -> anyhow::Result<()> {
         let folder = self.args.json.as_deref().unwrap_or(Path::new("soak.json")).with_extension("evidence");
         std::fs::create_dir_all(&folder)?;
@@ -543,6 +585,9 @@ impl Soak<'_> {
         std::fs::write(folder.join("messages.txt"), text(&mut self.notes.evidence.iter()))?;
         std::fs::write(folder.join("schedule.txt"), text(&mut self.outcome.schedule.iter()))?;
         std::fs::copy(self.graph.log(), folder.join("launcher.log"))?;
+        for file in self.recorder.files()? {
+            std::fs::copy(&file, folder.join(file.file_name().context("a recording without a name")?))?;
+        }
         self.outcome.evidence = Some(folder.display().to_string());
         Ok(())
     }

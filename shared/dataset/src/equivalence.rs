@@ -37,22 +37,27 @@ impl Equivalence {
     /// picture in a view is the same only as itself.
     pub fn from_dataset(dataset: &Dataset, images: &[Image]) -> Self {
         let (views, states) = (dataset.view_count(), dataset.state_count());
-        let mut index = vec![None; views * states];
-        for (i, frame) in dataset.frames().iter().enumerate().take(images.len()) {
+        let mut pictures = vec![vec![None; states]; views];
+        for (image, frame) in images.iter().zip(dataset.frames()) {
             if let (Some(view), Some(state)) = (frame.view, frame.state) {
-                index[view * states + state] = Some(i);
+                pictures[view][state] = Some(image);
             }
         }
-        let same = (0..views)
-            .into_par_iter()
-            .flat_map_iter(|view| {
-                let of_view = &index[view * states..(view + 1) * states];
+        Self::of_pictures(states, &pictures)
+    }
+
+    /// Compares all pairs of states in each view; `pictures` has a row of `states` for each.
+    pub fn of_pictures(states: usize, pictures: &[Vec<Option<&Image>>]) -> Self {
+        let same = pictures
+            .par_iter()
+            .flat_map_iter(|of_view| {
+                let of = |state: usize| of_view.get(state).copied().flatten();
                 let mut same = vec![false; states * states];
                 for a in 0..states {
                     same[a * states + a] = true;
                     for b in 0..a {
-                        let equal = match (of_view[a], of_view[b]) {
-                            (Some(a), Some(b)) => looks_same(&images[a], &images[b]),
+                        let equal = match (of(a), of(b)) {
+                            (Some(a), Some(b)) => looks_same(a, b),
                             _ => false,
                         };
                         same[a * states + b] = equal;
@@ -73,9 +78,14 @@ impl Equivalence {
         self.same.get((view * self.states + a) * self.states + b).copied().unwrap_or(a == b)
     }
 
+    /// The states that look like `state` from `view`, itself among them.
+    pub fn alike(&self, view: usize, state: usize) -> impl Iterator<Item = usize> + '_ {
+        (0..self.states).filter(move |&other| self.same(view, other, state))
+    }
+
     /// How many states look like `state` from `view`, itself counted: at least 1.
     pub fn class_size(&self, view: usize, state: usize) -> usize {
-        (0..self.states).filter(|&other| self.same(view, state, other)).count().max(1)
+        self.alike(view, state).count().max(1)
     }
 
     /// The best mean accuracy of naming the state from a picture, over the given (view, state) pairs: the mean of
@@ -116,6 +126,7 @@ mod tests {
     fn ceiling_of_a_known_case() {
         let e = Equivalence { states: 3, same: vec![true, true, false, true, true, false, false, false, true] };
         assert_eq!([0, 1, 2].map(|s| e.class_size(0, s)), [2, 2, 1]);
+        assert_eq!(e.alike(0, 1).collect::<Vec<_>>(), [0, 1]);
         let ceiling = e.ceiling((0..3).map(|s| (0, s))).unwrap();
         assert!((ceiling - 2.0 / 3.0).abs() < 1e-12);
         assert_eq!(e.ceiling([]), None);

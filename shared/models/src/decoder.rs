@@ -66,6 +66,11 @@ impl Decoder {
         }
     }
 
+    /// Where it computes.
+    pub fn device(&self) -> tch::Device {
+        self.join.ws.device()
+    }
+
     /// Latents `[N, 8]` and pose numbers `[N]` (int64) to `[N, 3, 128, 128]`: a picture in 0..=1, or the residual
     /// over the pose's mean picture, whichever it was trained for.
     pub fn forward(&self, latents: &Tensor, poses: &Tensor) -> Tensor {

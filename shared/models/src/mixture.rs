@@ -92,6 +92,11 @@ impl MixtureNet {
         })
     }
 
+    /// Where it computes.
+    pub fn device(&self) -> tch::Device {
+        self.first.ws.device()
+    }
+
     /// Posterior means and log-variances, each `[N, 8]`, to log weights `[N, K]`, means `[N, K, 8]` and
     /// log-variances `[N, K, 8]`.
     pub fn forward(&self, mean: &Tensor, log_variance: &Tensor) -> (Tensor, Tensor, Tensor) {
@@ -128,13 +133,13 @@ impl MixtureNet {
         tch::no_grad(|| {
             let flat = |part: fn(&LatentGaussian) -> &[f32; LATENT_DIM]| {
                 let values: Vec<f32> = posteriors.iter().flat_map(|p| part(p).iter().copied()).collect();
-                Tensor::from_slice(&values).view([-1, LATENT_DIM as i64])
+                Tensor::from_slice(&values).view([-1, LATENT_DIM as i64]).to_device(self.device())
             };
             let (log_weights, means, log_variances) = self.forward(&flat(|p| &p.mean), &flat(|p| &p.log_variance));
             let k = self.components as usize;
             let mut weights = vec![0.0_f32; posteriors.len() * k];
             let count = weights.len();
-            log_weights.exp().contiguous().copy_data(&mut weights, count);
+            log_weights.exp().to_device(tch::Device::Cpu).contiguous().copy_data(&mut weights, count);
             let components = gaussians(&means, &log_variances);
             weights
                 .chunks_exact(k)

@@ -146,7 +146,7 @@ pub fn row(
             .map_err(|e| ResultsError::Format { path, what: format!("{e}; remove the file to score it again") });
     }
     let (_, checkpoint) = folders(out, variant);
-    pipeline::train(&variant.apply(config), dataset, free, &checkpoint, Stage::Vae, run)?;
+    pipeline::train(&variant.apply(config), dataset, free, &checkpoint, Stage::Vae, options.device, run)?;
     let subject = Subject::load(&checkpoint, dataset, options, run.on_progress)?;
     let row = Row { variant, description: variant.description(config).to_owned(), scores: encoder_table(&subject) };
     write(&path, &to_json(&row, &path)?)?;

@@ -108,7 +108,8 @@ impl Place {
 
     fn train(&self, stage: Stage) {
         self.run("run", |run| {
-            pipeline::train(&self.config, &self.at("set"), None, &self.at("checkpoint"), stage, run).unwrap();
+            pipeline::train(&self.config, &self.at("set"), None, &self.at("checkpoint"), stage, tch::Device::Cpu, run)
+                .unwrap();
         });
     }
 

@@ -30,9 +30,9 @@ pub struct Mdn {
 }
 
 impl Mdn {
-    /// Fresh weights from the global generator (seed it first).
-    pub fn new(config: &TrainingConfig) -> Result<Self, ModelError> {
-        let store = VarStore::new(Device::Cpu);
+    /// Fresh weights on `device` from the global generator (seed it first).
+    pub fn new(config: &TrainingConfig, device: Device) -> Result<Self, ModelError> {
+        let store = VarStore::new(device);
         Ok(Self { net: MixtureNet::new(&(store.root() / "mixture"), &config.mixture)?, store })
     }
 
@@ -93,7 +93,8 @@ pub fn train(
             let unit: [f32; LATENT_DIM] = std::array::from_fn(|_| rng.sample(StandardNormal));
             targets.extend(next.at(&unit));
         }
-        let rows = |values: &[f32]| Tensor::from_slice(values).view([-1, LATENT_DIM as i64]);
+        let rows =
+            |values: &[f32]| Tensor::from_slice(values).view([-1, LATENT_DIM as i64]).to_device(mdn.net.device());
         let loss = mdn.net.negative_log_likelihood(&rows(&means), &rows(&log_variances), &rows(&targets));
         adam.step(&loss, settings.learning_rate * cosine(step, settings.steps), 5.0);
         sum += loss.double_value(&[]);
@@ -141,7 +142,7 @@ pub fn telling(pictures: &Pictures) -> Vec<Vec<usize>> {
 
 /// Mean negative log-likelihood over given pairs, for tests and reports.
 pub fn likelihood(net: &MixtureNet, inputs: &[LatentGaussian], targets: &[[f32; LATENT_DIM]]) -> f64 {
-    let rows = |values: Vec<f32>| Tensor::from_slice(&values).view([-1, LATENT_DIM as i64]);
+    let rows = |values: Vec<f32>| Tensor::from_slice(&values).view([-1, LATENT_DIM as i64]).to_device(net.device());
     tch::no_grad(|| {
         net.negative_log_likelihood(
             &rows(inputs.iter().flat_map(|g| g.mean).collect()),

@@ -123,11 +123,10 @@ impl Pictures {
     /// The states that look the same as `state` in a view, itself among them.
     pub fn alike(&self, view: usize, state: usize) -> Vec<usize> {
         let poses = self.dataset.view_count();
-        let same = |other| match &self.free_equivalence {
-            Some(free) if view >= poses => free.same(view - poses, other, state),
-            _ => self.equivalence.same(view, other, state),
-        };
-        (0..self.scenario.state_count()).filter(|&s| s == state || same(s)).collect()
+        match &self.free_equivalence {
+            Some(free) if view >= poses => free.alike(view - poses, state).collect(),
+            _ => self.equivalence.alike(view, state).collect(),
+        }
     }
 
     /// The state that follows: the next timestamp of the branch; the last one follows itself.

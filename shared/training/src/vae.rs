@@ -42,14 +42,15 @@ pub struct Vae {
 }
 
 impl Vae {
-    /// Fresh weights from the global generator (seed it first); the backbone's from `pretrained`.
+    /// Fresh weights on `device` from the global generator (seed it first); the backbone's from `pretrained`.
     pub fn new(
         config: &TrainingConfig,
         poses: usize,
         states: usize,
         pretrained: Option<&Path>,
+        device: Device,
     ) -> Result<Self, ModelError> {
-        let [mut backbone, head, decoder_store, read_out_store] = [(); 4].map(|()| VarStore::new(Device::Cpu));
+        let [mut backbone, head, decoder_store, read_out_store] = [(); 4].map(|()| VarStore::new(device));
         let encoder =
             Encoder::new(&config.encoder, &(backbone.root() / "backbone"), &(head.root() / "encoder"), pretrained)?;
         let decoder = Decoder::new(&(decoder_store.root() / "decoder"), &config.decoder, poses as i64);
@@ -69,6 +70,11 @@ impl Vae {
     /// Weights that a checkpoint keeps: (encoder head, decoder, backbone).
     pub fn weights(&self) -> (Tensors, Tensors, Tensors) {
         (weights::of_store(&self.head), weights::of_store(&self.decoder_store), weights::of_store(&self.backbone))
+    }
+
+    /// Where it computes.
+    pub fn device(&self) -> Device {
+        self.head.device()
     }
 
     fn stores(&self) -> Vec<&VarStore> {
@@ -169,7 +175,7 @@ impl<'a> Inputs<'a> {
         if let Some(features) = &self.features {
             let n = self.pictures.images.len();
             let rows: Vec<i64> = chosen.iter().map(|&(i, copy)| (copy * n + i) as i64).collect();
-            return features.index_select(0, &Tensor::from_slice(&rows)).to_kind(Kind::Float);
+            return features.index_select(0, &indices(&rows, features.device())).to_kind(Kind::Float);
         }
         let inputs: Vec<Tensor> = chosen
             .iter()
@@ -218,7 +224,7 @@ pub fn train(
         first = done;
     }
     let trained = pictures.trained_and_free();
-    let state_targets = state_targets(pictures);
+    let state_targets = state_targets(pictures).to_device(vae.device());
     let copies = config.augmentation.copies + 1;
     let per_epoch = trained.len().div_ceil(settings.batch).max(1);
     let mut clock = SaveClock::default();
@@ -348,12 +354,13 @@ fn reconstruction(
     let settings = &config.vae;
     let views: Vec<i64> = decoded.iter().map(|&i| pictures.labels[i].view as i64).collect();
     let views = Tensor::from_slice(&views);
-    let targets = pictures.targets(decoded);
-    let residual = &targets - pictures.pose_means.index_select(0, &views);
+    let device = latents.device();
+    let targets = pictures.targets(decoded).to_device(device);
+    let residual = &targets - pictures.pose_means.index_select(0, &views).to_device(device);
     let changed = residual.abs().amax([1_i64].as_slice(), true).gt(12.0 / 255.0).to_kind(Kind::Float);
     let weight = changed * (settings.foreground_weight - 1.0) + 1.0;
     let wanted = if settings.residual { residual } else { targets };
-    let error = (vae.decoder.forward(latents, &views) - wanted).square();
+    let error = (vae.decoder.forward(latents, &views.to_device(device)) - wanted).square();
     (error * weight).mean(Kind::Float) * 10.0
 }
 
@@ -376,20 +383,24 @@ fn losses(
     let reconstruction = (!known.is_empty()).then(|| {
         let decoded: Vec<usize> = known.iter().map(|&row| only[row]).collect();
         let rows: Vec<i64> = known.iter().map(|&row| row as i64).collect();
-        reconstruction(config, pictures, vae, &latent.index_select(0, &Tensor::from_slice(&rows)), &decoded)
+        reconstruction(config, pictures, vae, &latent.index_select(0, &indices(&rows, latent.device())), &decoded)
     });
     let kl = kl_divergence(&mean, &log_variance);
     let state = (settings.state_weight > 0.0).then(|| {
         let rows: Vec<i64> = only.iter().map(|&i| i as i64).collect();
-        let wanted = state_targets.index_select(0, &Tensor::from_slice(&rows));
+        let wanted = state_targets.index_select(0, &indices(&rows, state_targets.device()));
         let log = vae.read_out.forward(&latent).log_softmax(-1, Kind::Float);
         -(wanted * log).sum_dim_intlist([-1_i64].as_slice(), false, Kind::Float).mean(Kind::Float)
     });
     let contrastive = (settings.contrastive_weight > 0.0).then(|| {
         let states: Vec<i64> = only.iter().map(|&i| pictures.labels[i].state as i64).collect();
-        contrastive(&mean, &Tensor::from_slice(&states), settings.contrastive_temperature)
+        contrastive(&mean, &indices(&states, mean.device()), settings.contrastive_temperature)
     });
     Losses { reconstruction, kl, state, contrastive }
+}
+
+fn indices(rows: &[i64], device: Device) -> Tensor {
+    Tensor::from_slice(rows).to_device(device)
 }
 
 /// Mean over the batch of KL(N(mean, exp(log variance)) || N(0, 1)), summed over dimensions. Inputs `[N, 8]`.
@@ -489,7 +500,7 @@ pub fn decoded_quality(
 }
 
 /// Decoded pictures `[N, 3, 128, 128]` in 0..=1 of latents, each from the pose of one of the data set's pictures; and the
-/// mean pictures of these poses.
+/// mean pictures of these poses. Both on the processor, wherever the decoder computes.
 pub fn decoded(
     pictures: &Pictures,
     decoder: &Decoder,
@@ -501,7 +512,8 @@ pub fn decoded(
         let views: Vec<i64> = pairs.iter().map(|pair| pictures.labels[pair.0].view as i64).collect();
         let views = Tensor::from_slice(&views);
         let means = pictures.pose_means.index_select(0, &views);
-        let out = decoder.forward(&Tensor::from_slice(&latents).view([-1, LATENT_DIM as i64]), &views);
+        let latents = Tensor::from_slice(&latents).view([-1, LATENT_DIM as i64]).to_device(decoder.device());
+        let out = decoder.forward(&latents, &views.to_device(decoder.device())).to_device(Device::Cpu);
         let out = if residual { out + &means } else { out };
         (out.clamp(0.0, 1.0), means)
     })

@@ -111,7 +111,7 @@ impl Place {
         let dir = self.out(&format!("{name}-run"));
         std::fs::create_dir_all(&dir).unwrap();
         let run = Run { dir, on_progress: &on_progress, stop: &stop };
-        pipeline::train(&self.config, &self.out("set"), None, &self.out(name), Stage::All, &run)
+        pipeline::train(&self.config, &self.out("set"), None, &self.out(name), Stage::All, tch::Device::Cpu, &run)
     }
 }
 

@@ -98,7 +98,7 @@ fn an_imported_set_trains_the_field() {
     let (stop, on_progress) = (AtomicBool::new(false), |_: &Progress| {});
     let train = |stage: Stage| {
         let run = Run { dir: folder.path().to_owned(), on_progress: &on_progress, stop: &stop };
-        pipeline::train(&config, &path("set"), None, &path("out"), stage, &run)
+        pipeline::train(&config, &path("set"), None, &path("out"), stage, tch::Device::Cpu, &run)
     };
     for stage in [Stage::Vae, Stage::Mdn] {
         let error = train(stage).unwrap_err();

@@ -4,6 +4,7 @@
 mod raw;
 mod valid;
 
+use carff::soak::{Kind, SoakConfig};
 use carff_checkpoint::Manifest;
 use carff_config::{CheckpointPlanning, GraphConfig};
 use carff_dataset::{Dataset, Image, ImportOptions, import};
@@ -33,10 +34,11 @@ pub struct Reader {
 }
 
 /// All of them.
-pub const READERS: [Reader; 12] = [
+pub const READERS: [Reader; 13] = [
     Reader { name: "messages", read: messages, examples: |_| (0..7).map(|kind| vec![kind]).collect() },
     Reader { name: "graph", read: graph, examples: |_| shipped("configs/graphs", "toml") },
     Reader { name: "scenario", read: scenario, examples: |_| shipped("configs/scenarios", "toml") },
+    Reader { name: "soak", read: soak, examples: |_| shipped("configs/soak", "toml") },
     Reader { name: "training", read: training, examples: |_| shipped("configs/training", "toml") },
     Reader { name: "dataset", read: dataset, examples: |_| vec![SET.into()] },
     Reader { name: "import", read: plain_set, examples: |_| vec![PLAIN_SET.into()] },
@@ -179,6 +181,14 @@ fn scenario(bytes: &[u8], _: &Path) -> Verdict {
     })?;
     let info = scenario.info();
     assert!(info.state_count() > 0 && info.hazard_branches.iter().all(|b| *b < info.branches.len()), "{info:?}");
+    Ok(())
+}
+
+fn soak(bytes: &[u8], _: &Path) -> Verdict {
+    let soak = SoakConfig::parse(text(bytes)?).map_err(|e| format!("{e:#}"))?;
+    let weight: u64 = Kind::ALL.iter().map(|kind| u64::from(soak.faults.of(*kind))).sum();
+    assert!(weight > 0 && soak.pace.min_pause_ms <= soak.pace.max_pause_ms, "{soak:?}");
+    assert!(soak.contract.p99_drift_percent.is_finite(), "{soak:?}");
     Ok(())
 }
 

@@ -96,6 +96,7 @@ readers!(
     messages "messages",
     graphs "graph",
     scenarios "scenario",
+    soak_files "soak",
     training_files "training",
     data_sets "dataset",
     plain_sets "import",
