@@ -17,7 +17,7 @@ else ifneq ($(CARGO_TARGET_DIR),)
 export LD_LIBRARY_PATH := $(CURDIR)/.libtorch/lib$(if $(LD_LIBRARY_PATH),:$(LD_LIBRARY_PATH))
 endif
 
-.PHONY: help run build deb check-deb test soak fuzz bench-peer lint sanitize fmt libtorch
+.PHONY: help run build deb check-deb link check-link test soak fuzz bench-peer lint sanitize miri sbom fmt libtorch
 
 help: ## List the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -37,6 +37,16 @@ deb: build ## Build a Debian package: programs, checkpoints, configs, systemd un
 check-deb: deb ## Install that package here, drive, look at it as another user, purge it (as root)
 	$(PYTHON) tests/check_deb.py $(TARGET)/carff_*.deb
 
+link: ## Build carff-link, which carries topics to another machine (zenoh: 300 crates more; nothing else needs it)
+	cargo build --release --locked --manifest-path services/link/Cargo.toml --target-dir $(TARGET)/link
+	mkdir -p $(TARGET)/release
+	cp $(TARGET)/link/release/carff-link $(TARGET)/release/
+
+check-link: build link ## Test it; then drive here, look from another network, and cut the link between (as root)
+	cargo fmt --manifest-path services/link/Cargo.toml --check
+	cargo test --release --locked --manifest-path services/link/Cargo.toml --target-dir $(TARGET)/link
+	$(PYTHON) tests/check_link.py $(TARGET)/release
+
 bench-peer: ## Build the program by which `carff bench ipc` measures zenoh as well (300 crates more; nothing else needs it)
 	cargo build --release --locked --manifest-path tests/zenoh-peer/Cargo.toml --target-dir $(TARGET)/zenoh-peer
 	mkdir -p $(TARGET)/release
@@ -50,6 +60,10 @@ sanitize: libtorch ## Run the tests around `unsafe` under the address sanitizer 
 	RUSTFLAGS=-Zsanitizer=address LD_LIBRARY_PATH=$(CURDIR)/.libtorch/lib cargo +nightly test --locked --lib --tests \
 		--target x86_64-unknown-linux-gnu --target-dir $(TARGET)/sanitize \
 		-p carff-field -p carff-messages -p carff-models -p carff-transport
+
+miri: ## Run the kernels of the field (portable path) and the messages' tests under Miri (nightly with miri and rust-src)
+	cargo +nightly miri test --locked --lib --target-dir $(TARGET)/miri -p carff-field -- dispatch::
+	cargo +nightly miri test --locked --lib --target-dir $(TARGET)/miri -p carff-messages
 
 # Instrumentation as libFuzzer wants it.
 FUZZ_FLAGS := --cfg fuzzing -Ccodegen-units=1 -Cpasses=sancov-module -Cllvm-args=-sanitizer-coverage-level=4 \
@@ -73,6 +87,9 @@ fuzz: libtorch ## Feed each of READERS (default: all) with RUNS inputs (default 
 
 soak: build ## Soak the shipped graph for MINUTES (default 10) with SEED (default 1) under every kind of fault
 	$(TARGET)/release/carff soak configs/soak/all.toml --minutes $(or $(MINUTES),10) --seed $(or $(SEED),1) --json reports/soak.json
+
+sbom: ## Write what the programs are built of, as CycloneDX JSON (needs cargo-cyclonedx)
+	$(PYTHON) launch/build_sbom.py $(TARGET)/carff.cdx.json
 
 fmt: ## Format
 	cargo fmt --all

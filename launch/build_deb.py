@@ -6,8 +6,8 @@ Usage: python3 launch/build_deb.py [TARGET] [OUT]     (default: target, target/c
 Programs go to /usr/lib/carff/bin with libtorch beside them, what they read to
 /usr/share/carff/configs, the graph of the service to /etc/carff/vehicle.toml, units to
 /lib/systemd/system, manual pages and completions to where they belong. Needs
-dpkg-deb and nothing else. The package is the same for the same files: times are those of
-the last commit.
+dpkg-deb; with cargo-cyclonedx too, a bill of materials is among the documents. The
+package is the same for the same files: times are those of the last commit.
 """
 
 import gzip
@@ -18,6 +18,8 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
+
+import build_sbom
 
 ROOT = Path(__file__).resolve().parent.parent
 PROGRAMS = ["carff", "carff-camera", "carff-encoder", "carff-forecaster", "carff-prober", "carff-renderer",
@@ -80,6 +82,11 @@ def fill(tree: Path, target: Path) -> None:
     for page in ["README.md", "THIRD_PARTY.md", "CHANGELOG.md", "LICENSE-MIT", "LICENSE-APACHE"]:
         put(ROOT / page, doc / page)
     put_tree(Path("docs"), doc / "docs")
+    if build_sbom.is_there():
+        (doc / "carff.cdx.json").write_text(build_sbom.build(), encoding="utf-8")
+        (doc / "carff.cdx.json").chmod(0o644)
+    else:
+        print("no bill of materials is in it: cargo-cyclonedx is not installed (see `make sbom`)")
     debian = ROOT / "launch/debian"
     put(debian / "vehicle.toml", tree / "etc/carff/vehicle.toml")
     for unit in ["carff.service", "carff.target"]:

@@ -1,16 +1,16 @@
 //! `carff export`: a recording as pictures, tables, a film, or a trace.
 
+use crate::film::FilmWriter;
 use crate::probe::image::view_name;
 use crate::spans::{Span, trace_events};
-use anyhow::{Context, bail, ensure};
+use anyhow::{Context, ensure};
 use carff_observe::TopicId;
 use carff_recording::{OwnedMessage, Reader};
 use clap::Args;
 use serde_json::Value;
 use std::collections::{BTreeMap, BTreeSet};
-use std::io::Write;
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, ExitCode, Stdio};
+use std::process::ExitCode;
 
 /// Rate of a film whose recording holds one frame alone, frames a second.
 const LONE_FRAME_HZ: f64 = 10.0;
@@ -25,7 +25,7 @@ pub struct Outputs {
     /// A table for each topic as a CSV file in this folder, with a column for each field.
     #[arg(long, value_name = "DIR")]
     pub csv: Option<PathBuf>,
-    /// The camera's frames as a film, at the recorded rate; needs the program ffmpeg.
+    /// The camera's frames as a film (H.264), each shown from the time of its capture to that of the next one.
     #[arg(long, value_name = "FILE")]
     pub mp4: Option<PathBuf>,
     /// When each stage worked on which frame, in the trace event format that ui.perfetto.dev opens.
@@ -168,44 +168,18 @@ fn frame_rate_hz(recording: &Path) -> anyhow::Result<f64> {
 fn film(recording: &Path, file: &Path) -> anyhow::Result<u64> {
     let rate_hz = frame_rate_hz(recording)?;
     let mut reader = Reader::open(recording)?;
-    let mut encoder: Option<(Child, [u32; 2])> = None;
-    let mut count = 0;
-    let result = loop {
-        let Some(entry) = reader.next()? else { break Ok(()) };
+    let mut film = None;
+    while let Some(entry) = reader.next()? {
         let OwnedMessage::Frame(m, rgb) = &entry.message else { continue };
-        let size = [m.width_px, m.height_px];
-        let (child, first) = match &mut encoder {
-            Some(encoder) => encoder,
-            None => encoder.insert((ffmpeg(file, size, rate_hz)?, size)),
+        let size_px = [m.width_px, m.height_px];
+        let film = match &mut film {
+            Some(film) => film,
+            None => film.insert(FilmWriter::create(file, size_px, rate_hz)?),
         };
-        if *first != size {
-            break Err(anyhow::anyhow!("frame {} has another size than the first", m.header.frame_id));
-        }
-        // What ffmpeg has to say is on standard error.
-        match child.stdin.as_mut().map(|input| input.write_all(rgb)) {
-            Some(Ok(())) => count += 1,
-            _ => break Ok(()),
-        }
-    };
-    let Some((mut child, _)) = encoder else { bail!("{} holds no camera frame", recording.display()) };
-    drop(child.stdin.take());
-    let status = child.wait().context("cannot wait for ffmpeg")?;
-    result?;
-    ensure!(status.success(), "ffmpeg could not write {} ({status})", file.display());
-    Ok(count)
-}
-
-fn ffmpeg(file: &Path, [width_px, height_px]: [u32; 2], rate_hz: f64) -> anyhow::Result<Child> {
-    Command::new("ffmpeg")
-        .args(["-y", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24"])
-        .args(["-s", &format!("{width_px}x{height_px}"), "-r", &format!("{rate_hz:.6}"), "-i", "-"])
-        // Players want even sizes and this colour space.
-        .args(["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-c:v", "libx264", "-crf", "16", "-pix_fmt", "yuv420p"])
-        .arg(file)
-        .stdin(Stdio::piped())
-        .stdout(Stdio::null())
-        .spawn()
-        .context("cannot start ffmpeg: install it, or export PNG files with --png")
+        ensure!(film.size_px() == size_px, "frame {} has another size than the first", m.header.frame_id);
+        film.add(rgb, m.header.capture_time_ns)?;
+    }
+    film.with_context(|| format!("{} holds no camera frame", recording.display()))?.finish()
 }
 
 fn spans(recording: &Path, file: &Path) -> anyhow::Result<usize> {
@@ -240,7 +214,8 @@ mod tests {
         writer.finish().unwrap();
     }
 
-    /// Pictures have their bytes, tables a row for each message and a column for each field, traces a span each.
+    /// Pictures have their bytes, tables a row for each message and a column for each field, films every frame, traces a
+    /// span each; without frames there is no film.
     #[test]
     fn recordings_become_files() {
         let folder = tempfile::tempdir().unwrap();
@@ -258,8 +233,14 @@ mod tests {
         assert_eq!(text.lines().nth(3).unwrap().split(',').nth(column), Some("2"));
         assert!(head.contains(&"gaussian.mean.7") && head.contains(&"header.frame_id"), "{head:?}");
 
+        assert_eq!(film(&path, &folder.path().join("film.mp4")).unwrap(), 3);
         assert_eq!(spans(&path, &folder.path().join("trace.json")).unwrap(), 6);
         assert!((frame_rate_hz(&path).unwrap() - 20.0).abs() < 1e-9);
+
+        let empty = folder.path().join("empty.mcap");
+        Writer::create(&empty, &About::default(), &[]).unwrap().finish().unwrap();
+        let error = film(&empty, &folder.path().join("none.mp4")).unwrap_err().to_string();
+        assert!(error.contains("no camera frame") && !folder.path().join("none.mp4").exists(), "{error}");
     }
 
     /// Columns of lists are in the order of their numbers.

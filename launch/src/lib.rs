@@ -7,6 +7,7 @@ pub mod dataset;
 pub mod doctor;
 pub mod eval;
 pub mod export;
+mod film;
 mod filmstrip;
 pub mod health;
 pub mod launch;

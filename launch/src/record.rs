@@ -84,7 +84,7 @@ pub fn run(args: &RecordArgs) -> anyhow::Result<ExitCode> {
         },
     )?;
     terminal.status(String::new());
-    let counts = queue.finish()?;
+    let counts = queue.finish().context("the recording ends early; what is in the file can be read")?;
     println!("{}: {} messages of run {name}, {} dropped", args.out.display(), counts.written, counts.dropped);
     session.say_end(going);
     Ok(ExitCode::SUCCESS)

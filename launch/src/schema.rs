@@ -1,8 +1,7 @@
 //! `carff schema`: the JSON Schema of each kind of file, made from the structures that read it, so that editors
 //! complete and check. What lies in `configs/schemas` is this.
 
-use crate::soak::SoakConfig;
-use carff_config::GraphConfig;
+use carff_config::{GraphConfig, SoakConfig};
 use carff_scenes::config::ScenarioConfig;
 use carff_training::config::TrainingConfig;
 use schemars::generate::SchemaSettings;

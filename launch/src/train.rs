@@ -2,6 +2,7 @@
 
 use crate::dataset::render;
 use anyhow::{Context, bail};
+use carff_checkpoint::Manifest;
 use carff_scenes::{Extras, Scenario};
 use carff_training::{
     TrainingError,
@@ -44,6 +45,9 @@ pub struct TrainArgs {
     /// Folder for saved states, metrics and curves.
     #[arg(long)]
     run_dir: Option<PathBuf>,
+    /// Replace a finished checkpoint, and forget saved states of another configuration.
+    #[arg(long)]
+    force: bool,
 }
 
 /// The models, in the order of training.
@@ -68,6 +72,11 @@ pub fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
     let name = out.file_name().map_or_else(|| "training".into(), |n| n.to_string_lossy().into_owned());
     let dir = args.run_dir.clone().unwrap_or_else(|| Path::new("runs").join(name));
     std::fs::create_dir_all(&dir).with_context(|| format!("cannot make {}", dir.display()))?;
+    if args.force {
+        forget_another_configuration(&dir, &config, &dataset)?;
+    } else {
+        refuse_finished(&dir, &out)?;
+    }
     refuse_another_configuration(&dir, &config, &dataset)?;
 
     let device = carff_models::device::parse(&args.device)?;
@@ -144,16 +153,50 @@ fn free_poses(config: &TrainingConfig, given: Option<&Path>) -> anyhow::Result<O
     Ok(Some(dir))
 }
 
+const CONFIGURATION: &str = "configuration.json";
+
+/// A training that has just begun must not write over what another one has finished. One that goes on may: what it
+/// writes over is its own.
+fn refuse_finished(dir: &Path, out: &Path) -> anyhow::Result<()> {
+    let begins = !dir.join(CONFIGURATION).is_file();
+    if begins && Manifest::load(out).is_ok_and(|m| m.field.is_some()) {
+        bail!(
+            "{} holds a finished checkpoint: name another folder with --out, or replace it with --force",
+            out.display()
+        );
+    }
+    Ok(())
+}
+
+/// Removes the states of another configuration or data set.
+fn forget_another_configuration(dir: &Path, config: &TrainingConfig, dataset: &Path) -> anyhow::Result<()> {
+    if !dir.join(CONFIGURATION).is_file() || refuse_another_configuration(dir, config, dataset).is_ok() {
+        return Ok(());
+    }
+    let states = ["vae", "nerf", "mdn"].map(|stage| format!("{stage}.state.safetensors"));
+    let others = ["posteriors.safetensors", "metrics.jsonl", CONFIGURATION].map(str::to_owned);
+    for name in states.into_iter().chain(others) {
+        let path = dir.join(name);
+        match std::fs::remove_file(&path) {
+            Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
+                return Err(error).with_context(|| format!("cannot remove {}", path.display()));
+            }
+            _ => {}
+        }
+    }
+    Ok(())
+}
+
 /// A run folder belongs to one configuration and one data set: going on with another would mix them.
 pub fn refuse_another_configuration(dir: &Path, config: &TrainingConfig, dataset: &Path) -> anyhow::Result<()> {
-    let path = dir.join("configuration.json");
+    let path = dir.join(CONFIGURATION);
     let mine = what_is_learnt(config, dataset)?;
     match std::fs::read_to_string(&path) {
         // Read and written again: keys that an earlier version did not have yet take their defaults.
         Ok(text) if serde_json::from_str::<Value>(&text).is_ok_and(|there| completed(there) == mine) => Ok(()),
         Ok(_) => bail!(
-            "{} holds states of another training configuration or data set; remove the folder, or name another with \
-             --run-dir",
+            "{} holds states of another training configuration or data set; name another folder with --run-dir, or forget \
+             these with --force",
             dir.display()
         ),
         Err(_) => std::fs::write(&path, serde_json::to_string_pretty(&mine)?)
@@ -263,5 +306,27 @@ mod tests {
         assert!(refused("data/x"));
         std::fs::write(&saved, "garbage").unwrap();
         assert!(refused("data/x"));
+
+        // Forced, it is begun anew; what belongs to it is kept.
+        let state = folder.path().join("vae.state.safetensors");
+        std::fs::write(&state, "state").unwrap();
+        forget_another_configuration(folder.path(), &config, Path::new("data/x")).unwrap();
+        assert!(!state.exists() && !refused("data/x"));
+        std::fs::write(&state, "state").unwrap();
+        forget_another_configuration(folder.path(), &config, Path::new("data/x")).unwrap();
+        assert!(state.exists());
+    }
+
+    /// A finished checkpoint is not written over by a training that begins; one that goes on may, and so may any where
+    /// nothing is finished.
+    #[test]
+    fn a_finished_checkpoint_is_kept() {
+        let folder = tempfile::tempdir().unwrap();
+        let shipped = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/checkpoints/approaching-intersection");
+        let error = refuse_finished(folder.path(), &shipped).unwrap_err().to_string();
+        assert!(error.contains("--out") && error.contains("--force"), "{error}");
+        refuse_finished(folder.path(), &folder.path().join("new")).unwrap();
+        std::fs::write(folder.path().join(CONFIGURATION), "{}").unwrap();
+        refuse_finished(folder.path(), &shipped).unwrap();
     }
 }

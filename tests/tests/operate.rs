@@ -3,12 +3,18 @@
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
 use carff_observe::{AnyReceiver, TopicId, attach};
-use carff_tests::{Finished, Process, TestGraph, eventually, program, scenario_set, shipped_checkpoint};
+use carff_tests::{Finished, Process, TestGraph, WATCHDOG, eventually, program, scenario_set, shipped_checkpoint};
 use carff_transport::OpenError;
+use foxglove::Decode as _;
+use foxglove::messages::RawImage;
 use rustix::process::Signal;
-use serde_json::Value;
+use serde_json::{Value, json};
+use std::collections::BTreeMap;
+use std::net::{Ipv4Addr, TcpStream};
 use std::path::Path;
 use std::process::Command;
+use tungstenite::client::IntoClientRequest as _;
+use tungstenite::{Message, WebSocket};
 
 /// Settings under which the pace of the machine changes no decision, and drives go on until somebody stops them.
 const PATIENT: &str = "[camera]\nrepeat = true\n[controller]\nrate_hz = 4.0\ndeadline_ms = 60000\n[launcher]\n\
@@ -67,6 +73,11 @@ fn probes_show_what_runs() {
     assert!(bandwidth.contains("size, bytes"), "{bandwidth}");
     let delay = probe(&graph, &["delay", "action"], &["--seconds", "3"]);
     assert!(delay.contains("age on arrival, ms"), "{delay}");
+    let shown = probe(&graph, &["image", "camera/frame"], &["--as", "kitty", "--count", "1"]);
+    assert!(
+        shown.starts_with("\x1b_Ga=T,f=100,") && shown.trim_end().ends_with(|c: char| c.is_ascii_digit()),
+        "{shown}"
+    );
     probe(&graph, &["image", "camera/frame"], &["-o", "pictures", "--count", "2"]);
     let pictures: Vec<_> = std::fs::read_dir(graph.path("pictures")).unwrap().map(|e| e.unwrap().path()).collect();
     assert_eq!(pictures.len(), 2);
@@ -102,7 +113,6 @@ fn probes_come_and_go() {
         assert!(!probe.end().status.success());
     }
     probe(&graph, &["echo", "frame"], &["--count", "1"]);
-    let decisions = |text: &str| text.lines().filter(|l| l.contains("hazard ")).count();
     let before = decisions(&launcher.text());
     launcher.wait_for("further decisions", |text| decisions(text) > before);
 
@@ -128,8 +138,19 @@ fn replay(graph: &TestGraph, words: &[&str]) -> Finished {
     carff(graph, &[&["replay", "run.mcap"], words].concat(), &[]).end()
 }
 
-fn frames_in(path: &Path) -> usize {
+fn export(graph: &TestGraph, words: &[&str]) -> Finished {
+    let mut command = Command::new(program("carff"));
+    command.current_dir(graph.file().parent().unwrap()).arg("export").args(words);
+    Process::start(&mut command).end()
+}
+
+/// Rows of a table; 0 when there is none.
+fn rows(path: &Path) -> usize {
     std::fs::read_to_string(path).map_or(0, |text| text.lines().count().saturating_sub(1))
+}
+
+fn decisions(text: &str) -> usize {
+    text.lines().filter(|line| line.contains("hazard ")).count()
 }
 
 /// A recording goes through the same graph again with the same beliefs and decisions, bit for bit; through a graph that
@@ -159,11 +180,10 @@ fn a_recording_is_decided_again_as_it_was() {
     assert!(only.text.contains("hazard ") || only.text.contains("replaying"), "{}", only.text);
     graph.assert_nothing_left();
 
-    let export = ["export", "run.mcap", "--png", "png", "--csv", "csv", "--trace", "t.json"];
-    let mut command = Command::new(program("carff"));
-    command.current_dir(graph.file().parent().unwrap()).args(export);
-    Process::start(&mut command).end().assert_success();
-    let frames = frames_in(&graph.path("csv/camera-frame.csv"));
+    export(&graph, &["run.mcap", "--png", "png", "--csv", "csv", "--mp4", "film.mp4", "--trace", "t.json"])
+        .assert_success();
+    assert!(std::fs::read(graph.path("film.mp4")).unwrap()[4..].starts_with(b"ftyp"));
+    let frames = rows(&graph.path("csv/camera-frame.csv"));
     assert!(frames > 0);
     let pictures = std::fs::read_dir(graph.path("png")).unwrap().flatten();
     assert_eq!(pictures.filter(|e| e.file_name().to_string_lossy().starts_with("frame-")).count(), frames);
@@ -174,17 +194,216 @@ fn a_recording_is_decided_again_as_it_was() {
 fn a_killed_recorder_leaves_its_recording() {
     let (graph, launcher) = running();
     let recorder = carff(&graph, &["record"], &["-o", "run.mcap"]);
-    let export = || {
-        let mut command = Command::new(program("carff"));
-        command.current_dir(graph.file().parent().unwrap()).args(["export", "run.mcap", "--csv", "csv"]);
-        let finished = Process::start(&mut command).end();
-        finished.status.success() && frames_in(&graph.path("csv/controller-action.csv")) > 0
+    let readable = || {
+        let finished = export(&graph, &["run.mcap", "--csv", "csv"]);
+        finished.status.success() && rows(&graph.path("csv/controller-action.csv")) > 0
     };
     // Readable while it is written.
-    assert!(eventually(export), "{}", recorder.text());
+    assert!(eventually(readable), "{}", recorder.text());
     recorder.signal(Signal::KILL);
     recorder.end();
-    assert!(export());
+    assert!(readable());
     carff(&graph, &["record"], &["-o", "run.mcap"]).end().assert_one_error(&["run.mcap", "exists"]);
+    stop(&graph, launcher);
+}
+
+/// Fails if a stage was started again, met an error, or dropped an input as invalid.
+#[track_caller]
+fn assert_unharmed(graph: &TestGraph) {
+    let status = carff(graph, &["metrics", "--once"], &[]).end();
+    status.assert_success();
+    let status: Value = serde_json::from_str(&status.text).unwrap();
+    for (stage, vitals) in status["stages"].as_object().unwrap() {
+        for count in ["restarts", "errors", "invalid"] {
+            assert_eq!(vitals[count], 0, "{count} of {stage}: {status:#}");
+        }
+    }
+}
+
+/// On a disk that is full the recorder says so in one sentence and ends; what it had written can be read, and the graph
+/// goes on unharmed.
+#[test]
+fn a_full_disk_ends_the_recording_alone() {
+    let (graph, mut launcher) = running();
+    // The disk is in memory, of a megabyte, and seen by the recorder alone. Back to this user within: the run's folder is
+    // named after them.
+    let user = rustix::process::getuid();
+    let (enter, back) = match user.is_root() {
+        true => (vec!["--mount"], String::new()),
+        false => {
+            (vec!["--user", "--map-root-user", "--mount"], format!("unshare --user --map-user={} ", user.as_raw()))
+        }
+    };
+    let on_small_disk = |what: &str| {
+        let mut command = Command::new("unshare");
+        command.current_dir(graph.file().parent().unwrap()).args(&enter).args(["sh", "-c"]);
+        command.arg(format!("mount -t tmpfs -o size=1m tmpfs disk && {what}"));
+        command.arg("sh").arg(program("carff")).args(["record", "--run", graph.run().name(), "-o", "disk/run.mcap"]);
+        Process::start(&mut command).end()
+    };
+    std::fs::create_dir(graph.path("disk")).unwrap();
+    if !on_small_disk(&format!("{back}true")).status.success() {
+        println!("skipped: this system lets its users mount nothing");
+        stop(&graph, launcher);
+        return;
+    }
+    let recorder = on_small_disk(&format!("{back}\"$@\"; code=$?; cp disk/run.mcap kept.mcap; exit $code"));
+    recorder.assert_one_error(&["disk/run.mcap", "No space left", "can be read"]);
+
+    let before = decisions(&launcher.text());
+    launcher.wait_for("further decisions", |text| decisions(text) > before);
+    assert_unharmed(&graph);
+    assert!(std::fs::metadata(graph.path("kept.mcap")).unwrap().len() > 500_000);
+    export(&graph, &["kept.mcap", "--csv", "csv"]).assert_success();
+    let kept =
+        ["camera-frame", "prober-belief", "controller-action"].map(|t| rows(&graph.path(&format!("csv/{t}.csv"))));
+    assert!(kept.iter().all(|&rows| rows > 0), "{kept:?}");
+    stop(&graph, launcher);
+}
+
+/// On a disk that takes eight seconds for each of its first writes the recorder drops whole messages, says so, counts
+/// them, and goes on; what it has written is whole, and the graph decides meanwhile, unharmed.
+#[test]
+fn a_slow_disk_costs_messages_alone() {
+    let (graph, mut launcher) = running();
+    let folder = graph.file().parent().unwrap().canonicalize().unwrap();
+    let path = folder.join("run.mcap");
+    // strace holds up the system call itself, and the recorder is this test's own child under it.
+    let slow = |program: &Path| {
+        let mut command = Command::new("strace");
+        command.current_dir(&folder).args(["-D", "-f", "-qq", "--seccomp-bpf", "-o", "/dev/null", "-P"]).arg(&path);
+        command.args(["-e", "trace=write", "-e", "inject=write:delay_exit=8000000:when=1..2"]).arg(program);
+        command
+    };
+    if !slow(Path::new("true")).status().is_ok_and(|status| status.success()) {
+        println!("skipped: there is no strace that may slow a program down");
+        stop(&graph, launcher);
+        return;
+    }
+    let mut record = slow(&program("carff"));
+    record.args(["record", "--run", graph.run().name(), "--queue-mb", "1", "-o"]).arg(&path);
+    let mut recorder = Process::start(&mut record);
+    recorder.wait_for("word of the slow disk", |text| text.contains("the disk is too slow"));
+    let before = decisions(&launcher.text());
+    launcher.wait_for("further decisions", |text| decisions(text) > before);
+    assert_unharmed(&graph);
+
+    recorder.signal(Signal::INT);
+    let finished = recorder.end();
+    finished.assert_success();
+    let counts: Vec<usize> = finished.text.lines().last().unwrap().split(' ').filter_map(|w| w.parse().ok()).collect();
+    let [written, dropped] = counts[..] else { panic!("{}", finished.text) };
+    assert!(written > 0 && dropped > 0, "{}", finished.text);
+    export(&graph, &["run.mcap", "--csv", "csv"]).assert_success();
+    let tables = std::fs::read_dir(graph.path("csv")).unwrap().flatten();
+    assert_eq!(tables.map(|table| rows(&table.path())).sum::<usize>(), written);
+    stop(&graph, launcher);
+}
+
+/// A client of the Foxglove WebSocket protocol, version 1.
+struct Client(WebSocket<TcpStream>);
+
+impl Client {
+    fn connect(port: u16, protocol: Option<&'static str>) -> Result<Self, String> {
+        let stream = TcpStream::connect((Ipv4Addr::LOCALHOST, port)).unwrap();
+        stream.set_read_timeout(Some(WATCHDOG)).unwrap();
+        let mut request = format!("ws://127.0.0.1:{port}").into_client_request().unwrap();
+        if let Some(protocol) = protocol {
+            request.headers_mut().insert("Sec-WebSocket-Protocol", protocol.parse().unwrap());
+        }
+        tungstenite::client(request, stream).map(|(socket, _)| Self(socket)).map_err(|error| error.to_string())
+    }
+
+    fn say(&mut self, what: &Value) {
+        self.0.send(Message::text(what.to_string())).unwrap();
+    }
+
+    /// The next message in words that is of this kind.
+    fn hear(&mut self, op: &str) -> Value {
+        loop {
+            if let Message::Text(text) = self.0.read().unwrap() {
+                let said: Value = serde_json::from_str(&text).unwrap();
+                if said["op"] == op {
+                    return said;
+                }
+            }
+        }
+    }
+
+    /// The next data of a subscription, and its time, nanoseconds since 1970.
+    fn receive(&mut self, subscription: u32) -> (u64, Vec<u8>) {
+        loop {
+            if let Message::Binary(bytes) = self.0.read().unwrap() {
+                let (kind, rest) = bytes.split_first().unwrap();
+                let (id, rest) = rest.split_first_chunk().unwrap();
+                let (time_ns, data) = rest.split_first_chunk().unwrap();
+                if *kind == 1 && u32::from_le_bytes(*id) == subscription {
+                    return (u64::from_le_bytes(*time_ns), data.to_vec());
+                }
+            }
+        }
+    }
+}
+
+/// A client of the Foxglove protocol finds the topics, subscribes and gets messages that it can read, in JSON and in
+/// protobuf; it can publish nothing. The bridge listens to this machine alone, unless it is told otherwise.
+#[test]
+fn a_bridge_serves_clients_that_only_look() {
+    let (graph, launcher) = running();
+    let remote = carff(&graph, &["bridge", "--listen", "0.0.0.0:0"], &[]).end();
+    remote.assert_one_error(&["0.0.0.0", "--remote"]);
+    let mut bridge = carff(&graph, &["bridge", "--listen", "127.0.0.1:0"], &[]);
+    bridge.wait_for("address", |text| text.contains("ws://127.0.0.1:") && text.ends_with('\n'));
+    let port: u16 = bridge.text().trim().rsplit_once(':').unwrap().1.parse().unwrap();
+    // Whoever listens at all addresses listens at this one too.
+    assert!(TcpStream::connect((Ipv4Addr::new(127, 0, 0, 2), port)).is_err());
+
+    assert!(Client::connect(port, None).is_err() && Client::connect(port, Some("chat")).is_err());
+    let mut client = Client::connect(port, Some("foxglove.sdk.v1")).unwrap();
+    let info = client.hear("serverInfo");
+    assert!(info["name"].as_str().unwrap().contains(graph.run().name()), "{info}");
+    assert_eq!(info["capabilities"], json!([]));
+    let mut channels = BTreeMap::new();
+    while !["prober/belief", "camera/image"].iter().all(|topic| channels.contains_key(*topic)) {
+        for channel in client.hear("advertise")["channels"].as_array().unwrap() {
+            channels.insert(channel["topic"].as_str().unwrap().to_owned(), channel.clone());
+        }
+    }
+    let (belief, image) = (&channels["prober/belief"], &channels["camera/image"]);
+    assert_eq!((&belief["encoding"], &belief["schemaName"]), (&json!("json"), &json!("carff.Belief")));
+    let schema: Value = serde_json::from_str(belief["schema"].as_str().unwrap()).unwrap();
+    assert!(schema["properties"]["hazard_probability"].is_object(), "{schema}");
+    assert_eq!((&image["encoding"], &image["schemaName"]), (&json!("protobuf"), &json!("foxglove.RawImage")));
+
+    client.say(&json!({ "op": "subscribe", "subscriptions": [
+        { "id": 7, "channelId": belief["id"] }, { "id": 8, "channelId": image["id"] },
+    ] }));
+    let run_id = format!("{:016x}", attach(Some(graph.run().name()), "test").unwrap().live.run_id);
+    let belief_of = |(_, data): (u64, Vec<u8>)| serde_json::from_slice::<Value>(&data).unwrap();
+    let (first_ns, data) = client.receive(7);
+    let belief = belief_of((first_ns, data));
+    assert_eq!(belief["header"]["run_id"], run_id.as_str());
+    assert!(belief["hazard_probability"].as_f64().is_some_and(|p| (0.0..=1.0).contains(&p)), "{belief}");
+    let picture = RawImage::decode(&client.receive(8).1[..]).unwrap();
+    assert_eq!((picture.encoding.as_str(), picture.step), ("rgb8", picture.width * 3));
+    assert!(picture.height > 0 && picture.data.len() as u32 == picture.step * picture.height);
+
+    // An action of one's own: neither is it taken for a channel, nor does its data go anywhere.
+    client.say(&json!({ "op": "advertise", "channels": [
+        { "id": 1, "topic": "controller/action", "encoding": "json", "schemaName": "carff.Action" },
+    ] }));
+    let refused = client.hear("status");
+    assert!(refused["level"] == 2 && refused["message"].as_str().unwrap().contains("clientPublish"), "{refused}");
+    client.0.send(Message::binary([&[1], &1_u32.to_le_bytes()[..], b"{}"].concat())).unwrap();
+    let refused = client.hear("status");
+    assert!(refused["level"] == 2 && refused["message"].as_str().unwrap().contains("nknown channel"), "{refused}");
+    assert!(client.receive(7).0 > first_ns, "it still looks");
+    let topics: Value = serde_json::from_str(&probe(&graph, &["list"], &["--json", "--seconds", "1"])).unwrap();
+    let actions = topics.as_array().unwrap().iter().find(|t| t["topic"] == "controller/action").unwrap();
+    assert_eq!(actions["publishers"], json!(["controller"]));
+    assert_unharmed(&graph);
+
+    bridge.signal(Signal::INT);
+    bridge.end().assert_success();
     stop(&graph, launcher);
 }

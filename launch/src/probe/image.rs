@@ -1,17 +1,14 @@
 //! `carff probe image`: pictures to files, or into the terminal.
 
 use super::file_in;
+use super::inline::{Inline, columns};
 use super::session::{Session, SessionArgs, colours};
 use anyhow::{Context, bail, ensure};
 use carff_messages::{ViewKind, ViewMeta};
 use carff_observe::{Received, TopicId};
 use clap::Args;
-use std::fmt::Write as _;
 use std::io::Write as _;
 use std::path::PathBuf;
-
-/// Widest picture in a terminal, columns.
-const MAX_COLUMNS: u32 = 80;
 
 /// Show pictures.
 #[derive(Clone, Debug, Args)]
@@ -21,6 +18,9 @@ pub struct ImageArgs {
     /// Folder for PNG files; without it pictures go into the terminal.
     #[arg(short, long)]
     pub out: Option<PathBuf>,
+    /// How pictures are shown in the terminal.
+    #[arg(long = "as", value_name = "WAY", value_enum, default_value_t, conflicts_with = "out")]
+    pub inline: Inline,
     /// Stop after so many pictures.
     #[arg(long)]
     pub count: Option<u64>,
@@ -37,7 +37,12 @@ pub(super) fn run(args: &ImageArgs) -> anyhow::Result<()> {
         TopicId::Frame,
         TopicId::View
     );
-    ensure!(args.out.is_some() || colours(), "this is no terminal with colours: give a folder for PNG files with -o");
+    ensure!(
+        args.out.is_some() || args.inline != Inline::Auto || colours(),
+        "this is no terminal with colours: give a folder for PNG files with -o, or a way to show them with --as"
+    );
+    let inline = if args.out.is_some() { args.inline } else { args.inline.resolved() };
+    let columns = columns();
     let mut session = Session::open(&args.session, "probe-image")?;
     session.listen([args.topic])?;
     let mut shown = 0;
@@ -57,7 +62,7 @@ pub(super) fn run(args: &ImageArgs) -> anyhow::Result<()> {
                     .with_context(|| format!("cannot write {}", path.display()))?;
                 println!("{}", path.display());
             } else {
-                println!("{}{name}", in_blocks(rgb, width_px, height_px));
+                println!("{}{name}", inline.encode(rgb, [width_px, height_px], columns)?);
                 let _ = std::io::stdout().flush();
             }
             shown += 1;
@@ -73,38 +78,4 @@ pub(super) fn run(args: &ImageArgs) -> anyhow::Result<()> {
 pub(crate) fn view_name(meta: &ViewMeta) -> String {
     let kind = ViewKind::try_from(meta.kind).map_or("view", ViewKind::name);
     format!("view-{:06}-step{}-{:02}-{kind}", meta.header.frame_id, meta.header.step, meta.hypothesis)
-}
-
-/// A picture out of half blocks: each character is two pixels, one above the other.
-fn in_blocks(rgb: &[u8], width_px: u32, height_px: u32) -> String {
-    let columns = width_px.clamp(1, MAX_COLUMNS);
-    let rows = (height_px * columns / width_px.max(1)).max(1);
-    let pixel = |column: u32, row: u32| {
-        let (x, y) = (column * width_px / columns, (row * height_px / rows).min(height_px.saturating_sub(1)));
-        let at = ((y * width_px + x) * 3) as usize;
-        rgb.get(at..at + 3).map_or([0; 3], |p| [p[0], p[1], p[2]])
-    };
-    let mut text = String::new();
-    for row in (0..rows).step_by(2) {
-        for column in 0..columns {
-            let ([r, g, b], [br, bg, bb]) = (pixel(column, row), pixel(column, row + 1));
-            let _ = write!(text, "\x1b[38;2;{r};{g};{b}m\x1b[48;2;{br};{bg};{bb}m\u{2580}");
-        }
-        text += "\x1b[0m\n";
-    }
-    text
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    /// A picture of two rows is one line of blocks, the upper pixel before the lower.
-    #[test]
-    fn two_pixels_make_a_block() {
-        let text = in_blocks(&[1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12], 2, 2);
-        assert_eq!(text.lines().count(), 1);
-        assert!(text.starts_with("\x1b[38;2;1;2;3m\x1b[48;2;7;8;9m\u{2580}"), "{text:?}");
-        assert_eq!(in_blocks(&vec![0; 200 * 100 * 3], 200, 100).lines().count(), 20);
-    }
 }

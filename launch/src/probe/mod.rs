@@ -3,6 +3,7 @@
 mod belief;
 mod echo;
 pub(crate) mod image;
+mod inline;
 mod measure;
 pub(crate) mod session;
 mod structure;
@@ -55,9 +56,9 @@ pub enum ProbeCommand {
     /// Age of a topic's messages on arrival, and time from the camera's capture to here, live; on exit percentiles.
     #[command(after_help = "Example:\n  carff probe delay controller/action --seconds 10")]
     Delay(TopicArgs),
-    /// Camera frames or rendered views, to PNG files, or into the terminal.
+    /// Camera frames or rendered views, to PNG files, or into the terminal, as well as it can show them.
     #[command(
-        after_help = "Example: the next five views, as files\n  carff probe image renderer/view -o views --count 5"
+        after_help = "Example: the next five views, as files; and a frame, here\n  carff probe image renderer/view -o views --count 5\n  carff probe image camera/frame --count 1"
     )]
     Image(image::ImageArgs),
     /// The belief over states, live, with the samples behind it.

@@ -1,9 +1,8 @@
 //! The graph under fire: its launcher's process, its folder, and what it holds of the system.
 
-use super::config::SoakConfig;
 use super::patience::Patience;
 use anyhow::{Context, bail, ensure};
-use carff_config::{GraphConfig, LogLevel, RestartPolicy};
+use carff_config::{GraphConfig, LogLevel, RestartPolicy, SoakConfig};
 use carff_messages::Stage;
 use carff_observe::RunRecord;
 use carff_transport::{Run, living_processes, runtime_dir};

@@ -6,7 +6,6 @@
 //!  \<------------- beliefs, actions, heartbeats --------- topics
 //! ```
 
-mod config;
 mod graph;
 mod inject;
 mod patience;
@@ -15,11 +14,11 @@ mod report;
 mod schedule;
 mod watch;
 
-pub use config::{Contract, Kind, Pace, SoakConfig, Weights};
 pub use inject::{InjectArgs, run as inject};
 pub use schedule::{Fault, fault};
 
 use anyhow::{Context, ensure};
+use carff_config::{Kind, SoakConfig};
 use carff_messages::Stage;
 use carff_transport::{Node, Run, SHARED_MEMORY_DIR, Stop, Waiter, monotonic_now_ns};
 use graph::{Graph, Holdings, Victim, resident_bytes};

@@ -1,8 +1,8 @@
 //! What a soak found, as figures.
 
 use super::SoakArgs;
-use super::config::Contract;
 use super::watch::Notes;
+use carff_config::Contract;
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
 

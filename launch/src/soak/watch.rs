@@ -2,8 +2,8 @@
 //!
 //! All that is judged of actions is judged by the times that the controller itself wrote into them.
 
-use super::config::Contract;
 use anyhow::Context;
+use carff_config::Contract;
 use carff_config::{CheckpointPlanning, GraphConfig};
 use carff_messages::{Action, ActionCode, Belief, Health, HealthState, Message, Reason, Stage};
 use carff_planning::{Evidence, Rule, decide};

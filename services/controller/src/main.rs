@@ -5,7 +5,7 @@ use carff_config::CheckpointPlanning;
 use carff_controller::{Controller, Settings};
 use carff_messages::Stage;
 use carff_planning::Rule;
-use carff_stage::StageContext;
+use carff_stage::{StageContext, frame_span};
 use carff_transport::{Woken, monotonic_now_ns, topics};
 
 /// Beliefs taken in before the clock is looked at again: a flood of them holds up no tick.
@@ -33,6 +33,7 @@ fn run(stage: &mut StageContext) -> anyhow::Result<()> {
         for _ in 0..MOST_AT_ONCE {
             let Some(belief) = beliefs.next()? else { break };
             let started_ns = monotonic_now_ns();
+            let _span = frame_span(&belief.header);
             if let Some(action) = controller.on_belief(&belief, started_ns) {
                 actions.send(action)?;
                 stage.worked(&action.header, started_ns);

@@ -2,7 +2,7 @@
 
 use carff_encoder::{encode, load};
 use carff_messages::{Posterior, Stage};
-use carff_stage::StageContext;
+use carff_stage::{StageContext, frame_span};
 use carff_transport::{monotonic_now_ns, topics};
 
 fn main() -> std::process::ExitCode {
@@ -18,6 +18,7 @@ fn run(stage: &mut StageContext) -> anyhow::Result<()> {
         let started_ns = monotonic_now_ns();
         let Some(frame) = frames.newest()? else { continue };
         let meta = frame.meta();
+        let _span = frame_span(&meta.header);
         match encode(&encoder, frame.bytes(), meta.height_px as usize, meta.width_px as usize) {
             Ok(gaussian) => {
                 let stage_latency_ns = stage.worked(&meta.header, started_ns);

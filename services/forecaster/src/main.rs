@@ -3,7 +3,7 @@
 use carff_forecaster::Forecaster;
 use carff_messages::Stage;
 use carff_models::mixture::Sampling;
-use carff_stage::{Overload, StageContext};
+use carff_stage::{Overload, StageContext, frame_span};
 use carff_transport::{monotonic_now_ns, topics};
 
 fn main() -> std::process::ExitCode {
@@ -27,6 +27,7 @@ fn run(stage: &mut StageContext) -> anyhow::Result<()> {
     while stage.wait(&[&posteriors, &beliefs])? {
         let started_ns = monotonic_now_ns();
         if let Some(posterior) = posteriors.newest()? {
+            let _span = frame_span(&posterior.header);
             newest_frame = posterior.header.frame_id;
             let mut forecast = forecaster.from_observation(&posterior);
             forecast.stage_latency_ns = stage.worked(&forecast.header, started_ns);
@@ -35,6 +36,7 @@ fn run(stage: &mut StageContext) -> anyhow::Result<()> {
         while let Some(belief) = beliefs.next()? {
             // A belief on a frame that a newer one has overtaken is not looked ahead from.
             let started_ns = monotonic_now_ns();
+            let _span = frame_span(&belief.header);
             if overload.observe(&belief) {
                 let quality = overload.quality();
                 forecaster.set_quality(quality.samples as usize, quality.horizon);

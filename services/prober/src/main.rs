@@ -2,7 +2,7 @@
 
 use carff_messages::Stage;
 use carff_prober::{believe, load};
-use carff_stage::StageContext;
+use carff_stage::{StageContext, frame_span};
 use carff_transport::{monotonic_now_ns, topics};
 
 fn main() -> std::process::ExitCode {
@@ -17,6 +17,7 @@ fn run(stage: &mut StageContext) -> anyhow::Result<()> {
     while stage.wait(&[&forecasts])? {
         let started_ns = monotonic_now_ns();
         let Some(forecast) = forecasts.newest()? else { continue };
+        let _span = frame_span(&forecast.header);
         let mut belief = believe(&mut probe, &forecast);
         belief.stage_latency_ns = stage.worked(&belief.header, started_ns);
         beliefs.send(belief)?;

@@ -4,7 +4,7 @@ use anyhow::Context;
 use carff_field::HypothesisBuffer;
 use carff_messages::Stage;
 use carff_renderer::{camera, hypotheses, load, meta, render, write};
-use carff_stage::{Overload, StageContext};
+use carff_stage::{Overload, StageContext, frame_span};
 use carff_transport::{Woken, monotonic_now_ns, topics};
 
 /// Smallest side of a view, however little room there is, pixels.
@@ -51,6 +51,7 @@ fn run(stage: &mut StageContext) -> anyhow::Result<()> {
         else {
             continue;
         };
+        let _span = frame_span(&belief.header);
         let hypotheses = hypotheses(&forecast, &belief, settings.hypotheses as usize);
         let divisor = overload.quality().resolution_divisor;
         let [width_px, height_px] =

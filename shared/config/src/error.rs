@@ -3,12 +3,14 @@
 use std::path::{Path, PathBuf};
 use toml::de::{DeTable, DeValue};
 
-/// What is wrong with a graph file.
+/// What is wrong with a graph or soak file.
 #[derive(Debug, thiserror::Error)]
 pub enum ConfigError {
     /// The file cannot be read.
-    #[error("cannot read the graph file {path}: {source}{}", carff_nearest::beside(path))]
+    #[error("cannot read the {what} file {path}: {source}{}", carff_nearest::beside(path))]
     Read {
+        /// What kind of file it was to be.
+        what: &'static str,
         /// Which file.
         path: PathBuf,
         /// What the system said.
@@ -42,7 +44,7 @@ pub enum ConfigError {
     },
 }
 
-/// The text of a graph file, to find lines and keys in.
+/// The text of a file, to find lines and keys in.
 pub(crate) struct Source<'a> {
     pub(crate) path: &'a Path,
     pub(crate) text: &'a str,

@@ -576,7 +576,11 @@ fn ten_f64() -> f64 {
 impl GraphConfig {
     /// Reads and checks a graph file.
     pub fn load(path: &Path) -> Result<Self, ConfigError> {
-        let text = std::fs::read_to_string(path).map_err(|source| ConfigError::Read { path: path.into(), source })?;
+        let text = std::fs::read_to_string(path).map_err(|source| ConfigError::Read {
+            what: "graph",
+            path: path.into(),
+            source,
+        })?;
         Self::parse(&text, path)
     }
 

@@ -1,4 +1,4 @@
-//! The graph file: one typed, documented configuration per stage. Nothing is started here.
+//! The graph file: one typed, documented configuration per stage; and the soak file. Nothing is started here.
 //!
 //! The doc of each field is the user's doc: what it means, its unit, what is allowed, and the default.
 //!
@@ -25,6 +25,7 @@
 mod checkpoint;
 mod error;
 mod graph;
+mod soak;
 
 pub use checkpoint::{CheckpointPlanning, CheckpointPlanningError};
 pub use error::ConfigError;
@@ -34,3 +35,4 @@ pub use graph::{
     RendererConfig, RestartConfig, RestartPolicy, Rule, RunConfig, Sampling, StageRealtime, ThreadsConfig, ViewChoice,
     WhenLost,
 };
+pub use soak::{Contract, Kind, Pace, SoakConfig, Weights};

@@ -180,3 +180,100 @@ pub(crate) fn scatter(
         _ => scatter8(set, levels, gradient, points, block),
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::FieldConfig;
+    use crate::kernels::{LANES, stride};
+    use crate::layout::grid_levels;
+
+    // Small enough for an interpreter (`make miri`), which has no instruction set but the portable one.
+    const SETS: [fn() -> InstructionSet; 2] = [InstructionSet::portable, InstructionSet::detect];
+
+    /// Numbers between -1 and 1, the same for the same seed.
+    fn numbers(count: usize, seed: u32) -> Vec<f32> {
+        let mut state = seed.wrapping_mul(2_654_435_761).wrapping_add(1);
+        let mut next = || {
+            state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            (state >> 8) as f32 / (1 << 23) as f32 - 1.0
+        };
+        (0..count).map(|_| next()).collect()
+    }
+
+    fn near(a: f64, b: f64) -> bool {
+        (a - b).abs() <= 1e-5 * (1.0 + b.abs())
+    }
+
+    fn dot(a: &[f32], b: &[f32]) -> f64 {
+        a.iter().zip(b).map(|(a, b)| f64::from(*a) * f64::from(*b)).sum()
+    }
+
+    /// A layer is its matrix: forward as the sum says, both backward kernels its adjoints, on every path.
+    #[test]
+    fn layers_are_their_sums() {
+        let (inputs, outputs, blocks) = (8, 4, 2);
+        let (x_apart, y_apart) = (stride(inputs), stride(outputs));
+        let (weights, bias) = (numbers(inputs * outputs, 1), numbers(outputs, 2));
+        let (x, dy) = (numbers(blocks * x_apart, 3), numbers(blocks * y_apart, 4));
+        for set in SETS.map(|set| set()) {
+            let mut y = vec![0.0; blocks * y_apart];
+            dense_forward(set, &weights, &bias, &x, x_apart, &mut y, y_apart, false);
+            let (mut dx, mut dw, mut db) = (vec![0.0; x.len()], vec![0.0; weights.len()], vec![0.0; outputs]);
+            dense_backward_input(set, &weights, outputs, &dy, y_apart, &mut dx, x_apart, inputs, None);
+            dense_backward_weights(set, &x, x_apart, &dy, y_apart, &mut dw, &mut db);
+            let at = |block: usize, apart: usize, row: usize, lane: usize| block * apart + row * LANES + lane;
+            let columns = || (0..blocks).flat_map(|b| (0..LANES).map(move |l| (b, l)));
+            for (b, l) in columns() {
+                for o in 0..outputs {
+                    let sum: f64 = (0..inputs)
+                        .map(|i| f64::from(weights[i * outputs + o]) * f64::from(x[at(b, x_apart, i, l)]))
+                        .sum();
+                    let found = f64::from(y[at(b, y_apart, o, l)]);
+                    assert!(near(found, sum + f64::from(bias[o])), "{}: {found} for {sum}", set.name());
+                }
+                for i in 0..inputs {
+                    let sum: f64 = (0..outputs)
+                        .map(|o| f64::from(weights[i * outputs + o]) * f64::from(dy[at(b, y_apart, o, l)]))
+                        .sum();
+                    assert!(near(f64::from(dx[at(b, x_apart, i, l)]), sum), "{}", set.name());
+                }
+            }
+            for o in 0..outputs {
+                let sum: f64 = columns().map(|(b, l)| f64::from(dy[at(b, y_apart, o, l)])).sum();
+                assert!(near(f64::from(db[o]), sum), "{}", set.name());
+                for i in 0..inputs {
+                    let product = |(b, l)| f64::from(x[at(b, x_apart, i, l)]) * f64::from(dy[at(b, y_apart, o, l)]);
+                    let sum: f64 = columns().map(product).sum();
+                    assert!(near(f64::from(dw[i * outputs + o]), sum), "{}", set.name());
+                }
+            }
+        }
+    }
+
+    /// Scattering is the adjoint of encoding, for dense and hashed levels, also at the cube's faces and outside of it.
+    #[test]
+    fn scattering_is_the_adjoint_of_encoding() {
+        let features = 4;
+        let levels = grid_levels(&FieldConfig {
+            levels: 2,
+            features_per_level: features,
+            log2_table_size: 6,
+            base_resolution: 2,
+            max_resolution: 8,
+            ..FieldConfig::default()
+        });
+        assert!(levels[0].dense && !levels[1].dense);
+        let table = numbers(levels.iter().map(|l| l.entries).sum::<usize>() * features, 5);
+        let points = [[0.3, 0.6, 0.9], [0.0, 1.0, 0.5], [1.0, 1.0, 1.0], [-3.0, 0.2, f32::NAN]];
+        let gradient = numbers(levels.len() * features * LANES, 6);
+        for set in SETS.map(|set| set()) {
+            let mut block = vec![0.0; gradient.len()];
+            encode(set, features, &levels, &table, &points, &mut block);
+            let mut back = vec![0.0; table.len()];
+            scatter(set, features, &levels, &mut back, &points, &gradient);
+            assert!(block.iter().any(|v| *v != 0.0));
+            assert!(near(dot(&table, &back), dot(&block, &gradient)), "{}", set.name());
+        }
+    }
+}

@@ -35,6 +35,13 @@ pub fn run_with(stage: Stage, args: StageArgs, run: impl FnOnce(&mut StageContex
     }
 }
 
+/// The span of the work on a frame: what is logged until it is dropped says of which frame and step. It is there at the
+/// level `debug`; above it costs nothing.
+#[must_use = "the span ends when it is dropped"]
+pub fn frame_span(header: &Header) -> tracing::span::EnteredSpan {
+    tracing::debug_span!("frame", frame = header.frame_id, step = header.step).entered()
+}
+
 /// An error and its causes in one sentence; a cause that the sentence has told already is not told again.
 pub fn describe(error: &anyhow::Error) -> String {
     let mut sentence = error.to_string();
@@ -278,13 +285,34 @@ fn init_log(level: LogLevel, format: LogFormat) {
     // It fails only when a log is set up already, which then stays.
     let _ = match format {
         LogFormat::Text => log.try_init(),
-        LogFormat::Json => log.json().flatten_event(true).with_current_span(false).with_span_list(false).try_init(),
+        LogFormat::Json => log.json().flatten_event(true).with_span_list(false).try_init(),
     };
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// At the default level a frame's span is not even made; at `debug` it is, and says which frame and step in what is
+    /// logged within.
+    #[test]
+    fn frames_have_spans_where_they_are_asked_for() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("log");
+        let logged = |level: tracing::Level| {
+            let file = Arc::new(std::fs::File::create(&path).unwrap());
+            let log = tracing_subscriber::fmt().with_max_level(level).with_ansi(false).with_writer(file);
+            tracing::subscriber::with_default(log.finish(), || {
+                let span = frame_span(&Header::of_frame(41, 1, 1).at_step(2));
+                tracing::error!("odd");
+                assert_eq!(span.is_disabled(), level < tracing::Level::DEBUG);
+            });
+            std::fs::read_to_string(&path).unwrap()
+        };
+        assert!(!logged(tracing::Level::INFO).contains("41"));
+        let text = logged(tracing::Level::DEBUG);
+        assert!(text.contains("frame{frame=41 step=2}") && text.contains("odd"), "{text}");
+    }
 
     /// Causes that a message contains are not repeated; others are added.
     #[test]

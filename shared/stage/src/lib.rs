@@ -5,7 +5,7 @@
 //!
 //! ```no_run
 //! use carff_messages::{Gaussian, Posterior, Stage};
-//! use carff_stage::StageContext;
+//! use carff_stage::{StageContext, frame_span};
 //! use carff_transport::{monotonic_now_ns, topics};
 //!
 //! fn main() -> std::process::ExitCode {
@@ -19,6 +19,7 @@
 //!     while stage.wait(&[&frames])? {
 //!         let Some(frame) = frames.newest()? else { continue };
 //!         let started_ns = monotonic_now_ns();
+//!         let _span = frame_span(&frame.meta().header);
 //!         let gaussian = Gaussian::standard(); // computed from frame.meta() and frame.bytes(), read in place
 //!         let header = frame.meta().header;
 //!         let stage_latency_ns = stage.worked(&header, started_ns);
@@ -38,5 +39,5 @@ mod overload;
 mod realtime;
 
 pub use args::StageArgs;
-pub use context::{StageContext, describe, main, run_with};
+pub use context::{StageContext, describe, frame_span, main, run_with};
 pub use overload::{Overload, Quality};

@@ -53,16 +53,14 @@ impl Node {
         let failed =
             |cause: String| OpenError::Node { run: self.run().name().to_owned(), path: self.run().folder(), cause };
         let mut members = Members::new();
-        iceoryx2::node::Node::<Service>::list(self.inner().config(), |node| {
+        for node in crate::run::nodes(self.run(), self.inner().config()).map_err(failed)? {
             if let NodeState::Alive(node) = node
                 && let Some(details) = node.details()
             {
                 let member = Member { name: details.name().to_string(), pid: details.process_id().value() as u32 };
                 members.insert(node.id().value(), member);
             }
-            CallbackProgression::Continue
-        })
-        .map_err(|e| failed(e.to_string()))?;
+        }
         Ok(members)
     }
 

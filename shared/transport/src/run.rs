@@ -13,6 +13,10 @@ const MAX_NAME_BYTES: usize = 24;
 /// How long to wait for another thread or process that is cleaning up too.
 pub(crate) const CLEANUP_PATIENCE: Duration = Duration::from_millis(500);
 
+/// How often the list of nodes is read before it counts as unreadable, and the pause in between.
+const LIST_TRIES: u32 = 10;
+const LIST_PAUSE: Duration = Duration::from_millis(2);
+
 /// One run of a graph: its name, which names its files, and its id, which is in every header.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Run {
@@ -105,15 +109,13 @@ pub fn cleanup_dead(run: &Run) -> Result<u32, CleanupError> {
     let failed = |cause: String| CleanupError::List { run: run.name.clone(), cause };
     let config = run.config().map_err(failed)?;
     let mut cleaned = 0;
-    iceoryx2::node::Node::<Service>::list(&config, |node| {
+    for node in nodes(run, &config).map_err(failed)? {
         if let NodeState::Dead(dead) = node
             && dead.blocking_remove_stale_resources(CLEANUP_PATIENCE).is_ok()
         {
             cleaned += 1;
         }
-        CallbackProgression::Continue
-    })
-    .map_err(|e| failed(e.to_string()))?;
+    }
     Ok(cleaned)
 }
 
@@ -122,17 +124,31 @@ pub fn living_processes(run: &Run) -> Result<Vec<u32>, CleanupError> {
     crate::node::quiet();
     let failed = |cause: String| CleanupError::List { run: run.name.clone(), cause };
     let config = run.config().map_err(failed)?;
-    let mut living = Vec::new();
-    iceoryx2::node::Node::<Service>::list(&config, |node| {
-        if let NodeState::Alive(node) = node
-            && let Some(details) = node.details()
-        {
-            living.push(details.process_id().value() as u32);
+    let living = nodes(run, &config).map_err(failed)?.into_iter().filter_map(|node| match node {
+        NodeState::Alive(node) => node.details().as_ref().map(|d| d.process_id().value() as u32),
+        _ => None,
+    });
+    Ok(living.collect())
+}
+
+/// All nodes of a run, the dead among them; none once its folder is gone. iceoryx2 gives up when a file or the folder
+/// vanishes while it reads the list, which is what happens when processes end: then it is read again.
+pub(crate) fn nodes(run: &Run, config: &Config) -> Result<Vec<NodeState<Service>>, String> {
+    let mut tries = 0;
+    loop {
+        let mut nodes = Vec::new();
+        let listed = iceoryx2::node::Node::<Service>::list(config, |node| {
+            nodes.push(node);
+            CallbackProgression::Continue
+        });
+        tries += 1;
+        match listed {
+            Ok(()) => return Ok(nodes),
+            Err(_) if !run.folder().is_dir() => return Ok(Vec::new()),
+            Err(error) if tries == LIST_TRIES => return Err(error.to_string()),
+            Err(_) => std::thread::sleep(LIST_PAUSE),
         }
-        CallbackProgression::Continue
-    })
-    .map_err(|e| failed(e.to_string()))?;
-    Ok(living)
+    }
 }
 
 /// Removes all files of a run. Only for whoever knows that no process of the run lives any more.

@@ -5,7 +5,9 @@
 mod common;
 
 use carff_messages::Message;
-use carff_transport::{Node, OpenError, Run, SendError, Stop, Waiter, Woken, monotonic_now_ns, topics};
+use carff_transport::{
+    Node, OpenError, Run, SendError, Stop, Waiter, Woken, living_processes, monotonic_now_ns, topics,
+};
 use common::{TestRun, frame, in_seconds, posterior};
 
 /// Newest wins: of three messages the last is received, and the two before it are counted as skipped.
@@ -219,4 +221,23 @@ fn pictures_are_sent_from_elsewhere() {
     let error = output.send_bytes(&[0; 1001], meta).unwrap_err();
     assert!(matches!(error, SendError::Size { max: 1000, .. }), "{error}");
     assert!(input.next().unwrap().is_none());
+}
+
+/// Whoever lists a run's processes while they come and go, and its folder with them, gets a list and never an error.
+#[test]
+fn a_run_that_comes_and_goes_can_be_listed() {
+    let run = TestRun::new();
+    let theirs = run.0.clone();
+    let coming_and_going = std::thread::spawn(move || {
+        for _ in 0..200 {
+            drop(Node::open(&theirs, "guest").unwrap());
+            carff_transport::remove_run_leftovers(&theirs).unwrap();
+        }
+    });
+    while !coming_and_going.is_finished() {
+        let living = living_processes(&run.0).unwrap();
+        assert!(living.iter().all(|pid| *pid == std::process::id()), "{living:?}");
+    }
+    coming_and_going.join().unwrap();
+    assert_eq!(living_processes(&run.0).unwrap(), Vec::<u32>::new());
 }

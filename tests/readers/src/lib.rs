@@ -4,9 +4,8 @@
 mod raw;
 mod valid;
 
-use carff::soak::{Kind, SoakConfig};
 use carff_checkpoint::Manifest;
-use carff_config::{CheckpointPlanning, GraphConfig};
+use carff_config::{CheckpointPlanning, GraphConfig, Kind, SoakConfig};
 use carff_dataset::{Dataset, Image, ImportOptions, import};
 use carff_field::FieldConfig;
 use carff_messages::{
@@ -185,7 +184,10 @@ fn scenario(bytes: &[u8], _: &Path) -> Verdict {
 }
 
 fn soak(bytes: &[u8], _: &Path) -> Verdict {
-    let soak = SoakConfig::parse(text(bytes)?).map_err(|e| format!("{e:#}"))?;
+    let soak = SoakConfig::parse(text(bytes)?, Path::new("soak.toml")).map_err(|e| {
+        assert!(e.to_string().starts_with("soak.toml:"), "{e}");
+        words(e)
+    })?;
     let weight: u64 = Kind::ALL.iter().map(|kind| u64::from(soak.faults.of(*kind))).sum();
     assert!(weight > 0 && soak.pace.min_pause_ms <= soak.pace.max_pause_ms, "{soak:?}");
     assert!(soak.contract.p99_drift_percent.is_finite(), "{soak:?}");

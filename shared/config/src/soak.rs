@@ -1,6 +1,7 @@
 //! The soak file: which faults, how often, and what is asked of the graph in between.
 
-use anyhow::{Context, anyhow, ensure};
+use crate::ConfigError;
+use crate::error::Source;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
@@ -154,48 +155,68 @@ impl Default for Contract {
 
 impl SoakConfig {
     /// Reads and checks a soak file.
-    pub fn load(path: &Path) -> anyhow::Result<Self> {
-        let text = std::fs::read_to_string(path).map_err(|error| {
-            anyhow!("cannot read the soak file {}: {error}{}", path.display(), carff_nearest::beside(path))
+    pub fn load(path: &Path) -> Result<Self, ConfigError> {
+        let text = std::fs::read_to_string(path).map_err(|source| ConfigError::Read {
+            what: "soak",
+            path: path.into(),
+            source,
         })?;
-        Self::parse(&text).with_context(|| format!("wrong soak file {}", path.display()))
+        Self::parse(&text, path)
     }
 
-    /// The same for a text.
-    pub fn parse(text: &str) -> anyhow::Result<Self> {
-        let config: Self = toml::from_str(text).map_err(|error| {
-            let before = error.span().and_then(|span| text.get(..span.start)).unwrap_or_default();
-            let message = carff_nearest::explained(error.message());
-            anyhow!("line {}: {message}", before.matches('\n').count() + 1)
-        })?;
-        let (pace, contract) = (&config.pace, &config.contract);
-        let sum: u64 = Kind::ALL.iter().map(|&kind| u64::from(config.faults.of(kind))).sum();
-        ensure!(sum > 0, "`faults` has no weight above 0: nothing would be tried");
+    /// The same for a text; `path` is what errors name.
+    pub fn parse(text: &str, path: &Path) -> Result<Self, ConfigError> {
+        let source = Source { path, text };
+        let config: Self = toml::from_str(text).map_err(|e| source.syntax(&e))?;
+        config.check(&source)?;
+        Ok(config)
+    }
+
+    fn check(&self, source: &Source) -> Result<(), ConfigError> {
+        let (faults, pace, contract) = (&self.faults, &self.pace, &self.contract);
+        let within = |key: &str, value: u64, min: u64, max: u64| {
+            let fits = (min..=max).contains(&value);
+            if fits { Ok(()) } else { Err(source.range(key, value.to_string(), format!("{min} to {max}"))) }
+        };
         for &kind in Kind::ALL {
-            ensure!(config.faults.of(kind) <= 1000, "`faults.{}` is above 1000", kind.name());
+            within(&format!("faults.{}", kind.name()), faults.of(kind).into(), 0, 1000)?;
         }
-        for (key, value, min, max) in [
-            ("pace.max_pause_ms", pace.max_pause_ms, pace.min_pause_ms, 600_000),
-            ("pace.max_hold_ms", pace.max_hold_ms, 50, 60_000),
-            ("contract.recovery_ms", contract.recovery_ms, 100, 600_000),
-            ("contract.stop_ms", contract.stop_ms, 100, 600_000),
-            ("contract.slack_ms", contract.slack_ms, 1, 60_000),
-        ] {
-            ensure!((min..=max).contains(&value), "`{key}` is {value}; allowed: {min} to {max}");
+        if Kind::ALL.iter().all(|&kind| faults.of(kind) == 0) {
+            return Err(source.range("faults", "without a weight".into(), "at least one weight above 0".into()));
         }
+        within("pace.max_pause_ms", pace.max_pause_ms, pace.min_pause_ms, 600_000)?;
+        within("pace.max_hold_ms", pace.max_hold_ms, 50, 60_000)?;
+        within("contract.recovery_ms", contract.recovery_ms, 100, 600_000)?;
+        within("contract.stop_ms", contract.stop_ms, 100, 600_000)?;
+        within("contract.slack_ms", contract.slack_ms, 1, 60_000)?;
+        within("contract.warm_up_s", contract.warm_up_s, 0, 86_400)?;
+        within("contract.memory_span_s", contract.memory_span_s, 1, 604_800)?;
+        within("contract.p99_frames", contract.p99_frames as u64, 100, 1_000_000)?;
         for (key, value) in [
             ("contract.memory_growth_percent_per_hour", contract.memory_growth_percent_per_hour),
             ("contract.p99_drift_percent", contract.p99_drift_percent),
         ] {
-            ensure!((0.0..=1000.0).contains(&value), "`{key}` is {value}; allowed: 0 to 1000");
+            if !(0.0..=1000.0).contains(&value) {
+                return Err(source.range(key, value.to_string(), "0 to 1000".into()));
+            }
         }
-        for (key, value, min, max) in [
-            ("contract.warm_up_s", contract.warm_up_s, 0, 86_400),
-            ("contract.memory_span_s", contract.memory_span_s, 1, 604_800),
-            ("contract.p99_frames", contract.p99_frames as u64, 100, 1_000_000),
-        ] {
-            ensure!((min..=max).contains(&value), "`{key}` is {value}; allowed: {min} to {max}");
-        }
-        Ok(config)
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Wrong soak files are named by line and key, with what is allowed.
+    #[test]
+    fn wrong_files_are_refused() {
+        let wrong = |text: &str| SoakConfig::parse(text, "s.toml".as_ref()).unwrap_err().to_string();
+        assert!(wrong("graph = \"g\"\n[faults]\n").contains("at least one weight above 0"));
+        assert!(wrong("graph = \"g\"\n[faults]\nkil = 1\n").contains("kil"));
+        let late = "graph = \"g\"\n[faults]\nkill = 1\n[pace]\nmax_hold_ms = 1\n";
+        assert!(wrong(late).starts_with("s.toml:5: `pace.max_hold_ms` is 1"), "{}", wrong(late));
+        let unmeasurable = "graph = \"g\"\n[faults]\nkill = 1\n[contract]\np99_drift_percent = nan\n";
+        assert!(wrong(unmeasurable).contains("0 to 1000"), "{}", wrong(unmeasurable));
     }
 }
