@@ -12,7 +12,10 @@ use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::process::ExitCode;
 use std::sync::Arc;
-use std::time::SystemTime;
+use std::time::{Duration, SystemTime};
+
+/// Longest time that clients get to hear of the end.
+const FAREWELL: Duration = Duration::from_secs(1);
 
 /// Serve a run's topics.
 #[derive(Clone, Debug, Args)]
@@ -70,7 +73,15 @@ pub fn run(args: &BridgeArgs) -> anyhow::Result<ExitCode> {
         },
         || Ok(()),
     )?;
-    server.stop().wait_blocking();
+    // The server waits for its clients, and one that no longer reads would hold it up for ever.
+    let stopping = server.stop();
+    let (stopped, wait) = std::sync::mpsc::sync_channel(1);
+    std::thread::spawn(move || {
+        stopping.wait_blocking();
+        // Nobody waits any longer when the time is over.
+        let _ = stopped.send(());
+    });
+    let _ = wait.recv_timeout(FAREWELL);
     session.say_end(going);
     Ok(ExitCode::SUCCESS)
 }

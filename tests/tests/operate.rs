@@ -228,11 +228,10 @@ fn a_full_disk_ends_the_recording_alone() {
     // The disk is in memory, of a megabyte, and seen by the recorder alone. Back to this user within: the run's folder is
     // named after them.
     let user = rustix::process::getuid();
-    let (enter, back) = match user.is_root() {
-        true => (vec!["--mount"], String::new()),
-        false => {
-            (vec!["--user", "--map-root-user", "--mount"], format!("unshare --user --map-user={} ", user.as_raw()))
-        }
+    let (enter, back) = if user.is_root() {
+        (vec!["--mount"], String::new())
+    } else {
+        (vec!["--user", "--map-root-user", "--mount"], format!("unshare --user --map-user={} ", user.as_raw()))
     };
     let on_small_disk = |what: &str| {
         let mut command = Command::new("unshare");
@@ -403,6 +402,7 @@ fn a_bridge_serves_clients_that_only_look() {
     assert_eq!(actions["publishers"], json!(["controller"]));
     assert_unharmed(&graph);
 
+    // The client is still there, and reads no more: that is not waited for.
     bridge.signal(Signal::INT);
     bridge.end().assert_success();
     stop(&graph, launcher);
