@@ -1,7 +1,6 @@
 //! `carff launch`: starts a graph, watches it, shows its decisions, ends it, and reports.
 
 use crate::health::{Ailment, Limits, StageHealth};
-use crate::lock::RunLock;
 use crate::monitor::{FrameRecord, Monitor};
 use crate::planning::{self, Planning};
 use crate::process::StageProcess;
@@ -14,12 +13,11 @@ use carff_checkpoint::{Manifest, ScenarioIdentity};
 use carff_config::{CameraSource, GraphConfig, RestartPolicy, WhenLost};
 use carff_dataset::Dataset;
 use carff_messages::{ActionCode, Stage};
-use carff_observe::RunRecord;
+use carff_observe::{RunLock, RunRecord};
 use carff_scenes::{Extras, Scenario};
 use carff_stage::StageArgs;
 use carff_transport::{
-    Node, Run, Stop, Waiter, Woken, check_space, living_processes, monotonic_now_ns, remove_run_leftovers, run_id_of,
-    runtime_dir, topics,
+    Node, Run, Stop, Waiter, Woken, check_space, monotonic_now_ns, remove_run_leftovers, run_id_of, runtime_dir, topics,
 };
 use serde_json::Value;
 use std::collections::{BTreeMap, BTreeSet};
@@ -42,8 +40,6 @@ const OWN_PAUSE_NS: u64 = 300_000_000;
 const STANDSTILL_DEADLINES: u64 = 10;
 /// A stage's topic may be quiet for so many frames.
 const QUIET_FRAMES: f64 = 3.0;
-/// How long processes of an earlier, killed launch may take to end.
-const ORPHAN_PATIENCE_NS: u64 = 2_000_000_000;
 /// Exit code after Ctrl-C, as shells have it: 128 and the signal's number.
 pub(crate) const INTERRUPTED: u8 = 130;
 /// Source of the launcher's own lines in the log.
@@ -150,8 +146,8 @@ pub(crate) fn run_graph(
         checkpoint: absolute(&checkpoint)?,
         started_unix_s: SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default().as_secs(),
     };
-    let _lock = RunLock::take(&runtime_dir(), &name, &record)?;
-    sweep(&run)?;
+    let lock = RunLock::take(&runtime_dir(), &name, &record, "--run")?;
+    lock.sweep(&run, "--run")?;
 
     // A feed brings its own pictures.
     if feed.is_none() {
@@ -554,28 +550,6 @@ impl Launcher<'_> {
             self.terminal.log(LAUNCHER, &format!("ERROR {}", carff_stage::describe(&error)));
         }
     }
-}
-
-/// Makes sure that no process of an earlier launch lives, and removes what it left.
-fn sweep(run: &Run) -> anyhow::Result<()> {
-    let patience_ns = monotonic_now_ns() + ORPHAN_PATIENCE_NS;
-    if run.folder().is_dir() {
-        // The stages of a killed launcher end by themselves; it takes them a moment.
-        loop {
-            let living = living_processes(run)?;
-            if living.is_empty() {
-                break;
-            }
-            ensure!(
-                monotonic_now_ns() < patience_ns,
-                "processes {living:?} of an earlier launch of run `{}` still live: stop them, or give this one another \
-                 name with --run",
-                run.name()
-            );
-            std::thread::sleep(Duration::from_millis(20));
-        }
-    }
-    Ok(remove_run_leftovers(run)?)
 }
 
 /// Renders the data set when it is missing and the graph says from which scenario.

@@ -11,7 +11,6 @@ mod film;
 mod filmstrip;
 pub mod health;
 pub mod launch;
-pub mod lock;
 mod log_line;
 pub mod metrics;
 pub mod monitor;

@@ -483,7 +483,7 @@ impl Soak<'_> {
     /// Probes attach; half of them detach, the others are killed, holding a frame.
     fn storm(&mut self, fault: &Fault) -> anyhow::Result<()> {
         let mut probes = Vec::new();
-        // As many as there is room for beside the graph's own subscribers.
+        // As many as there is room for beside the graph's own subscribers, the soak and its recorder.
         for i in 0..fault.count.min(3) {
             let mut probe = self.helper("probe", i, 0)?;
             let mut ready = String::new();

@@ -27,6 +27,11 @@ fn recorder(run: &Run, out: &Path) -> std::io::Result<Command> {
     Ok(command)
 }
 
+fn recordings(folder: &Path) -> anyhow::Result<Vec<PathBuf>> {
+    let entries = std::fs::read_dir(folder)?.flatten().map(|e| e.path());
+    Ok(entries.filter(|p| p.extension().is_some_and(|e| e == "mcap")).collect())
+}
+
 /// Records the graph as long as it runs.
 #[derive(Debug)]
 pub(super) struct FlightRecorder {
@@ -41,8 +46,7 @@ impl FlightRecorder {
 
     /// The files, those of the latest graph alone.
     pub(super) fn files(&self) -> anyhow::Result<Vec<PathBuf>> {
-        let entries = std::fs::read_dir(self.folder.path())?.flatten().map(|e| e.path());
-        Ok(entries.filter(|p| p.extension().is_some_and(|e| e == "mcap")).collect())
+        recordings(self.folder.path())
     }
 
     /// Begins, if it does not record already; what was recorded before goes.
@@ -61,8 +65,7 @@ impl FlightRecorder {
         let child = self.child.insert(child.context("cannot start a recorder")?);
         // It makes its file when it has joined.
         let mut patience = Patience::of_ms(LIMIT_MS);
-        while std::fs::read_dir(self.folder.path())?.flatten().all(|e| e.path().extension().is_none_or(|x| x != "mcap"))
-        {
+        while recordings(self.folder.path())?.is_empty() {
             if let Some(status) = child.try_wait()? {
                 let said = std::fs::read_to_string(self.folder.path().join("recorder.log")).unwrap_or_default();
                 bail!("the recorder ended at its start ({status}): {said}");

@@ -8,7 +8,6 @@
 
 mod address;
 mod clock;
-mod lock;
 mod outputs;
 mod receive;
 mod send;

@@ -2,13 +2,12 @@
 
 use crate::address::AddressArgs;
 use crate::clock::ClockDifference;
-use crate::lock::{RunLock, sweep};
 use crate::outputs::Outputs;
 use crate::wire::{Tag, decode};
 use crate::{note, topics};
 use anyhow::{Context, anyhow};
 use carff_config::GraphConfig;
-use carff_observe::{RunRecord, TopicId};
+use carff_observe::{RunLock, RunRecord, TopicId};
 use carff_transport::{Node, Run, Stop, monotonic_now_ns, remove_run_leftovers, run_id_of, runtime_dir};
 use clap::Args;
 use std::collections::BTreeMap;
@@ -64,8 +63,8 @@ pub fn run(args: &ReceiveArgs, stop: &Stop) -> anyhow::Result<()> {
         checkpoint: absolute(&graph.resolve(args.checkpoint.as_ref().unwrap_or(&graph.run.checkpoint)))?,
         started_unix_s: SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default().as_secs(),
     };
-    let _lock = RunLock::take(&runtime_dir(), name, &record)?;
-    sweep(&run)?;
+    let lock = RunLock::take(&runtime_dir(), name, &record, "--as")?;
+    lock.sweep(&run, "--as")?;
     note(&format!(
         "run `{name}`; a renderer joins it with --graph {} --run {name} --run-id {}",
         record.graph,

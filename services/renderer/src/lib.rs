@@ -3,14 +3,16 @@
 use anyhow::Context;
 use carff_checkpoint::Manifest;
 use carff_config::ViewChoice;
-use carff_field::{Field, HypothesisBuffer, RenderBuffer, RenderOptions};
+use carff_field::{Field, HypothesisBuffer, InstructionSet, RenderBuffer, RenderOptions};
 use carff_geometry::PinholeCamera;
 use carff_messages::{Belief, Forecast, Intrinsics, LATENT_DIM, ViewKind, ViewMeta};
 use std::path::Path;
 
-/// Loads the field.
+/// Loads the field, for pictures alone.
 pub fn load(checkpoint: &Path) -> anyhow::Result<Field> {
-    Ok(carff_checkpoint::load_field(checkpoint, &Manifest::load(checkpoint)?)?)
+    let mut field = carff_checkpoint::load_field(checkpoint, &Manifest::load(checkpoint)?)?;
+    field.set_instruction_set(InstructionSet::detect_for_pictures());
+    Ok(field)
 }
 
 /// One hypothesis to render.

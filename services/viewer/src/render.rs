@@ -3,7 +3,7 @@
 
 use crate::slice::density_slice;
 use carff_dataset::Image;
-use carff_field::{Field, HypothesisBuffer, LATENT_DIM, RenderBuffer, RenderOptions};
+use carff_field::{Field, HypothesisBuffer, InstructionSet, LATENT_DIM, RenderBuffer, RenderOptions};
 use carff_geometry::PinholeCamera;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
@@ -220,7 +220,8 @@ pub struct RenderWorker {
 
 impl RenderWorker {
     /// Starts the thread. It draws with so many threads, and calls `wake` when something is done.
-    pub fn start(field: Field, threads: usize, wake: impl Fn() + Send + 'static) -> std::io::Result<Self> {
+    pub fn start(mut field: Field, threads: usize, wake: impl Fn() + Send + 'static) -> std::io::Result<Self> {
+        field.set_instruction_set(InstructionSet::detect_for_pictures());
         let shared =
             Arc::new(Shared { desk: Mutex::default(), called: Condvar::new(), newest_view: AtomicU64::new(0) });
         let theirs = shared.clone();

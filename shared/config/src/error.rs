@@ -50,6 +50,11 @@ pub(crate) struct Source<'a> {
     pub(crate) text: &'a str,
 }
 
+/// Reads a file; `what` kind of file it is to be, errors say.
+pub(crate) fn read(path: &Path, what: &'static str) -> Result<String, ConfigError> {
+    std::fs::read_to_string(path).map_err(|source| ConfigError::Read { what, path: path.into(), source })
+}
+
 impl Source<'_> {
     pub(crate) fn syntax(&self, error: &toml::de::Error) -> ConfigError {
         let offset = error.span().map_or(0, |span| span.start);

@@ -1,7 +1,7 @@
 //! The graph file's structures, their defaults and their ranges.
 
 use crate::ConfigError;
-use crate::error::Source;
+use crate::error::{Source, read};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::fmt::Display;
@@ -576,12 +576,7 @@ fn ten_f64() -> f64 {
 impl GraphConfig {
     /// Reads and checks a graph file.
     pub fn load(path: &Path) -> Result<Self, ConfigError> {
-        let text = std::fs::read_to_string(path).map_err(|source| ConfigError::Read {
-            what: "graph",
-            path: path.into(),
-            source,
-        })?;
-        Self::parse(&text, path)
+        Self::parse(&read(path, "graph")?, path)
     }
 
     /// The same for a text; `path` is what errors name, and where relative paths are looked for.

@@ -1,7 +1,7 @@
 //! The soak file: which faults, how often, and what is asked of the graph in between.
 
 use crate::ConfigError;
-use crate::error::Source;
+use crate::error::{Source, read};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
@@ -156,12 +156,7 @@ impl Default for Contract {
 impl SoakConfig {
     /// Reads and checks a soak file.
     pub fn load(path: &Path) -> Result<Self, ConfigError> {
-        let text = std::fs::read_to_string(path).map_err(|source| ConfigError::Read {
-            what: "soak",
-            path: path.into(),
-            source,
-        })?;
-        Self::parse(&text, path)
+        Self::parse(&read(path, "soak")?, path)
     }
 
     /// The same for a text; `path` is what errors name.

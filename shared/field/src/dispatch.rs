@@ -1,7 +1,10 @@
-//! The kernels compiled for each instruction set, chosen at run time. The only module of this crate with `unsafe`.
+//! The kernels compiled for each instruction set, chosen at run time. With `bf16`, the only module of this crate with
+//! `unsafe`.
 
 #![allow(unsafe_code)]
 
+#[cfg(target_arch = "x86_64")]
+use crate::bf16;
 use crate::kernels::{self, AdamStep};
 use crate::layout::Level;
 use crate::walk::{self, OCTET, Octet, Placed, Walk};
@@ -13,6 +16,8 @@ enum Set {
     Avx2,
     #[cfg(target_arch = "x86_64")]
     Avx512,
+    #[cfg(target_arch = "x86_64")]
+    Avx512Bf16,
 }
 
 /// An instruction set that this processor is known to have: the value can only be made by asking it.
@@ -20,7 +25,7 @@ enum Set {
 pub struct InstructionSet(Set);
 
 impl InstructionSet {
-    /// The best one here.
+    /// The best one here that works in f32.
     pub fn detect() -> Self {
         #[cfg(target_arch = "x86_64")]
         {
@@ -33,6 +38,27 @@ impl InstructionSet {
             }
         }
         Self(Set::Portable)
+    }
+
+    /// The quickest one here, for pictures: products of the networks in bf16, where the processor has an instruction for
+    /// them. Otherwise as [`Self::detect`].
+    pub fn detect_for_pictures() -> Self {
+        #[cfg(target_arch = "x86_64")]
+        if Self::detect().0 == Set::Avx512
+            && std::is_x86_feature_detected!("avx512bw")
+            && std::is_x86_feature_detected!("avx512bf16")
+        {
+            return Self(Set::Avx512Bf16);
+        }
+        Self::detect()
+    }
+
+    /// Whether the networks' products are in bf16.
+    pub fn is_bf16(self) -> bool {
+        #[cfg(target_arch = "x86_64")]
+        return self.0 == Set::Avx512Bf16;
+        #[cfg(not(target_arch = "x86_64"))]
+        false
     }
 
     /// What every processor has.
@@ -48,29 +74,34 @@ impl InstructionSet {
             Set::Avx2 => "avx2+fma",
             #[cfg(target_arch = "x86_64")]
             Set::Avx512 => "avx512",
+            #[cfg(target_arch = "x86_64")]
+            Set::Avx512Bf16 => "avx512+bf16",
         }
     }
 }
 
-/// Asks for a value's cache line ahead of its use; nothing where there is no such instruction.
+/// Asks for an entry's cache line ahead of its use; nothing where there is no such instruction.
 #[inline(always)]
-pub(crate) fn prefetch<T>(value: &T) {
+pub(crate) fn prefetch<T>(table: &[T], index: usize) {
     #[cfg(target_arch = "x86_64")]
-    // SAFETY: prefetching reads nothing and cannot fault, and the address is that of a live reference; the instruction
-    // is part of every x86-64 processor (SSE).
+    // SAFETY: prefetching reads nothing and cannot fault, whatever the address; the instruction is part of every x86-64
+    // processor (SSE).
     unsafe {
-        std::arch::x86_64::_mm_prefetch::<{ std::arch::x86_64::_MM_HINT_T0 }>(std::ptr::from_ref(value).cast());
+        use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
+        _mm_prefetch::<{ _MM_HINT_T0 }>(table.as_ptr().wrapping_add(index).cast());
     }
     #[cfg(not(target_arch = "x86_64"))]
-    let _ = value;
+    let _ = (table, index);
 }
 
 /// Fused multiply-add pays on the portable path too where the architecture always has it.
 const PORTABLE_FMA: bool = cfg!(any(target_arch = "aarch64", target_feature = "fma"));
 
-/// Makes, for one generic body, its versions for each instruction set and the function that picks one.
+/// Makes, for one generic body, its versions for each instruction set and the function that picks one. The literal is what
+/// the version for AVX-512 is compiled with: `"avx2,fma"` for bodies whose loops over rows the compiler would turn into
+/// gathers and scatters of single numbers, if it had the instructions.
 macro_rules! dispatched {
-    ($(#[$doc:meta])* $name:ident, $room:ident::$body:ident, [$($generic:tt)*], ($($arg:ident: $ty:ty),* $(,)?)
+    ($(#[$doc:meta])* $name:ident, $wide:literal, $room:ident::$body:ident, [$($generic:tt)*], ($($arg:ident: $ty:ty),* $(,)?)
      $(-> $result:ty)?) => {
         $(#[$doc])*
         #[allow(clippy::too_many_arguments)]
@@ -82,7 +113,7 @@ macro_rules! dispatched {
                 $room::$body::<true $($generic)*>($($arg),*)
             }
             #[cfg(target_arch = "x86_64")]
-            #[target_feature(enable = "avx2,fma,avx512f,avx512vl")]
+            #[target_feature(enable = $wide)]
             #[allow(clippy::too_many_arguments)]
             fn avx512($($arg: $ty),*) $(-> $result)? {
                 $room::$body::<true $($generic)*>($($arg),*)
@@ -93,9 +124,9 @@ macro_rules! dispatched {
                 #[cfg(target_arch = "x86_64")]
                 Set::Avx2 => unsafe { avx2($($arg),*) },
                 // SAFETY: `Set::Avx512` is only ever made by `detect`, after the processor said that it has AVX2, FMA,
-                // AVX-512F and AVX-512VL.
+                // AVX-512F and AVX-512VL; `Set::Avx512Bf16` only where `detect` makes `Set::Avx512`.
                 #[cfg(target_arch = "x86_64")]
-                Set::Avx512 => unsafe { avx512($($arg),*) },
+                Set::Avx512 | Set::Avx512Bf16 => unsafe { avx512($($arg),*) },
             }
         }
     };
@@ -103,51 +134,78 @@ macro_rules! dispatched {
 
 dispatched!(
     /// See [`kernels::dense_forward`].
-    dense_forward, kernels::dense_forward, [],
+    dense_forward, "avx2,fma,avx512f,avx512vl", kernels::dense_forward, [],
     (weights: &[f32], bias: &[f32], x: &[f32], x_stride: usize, y: &mut [f32], y_stride: usize, relu: bool)
 );
 dispatched!(
     /// See [`kernels::bias_relu`].
-    bias_relu, kernels::bias_relu, [], (x: &[f32], bias: &[f32], y: &mut [f32], blocks_apart: usize)
+    bias_relu, "avx2,fma", kernels::bias_relu, [], (x: &[f32], bias: &[f32], y: &mut [f32], blocks_apart: usize)
 );
 dispatched!(
     /// See [`kernels::activate`].
-    activate, kernels::activate, [],
+    activate, "avx2,fma,avx512f,avx512vl", kernels::activate, [],
     (raw: &[f32], apart: usize, offset: f32, length_m: &[f32], density: &mut [f32], passes: &mut [f32])
 );
 dispatched!(
     /// See [`kernels::densities`].
-    densities, kernels::densities, [], (raw: &[f32], apart: usize, offset: f32, density: &mut [f32])
+    densities, "avx2,fma,avx512f,avx512vl", kernels::densities, [], (raw: &[f32], apart: usize, offset: f32, density: &mut [f32])
+);
+dispatched!(
+    /// See [`kernels::logistic`].
+    logistic, "avx2,fma,avx512f,avx512vl", kernels::logistic, [], (values: &mut [f32])
 );
 dispatched!(
     /// See [`kernels::dense_backward_input`].
-    dense_backward_input, kernels::dense_backward_input, [],
+    dense_backward_input, "avx2,fma,avx512f,avx512vl", kernels::dense_backward_input, [],
     (weights: &[f32], outputs: usize, dy: &[f32], dy_stride: usize, dx: &mut [f32], dx_stride: usize, rows: usize,
      relu_of: Option<&[f32]>)
 );
 dispatched!(
     /// See [`kernels::dense_backward_weights`].
-    dense_backward_weights, kernels::dense_backward_weights, [],
+    dense_backward_weights, "avx2,fma,avx512f,avx512vl", kernels::dense_backward_weights, [],
     (x: &[f32], x_stride: usize, dy: &[f32], dy_stride: usize, dw: &mut [f32], db: &mut [f32])
 );
-dispatched!(encode2, kernels::encode, [, 2], (levels: &[Level], table: &[f32], points: &[[f32; 3]], block: &mut [f32]));
-dispatched!(encode4, kernels::encode, [, 4], (levels: &[Level], table: &[f32], points: &[[f32; 3]], block: &mut [f32]));
-dispatched!(encode8, kernels::encode, [, 8], (levels: &[Level], table: &[f32], points: &[[f32; 3]], block: &mut [f32]));
-dispatched!(scatter2, kernels::scatter, [, 2], (levels: &[Level], gradient: &mut [f32], points: &[[f32; 3]], block: &[f32]));
-dispatched!(scatter4, kernels::scatter, [, 4], (levels: &[Level], gradient: &mut [f32], points: &[[f32; 3]], block: &[f32]));
-dispatched!(scatter8, kernels::scatter, [, 8], (levels: &[Level], gradient: &mut [f32], points: &[[f32; 3]], block: &[f32]));
+dispatched!(encode2, "avx2,fma", kernels::encode, [, 2], (levels: &[Level], table: &[f32], points: &[[f32; 3]], block: &mut [f32]));
+dispatched!(encode4, "avx2,fma", kernels::encode, [, 4], (levels: &[Level], table: &[f32], points: &[[f32; 3]], block: &mut [f32]));
+dispatched!(encode8, "avx2,fma", kernels::encode, [, 8], (levels: &[Level], table: &[f32], points: &[[f32; 3]], block: &mut [f32]));
+dispatched!(scatter2, "avx2,fma", kernels::scatter, [, 2], (levels: &[Level], gradient: &mut [f32], points: &[[f32; 3]], block: &[f32]));
+dispatched!(scatter4, "avx2,fma", kernels::scatter, [, 4], (levels: &[Level], gradient: &mut [f32], points: &[[f32; 3]], block: &[f32]));
+dispatched!(scatter8, "avx2,fma", kernels::scatter, [, 8], (levels: &[Level], gradient: &mut [f32], points: &[[f32; 3]], block: &[f32]));
 dispatched!(
     /// See [`kernels::adam`].
-    adam, kernels::adam, [],
+    adam, "avx2,fma,avx512f,avx512vl", kernels::adam, [],
     (step: AdamStep, sparse: bool, parameters: &mut [f32], first: &mut [f32], second: &mut [f32],
      gradients: &mut [&mut [f32]])
 );
 
 dispatched!(
     /// See [`walk::walk`].
-    walk_octet, walk::walk, [],
+    walk_octet, "avx2,fma,avx512f,avx512vl", walk::walk, [],
     (about: &Walk<'_>, octet: &mut Octet, want: [u32; OCTET], first: u32, out: &mut Placed, at: usize) -> usize
 );
+
+/// See [`bf16::dense_forward`]; without the instruction, nothing is written (see [`InstructionSet::is_bf16`]).
+#[allow(clippy::too_many_arguments)]
+pub(crate) fn dense_forward_bf16(
+    set: InstructionSet,
+    pairs: &[u32],
+    inputs: usize,
+    bias: &[f32],
+    x: &[f32],
+    x_stride: usize,
+    y: &mut [f32],
+    y_stride: usize,
+    relu: bool,
+) {
+    #[cfg(target_arch = "x86_64")]
+    if set.0 == Set::Avx512Bf16 {
+        // SAFETY: `Set::Avx512Bf16` is only ever made by `detect_for_pictures`, after the processor said that it has
+        // AVX-512F, AVX-512BW and AVX-512 BF16.
+        unsafe { bf16::dense_forward(pairs, inputs, bias, x, x_stride, y, y_stride, relu) }
+    }
+    #[cfg(not(target_arch = "x86_64"))]
+    let _ = (set, pairs, inputs, bias, x, x_stride, y, y_stride, relu);
+}
 
 /// See [`kernels::encode`]; `features_per_level` is 2, 4 or 8.
 pub(crate) fn encode(
@@ -247,6 +305,41 @@ mod tests {
                     let sum: f64 = columns().map(product).sum();
                     assert!(near(f64::from(dw[i * outputs + o]), sum), "{}", set.name());
                 }
+            }
+        }
+    }
+
+    /// With bf16 products a layer is the sum of the rounded numbers' products, for any number of blocks and inputs, odd
+    /// ones and more than are packed at once among them. (Where the processor has the instruction; else nothing is tried.)
+    #[test]
+    fn bf16_layers_are_the_sums_of_rounded_numbers() {
+        let set = InstructionSet::detect_for_pictures();
+        if !set.is_bf16() {
+            eprintln!("no bf16 instruction on this processor: not tried");
+            return;
+        }
+        let rounded = |v: f32| {
+            let bits = v.to_bits();
+            f64::from(f32::from_bits((bits + 0x7fff + ((bits >> 16) & 1)) & 0xffff_0000))
+        };
+        for (inputs, outputs, blocks, relu) in
+            [(1, 4, 1, false), (7, 8, 2, true), (64, 16, 7, true), (130, 4, 5, false)]
+        {
+            let (x_apart, y_apart) = (stride(inputs), stride(outputs));
+            let (weights, bias) = (numbers(inputs * outputs, 1), numbers(outputs, 2));
+            let x = numbers(blocks * x_apart, 3);
+            let mut pairs = vec![0; inputs.div_ceil(2) * outputs];
+            crate::bf16::pack(&weights, outputs, &mut pairs);
+            let mut y = vec![0.0; blocks * y_apart];
+            dense_forward_bf16(set, &pairs, inputs, &bias, &x, x_apart, &mut y, y_apart, relu);
+            for (b, o, l) in (0..blocks).flat_map(|b| (0..outputs * LANES).map(move |r| (b, r / LANES, r % LANES))) {
+                let sum = (0..inputs)
+                    .map(|i| rounded(weights[i * outputs + o]) * rounded(x[b * x_apart + i * LANES + l]))
+                    .sum::<f64>()
+                    + f64::from(bias[o]);
+                let found = f64::from(y[b * y_apart + o * LANES + l]);
+                let wanted = if relu { sum.max(0.0) } else { sum };
+                assert!(near(found, wanted), "{inputs} inputs, block {b}: {found} for {wanted}");
             }
         }
     }

@@ -3,12 +3,13 @@
 use std::borrow::Cow;
 use std::cell::RefCell;
 
+use crate::bf16;
 use crate::config::{FieldConfig, FieldError, LATENT_DIM, MAX_GRID_RESOLUTION, MAX_HIDDEN_WIDTH};
 use crate::dispatch::{self, InstructionSet};
 use crate::kernels::{LANES, stride};
-use crate::layout::Layout;
+use crate::layout::{Layer, Layout};
 use crate::march::Marcher;
-use crate::math::{hash, round_to_f16, sigmoid, spherical_harmonics, unit};
+use crate::math::{hash, round_to_f16, spherical_harmonics, unit};
 use crate::space::{Contraction, OccupancyGrid};
 
 /// Blocks that go through a network together: their activations stay in the second-level cache.
@@ -105,6 +106,8 @@ pub struct Field {
     pub(crate) set: InstructionSet,
     pub(crate) table: Vec<f32>,
     pub(crate) networks: Vec<f32>,
+    /// The networks' weights in bf16, layer by layer ([`Layer::pairs`]); empty unless `set` works in bf16.
+    pairs: Vec<u32>,
     pub(crate) occupancy: OccupancyGrid,
     pub(crate) changing: OccupancyGrid,
 }
@@ -138,6 +141,7 @@ impl Field {
             contraction,
             table,
             networks,
+            pairs: Vec::new(),
         })
     }
 
@@ -171,9 +175,17 @@ impl Field {
         self.set
     }
 
-    /// Runs its kernels on another instruction set (for parity tests and benchmarks).
+    /// Runs its kernels on another instruction set: [`InstructionSet::detect_for_pictures`] where nothing but pictures is
+    /// wanted, others for parity tests and benchmarks. A field begins with [`InstructionSet::detect`].
     pub fn set_instruction_set(&mut self, set: InstructionSet) {
         self.set = set;
+        self.pairs.clear();
+        if set.is_bf16() {
+            self.pairs.resize(self.networks.len() / 2, 0);
+            for (_, layer) in self.layout.named_layers() {
+                bf16::pack(layer.weights(&self.networks), layer.outputs, &mut self.pairs[layer.pairs()]);
+            }
+        }
     }
 
     /// Rounds every weight to half precision, as a checkpoint in f16 would.
@@ -181,6 +193,7 @@ impl Field {
         for v in self.table.iter_mut().chain(&mut self.networks) {
             *v = round_to_f16(*v);
         }
+        self.set_instruction_set(self.set);
     }
 
     /// Halves the side of the grids' cells, as far as their resolution may go.
@@ -213,13 +226,21 @@ impl Field {
         }
     }
 
+    /// One layer over blocks: y = W^T x + `bias`, clamped from below at zero when `relu`.
+    pub(crate) fn dense(&self, layer: &Layer, bias: &[f32], x: &[f32], y: &mut [f32], relu: bool) {
+        let (sx, sy) = (stride(layer.inputs), stride(layer.outputs));
+        if self.set.is_bf16() {
+            dispatch::dense_forward_bf16(self.set, &self.pairs[layer.pairs()], layer.inputs, bias, x, sx, y, sy, relu);
+        } else {
+            dispatch::dense_forward(self.set, layer.weights(&self.networks), bias, x, sx, y, sy, relu);
+        }
+    }
+
     /// What the density network's first layer makes of blocks of features, before any latent.
     pub(crate) fn first_layer(&self, features: &[f32], before: &mut [f32]) {
-        let l = &self.layout;
         let none = [0.0; MAX_HIDDEN_WIDTH];
-        let weights = l.density[0].weights(&self.networks);
-        let (sf, sw) = (stride(l.features), stride(l.width));
-        dispatch::dense_forward(self.set, weights, &none[..l.width], features, sf, before, sw, false);
+        let first = &self.layout.density[0];
+        self.dense(first, &none[..first.outputs], features, before, false);
     }
 
     /// Density network over blocks: raw density and geometry features into `geometry`.
@@ -242,20 +263,19 @@ impl Field {
             match input {
                 FirstLayer::Features(features) => {
                     let features = &features[at * sf..(at + blocks) * sf];
-                    let weights = l.density[0].weights(w);
-                    dispatch::dense_forward(self.set, weights, &folded.density, features, sf, a, sw, true);
+                    self.dense(&l.density[0], &folded.density, features, a, true);
                 }
                 FirstLayer::Done(before) => {
                     dispatch::bias_relu(self.set, &before[at * sw..(at + blocks) * sw], &folded.density, a, sw);
                 }
             }
             let [_, second, last] = &l.density;
-            dispatch::dense_forward(self.set, second.weights(w), second.biases(w), a, sw, b, sw, true);
-            dispatch::dense_forward(self.set, last.weights(w), last.biases(w), b, sw, geometry, sg, false);
+            self.dense(second, second.biases(w), a, b, true);
+            self.dense(last, last.biases(w), b, geometry, false);
         }
     }
 
-    /// Colour network over blocks of (geometry features, direction); raw outputs (before the logistic) to `output`.
+    /// Colour network over blocks of (geometry features, direction); colours (0..=1) to `output`.
     pub(crate) fn color_network(
         &self,
         folded: &Folded,
@@ -271,20 +291,20 @@ impl Field {
             let a = grow(hidden_a, blocks * sw);
             let b = grow(hidden_b, blocks * sw);
             let w = &self.networks;
-            dispatch::dense_forward(self.set, l.color[0].weights(w), &folded.color, inputs, si, a, sw, true);
-            dispatch::dense_forward(self.set, l.color[1].weights(w), l.color[1].biases(w), a, sw, b, sw, true);
-            dispatch::dense_forward(self.set, l.color[2].weights(w), l.color[2].biases(w), b, sw, output, so, false);
+            let [first, second, last] = &l.color;
+            self.dense(first, &folded.color, inputs, a, true);
+            self.dense(second, second.biases(w), a, b, true);
+            self.dense(last, last.biases(w), b, output, false);
+            dispatch::logistic(self.set, output);
         }
     }
 
-    /// Background network over blocks of directions.
+    /// Background network over blocks of directions; colours (0..=1) to `output`.
     pub(crate) fn background_network(&self, folded: &Folded, inputs: &[f32], hidden: &mut [f32], output: &mut [f32]) {
-        let l = &self.layout;
-        let w = &self.networks;
-        let (si, sh, so) = (stride(l.direction), stride(l.background[0].outputs), stride(4));
-        dispatch::dense_forward(self.set, l.background[0].weights(w), &folded.background, inputs, si, hidden, sh, true);
-        let (weights, bias) = (l.background[1].weights(w), l.background[1].biases(w));
-        dispatch::dense_forward(self.set, weights, bias, hidden, sh, output, so, false);
+        let [first, last] = &self.layout.background;
+        self.dense(first, &folded.background, inputs, hidden, true);
+        self.dense(last, last.biases(&self.networks), hidden, output, false);
+        dispatch::logistic(self.set, output);
     }
 
     /// Density (1/metre) and colour (0..=1) at world points (metres) seen along unit `directions`, under one latent.
@@ -320,7 +340,7 @@ impl Field {
                 let output = grow(&mut s.output, so);
                 self.color_network(&folded, &inputs, &mut s.hidden_a, &mut s.hidden_b, output);
                 for lane in 0..end - at {
-                    out_rgb[at + lane] = [0, 1, 2].map(|c| sigmoid(output[c * LANES + lane]));
+                    out_rgb[at + lane] = [0, 1, 2].map(|c| output[c * LANES + lane]);
                 }
             }
             s.folded = folded;

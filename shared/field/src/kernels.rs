@@ -9,7 +9,7 @@
 
 use crate::dispatch::prefetch;
 use crate::layout::Level;
-use crate::math::{exp, fma};
+use crate::math::{exp, fma, sigmoid};
 
 /// Samples of one block.
 pub(crate) const LANES: usize = 16;
@@ -53,15 +53,12 @@ pub(crate) fn dense_forward<const FMA: bool>(
                     }
                 }
             }
-            for (yr, a) in yo.as_chunks_mut::<LANES>().0.iter_mut().zip(&acc) {
-                if relu {
-                    for l in 0..LANES {
-                        yr[l] = a[l].max(0.0);
-                    }
-                } else {
-                    *yr = *a;
-                }
+            if relu {
+                // Row by row and not in a loop: see `dispatched`.
+                let least = |a: &[f32; LANES]| a.map(|v| v.max(0.0));
+                acc = [least(&acc[0]), least(&acc[1]), least(&acc[2]), least(&acc[3])];
             }
+            yo.copy_from_slice(acc.as_flattened());
         }
     }
 }
@@ -282,7 +279,7 @@ pub(crate) fn encode<const FMA: bool, const F: usize>(
         // All at once, so that the misses overlap: the gathers below would wait for them a few at a time.
         for c in 0..8 {
             for l in 0..count {
-                prefetch(&table[index[c][l] as usize]);
+                prefetch(table, index[c][l] as usize);
             }
         }
         let mut sums = [[0.0_f32; F]; LANES];
@@ -322,7 +319,7 @@ pub(crate) fn scatter<const FMA: bool, const F: usize>(
         corners(level, &points, &mut index, &mut weight);
         for c in 0..8 {
             for l in 0..count {
-                prefetch(&gradient[index[c][l] as usize]);
+                prefetch(gradient, index[c][l] as usize);
             }
         }
         for l in 0..count {
@@ -371,6 +368,16 @@ pub(crate) fn densities<const FMA: bool>(raw: &[f32], apart: usize, offset: f32,
             lanes[l] = exp((raw[l] + offset).min(15.0));
         }
         out.copy_from_slice(&lanes[..out.len()]);
+    }
+}
+
+/// The logistic function of every number.
+#[inline(always)]
+pub(crate) fn logistic<const FMA: bool>(values: &mut [f32]) {
+    for row in values.as_chunks_mut::<LANES>().0 {
+        for l in 0..LANES {
+            row[l] = sigmoid(row[l]);
+        }
     }
 }
 

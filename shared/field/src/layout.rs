@@ -70,6 +70,13 @@ impl Layer {
         &mut networks[self.bias..self.bias + self.outputs]
     }
 
+    /// Its weights as pairs in bf16, in a buffer half as long as the networks' ([`crate::bf16::pack`]). They fit: what
+    /// rounding up an odd number of inputs takes, the biases leave.
+    pub fn pairs(&self) -> std::ops::Range<usize> {
+        let start = self.weight / 2;
+        start..start + self.inputs.div_ceil(2) * self.outputs
+    }
+
     /// Biases with the latent's share added: `W_z z + b`.
     pub fn fold(&self, networks: &[f32], latent: &[f32; LATENT_DIM], out: &mut Vec<f32>) {
         out.clear();

@@ -8,6 +8,7 @@
 // Bodies must be inlined into each instruction set's version of them, or they would be compiled for the wrong one.
 #![allow(clippy::inline_always)]
 
+mod bf16;
 mod config;
 mod dispatch;
 mod field;

@@ -130,16 +130,7 @@ impl Field {
                 let b = grow(&mut work.hidden_b, blocks * sw);
                 let raw = grow(&mut work.raw, blocks * so);
                 dispatch::bias_relu(self.set, before, &work.first_bias, a, sw);
-                dispatch::dense_forward(
-                    self.set,
-                    second.weights(networks),
-                    second.biases(networks),
-                    a,
-                    sw,
-                    b,
-                    sw,
-                    true,
-                );
+                self.dense(second, second.biases(networks), a, b, true);
                 dispatch::dense_forward(self.set, &work.last_weights, last_bias, b, sw, raw, so, false);
                 dispatch::densities(self.set, raw, so, self.config.density_offset, out);
             }

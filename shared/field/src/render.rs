@@ -9,7 +9,7 @@ use crate::config::{LATENT_DIM, RenderOptions};
 use crate::field::{Field, Folded, Scratch, grow, write_direction};
 use crate::kernels::{LANES, stride};
 use crate::march::{NO_RAY, RayLimits, Samples, Seen};
-use crate::math::{sigmoid, spherical_harmonics};
+use crate::math::spherical_harmonics;
 use crate::walk::Placed;
 
 /// Rays that are worked on together: a square of the picture, whose rays meet the same entries of the hash grid.
@@ -394,7 +394,7 @@ impl Colors {
         for (i, pixel) in rgb.chunks_exact_mut(3).enumerate() {
             let passes = seen.rays[i].transmittance;
             for (c, v) in pixel.iter_mut().enumerate() {
-                *v = passes * sigmoid(out[i / LANES * so + c * LANES + i % LANES]);
+                *v = passes * out[i / LANES * so + c * LANES + i % LANES];
             }
             opacity[i] = 1.0 - passes;
             depth[i] = if opacity[i] > 1e-4 { pixels[i].distance / opacity[i] } else { 0.0 };
@@ -421,7 +421,7 @@ impl Colors {
                 let (pixel, weight) = (&mut pixels[seen.ray[i] as usize], seen.weight[i]);
                 pixel.colored.0 += weight;
                 for c in 0..3 {
-                    pixel.colored.1[c] += weight * sigmoid(out[at / LANES * so + c * LANES + at % LANES]);
+                    pixel.colored.1[c] += weight * out[at / LANES * so + c * LANES + at % LANES];
                 }
             }
         }

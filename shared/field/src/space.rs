@@ -63,7 +63,8 @@ impl Contraction {
     pub(crate) fn uncontract_axis(q: f32) -> f32 {
         let g = (q - 0.5) * 4.0;
         let a = g.abs();
-        let outside = 1.0 / (2.0 - a).max(1e-4);
+        let rest = 2.0 - a;
+        let outside = 1.0 / if rest > 1e-4 { rest } else { 1e-4 };
         let u = if a <= 1.0 { a } else { outside };
         u.copysign(g)
     }

@@ -4,13 +4,13 @@ use carff_geometry::Ray;
 use rayon::prelude::*;
 
 use crate::config::{FieldError, LATENT_DIM, TrainerConfig};
-use crate::dispatch;
+use crate::dispatch::{self, InstructionSet};
 use crate::field::{
     Field, Folded, GROUP, NamedTensor, Scratch, grow, network_tensors, set_network_tensor, write_direction,
 };
 use crate::kernels::{AdamStep, LANES, stride};
 use crate::march::{NO_RAY, RayLimits, RayState, Samples};
-use crate::math::{hash, sigmoid, spherical_harmonics, unit};
+use crate::math::{hash, spherical_harmonics, unit};
 
 /// Most rays that are worked on together; all of one latent.
 const CHUNK: usize = 32;
@@ -181,13 +181,17 @@ pub struct FieldTrainer {
 
 impl FieldTrainer {
     /// A trainer at step 0. Errors when a thread pool cannot be made or the configuration is out of range.
-    pub fn new(field: Field, config: TrainerConfig) -> Result<Self, FieldError> {
+    pub fn new(mut field: Field, config: TrainerConfig) -> Result<Self, FieldError> {
         fn positive(value: usize, key: &'static str) -> Result<(), FieldError> {
             if value >= 1 {
                 Ok(())
             } else {
                 Err(FieldError::Config { key, value: value.to_string(), allowed: "1 or more" })
             }
+        }
+        // Weights change: no copy of them in bf16 would follow.
+        if field.set.is_bf16() {
+            field.set_instruction_set(InstructionSet::detect());
         }
         positive(config.threads, "threads")?;
         positive(config.gradient_shards, "gradient_shards")?;
@@ -781,9 +785,8 @@ impl Shard {
         let output = grow(&mut tile.output, blocks * so);
         field.background_network(&self.folded, inputs, grow(&mut tile.color_a, blocks * sh), output);
         self.behind_rgb.clear();
-        self.behind_rgb.extend(
-            (0..self.rays.len()).map(|i| [0, 1, 2].map(|c| sigmoid(output[i / LANES * so + c * LANES + i % LANES]))),
-        );
+        self.behind_rgb
+            .extend((0..self.rays.len()).map(|i| [0, 1, 2].map(|c| output[i / LANES * so + c * LANES + i % LANES])));
     }
 
     /// Both networks over the kept samples, with all activations stored.
@@ -829,8 +832,9 @@ impl Shard {
             dispatch::dense_forward(set, c0.weights(w), &self.folded.color, inputs, si, ca, sw, true);
             dispatch::dense_forward(set, c1.weights(w), c1.biases(w), ca, sw, cb, sw, true);
             dispatch::dense_forward(set, c2.weights(w), c2.biases(w), cb, sw, output, so, false);
+            dispatch::logistic(set, output);
             for (at, k) in kept.iter_mut().enumerate() {
-                k.color = [0, 1, 2].map(|c| sigmoid(output[at / LANES * so + c * LANES + at % LANES]));
+                k.color = [0, 1, 2].map(|c| output[at / LANES * so + c * LANES + at % LANES]);
             }
         }
     }

@@ -3,6 +3,7 @@
 use super::*;
 use crate::config::FieldConfig;
 use crate::layout::Layer;
+use crate::math::sigmoid;
 use crate::{InstructionSet, RenderBuffer, RenderOptions};
 
 fn small_config() -> FieldConfig {

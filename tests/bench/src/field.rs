@@ -8,8 +8,8 @@ use anyhow::Context;
 use carff_belief::Probe;
 use carff_checkpoint::Manifest;
 use carff_field::{
-    Field, FieldConfig, FieldTrainer, HypothesisBuffer, LATENT_DIM, RayBatch, RayLimits, RaySamples, RenderBuffer,
-    RenderOptions, TrainerConfig,
+    Field, FieldConfig, FieldTrainer, HypothesisBuffer, InstructionSet, LATENT_DIM, RayBatch, RayLimits, RaySamples,
+    RenderBuffer, RenderOptions, TrainerConfig,
 };
 use carff_field_reference::{Precision, Rays, ReferenceField, Samples, huber_sum};
 use carff_geometry::{PinholeCamera, Ray};
@@ -60,10 +60,11 @@ pub(crate) fn run(args: &FieldArgs) -> anyhow::Result<Report> {
     let states: Vec<[f32; LATENT_DIM]> = manifest.states.iter().map(|s| s.mean).collect();
     anyhow::ensure!(!states.is_empty(), "checkpoint {}: it knows no states", args.checkpoint.display());
     println!(
-        "field of {}: {} numbers, {} instructions, {} threads\n",
+        "field of {}: {} numbers, {} instructions ({} for pictures), {} threads\n",
         args.checkpoint.display(),
         field.parameter_count(),
         field.instruction_set().name(),
+        InstructionSet::detect_for_pictures().name(),
         threads
     );
     let bench = Bench {
@@ -73,11 +74,14 @@ pub(crate) fn run(args: &FieldArgs) -> anyhow::Result<Report> {
         precisions: precisions(&field),
     };
 
+    let mut pictures = field.clone();
+    pictures.set_instruction_set(InstructionSet::detect_for_pictures());
     let mut report = Report::default();
     report.set_value("field.instruction_set", field.instruction_set().name().into());
+    report.set_value("field.instruction_set_for_pictures", pictures.instruction_set().name().into());
     report.set("field.threads", threads as f64);
-    bench.networks(&field, &mut report);
-    bench.rendering(&field, &states, &mut report);
+    bench.networks(&field, &pictures, &mut report);
+    bench.rendering(&field, &pictures, &states, &mut report);
     bench.probes(&mut probe, &states, &mut report);
     bench.training(&field, &states, &mut report)?;
     Ok(report)
@@ -125,31 +129,34 @@ struct Bench {
 }
 
 impl Bench {
-    /// The density network's rate against the rate of matrix products.
-    fn networks(&self, field: &Field, report: &mut Report) {
+    /// The density network's rate against the rate of matrix products, in f32 and as for pictures.
+    fn networks(&self, field: &Field, pictures: &Field, report: &mut Report) {
         let points: Vec<[f32; 3]> = (0..POINTS).map(|i| random_point(field.config(), i as u64)).collect();
         let latents: Vec<[f32; LATENT_DIM]> = (0..LATENTS).map(|i| random_latent(i as u64)).collect();
-        let mut outs = vec![vec![0.0_f32; POINTS * LATENTS]; self.threads];
         let each = Operations::of(field.config());
         let operations = (each.first + each.rest * LATENTS as f64) * (POINTS * self.threads) as f64;
-        let native = timed(move || {
-            std::thread::scope(|scope| {
-                for out in &mut outs {
-                    let (points, latents) = (&points, &latents);
-                    scope.spawn(move || field.density_by_latent(points, latents, out));
-                }
-            });
-        });
+        let native = |field| {
+            let mut outs = vec![vec![0.0_f32; POINTS * LATENTS]; self.threads];
+            let (points, latents) = (&points, &latents);
+            timed(move || {
+                std::thread::scope(|scope| {
+                    for out in &mut outs {
+                        scope.spawn(move || Field::density_by_latent(field, points, latents, out));
+                    }
+                });
+            })
+        };
         let width = field.config().hidden_width as i64;
         let square = [1024, 1024, 1024];
         let layer = [1 << 17, width, width];
         let named = [
-            ("density network, native f32", (native, operations)),
+            ("density network, native f32", (native(field), operations)),
             ("matrix product 1024^3, f32", matrix_product(Kind::Float, square)),
             ("matrix product 131072 x width x width, f32", matrix_product(Kind::Float, layer)),
             ("matrix product 1024^3, bf16", matrix_product(Kind::BFloat16, square)),
             ("matrix product 131072 x width x width, bf16", matrix_product(Kind::BFloat16, layer)),
             ("memory bandwidth (GB/s)", triad(self.threads)),
+            ("density network, native, as for pictures", (native(pictures), operations)),
         ];
         let (names, measured): (Vec<_>, Vec<_>) = named.into_iter().unzip();
         let (mut contenders, amounts): (Vec<_>, Vec<_>) = measured.into_iter().unzip();
@@ -166,7 +173,15 @@ impl Bench {
         let native = rates[0].median();
         let limit = rates[1].median().max(rates[2].median());
         let share = native / limit;
-        println!("networks: {} of the measured limit of f32 matrix products\n", percent(share));
+        println!("networks: {} of the measured limit of f32 matrix products", percent(share));
+        if pictures.instruction_set().is_bf16() {
+            let limit = rates[3].median().max(rates[4].median());
+            let share = rates[6].median() / limit;
+            println!("with bf16 products: {} of that of bf16 matrix products", percent(share));
+            report.set("field.mlp_bf16_gflops", rates[6].median());
+            report.set("field.mlp_bf16_share_of_limit", share);
+        }
+        println!();
         report.set("field.mlp_gflops", native);
         report.set("field.mlp_share_of_limit", share);
         report.set("field.limit.f32_gflops", limit);
@@ -175,7 +190,7 @@ impl Bench {
     }
 
     /// Bird's-eye views of every state.
-    fn rendering(&self, field: &Field, states: &[[f32; LATENT_DIM]], report: &mut Report) {
+    fn rendering(&self, field: &Field, pictures: &Field, states: &[[f32; LATENT_DIM]], report: &mut Report) {
         let camera = birds_eye(field.config(), self.side_px);
         let rays: Vec<Ray> = (0..self.side_px * self.side_px)
             .map(|i| camera.ray(f64::from(i % self.side_px) + 0.5, f64::from(i / self.side_px) + 0.5))
@@ -216,15 +231,18 @@ impl Bench {
         let hypotheses: Vec<[f32; LATENT_DIM]> = (0..HYPOTHESES).map(|i| states[i % states.len()]).collect();
         let mut together = HypothesisBuffer::default();
         let mut buffer = RenderBuffer::new();
-        let mut contenders =
-            vec![round_and_round(states.len(), |s| field.render(&camera, &states[s], &options, &mut buffer))];
+        let mut exact = RenderBuffer::new();
+        let mut contenders = vec![
+            round_and_round(states.len(), |s| pictures.render(&camera, &states[s], &options, &mut buffer)),
+            round_and_round(states.len(), |s| field.render(&camera, &states[s], &options, &mut exact)),
+        ];
         let mut chunks = Vec::new();
         for reference in &references {
             let chunk = best(&[1 << 13, 1 << 12, 1 << 14, 1 << 16, 1 << 22], |chunk| frame(reference, 0, chunk));
             chunks.push(chunk.min(count as i64));
             contenders.push(round_and_round(states.len(), move |s| frame(reference, s, chunk)));
         }
-        contenders.push(timed(|| field.render_hypotheses(&camera, &hypotheses, &options, &mut together)));
+        contenders.push(timed(|| pictures.render_hypotheses(&camera, &hypotheses, &options, &mut together)));
         let mut seconds = in_turns(self.rounds, &mut contenders);
         drop(contenders);
         println!(
@@ -232,8 +250,24 @@ impl Bench {
             self.side_px, count, kept
         );
         let shared = Times::new(seconds.pop().unwrap_or_default()).median() / HYPOTHESES as f64;
+        let in_f32 = seconds.remove(1);
         let native = self.versus("render", count, &chunks, &seconds, report);
         println!("(tensor operations are given where the samples lie: they need not march)");
+        if pictures.instruction_set().is_bf16() {
+            let ratio = Ratio::new(&in_f32, &seconds[0]);
+            let (mut here, mut exact) = (Vec::new(), Vec::new());
+            for z in states {
+                for (field, all) in [(pictures, &mut here), (field, &mut exact)] {
+                    field.render(&camera, z, &options, &mut buffer);
+                    all.extend_from_slice(&buffer.rgb);
+                }
+            }
+            let db = carff_metrics::psnr_db(&here, &exact).unwrap_or(f64::INFINITY);
+            println!("native kernels with bf16 products are {ratio} as fast as in f32; {} dB against it", number(db));
+            report.set("field.render_f32_ms", Times::new(in_f32).median() * 1e3);
+            report.set("field.render_bf16_vs_f32", ratio.of_medians);
+            report.set("field.render_bf16_psnr_db", db);
+        }
         let changing = together.pictures[0].changing.iter().filter(|c| **c).count() as f64
             / f64::from(self.side_px * self.side_px);
         println!(
@@ -247,7 +281,7 @@ impl Bench {
         report.set("field.render_changing_rays", changing);
         report.set("field.render_samples", count);
         report.set("field.render_colored_samples", kept);
-        self.breakdown(field, states, &camera, &samples, report);
+        self.breakdown(pictures, states, &camera, &samples, report);
     }
 
     /// Where rendering's time goes, on one thread: by leaving parts out.

@@ -1,0 +1,165 @@
+//! Dense layers with bf16 products and f32 sums, on processors that have an instruction for pairs of them (AVX-512 BF16,
+//! VDPBF16PS). With `dispatch`, the only module of this crate with `unsafe`.
+//!
+//! A 32-bit lane of the instruction holds two neighbouring inputs of one sample, and two weights: the products of both
+//! are added to the lane's f32 sum.
+
+#![allow(unsafe_code)]
+
+#[cfg(target_arch = "x86_64")]
+use crate::kernels::LANES;
+#[cfg(target_arch = "x86_64")]
+use std::arch::x86_64::{
+    __m512, __m512bh, __m512i, _mm512_cvtne2ps_pbh, _mm512_dpbf16_ps, _mm512_loadu_ps, _mm512_max_ps,
+    _mm512_permutexvar_epi16, _mm512_set1_epi32, _mm512_set1_ps, _mm512_setzero_ps, _mm512_setzero_si512,
+    _mm512_storeu_ps,
+};
+
+/// Pairs of inputs that are packed at once: what is packed stays in the first-level cache.
+#[cfg(target_arch = "x86_64")]
+const PAIRS: usize = 32;
+/// Outputs that are summed together.
+#[cfg(target_arch = "x86_64")]
+const TILE: usize = 4;
+
+/// Weights `[inputs][outputs]` as pairs `[inputs / 2][outputs]`, the even input in the low half, rounded to nearest even;
+/// an odd last input has a zero beside it.
+pub(crate) fn pack(weights: &[f32], outputs: usize, pairs: &mut [u32]) {
+    let rounded = |v: f32| {
+        let bits = v.to_bits();
+        bits.wrapping_add(0x7fff + ((bits >> 16) & 1)) >> 16
+    };
+    for (rows, pairs) in weights.chunks(2 * outputs).zip(pairs.chunks_exact_mut(outputs)) {
+        let (even, odd) = rows.split_at(outputs);
+        for (o, pair) in pairs.iter_mut().enumerate() {
+            *pair = rounded(even[o]) | odd.get(o).map_or(0, |v| rounded(*v) << 16);
+        }
+    }
+}
+
+/// [`crate::kernels::dense_forward`] with weights as [`pack`] leaves them.
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx512f,avx512bw,avx512bf16")]
+#[allow(clippy::too_many_arguments)]
+pub(crate) fn dense_forward(
+    pairs: &[u32],
+    inputs: usize,
+    bias: &[f32],
+    x: &[f32],
+    x_stride: usize,
+    y: &mut [f32],
+    y_stride: usize,
+    relu: bool,
+) {
+    let blocks = (x.len() / x_stride).min(y.len() / y_stride);
+    let mut at = 0;
+    while at < blocks {
+        let (x, y) = (&x[at * x_stride..], &mut y[at * y_stride..]);
+        at += match blocks - at {
+            1 => tile::<1>(pairs, inputs, bias, x, x_stride, y, y_stride, relu),
+            2 | 3 => tile::<2>(pairs, inputs, bias, x, x_stride, y, y_stride, relu),
+            _ => tile::<4>(pairs, inputs, bias, x, x_stride, y, y_stride, relu),
+        };
+    }
+}
+
+/// The same for `B` blocks; returns `B`.
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx512f,avx512bw,avx512bf16")]
+#[allow(clippy::too_many_arguments)]
+fn tile<const B: usize>(
+    pairs: &[u32],
+    inputs: usize,
+    bias: &[f32],
+    x: &[f32],
+    x_stride: usize,
+    y: &mut [f32],
+    y_stride: usize,
+    relu: bool,
+) -> usize {
+    let outputs = bias.len();
+    let mut packed = [[_mm512_setzero_si512(); B]; PAIRS];
+    let mut done = 0;
+    while done < inputs {
+        let rows = (inputs - done).min(2 * PAIRS);
+        for (k, packed) in packed[..rows.div_ceil(2)].iter_mut().enumerate() {
+            for (b, packed) in packed.iter_mut().enumerate() {
+                let row = |r: usize| &x[b * x_stride + (done + r) * LANES..];
+                let odd = if 2 * k + 1 < rows { load(row(2 * k + 1)) } else { _mm512_setzero_ps() };
+                *packed = pair_up(load(row(2 * k)), odd);
+            }
+        }
+        let weights = &pairs[done / 2 * outputs..];
+        for o in (0..outputs).step_by(TILE) {
+            let mut sums = [[_mm512_setzero_ps(); B]; TILE];
+            for (j, sums) in sums.iter_mut().enumerate() {
+                for (b, sum) in sums.iter_mut().enumerate() {
+                    let before = done > 0;
+                    *sum =
+                        if before { load(&y[b * y_stride + (o + j) * LANES..]) } else { _mm512_set1_ps(bias[o + j]) };
+                }
+            }
+            for (x, w) in packed[..rows.div_ceil(2)].iter().zip(weights.chunks_exact(outputs)) {
+                let w: &[u32; TILE] = w[o..].first_chunk().expect("outputs are a multiple of 4");
+                for (w, sums) in w.iter().zip(&mut sums) {
+                    let w = halves(_mm512_set1_epi32(*w as i32));
+                    for (x, sum) in x.iter().zip(sums) {
+                        *sum = _mm512_dpbf16_ps(*sum, halves(*x), w);
+                    }
+                }
+            }
+            let last = done + rows == inputs;
+            for (j, sums) in sums.iter().enumerate() {
+                for (b, sum) in sums.iter().enumerate() {
+                    let sum = if relu && last { _mm512_max_ps(*sum, _mm512_setzero_ps()) } else { *sum };
+                    store(sum, &mut y[b * y_stride + (o + j) * LANES..]);
+                }
+            }
+        }
+        done += rows;
+    }
+    B
+}
+
+/// Two rows rounded to bf16, lane by lane beside each other: the first in the low halves.
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx512f,avx512bw,avx512bf16")]
+fn pair_up(even: __m512, odd: __m512) -> __m512i {
+    const ORDER: [u16; 32] = {
+        let mut order = [0; 32];
+        let mut l = 0;
+        while l < LANES {
+            order[2 * l] = l as u16;
+            order[2 * l + 1] = (LANES + l) as u16;
+            l += 1;
+        }
+        order
+    };
+    // SAFETY: both are 512 bits of whole numbers; every bit pattern is one.
+    let (order, rows): (__m512i, __m512i) =
+        unsafe { (std::mem::transmute(ORDER), std::mem::transmute(_mm512_cvtne2ps_pbh(odd, even))) };
+    _mm512_permutexvar_epi16(order, rows)
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx512f")]
+fn halves(bits: __m512i) -> __m512bh {
+    // SAFETY: both are 512 bits, and every bit pattern is 32 numbers in bf16.
+    unsafe { std::mem::transmute(bits) }
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx512f")]
+fn load(row: &[f32]) -> __m512 {
+    let row: &[f32; LANES] = row.first_chunk().expect("a block holds all its rows");
+    // SAFETY: the reference is to 16 numbers, and the load asks for no alignment.
+    unsafe { _mm512_loadu_ps(row.as_ptr()) }
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx512f")]
+fn store(sum: __m512, row: &mut [f32]) {
+    let row: &mut [f32; LANES] = row.first_chunk_mut().expect("a block holds all its rows");
+    // SAFETY: the reference is to 16 numbers that nobody else reads or writes, and the store asks for no alignment.
+    unsafe { _mm512_storeu_ps(row.as_mut_ptr(), sum) }
+}

@@ -1,0 +1,155 @@
+//! One owner for a run: its record, locked; and the end of what an earlier owner left.
+
+use crate::RunRecord;
+use carff_transport::{
+    CleanupError, OpenError, Run, living_processes, make_private_dir, monotonic_now_ns, remove_run_leftovers,
+};
+use rustix::fs::{FlockOperation, OFlags, flock};
+use std::fs::{File, OpenOptions};
+use std::io::Write;
+use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+/// How long processes of an earlier owner are given to end, nanoseconds: the stages of a killed launcher end by
+/// themselves, which takes them a moment.
+const ORPHAN_PATIENCE_NS: u64 = 2_000_000_000;
+/// Time between two looks at them.
+const ORPHAN_LOOK: Duration = Duration::from_millis(20);
+
+/// Why a run cannot be owned.
+#[derive(Debug, thiserror::Error)]
+pub enum LockError {
+    /// Another process owns it.
+    #[error("run `{run}` is already running{}: stop it, or give this one another name with {option}", who(.holder.as_deref()))]
+    Held {
+        /// The run.
+        run: String,
+        /// Its owner, where the record can be read.
+        holder: Option<Box<RunRecord>>,
+        /// The option that names a run.
+        option: &'static str,
+    },
+    /// Processes of an earlier owner have not ended.
+    #[error(
+        "processes {living:?} of an earlier launch of run `{run}` still live: stop them, or give this one another name \
+         with {option}"
+    )]
+    Orphans {
+        /// The run.
+        run: String,
+        /// Their process ids.
+        living: Vec<u32>,
+        /// The option that names a run.
+        option: &'static str,
+    },
+    /// The record cannot be opened or written.
+    #[error("cannot write {path}: {source}")]
+    Record {
+        /// Its file.
+        path: PathBuf,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// The folder of all runs cannot be used.
+    #[error(transparent)]
+    Folder(#[from] OpenError),
+    /// What an earlier owner left cannot be removed.
+    #[error(transparent)]
+    Cleanup(#[from] CleanupError),
+}
+
+fn who(holder: Option<&RunRecord>) -> String {
+    holder.map(|h| format!(" (process {}, graph {})", h.pid, h.graph)).unwrap_or_default()
+}
+
+/// Held while a run runs. The system frees it when the process ends, however it ends.
+#[derive(Debug)]
+pub struct RunLock {
+    path: PathBuf,
+    _file: File,
+}
+
+impl RunLock {
+    /// Takes the lock of a run in the folder of all runs ([`carff_transport::runtime_dir`]) and writes the record, or says
+    /// who holds it. `option` is the one by which this program's user names a run.
+    pub fn take(folder: &Path, run: &str, record: &RunRecord, option: &'static str) -> Result<Self, LockError> {
+        make_private_dir(folder)?;
+        let path = RunRecord::path(folder, run);
+        let failed = |source| LockError::Record { path: path.clone(), source };
+        loop {
+            let mut file = OpenOptions::new()
+                .read(true)
+                .write(true)
+                .create(true)
+                .truncate(false)
+                .mode(0o600)
+                .custom_flags(OFlags::NOFOLLOW.bits() as i32)
+                .open(&path)
+                .map_err(failed)?;
+            if flock(&file, FlockOperation::NonBlockingLockExclusive).is_err() {
+                let holder = std::fs::read(&path).ok().and_then(|bytes| RunRecord::from_bytes(&bytes)).map(Box::new);
+                return Err(LockError::Held { run: run.to_owned(), holder, option });
+            }
+            // Whoever held it before may have removed the file in between: then this lock is on a file without a name.
+            let same =
+                std::fs::metadata(&path).is_ok_and(|named| file.metadata().is_ok_and(|held| named.ino() == held.ino()));
+            if same {
+                let bytes = record.to_bytes().map_err(|e| failed(std::io::Error::other(e)))?;
+                file.set_len(0).and_then(|()| file.write_all(&bytes)).map_err(failed)?;
+                return Ok(Self { path, _file: file });
+            }
+        }
+    }
+
+    /// Makes sure that no process of an earlier owner of the run lives, and removes what it left.
+    pub fn sweep(&self, run: &Run, option: &'static str) -> Result<(), LockError> {
+        let patience_ns = monotonic_now_ns() + ORPHAN_PATIENCE_NS;
+        while run.folder().is_dir() {
+            let living = living_processes(run)?;
+            if living.is_empty() {
+                break;
+            }
+            if monotonic_now_ns() >= patience_ns {
+                return Err(LockError::Orphans { run: run.name().to_owned(), living, option });
+            }
+            std::thread::sleep(ORPHAN_LOOK);
+        }
+        Ok(remove_run_leftovers(run)?)
+    }
+}
+
+impl Drop for RunLock {
+    fn drop(&mut self) {
+        // While the lock is held, the name is ours to remove.
+        let _ = std::fs::remove_file(&self.path);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A second taker is told who holds the lock, and by which option to name another run; once it is dropped, it can be
+    /// taken, and no file is left. While it is held, the record can be read.
+    #[test]
+    fn one_owner_for_a_run() {
+        let folder = tempfile::tempdir().unwrap();
+        let (graph, dataset, checkpoint) = ("g.toml".to_owned(), "d".to_owned(), "c".to_owned());
+        let record = RunRecord { pid: 4711, run_id: 1, graph, dataset, checkpoint, started_unix_s: 0 };
+        let take = |run: &str| RunLock::take(folder.path(), run, &record, "--run");
+        let held = take("a").unwrap();
+        let written = std::fs::read(RunRecord::path(folder.path(), "a")).unwrap();
+        assert_eq!(RunRecord::from_bytes(&written).as_ref(), Some(&record));
+        let error = take("a").unwrap_err().to_string();
+        assert!(
+            error.contains("`a` is already running") && error.contains("4711") && error.contains("--run"),
+            "{error}"
+        );
+        let other = take("b").unwrap();
+        drop(held);
+        drop(take("a").unwrap());
+        drop(other);
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
+    }
+}
