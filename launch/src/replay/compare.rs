@@ -1,27 +1,29 @@
-//! What a replayed graph believed and decided, against what was recorded.
+//! What a replayed graph made of its frames, against what was recorded: posteriors, forecasts, beliefs and decisions.
 
 use carff_observe::TopicId;
-use carff_readable::{ActionForm, AnyMessage, BeliefForm, HeaderForm};
-use carff_recording::{OwnedMessage, Reader};
+use carff_readable::{ActionForm, AnyMessage, BeliefForm, ForecastForm, HeaderForm, PosteriorForm};
+use carff_recording::Reader;
 use serde_json::Value;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 use std::path::Path;
+
+/// What is compared, in the order in which a graph makes it.
+pub(super) const COMPARED: [TopicId; 4] = [TopicId::Posterior, TopicId::Forecast, TopicId::Belief, TopicId::Action];
+
+/// A message that is compared: its topic, its frame and its step.
+type Place = (TopicId, u64, u32);
 
 /// What a graph made of replayed frames, without times.
 #[derive(Debug, Default)]
 pub(super) struct Replayed {
-    /// By frame and step.
-    beliefs: BTreeMap<(u64, u32), BeliefForm>,
-    /// By frame.
-    decisions: BTreeMap<u64, ActionForm>,
+    made: BTreeMap<Place, Value>,
 }
 
 /// What came of a comparison.
 #[derive(Debug, Default, PartialEq, Eq)]
 pub(super) struct Comparison {
-    beliefs: u64,
-    decisions: u64,
+    compared: BTreeMap<TopicId, u64>,
     different: u64,
     missing: u64,
     first: Option<String>,
@@ -33,58 +35,59 @@ fn without_times(header: &mut HeaderForm) {
     (header.sequence, header.capture_time_ns, header.publish_time_ns) = (0, 0, 0);
 }
 
-/// A belief, but for when it was made.
-fn belief(message: &carff_messages::Belief) -> BeliefForm {
-    let mut form = BeliefForm::from(message);
-    without_times(&mut form.header);
-    (form.encoder_ns, form.forecaster_ns, form.stage_latency_ns) = (0, 0, 0);
-    form
-}
-
-/// A decision, but for when it was made.
-fn decision(message: &carff_messages::Action) -> ActionForm {
-    let mut form = ActionForm::from(message);
-    without_times(&mut form.header);
-    (form.valid_until_ns, form.latency_ns) = (0, 0);
-    form
+/// What a message says but for when it was made; none for messages that are not compared.
+fn timeless(message: AnyMessage<'_>) -> Option<(Place, Value)> {
+    let header = message.header();
+    let (mut frame, mut step) = (header.frame_id, header.step);
+    let (topic, value) = match message {
+        AnyMessage::Posterior(m) => {
+            let mut form = PosteriorForm::from(m);
+            without_times(&mut form.header);
+            form.stage_latency_ns = 0;
+            (TopicId::Posterior, serde_json::to_value(form))
+        }
+        AnyMessage::Forecast(m) => {
+            let mut form = ForecastForm::from(m);
+            without_times(&mut form.header);
+            (form.encoder_ns, form.stage_latency_ns) = (0, 0);
+            (TopicId::Forecast, serde_json::to_value(form))
+        }
+        AnyMessage::Belief(m) => {
+            let mut form = BeliefForm::from(m);
+            without_times(&mut form.header);
+            (form.encoder_ns, form.forecaster_ns, form.stage_latency_ns) = (0, 0, 0);
+            (TopicId::Belief, serde_json::to_value(form))
+        }
+        AnyMessage::Action(m) if m.is_decision == 1 => {
+            let mut form = ActionForm::from(m);
+            without_times(&mut form.header);
+            (form.valid_until_ns, form.latency_ns) = (0, 0);
+            (frame, step) = (m.based_on_frame, 0);
+            (TopicId::Action, serde_json::to_value(form))
+        }
+        _ => return None,
+    };
+    Some(((topic, frame, step), value.unwrap_or_default()))
 }
 
 impl Replayed {
     /// Takes what the replayed graph sent.
     pub(super) fn take(&mut self, message: AnyMessage<'_>) {
-        match message {
-            AnyMessage::Belief(m) => {
-                self.beliefs.insert((m.header.frame_id, m.header.step), belief(m));
-            }
-            AnyMessage::Action(m) if m.is_decision == 1 => {
-                self.decisions.insert(m.based_on_frame, decision(m));
-            }
-            _ => {}
-        }
+        self.made.extend(timeless(message));
     }
 
-    /// Compares every recorded belief and decision on a recorded frame.
+    /// Compares all that was recorded of recorded frames.
     pub(super) fn compare(&self, recording: &Path) -> anyhow::Result<Comparison> {
         let mut reader = Reader::open(recording)?;
         let mut comparison = Comparison::default();
-        let mut frames = std::collections::BTreeSet::new();
+        let mut frames = BTreeSet::new();
         while let Some(entry) = reader.next()? {
-            match (&entry.topic, &entry.message) {
-                (TopicId::Frame, OwnedMessage::Frame(m, _)) => {
-                    frames.insert(m.header.frame_id);
-                }
-                (_, OwnedMessage::Belief(m)) if frames.contains(&m.header.frame_id) => {
-                    comparison.beliefs += 1;
-                    let (frame, step) = (m.header.frame_id, m.header.step);
-                    let replayed = self.beliefs.get(&(frame, step));
-                    comparison.hold(&format!("frame {frame}, belief of step {step}"), &belief(m), replayed);
-                }
-                (_, OwnedMessage::Action(m)) if m.is_decision == 1 && frames.contains(&m.based_on_frame) => {
-                    comparison.decisions += 1;
-                    let replayed = self.decisions.get(&m.based_on_frame);
-                    comparison.hold(&format!("frame {}, decision", m.based_on_frame), &decision(m), replayed);
-                }
-                _ => {}
+            let message = entry.message.as_message();
+            if entry.topic == TopicId::Frame {
+                frames.insert(message.header().frame_id);
+            }
+            if let Some((place, recorded)) = timeless(message).filter(|((_, frame, _), _)| frames.contains(frame)) {
+                comparison.hold(place, &recorded, self.made.get(&place));
             }
         }
         comparison.cut_off = reader.is_cut_off();
@@ -95,24 +98,34 @@ impl Replayed {
 impl Comparison {
     /// Whether all was there, and the same.
     pub(super) fn is_same(&self) -> bool {
-        self.different == 0 && self.missing == 0 && self.beliefs + self.decisions > 0
+        self.different == 0 && self.missing == 0 && !self.compared.is_empty()
     }
 
-    fn hold<T: serde::Serialize + PartialEq>(&mut self, what: &str, recorded: &T, replayed: Option<&T>) {
+    fn hold(&mut self, (topic, frame, step): Place, recorded: &Value, replayed: Option<&Value>) {
+        *self.compared.entry(topic).or_default() += 1;
         let found = match replayed {
             Some(replayed) if replayed == recorded => return,
             Some(replayed) => {
                 self.different += 1;
-                let values =
-                    [serde_json::to_value(recorded), serde_json::to_value(replayed)].map(Result::unwrap_or_default);
-                first_difference("", &values[0], &values[1]).unwrap_or_default()
+                first_difference("", recorded, replayed).unwrap_or_default()
             }
             None => {
                 self.missing += 1;
                 "recorded, but not made by the replay".to_owned()
             }
         };
-        self.first.get_or_insert_with(|| format!("{what}: {found}"));
+        let of_step = if step > 0 { format!(" of step {step}") } else { String::new() };
+        self.first.get_or_insert_with(|| format!("frame {frame}, {}{of_step}: {found}", noun(topic)));
+    }
+}
+
+/// What a topic's message is called.
+fn noun(topic: TopicId) -> &'static str {
+    match topic {
+        TopicId::Posterior => "posterior",
+        TopicId::Forecast => "forecast",
+        TopicId::Belief => "belief",
+        _ => "decision",
     }
 }
 
@@ -136,16 +149,18 @@ fn first_difference(path: &str, recorded: &Value, replayed: &Value) -> Option<St
 
 impl fmt::Display for Comparison {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { beliefs, decisions, different, missing, .. } = self;
+        let counts: Vec<String> =
+            COMPARED.iter().filter_map(|t| Some(format!("{} {}s", self.compared.get(t)?, noun(*t)))).collect();
+        let counts = counts.join(", ");
         if self.is_same() {
-            write!(f, "{beliefs} beliefs and {decisions} decisions: all the same, bit for bit")?;
-        } else if beliefs + decisions == 0 {
+            write!(f, "{counts}: all the same, bit for bit")?;
+        } else if self.compared.is_empty() {
             write!(
                 f,
-                "the recording holds no belief and no decision on a recorded frame: there is nothing to compare"
+                "the recording holds nothing that a graph makes of a recorded frame: there is nothing to compare"
             )?;
         } else {
-            write!(f, "{beliefs} beliefs and {decisions} decisions: {different} differ, {missing} are missing")?;
+            write!(f, "{counts}: {} differ, {} are missing", self.different, self.missing)?;
         }
         if let Some(first) = &self.first {
             write!(f, "\nfirst difference: {first}")?;
@@ -201,10 +216,10 @@ mod tests {
             replayed.take(AnyMessage::Belief(&belief));
         }
         let same = replayed.compare(&path).unwrap();
-        assert!(same.is_same() && same.beliefs == 3, "{same}");
+        assert!(same.is_same() && same.compared[&TopicId::Belief] == 3, "{same}");
 
         replayed.take(AnyMessage::Belief(&a_belief(1, 0.5)));
-        replayed.beliefs.remove(&(2, 1));
+        replayed.made.remove(&(TopicId::Belief, 2, 1));
         let other = replayed.compare(&path).unwrap();
         assert!(!other.is_same() && (other.different, other.missing) == (1, 1));
         let text = other.to_string();

@@ -1,6 +1,6 @@
 //! Sending recorded messages in place of the stages that sent them.
 
-use super::compare::Replayed;
+use super::compare::{COMPARED, Replayed};
 use crate::terminal::Terminal;
 use anyhow::{Context, ensure};
 use carff_messages::{Action, Belief, Forecast, FrameMeta, Header, MAX_PICTURE_BYTES, Posterior, ViewMeta};
@@ -143,7 +143,7 @@ impl Player {
         let largest_bytes = self.largest_pictures()?;
         let mut publishers = Publishers::open(&node, &self.topics, largest_bytes)?;
         let mut back = Vec::new();
-        for topic in [TopicId::Belief, TopicId::Action] {
+        for topic in COMPARED {
             if !self.topics.contains(&topic) {
                 back.push(AnyReceiver::open(&node, topic)?);
             }

@@ -38,7 +38,8 @@ pub struct ReplayArgs {
     /// them, and those before, are not started. `all`: no stage is.
     #[arg(long, value_parser = only)]
     pub only: Option<Only>,
-    /// One frame after another, each waited for; then compare every belief and decision with the recorded ones.
+    /// One frame after another, each waited for; then compare every posterior, forecast, belief and decision with the
+    /// recorded ones.
     #[arg(long, conflicts_with_all = ["rate", "step", "only"])]
     pub verify: bool,
     /// Run name, in place of the recorded one's.

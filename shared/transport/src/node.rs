@@ -219,10 +219,17 @@ pub(crate) fn service_name(topic: &str) -> Result<ServiceName, String> {
     ServiceName::new(topic).map_err(|e| format!("name: {e:?}"))
 }
 
-/// Opens, again and again for a while where another process is just creating or removing the same thing.
+/// Opens or creates, again and again for a while where another process is just creating or removing the same thing.
 fn retry<T>(topic: &str, mut open: impl FnMut() -> Result<T, String>) -> Result<T, OpenError> {
-    const PASSING: [&str; 5] =
-        ["SystemInFlux", "IsBeingCreated", "IsMarkedForDestruction", "HangsInCreation", "AlreadyExists"];
+    // "DoesNotExist": it was there when it was looked for, and gone when it was opened.
+    const PASSING: [&str; 6] = [
+        "SystemInFlux",
+        "IsBeingCreated",
+        "IsMarkedForDestruction",
+        "HangsInCreation",
+        "AlreadyExists",
+        "DoesNotExist",
+    ];
     let start = Instant::now();
     loop {
         let cause = match open() {
