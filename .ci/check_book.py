@@ -1,12 +1,14 @@
 #!/usr/bin/env python3
 """Checks the book and the other pages without network: links and pictures resolve, headings that are linked to exist,
-every page of the book is in its summary, and what a page includes begins and ends where a block of it does.
+every page of the book is in its summary, no link of the built book is dead, and what a page includes begins and ends
+where a block of it does.
 
 That the commands in them are understood is a test of the command's own (launch/src/main.rs).
 
 Usage: python3 .ci/check_book.py      (from anywhere; exit code 1 and one line per finding)
 """
 
+import json
 import re
 import subprocess
 import sys
@@ -65,6 +67,30 @@ def check_includes(page: Path, text: str) -> None:
             find(f"{here}: lines {begin} to {end} of {path} do not begin and end where a block does")
 
 
+def check_built_links() -> None:
+    """What the book's preprocessor makes of links that lead out of the book: links to files that are in the repository."""
+    pages = sorted(BOOK.glob("**/*.md"))
+    chapters = [
+        {"Chapter": {"content": p.read_text(encoding="utf-8"), "source_path": str(p.relative_to(BOOK)), "sub_items": []}}
+        for p in pages
+    ]
+    repository = "https://example.org/book"
+    context = {"config": {"output": {"html": {"git-repository-url": repository}}}}
+    done = subprocess.run(
+        [sys.executable, "outside_links.py"], cwd=BOOK.parent, input=json.dumps([context, {"items": chapters}]),
+        capture_output=True, text=True, check=True,
+    )
+    for page, item in zip(pages, json.loads(done.stdout)["items"], strict=True):
+        for target in LINK.findall(FENCE.sub("", item["Chapter"]["content"])):
+            inside = (page.parent / target.partition("#")[0]).resolve().is_relative_to(BOOK)
+            file = target.removeprefix(f"{repository}/blob/main/").partition("#")[0]
+            if target.startswith(repository):
+                if not (ROOT / file).is_file():
+                    find(f"{page.relative_to(ROOT)}: the built book links to {target}, which is no file")
+            elif not re.match(r"[a-z]+:", target) and not inside:
+                find(f"{page.relative_to(ROOT)}: {target} is dead in the built book")
+
+
 def main() -> None:
     listed = subprocess.run(
         ["git", "ls-files", "--cached", "--others", "--exclude-standard", "*.md"],
@@ -79,6 +105,7 @@ def main() -> None:
     named = {(BOOK / t).resolve() for t in LINK.findall(summary.read_text(encoding="utf-8"))}
     for page in sorted(set(BOOK.glob("**/*.md")) - named - {summary}):
         find(f"{page.relative_to(ROOT)}: it is not in {summary.relative_to(ROOT)}")
+    check_built_links()
     print(f"pages: {len(pages)}, {len(named)} of them the book's")
     for text in findings:
         print(f"error: {text}", file=sys.stderr)
