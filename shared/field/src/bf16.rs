@@ -135,9 +135,11 @@ fn pair_up(even: __m512, odd: __m512) -> __m512i {
         }
         order
     };
-    // SAFETY: both are 512 bits of whole numbers; every bit pattern is one.
-    let (order, rows): (__m512i, __m512i) =
-        unsafe { (std::mem::transmute(ORDER), std::mem::transmute(_mm512_cvtne2ps_pbh(odd, even))) };
+    // SAFETY: both are 512 bits, and every bit pattern is 32 whole numbers.
+    let order = unsafe { std::mem::transmute::<[u16; 32], __m512i>(ORDER) };
+    let rows = _mm512_cvtne2ps_pbh(odd, even);
+    // SAFETY: as above.
+    let rows = unsafe { std::mem::transmute::<__m512bh, __m512i>(rows) };
     _mm512_permutexvar_epi16(order, rows)
 }
 
@@ -145,7 +147,7 @@ fn pair_up(even: __m512, odd: __m512) -> __m512i {
 #[target_feature(enable = "avx512f")]
 fn halves(bits: __m512i) -> __m512bh {
     // SAFETY: both are 512 bits, and every bit pattern is 32 numbers in bf16.
-    unsafe { std::mem::transmute(bits) }
+    unsafe { std::mem::transmute::<__m512i, __m512bh>(bits) }
 }
 
 #[cfg(target_arch = "x86_64")]
