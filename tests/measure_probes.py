@@ -1,0 +1,127 @@
+#!/usr/bin/env python3
+"""Measures what probes that come and go cost a running graph.
+
+Usage: python3 tests/measure_probes.py [--rounds N] [--drives N] [FOLDER OF THE PROGRAMS]   (default: 4, 60, target/release)
+
+In each round the shipped graph drives twice, in turns: once alone, and once while probes attach, hear a message, and
+detach or are killed with -9, three at a time, as quickly as they come. Printed are both ways' latencies from camera to
+action, how many probes heard something, and the ratio of the medians of the p99s. In the end nothing may be left of any
+run. For a machine with nothing else to do; no test, since it measures times.
+"""
+
+import argparse
+import json
+import os
+import signal
+import statistics
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+GRAPH = "configs/graphs/approaching-intersection.toml"
+TOPICS = ["prober/belief", "controller/action", "camera/frame"]
+AT_ONCE = 3
+RUNS = Path("/tmp") / f"carff-{os.geteuid()}"
+PATIENCE_S = 60
+
+
+class Storm:
+    """Probes that come and go until they are told to stop."""
+
+    def __init__(self, carff: Path, run: str):
+        self.carff, self.run = carff, run
+        self.heard = self.killed = 0
+        self.over = threading.Event()
+        self.lock = threading.Lock()
+        self.threads = [threading.Thread(target=self.work, args=(i,)) for i in range(AT_ONCE)]
+
+    def work(self, number: int) -> None:
+        turn = number
+        while not self.over.is_set():
+            topic, kill = TOPICS[turn % len(TOPICS)], turn % 2 == 0
+            turn += 1
+            count = [] if kill else ["--count", "1"]
+            probe = subprocess.Popen(
+                [self.carff, "probe", "echo", topic, "--json", "--run", self.run, *count],
+                stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
+            )
+            # A probe that finds no run ends without a word.
+            heard = bool(probe.stdout.readline())
+            if kill:
+                probe.send_signal(signal.SIGKILL)
+            probe.stdout.close()
+            probe.wait()
+            with self.lock:
+                self.heard += heard
+                self.killed += heard and kill
+
+    def __enter__(self):
+        for thread in self.threads:
+            thread.start()
+        return self
+
+    def __exit__(self, *_):
+        self.over.set()
+        for thread in self.threads:
+            thread.join()
+
+
+def held() -> set[Path]:
+    """What runs hold of the system."""
+    return {p for folder in (RUNS, Path("/dev/shm")) if folder.is_dir() for p in folder.iterdir()}
+
+
+def drive(carff: Path, run: str, drives: int, storms: bool) -> tuple[dict, int, int]:
+    """The latencies of one launch, milliseconds, and the probes that heard something, and those of them that were killed."""
+    before, record = held(), RUNS / f"{run}.run"
+    with tempfile.TemporaryDirectory() as folder:
+        report = Path(folder) / "report.json"
+        launch = subprocess.Popen(
+            [carff, "launch", GRAPH, "--run", run, "--drives", str(drives), "--report", report],
+            cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        )
+        heard = killed = 0
+        if storms:
+            until = time.monotonic() + PATIENCE_S
+            while not record.exists() and launch.poll() is None and time.monotonic() < until:
+                time.sleep(0.01)
+            with Storm(carff, run) as storm:
+                while record.exists() and launch.poll() is None:
+                    time.sleep(0.1)
+            heard, killed = storm.heard, storm.killed
+        if launch.wait() != 0:
+            sys.exit(f"the graph ended with {launch.returncode}")
+        latency = json.loads(report.read_text())["latency_ms"]["camera_to_action"]
+    if left := held() - before:
+        sys.exit(f"left behind by run {run}: {sorted(map(str, left))}")
+    return latency, heard, killed
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
+    parser.add_argument("--rounds", type=int, default=4)
+    parser.add_argument("--drives", type=int, default=60)
+    parser.add_argument("programs", nargs="?", default=ROOT / "target/release")
+    args = parser.parse_args()
+    carff = Path(args.programs).resolve() / "carff"
+    ways: dict[bool, list[dict]] = {False: [], True: []}
+    heard = killed = 0
+    for number in range(args.rounds):
+        # The second of two is the first of the next two: none is always the one after the other.
+        for storms in [False, True] if number % 2 == 0 else [True, False]:
+            latency, more, ended = drive(carff, f"measured{number}{int(storms)}", args.drives, storms)
+            ways[storms].append(latency)
+            heard, killed = heard + more, killed + ended
+            print(f"round {number + 1}, {'probes' if storms else 'alone':6}: {json.dumps(latency)}", flush=True)
+    p99 = {way: [latency["p99"] for latency in found] for way, found in ways.items()}
+    ratio = statistics.median(p99[True]) / statistics.median(p99[False])
+    print(f"{heard} probes heard a message, {killed} of them were killed with -9")
+    print(f"p99, ms: alone {p99[False]}, with probes {p99[True]}; ratio of medians {ratio:.3f}")
+
+
+if __name__ == "__main__":
+    main()
