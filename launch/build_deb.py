@@ -3,7 +3,7 @@
 
 Usage: python3 launch/build_deb.py [TARGET] [OUT]     (default: target, target/carff_VERSION_ARCH.deb)
 
-Programs go to /usr/lib/carff/bin with libtorch beside them, what they read to
+Programs go to /usr/lib/carff/bin with libtorch beside them (carff-link among them where it was built), what they read to
 /usr/share/carff/configs, the graph of the service to /etc/carff/vehicle.toml, units to
 /lib/systemd/system, manual pages and completions to where they belong. Needs
 dpkg-deb; with cargo-cyclonedx too, a bill of materials is among the documents. The
@@ -22,8 +22,10 @@ from pathlib import Path
 import build_sbom
 
 ROOT = Path(__file__).resolve().parent.parent
-PROGRAMS = ["carff", "carff-camera", "carff-encoder", "carff-forecaster", "carff-prober", "carff-renderer",
+PROGRAMS = ["carff", "carff-launch", "carff-camera", "carff-encoder", "carff-forecaster", "carff-prober", "carff-renderer",
             "carff-controller", "carff-viewer"]
+# Where it was built: `make link`.
+OPTIONAL = ["carff-link"]
 # What a program that was built in the project is linked with, and what takes its place.
 BUILT_RUNPATH = b"$ORIGIN/../../.libtorch/lib:$ORIGIN/../../../.libtorch/lib"
 INSTALLED_RUNPATH = b"$ORIGIN/../lib"
@@ -68,7 +70,7 @@ def put_compressed(text: bytes, target: Path) -> None:
 
 def fill(tree: Path, target: Path) -> None:
     home, share, doc = tree / "usr/lib/carff", tree / "usr/share/carff", tree / "usr/share/doc/carff"
-    for program in PROGRAMS:
+    for program in PROGRAMS + [name for name in OPTIONAL if (target / "release" / name).is_file()]:
         put_program(target / "release" / program, home / "bin" / program)
     libtorch = Path(os.environ.get("LIBTORCH") or ROOT / ".libtorch")
     for library in sorted((libtorch / "lib").glob("*.so*")):

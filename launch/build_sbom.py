@@ -21,8 +21,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 TARGET = "x86_64-unknown-linux-gnu"
-PROGRAMS = ["launch", "services/camera", "services/encoder", "services/forecaster", "services/prober", "services/renderer",
-            "services/controller", "services/viewer"]
+PROGRAMS = ["launch", "launch/attach", "services/camera", "services/encoder", "services/forecaster", "services/prober",
+            "services/renderer", "services/controller", "services/viewer"]
 TOOL = ["cargo", "cyclonedx"]
 # The crate that links with libtorch.
 LINKED = "torch-sys"

@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
 """Measures what probes that come and go cost a running graph.
 
-Usage: python3 tests/measure_probes.py [--rounds N] [--drives N] [FOLDER OF THE PROGRAMS]   (default: 4, 60, target/release)
+Usage: python3 tests/measure_probes.py [--rounds N] [--drives N] [--per-second R] [FOLDER OF THE PROGRAMS]
 
-In each round the shipped graph drives twice, in turns: once alone, and once while probes attach, hear a message, and
-detach or are killed with -9, three at a time, as quickly as they come. Printed are both ways' latencies from camera to
-action, how many probes heard something, and the ratio of the medians of the p99s. In the end nothing may be left of any
-run. For a machine with nothing else to do; no test, since it measures times.
+In each round (4) the shipped graph drives (60 times) twice, in turns: once alone, and once while probes attach, hear a
+message, and detach or are killed with -9, R (4) of them a second, at most three at a time. Printed are both ways'
+latencies from camera to action, how many probes heard something, and the ratio of the medians of the p99s. In the end
+nothing may be left of any run. For a machine with nothing else to do; no test, since it measures times.
 """
 
 import argparse
@@ -32,8 +32,9 @@ PATIENCE_S = 60
 class Storm:
     """Probes that come and go until they are told to stop."""
 
-    def __init__(self, carff: Path, run: str):
+    def __init__(self, carff: Path, run: str, per_second: float):
         self.carff, self.run = carff, run
+        self.pause = AT_ONCE / per_second
         self.heard = self.killed = 0
         self.over = threading.Event()
         self.lock = threading.Lock()
@@ -41,7 +42,9 @@ class Storm:
 
     def work(self, number: int) -> None:
         turn = number
-        while not self.over.is_set():
+        begun = time.monotonic() + self.pause * number / AT_ONCE
+        while not self.over.wait(max(0.0, begun - time.monotonic())):
+            begun = max(begun + self.pause, time.monotonic())
             topic, kill = TOPICS[turn % len(TOPICS)], turn % 2 == 0
             turn += 1
             count = [] if kill else ["--count", "1"]
@@ -75,7 +78,7 @@ def held() -> set[Path]:
     return {p for folder in (RUNS, Path("/dev/shm")) if folder.is_dir() for p in folder.iterdir()}
 
 
-def drive(carff: Path, run: str, drives: int, storms: bool) -> tuple[dict, int, int]:
+def drive(carff: Path, run: str, drives: int, per_second: float | None) -> tuple[dict, int, int]:
     """The latencies of one launch, milliseconds, and the probes that heard something, and those of them that were killed."""
     before, record = held(), RUNS / f"{run}.run"
     with tempfile.TemporaryDirectory() as folder:
@@ -85,11 +88,11 @@ def drive(carff: Path, run: str, drives: int, storms: bool) -> tuple[dict, int, 
             cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
         )
         heard = killed = 0
-        if storms:
+        if per_second:
             until = time.monotonic() + PATIENCE_S
             while not record.exists() and launch.poll() is None and time.monotonic() < until:
                 time.sleep(0.01)
-            with Storm(carff, run) as storm:
+            with Storm(carff, run, per_second) as storm:
                 while record.exists() and launch.poll() is None:
                     time.sleep(0.1)
             heard, killed = storm.heard, storm.killed
@@ -105,6 +108,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
     parser.add_argument("--rounds", type=int, default=4)
     parser.add_argument("--drives", type=int, default=60)
+    parser.add_argument("--per-second", type=float, default=4)
     parser.add_argument("programs", nargs="?", default=ROOT / "target/release")
     args = parser.parse_args()
     carff = Path(args.programs).resolve() / "carff"
@@ -113,7 +117,8 @@ def main() -> None:
     for number in range(args.rounds):
         # The second of two is the first of the next two: none is always the one after the other.
         for storms in [False, True] if number % 2 == 0 else [True, False]:
-            latency, more, ended = drive(carff, f"measured{number}{int(storms)}", args.drives, storms)
+            latency, more, ended = drive(carff, f"measured{number}{int(storms)}", args.drives,
+                                          args.per_second if storms else None)
             ways[storms].append(latency)
             heard, killed = heard + more, killed + ended
             print(f"round {number + 1}, {'probes' if storms else 'alone':6}: {json.dumps(latency)}", flush=True)

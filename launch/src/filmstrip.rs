@@ -174,7 +174,7 @@ impl Artist<'_> {
         birds_eye_camera(&self.setup.dataset, self.probe.field())
     }
 
-    fn rendered(&mut self, camera: &PinholeCamera, latent: &[f32; carff_models::LATENT_DIM]) -> Image {
+    fn rendered(&mut self, camera: &PinholeCamera, latent: &[f32; carff_latent::LATENT_DIM]) -> Image {
         let threads = std::thread::available_parallelism().map_or(1, std::num::NonZero::get);
         let options = RenderOptions { threads, ..RenderOptions::default() };
         self.probe.field().render(camera, latent, &options, &mut self.buffer);

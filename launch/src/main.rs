@@ -1,22 +1,17 @@
-//! The `carff` command.
+//! Every command of `carff`, its help, completions and manual pages: what `carff` becomes for all that computes.
 
-use carff::ablate::AblateArgs;
-use carff::bridge::BridgeArgs;
-use carff::dataset::DatasetCommand;
-use carff::doctor::DoctorArgs;
-use carff::eval::EvalArgs;
-use carff::export::ExportArgs;
-use carff::launch::LaunchArgs;
-use carff::metrics::MetricsArgs;
-use carff::probe::ProbeCommand;
-use carff::record::RecordArgs;
-use carff::replay::ReplayArgs;
-use carff::schema::SchemaArgs;
-use carff::shell::{CompletionsArgs, ManArgs};
-use carff::soak::{InjectArgs, SoakArgs};
-use carff::train::TrainArgs;
-use carff::view::ViewArgs;
+use carff::{Attach, exit_code};
 use carff_bench::BenchCommand;
+use carff_launch::ablate::AblateArgs;
+use carff_launch::dataset::DatasetCommand;
+use carff_launch::doctor::DoctorArgs;
+use carff_launch::eval::EvalArgs;
+use carff_launch::launch::LaunchArgs;
+use carff_launch::replay::ReplayArgs;
+use carff_launch::schema::SchemaArgs;
+use carff_launch::shell::{CompletionsArgs, ManArgs};
+use carff_launch::soak::{InjectArgs, SoakArgs};
+use carff_launch::train::TrainArgs;
 use clap::{CommandFactory, Parser, Subcommand};
 use std::process::ExitCode;
 
@@ -38,7 +33,7 @@ Environment:
 
 /// CARFF: from a camera image to a driving decision, in separate processes.
 #[derive(Debug, Parser)]
-#[command(version, after_help = ENDS)]
+#[command(name = "carff", bin_name = "carff", version, after_help = ENDS)]
 struct Cli {
     #[command(subcommand)]
     command: Command,
@@ -50,26 +45,8 @@ enum Command {
     #[command(after_help = "Example: two drives, with a report
   carff launch configs/graphs/approaching-intersection.toml --drives 2 --report reports/run.json")]
     Launch(LaunchArgs),
-    /// Look at a running graph from another terminal.
-    #[command(
-        subcommand,
-        after_help = "Example: what runs, and how each stage does
-  carff probe list
-  carff probe top"
-    )]
-    Probe(ProbeCommand),
-    /// Open the live window: each hypothesis from any camera.
-    #[command(after_help = "Example: on the run that lives, or on a checkpoint alone
-  carff view
-  carff view --checkpoint configs/checkpoints/approaching-intersection")]
-    View(ViewArgs),
-    /// Record a running graph into an MCAP file.
-    #[command(
-        after_help = "Example: a minute of everything; actions and beliefs alone, in files of 10 minutes of which 6 are kept
-  carff record -o run.mcap --seconds 60
-  carff record belief action -o drive.mcap --file-seconds 600 --keep 6"
-    )]
-    Record(RecordArgs),
+    #[command(flatten)]
+    Attach(Attach),
     /// Send a recording through a graph again, and compare.
     #[command(after_help = "Example: is everything still decided as it was? And at half the speed, to look at
   carff replay run.mcap --verify
@@ -77,23 +54,6 @@ enum Command {
 
 Exit code: 1 when --verify finds a difference.")]
     Replay(ReplayArgs),
-    /// Make pictures, tables, a film, or a trace of a recording.
-    #[command(after_help = "Example:
-  carff export run.mcap --png pictures --csv tables --trace trace.json")]
-    Export(ExportArgs),
-    /// Serve a run's topics over the Foxglove WebSocket protocol, read-only, on this machine alone.
-    #[command(
-        after_help = "Example: on the vehicle, and through a tunnel to the desk, where Foxglove opens ws://localhost:8765
-  carff bridge
-  ssh -L 8765:localhost:8765 vehicle"
-    )]
-    Bridge(BridgeArgs),
-    /// Serve a run's numbers over HTTP, for Prometheus, on this machine alone.
-    #[command(after_help = "Example:
-  carff metrics --listen 127.0.0.1:9464
-  curl http://127.0.0.1:9464/metrics
-  carff metrics --once")]
-    Metrics(MetricsArgs),
     /// Render and check data sets.
     #[command(
         subcommand,
@@ -153,33 +113,24 @@ A TOML file names its schema in its first line, for editors that know taplo: #:s
 
 fn main() -> ExitCode {
     let result = match Cli::parse().command {
-        Command::Launch(args) => carff::launch::run(&args),
-        Command::Probe(command) => carff::probe::run(&command),
-        Command::View(args) => carff::view::run(&args),
-        Command::Record(args) => carff::record::run(&args),
-        Command::Replay(args) => carff::replay::run(&args),
-        Command::Export(args) => carff::export::run(&args),
-        Command::Bridge(args) => carff::bridge::run(&args),
-        Command::Metrics(args) => carff::metrics::run(&args),
-        Command::Train(args) => carff::train::run(&args),
-        Command::Eval(args) => carff::eval::run(&args),
-        Command::Ablate(args) => carff::ablate::run(&args),
+        Command::Launch(args) => carff_launch::launch::run(&args),
+        Command::Attach(command) => command.run(),
+        Command::Replay(args) => carff_launch::replay::run(&args),
+        Command::Train(args) => carff_launch::train::run(&args),
+        Command::Eval(args) => carff_launch::eval::run(&args),
+        Command::Ablate(args) => carff_launch::ablate::run(&args),
         Command::Bench(command) => carff_bench::run(command),
-        Command::Soak(args) => carff::soak::run(&args),
-        Command::SoakInject(args) => carff::soak::inject(&args).map(|()| ExitCode::SUCCESS),
-        Command::Doctor(args) => carff::doctor::run(&args),
-        Command::Schema(args) => carff::schema::run(&args).map(|()| ExitCode::SUCCESS),
-        Command::Completions(args) => carff::shell::completions(&args, Cli::command()).map(|()| ExitCode::SUCCESS),
-        Command::Man(args) => carff::shell::man(&args, Cli::command()).map(|()| ExitCode::SUCCESS),
-        Command::Dataset(command) => carff::dataset::run(command).map(|()| ExitCode::SUCCESS),
-    };
-    match result {
-        Ok(code) => code,
-        Err(error) => {
-            eprintln!("error: {}", carff_stage::describe(&error));
-            ExitCode::FAILURE
+        Command::Soak(args) => carff_launch::soak::run(&args),
+        Command::SoakInject(args) => carff_launch::soak::inject(&args).map(|()| ExitCode::SUCCESS),
+        Command::Doctor(args) => carff_launch::doctor::run(&args),
+        Command::Schema(args) => carff_launch::schema::run(&args).map(|()| ExitCode::SUCCESS),
+        Command::Completions(args) => {
+            carff_launch::shell::completions(&args, Cli::command()).map(|()| ExitCode::SUCCESS)
         }
-    }
+        Command::Man(args) => carff_launch::shell::man(&args, Cli::command()).map(|()| ExitCode::SUCCESS),
+        Command::Dataset(command) => carff_launch::dataset::run(command).map(|()| ExitCode::SUCCESS),
+    };
+    exit_code(result)
 }
 
 #[cfg(test)]
@@ -263,7 +214,7 @@ mod tests {
             assert!(String::from_utf8_lossy(&script).contains("doctor"), "{shell}");
         }
         let folder = tempfile::tempdir().unwrap();
-        carff::shell::man(&ManArgs { dir: folder.path().join("man1") }, Cli::command()).unwrap();
+        carff_launch::shell::man(&ManArgs { dir: folder.path().join("man1") }, Cli::command()).unwrap();
         let page = std::fs::read_to_string(folder.path().join("man1/carff-launch.1")).unwrap();
         assert!(page.contains("carff launch configs/graphs"), "{page}");
     }

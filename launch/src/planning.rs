@@ -12,8 +12,8 @@ use carff_dataset::{
     sensor::SensorNoise,
 };
 use carff_evaluation::{Models, PlanningTable, SAMPLE_COUNTS, count, planning_table, trials};
+use carff_latent::{LatentGaussian, Sampling};
 use carff_messages::{ActionCode, Observability};
-use carff_models::{LatentGaussian, mixture::Sampling};
 use carff_planning::Rule;
 use carff_scenes::Scenario;
 use serde_json::{Map, Value, json};
@@ -138,7 +138,7 @@ impl Setup {
         let posterior = LatentGaussian { mean: posterior.mean, log_variance: posterior.log_variance };
         let horizon = self.graph.run.horizon;
         let plan = Plan { samples, sampling: self.sampling(), horizon, seed: self.seed, frame: frame.frame_id };
-        Some(look_ahead(&self.models.mixture, probe, &posterior, plan))
+        Some(look_ahead(|input, _| self.models.mixture.forecast(input), probe, &posterior, plan))
     }
 }
 

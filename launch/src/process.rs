@@ -1,8 +1,8 @@
 //! One child process of the launcher.
 
-use crate::log_line;
-use crate::terminal::Terminal;
 use anyhow::Context;
+use carff::log_line;
+use carff::terminal::Terminal;
 use carff_messages::Stage;
 use carff_stage::StageArgs;
 use rustix::process::{Pid, Signal, kill_process};

@@ -7,7 +7,7 @@ use std::path::Path;
 use std::process::{Command, Output};
 
 fn carff(args: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_carff")).args(args).output().unwrap()
+    Command::new(env!("CARGO_BIN_EXE_carff-launch")).args(args).output().unwrap()
 }
 
 /// The JSON is whole, its counts are those of its findings, and the exit code is 1 exactly when an error is among them.

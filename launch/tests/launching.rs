@@ -190,7 +190,7 @@ impl Graph {
     }
 
     fn command(&self, frames: u64) -> Command {
-        let mut command = Command::new(env!("CARGO_BIN_EXE_carff"));
+        let mut command = Command::new(env!("CARGO_BIN_EXE_carff-launch"));
         command
             .arg("launch")
             .arg(self.path("graph.toml"))
@@ -356,7 +356,7 @@ fn a_killed_launcher_leaves_no_stage_and_no_obstacle() {
 fn wrong_graph_files_are_named() {
     let graph = Graph::new("none");
     let launch = |path: &Path| {
-        let output = Command::new(env!("CARGO_BIN_EXE_carff")).arg("launch").arg(path).output().unwrap();
+        let output = Command::new(env!("CARGO_BIN_EXE_carff-launch")).arg("launch").arg(path).output().unwrap();
         assert_eq!(output.status.code(), Some(1));
         text(&output)
     };

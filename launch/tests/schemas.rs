@@ -2,7 +2,7 @@
 
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
-use carff::schema::{FileKind, schema};
+use carff_launch::schema::{FileKind, schema};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 

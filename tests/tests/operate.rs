@@ -48,6 +48,22 @@ fn stop(graph: &TestGraph, launcher: Process) {
     graph.assert_nothing_left();
 }
 
+/// Loading libtorch takes thirty times what a probe takes to start: what computes with no tensor is not linked with it.
+/// (Asked to, the dynamic loader lists what it would load, and ends.)
+#[test]
+fn what_needs_no_tensors_is_not_linked_with_libtorch() {
+    let loads = |name: &str| {
+        let output = Command::new(program(name)).env("LD_TRACE_LOADED_OBJECTS", "1").output().unwrap();
+        let text = String::from_utf8(output.stdout).unwrap();
+        assert!(text.contains("libc.so"), "{name}: {text}");
+        text.contains("libtorch")
+    };
+    assert!(loads("carff-launch") && loads("carff-encoder"));
+    for name in ["carff", "carff-camera", "carff-prober", "carff-renderer", "carff-controller"] {
+        assert!(!loads(name), "{name} is linked with libtorch");
+    }
+}
+
 /// Every probe shows what runs, without a config; the graph's decisions go on, and nothing is left at the end.
 #[test]
 fn probes_show_what_runs() {

@@ -145,8 +145,8 @@ fn models(checkpoint: &Path, shown: Option<&ScenarioIdentity>, findings: &mut Ve
         }
     };
     let parts = [
-        carff_checkpoint::load_encoder(checkpoint, &manifest).map(drop).map_err(|e| e.to_string()),
-        carff_checkpoint::load_mixture(checkpoint, &manifest).map(drop).map_err(|e| e.to_string()),
+        carff_models::stored::load_encoder(checkpoint, &manifest).map(drop).map_err(|e| e.to_string()),
+        carff_models::stored::load_mixture(checkpoint, &manifest).map(drop).map_err(|e| e.to_string()),
         carff_checkpoint::load_field(checkpoint, &manifest).map(drop).map_err(|e| e.to_string()),
         carff_checkpoint::load_probing(checkpoint, &manifest).map(drop).map_err(|e| e.to_string()),
         CheckpointPlanning::load(checkpoint).map(drop).map_err(|e| e.to_string()),

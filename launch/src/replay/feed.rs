@@ -1,8 +1,8 @@
 //! Sending recorded messages in place of the stages that sent them.
 
 use super::compare::{COMPARED, Replayed};
-use crate::terminal::Terminal;
 use anyhow::{Context, ensure};
+use carff::terminal::Terminal;
 use carff_messages::{Action, Belief, Forecast, FrameMeta, Header, MAX_PICTURE_BYTES, Posterior, ViewMeta};
 use carff_observe::{AnyReceiver, Received, TopicId};
 use carff_recording::{Entry, OwnedMessage, Reader};

@@ -4,8 +4,8 @@ mod compare;
 mod feed;
 
 use crate::launch::{Ended, Feed, LaunchArgs, run_graph};
-use crate::terminal::Terminal;
 use anyhow::{Context, ensure};
+use carff::terminal::Terminal;
 use carff_messages::Stage;
 use carff_observe::TopicId;
 use carff_recording::Reader;

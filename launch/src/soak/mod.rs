@@ -202,7 +202,10 @@ impl Soak<'_> {
             }
             self.notes.note(fault.to_string());
             self.outcome.schedule.push(fault.to_string());
-            if self.inflict(&fault)? {
+            let recovered = self.outcome.recoveries_ms.len();
+            let inflicted = self.inflict(&fault)?;
+            self.outcome.note_recoveries(fault.kind.name(), recovered);
+            if inflicted {
                 *self.outcome.faults.entry(fault.kind.name()).or_default() += 1;
             } else {
                 *self.outcome.not_tried.entry(fault.kind.name()).or_default() += 1;

@@ -22,7 +22,7 @@ pub(super) fn small_disk() -> PathBuf {
 }
 
 fn recorder(run: &Run, out: &Path) -> std::io::Result<Command> {
-    let mut command = Command::new(std::env::current_exe()?);
+    let mut command = Command::new(std::env::current_exe()?.with_file_name("carff"));
     command.args(["record", "--run", run.name(), "--out"]).arg(out).stdin(Stdio::null()).stdout(Stdio::null());
     Ok(command)
 }

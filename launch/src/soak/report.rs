@@ -20,6 +20,8 @@ pub(super) struct Outcome {
     /// Graphs stopped and started.
     pub(super) cycles: u64,
     pub(super) recoveries_ms: Vec<f64>,
+    /// The worst of them by kind of fault.
+    pub(super) worst_recoveries_ms: BTreeMap<&'static str, f64>,
     pub(super) worst_start_ms: f64,
     pub(super) leaked_files: usize,
     pub(super) growth_percent_per_hour: Option<f64>,
@@ -77,6 +79,14 @@ fn quantile(values: &[f64], share: f64) -> Option<f64> {
 }
 
 impl Outcome {
+    /// Puts the recoveries from number `first` on down to a kind of fault.
+    pub(super) fn note_recoveries(&mut self, kind: &'static str, first: usize) {
+        for &ms in self.recoveries_ms.iter().skip(first) {
+            let worst = self.worst_recoveries_ms.entry(kind).or_default();
+            *worst = worst.max(ms);
+        }
+    }
+
     /// Judges what only the whole tells.
     pub(super) fn finish(&mut self, notes: &Notes, lives: &Lives, contract: &Contract) {
         let growth = lives.growth_percent_per_hour(contract.warm_up_s, contract.memory_span_s);
@@ -114,6 +124,7 @@ impl Outcome {
             "violation": self.violation,
             "evidence": self.evidence,
             "worst_recovery_ms": self.recoveries_ms.iter().copied().reduce(f64::max),
+            "worst_recovery_ms_by_kind": self.worst_recoveries_ms,
             "median_recovery_ms": quantile(&self.recoveries_ms, 0.5),
             "worst_start_ms": self.worst_start_ms,
             "worst_safe_action_ms": ms(notes.judge.worst_safe_action_ns),
@@ -164,6 +175,20 @@ mod tests {
         assert_eq!(name, "prober");
         assert!((1.9..2.1).contains(&percent), "{percent}");
         assert!(lives.growth_percent_per_hour(120, 4000).is_none());
+    }
+
+    /// Each kind of fault has the worst of its own recoveries; one without recoveries has none.
+    #[test]
+    fn recoveries_belong_to_their_kind() {
+        let mut outcome = Outcome::default();
+        for (kind, found) in
+            [("kill", vec![200.0]), ("stop", vec![900.0, 300.0]), ("full_disk", vec![]), ("kill", vec![500.0])]
+        {
+            let first = outcome.recoveries_ms.len();
+            outcome.recoveries_ms.extend(found);
+            outcome.note_recoveries(kind, first);
+        }
+        assert_eq!(outcome.worst_recoveries_ms, BTreeMap::from([("kill", 500.0), ("stop", 900.0)]));
     }
 
     /// Quantiles are values that occurred; of none there is none.

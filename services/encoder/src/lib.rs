@@ -11,7 +11,7 @@ pub fn load(checkpoint: &Path, threads: usize) -> anyhow::Result<Encoder> {
     carff_models::allocator::keep_large_blocks();
     tch::set_num_threads(threads as i32);
     let manifest = Manifest::load(checkpoint)?;
-    let encoder = carff_checkpoint::load_encoder(checkpoint, &manifest)?;
+    let encoder = carff_models::stored::load_encoder(checkpoint, &manifest)?;
     for _ in 0..3 {
         encode(&encoder, &vec![128; 128 * 128 * 3], 128, 128)?;
     }

@@ -1,11 +1,9 @@
 //! The forecaster stage's arithmetic: from a posterior, observed or fed back, to a mixture and its draws.
 
 use carff_checkpoint::Manifest;
+use carff_latent::{LatentGaussian, Sampling};
 use carff_messages::{Belief, Forecast, ForecastSource, Gaussian, Header, Posterior};
-use carff_models::{
-    LatentGaussian,
-    mixture::{MixtureNet, Sampling},
-};
+use carff_models::mixture::MixtureNet;
 use std::path::Path;
 
 /// The forecaster's model and settings.
@@ -29,7 +27,7 @@ impl Forecaster {
         carff_models::allocator::keep_large_blocks();
         tch::set_num_threads(threads as i32);
         let manifest = Manifest::load(checkpoint)?;
-        let net = carff_checkpoint::load_mixture(checkpoint, &manifest)?;
+        let net = carff_models::stored::load_mixture(checkpoint, &manifest)?;
         for _ in 0..3 {
             net.forecast(&LatentGaussian { mean: [0.0; 8], log_variance: [0.0; 8] });
         }

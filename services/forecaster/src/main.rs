@@ -1,8 +1,8 @@
 //! The forecaster stage: posteriors and fed-back beliefs in, forecasts out.
 
 use carff_forecaster::Forecaster;
+use carff_latent::Sampling;
 use carff_messages::Stage;
-use carff_models::mixture::Sampling;
 use carff_stage::{Overload, StageContext, frame_span};
 use carff_transport::{monotonic_now_ns, topics};
 

@@ -2,11 +2,8 @@
 
 use carff_belief::{Probe, Probed, Step};
 use carff_checkpoint::Manifest;
+use carff_latent::{Draw, LatentGaussian, Mixture};
 use carff_messages::{Belief, Forecast, Gaussian, MAX_PLACES, ProbeResult};
-use carff_models::{
-    LatentGaussian,
-    mixture::{Draw, Mixture},
-};
 use std::path::Path;
 
 /// Loads the field and its calibration, and probes once.

@@ -6,13 +6,10 @@ use crate::session::{Forecast, Moment};
 use carff_belief::{Probed, Step};
 use carff_dataset::{Image, Observability};
 use carff_geometry::PinholeCamera;
+use carff_latent::{Draw, LatentGaussian, Mixture};
 use carff_messages::{
     Action, ActionCode, Belief, FrameMeta, Gaussian, Health, MAX_COMPONENTS, Posterior, ProbeResult, Reason, RuleCode,
     Stage,
-};
-use carff_models::{
-    LatentGaussian,
-    mixture::{Draw, Mixture},
 };
 use carff_observe::{AttachError, Attached, LiveRun, attach};
 use carff_probing::{Reading, Resolved};

@@ -1,11 +1,17 @@
 //! A checkpoint's models, loaded once, as the stages load them.
 
 use carff_belief::Probe;
-use carff_checkpoint::{CheckpointError, Manifest, load_encoder, load_mixture};
+use carff_checkpoint::{CheckpointError, Manifest};
 use carff_config::CheckpointPlanning;
 use carff_dataset::Image;
 use carff_field::Field;
-use carff_models::{LatentGaussian, borrow, encoder::Encoder, mixture::MixtureNet};
+use carff_latent::LatentGaussian;
+use carff_models::{
+    borrow,
+    encoder::Encoder,
+    mixture::MixtureNet,
+    stored::{load_encoder, load_mixture},
+};
 use carff_planning::Rule;
 use std::path::{Path, PathBuf};
 

@@ -9,11 +9,8 @@ use crate::input::Input;
 use crate::journal::{Decision, Journal};
 use crate::models::Models;
 use carff_belief::{Probed, Step, decision, hazard_probability, next_path_probability};
+use carff_latent::{Draw, LATENT_DIM, LatentGaussian, Mixture, Sampling};
 use carff_messages::{MAX_HORIZON, MAX_SAMPLES};
-use carff_models::{
-    LATENT_DIM, LatentGaussian,
-    mixture::{Draw, Mixture, Sampling},
-};
 use carff_probing::Resolved;
 use std::sync::Arc;
 use std::time::Instant;

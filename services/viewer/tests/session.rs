@@ -4,7 +4,7 @@ mod common;
 
 use carff_belief::{Plan, Step, look_ahead};
 use carff_dataset::Image;
-use carff_models::mixture::Sampling;
+use carff_latent::Sampling;
 use carff_scenes::{Extras, RenderOptions};
 use carff_viewer::input::{Album, Input};
 use carff_viewer::models::Models;
@@ -47,7 +47,8 @@ fn follows_the_stages_path() {
     session.toggle(input).unwrap();
     let posterior = session.moment().unwrap().source;
     let mut probe = session.models().probe.clone();
-    let wanted = look_ahead(session.models().mixture.as_ref().unwrap(), &mut probe, &posterior, plan);
+    let net = session.models().mixture.as_ref().unwrap();
+    let wanted = look_ahead(|input, _| net.forecast(input), &mut probe, &posterior, plan);
     session.predict().unwrap();
     for step in &wanted {
         session.probe().unwrap();

@@ -5,10 +5,7 @@
 
 use carff_checkpoint::{CheckpointError, Manifest};
 use carff_field::{Field, PreparedPoints};
-use carff_models::{
-    LATENT_DIM, LatentGaussian,
-    mixture::{Draw, Mixture, MixtureNet, Sampling},
-};
+use carff_latent::{Draw, LATENT_DIM, LatentGaussian, Mixture, Sampling};
 use carff_planning::{Decision, Evidence, Rule, decide};
 use carff_probing::{Calibration, Prober, Reading, Resolved, resolve};
 use std::path::Path;
@@ -130,14 +127,9 @@ pub struct Plan {
     pub frame: u64,
 }
 
-/// Looks ahead from one posterior: each step's resolved state feeds the next.
-pub fn look_ahead(net: &MixtureNet, probe: &mut Probe, posterior: &LatentGaussian, plan: Plan) -> Vec<Step> {
-    look_ahead_with(|posterior, _| net.forecast(posterior), probe, posterior, plan)
-}
-
-/// [`look_ahead`] with forecasts from elsewhere: `forecast` is given the input, and the known state that it stands for
-/// (`None` at the first step).
-pub fn look_ahead_with(
+/// Looks ahead from one posterior: each step's resolved state feeds the next. `forecast` is given the input, and the
+/// known state that it stands for (`None` at the first step).
+pub fn look_ahead(
     mut forecast: impl FnMut(&LatentGaussian, Option<usize>) -> Mixture,
     probe: &mut Probe,
     posterior: &LatentGaussian,

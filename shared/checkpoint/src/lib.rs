@@ -1,21 +1,22 @@
 //! A trained scenario on disk: manifest and weights.
 //!
 //! A checkpoint is a folder: `manifest.json` says what was trained, on what, how and how well; the weights lie beside
-//! it as safetensors. Nothing in it is code. What does not fit is an error that names the key.
+//! it as safetensors. Nothing in it is code. What does not fit is an error that names the key. The field's weights are
+//! read here; those of the networks in tch are read in `carff_models`, so that whoever needs none of them is not linked
+//! with libtorch.
+
+mod field;
+pub mod shapes;
+
+pub use field::{load_field, save_field};
 
 use carff_dataset::ScenarioInfo;
-use carff_field::{Field, FieldConfig};
-use carff_models::{
-    LatentGaussian, ModelError,
-    decoder::{Decoder, DecoderConfig},
-    encoder::{Encoder, EncoderConfig},
-    mixture::{MixtureConfig, MixtureNet},
-    weights::{self, Tensors},
-};
+use carff_field::FieldConfig;
+use carff_latent::LatentGaussian;
 use carff_probing::{Calibration, Place, Prober, ProbingError};
 use serde::{Deserialize, Serialize};
+use shapes::{DecoderConfig, EncoderConfig, MixtureConfig};
 use std::path::{Path, PathBuf};
-use tch::{Device, Kind, Tensor, nn::VarStore};
 
 /// The format that this program writes and reads.
 pub const FORMAT_VERSION: u32 = 1;
@@ -66,13 +67,13 @@ pub enum CheckpointError {
         /// The training stage that makes it.
         stage: &'static str,
     },
-    /// Weights do not fit.
-    #[error("checkpoint {path}: {source}")]
-    Model {
+    /// A weights file cannot be read or written, or does not fit.
+    #[error("checkpoint {path}: {what}")]
+    Weights {
         /// Which checkpoint.
         path: PathBuf,
-        /// What is wrong.
-        source: ModelError,
+        /// What is wrong, and in which file.
+        what: String,
     },
     /// The field's weights do not fit.
     #[error("checkpoint {path}: {source}")]
@@ -280,100 +281,6 @@ impl Manifest {
         }
         Ok(())
     }
-}
-
-fn model(dir: &Path) -> impl Fn(ModelError) -> CheckpointError + '_ {
-    move |source| CheckpointError::Model { path: dir.into(), source }
-}
-
-/// Reads the encoder.
-pub fn load_encoder(dir: &Path, manifest: &Manifest) -> Result<Encoder, CheckpointError> {
-    load_encoder_on(dir, manifest, Device::Cpu)
-}
-
-/// Reads the encoder onto a device.
-pub fn load_encoder_on(dir: &Path, manifest: &Manifest, device: Device) -> Result<Encoder, CheckpointError> {
-    let wrong = model(dir);
-    let backbone = VarStore::new(device);
-    let head = VarStore::new(device);
-    let frozen = manifest.encoder.backbone.frozen;
-    let file = dir.join(files::BACKBONE);
-    let pretrained = (frozen && file.is_file()).then_some(file.as_path());
-    let encoder =
-        Encoder::new(&manifest.encoder, &(backbone.root() / "backbone"), &(head.root() / "encoder"), pretrained)
-            .map_err(&wrong)?;
-    let mut tensors = weights::read(&dir.join(files::ENCODER)).map_err(&wrong)?;
-    if pretrained.is_none() {
-        // A backbone that learned lies in the encoder's own file.
-        let own: Tensors =
-            weights::of_store(&backbone).into_keys().filter_map(|k| tensors.remove(&k).map(|t| (k, t))).collect();
-        weights::fill_store(&backbone, &own).map_err(&wrong)?;
-    }
-    weights::fill_store(&head, &tensors).map_err(&wrong)?;
-    Ok(encoder)
-}
-
-/// Reads the decoder.
-pub fn load_decoder(dir: &Path, manifest: &Manifest) -> Result<Decoder, CheckpointError> {
-    let wrong = model(dir);
-    let store = VarStore::new(Device::Cpu);
-    let decoder = Decoder::new(&(store.root() / "decoder"), &manifest.decoder, manifest.scenario.poses as i64);
-    let tensors = weights::read(&dir.join(files::DECODER)).map_err(&wrong)?;
-    weights::fill_store(&store, &tensors).map_err(&wrong)?;
-    Ok(decoder)
-}
-
-/// Reads the mixture density network.
-pub fn load_mixture(dir: &Path, manifest: &Manifest) -> Result<MixtureNet, CheckpointError> {
-    let path = dir.join(files::MIXTURE);
-    if !path.is_file() {
-        return Err(CheckpointError::Missing { path: dir.into(), part: "mixture density network", stage: "mdn" });
-    }
-    let wrong = model(dir);
-    let store = VarStore::new(Device::Cpu);
-    let net = MixtureNet::new(&(store.root() / "mixture"), &manifest.mixture).map_err(&wrong)?;
-    weights::fill_store(&store, &weights::read(&path).map_err(&wrong)?).map_err(&wrong)?;
-    Ok(net)
-}
-
-/// Reads the field.
-pub fn load_field(dir: &Path, manifest: &Manifest) -> Result<Field, CheckpointError> {
-    let path = dir.join(files::FIELD);
-    let missing = || CheckpointError::Missing { path: dir.into(), part: "field", stage: "nerf" };
-    let config = manifest.field.clone().ok_or_else(missing)?;
-    if !path.is_file() {
-        return Err(missing());
-    }
-    let tensors = weights::read(&path).map_err(model(dir))?;
-    let rows = tensors.into_iter().map(|(name, t)| {
-        let shape: Vec<usize> = t.size().iter().map(|&s| s as usize).collect();
-        let mut values = vec![0.0_f32; t.numel()];
-        let count = values.len();
-        t.to_kind(Kind::Float).contiguous().copy_data(&mut values, count);
-        (name, shape, values)
-    });
-    Field::from_tensors(config, rows).map_err(|source| CheckpointError::Field { path: dir.into(), source })
-}
-
-/// Writes the field: weights in half precision, bit fields as bytes.
-pub fn save_field(dir: &Path, field: &Field) -> Result<(), CheckpointError> {
-    let tensors: Tensors = field
-        .tensors()
-        .into_iter()
-        .map(|t| {
-            let shape: Vec<i64> = t.shape.iter().map(|&s| s as i64).collect();
-            let tensor = Tensor::from_slice(&t.data).view(shape.as_slice());
-            let kind = if t.name.ends_with(".bytes") { Kind::Uint8 } else { Kind::Float };
-            (t.name.into_owned(), tensor.to_kind(kind))
-        })
-        .collect();
-    save_weights(dir, files::FIELD, &tensors)
-}
-
-/// Writes the weights of one part, in half precision.
-pub fn save_weights(dir: &Path, file: &str, tensors: &Tensors) -> Result<(), CheckpointError> {
-    std::fs::create_dir_all(dir).map_err(|source| CheckpointError::File { path: dir.into(), source })?;
-    weights::write(&dir.join(file), tensors, Kind::Half).map_err(model(dir))
 }
 
 /// The prober of a checkpoint, and its calibration.

@@ -2,8 +2,8 @@
 
 use carff_dataset::{Dataset, DatasetError, Image};
 use carff_field::{Field, RenderBuffer, RenderOptions};
+use carff_latent::LatentGaussian;
 use carff_metrics::{mean, psnr_db, psnr_where};
-use carff_models::LatentGaussian;
 use serde::{Deserialize, Serialize};
 
 /// Every state's rendering against every state's true picture.

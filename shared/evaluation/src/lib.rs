@@ -38,8 +38,8 @@ impl Models {
     pub fn load(dir: &Path) -> Result<Self, CheckpointError> {
         let manifest = Manifest::load(dir)?;
         Ok(Self {
-            encoder: carff_checkpoint::load_encoder(dir, &manifest)?,
-            mixture: carff_checkpoint::load_mixture(dir, &manifest)?,
+            encoder: carff_models::stored::load_encoder(dir, &manifest)?,
+            mixture: carff_models::stored::load_mixture(dir, &manifest)?,
             probe: Probe::load(dir, &manifest)?,
             manifest,
         })

@@ -1,15 +1,15 @@
 //! The planning table (paper section 4.3): success of each decision rule over eligible input views.
 
-use carff_belief::{Plan, Probe, decision, hazard_probability, look_ahead_with};
+use carff_belief::{Plan, Probe, decision, hazard_probability, look_ahead};
 use carff_dataset::{
     Dataset, DatasetError, Image,
     drives::{DriveKind, EligibleInput},
     sensor::{SensorNoise, apply_noise_into},
 };
+use carff_latent::{LatentGaussian, Sampling};
 use carff_models::{
-    LatentGaussian,
     encoder::{Encoder, pictures_from_bytes},
-    mixture::{MixtureNet, Sampling},
+    mixture::MixtureNet,
 };
 use carff_planning::Rule;
 use carff_random::Key;
@@ -136,7 +136,7 @@ pub fn planning_table(
                     let plan = Plan { samples, sampling, horizon, seed: trial.seed, frame: trial.frame };
                     let forecast =
                         |_: &LatentGaussian, state: Option<usize>| state.map_or(mixture, |s| &later[s]).clone();
-                    let steps = look_ahead_with(forecast, probe, &trial.posterior, plan);
+                    let steps = look_ahead(forecast, probe, &trial.posterior, plan);
                     actions.extend(rules.iter().enumerate().map(|(r, rule)| (r, column, decision(*rule, &steps).halt)));
                     if samples == 10 {
                         let hazard = steps.iter().map(|s| (s.resolved.hazard_probability, s.path_probability));

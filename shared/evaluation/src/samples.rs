@@ -2,10 +2,8 @@
 
 use carff_belief::Probe;
 use carff_dataset::Equivalence;
-use carff_models::{
-    LatentGaussian,
-    mixture::{MixtureNet, Sampling},
-};
+use carff_latent::{LatentGaussian, Sampling};
+use carff_models::mixture::MixtureNet;
 use serde::{Deserialize, Serialize};
 
 /// Shares over all samples of all views of one kind.

@@ -5,7 +5,7 @@
 use carff_belief::{Plan, hazard_probability, look_ahead};
 use carff_dataset::Observability;
 use carff_evaluation::Models;
-use carff_models::mixture::Sampling;
+use carff_latent::Sampling;
 use carff_scenes::{RenderOptions, Scenario};
 use std::path::Path;
 
@@ -33,7 +33,7 @@ fn hidden_views_give_an_even_belief() {
             seed: 1,
             frame: (view * 2 + branch) as u64,
         };
-        let steps = look_ahead(&models.mixture, &mut models.probe, &posterior, plan);
+        let steps = look_ahead(|input, _| models.mixture.forecast(input), &mut models.probe, &posterior, plan);
         let steps = steps.iter().map(|s| (s.resolved.hazard_probability, s.path_probability));
         (hidden, f64::from(hazard_probability(steps)))
     };

@@ -1,28 +1,8 @@
 //! The pose-conditional VAE's decoder: from a scene latent and a pose's number to that pose's picture (section 3.2).
 
-use crate::LATENT_DIM;
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
+use carff_checkpoint::shapes::DecoderConfig;
+use carff_latent::LATENT_DIM;
 use tch::{Tensor, nn, nn::Module};
-
-/// Shape of the decoder.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields, default)]
-pub struct DecoderConfig {
-    /// Width of the hidden layer that joins latent and pose.
-    pub hidden: i64,
-    /// Channels at 8x8; halved at most once on the way up.
-    pub channels: i64,
-    /// Whether it is told the pose. Without, one latent has one picture, and the encoder must put the pose into it; the
-    /// residual over the pose's mean picture would tell the pose too (`vae.residual = false`).
-    pub pose_condition: bool,
-}
-
-impl Default for DecoderConfig {
-    fn default() -> Self {
-        Self { hidden: 256, channels: 64, pose_condition: true }
-    }
-}
 
 /// Side of the decoder's pictures, pixels.
 pub const PICTURE_PX: i64 = 128;

@@ -1,42 +1,13 @@
 //! The pose-conditional VAE's encoder: from one picture to a Gaussian over the scene latent (paper section 3.2).
 
 use crate::{
-    LATENT_DIM, LatentGaussian, ModelError,
-    backbone::{self, Backbone, BackboneConfig},
+    ModelError,
+    backbone::{self, Backbone},
 };
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
+use carff_checkpoint::shapes::EncoderConfig;
+use carff_latent::{LATENT_DIM, LatentGaussian};
 use std::path::Path;
 use tch::{Kind, Tensor, nn, nn::Module};
-
-/// Shape of the encoder.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields, default)]
-pub struct EncoderConfig {
-    /// The image backbone.
-    pub backbone: BackboneConfig,
-    /// Channels of the optional convolutional stem before the backbone; 0 leaves it out. A stem makes training run
-    /// the backbone in every step, since its features cannot be kept.
-    pub stem_channels: i64,
-    /// Channels after the head's 1x1 convolution.
-    pub reduce_channels: i64,
-    /// Channels after the head's strided 3x3 convolution.
-    pub pool_channels: i64,
-    /// Width of the head's hidden layer.
-    pub hidden: i64,
-}
-
-impl Default for EncoderConfig {
-    fn default() -> Self {
-        Self {
-            backbone: BackboneConfig::default(),
-            stem_channels: 0,
-            reduce_channels: 128,
-            pool_channels: 64,
-            hidden: 256,
-        }
-    }
-}
 
 /// Log-variances are kept inside this range, so that no posterior is a point or the whole space.
 pub const LOG_VARIANCE_RANGE: (f64, f64) = (-8.0, 4.0);

@@ -1,7 +1,7 @@
-//! The learned models in tch, their weights and manifests.
+//! The learned models in tch, and their weights.
 //!
-//! What lives here: the encoder (backbone and head), the pose-conditional decoder, the mixture density network, the
-//! belief's sampling, and how weights lie on disk. What never does: training loops, processes, topics.
+//! What lives here: the encoder (backbone and head), the pose-conditional decoder, the mixture density network, and how
+//! weights lie on disk. What never does: training loops, processes, topics.
 //!
 //! Tensors are `f32`, pictures `[N, 3, H, W]` in 0..=1 unless said otherwise.
 
@@ -13,26 +13,8 @@ pub mod decoder;
 pub mod device;
 pub mod encoder;
 pub mod mixture;
+pub mod stored;
 pub mod weights;
-
-/// Number of dimensions of the scene latent (paper: z in R^8).
-pub const LATENT_DIM: usize = 8;
-
-/// A Gaussian over the scene latent with diagonal covariance: an encoder posterior q(z | I).
-#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
-pub struct LatentGaussian {
-    /// Mean.
-    pub mean: [f32; LATENT_DIM],
-    /// Natural logarithm of the variance, per dimension.
-    pub log_variance: [f32; LATENT_DIM],
-}
-
-impl LatentGaussian {
-    /// mean + exp(log variance / 2) * `unit`, for a draw `unit` from the standard normal distribution.
-    pub fn at(&self, unit: &[f32; LATENT_DIM]) -> [f32; LATENT_DIM] {
-        std::array::from_fn(|i| self.mean[i] + (0.5 * self.log_variance[i]).exp() * unit[i])
-    }
-}
 
 /// What goes wrong with models and their files.
 #[derive(Debug, thiserror::Error)]

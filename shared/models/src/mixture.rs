@@ -1,28 +1,9 @@
 //! The mixture density network: from one posterior to the belief over the next scene latent (paper section 3.4).
 
-use crate::{LATENT_DIM, LatentGaussian, ModelError, encoder::gaussians};
-use carff_random::Key;
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
+use crate::{ModelError, encoder::gaussians};
+use carff_checkpoint::shapes::MixtureConfig;
+use carff_latent::{LATENT_DIM, LatentGaussian, Mixture};
 use tch::{Kind, Tensor, nn, nn::Module};
-
-/// Shape of the network.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields, default)]
-pub struct MixtureConfig {
-    /// Number of mixture components K, 1 to 4 (paper: 2).
-    pub components: i64,
-    /// Width of the two hidden layers (paper: 512).
-    pub hidden: i64,
-    /// Width of the weight head's hidden layers.
-    pub weight_hidden: i64,
-}
-
-impl Default for MixtureConfig {
-    fn default() -> Self {
-        Self { components: 2, hidden: 512, weight_hidden: 128 }
-    }
-}
 
 /// Component log-variances are kept inside this range.
 pub const LOG_VARIANCE_RANGE: (f64, f64) = (-7.0, 4.0);
@@ -36,34 +17,6 @@ pub struct MixtureNet {
     log_variances: nn::Linear,
     weights: [nn::Linear; 3],
     components: i64,
-}
-
-/// A mixture of Gaussians over the scene latent.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Mixture {
-    /// Component weights; they sum to 1.
-    pub weights: Vec<f32>,
-    /// One Gaussian a component.
-    pub components: Vec<LatentGaussian>,
-}
-
-/// One latent drawn from a mixture.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Draw {
-    /// The latent.
-    pub latent: [f32; LATENT_DIM],
-    /// The component it came from.
-    pub component: usize,
-}
-
-/// How draws are spread over the components.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum Sampling {
-    /// As in systematic resampling: each component gets its share of the draws, to within one.
-    Stratified,
-    /// Each draw picks its component by itself.
-    Independent,
 }
 
 impl MixtureNet {
@@ -150,88 +103,10 @@ impl MixtureNet {
     }
 }
 
-impl Mixture {
-    /// Draws `count` latents. Draw i of a (seed, frame, step) is the same whatever else is drawn; which component it
-    /// comes from depends on `count` too when sampling is stratified.
-    pub fn draw(&self, count: usize, sampling: Sampling, seed: u64, frame: u64, step: u32) -> Vec<Draw> {
-        // Index u32::MAX: a stream that no sample uses.
-        let offset = carff_random::uniform(Key { seed, frame, step, sample: u32::MAX });
-        (0..count)
-            .map(|i| {
-                let position = match sampling {
-                    Sampling::Stratified => (i as f64 + offset) / count as f64,
-                    Sampling::Independent => {
-                        carff_random::uniform(Key { seed, frame, step, sample: i as u32 | 0x8000_0000 })
-                    }
-                };
-                let component = self.component_at(position);
-                let unit = carff_random::gaussians(Key { seed, frame, step, sample: i as u32 });
-                Draw { latent: self.components[component].at(&unit), component }
-            })
-            .collect()
-    }
-
-    /// The component whose share of the weights holds `position` in 0..1.
-    fn component_at(&self, position: f64) -> usize {
-        let total: f64 = self.weights.iter().map(|&w| f64::from(w)).sum();
-        let mut sum = 0.0;
-        for (i, &w) in self.weights.iter().enumerate() {
-            sum += f64::from(w) / total;
-            if position < sum {
-                return i;
-            }
-        }
-        self.weights.len() - 1
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use tch::{Device, nn::VarStore};
-
-    fn mixture(weights: [f32; 2]) -> Mixture {
-        let at = |x: f32| LatentGaussian { mean: [x; 8], log_variance: [-2.0; 8] };
-        Mixture { weights: weights.to_vec(), components: vec![at(-1.0), at(1.0)] }
-    }
-
-    /// Stratified draws give each component its share to within one draw, for every n.
-    #[test]
-    fn stratified_draws_follow_the_weights() {
-        let m = mixture([0.3, 0.7]);
-        for n in 1..=50 {
-            for frame in 0..20 {
-                let first = m.draw(n, Sampling::Stratified, 5, frame, 1).iter().filter(|d| d.component == 0).count();
-                assert!((first as f64 - 0.3 * n as f64).abs() <= 1.0, "n {n}: {first}");
-            }
-        }
-    }
-
-    /// Independent draws follow the weights within five standard errors.
-    #[test]
-    fn independent_draws_follow_the_weights() {
-        let m = mixture([0.3, 0.7]);
-        let first: usize = (0..500)
-            .map(|frame| m.draw(10, Sampling::Independent, 5, frame, 1).iter().filter(|d| d.component == 0).count())
-            .sum();
-        let share = first as f64 / 5000.0;
-        assert!((share - 0.3).abs() < 5.0 * (0.21_f64 / 5000.0).sqrt(), "{share}");
-    }
-
-    /// Draws have their component's mean and spread (five standard errors), and repeat for the same key.
-    #[test]
-    fn draws_are_from_their_component() {
-        let m = mixture([0.5, 0.5]);
-        let draws = m.draw(4000, Sampling::Stratified, 1, 2, 3);
-        assert_eq!(draws, m.draw(4000, Sampling::Stratified, 1, 2, 3));
-        let second: Vec<f32> = draws.iter().filter(|d| d.component == 1).map(|d| d.latent[4]).collect();
-        let n = second.len() as f32;
-        let mean = second.iter().sum::<f32>() / n;
-        let variance = second.iter().map(|v| (v - mean).powi(2)).sum::<f32>() / n;
-        let expected = (-2.0_f32).exp();
-        assert!((mean - 1.0).abs() < 5.0 * (expected / n).sqrt());
-        assert!((variance / expected - 1.0).abs() < 5.0 * (2.0 / n).sqrt());
-    }
 
     /// The loss is the closed form: -ln of the weighted sum of normal densities, computed by hand in f64.
     #[test]

@@ -4,10 +4,7 @@
 
 use crate::subject::{EvalOptions, Subject};
 use crate::{EncoderTable, ResultsError, encoder_table, page};
-use carff_models::{
-    backbone::{BackboneConfig, BackboneKind, VitConfig},
-    encoder::EncoderConfig,
-};
+use carff_checkpoint::shapes::{BackboneConfig, BackboneKind, EncoderConfig, VitConfig};
 use carff_training::{
     config::TrainingConfig,
     pipeline::{self, Stage},

@@ -8,10 +8,7 @@ use carff_evaluation::draws::{
     Curve, OpenInput, Shown, TrialCurve, accuracy_curve, expected_recall, frequencies, met_all, recall_curve,
     right_shares,
 };
-use carff_models::{
-    LATENT_DIM, LatentGaussian,
-    mixture::{Mixture, Sampling},
-};
+use carff_latent::{LATENT_DIM, LatentGaussian, Mixture, Sampling};
 use carff_plots::{Panel, Series};
 use carff_random::Key;
 use carff_training::run::Progress;
@@ -187,7 +184,7 @@ fn trials<'a>(
             }
             let latents: Vec<_> = distinct.values().copied().collect();
             let shown: BTreeMap<_, _> = distinct.into_keys().zip(show(&latents)).collect();
-            let look_up = |(i, d): (usize, &carff_models::mixture::Draw)| shown[&(i, d.component)];
+            let look_up = |(i, d): (usize, &carff_latent::Draw)| shown[&(i, d.component)];
             stratified = sets.iter().map(|set| set.iter().enumerate().map(look_up).collect()).collect();
         }
         Trial { input, independent: show(&independent), posterior: show(&posterior), stratified }

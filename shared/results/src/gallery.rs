@@ -6,7 +6,7 @@ use crate::subject::Subject;
 use carff_dataset::{Image, Observability, PoseRole};
 use carff_evaluation::hypotheses::{birds_eye_camera, hypotheses};
 use carff_field::Field;
-use carff_models::{LATENT_DIM, mixture::Sampling};
+use carff_latent::{LATENT_DIM, Sampling};
 use carff_plots::{Marks, Panel, Series, StripCell, StripRow};
 use carff_random::Key;
 use carff_training::{curves, run::Progress, vae::decoded};

@@ -8,8 +8,8 @@ use carff_dataset::{
     drives::{DriveKind, EligibleInput, eligible_inputs},
 };
 use carff_evaluation::{PlanningTable, Trial, planning_table, trial, trials};
+use carff_latent::Sampling;
 use carff_metrics::{Reliability, reliability};
-use carff_models::mixture::Sampling;
 use carff_planning::Rule;
 use carff_plots::{Panel, Series};
 use carff_random::Key;

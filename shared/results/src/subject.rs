@@ -2,15 +2,19 @@
 
 use crate::{About, ResultsError};
 use carff_belief::Probe;
-use carff_checkpoint::{CheckpointError, Manifest, ScenarioIdentity, load_decoder, load_encoder_on, load_mixture};
+use carff_checkpoint::{CheckpointError, Manifest, ScenarioIdentity};
 use carff_config::CheckpointPlanning;
 use carff_dataset::{
     Image, PoseRole,
     drives::DriveKind,
     sensor::{SensorNoise, apply_noise_into},
 };
+use carff_latent::LatentGaussian;
 use carff_models::{
-    LatentGaussian, decoder::Decoder, encoder::Encoder, encoder::pictures_from_bytes, mixture::MixtureNet,
+    decoder::Decoder,
+    encoder::{Encoder, pictures_from_bytes},
+    mixture::MixtureNet,
+    stored::{load_decoder, load_encoder_on, load_mixture},
 };
 use carff_random::Key;
 use carff_training::{pictures::Pictures, run::Progress};

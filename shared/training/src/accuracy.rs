@@ -2,7 +2,7 @@
 
 use crate::pictures::Pictures;
 use carff_dataset::{Observability, PoseRole};
-use carff_models::{LATENT_DIM, LatentGaussian};
+use carff_latent::{LATENT_DIM, LatentGaussian};
 use serde::{Deserialize, Serialize};
 
 /// State centroids with one pooled variance per dimension.

@@ -1,8 +1,8 @@
 //! The training file: what `carff train` reads.
 
 use crate::{TrainingError, field::FieldTraining};
+use carff_checkpoint::shapes::{DecoderConfig, EncoderConfig, MixtureConfig};
 use carff_dataset::sensor::SensorNoise;
-use carff_models::{decoder::DecoderConfig, encoder::EncoderConfig, mixture::MixtureConfig};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};

@@ -12,7 +12,8 @@ use crate::{
 };
 use carff_dataset::PoseRole;
 use carff_field::{Field, FieldConfig, FieldTrainer, NamedTensor, RayBatch, RaySampler, TrainingView, changed_pixels};
-use carff_models::{LATENT_DIM, LatentGaussian, weights::Tensors};
+use carff_latent::{LATENT_DIM, LatentGaussian};
+use carff_models::weights::Tensors;
 use carff_random::Key;
 use rand::Rng;
 use rand_distr::StandardNormal;

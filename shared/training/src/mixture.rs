@@ -10,8 +10,9 @@ use crate::{
     pictures::Pictures,
     run::{Progress, Run, SaveClock, cosine, damaged, part, prefixed},
 };
+use carff_latent::{LATENT_DIM, LatentGaussian};
 use carff_models::{
-    LATENT_DIM, LatentGaussian, ModelError,
+    ModelError,
     adam::Adam,
     mixture::MixtureNet,
     weights::{self, Tensors},

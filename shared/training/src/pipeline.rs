@@ -9,12 +9,13 @@ use crate::{
     run::{Progress, Run, damaged},
     vae::{self, Inputs, Vae},
 };
-use carff_checkpoint::{FORMAT_VERSION, Manifest, ScenarioIdentity, SplitRecord, files, save_field, save_weights};
+use carff_checkpoint::{FORMAT_VERSION, Manifest, ScenarioIdentity, SplitRecord, files, save_field};
 use carff_config::CheckpointPlanning;
 use carff_dataset::{Observability, PoseRole, drives::eligible_inputs};
 use carff_evaluation::{Input, Models, Trial, birds_eye, planning_table, sample_accuracy, trials};
 use carff_field::{Field, RenderBuffer, RenderOptions};
-use carff_models::{LATENT_DIM, LatentGaussian, mixture::Sampling};
+use carff_latent::{LATENT_DIM, LatentGaussian, Sampling};
+use carff_models::stored::save_weights;
 use carff_planning::{CalibrationTrial, Rule, choose_threshold};
 use carff_probing::{Calibration, Place, Prober};
 use carff_random::Key;
@@ -366,7 +367,12 @@ fn calibrate_threshold(
             seed: trial.seed,
             frame: trial.frame,
         };
-        let steps = carff_belief::look_ahead(&models.mixture, &mut models.probe, &trial.posterior, plan);
+        let steps = carff_belief::look_ahead(
+            |input, _| models.mixture.forecast(input),
+            &mut models.probe,
+            &trial.posterior,
+            plan,
+        );
         let hazard =
             carff_belief::hazard_probability(steps.iter().map(|s| (s.resolved.hazard_probability, s.path_probability)));
         found.push(CalibrationTrial {

@@ -1,8 +1,8 @@
 //! What every training loop does the same way: report, save, stop.
 
 use crate::{TrainingError, curves};
+use carff_latent::{LATENT_DIM, LatentGaussian};
 use carff_models::{
-    LATENT_DIM, LatentGaussian,
     encoder::gaussians,
     weights::{self, Tensors},
 };

@@ -13,8 +13,9 @@ use crate::{
     run::{Progress, Run, SaveClock, cosine, damaged, part, prefixed},
 };
 use carff_dataset::PoseRole;
+use carff_latent::{LATENT_DIM, LatentGaussian};
 use carff_models::{
-    LATENT_DIM, LatentGaussian, ModelError,
+    ModelError,
     adam::Adam,
     decoder::Decoder,
     encoder::{Encoder, gaussians},

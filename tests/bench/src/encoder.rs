@@ -4,13 +4,14 @@ use crate::OutputArgs;
 use crate::report::{Report, number, table};
 use crate::stats::{Contender, Ratio, Times, in_turns, timed};
 use anyhow::Context;
-use carff_checkpoint::Manifest;
+use carff_checkpoint::{
+    Manifest,
+    shapes::{BackboneConfig, BackboneKind, EncoderConfig},
+};
+use carff_latent::{LatentGaussian, Sampling};
 use carff_models::{
-    LatentGaussian,
-    backbone::{BackboneConfig, BackboneKind},
     borrow,
-    encoder::{Encoder, EncoderConfig, gaussians, pictures_from_bytes},
-    mixture::Sampling,
+    encoder::{Encoder, gaussians, pictures_from_bytes},
 };
 use std::path::PathBuf;
 use tch::{Device, Kind, nn::VarStore};
@@ -39,8 +40,8 @@ pub struct EncoderArgs {
 pub(crate) fn run(args: &EncoderArgs) -> anyhow::Result<Report> {
     carff_models::allocator::keep_large_blocks();
     let manifest = Manifest::load(&args.checkpoint)?;
-    let encoder = carff_checkpoint::load_encoder(&args.checkpoint, &manifest)?;
-    let net = carff_checkpoint::load_mixture(&args.checkpoint, &manifest)?;
+    let encoder = carff_models::stored::load_encoder(&args.checkpoint, &manifest)?;
+    let net = carff_models::stored::load_mixture(&args.checkpoint, &manifest)?;
     let rgb: Vec<u8> = (0..SIDE_PX * SIDE_PX * 3).map(|i| ((i * 2_654_435_761) >> 13) as u8).collect();
     let posterior = encode(&encoder, &rgb).context("the encoder gives no posterior")?;
 

@@ -13,7 +13,7 @@ use carff_field::{
 };
 use carff_field_reference::{Precision, Rays, ReferenceField, Samples, huber_sum};
 use carff_geometry::{PinholeCamera, Ray};
-use carff_models::mixture::{Draw, Mixture};
+use carff_latent::{Draw, Mixture};
 use carff_random::{Key, gaussians, uniform};
 use std::path::PathBuf;
 use std::time::Instant;

@@ -3,8 +3,8 @@
 
 use super::{Choice, Command, Viewer, theme};
 use carff_dataset::Observability;
+use carff_latent::{LatentGaussian, Sampling};
 use carff_messages::{HealthState, MAX_HORIZON, MAX_SAMPLES};
-use carff_models::{LatentGaussian, mixture::Sampling};
 use eframe::egui::{
     Button, ComboBox, DragValue, Grid, Image, Rect, ScrollArea, Sense, Slider, Stroke, Ui, load::SizedTexture, pos2,
     vec2,

@@ -6,11 +6,10 @@ mod vit;
 
 pub use convnet::ConvNet;
 pub use efficientnet::EfficientNetLite0;
-pub use vit::{VisionTransformer, VitConfig};
+pub use vit::VisionTransformer;
 
 use crate::{ModelError, weights};
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
+use carff_checkpoint::shapes::{BackboneConfig, BackboneKind};
 use std::path::Path;
 use tch::{Tensor, nn};
 
@@ -22,50 +21,6 @@ pub trait Backbone: Send {
     fn channels(&self) -> i64;
     /// Side of the feature map, in cells.
     fn grid(&self) -> i64;
-}
-
-/// Which backbone, and whether it learns.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields)]
-pub struct BackboneConfig {
-    /// Which network.
-    pub kind: BackboneKind,
-    /// Whether the weights stay as they were loaded. A small convolutional network from scratch must learn.
-    #[serde(default = "yes")]
-    pub frozen: bool,
-    /// Side in pixels that pictures are resized to before they enter.
-    #[serde(default = "default_input_px")]
-    pub input_px: i64,
-    /// Size of a vision transformer; ignored by the others.
-    #[serde(default)]
-    pub vit: VitConfig,
-}
-
-fn yes() -> bool {
-    true
-}
-
-fn default_input_px() -> i64 {
-    224
-}
-
-impl Default for BackboneConfig {
-    fn default() -> Self {
-        Self { kind: BackboneKind::EfficientNetLite0, frozen: true, input_px: 224, vit: VitConfig::default() }
-    }
-}
-
-/// The backbones there are.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
-#[serde(rename_all = "kebab-case")]
-pub enum BackboneKind {
-    /// EfficientNet-Lite0 up to its 112-channel stage (stride 16), pretrained on ImageNet-1k.
-    #[serde(rename = "efficientnet-lite0")]
-    EfficientNetLite0,
-    /// A vision transformer of any size; standard safetensors weights, or random ones.
-    Vit,
-    /// A small convolutional network, from scratch.
-    ConvNet,
 }
 
 /// Builds a backbone in `path`. With `pretrained`, its weights are read from that file.

@@ -2,29 +2,8 @@
 
 use super::{Backbone, resize};
 use crate::{ModelError, weights::Tensors};
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
+use carff_checkpoint::shapes::VitConfig;
 use tch::{Kind, Tensor, nn, nn::Module};
-
-/// Size of a vision transformer. The default is ViT-L/16, the paper's.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields, default)]
-pub struct VitConfig {
-    /// Patch side, pixels.
-    pub patch_px: i64,
-    /// Token width.
-    pub width: i64,
-    /// Number of blocks.
-    pub depth: i64,
-    /// Attention heads; must divide the width.
-    pub heads: i64,
-}
-
-impl Default for VitConfig {
-    fn default() -> Self {
-        Self { patch_px: 16, width: 1024, depth: 24, heads: 16 }
-    }
-}
 
 /// The network without its classifier.
 #[derive(Debug)]

@@ -8,7 +8,7 @@ use anyhow::ensure;
 use carff_belief::Probe;
 use carff_checkpoint::Manifest;
 use carff_field::{LATENT_DIM, RenderBuffer, RenderOptions};
-use carff_models::mixture::{Draw, Mixture};
+use carff_latent::{Draw, Mixture};
 use carff_probing::{Calibration, Place, Prober};
 use rustix::time::{ClockId, clock_gettime};
 use std::cell::RefCell;

@@ -21,7 +21,7 @@ pub(crate) fn formatted(format: LogFormat, time: &str, source: &str, said: &str)
 }
 
 /// What went wrong, if that is what the line says.
-pub(crate) fn error_in(said: &str) -> Option<String> {
+pub fn error_in(said: &str) -> Option<String> {
     let fields = fields(said);
     let text = |key: &str| fields.get(key).and_then(Value::as_str).unwrap_or_default();
     (text("level") == "ERROR" || text("message").contains("panicked at")).then(|| text("message").to_owned())

@@ -1,0 +1,83 @@
+//! What attaches to a run from outside, or reads what was taken home of one: probes, recorder, exports, bridge, metrics.
+//!
+//! What lives here: the commands that need no model, and what the terminal shows. What never does: a model, and whatever
+//! links libtorch, which would make a probe's start thirty times as dear.
+
+pub mod bridge;
+pub mod export;
+mod film;
+pub mod log_line;
+pub mod metrics;
+pub mod probe;
+pub mod record;
+mod spans;
+pub mod terminal;
+pub mod view;
+mod vitals;
+
+use clap::Subcommand;
+use std::process::ExitCode;
+
+/// The commands of this room.
+#[derive(Debug, Subcommand)]
+pub enum Attach {
+    /// Look at a running graph from another terminal.
+    #[command(
+        subcommand,
+        after_help = "Example: what runs, and how each stage does
+  carff probe list
+  carff probe top"
+    )]
+    Probe(probe::ProbeCommand),
+    /// Open the live window: each hypothesis from any camera.
+    #[command(after_help = "Example: on the run that lives, or on a checkpoint alone
+  carff view
+  carff view --checkpoint configs/checkpoints/approaching-intersection")]
+    View(view::ViewArgs),
+    /// Record a running graph into an MCAP file.
+    #[command(
+        after_help = "Example: a minute of everything; actions and beliefs alone, in files of 10 minutes of which 6 are kept
+  carff record -o run.mcap --seconds 60
+  carff record belief action -o drive.mcap --file-seconds 600 --keep 6"
+    )]
+    Record(record::RecordArgs),
+    /// Make pictures, tables, a film, or a trace of a recording.
+    #[command(after_help = "Example:
+  carff export run.mcap --png pictures --csv tables --trace trace.json")]
+    Export(export::ExportArgs),
+    /// Serve a run's topics over the Foxglove WebSocket protocol, read-only, on this machine alone.
+    #[command(
+        after_help = "Example: on the vehicle, and through a tunnel to the desk, where Foxglove opens ws://localhost:8765
+  carff bridge
+  ssh -L 8765:localhost:8765 vehicle"
+    )]
+    Bridge(bridge::BridgeArgs),
+    /// Serve a run's numbers over HTTP, for Prometheus, on this machine alone.
+    #[command(after_help = "Example:
+  carff metrics --listen 127.0.0.1:9464
+  curl http://127.0.0.1:9464/metrics
+  carff metrics --once")]
+    Metrics(metrics::MetricsArgs),
+}
+
+impl Attach {
+    /// Does what is asked for.
+    pub fn run(&self) -> anyhow::Result<ExitCode> {
+        match self {
+            Self::Probe(command) => probe::run(command),
+            Self::View(args) => view::run(args),
+            Self::Record(args) => record::run(args),
+            Self::Export(args) => export::run(args),
+            Self::Bridge(args) => bridge::run(args),
+            Self::Metrics(args) => metrics::run(args),
+        }
+    }
+}
+
+/// A program's exit code; an error is told in one sentence.
+pub fn exit_code(result: anyhow::Result<ExitCode>) -> ExitCode {
+    result.unwrap_or_else(|error| {
+        eprintln!("error: {}", carff_stage::describe(&error));
+        ExitCode::FAILURE
+    })
+}
