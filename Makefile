@@ -17,7 +17,7 @@ else ifneq ($(CARGO_TARGET_DIR),)
 export LD_LIBRARY_PATH := $(CURDIR)/.libtorch/lib$(if $(LD_LIBRARY_PATH),:$(LD_LIBRARY_PATH))
 endif
 
-.PHONY: help run build deb check-deb link check-link test soak fuzz bench-peer lint sanitize sanitize-threads miri sbom fmt libtorch
+.PHONY: help run build deb check-deb link check-link test soak fuzz bench-peer lint sanitize miri sbom fmt libtorch
 
 help: ## List the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -60,12 +60,6 @@ sanitize: libtorch ## Run the tests around `unsafe` under the address sanitizer 
 	RUSTFLAGS=-Zsanitizer=address LD_LIBRARY_PATH=$(CURDIR)/.libtorch/lib cargo +nightly test --locked --lib --tests \
 		--target x86_64-unknown-linux-gnu --target-dir $(TARGET)/sanitize \
 		-p carff-field -p carff-messages -p carff-models -p carff-transport
-
-sanitize-threads: libtorch ## Run the tests of what shares memory among threads under the thread sanitizer (needs a nightly toolchain)
-	RUSTFLAGS="-Zsanitizer=thread -Cunsafe-allow-abi-mismatch=sanitizer" LD_LIBRARY_PATH=$(CURDIR)/.libtorch/lib \
-		cargo +nightly test --locked --lib --tests \
-		--target x86_64-unknown-linux-gnu --target-dir $(TARGET)/sanitize-threads \
-		-p carff-field -p carff-recording -p carff-stage
 
 miri: ## Run the kernels of the field (portable path) and the messages' tests under Miri (nightly with miri and rust-src)
 	cargo +nightly miri test --locked --lib --target-dir $(TARGET)/miri -p carff-field -- dispatch::
