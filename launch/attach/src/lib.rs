@@ -15,8 +15,11 @@ pub mod terminal;
 pub mod view;
 mod vitals;
 
+use anyhow::Context;
 use clap::Subcommand;
-use std::process::ExitCode;
+use std::ffi::OsString;
+use std::os::unix::process::CommandExt;
+use std::process::{Command, ExitCode};
 
 /// The commands of this room.
 #[derive(Debug, Subcommand)]
@@ -80,4 +83,11 @@ pub fn exit_code(result: anyhow::Result<ExitCode>) -> ExitCode {
         eprintln!("error: {}", carff_stage::describe(&error));
         ExitCode::FAILURE
     })
+}
+
+/// Becomes another program of ours, which lies beside this one; returns when it cannot be started.
+pub fn become_program(name: &str, args: &[OsString]) -> anyhow::Result<ExitCode> {
+    let program = std::env::current_exe()?.with_file_name(name);
+    let error = Command::new(&program).args(args).exec();
+    Err(error).with_context(|| format!("cannot start {}; build it with `make build`", program.display()))
 }

@@ -1,9 +1,8 @@
 //! `carff view`: the live window, a program of its own beside this one.
 
-use anyhow::Context;
+use crate::become_program;
 use std::ffi::OsString;
-use std::os::unix::process::CommandExt;
-use std::process::{Command, ExitCode};
+use std::process::ExitCode;
 
 /// The window's program.
 const PROGRAM: &str = "carff-viewer";
@@ -18,7 +17,5 @@ pub struct ViewArgs {
 
 /// Becomes the window's program.
 pub fn run(args: &ViewArgs) -> anyhow::Result<ExitCode> {
-    let program = std::env::current_exe()?.with_file_name(PROGRAM);
-    let error = Command::new(&program).args(&args.args).exec();
-    Err(error).with_context(|| format!("cannot start {}; build it with `cargo build --release`", program.display()))
+    become_program(PROGRAM, &args.args)
 }
