@@ -286,7 +286,7 @@ impl Default for TrainerConfig {
             beta2: 0.99,
             epsilon: 1e-15,
             weight_decay: 1e-6,
-            huber_delta: 0.1,
+            huber_delta: 1.0,
             max_samples_per_ray: 192,
             samples_per_step: 1 << 15,
             min_transmittance: 1e-3,

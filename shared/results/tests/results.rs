@@ -15,7 +15,7 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
-/// A block drives along a road, or does not; twelve cameras look down on it, eight stand behind a wall.
+/// A block drives along a road, or does not; fourteen cameras look at it, eight stand behind a wall.
 const SCENARIO: &str = include_str!("../../../tests/data/small-scenario.toml");
 
 /// Nets so small that they are trained in seconds, and a little.

@@ -133,7 +133,8 @@ pub struct VaeTraining {
     pub epochs: usize,
     /// Pictures a step.
     pub batch: usize,
-    /// How many of them the decoder reconstructs: it costs twelve times as much as the head.
+    /// How many of them the decoder reconstructs, where they are of the data set's own poses: it costs twelve times as
+    /// much as the head, but of a few pictures a step it learns nothing.
     pub decoder_batch: usize,
     /// Learning rate at the start; it falls to 2 % of it along a cosine.
     pub learning_rate: f64,
@@ -168,7 +169,7 @@ impl Default for VaeTraining {
         Self {
             epochs: 100,
             batch: 30,
-            decoder_batch: 6,
+            decoder_batch: 30,
             learning_rate: 1e-3,
             weight_decay: 0.05,
             dropout: 0.3,
@@ -222,7 +223,7 @@ impl TrainingConfig {
         let counts = [
             ("vae.epochs", self.vae.epochs, 1, 10_000),
             ("vae.batch", self.vae.batch, 2, 4096),
-            ("vae.decoder_batch", self.vae.decoder_batch, 1, self.vae.batch),
+            ("vae.decoder_batch", self.vae.decoder_batch, 1, 4096),
             ("nerf.rays", self.nerf.rays, 32, 1 << 20),
             ("calibration.repeats", self.calibration.repeats, 1, 1000),
             ("calibration.samples", self.calibration.samples, 1, 64),

@@ -234,6 +234,7 @@ pub fn train(
             carff_random::stream(Key { seed: config.seed, frame: epoch as u64, step: 0x7661_6500, sample: 0 });
         let batches = batches(pictures, &trained, settings.batch, &mut rng);
         let mut sums = [0.0_f64; 4];
+        let mut decoded_batches = 0_usize;
         for (b, batch) in batches.iter().enumerate() {
             let step = epoch * per_epoch + b;
             let at = step as f64 / (settings.epochs * per_epoch) as f64;
@@ -257,10 +258,12 @@ pub fn train(
             let value = |t: &Tensor| t.double_value(&[]);
             sums[0] += value(&loss);
             sums[1] += losses.reconstruction.as_ref().map_or(0.0, value);
+            decoded_batches += usize::from(losses.reconstruction.is_some());
             sums[2] += value(&losses.kl);
             sums[3] += losses.state.as_ref().map_or(0.0, value);
         }
-        let means = sums.map(|s| s / batches.len() as f64);
+        let mut means = sums.map(|s| s / batches.len() as f64);
+        means[1] = sums[1] / decoded_batches.max(1) as f64;
         let posteriors = inputs.posteriors(vae, 0);
         let report = evaluate(config, pictures, vae, &posteriors, epoch + 1 == settings.epochs || epoch % 10 == 9)?;
         let mut record = json!({
@@ -302,7 +305,9 @@ pub fn train(
 }
 
 /// One pass over the pictures, in batches made of whole poses: all states of a pose stand in one batch, so that what
-/// tells states apart is not drowned by what tells poses apart.
+/// tells states apart is not drowned by what tells poses apart. Poses of the data set, which alone the decoder knows,
+/// stand together: a few pictures of one pose at a time never got it away from the mean pictures. Within a batch
+/// pictures are shuffled, so that a decoder that takes the first few sees all states.
 fn batches(pictures: &Pictures, trained: &[usize], size: usize, rng: &mut impl rand::Rng) -> Vec<Vec<usize>> {
     let mut by_view = vec![Vec::new(); pictures.view_count()];
     for &i in trained {
@@ -310,17 +315,20 @@ fn batches(pictures: &Pictures, trained: &[usize], size: usize, rng: &mut impl r
     }
     by_view.retain(|v| !v.is_empty());
     by_view.shuffle(rng);
+    let (known, free): (Vec<_>, Vec<_>) = by_view.into_iter().partition(|v| pictures.labels[v[0]].role.is_some());
     let mut batches = Vec::new();
-    let mut batch = Vec::new();
-    for view in by_view {
-        batch.extend(view);
-        if batch.len() >= size {
-            batches.push(std::mem::take(&mut batch));
+    for views in [known, free] {
+        let mut batch = Vec::new();
+        for view in views {
+            batch.extend(view);
+            if batch.len() >= size {
+                batches.push(std::mem::take(&mut batch));
+            }
         }
+        batches.extend((!batch.is_empty()).then_some(batch));
     }
-    if !batch.is_empty() {
-        batches.push(batch);
-    }
+    batches.iter_mut().for_each(|batch| batch.shuffle(rng));
+    batches.shuffle(rng);
     batches
 }
 

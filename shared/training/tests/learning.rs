@@ -16,7 +16,7 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
-/// A block drives along a road, or does not; twelve cameras look down on it, eight stand behind a wall.
+/// A block drives along a road, or does not; fourteen cameras look at it, eight stand behind a wall.
 const SCENARIO: &str = include_str!("../../../tests/data/small-scenario.toml");
 
 /// Nets so small that all three are trained in seconds.
@@ -65,7 +65,7 @@ samples_across = 64.0
 rays = 1024
 
 [nerf.trainer]
-steps = 1000
+steps = 1500
 occupancy_warmup_steps = 100
 threads = 1
 "#;
