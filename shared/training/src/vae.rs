@@ -327,7 +327,9 @@ fn batches(pictures: &Pictures, trained: &[usize], size: usize, rng: &mut impl r
         }
         batches.extend((!batch.is_empty()).then_some(batch));
     }
-    batches.iter_mut().for_each(|batch| batch.shuffle(rng));
+    for batch in &mut batches {
+        batch.shuffle(rng);
+    }
     batches.shuffle(rng);
     batches
 }
