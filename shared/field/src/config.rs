@@ -73,6 +73,9 @@ pub struct FieldConfig {
     pub near_m: f32,
     /// Rays end here, metres; what lies beyond is background.
     pub far_m: f32,
+    /// Above 0, what a sample of a ray sees is as wide as its pixel is there: levels of the grid whose cells are narrower
+    /// count less. Points that no ray asks about are taken to be this wide, metres. At 0 all levels count in full.
+    pub point_width_m: f32,
     /// Subtracted from each latent before use.
     pub latent_mean: [f32; LATENT_DIM],
     /// Multiplies each latent after the mean is subtracted: brings latents to unit scale.
@@ -99,6 +102,7 @@ impl Default for FieldConfig {
             cone_angle: 1.0 / 256.0,
             near_m: 0.2,
             far_m: 150.0,
+            point_width_m: 0.0,
             latent_mean: [0.0; LATENT_DIM],
             latent_scale: [1.0; LATENT_DIM],
         }
@@ -172,6 +176,12 @@ impl FieldConfig {
         check((0.0..=1.0).contains(&self.cone_angle), "cone_angle", self.cone_angle, "0..=1")?;
         check(self.near_m.is_finite() && self.near_m >= 0.0, "near_m", self.near_m, "zero or more, finite")?;
         check(self.far_m.is_finite() && self.far_m > self.near_m, "far_m", self.far_m, "above near_m, finite")?;
+        check(
+            self.point_width_m.is_finite() && self.point_width_m >= 0.0,
+            "point_width_m",
+            self.point_width_m,
+            "zero or more, finite",
+        )?;
         check(self.latent_mean.iter().all(|v| v.is_finite()), "latent_mean", self.latent_mean, "finite numbers")?;
         check(self.latent_scale.iter().all(|v| v.is_finite()), "latent_scale", self.latent_scale, "finite numbers")
     }

@@ -142,6 +142,11 @@ dispatched!(
     bias_relu, "avx2,fma", kernels::bias_relu, [], (x: &[f32], bias: &[f32], y: &mut [f32], blocks_apart: usize)
 );
 dispatched!(
+    /// See [`kernels::attenuate`].
+    attenuate, "avx2,fma,avx512f,avx512vl", kernels::attenuate, [],
+    (levels: &[Level], features_per_level: usize, widths: &[f32], block: &mut [f32])
+);
+dispatched!(
     /// See [`kernels::activate`].
     activate, "avx2,fma,avx512f,avx512vl", kernels::activate, [],
     (raw: &[f32], apart: usize, offset: f32, length_m: &[f32], density: &mut [f32], passes: &mut [f32])
@@ -340,6 +345,34 @@ mod tests {
                 let found = f64::from(y[b * y_apart + o * LANES + l]);
                 let wanted = if relu { sum.max(0.0) } else { sum };
                 assert!(near(found, wanted), "{inputs} inputs, block {b}: {found} for {wanted}");
+            }
+        }
+    }
+
+    /// A level counts the less, the more of its cells a sample is wide: by 1 / sqrt(1 + w^2 / 2); a sample of no width
+    /// counts in full, and so does the block's padding.
+    #[test]
+    fn wide_samples_see_less_of_fine_levels() {
+        let features = 4;
+        let config = FieldConfig {
+            levels: 3,
+            features_per_level: features,
+            base_resolution: 4,
+            max_resolution: 64,
+            ..FieldConfig::default()
+        };
+        let levels = grid_levels(&config);
+        let before = numbers(stride(levels.len() * features), 7);
+        let widths = [0.0, 0.01, 0.1, 0.5];
+        for set in SETS.map(|set| set()) {
+            let mut block = before.clone();
+            attenuate(set, &levels, features, &widths, &mut block);
+            for (i, (found, was)) in block.iter().zip(&before).enumerate() {
+                let (row, lane) = (i / LANES, i % LANES);
+                let cells = levels.get(row / features).map_or(0.0, |level| f64::from(level.resolution));
+                let w = f64::from(widths.get(lane).copied().unwrap_or(0.0)) * cells;
+                let wanted = f64::from(*was) / (1.0 + 0.5 * w * w).sqrt();
+                assert!(near(f64::from(*found), wanted), "{}: {i}: {found} for {wanted}", set.name());
             }
         }
     }

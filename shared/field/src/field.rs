@@ -218,11 +218,28 @@ impl Field {
         self.layout.background[0].fold(&self.networks, &folded.latent, &mut folded.background);
     }
 
-    /// Features of points of the unit cube, 16 to a block.
-    pub(crate) fn encode(&self, points: &[[f32; 3]], features: &mut [f32]) {
+    /// Whether features depend on how wide a sample is.
+    pub(crate) fn attenuates(&self) -> bool {
+        self.config.point_width_m > 0.0
+    }
+
+    /// A width in sides of the unit cube. Outside of the bounds, where the cube is squeezed, it is taken as if it were not.
+    pub(crate) fn width_in_cube(&self, width_m: f32) -> f32 {
+        0.25 * width_m / self.contraction.longest_half_m()
+    }
+
+    /// Features of points of the unit cube, 16 to a block; each as wide as `widths` says (in sides of the cube), or with
+    /// none as [`FieldConfig::point_width_m`] says.
+    pub(crate) fn encode(&self, points: &[[f32; 3]], widths: Option<&[f32]>, features: &mut [f32]) {
         let l = &self.layout;
-        for (points, block) in points.chunks(LANES).zip(features.chunks_exact_mut(stride(l.features))) {
+        let all_alike = [self.width_in_cube(self.config.point_width_m); LANES];
+        let blocks = features.chunks_exact_mut(stride(l.features));
+        for (i, (points, block)) in points.chunks(LANES).zip(blocks).enumerate() {
             dispatch::encode(self.set, l.features_per_level, &l.levels, &self.table, points, block);
+            if self.attenuates() {
+                let widths = widths.map_or(&all_alike[..], |widths| &widths[i * LANES..][..points.len()]);
+                dispatch::attenuate(self.set, &l.levels, l.features_per_level, widths, block);
+            }
         }
     }
 
@@ -328,7 +345,7 @@ impl Field {
                 let end = (at + LANES).min(n);
                 s.points.clear();
                 s.points.extend(points_m[at..end].iter().map(|p| self.contraction.contract(*p)));
-                self.encode(&s.points, grow(&mut s.features, sf));
+                self.encode(&s.points, None, grow(&mut s.features, sf));
                 let geometry = grow(&mut s.geometry, sg);
                 let input = FirstLayer::Features(&s.features[..sf]);
                 self.density_network(&folded, &input, &mut s.hidden_a, &mut s.hidden_b, geometry);

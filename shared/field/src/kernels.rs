@@ -302,6 +302,36 @@ pub(crate) fn encode<const FMA: bool, const F: usize>(
     }
 }
 
+/// Weakens one block's features, level by level, where a lane's sample is wider than the level's cells: by
+/// 1 / sqrt(1 + w^2 / 2) for a width of w cells. That is Zip-NeRF's erf(1 / sqrt(8 s^2)) (Barron et al. 2023, section 3.1),
+/// to 0.1, for the deviation s = w / sqrt(12) of what is spread evenly over w. `widths` are in sides of the unit cube, one a
+/// lane. It is its own adjoint.
+#[inline(always)]
+pub(crate) fn attenuate<const FMA: bool>(
+    levels: &[Level],
+    features_per_level: usize,
+    widths: &[f32],
+    block: &mut [f32],
+) {
+    let mut width = [0.0_f32; LANES];
+    for (to, from) in width.iter_mut().zip(widths) {
+        *to = *from;
+    }
+    let mut weight = [0.0_f32; LANES];
+    for (level, rows) in levels.iter().zip(block.chunks_exact_mut(features_per_level * LANES)) {
+        let cells = level.resolution as f32;
+        for l in 0..LANES {
+            let w = width[l] * cells;
+            weight[l] = 1.0 / fma::<FMA>(0.5 * w, w, 1.0).sqrt();
+        }
+        for row in rows.as_chunks_mut::<LANES>().0 {
+            for l in 0..LANES {
+                row[l] *= weight[l];
+            }
+        }
+    }
+}
+
 /// Backward of `encode`: adds the features' gradients to the table's.
 #[inline(always)]
 pub(crate) fn scatter<const FMA: bool, const F: usize>(

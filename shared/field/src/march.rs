@@ -105,6 +105,8 @@ pub(crate) struct Seen {
 #[derive(Debug, Default)]
 pub(crate) struct Samples {
     pub placed: Placed,
+    /// How wide each sample is, in sides of the unit cube; none where features do not depend on it.
+    pub widths: Vec<f32>,
     /// One for each latent.
     pub seen: Vec<Seen>,
     /// Features, one block for each 16 samples.
@@ -164,8 +166,9 @@ impl Samples {
     ) {
         let sf = stride(field.layout.features);
         let m = &field.marcher;
-        let Self { placed, seen, features, before, octets, left } = self;
+        let Self { placed, widths, seen, features, before, octets, left } = self;
         placed.resize(0, NO_RAY);
+        widths.clear();
         seen.resize_with(latents.len(), Seen::default);
         for seen in seen.iter_mut() {
             seen.begin(rays.len());
@@ -217,7 +220,13 @@ impl Samples {
             let blocks = start / LANES..placed.len() / LANES;
             grow(features, blocks.end * sf);
             let features = &mut features[blocks.start * sf..blocks.end * sf];
-            field.encode(&placed.points[start..], features);
+            let widths = field.attenuates().then(|| {
+                let spread = |ray: u32| rays.get(ray as usize).map_or(0.0, |ray| ray.spread);
+                let samples = placed.ray[start..].iter().zip(&placed.distance_m[start..]);
+                widths.extend(samples.map(|(ray, distance)| field.width_in_cube(spread(*ray) * distance)));
+                &widths[start..]
+            });
+            field.encode(&placed.points[start..], widths, features);
             let input = if latents.len() > 1 {
                 let before = grow(before, blocks.len() * stride(field.layout.width));
                 field.first_layer(features, before);

@@ -97,7 +97,7 @@ impl Field {
         let (sf, sw) = (stride(l.features), stride(l.width));
         for (points, before) in points.chunks(GROUP * LANES).zip(before.chunks_mut(GROUP * sw)) {
             let features = grow(features, before.len() / sw * sf);
-            self.encode(points, features);
+            self.encode(points, None, features);
             self.first_layer(features, before);
         }
     }

@@ -91,6 +91,7 @@ struct Backward {
     inputs: Vec<f32>,
     features: Vec<f32>,
     points: Vec<[f32; 3]>,
+    widths: Vec<f32>,
     density_bias: Vec<f32>,
     color_bias: Vec<f32>,
     background_bias: Vec<f32>,
@@ -154,7 +155,7 @@ struct Shard {
 /// let mut trainer = FieldTrainer::new(Field::new(config, 1)?, trainer_config)?;
 /// trainer.set_state_latents(&[vec![[0.0; 8]]]);
 /// let report = trainer.step(&RayBatch {
-///     rays: vec![Ray { origin: [0.0, 0.0, 5.0], direction: [0.0, 0.0, -1.0] }],
+///     rays: vec![Ray { origin: [0.0, 0.0, 5.0], direction: [0.0, 0.0, -1.0], spread: 0.0 }],
 ///     target_rgb: vec![[0.2, 0.4, 0.6]],
 ///     latent_index: vec![0],
 ///     latents: vec![[0.0; 8]],
@@ -998,6 +999,13 @@ impl Shard {
             dispatch::dense_backward_input(set, d0.weights(w), d0.outputs, gb, sw, g_features, sf, l.features, None);
             b.points.clear();
             b.points.extend(kept.iter().map(|k| self.samples.placed.points[k.sample as usize]));
+            if field.attenuates() {
+                b.widths.clear();
+                b.widths.extend(kept.iter().map(|k| self.samples.widths[k.sample as usize]));
+                for (widths, block) in b.widths.chunks(LANES).zip(g_features.chunks_exact_mut(sf)) {
+                    dispatch::attenuate(set, &l.levels, l.features_per_level, widths, block);
+                }
+            }
             for (points, block) in b.points.chunks(LANES).zip(g_features.chunks_exact(sf)) {
                 dispatch::scatter(set, l.features_per_level, &l.levels, &mut self.table_gradient, points, block);
             }

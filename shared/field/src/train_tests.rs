@@ -42,7 +42,7 @@ fn random_rays(count: usize, seed: u64) -> Vec<Ray> {
             let target = [normal(seed, 3 * i), normal(seed, 3 * i + 1), 0.5 + 0.3 * normal(seed, 3 * i + 2)];
             let d = [0, 1, 2].map(|k| target[k] - origin[k]);
             let n = d.iter().map(|v| v * v).sum::<f32>().sqrt();
-            Ray { origin, direction: d.map(|v| v / n) }
+            Ray { origin, direction: d.map(|v| v / n), spread: 0.02 }
         })
         .collect()
 }
@@ -92,10 +92,17 @@ fn loss_of(field: &Field, batch: &RayBatch) -> f64 {
 }
 
 /// The loss's change along each parameter group's gradient is what the gradient says (central differences), for
-/// tables, every layer's weights, latent columns and biases, and the latents.
+/// tables, every layer's weights, latent columns and biases, and the latents; with samples of no width and of some.
 #[test]
 fn gradients_agree_with_finite_differences() {
-    let field = rough_field(3);
+    for point_width_m in [0.0, 0.1] {
+        gradients_agree(point_width_m);
+    }
+}
+
+fn gradients_agree(point_width_m: f32) {
+    let mut field = rough_field(3);
+    field.config.point_width_m = point_width_m;
     let batch = random_batch(40, 3, 9);
     let mut trainer = FieldTrainer::new(field.clone(), exact_config()).unwrap();
     let report = trainer.accumulate(&batch);
@@ -173,7 +180,7 @@ fn constant_density_renders_as_beer_and_lambert_say() {
     field.occupancy.set_from(|i| (8..10).contains(&(i / (n * n))));
     let c = *field.contraction();
     let (top, bottom) = (c.uncontract([0.5, 0.5, 10.0 / 16.0])[2], c.uncontract([0.5, 0.5, 0.5])[2]);
-    let ray = Ray { origin: [0.3, -0.2, 5.0], direction: [0.0, 0.0, -1.0] };
+    let ray = Ray { origin: [0.3, -0.2, 5.0], direction: [0.0, 0.0, -1.0], spread: 0.0 };
     let mut fine = field.clone();
     fine.marcher.step_m = 1e-3;
     let mut out = RenderBuffer::new();

@@ -214,7 +214,7 @@ mod tests {
                 let v = |k: u64| unit(hash(5, i, k)) * 2.0 - 1.0;
                 let d = [v(3), v(4), v(5)];
                 let norm = d.iter().map(|v| v * v).sum::<f32>().sqrt().max(1e-3);
-                Ray { origin: [30.0 * v(0), 30.0 * v(1), 10.0 * v(2)], direction: d.map(|v| v / norm) }
+                Ray { origin: [30.0 * v(0), 30.0 * v(1), 10.0 * v(2)], direction: d.map(|v| v / norm), spread: 0.0 }
             })
             .collect()
     }

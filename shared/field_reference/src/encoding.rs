@@ -19,6 +19,9 @@ struct Group {
 /// From world points to features.
 #[derive(Debug)]
 pub(crate) struct Encoding {
+    point_width_m: f32,
+    /// Sides of the unit cube a metre, along the bounds' longest side.
+    cubes_a_metre: f64,
     center: Tensor,
     inverse_half: Tensor,
     groups: Vec<Group>,
@@ -65,7 +68,13 @@ impl Encoding {
                 }
             })
             .collect();
-        Self { center: Tensor::from_slice(&center), inverse_half: Tensor::from_slice(&half.map(|h| 1.0 / h)), groups }
+        Self {
+            point_width_m: config.point_width_m,
+            cubes_a_metre: 0.25 / f64::from(longest),
+            center: Tensor::from_slice(&center),
+            inverse_half: Tensor::from_slice(&half.map(|h| 1.0 / h)),
+            groups,
+        }
     }
 
     /// World metres to the unit cube: linear inside the bounds, squeezed by 2 - 1/u outside, axis by axis.
@@ -76,8 +85,9 @@ impl Encoding {
         squeezed.copysign(&u) * 0.25 + 0.5
     }
 
-    /// Features `[N, levels x features per level]` of world points `[N, 3]`, from the table `[entries, features]`.
-    pub(crate) fn features(&self, table: &Tensor, points_m: &Tensor) -> Tensor {
+    /// Features `[N, levels x features per level]` of world points `[N, 3]`, from the table `[entries, features]`; of
+    /// points that are `widths_m` `[N]` wide (see [`FieldConfig::point_width_m`]).
+    pub(crate) fn features(&self, table: &Tensor, points_m: &Tensor, widths_m: Option<&Tensor>) -> Tensor {
         let (indices, weights): (Vec<Tensor>, Vec<Tensor>) = tch::no_grad(|| {
             let q = self.contract(points_m).clamp(0.0, 1.0).unsqueeze(1);
             self.groups.iter().map(|group| group.corners(&q)).unzip()
@@ -86,7 +96,15 @@ impl Encoding {
         let f = table.size()[1];
         let (indices, weights) = (Tensor::cat(&indices, 1), Tensor::cat(&weights, 1));
         let entries = table.index_select(0, &indices.view(-1)).view([n, levels, 8, f]);
-        (entries * weights.unsqueeze(-1)).sum_dim_intlist([2_i64].as_slice(), false, Kind::Float).view([n, levels * f])
+        let features = (entries * weights.unsqueeze(-1)).sum_dim_intlist([2_i64].as_slice(), false, Kind::Float);
+        if self.point_width_m <= 0.0 {
+            return features.view([n, levels * f]);
+        }
+        let resolutions: Vec<Tensor> = self.groups.iter().map(|group| group.resolution.view([1, -1])).collect();
+        let widths_m = widths_m.map_or_else(|| Tensor::from(self.point_width_m).view([1, 1]), |w| w.unsqueeze(1));
+        let cells = widths_m * self.cubes_a_metre * Tensor::cat(&resolutions, 1);
+        let weight = (cells.square() * 0.5 + 1.0).rsqrt();
+        (features * weight.unsqueeze(-1)).view([n, levels * f])
     }
 }
 

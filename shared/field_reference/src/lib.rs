@@ -125,19 +125,20 @@ impl ReferenceField {
 
     /// Density, 1/metre, `[N]`, at `points_m` `[N, 3]`; `latent` is `[8]` for all or `[N, 8]`.
     pub fn density(&self, points_m: &Tensor, latent: &Tensor) -> Tensor {
-        self.activate(&self.geometry(points_m, latent))
+        self.activate(&self.geometry(points_m, None, latent))
     }
 
     /// Density `[N]` and colour `[N, 3]` (0..=1) at `points_m` `[N, 3]` seen along unit `directions` `[N, 3]`.
     pub fn density_and_color(&self, points_m: &Tensor, directions: &Tensor, latent: &Tensor) -> (Tensor, Tensor) {
-        let geometry = self.geometry(points_m, latent);
+        let geometry = self.geometry(points_m, None, latent);
         let harmonics = spherical_harmonics(directions, self.config.direction_degree);
         (self.activate(&geometry), self.color(&geometry, &harmonics, latent))
     }
 
-    /// Outputs of the density network `[N, 1 + geometry features]`, raw density first, in the networks' arithmetic.
-    pub(crate) fn geometry(&self, points_m: &Tensor, latent: &Tensor) -> Tensor {
-        let features = self.encoding.features(&self.table, points_m).to_kind(self.precision.kind());
+    /// Outputs of the density network `[N, 1 + geometry features]`, raw density first, in the networks' arithmetic. Each
+    /// point is as wide as `widths_m` `[N]` says, or with none as the configuration says.
+    pub(crate) fn geometry(&self, points_m: &Tensor, widths_m: Option<&Tensor>, latent: &Tensor) -> Tensor {
+        let features = self.encoding.features(&self.table, points_m, widths_m).to_kind(self.precision.kind());
         let hidden = self.density[0].forward_with(&features, &self.normalized(latent)).relu();
         self.density[2].forward(&self.density[1].forward(&hidden).relu())
     }

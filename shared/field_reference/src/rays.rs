@@ -11,6 +11,7 @@ pub struct Rays {
     origins_m: Tensor,
     directions: Tensor,
     harmonics: Tensor,
+    spreads: Tensor,
 }
 
 impl Rays {
@@ -21,7 +22,13 @@ impl Rays {
             Tensor::from_slice(&values).view([-1, 3])
         };
         let directions = flat(|r| &r.direction);
-        Self { origins_m: flat(|r| &r.origin), harmonics: spherical_harmonics(&directions, degree), directions }
+        let spreads: Vec<f32> = rays.iter().map(|r| r.spread).collect();
+        Self {
+            origins_m: flat(|r| &r.origin),
+            harmonics: spherical_harmonics(&directions, degree),
+            directions,
+            spreads: Tensor::from_slice(&spreads),
+        }
     }
 
     /// How many.
@@ -69,6 +76,12 @@ impl Samples {
         rays.origins_m.index_select(0, &ray) + distance * rays.directions.index_select(0, &ray)
     }
 
+    /// Widths of the same samples, `[count]`.
+    fn widths_m(&self, rays: &Rays, first: i64, count: i64) -> Tensor {
+        let ray = self.ray.narrow(0, first, count);
+        self.distance_m.narrow(0, first, count) * rays.spreads.index_select(0, &ray)
+    }
+
     /// Weight of each sample and transmittance of each ray (Max 1995), from densities.
     fn weights(&self, density: &Tensor, rays: i64) -> (Tensor, Tensor) {
         let depth = (density * &self.length_m).to_kind(Kind::Double);
@@ -84,7 +97,9 @@ impl ReferenceField {
     /// Pixels `[R, 3]`, with gradients. `latent` is `[8]` for all rays or `[R, 8]`.
     pub fn pixels(&self, rays: &Rays, samples: &Samples, latent: &Tensor) -> Tensor {
         let of_samples = if latent.dim() == 1 { latent.shallow_clone() } else { latent.index_select(0, &samples.ray) };
-        let geometry = self.geometry(&samples.points_m(rays, 0, samples.count()), &of_samples);
+        let (points_m, widths_m) =
+            (samples.points_m(rays, 0, samples.count()), samples.widths_m(rays, 0, samples.count()));
+        let geometry = self.geometry(&points_m, Some(&widths_m), &of_samples);
         let (weight, transmittance) = samples.weights(&self.activate(&geometry), rays.count());
         let color = self.color(&geometry, &rays.harmonics.index_select(0, &samples.ray), &of_samples);
         let beyond = self.background(&rays.harmonics, latent) * transmittance.unsqueeze(1);
@@ -97,7 +112,10 @@ impl ReferenceField {
         let chunks = |count: i64| (0..count).step_by(chunk.max(1) as usize).map(move |at| (at, chunk.min(count - at)));
         tch::no_grad(|| {
             let geometry: Vec<Tensor> = chunks(samples.count())
-                .map(|(first, count)| self.geometry(&samples.points_m(rays, first, count), latent))
+                .map(|(first, count)| {
+                    let widths_m = samples.widths_m(rays, first, count);
+                    self.geometry(&samples.points_m(rays, first, count), Some(&widths_m), latent)
+                })
                 .collect();
             let mut pixels = self.background(&rays.harmonics, latent);
             if geometry.is_empty() {

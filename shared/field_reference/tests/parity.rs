@@ -77,13 +77,15 @@ fn values(t: &Tensor) -> Vec<f32> {
 }
 
 /// Densities agree to 1e-4 of their value and colours to 1e-4, in f32, for dense and hashed levels, 2, 4 and 8
-/// features, each degree of the directions, several latents, and every instruction set here.
+/// features, each degree of the directions, points with and without a width, several latents, and every instruction set
+/// here.
 #[test]
 fn values_agree_in_f32() {
     for (seed, (features_per_level, levels, direction_degree)) in
         [(2, 8, 1), (4, 8, 3), (8, 4, 4), (4, 1, 2)].into_iter().enumerate()
     {
-        let config = FieldConfig { features_per_level, levels, direction_degree, ..config() };
+        let point_width_m = 0.1 * (seed % 2) as f32;
+        let config = FieldConfig { features_per_level, levels, direction_degree, point_width_m, ..config() };
         let mut field = rough_field(config, seed as u64);
         let reference = ReferenceField::new(&field, Precision::F32);
         let (points, directions) = points(500, 10 + seed as u64);
@@ -165,15 +167,22 @@ fn rays(count: usize, seed: u64) -> Vec<Ray> {
             let [a, h, x, y, z] = normals::<5>(seed, i);
             let origin = [-5.0 + 25.0 * a.cos(), -6.0 + 25.0 * a.sin(), 4.0 + h.abs()];
             let target = [-5.0 + 5.0 * x, -6.0 + 5.0 * y, 1.0 + z];
-            Ray { origin, direction: unit([0, 1, 2].map(|k| target[k] - origin[k])) }
+            Ray { origin, direction: unit([0, 1, 2].map(|k| target[k] - origin[k])), spread: 0.01 }
         })
         .collect()
 }
 
-/// Pictures agree pixel by pixel: volume rendering, background, occupancy and early ends included.
+/// Pictures agree pixel by pixel: volume rendering, background, occupancy and early ends included, with pixels of no width
+/// and of some.
 #[test]
 fn pictures_agree() {
-    let tensors: Vec<_> = rough_field(config(), 6)
+    for point_width_m in [0.0, 0.1] {
+        pictures_agree_with(FieldConfig { point_width_m, ..config() });
+    }
+}
+
+fn pictures_agree_with(config: FieldConfig) {
+    let tensors: Vec<_> = rough_field(config.clone(), 6)
         .tensors()
         .into_iter()
         .map(|t| {
@@ -186,7 +195,7 @@ fn pictures_agree() {
             (t.name.into_owned(), t.shape, data)
         })
         .collect();
-    let field = Field::from_tensors(config(), tensors).unwrap();
+    let field = Field::from_tensors(config.clone(), tensors).unwrap();
     let reference = ReferenceField::new(&field, Precision::F32);
     let (rays, z) = (rays(300, 4), latent(5));
     let options = RenderOptions::default();
@@ -206,7 +215,7 @@ fn pictures_agree() {
         assert!((sum - buffer.opacity[ray]).abs() < 1e-4);
     }
     assert!(buffer.opacity.iter().any(|o| *o > 0.5) && buffer.opacity.iter().any(|o| *o < 0.999));
-    let rays = Rays::new(&rays, config().direction_degree);
+    let rays = Rays::new(&rays, config.direction_degree);
     let min_weight = f64::from(options.min_weight);
     for chunk in [100, 1 << 20] {
         let picture =
@@ -269,10 +278,16 @@ fn reference_loss(reference: &ReferenceField, trainer: &FieldTrainer, batch: &Ra
 }
 
 /// The native step's loss and its gradients by every tensor and by the latents are those of automatic
-/// differentiation: to 1e-5 and to 1e-3 of each tensor's largest gradient.
+/// differentiation: to 1e-5 and to 1e-3 of each tensor's largest gradient, with pixels of no width and of some.
 #[test]
 fn gradients_agree_with_automatic_differentiation() {
-    let field = rough_field(small_config(), 8);
+    for point_width_m in [0.0, 0.1] {
+        gradients_agree(FieldConfig { point_width_m, ..small_config() });
+    }
+}
+
+fn gradients_agree(config: FieldConfig) {
+    let field = rough_field(config, 8);
     let batch = batch(60, 12);
     let mut trainer = FieldTrainer::new(field.clone(), trainer_config()).unwrap();
     let reference = ReferenceField::new(&field, Precision::F32);

@@ -19,6 +19,8 @@ pub struct Ray {
     pub origin: [f32; 3],
     /// Unit vector, world space.
     pub direction: [f32; 3],
+    /// Width of its pixel at one metre along the ray, metres; 0 for a ray that is no pixel's.
+    pub spread: f32,
 }
 
 /// Why a camera is not usable.
@@ -101,7 +103,13 @@ impl PinholeCamera {
         let m = &self.world_from_camera;
         let world = [0, 1, 2].map(|i| m[i][0] * in_camera[0] + m[i][1] * in_camera[1] + m[i][2] * in_camera[2]);
         let direction = normalize(world);
-        Ray { origin: self.position_m().map(|v| v as f32), direction: direction.map(|v| v as f32) }
+        let length = in_camera.iter().map(|v| v * v).sum::<f64>().sqrt();
+        let spread = 1.0 / ((self.fl_x_px * self.fl_y_px).sqrt() * length);
+        Ray {
+            origin: self.position_m().map(|v| v as f32),
+            direction: direction.map(|v| v as f32),
+            spread: spread as f32,
+        }
     }
 
     /// Where a world point falls in the picture: (x, y) in pixels and the depth along the optical axis in metres;
@@ -296,7 +304,7 @@ mod tests {
     fn boxes_are_met() {
         let upright = OrientedBox { center: [3.0, 0.0, 1.0], half_size: [1.0, 0.2, 1.0], yaw: 0.0 };
         let turned = OrientedBox { yaw: std::f64::consts::FRAC_PI_2, ..upright };
-        let ray = |origin, direction| Ray { origin, direction };
+        let ray = |origin, direction| Ray { origin, direction, spread: 0.0 };
         let along_x = |y| ray([-5.0, y, 1.0], [1.0, 0.0, 0.0]);
         assert!(upright.is_met_by(&along_x(0.1)) && !upright.is_met_by(&along_x(0.5)));
         assert!(turned.is_met_by(&along_x(0.5)) && !turned.is_met_by(&along_x(1.5)));

@@ -103,6 +103,9 @@ pub struct Augmentation {
     /// Altered copies of each picture, besides one with sensor noise alone. With a frozen backbone their features are
     /// computed once and kept.
     pub copies: usize,
+    /// Further copies of the pictures that the data set's own poses are trained with: the first as it is, the others
+    /// altered. There are few of them beside those of freely drawn poses.
+    pub own_copies: usize,
     /// Sensor noise and colour errors, on every copy.
     pub sensor: SensorNoise,
     /// Largest shift, as a share of the picture's side.
@@ -117,6 +120,7 @@ impl Default for Augmentation {
     fn default() -> Self {
         Self {
             copies: 11,
+            own_copies: 0,
             sensor: SensorNoise { sigma: 2.0, gain_sigma: 0.04, channel_gain_sigma: 0.02, channel_offset_sigma: 2.0 },
             shift: 0.1,
             zoom: 0.15,
@@ -131,6 +135,9 @@ impl Default for Augmentation {
 pub struct VaeTraining {
     /// Passes over the training pictures.
     pub epochs: usize,
+    /// Further passes in which the decoder learns alone, over the pictures of the data set's own poses: while the encoder
+    /// learns, the decoder runs after latents that move.
+    pub decoder_epochs: usize,
     /// Pictures a step.
     pub batch: usize,
     /// How many of them the decoder reconstructs, where they are of the data set's own poses: it costs twelve times as
@@ -168,6 +175,7 @@ impl Default for VaeTraining {
     fn default() -> Self {
         Self {
             epochs: 100,
+            decoder_epochs: 0,
             batch: 30,
             decoder_batch: 30,
             learning_rate: 1e-3,
@@ -206,6 +214,13 @@ impl Default for MdnTraining {
     }
 }
 
+impl VaeTraining {
+    /// Passes in all, those of the decoder alone among them.
+    pub fn all_epochs(&self) -> usize {
+        self.epochs + self.decoder_epochs
+    }
+}
+
 impl TrainingConfig {
     /// Reads a training file; the error shows file, line and key.
     pub fn load(path: &Path) -> Result<Self, TrainingError> {
@@ -222,6 +237,7 @@ impl TrainingConfig {
     pub fn validate(&self) -> Result<(), String> {
         let counts = [
             ("vae.epochs", self.vae.epochs, 1, 10_000),
+            ("vae.decoder_epochs", self.vae.decoder_epochs, 0, 10_000),
             ("vae.batch", self.vae.batch, 2, 4096),
             ("vae.decoder_batch", self.vae.decoder_batch, 1, 4096),
             ("nerf.rays", self.nerf.rays, 32, 1 << 20),
@@ -232,6 +248,7 @@ impl TrainingConfig {
             ("mdn.batch", self.mdn.batch, 2, 65_536),
             ("free_poses.count", self.free_poses.count, 0, 10_000),
             ("augmentation.copies", self.augmentation.copies, 0, 64),
+            ("augmentation.own_copies", self.augmentation.own_copies, 0, 64),
             ("threads", self.threads.max(0) as usize, 1, 256),
         ];
         for (key, value, low, high) in counts {

@@ -34,6 +34,9 @@ pub struct FieldTraining {
     pub resampled_share: f64,
     /// Share of the training in which it rises from 0.
     pub resampled_ramp: f64,
+    /// Whether a pixel sees what is as wide as itself (see `point_width_m` of the field, which is then the median of what the
+    /// pictures' pixels are in the middle of the bounds), or a mere point.
+    pub wide_pixels: bool,
     /// The optimiser; `steps` is the length of the training.
     pub trainer: carff_field::TrainerConfig,
 }
@@ -45,6 +48,7 @@ impl Default for FieldTraining {
             changed_share: 0.34,
             resampled_share: 0.7,
             resampled_ramp: 0.3,
+            wide_pixels: false,
             trainer: carff_field::TrainerConfig::default(),
         }
     }
@@ -94,7 +98,7 @@ impl Clouds {
     }
 
     /// The field's structure for these latents and this scenario.
-    fn structure(&self, config: &FieldConfig, pictures: &Pictures) -> FieldConfig {
+    fn structure(&self, config: &TrainingConfig, pictures: &Pictures) -> FieldConfig {
         let means: Vec<[f32; LATENT_DIM]> = self.by_state.iter().flatten().map(|g| g.mean).collect();
         let n = means.len() as f32;
         let mean: [f32; LATENT_DIM] = std::array::from_fn(|d| means.iter().map(|m| m[d]).sum::<f32>() / n);
@@ -103,8 +107,26 @@ impl Clouds {
             1.0 / variance.sqrt().max(0.05)
         });
         let bounds_m = pictures.scenario.bounds.map(|corner| corner.map(|v| v as f32));
-        FieldConfig { bounds_m, latent_mean: mean, latent_scale: scale, ..config.clone() }
+        let point_width_m = if config.nerf.wide_pixels { middle_width_m(pictures) } else { config.field.point_width_m };
+        FieldConfig { bounds_m, latent_mean: mean, latent_scale: scale, point_width_m, ..config.field.clone() }
     }
+}
+
+/// Median over the data set's pictures of a pixel's width in the middle of the bounds, metres.
+fn middle_width_m(pictures: &Pictures) -> f32 {
+    let [low, high] = pictures.scenario.bounds;
+    let mut widths: Vec<f64> = pictures
+        .dataset
+        .frames()
+        .iter()
+        .map(|frame| {
+            let from = frame.camera.position_m();
+            let distance = (0..3).map(|a| (0.5 * (low[a] + high[a]) - from[a]).powi(2)).sum::<f64>().sqrt();
+            distance / frame.camera.fl_x_px
+        })
+        .collect();
+    widths.sort_by(f64::total_cmp);
+    widths.get(widths.len() / 2).map_or(0.0, |width| *width as f32)
 }
 
 /// Trains the field, or goes on where an earlier run stopped.
@@ -118,7 +140,7 @@ pub fn train(config: &TrainingConfig, pictures: &Pictures, clouds: &Clouds, run:
     let mut trainer = if let Some((done, state)) = run.load("nerf")? {
         resume(config, trainer_config.clone(), done, &state).ok_or_else(|| damaged(&run.state_path("nerf")))?
     } else {
-        FieldTrainer::new(Field::new(clouds.structure(&config.field, pictures), config.seed)?, trainer_config.clone())?
+        FieldTrainer::new(Field::new(clouds.structure(config, pictures), config.seed)?, trainer_config.clone())?
     };
     let states = pictures.scenario.state_count();
     trainer.set_state_latents(&state_latents(clouds, states, config.seed));
@@ -245,7 +267,8 @@ pub fn saved_field(config: &TrainingConfig, state: &Tensors) -> Option<Field> {
     let structure: FieldConfig = serde_json::from_slice(&text).ok()?;
     let wanted = &config.field;
     let same = (structure.levels, structure.log2_table_size, structure.hidden_width, structure.max_resolution)
-        == (wanted.levels, wanted.log2_table_size, wanted.hidden_width, wanted.max_resolution);
+        == (wanted.levels, wanted.log2_table_size, wanted.hidden_width, wanted.max_resolution)
+        && (structure.point_width_m > 0.0) == (config.nerf.wide_pixels || wanted.point_width_m > 0.0);
     if !same {
         return None;
     }

@@ -62,7 +62,7 @@ pub fn train(
     }
     let pretrained = config.pretrained_backbone.as_deref();
     let mut vae = Vae::new(config, pictures.dataset.view_count(), states, pretrained, device)?;
-    let posteriors = match finished(run, "vae", config.vae.epochs, |state| vae.restore_weights(state)) {
+    let posteriors = match finished(run, "vae", config.vae.all_epochs(), |state| vae.restore_weights(state)) {
         Ok(()) => posteriors_of(config, &pictures, &mut vae, run)?,
         Err(error) if matches!(stage, Stage::Nerf | Stage::Mdn) => return Err(error),
         Err(_) => {

@@ -8,11 +8,11 @@
 use crate::{
     TrainingError,
     accuracy::{Centroids, state_accuracy},
-    config::TrainingConfig,
+    config::{Augmentation, TrainingConfig},
     pictures::Pictures,
     run::{Progress, Run, SaveClock, cosine, damaged, part, prefixed},
 };
-use carff_dataset::PoseRole;
+use carff_dataset::{PoseRole, sensor::SensorNoise};
 use carff_latent::{LATENT_DIM, LatentGaussian};
 use carff_models::{
     ModelError,
@@ -115,10 +115,16 @@ impl Vae {
     }
 }
 
-/// Backbone features of the pictures' altered copies, where they can be kept.
+/// Backbone features of the pictures' copies, where they can be kept.
+///
+/// Every picture has `augmentation.copies` + 1 copies; those that the data set's own poses are trained with have
+/// `augmentation.own_copies` more, the first of them the picture as it is.
 pub struct Inputs<'a> {
     config: &'a TrainingConfig,
     pictures: &'a Pictures,
+    /// Per picture its place among those with more copies.
+    own: Vec<Option<usize>>,
+    own_count: usize,
     features: Option<Tensor>,
 }
 
@@ -129,7 +135,7 @@ const FEATURE_BATCH: usize = 4;
 const STANDARDISED: usize = 64;
 
 impl<'a> Inputs<'a> {
-    /// Computes what can be kept: features `[copies + 1, N, C, h, w]` in half precision.
+    /// Computes what can be kept: features `[copies of all pictures, C, h, w]` in half precision.
     pub fn new(
         config: &'a TrainingConfig,
         pictures: &'a Pictures,
@@ -137,26 +143,40 @@ impl<'a> Inputs<'a> {
         run: &Run,
     ) -> Result<Self, TrainingError> {
         let keep = config.encoder.backbone.frozen && config.encoder.stem_channels == 0;
-        let mut this = Self { config, pictures, features: None };
+        let trained = pictures.trained();
+        let mut own = vec![None; pictures.images.len()];
+        for (place, &i) in trained.iter().enumerate() {
+            own[i] = Some(place);
+        }
+        let mut this = Self { config, pictures, own, own_count: trained.len(), features: None };
         if keep {
             let all: Vec<usize> = (0..pictures.images.len()).collect();
             let copies = config.augmentation.copies + 1;
-            let total = copies * all.len();
-            let mut rows = Vec::new();
-            for copy in 0..copies {
-                for (i, chunk) in all.chunks(FEATURE_BATCH).enumerate() {
+            let total = copies * all.len() + config.augmentation.own_copies * trained.len();
+            let mut features: Option<Tensor> = None;
+            let mut done = 0;
+            for copy in 0..copies + config.augmentation.own_copies {
+                let of_copy = if copy < copies { &all } else { &trained };
+                for chunk in of_copy.chunks(FEATURE_BATCH) {
                     if run.stopped() {
                         return Err(TrainingError::Stopped);
                     }
-                    let inputs = pictures.inputs(chunk, copy, &config.augmentation, config.seed);
-                    rows.push(tch::no_grad(|| vae.encoder.features(&inputs)).to_kind(Kind::Half));
-                    let done = (copy * all.len() + (i + 1) * FEATURE_BATCH).min(total);
+                    let inputs = this.copies(chunk, copy);
+                    let rows = tch::no_grad(|| vae.encoder.features(&inputs));
+                    let all_rows = features.get_or_insert_with(|| {
+                        let mut shape = rows.size();
+                        shape[0] = total as i64;
+                        Tensor::zeros(shape, (Kind::Half, rows.device()))
+                    });
+                    all_rows.narrow(0, done as i64, chunk.len() as i64).copy_(&rows);
+                    done += chunk.len();
                     (run.on_progress)(&Progress { stage: "features", done, total, line: String::new() });
                 }
             }
-            let features = Tensor::cat(&rows, 0);
-            vae.encoder.standardise(&features.narrow(0, 0, all.len() as i64).to_kind(Kind::Float));
-            this.features = Some(features);
+            if let Some(features) = &features {
+                vae.encoder.standardise(&features.narrow(0, 0, all.len() as i64).to_kind(Kind::Float));
+            }
+            this.features = features;
         } else if run.load("vae")?.is_none() {
             // A backbone that learns changes its features; the head is set to how they are at first, and learns the rest.
             let count = pictures.images.len().min(STANDARDISED);
@@ -171,17 +191,39 @@ impl<'a> Inputs<'a> {
         Ok(this)
     }
 
+    /// How many copies there are of a picture.
+    fn copies_of(&self, picture: usize) -> usize {
+        let more = if self.own[picture].is_some() { self.config.augmentation.own_copies } else { 0 };
+        self.config.augmentation.copies + 1 + more
+    }
+
+    /// Encoder inputs: one copy of each picture.
+    fn copies(&self, pictures: &[usize], copy: usize) -> Tensor {
+        let augmentation = &self.config.augmentation;
+        if copy == augmentation.copies + 1 {
+            let as_it_is = Augmentation { sensor: SensorNoise::OFF, ..augmentation.clone() };
+            return self.pictures.inputs(pictures, 0, &as_it_is, self.config.seed);
+        }
+        self.pictures.inputs(pictures, copy, augmentation, self.config.seed)
+    }
+
+    /// Where a copy's features lie: first all pictures copy by copy, then the further copies of those that have more.
+    fn row(&self, picture: usize, copy: usize) -> i64 {
+        let (copies, n) = (self.config.augmentation.copies + 1, self.pictures.images.len());
+        let row = match self.own[picture] {
+            Some(place) if copy >= copies => copies * n + (copy - copies) * self.own_count + place,
+            _ => copy * n + picture,
+        };
+        row as i64
+    }
+
     /// Features of some pictures, each in its own copy.
     fn features(&self, vae: &Vae, chosen: &[(usize, usize)]) -> Tensor {
         if let Some(features) = &self.features {
-            let n = self.pictures.images.len();
-            let rows: Vec<i64> = chosen.iter().map(|&(i, copy)| (copy * n + i) as i64).collect();
+            let rows: Vec<i64> = chosen.iter().map(|&(i, copy)| self.row(i, copy)).collect();
             return features.index_select(0, &indices(&rows, features.device())).to_kind(Kind::Float);
         }
-        let inputs: Vec<Tensor> = chosen
-            .iter()
-            .map(|&(i, copy)| self.pictures.inputs(&[i], copy, &self.config.augmentation, self.config.seed))
-            .collect();
+        let inputs: Vec<Tensor> = chosen.iter().map(|&(i, copy)| self.copies(&[i], copy)).collect();
         vae.encoder.features(&Tensor::cat(&inputs, 0))
     }
 
@@ -224,37 +266,49 @@ pub fn train(
         }
         first = done;
     }
-    let trained = pictures.trained_and_free();
+    let (trained, own) = (pictures.trained_and_free(), pictures.trained());
     let state_targets = state_targets(pictures).to_device(vae.device());
-    let copies = config.augmentation.copies + 1;
-    let per_epoch = trained.len().div_ceil(settings.batch).max(1);
     let mut clock = SaveClock::default();
-    for epoch in first..settings.epochs {
+    for epoch in first..settings.all_epochs() {
+        let decoder_alone = epoch >= settings.epochs;
+        let (learnt, epochs_before, epochs) = if decoder_alone {
+            (&own, settings.epochs, settings.decoder_epochs)
+        } else {
+            (&trained, 0, settings.epochs)
+        };
+        let per_epoch = learnt.len().div_ceil(settings.batch).max(1);
         let mut rng =
             carff_random::stream(Key { seed: config.seed, frame: epoch as u64, step: 0x7661_6500, sample: 0 });
-        let batches = batches(pictures, &trained, settings.batch, &mut rng);
+        let batches = batches(pictures, learnt, settings.batch, &mut rng);
         let mut sums = [0.0_f64; 4];
         let mut decoded_batches = 0_usize;
         for (b, batch) in batches.iter().enumerate() {
-            let step = epoch * per_epoch + b;
-            let at = step as f64 / (settings.epochs * per_epoch) as f64;
+            let step = (epoch - epochs_before) * per_epoch + b;
+            let at = step as f64 / (epochs * per_epoch) as f64;
             let kl_weight =
                 settings.kl_weight * ((at - settings.kl_delay) / settings.kl_ramp.max(1e-9)).clamp(0.0, 1.0);
             let chosen: Vec<(usize, usize)> =
-                batch.iter().map(|&i| (i, rand::Rng::random_range(&mut rng, 0..copies))).collect();
-            tch::manual_seed(config.seed as i64 ^ ((step as i64) << 20));
-            let losses = losses(config, pictures, vae, inputs, &chosen, &state_targets);
-            let mut loss = &losses.kl * kl_weight;
-            if let Some(term) = &losses.reconstruction {
-                loss = &loss + term * settings.reconstruction_weight;
-            }
-            if let Some(term) = &losses.state {
-                loss = &loss + term * settings.state_weight;
-            }
-            if let Some(term) = &losses.contrastive {
-                loss = &loss + term * settings.contrastive_weight;
-            }
-            adam.step(&loss, settings.learning_rate * cosine(step, settings.epochs * per_epoch), 5.0);
+                batch.iter().map(|&i| (i, rand::Rng::random_range(&mut rng, 0..inputs.copies_of(i)))).collect();
+            tch::manual_seed(config.seed as i64 ^ ((step as i64) << 20) ^ i64::from(decoder_alone));
+            let losses = losses(config, pictures, vae, inputs, &chosen, &state_targets, decoder_alone);
+            let reconstruction = losses.reconstruction.as_ref().map(|term| term * settings.reconstruction_weight);
+            let loss = match reconstruction {
+                Some(term) if decoder_alone => term,
+                reconstruction => {
+                    let mut loss = &losses.kl * kl_weight;
+                    if let Some(term) = reconstruction {
+                        loss = &loss + term;
+                    }
+                    if let Some(term) = &losses.state {
+                        loss = &loss + term * settings.state_weight;
+                    }
+                    if let Some(term) = &losses.contrastive {
+                        loss = &loss + term * settings.contrastive_weight;
+                    }
+                    loss
+                }
+            };
+            adam.step(&loss, settings.learning_rate * cosine(step, epochs * per_epoch), 5.0);
             let value = |t: &Tensor| t.double_value(&[]);
             sums[0] += value(&loss);
             sums[1] += losses.reconstruction.as_ref().map_or(0.0, value);
@@ -265,7 +319,8 @@ pub fn train(
         let mut means = sums.map(|s| s / batches.len() as f64);
         means[1] = sums[1] / decoded_batches.max(1) as f64;
         let posteriors = inputs.posteriors(vae, 0);
-        let report = evaluate(config, pictures, vae, &posteriors, epoch + 1 == settings.epochs || epoch % 10 == 9)?;
+        let last = epoch + 1 == settings.all_epochs();
+        let report = evaluate(config, pictures, vae, &posteriors, last || epoch % 10 == 9)?;
         let mut record = json!({
             "stage": "vae", "epoch": epoch + 1, "loss": means[0], "reconstruction": means[1], "kl": means[2],
             "state": means[3],
@@ -278,7 +333,7 @@ pub fn train(
         (run.on_progress)(&Progress {
             stage: "vae",
             done: epoch + 1,
-            total: settings.epochs,
+            total: settings.all_epochs(),
             line: format!(
                 "loss {:.3} = {:.3} {:.3}  kl {:.1}  state accuracy trained {:.1}/{:.1}/{:.1} % unseen {:.1}/{:.1} %{}",
                 means[0],
@@ -294,7 +349,7 @@ pub fn train(
             ),
         });
         let stopping = run.stopped();
-        if stopping || clock.is_due() || epoch + 1 == settings.epochs {
+        if stopping || clock.is_due() || last {
             run.save("vae", epoch + 1, vae.state(&adam))?;
         }
         if stopping {
@@ -375,6 +430,7 @@ fn reconstruction(
     (error * weight).mean(Kind::Float) * 10.0
 }
 
+/// The terms of one batch. For a decoder that learns alone the encoder is as it is used later, and out of the loss's reach.
 fn losses(
     config: &TrainingConfig,
     pictures: &Pictures,
@@ -382,12 +438,14 @@ fn losses(
     inputs: &Inputs,
     chosen: &[(usize, usize)],
     state_targets: &Tensor,
+    decoder_alone: bool,
 ) -> Losses {
     let settings = &config.vae;
     let only: Vec<usize> = chosen.iter().map(|&(i, _)| i).collect();
     let features = inputs.features(vae, chosen);
-    let (mean, log_variance) = vae.encoder.posterior(&features, settings.dropout);
+    let (mean, log_variance) = vae.encoder.posterior(&features, if decoder_alone { 0.0 } else { settings.dropout });
     let latent = &mean + (&log_variance * 0.5).exp() * Tensor::randn_like(&mean);
+    let latent = if decoder_alone { latent.detach() } else { latent };
     // The decoder knows the data set's poses alone.
     let known: Vec<usize> =
         (0..only.len()).filter(|&row| pictures.labels[only[row]].role.is_some()).take(settings.decoder_batch).collect();

@@ -99,8 +99,12 @@ impl Place {
         self.folder.path().join(name)
     }
 
-    /// Trains, alone in this process, until `stop_at` (stage, steps done), or to the end.
+    /// Trains all stages, alone in this process, until `stop_at` (stage, steps done), or to the end.
     fn train(&self, name: &str, stop_at: Option<(&str, usize)>) -> Result<Value, TrainingError> {
+        self.train_stage(name, Stage::All, stop_at)
+    }
+
+    fn train_stage(&self, name: &str, stage: Stage, stop_at: Option<(&str, usize)>) -> Result<Value, TrainingError> {
         let _alone = alone();
         let stop = AtomicBool::new(false);
         let on_progress = |progress: &Progress| {
@@ -111,7 +115,7 @@ impl Place {
         let dir = self.out(&format!("{name}-run"));
         std::fs::create_dir_all(&dir).unwrap();
         let run = Run { dir, on_progress: &on_progress, stop: &stop };
-        pipeline::train(&self.config, &self.out("set"), None, &self.out(name), Stage::All, tch::Device::Cpu, &run)
+        pipeline::train(&self.config, &self.out("set"), None, &self.out(name), stage, tch::Device::Cpu, &run)
     }
 }
 
@@ -135,15 +139,33 @@ fn training_learns() {
     assert_eq!(Models::load(&place.out("learnt")).unwrap().probe.states().len(), 4);
 }
 
-/// A training that is stopped in each of its three stages, and each time goes on, ends with the same bytes as one that
-/// is not.
+/// A decoder that learns alone leaves the encoder as it is, and gets better.
+#[test]
+fn the_decoder_learns_alone() {
+    let mut place = Place::new();
+    place.config.vae.epochs = 12;
+    place.config.vae.learning_rate = 2e-3;
+    let before = place.train_stage("together", Stage::Vae, None).unwrap();
+    place.config.vae.decoder_epochs = 100;
+    let after = place.train_stage("alone", Stage::Vae, None).unwrap();
+    let read = |name: &str| std::fs::read(place.out(name).join("encoder.safetensors")).unwrap();
+    assert!(read("together") == read("alone"), "the encoder has changed");
+    let psnr_db = |metrics: &Value| metrics.pointer("/vae/changed_pixels_psnr_db").and_then(Value::as_f64).unwrap();
+    assert!(psnr_db(&after) > psnr_db(&before) + 0.5, "{before:#} {after:#}");
+}
+
+/// A training that is stopped in each of its three stages, and while the decoder learns alone, and each time goes on, ends
+/// with the same bytes as one that is not.
 #[test]
 fn training_resumes() {
     let mut place = Place::new();
     place.config.vae.epochs = 6;
+    place.config.vae.decoder_epochs = 3;
+    place.config.augmentation.own_copies = 2;
+    place.config.nerf.wide_pixels = true;
     place.config.nerf.trainer.steps = 160;
     place.train("straight", None).unwrap();
-    for stop_at in [("vae", 3), ("mdn", 100), ("nerf", 60)] {
+    for stop_at in [("vae", 3), ("vae", 7), ("mdn", 100), ("nerf", 60)] {
         assert!(matches!(place.train("halting", Some(stop_at)), Err(TrainingError::Stopped)), "{stop_at:?}");
     }
     place.train("halting", None).unwrap();

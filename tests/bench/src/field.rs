@@ -316,7 +316,11 @@ impl Bench {
         let colored = samples.weight.iter().filter(|w| **w > options.min_weight).count() as f64;
         let up: Vec<Ray> = rays
             .iter()
-            .map(|r| Ray { origin: [r.origin[0], r.origin[1], 1e6], direction: r.direction.map(|v| v * 1e-9) })
+            .map(|r| Ray {
+                origin: [r.origin[0], r.origin[1], 1e6],
+                direction: r.direction.map(|v| v * 1e-9),
+                spread: r.spread,
+            })
             .collect();
         let seconds = in_turns(
             self.rounds,
@@ -562,7 +566,8 @@ fn training_batch(config: &FieldConfig, states: &[[f32; LATENT_DIM]]) -> RayBatc
         let target = random_point(config, i as u64);
         let d: [f32; 3] = std::array::from_fn(|k| target[k] - origin[k]);
         let n = d.iter().map(|v| v * v).sum::<f32>().sqrt().max(1e-6);
-        batch.rays.push(Ray { origin, direction: d.map(|v| v / n) });
+        // As wide as a pixel of a picture of 128 by 128 pixels that sees 60 degrees.
+        batch.rays.push(Ray { origin, direction: d.map(|v| v / n), spread: 0.009 });
         batch.target_rgb.push([at(2), at(3), at(4)]);
         batch.latent_index.push((i % states.len()) as u32);
     }
