@@ -177,11 +177,11 @@ fn rays(count: usize, seed: u64) -> Vec<Ray> {
 #[test]
 fn pictures_agree() {
     for point_width_m in [0.0, 0.1] {
-        pictures_agree_with(FieldConfig { point_width_m, ..config() });
+        pictures_agree_with(&FieldConfig { point_width_m, ..config() });
     }
 }
 
-fn pictures_agree_with(config: FieldConfig) {
+fn pictures_agree_with(config: &FieldConfig) {
     let tensors: Vec<_> = rough_field(config.clone(), 6)
         .tensors()
         .into_iter()
