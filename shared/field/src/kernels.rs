@@ -303,8 +303,8 @@ pub(crate) fn encode<const FMA: bool, const F: usize>(
 }
 
 /// Weakens one block's features, level by level, where a lane's sample is wider than the level's cells: by
-/// 1 / sqrt(1 + w^2 / 2) for a width of w cells. That is Zip-NeRF's erf(1 / sqrt(8 s^2)) (Barron et al. 2023, section 3.1),
-/// to 0.1, for the deviation s = w / sqrt(12) of what is spread evenly over w. `widths` are in sides of the unit cube, one a
+/// 1 / sqrt(1 + w^2 / 2) for a width of w cells. That is Zip-NeRF's erf(1 / sqrt(8 s^2)) (Barron et al. 2023, section 3),
+/// within 0.11, for the deviation s = w / sqrt(12) of what is spread evenly over w. `widths` are in sides of the unit cube, one a
 /// lane. It is its own adjoint.
 #[inline(always)]
 pub(crate) fn attenuate<const FMA: bool>(

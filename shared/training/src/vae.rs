@@ -207,20 +207,14 @@ impl<'a> Inputs<'a> {
         self.pictures.inputs(pictures, copy, augmentation, self.config.seed)
     }
 
-    /// Where a copy's features lie: first all pictures copy by copy, then the further copies of those that have more.
-    fn row(&self, picture: usize, copy: usize) -> i64 {
-        let (copies, n) = (self.config.augmentation.copies + 1, self.pictures.images.len());
-        let row = match self.own[picture] {
-            Some(place) if copy >= copies => copies * n + (copy - copies) * self.own_count + place,
-            _ => copy * n + picture,
-        };
-        row as i64
-    }
-
     /// Features of some pictures, each in its own copy.
     fn features(&self, vae: &Vae, chosen: &[(usize, usize)]) -> Tensor {
         if let Some(features) = &self.features {
-            let rows: Vec<i64> = chosen.iter().map(|&(i, copy)| self.row(i, copy)).collect();
+            let copies = self.config.augmentation.copies + 1;
+            let rows: Vec<i64> = chosen
+                .iter()
+                .map(|&(i, copy)| feature_row(&self.own, self.own_count, copies, i, copy) as i64)
+                .collect();
             return features.index_select(0, &indices(&rows, features.device())).to_kind(Kind::Float);
         }
         let inputs: Vec<Tensor> = chosen.iter().map(|&(i, copy)| self.copies(&[i], copy)).collect();
@@ -246,6 +240,15 @@ impl<'a> Inputs<'a> {
                 })
                 .collect()
         })
+    }
+}
+
+/// Where a copy's features lie: first all pictures copy by copy, `copies` times, then the further copies of those that
+/// have a place in `own`.
+fn feature_row(own: &[Option<usize>], own_count: usize, copies: usize, picture: usize, copy: usize) -> usize {
+    match own[picture] {
+        Some(place) if copy >= copies => copies * own.len() + (copy - copies) * own_count + place,
+        _ => copy * own.len() + picture,
     }
 }
 
@@ -598,6 +601,18 @@ mod tests {
         let zero = Tensor::zeros([2, 8], (Kind::Float, Device::Cpu));
         assert!(kl_divergence(&zero, &zero).double_value(&[]).abs() < 1e-6);
         assert!((kl_divergence(&(&zero + 0.5), &zero).double_value(&[]) - 1.0).abs() < 1e-5);
+    }
+
+    /// Features lie in the order in which they are computed: every copy of all pictures, then every further copy of those
+    /// that have more.
+    #[test]
+    fn features_are_found_where_they_were_put() {
+        let own = [Some(0), None, Some(1), None, Some(2)];
+        let all = (0..2).flat_map(|copy| (0..5).map(move |picture| (picture, copy)));
+        let further = (2..5).flat_map(|copy| [0, 2, 4].map(|picture| (picture, copy)));
+        for (row, (picture, copy)) in all.chain(further).enumerate() {
+            assert_eq!(feature_row(&own, 3, 2, picture, copy), row, "picture {picture}, copy {copy}");
+        }
     }
 
     /// Views of one state closer together, states further apart: a smaller loss.
