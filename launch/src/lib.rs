@@ -2,6 +2,7 @@
 //! training and judging, data sets. What the stages compute lives in the stages; what looks at a run, in `carff`.
 
 pub mod ablate;
+pub mod backbone;
 pub mod dataset;
 pub mod doctor;
 pub mod eval;

@@ -3,6 +3,7 @@
 use carff::{Attach, exit_code};
 use carff_bench::BenchCommand;
 use carff_launch::ablate::AblateArgs;
+use carff_launch::backbone::BackboneCommand;
 use carff_launch::dataset::DatasetCommand;
 use carff_launch::doctor::DoctorArgs;
 use carff_launch::eval::EvalArgs;
@@ -74,6 +75,13 @@ Exit code: 1 when --verify finds a difference.")]
     #[command(after_help = "Example: two of the variants
   carff ablate configs/training/approaching-intersection-ablation.toml --only full --only stem --out reports/ablation")]
     Ablate(AblateArgs),
+    /// Make published weights of an image backbone ready for training.
+    #[command(
+        subcommand,
+        after_help = "Example: a vision transformer, as timm and Hugging Face publish them
+  carff backbone import model.safetensors --out runs/vit.safetensors"
+    )]
+    Backbone(BackboneCommand),
     /// Measure the program's parts, and the whole loop, on this machine.
     #[command(
         subcommand,
@@ -119,6 +127,7 @@ fn main() -> ExitCode {
         Command::Train(args) => carff_launch::train::run(&args),
         Command::Eval(args) => carff_launch::eval::run(&args),
         Command::Ablate(args) => carff_launch::ablate::run(&args),
+        Command::Backbone(command) => carff_launch::backbone::run(&command),
         Command::Bench(command) => carff_bench::run(command),
         Command::Soak(args) => carff_launch::soak::run(&args),
         Command::SoakInject(args) => carff_launch::soak::inject(&args).map(|()| ExitCode::SUCCESS),

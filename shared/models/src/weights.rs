@@ -43,23 +43,10 @@ pub fn of_store(store: &VarStore) -> Tensors {
 /// Copies `tensors` into a store's variables. Every key must be there with its shape, and none besides.
 pub fn fill_store(store: &VarStore, tensors: &Tensors) -> Result<(), ModelError> {
     let variables = of_store(store);
-    let mut faults = Vec::new();
-    for (name, variable) in &variables {
-        match tensors.get(name) {
-            None => faults.push(format!("`{name}` is missing")),
-            Some(t) if t.size() != variable.size() => {
-                faults.push(format!("`{name}` is {:?}, the model wants {:?}", t.size(), variable.size()));
-            }
-            Some(_) => {}
-        }
-    }
+    let wanted: Vec<(String, Vec<i64>)> = variables.iter().map(|(name, v)| (name.clone(), v.size())).collect();
+    let mut faults = faults(tensors, &wanted);
     faults.extend(tensors.keys().filter(|k| !variables.contains_key(*k)).map(|k| format!("`{k}` is unknown")));
-    if !faults.is_empty() {
-        let more = faults.len().saturating_sub(8);
-        faults.truncate(8);
-        let tail = if more > 0 { format!("; and {more} more") } else { String::new() };
-        return Err(ModelError::Mismatch(faults.join("; ") + &tail));
-    }
+    none_of(faults)?;
     tch::no_grad(|| {
         for (name, mut variable) in variables {
             variable.copy_(&tensors[&name]);
@@ -68,12 +55,29 @@ pub fn fill_store(store: &VarStore, tensors: &Tensors) -> Result<(), ModelError>
     Ok(())
 }
 
-/// Takes one tensor of a given shape.
-pub fn take(tensors: &Tensors, name: &str, shape: &[i64]) -> Result<Tensor, ModelError> {
-    let t = tensors.get(name).ok_or_else(|| ModelError::Mismatch(format!("`{name}` is missing")))?;
-    if t.size() == shape {
-        Ok(t.shallow_clone())
-    } else {
-        Err(ModelError::Mismatch(format!("`{name}` is {:?}, the model wants {shape:?}", t.size())))
+/// Takes the tensors of these names and shapes; the error lists what is missing or of another shape.
+pub fn select(tensors: &Tensors, wanted: &[(String, Vec<i64>)]) -> Result<Tensors, ModelError> {
+    none_of(faults(tensors, wanted))?;
+    Ok(wanted.iter().filter_map(|(name, _)| Some((name.clone(), tensors.get(name)?.shallow_clone()))).collect())
+}
+
+/// What is missing or of another shape.
+fn faults(tensors: &Tensors, wanted: &[(String, Vec<i64>)]) -> Vec<String> {
+    let fault = |(name, shape): &(String, Vec<i64>)| match tensors.get(name) {
+        None => Some(format!("`{name}` is missing")),
+        Some(t) if t.size() != *shape => Some(format!("`{name}` is {:?}, the model wants {shape:?}", t.size())),
+        Some(_) => None,
+    };
+    wanted.iter().filter_map(fault).collect()
+}
+
+/// An error that lists the first faults, and how many more there are; none without faults.
+fn none_of(mut faults: Vec<String>) -> Result<(), ModelError> {
+    if faults.is_empty() {
+        return Ok(());
     }
+    let more = faults.len().saturating_sub(8);
+    faults.truncate(8);
+    let tail = if more > 0 { format!("; and {more} more") } else { String::new() };
+    Err(ModelError::Mismatch(faults.join("; ") + &tail))
 }

@@ -4,7 +4,10 @@
 //! small, and what the network is told of pictures in general shall stay.
 
 use super::{Backbone, resize};
-use crate::{ModelError, weights::Tensors};
+use crate::{
+    ModelError,
+    weights::{Tensors, select},
+};
 use tch::{Kind, Tensor, nn};
 
 /// Kernel, stride, expansion, input and output channels of each block up to the 112-channel stage.
@@ -48,51 +51,83 @@ struct Convolution {
     groups: i64,
 }
 
-impl EfficientNetLite0 {
-    /// Reads the weights in the names of the published state dict (`_conv_stem.weight`, `_blocks.0._bn1.weight`, ..);
-    /// with none, the weights are random (for tests and for filling from a checkpoint).
-    /// The folded weights are registered in `path`; whoever wants them frozen freezes its store.
-    pub fn new(path: &nn::Path, tensors: Option<&Tensors>, input_px: i64) -> Result<Self, ModelError> {
-        let read = |conv: &str, norm: &str, shape: [i64; 4], stride: i64, groups: i64| {
-            let target = conv.split('.').fold(path.clone(), |p, part| p / part);
-            folded(&target, tensors, conv, norm, shape, stride, groups)
-        };
-        let stem = read("_conv_stem", "_bn0", [32, 3, 3, 3], 2, 1)?;
-        let blocks = BLOCKS
-            .iter()
-            .enumerate()
-            .map(|(i, &(kernel, stride, expansion, input, output))| {
-                let inner = input * expansion;
-                let name = |part: &str| format!("_blocks.{i}.{part}");
-                Ok(Block {
-                    expand: (expansion > 1)
-                        .then(|| read(&name("_expand_conv"), &name("_bn0"), [inner, input, 1, 1], 1, 1))
-                        .transpose()?,
-                    depthwise: read(
-                        &name("_depthwise_conv"),
-                        &name("_bn1"),
-                        [inner, 1, kernel, kernel],
-                        stride,
-                        inner,
-                    )?,
-                    project: read(&name("_project_conv"), &name("_bn2"), [output, inner, 1, 1], 1, 1)?,
-                    skip: stride == 1 && input == output,
-                })
-            })
-            .collect::<Result<Vec<_>, ModelError>>()?;
-        Ok(Self { stem, blocks, input_px })
-    }
-}
-
-fn folded(
-    path: &nn::Path,
-    tensors: Option<&Tensors>,
-    conv: &str,
-    norm: &str,
+/// One convolution and its batch normalisation, by their published names.
+struct Layer {
+    convolution: String,
+    norm: String,
+    /// Output channels, input channels of a group, kernel height and width.
     shape: [i64; 4],
     stride: i64,
     groups: i64,
-) -> Result<Convolution, ModelError> {
+}
+
+/// The parts of batch normalisation, each of as many numbers as there are output channels.
+const NORM_PARTS: [&str; 4] = ["weight", "bias", "running_mean", "running_var"];
+
+fn stem_layer() -> Layer {
+    Layer { convolution: "_conv_stem".into(), norm: "_bn0".into(), shape: [32, 3, 3, 3], stride: 2, groups: 1 }
+}
+
+/// A block's layers: the expansion, which the first block has not, the depthwise one and the projection.
+fn block_layers(block: usize) -> (Option<Layer>, Layer, Layer) {
+    let (kernel, stride, expansion, input, output) = BLOCKS[block];
+    let inner = input * expansion;
+    let layer = |convolution: &str, norm: &str, shape, stride, groups| Layer {
+        convolution: format!("_blocks.{block}.{convolution}"),
+        norm: format!("_blocks.{block}.{norm}"),
+        shape,
+        stride,
+        groups,
+    };
+    (
+        (expansion > 1).then(|| layer("_expand_conv", "_bn0", [inner, input, 1, 1], 1, 1)),
+        layer("_depthwise_conv", "_bn1", [inner, 1, kernel, kernel], stride, inner),
+        layer("_project_conv", "_bn2", [output, inner, 1, 1], 1, 1),
+    )
+}
+
+impl EfficientNetLite0 {
+    /// The tensors that are read, with their shapes, in the names of the published state dict (`_conv_stem.weight`,
+    /// `_blocks.0._bn1.weight`, ..).
+    pub fn published() -> Vec<(String, Vec<i64>)> {
+        let blocks = (0..BLOCKS.len()).flat_map(|i| {
+            let (expand, depthwise, project) = block_layers(i);
+            expand.into_iter().chain([depthwise, project])
+        });
+        std::iter::once(stem_layer())
+            .chain(blocks)
+            .flat_map(|layer| {
+                let norms = NORM_PARTS.map(|part| (format!("{}.{part}", layer.norm), vec![layer.shape[0]]));
+                std::iter::once((format!("{}.weight", layer.convolution), layer.shape.to_vec())).chain(norms)
+            })
+            .collect()
+    }
+
+    /// Reads the weights in the names of [`Self::published`]; others in the file are ignored. With none, the weights are
+    /// random (for tests and for filling from a checkpoint).
+    /// The folded weights are registered in `path`; whoever wants them frozen freezes its store.
+    pub fn new(path: &nn::Path, tensors: Option<&Tensors>, input_px: i64) -> Result<Self, ModelError> {
+        let tensors = tensors.map(|all| select(all, &Self::published())).transpose()?;
+        let read = |layer: &Layer| {
+            let target = layer.convolution.split('.').fold(path.clone(), |p, part| p / part);
+            folded(&target, tensors.as_ref(), layer)
+        };
+        let blocks = BLOCKS.iter().enumerate().map(|(i, &(_, stride, _, input, output))| {
+            let (expand, depthwise, project) = block_layers(i);
+            Block {
+                expand: expand.as_ref().map(read),
+                depthwise: read(&depthwise),
+                project: read(&project),
+                skip: stride == 1 && input == output,
+            }
+        });
+        Ok(Self { stem: read(&stem_layer()), blocks: blocks.collect(), input_px })
+    }
+}
+
+/// A layer's convolution with its normalisation folded in. `tensors` has all of [`EfficientNetLite0::published`].
+fn folded(path: &nn::Path, tensors: Option<&Tensors>, layer: &Layer) -> Convolution {
+    let shape = layer.shape;
     let (weight, bias) = match tensors {
         None => {
             let fan_in = (shape[1] * shape[2] * shape[3]) as f64;
@@ -102,18 +137,19 @@ fn folded(
             )
         }
         Some(tensors) => {
-            let take = |name: String, shape: &[i64]| crate::weights::take(tensors, &name, shape);
-            let channels = [shape[0]];
-            let gain = take(format!("{norm}.weight"), &channels)?;
-            let shift = take(format!("{norm}.bias"), &channels)?;
-            let mean = take(format!("{norm}.running_mean"), &channels)?;
-            let variance = take(format!("{norm}.running_var"), &channels)?;
+            let [gain, shift, mean, variance] = NORM_PARTS.map(|part| &tensors[&format!("{}.{part}", layer.norm)]);
             let scale = gain / (variance + BATCH_NORM_EPSILON).sqrt();
-            (take(format!("{conv}.weight"), &shape)? * scale.view([-1, 1, 1, 1]), shift - mean * scale)
+            let weight = &tensors[&format!("{}.weight", layer.convolution)];
+            (weight * scale.view([-1, 1, 1, 1]), shift - mean * scale)
         }
     };
     let [weight, bias] = [weight, bias].map(|t| t.to_device(path.device()));
-    Ok(Convolution { weight: path.add("weight", weight, true), bias: path.add("bias", bias, true), stride, groups })
+    Convolution {
+        weight: path.add("weight", weight, true),
+        bias: path.add("bias", bias, true),
+        stride: layer.stride,
+        groups: layer.groups,
+    }
 }
 
 impl Convolution {

