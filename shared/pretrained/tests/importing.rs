@@ -6,6 +6,8 @@ use carff_models::{
     weights::Tensors,
 };
 use carff_pretrained::read;
+use carff_random::{Key, stream};
+use rand::Rng;
 use std::{
     io::Write,
     path::{Path, PathBuf},
@@ -68,6 +70,34 @@ fn what_cannot_be_read_is_refused() {
             assert!(read(&path).is_err(), "{name} cut off after {length} bytes was read");
         }
     }
+}
+
+/// Whatever bytes are changed, a file is read or refused, without a panic.
+#[test]
+fn changed_files_are_read_or_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("file");
+    let [mut accepted, mut refused] = [0, 0];
+    for (form, name) in ["archive.pth", "stream.pth"].into_iter().enumerate() {
+        let bytes = std::fs::read(data(name)).unwrap();
+        for trial in 0..2000 {
+            let mut rng = stream(Key { seed: 1, frame: form as u64, step: trial, sample: 0 });
+            let mut changed = bytes.clone();
+            for _ in 0..rng.random_range(1..4) {
+                let at = rng.random_range(0..changed.len());
+                changed[at] = rng.random();
+            }
+            std::fs::write(&path, &changed).unwrap();
+            match read(&path) {
+                Ok(_) => accepted += 1,
+                Err(error) => {
+                    assert!(!error.to_string().is_empty());
+                    refused += 1;
+                }
+            }
+        }
+    }
+    assert!(accepted > 100 && refused > 100, "{accepted} accepted, {refused} refused");
 }
 
 /// Writes what was imported, and builds the backbone from it.
