@@ -1,6 +1,6 @@
 //! Backbone weights that others published, as a training file can name them.
 //!
-//! What lives here: reading a package, a PyTorch state dict or safetensors, finding out which network it is of, and
+//! What lives here: reading a package, a state dict of `torch`, or safetensors, finding out which network it is of, and
 //! writing what the network needs of it. What never does: the networks, and anything that runs with a graph.
 
 use carff_checkpoint::shapes::{BackboneConfig, BackboneKind};

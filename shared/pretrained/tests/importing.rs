@@ -1,5 +1,7 @@
 //! Contracts of imported weights: what others wrote is read, and what is written is what a backbone reads.
 
+#![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
+
 use carff_checkpoint::shapes::{BackboneKind, VitConfig};
 use carff_models::{
     backbone::{self, Backbone, EfficientNetLite0, VisionTransformer},

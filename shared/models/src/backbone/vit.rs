@@ -107,8 +107,8 @@ impl VisionTransformer {
                 "`pos_embed` is for {tokens} patches and a class token: a square of patches is wanted"
             )));
         }
-        let depth = (0..).take_while(|i| tensors.contains_key(&format!("blocks.{i}.norm1.weight"))).count();
-        Ok((VitConfig { patch_px, width, depth: depth as i64, heads: (width / 64).max(1) }, grid * patch_px))
+        let depth = depth(&tensors, "blocks", "norm1.weight");
+        Ok((VitConfig { patch_px, width, depth, heads: (width / 64).max(1) }, grid * patch_px))
     }
 
     fn fill(&self, tensors: &Tensors) -> Result<(), ModelError> {
@@ -143,6 +143,11 @@ impl VisionTransformer {
     }
 }
 
+/// How many blocks there are, by the tensor that each has.
+fn depth(tensors: &Tensors, blocks: &str, each: &str) -> i64 {
+    (0..tensors.len()).take_while(|i| tensors.contains_key(&format!("{blocks}.{i}.{each}"))).count() as i64
+}
+
 /// A layer's tensors by their names.
 fn named<'a>(
     layer: &str,
@@ -161,8 +166,7 @@ fn timm_names(tensors: &Tensors) -> Tensors {
     if !tensors.contains_key(&format!("{root}embeddings.cls_token")) {
         return tensors.iter().map(|(k, t)| (k.clone(), t.shallow_clone())).collect();
     }
-    let depth =
-        (0..).take_while(|i| tensors.contains_key(&format!("{root}encoder.layer.{i}.layernorm_before.weight"))).count();
+    let depth = depth(tensors, &format!("{root}encoder.layer"), "layernorm_before.weight");
     let mut renamed = Tensors::new();
     let mut rename = |to: String, from: String| {
         if let Some(t) = tensors.get(&format!("{root}{from}")) {
