@@ -123,16 +123,17 @@ fn find_scenario(scenario: &Path) -> anyhow::Result<PathBuf> {
 
 /// Renders a set, with a progress bar. Returns the number of pictures.
 pub fn render(scenario: &Scenario, out: &Path, extras: Extras) -> anyhow::Result<u64> {
-    let bar = ProgressBar::new((scenario.cameras().len() * scenario.info().state_count()) as u64);
+    let pictures = (scenario.cameras().len() * scenario.info().state_count()) as u64;
+    let bar = ProgressBar::new(pictures);
     bar.set_style(ProgressStyle::with_template("{msg} [{bar:40}] {pos}/{len} pictures, {eta} left")?);
     bar.set_message(scenario.info().name.clone());
-    let rendered = scenario.render_dataset(out, extras, |_, _| {
-        bar.inc(1);
+    let rendered = scenario.render_dataset(out, extras, |done, _| {
+        bar.set_position(done as u64);
         ControlFlow::Continue(())
     });
     bar.finish_and_clear();
     rendered.with_context(|| format!("cannot render {} into {}", scenario.path().display(), out.display()))?;
-    Ok(bar.position())
+    Ok(pictures)
 }
 
 fn check(dir: &Path, sheet: Option<&Path>, columns: usize) -> anyhow::Result<()> {

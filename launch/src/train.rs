@@ -7,6 +7,7 @@ use carff_scenes::{Extras, Scenario};
 use carff_training::{
     TrainingError,
     config::{FreePoses, TrainingConfig},
+    features::FEATURES,
     pipeline::{self, Stage},
     run::{Progress, Run},
 };
@@ -174,7 +175,7 @@ fn forget_another_configuration(dir: &Path, config: &TrainingConfig, dataset: &P
         return Ok(());
     }
     let states = ["vae", "nerf", "mdn"].map(|stage| format!("{stage}.state.safetensors"));
-    let others = ["posteriors.safetensors", "metrics.jsonl", CONFIGURATION].map(str::to_owned);
+    let others = ["posteriors.safetensors", FEATURES, "metrics.jsonl", CONFIGURATION].map(str::to_owned);
     for name in states.into_iter().chain(others) {
         let path = dir.join(name);
         match std::fs::remove_file(&path) {

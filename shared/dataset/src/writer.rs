@@ -1,11 +1,14 @@
 //! Writing of sets: pictures first, `transforms.json` last, so that an interrupted run never looks like a whole set.
+//! Until then, notes may say what is finished, so that the next run goes on from there.
 
-use std::fs;
+use std::fs::{self, File, OpenOptions};
+use std::io::{ErrorKind, Write};
 use std::path::{Component, Path, PathBuf};
+use std::sync::{Mutex, PoisonError};
 
 use carff_geometry::PinholeCamera;
 use image::ExtendedColorType;
-use serde::Serialize;
+use serde::{Serialize, de::DeserializeOwned};
 
 use crate::dataset::{Candidate, NamedBox, Observability, ScenarioInfo};
 use crate::error::DatasetError;
@@ -13,6 +16,9 @@ use crate::image::{Image, write_png};
 
 /// Marks a folder as written by this program, hence free to be written again.
 const MARKER: &str = ".carff-dataset";
+
+/// What is finished of a set that is not: first a line that says which set it is, then a line a note.
+const NOTES: &str = "unfinished.jsonl";
 
 /// What the transforms file says about one picture.
 #[derive(Clone, Debug, PartialEq)]
@@ -61,35 +67,62 @@ impl FrameRecord {
 #[derive(Debug)]
 pub struct DatasetWriter {
     dir: PathBuf,
+    notes: Option<Mutex<File>>,
 }
 
 impl DatasetWriter {
     /// Prepares a folder: it must not exist, be empty, or be a set that this program wrote (which is then replaced).
     pub fn create(dir: &Path) -> Result<Self, DatasetError> {
-        let io = |source| DatasetError::Io { path: dir.to_owned(), source };
-        if dir.exists() {
-            if !dir.is_dir() {
-                return Err(DatasetError::NotAFolder { path: dir.to_owned() });
-            }
-            let empty = fs::read_dir(dir).map_err(io)?.next().is_none();
-            if !empty && !dir.join(MARKER).is_file() {
-                return Err(DatasetError::NotOurs { path: dir.to_owned() });
-            }
-        }
-        fs::create_dir_all(dir).map_err(io)?;
-        fs::write(dir.join(MARKER), "Written by carff; `carff dataset render` may write this folder again.\n")
-            .map_err(io)?;
-        match fs::remove_file(dir.join("transforms.json")) {
-            Err(error) if error.kind() != std::io::ErrorKind::NotFound => return Err(io(error)),
-            _ => {}
+        claim(dir)?;
+        for file in ["transforms.json", NOTES] {
+            missing_is_fine(dir, fs::remove_file(dir.join(file)))?;
         }
         for folder in ["images", "depth", "masks"] {
-            match fs::remove_dir_all(dir.join(folder)) {
-                Err(error) if error.kind() != std::io::ErrorKind::NotFound => return Err(io(error)),
-                _ => {}
-            }
+            missing_is_fine(dir, fs::remove_dir_all(dir.join(folder)))?;
         }
-        Ok(Self { dir: dir.to_owned() })
+        Ok(Self { dir: dir.to_owned(), notes: None })
+    }
+
+    /// As [`Self::create`], but goes on with a set of the same `identity` (one line) that was interrupted: what was written
+    /// stays, and what was noted of it is handed back. Notes end where a line is not whole.
+    pub fn go_on<T: DeserializeOwned>(dir: &Path, identity: &str) -> Result<(Self, Vec<T>), DatasetError> {
+        claim(dir)?;
+        let path = dir.join(NOTES);
+        let io = |source| DatasetError::Io { path: path.clone(), source };
+        let text = match fs::read(&path) {
+            Err(error) if error.kind() == ErrorKind::NotFound => Vec::new(),
+            read => read.map_err(io)?,
+        };
+        let (mut notes, mut whole) = (Vec::new(), 0);
+        for (i, line) in text.split_inclusive(|b| *b == b'\n').enumerate() {
+            match line.strip_suffix(b"\n") {
+                Some(line) if i == 0 && line == identity.as_bytes() => {}
+                Some(line) if i > 0 => match serde_json::from_slice(line) {
+                    Ok(note) => notes.push(note),
+                    Err(_) => break,
+                },
+                _ => break,
+            }
+            whole += line.len();
+        }
+        if whole == 0 {
+            Self::create(dir)?;
+            fs::write(&path, format!("{identity}\n")).map_err(io)?;
+            whole = identity.len() + 1;
+        }
+        let file = OpenOptions::new().append(true).open(&path).map_err(io)?;
+        file.set_len(whole as u64).map_err(io)?;
+        Ok((Self { dir: dir.to_owned(), notes: Some(Mutex::new(file)) }, notes))
+    }
+
+    /// Notes that a part is finished, for [`Self::go_on`].
+    pub fn note<T: Serialize>(&self, note: &T) -> Result<(), DatasetError> {
+        let Some(notes) = &self.notes else { return Ok(()) };
+        let path = self.dir.join(NOTES);
+        let mut line = serde_json::to_vec(note).map_err(|source| DatasetError::Json { path: path.clone(), source })?;
+        line.push(b'\n');
+        let written = notes.lock().unwrap_or_else(PoisonError::into_inner).write_all(&line);
+        written.map_err(|source| DatasetError::Io { path, source })
     }
 
     fn place(&self, file_path: &str) -> Result<PathBuf, DatasetError> {
@@ -176,7 +209,31 @@ impl DatasetWriter {
         let partial = self.dir.join("transforms.json.partial");
         let json = serde_json::to_vec(&file).map_err(|source| DatasetError::Json { path: path.clone(), source })?;
         fs::write(&partial, json).map_err(|source| DatasetError::Io { path: partial.clone(), source })?;
-        fs::rename(&partial, &path).map_err(|source| DatasetError::Io { path, source })
+        fs::rename(&partial, &path).map_err(|source| DatasetError::Io { path, source })?;
+        missing_is_fine(&self.dir, fs::remove_file(self.dir.join(NOTES)))
+    }
+}
+
+/// Makes a folder ours: it must not exist, be empty, or be ours already.
+fn claim(dir: &Path) -> Result<(), DatasetError> {
+    let io = |source| DatasetError::Io { path: dir.to_owned(), source };
+    if dir.exists() {
+        if !dir.is_dir() {
+            return Err(DatasetError::NotAFolder { path: dir.to_owned() });
+        }
+        let empty = fs::read_dir(dir).map_err(io)?.next().is_none();
+        if !empty && !dir.join(MARKER).is_file() {
+            return Err(DatasetError::NotOurs { path: dir.to_owned() });
+        }
+    }
+    fs::create_dir_all(dir).map_err(io)?;
+    fs::write(dir.join(MARKER), "Written by carff; `carff dataset render` may write this folder again.\n").map_err(io)
+}
+
+fn missing_is_fine(dir: &Path, removed: std::io::Result<()>) -> Result<(), DatasetError> {
+    match removed {
+        Err(source) if source.kind() != ErrorKind::NotFound => Err(DatasetError::Io { path: dir.to_owned(), source }),
+        _ => Ok(()),
     }
 }
 

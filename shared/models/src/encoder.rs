@@ -85,6 +85,11 @@ impl Encoder {
         }
     }
 
+    /// The shape of one picture's features: channels, height, width.
+    pub fn feature_shape(&self) -> [i64; 3] {
+        [self.backbone.channels(), self.backbone.grid(), self.backbone.grid()]
+    }
+
     /// Backbone features to posterior mean and log-variance, each `[N, 8]`.
     /// With `dropout` above zero, hidden units are dropped with that probability (training only).
     pub fn posterior(&self, features: &Tensor, dropout: f64) -> (Tensor, Tensor) {

@@ -171,6 +171,10 @@ fn state_dict(path: &Path) -> Result<Tensors, PretrainedError> {
             };
             let shape: Vec<i64> = tensor.shape().iter().map(|&n| n as i64).collect();
             let bytes = tensor.read().map_err(|source| PretrainedError::File { path: path.into(), source })?;
+            let wanted = shape.iter().product::<i64>() as usize * kind.elt_size_in_bytes();
+            if bytes.len() != wanted {
+                return Err(format(path, &format!("`{name}` has {} bytes, {wanted} are wanted", bytes.len())));
+            }
             let tensor = Tensor::f_from_data_size(&bytes, &shape, kind).map_err(ModelError::from)?;
             Ok((name, if tensor.is_floating_point() { tensor.to_kind(Kind::Float) } else { tensor }))
         })

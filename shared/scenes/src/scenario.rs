@@ -1,6 +1,7 @@
 //! A loaded scenario: checked, with its solids and cameras made, ready to be rendered.
 
 use std::collections::HashMap;
+use std::hash::{DefaultHasher, Hash, Hasher};
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
@@ -8,6 +9,7 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use carff_dataset::{Candidate, DatasetWriter, FrameRecord, Image, Observability, ScenarioInfo, StateInfo, looks_same};
 use carff_geometry::PinholeCamera;
 use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
 use toml::Spanned;
 
 use crate::cameras::{Obstacles, ScenarioCamera, cameras, free_cameras};
@@ -51,7 +53,7 @@ impl Default for RenderOptions {
 }
 
 /// How much of the actor a view shows.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ActorView {
     /// Visible pixels over the pixels that it would cover in an unbounded picture with nothing in between, 0..=1.
     pub visible_fraction: f32,
@@ -408,19 +410,25 @@ impl Scenario {
 
     /// Renders every camera in every state into a posed data set, in parallel. `progress` is told how many pictures
     /// of how many are done, from any thread, and may stop the work. `transforms.json` is written last, so a stopped
-    /// run is not mistaken for a set and can be run again.
+    /// run is not mistaken for a set; the next one goes on with the cameras that are left.
     pub fn render_dataset(
         &self,
         out_dir: &Path,
         extras: Extras,
         progress: impl Fn(usize, usize) -> ControlFlow<()> + Sync,
     ) -> Result<(), ScenarioError> {
-        let writer = DatasetWriter::create(out_dir)?;
-        let total = self.cameras.len() * self.info.state_count();
-        let (done, stopped) = (AtomicUsize::new(0), AtomicBool::new(false));
+        let (writer, notes) = DatasetWriter::go_on::<ViewNote>(out_dir, &self.identity(extras))?;
+        let states = self.info.state_count();
+        let total = self.cameras.len() * states;
+        let known = notes.into_iter().filter(|n| n.view < self.cameras.len() && n.actors.len() == states);
+        let finished: HashMap<usize, Vec<Option<ActorView>>> = known.map(|n| (n.view, n.actors)).collect();
+        let (done, stopped) = (AtomicUsize::new(finished.len() * states), AtomicBool::new(false));
         let of_view = |(view, camera): (usize, &ScenarioCamera)| -> Result<Vec<FrameRecord>, ScenarioError> {
+            if let Some(actors) = finished.get(&view) {
+                return Ok(self.records(view, camera, actors, extras));
+            }
             let mut shots = Shots { scenario: self, camera: &camera.camera, taken: HashMap::new() };
-            let mut records = Vec::new();
+            let mut actors = Vec::with_capacity(states);
             for timestamp in 0..self.info.timestamps {
                 shots.taken.clear();
                 for branch in 0..self.info.branches.len() {
@@ -428,12 +436,15 @@ impl Scenario {
                         return Err(ScenarioError::Stopped);
                     }
                     let rendering = self.render_with(&mut shots, branch, timestamp, Detail::Observability)?;
-                    records.push(self.write_frame(&writer, branch, timestamp, view, camera, &rendering, extras)?);
+                    self.write_frame(&writer, &frame_name(branch, timestamp, view), &rendering, extras)?;
+                    actors.push(rendering.actor);
                     if progress(done.fetch_add(1, Ordering::Relaxed) + 1, total).is_break() {
                         stopped.store(true, Ordering::Relaxed);
                     }
                 }
             }
+            let records = self.records(view, camera, &actors, extras);
+            writer.note(&ViewNote { view, actors })?;
             Ok(records)
         };
         let by_view: Vec<_> = self.cameras.par_iter().enumerate().map(of_view).collect();
@@ -449,41 +460,70 @@ impl Scenario {
         Ok(())
     }
 
-    #[allow(clippy::too_many_arguments)]
+    /// One line that differs when what is rendered does; the program's version stands for how it is.
+    fn identity(&self, extras: Extras) -> String {
+        let mut hasher = DefaultHasher::new();
+        format!("{:?}", (&self.config, &self.cameras, extras)).hash(&mut hasher);
+        format!("{} {} {:016x}", self.info.name, env!("CARGO_PKG_VERSION"), hasher.finish())
+    }
+
+    /// What the transforms file says of one camera's pictures, given what they show of the actor, by timestamp, then branch.
+    fn records(
+        &self,
+        view: usize,
+        camera: &ScenarioCamera,
+        actors: &[Option<ActorView>],
+        extras: Extras,
+    ) -> Vec<FrameRecord> {
+        let states = (0..self.info.timestamps).flat_map(|t| (0..self.info.branches.len()).map(move |b| (b, t)));
+        states
+            .zip(actors)
+            .map(|((branch, timestamp), actor)| {
+                let name = frame_name(branch, timestamp, view);
+                let with_extras = extras == Extras::DepthAndMasks;
+                FrameRecord {
+                    branch_and_timestamp: Some((branch, timestamp)),
+                    view: Some(view),
+                    view_kind: Some(camera.view_kind.clone()),
+                    observability: actor.map(|a| a.observability),
+                    visible_fraction: actor.map(|a| a.visible_fraction),
+                    actor_px: actor.map(|a| a.actor_px),
+                    depth_file_path: with_extras.then(|| format!("depth/{name}")),
+                    mask_file_path: with_extras.then(|| format!("masks/{name}")),
+                    ..FrameRecord::new(format!("images/{name}"), camera.camera)
+                }
+            })
+            .collect()
+    }
+
     fn write_frame(
         &self,
         writer: &DatasetWriter,
-        branch: usize,
-        timestamp: usize,
-        view: usize,
-        camera: &ScenarioCamera,
+        name: &str,
         rendering: &Rendering,
         extras: Extras,
-    ) -> Result<FrameRecord, ScenarioError> {
-        let name = format!("b{branch}_t{timestamp}_v{view:03}.png");
-        let mut record = FrameRecord::new(format!("images/{name}"), camera.camera);
-        writer.write_image(&record.file_path, &rendering.image)?;
-        record.branch_and_timestamp = Some((branch, timestamp));
-        record.view = Some(view);
-        record.view_kind = Some(camera.view_kind.clone());
-        if let Some(actor) = rendering.actor {
-            record.observability = Some(actor.observability);
-            record.visible_fraction = Some(actor.visible_fraction);
-            record.actor_px = Some(actor.actor_px);
-        }
+    ) -> Result<(), ScenarioError> {
+        writer.write_image(&format!("images/{name}"), &rendering.image)?;
         if extras == Extras::DepthAndMasks {
             let (w, h) = (rendering.image.width_px, rendering.image.height_px);
-            let depth = format!("depth/{name}");
-            writer.write_depth(&depth, &rendering.depth_m, w, h)?;
-            record.depth_file_path = Some(depth);
+            writer.write_depth(&format!("depth/{name}"), &rendering.depth_m, w, h)?;
             let object = self.actor.as_ref().map(|a| self.scenery.next_object + a.dynamic as u16);
             let mask: Vec<bool> = rendering.object_id.iter().map(|id| Some(*id) == object).collect();
-            let path = format!("masks/{name}");
-            writer.write_mask(&path, &mask, w, h)?;
-            record.mask_file_path = Some(path);
+            writer.write_mask(&format!("masks/{name}"), &mask, w, h)?;
         }
-        Ok(record)
+        Ok(())
     }
+}
+
+fn frame_name(branch: usize, timestamp: usize, view: usize) -> String {
+    format!("b{branch}_t{timestamp}_v{view:03}.png")
+}
+
+/// A camera whose pictures are all written, and what they show of the actor, by timestamp, then branch.
+#[derive(Serialize, Deserialize)]
+struct ViewNote {
+    view: usize,
+    actors: Vec<Option<ActorView>>,
 }
 
 /// What a camera sees of one placement.

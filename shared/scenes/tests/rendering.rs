@@ -3,7 +3,8 @@
 #![allow(clippy::unwrap_used)] // The helpers below are parts of tests.
 
 use std::ops::ControlFlow;
-use std::path::Path;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicUsize, Ordering};
 
 use carff_dataset::{Dataset, Observability};
 use carff_geometry::PinholeCamera;
@@ -233,6 +234,43 @@ fn rendered_sets_are_read() {
     let expected = rendering.object_id.iter().filter(|id| **id == block).count();
     assert!(expected > 0 && mask.rgb.chunks(3).filter(|p| p[0] == 255).count() == expected);
     assert_eq!(scenario.object_name(block), "block");
+}
+
+/// A rendering that was interrupted, even in the middle of a note, goes on with the cameras that are left, and ends with the
+/// same files as one that was not. One of another kind starts anew.
+#[test]
+fn an_interrupted_rendering_goes_on() {
+    let scenario = small();
+    let dir = tempfile::tempdir().unwrap();
+    let [straight, halting] = ["straight", "halting"].map(|name| dir.path().join(name));
+    let rendered = |out: &Path, extras: Extras, last: usize| -> Result<usize, ScenarioError> {
+        let calls = AtomicUsize::new(0);
+        let result = scenario.render_dataset(out, extras, |done, _| {
+            calls.fetch_add(1, Ordering::Relaxed);
+            if done >= last { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+        });
+        result.map(|()| calls.into_inner())
+    };
+    assert_eq!(rendered(&straight, Extras::None, usize::MAX).unwrap(), 12);
+    // Three cameras of four pictures: of ten pictures, one camera's are whole.
+    assert!(rendered(&halting, Extras::None, 10).is_err());
+    let notes = halting.join("unfinished.jsonl");
+    let whole = std::fs::read_to_string(&notes).unwrap();
+    let finished = whole.lines().count() - 1;
+    assert!(finished >= 1, "{whole}");
+    std::fs::write(&notes, whole + "{\"view\":0,\"act").unwrap();
+    assert_eq!(rendered(&halting, Extras::None, usize::MAX).unwrap(), 12 - 4 * finished);
+    assert!(!notes.exists());
+    let files = |out: &Path| {
+        let images = std::fs::read_dir(out.join("images")).unwrap().map(|e| e.unwrap().path());
+        let mut files: Vec<PathBuf> = images.chain([out.join("transforms.json")]).collect();
+        files.sort();
+        files.into_iter().map(|f| (f.file_name().unwrap().to_owned(), std::fs::read(f).unwrap())).collect::<Vec<_>>()
+    };
+    assert!(files(&straight) == files(&halting), "the sets differ");
+
+    assert!(rendered(&halting, Extras::None, 10).is_err());
+    assert_eq!(rendered(&halting, Extras::DepthAndMasks, usize::MAX).unwrap(), 12);
 }
 
 /// Cameras and states that do not exist are errors.

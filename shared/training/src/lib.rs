@@ -6,6 +6,7 @@
 pub mod accuracy;
 pub mod config;
 pub mod curves;
+pub mod features;
 pub mod field;
 pub mod mixture;
 pub mod pictures;

@@ -9,6 +9,7 @@ use crate::{
     TrainingError,
     accuracy::{Centroids, state_accuracy},
     config::{Augmentation, TrainingConfig},
+    features::{self, FeatureFile},
     pictures::Pictures,
     run::{Progress, Run, SaveClock, cosine, damaged, part, prefixed},
 };
@@ -135,7 +136,8 @@ const FEATURE_BATCH: usize = 4;
 const STANDARDISED: usize = 64;
 
 impl<'a> Inputs<'a> {
-    /// Computes what can be kept: features `[copies of all pictures, C, h, w]` in half precision.
+    /// Computes what can be kept, or reads it where an earlier call was interrupted: features
+    /// `[copies of all pictures, C, h, w]` in half precision.
     pub fn new(
         config: &'a TrainingConfig,
         pictures: &'a Pictures,
@@ -152,31 +154,34 @@ impl<'a> Inputs<'a> {
         if keep {
             let all: Vec<usize> = (0..pictures.images.len()).collect();
             let copies = config.augmentation.copies + 1;
-            let total = copies * all.len() + config.augmentation.own_copies * trained.len();
-            let mut features: Option<Tensor> = None;
+            let batches: Vec<(usize, &[usize])> = (0..copies + config.augmentation.own_copies)
+                .flat_map(|copy| {
+                    let of_copy = if copy < copies { &all } else { &trained };
+                    of_copy.chunks(FEATURE_BATCH).map(move |chunk| (copy, chunk))
+                })
+                .collect();
+            let total: usize = batches.iter().map(|(_, chunk)| chunk.len()).sum();
+            let [channels, height, width] = vae.encoder.feature_shape();
+            let features = Tensor::zeros([total as i64, channels, height, width], (Kind::Half, vae.device()));
+            let mut file = FeatureFile::open(run, &[channels, height, width])?;
+            let kept = file.read(&features, batches.iter().map(|(_, chunk)| chunk.len()))?;
             let mut done = 0;
-            for copy in 0..copies + config.augmentation.own_copies {
-                let of_copy = if copy < copies { &all } else { &trained };
-                for chunk in of_copy.chunks(FEATURE_BATCH) {
-                    if run.stopped() {
-                        return Err(TrainingError::Stopped);
-                    }
-                    let inputs = this.copies(chunk, copy);
-                    let rows = tch::no_grad(|| vae.encoder.features(&inputs));
-                    let all_rows = features.get_or_insert_with(|| {
-                        let mut shape = rows.size();
-                        shape[0] = total as i64;
-                        Tensor::zeros(shape, (Kind::Half, rows.device()))
-                    });
-                    all_rows.narrow(0, done as i64, chunk.len() as i64).copy_(&rows);
-                    done += chunk.len();
-                    (run.on_progress)(&Progress { stage: "features", done, total, line: String::new() });
+            for (copy, chunk) in batches {
+                let rows = features.narrow(0, done as i64, chunk.len() as i64);
+                done += chunk.len();
+                if done <= kept {
+                    continue;
                 }
+                if run.stopped() {
+                    return Err(TrainingError::Stopped);
+                }
+                let inputs = this.copies(chunk, copy);
+                rows.shallow_clone().copy_(&tch::no_grad(|| vae.encoder.features(&inputs)));
+                file.append(&rows)?;
+                (run.on_progress)(&Progress { stage: "features", done, total, line: String::new() });
             }
-            if let Some(features) = &features {
-                vae.encoder.standardise(&features.narrow(0, 0, all.len() as i64).to_kind(Kind::Float));
-            }
-            this.features = features;
+            vae.encoder.standardise(&features.narrow(0, 0, all.len() as i64).to_kind(Kind::Float));
+            this.features = Some(features);
         } else if run.load("vae")?.is_none() {
             // A backbone that learns changes its features; the head is set to how they are at first, and learns the rest.
             let count = pictures.images.len().min(STANDARDISED);
@@ -221,10 +226,11 @@ impl<'a> Inputs<'a> {
         vae.encoder.features(&Tensor::cat(&inputs, 0))
     }
 
-    /// The posteriors of all pictures in all copies, `[copy][picture]`; kept in the run's folder.
+    /// The posteriors of all pictures in all copies, `[copy][picture]`; kept in the run's folder, in place of the features.
     pub fn all_posteriors(&self, vae: &Vae, run: &Run) -> Result<Vec<Vec<LatentGaussian>>, TrainingError> {
         let all: Vec<_> = (0..=self.config.augmentation.copies).map(|copy| self.posteriors(vae, copy)).collect();
         run.save_posteriors(&all)?;
+        features::remove(&run.dir)?;
         Ok(all)
     }
 

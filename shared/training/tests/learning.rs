@@ -7,6 +7,7 @@ use carff_scenes::{Extras, Scenario};
 use carff_training::{
     TrainingError,
     config::TrainingConfig,
+    features::FEATURES,
     pipeline::{self, Stage},
     run::{Progress, Run},
 };
@@ -154,8 +155,8 @@ fn the_decoder_learns_alone() {
     assert!(psnr_db(&after) > psnr_db(&before) + 0.5, "{before:#} {after:#}");
 }
 
-/// A training that is stopped in each of its three stages, and while the decoder learns alone, and each time goes on, ends
-/// with the same bytes as one that is not.
+/// A training that is stopped in each of its three stages, while features are computed, and while the decoder learns alone,
+/// and each time goes on, ends with the same bytes as one that is not.
 #[test]
 fn training_resumes() {
     let mut place = Place::new();
@@ -165,8 +166,11 @@ fn training_resumes() {
     place.config.nerf.wide_pixels = true;
     place.config.nerf.trainer.steps = 160;
     place.train("straight", None).unwrap();
-    for stop_at in [("vae", 3), ("vae", 7), ("mdn", 100), ("nerf", 60)] {
+    for stop_at in [("features", 40), ("vae", 3), ("vae", 7), ("mdn", 100), ("nerf", 60)] {
         assert!(matches!(place.train("halting", Some(stop_at)), Err(TrainingError::Stopped)), "{stop_at:?}");
+        // Kept as long as a training that is interrupted would need them.
+        let kept = place.out("halting-run").join(FEATURES).is_file();
+        assert_eq!(kept, ["features", "vae"].contains(&stop_at.0), "{stop_at:?}");
     }
     place.train("halting", None).unwrap();
     for file in ["encoder", "decoder", "mixture", "field"] {
