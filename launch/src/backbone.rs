@@ -48,25 +48,21 @@ pub fn run(command: &BackboneCommand) -> anyhow::Result<ExitCode> {
         std::fs::create_dir_all(folder).with_context(|| format!("cannot make {}", folder.display()))?;
     }
     carff_pretrained::write(&args.out, &published)?;
-    print!("{}", told(&published, &args.out));
+    print!("{}", told(&published, &args.out)?);
     Ok(ExitCode::SUCCESS)
 }
 
 /// What was written, and the lines of a training file that go with it.
-fn told(published: &Published, out: &Path) -> String {
+fn told(published: &Published, out: &Path) -> Result<String, toml::ser::Error> {
     let BackboneConfig { kind, input_px, vit, .. } = &published.config;
-    let (name, key) = match kind {
-        BackboneKind::EfficientNetLite0 => ("EfficientNet-Lite0", "efficientnet-lite0"),
-        BackboneKind::Vit => ("vision transformer", "vit"),
-        BackboneKind::ConvNet => ("convolutional network", "conv-net"),
-    };
+    let file = out.display().to_string();
     let numbers: usize = published.tensors.values().map(tch::Tensor::numel).sum();
     let mut text = format!(
-        "{name}: {} tensors with {numbers} numbers, in half precision, in {}\nIn a training file:\n\n\
-         pretrained_backbone = {:?}\n\n[encoder.backbone]\nkind = \"{key}\"\ninput_px = {input_px}\n",
+        "{} tensors with {numbers} numbers, in half precision, in {file}\nIn a training file:\n\n\
+         pretrained_backbone = {}\n\n[encoder.backbone]\nkind = {}\ninput_px = {input_px}\n",
         published.tensors.len(),
-        out.display(),
-        out.display().to_string(),
+        toml::Value::from(file.as_str()),
+        toml::Value::try_from(kind)?,
     );
     if *kind == BackboneKind::Vit {
         // Writing to a string cannot fail.
@@ -77,5 +73,5 @@ fn told(published: &Published, out: &Path) -> String {
             vit.patch_px, vit.width, vit.depth, vit.heads
         );
     }
-    text
+    Ok(text)
 }

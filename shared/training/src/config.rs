@@ -135,6 +135,9 @@ impl Default for Augmentation {
 pub struct VaeTraining {
     /// Passes over the training pictures.
     pub epochs: usize,
+    /// How often each of them takes the pictures of the data set's own poses, which are few beside those of freely drawn
+    /// poses: once for encoder and decoder, further for the encoder alone.
+    pub own_passes: usize,
     /// Further passes in which the decoder learns alone, over the pictures of the data set's own poses: while the encoder
     /// learns, the decoder runs after latents that move.
     pub decoder_epochs: usize,
@@ -175,6 +178,7 @@ impl Default for VaeTraining {
     fn default() -> Self {
         Self {
             epochs: 100,
+            own_passes: 1,
             decoder_epochs: 0,
             batch: 30,
             decoder_batch: 30,
@@ -237,6 +241,7 @@ impl TrainingConfig {
     pub fn validate(&self) -> Result<(), String> {
         let counts = [
             ("vae.epochs", self.vae.epochs, 1, 10_000),
+            ("vae.own_passes", self.vae.own_passes, 1, 100),
             ("vae.decoder_epochs", self.vae.decoder_epochs, 0, 10_000),
             ("vae.batch", self.vae.batch, 2, 4096),
             ("vae.decoder_batch", self.vae.decoder_batch, 1, 4096),

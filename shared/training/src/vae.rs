@@ -280,15 +280,15 @@ pub fn train(
     let mut clock = SaveClock::default();
     for epoch in first..settings.all_epochs() {
         let decoder_alone = epoch >= settings.epochs;
-        let (learnt, epochs_before, epochs) = if decoder_alone {
-            (&own, settings.epochs, settings.decoder_epochs)
+        let (learnt, own_passes, epochs_before, epochs) = if decoder_alone {
+            (&own, 1, settings.epochs, settings.decoder_epochs)
         } else {
-            (&trained, 0, settings.epochs)
+            (&trained, settings.own_passes, 0, settings.epochs)
         };
-        let per_epoch = learnt.len().div_ceil(settings.batch).max(1);
+        let per_epoch = (learnt.len() + (own_passes - 1) * own.len()).div_ceil(settings.batch).max(1);
         let mut rng =
             carff_random::stream(Key { seed: config.seed, frame: epoch as u64, step: 0x7661_6500, sample: 0 });
-        let batches = batches(pictures, learnt, settings.batch, &mut rng);
+        let batches = batches(pictures, learnt, own_passes, settings.batch, &mut rng);
         let mut sums = [0.0_f64; 4];
         let mut decoded_batches = 0_usize;
         for (b, batch) in batches.iter().enumerate() {
@@ -371,15 +371,37 @@ pub fn train(
 /// One pass over the pictures, in batches made of whole poses: all states of a pose stand in one batch, so that what
 /// tells states apart is not drowned by what tells poses apart. Poses of the data set, which alone the decoder knows,
 /// stand together: a few pictures of one pose at a time never got it away from the mean pictures. Within a batch
-/// pictures are shuffled, so that a decoder that takes the first few sees all states.
-fn batches(pictures: &Pictures, trained: &[usize], size: usize, rng: &mut impl rand::Rng) -> Vec<Vec<usize>> {
+/// pictures are shuffled, so that a decoder that takes the first few sees all states. Of `own_passes` over the data set's
+/// poses all but the first are for the encoder, among the free poses.
+fn batches(
+    pictures: &Pictures,
+    trained: &[usize],
+    own_passes: usize,
+    size: usize,
+    rng: &mut impl rand::Rng,
+) -> Vec<Vec<usize>> {
     let mut by_view = vec![Vec::new(); pictures.view_count()];
     for &i in trained {
         by_view[pictures.labels[i].view].push(i);
     }
     by_view.retain(|v| !v.is_empty());
     by_view.shuffle(rng);
-    let (known, free): (Vec<_>, Vec<_>) = by_view.into_iter().partition(|v| pictures.labels[v[0]].role.is_some());
+    let (known, free) = by_view.into_iter().partition(|v| pictures.labels[v[0]].role.is_some());
+    whole_poses(known, free, own_passes, size, rng)
+}
+
+/// Batches of at least `size` pictures, but for the last of each kind, from the pictures of each pose.
+fn whole_poses(
+    known: Vec<Vec<usize>>,
+    mut free: Vec<Vec<usize>>,
+    own_passes: usize,
+    size: usize,
+    rng: &mut impl rand::Rng,
+) -> Vec<Vec<usize>> {
+    if own_passes > 1 {
+        free.extend((1..own_passes).flat_map(|_| known.clone()));
+        free.shuffle(rng);
+    }
     let mut batches = Vec::new();
     for views in [known, free] {
         let mut batch = Vec::new();
@@ -411,7 +433,7 @@ fn state_targets(pictures: &Pictures) -> Tensor {
 }
 
 struct Losses {
-    /// None when the batch has no picture of the data set's own.
+    /// None when the batch has pictures of freely drawn poses.
     reconstruction: Option<Tensor>,
     kl: Tensor,
     state: Option<Tensor>,
@@ -455,13 +477,11 @@ fn losses(
     let (mean, log_variance) = vae.encoder.posterior(&features, if decoder_alone { 0.0 } else { settings.dropout });
     let latent = &mean + (&log_variance * 0.5).exp() * Tensor::randn_like(&mean);
     let latent = if decoder_alone { latent.detach() } else { latent };
-    // The decoder knows the data set's poses alone.
-    let known: Vec<usize> =
-        (0..only.len()).filter(|&row| pictures.labels[only[row]].role.is_some()).take(settings.decoder_batch).collect();
-    let reconstruction = (!known.is_empty()).then(|| {
-        let decoded: Vec<usize> = known.iter().map(|&row| only[row]).collect();
-        let rows: Vec<i64> = known.iter().map(|&row| row as i64).collect();
-        reconstruction(config, pictures, vae, &latent.index_select(0, &indices(&rows, latent.device())), &decoded)
+    // The decoder knows the data set's poses alone, and learns of batches of them.
+    let known = only.iter().all(|&i| pictures.labels[i].role.is_some());
+    let reconstruction = known.then(|| {
+        let decoded = &only[..only.len().min(settings.decoder_batch)];
+        reconstruction(config, pictures, vae, &latent.narrow(0, 0, decoded.len() as i64), decoded)
     });
     let kl = kl_divergence(&mean, &log_variance);
     let state = (settings.state_weight > 0.0).then(|| {
@@ -607,6 +627,27 @@ mod tests {
         let zero = Tensor::zeros([2, 8], (Kind::Float, Device::Cpu));
         assert!(kl_divergence(&zero, &zero).double_value(&[]).abs() < 1e-6);
         assert!((kl_divergence(&(&zero + 0.5), &zero).double_value(&[]) - 1.0).abs() < 1e-5);
+    }
+
+    /// A pass takes each picture of the data set's own poses as often as it is told, once in batches of them alone, and
+    /// each of a free pose once; what is of one pose stays together.
+    #[test]
+    fn a_pass_takes_own_pictures_as_often_as_told() {
+        let poses =
+            |of: std::ops::Range<usize>| of.map(|pose| (3 * pose..3 * pose + 3).collect()).collect::<Vec<Vec<_>>>();
+        let mut rng = carff_random::stream(Key { seed: 1, frame: 0, step: 0, sample: 0 });
+        for own_passes in [1, 4] {
+            let batches = whole_poses(poses(0..10), poses(10..60), own_passes, 30, &mut rng);
+            let mut taken = [0; 180];
+            batches.iter().flatten().for_each(|&picture| taken[picture] += 1);
+            assert!(taken[..30].iter().all(|&times| times == own_passes), "{taken:?}");
+            assert!(taken[30..].iter().all(|&times| times == 1), "{taken:?}");
+            let own = batches.iter().filter(|batch| batch.iter().all(|&picture| picture < 30)).count();
+            assert_eq!((own, batches.len()), (1, (own_passes * 30 + 150) / 30));
+            let together =
+                |batch: &[usize], picture: usize| batch.iter().filter(|&&p| p / 3 == picture / 3).count() % 3;
+            assert!(batches.iter().all(|batch| batch.iter().all(|&picture| together(batch, picture) == 0)));
+        }
     }
 
     /// Features lie in the order in which they are computed: every copy of all pictures, then every further copy of those

@@ -91,16 +91,27 @@ impl VisionTransformer {
     /// large.
     pub fn shape_of(tensors: &Tensors) -> Result<(VitConfig, i64), ModelError> {
         let tensors = timm_names(tensors);
-        let size = |name: &str, dimensions: usize| match tensors.get(name).map(Tensor::size) {
-            None => Err(ModelError::Mismatch(format!("`{name}` is missing"))),
-            Some(size) if size.len() != dimensions => {
-                Err(ModelError::Mismatch(format!("`{name}` is {size:?}, {dimensions} dimensions are wanted")))
-            }
-            Some(size) => Ok(size),
+        let size = |name: &str| {
+            tensors.get(name).map(Tensor::size).ok_or_else(|| ModelError::Mismatch(format!("`{name}` is missing")))
         };
-        let patch = size("patch_embed.proj.weight", 4)?;
-        let (width, patch_px) = (patch[0], patch[3]);
-        let tokens = size("pos_embed", 3)?[1] - 1;
+        let unfit = |name: &str, size: &[i64], wanted: &str| {
+            Err(ModelError::Mismatch(format!("`{name}` is {size:?}, {wanted} is wanted")))
+        };
+        let patch = size("patch_embed.proj.weight")?;
+        let (width, patch_px) = match patch[..] {
+            [width, 3, high, wide] if width >= 1 && high >= 1 && high == wide => (width, wide),
+            _ => return unfit("patch_embed.proj.weight", &patch, "[width, 3, patch_px, patch_px]"),
+        };
+        let positions = size("pos_embed")?;
+        let tokens = match positions[..] {
+            [1, tokens, w] if w == width => tokens - 1,
+            _ => return unfit("pos_embed", &positions, &format!("[1, patches + 1, {width}]")),
+        };
+        // A network of the width that one small tensor claims is made only if what takes the memory is there in that size.
+        let qkv = size("blocks.0.attn.qkv.weight")?;
+        if qkv != [3 * width, width] {
+            return unfit("blocks.0.attn.qkv.weight", &qkv, &format!("[{}, {width}]", 3 * width));
+        }
         let grid = (tokens.max(0) as f64).sqrt().round() as i64;
         if grid < 1 || grid * grid != tokens {
             return Err(ModelError::Mismatch(format!(
@@ -193,8 +204,9 @@ fn timm_names(tensors: &Tensors) -> Tensors {
                 .iter()
                 .filter_map(|q| tensors.get(&format!("{root}encoder.layer.{i}.attention.attention.{q}.{part}")))
                 .collect();
-            if parts.len() == 3 {
-                renamed.insert(format!("blocks.{i}.attn.qkv.{part}"), Tensor::cat(&parts, 0));
+            // Those that do not go together are left out, and told as missing.
+            if let (3, Ok(joined)) = (parts.len(), Tensor::f_cat(&parts, 0)) {
+                renamed.insert(format!("blocks.{i}.attn.qkv.{part}"), joined);
             }
         }
     }
@@ -300,6 +312,40 @@ mod tests {
             let heads_of_64 = VitConfig { heads: 1, ..tiny() };
             assert_eq!(VisionTransformer::shape_of(names).unwrap(), (heads_of_64, 64));
         }
+    }
+
+    /// A file whose first tensors claim another size than its blocks have is refused before a network of that size is made;
+    /// queries and keys that do not go together are told, in Hugging Face names too.
+    #[test]
+    fn a_size_that_the_blocks_do_not_have_is_refused() {
+        let store = VarStore::new(Device::Cpu);
+        let _net = VisionTransformer::new(&store.root(), &tiny(), None, 64).unwrap();
+        let zeros = |size: &[i64]| Tensor::zeros(size, (Kind::Float, Device::Cpu));
+        let refused = |changed: &[(&str, &[i64])]| {
+            let mut tensors: Tensors = store.variables().into_iter().collect();
+            for (name, size) in changed {
+                tensors.insert((*name).into(), zeros(size));
+            }
+            VisionTransformer::shape_of(&tensors).unwrap_err().to_string()
+        };
+        let wide: (&str, &[i64]) = ("patch_embed.proj.weight", &[1_000_000, 3, 1, 1]);
+        let error = refused(&[wide, ("pos_embed", &[1, 2, 1_000_000])]);
+        assert!(error.contains("`blocks.0.attn.qkv.weight` is [36, 12], [3000000, 1000000] is wanted"), "{error}");
+        assert!(refused(&[wide]).contains("`pos_embed` is [1, 17, 12]"));
+        assert!(refused(&[("pos_embed", &[1, 1_000_000_000_001, 0])]).contains("[1, patches + 1, 12] is wanted"));
+        assert!(refused(&[("patch_embed.proj.weight", &[12, 0, 9_000_000, 9_000_000])]).contains("patch_px"));
+        assert!(refused(&[("patch_embed.proj.weight", &[12])]).contains("patch_px"));
+
+        let mut hugging = Tensors::new();
+        hugging.insert("embeddings.cls_token".into(), zeros(&[1, 1, 12]));
+        hugging.insert("embeddings.patch_embeddings.projection.weight".into(), zeros(&[12, 3, 16, 16]));
+        hugging.insert("embeddings.position_embeddings".into(), zeros(&[1, 17, 12]));
+        hugging.insert("encoder.layer.0.layernorm_before.weight".into(), zeros(&[12]));
+        for (q, width) in [("query", 12), ("key", 12), ("value", 5)] {
+            hugging.insert(format!("encoder.layer.0.attention.attention.{q}.weight"), zeros(&[12, width]));
+        }
+        let error = VisionTransformer::shape_of(&hugging).unwrap_err().to_string();
+        assert!(error.contains("`blocks.0.attn.qkv.weight` is missing"), "{error}");
     }
 
     /// All that is missing or of another shape is named.
