@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::error::DatasetError;
 use crate::image::Image;
-use crate::transforms;
+use crate::{seen, transforms};
 
 /// Largest transforms file that is read, bytes.
 pub const MAX_TRANSFORMS_BYTES: u64 = 1 << 29;
@@ -62,7 +62,8 @@ pub struct Frame {
     pub timestamp: Option<usize>,
     /// Index of the fixed camera pose.
     pub view: Option<usize>,
-    /// How much of the actor the picture shows; `None` means unknown.
+    /// How much of the actor the picture shows; where the set does not say, what [`Dataset::open`] could tell. `None`
+    /// means unknown.
     pub observability: Option<Observability>,
     /// Visible pixels over pixels that would be covered with nothing in between, 0..=1.
     pub visible_fraction: Option<f32>,
@@ -169,17 +170,31 @@ pub struct Dataset {
 
 impl Dataset {
     /// Reads and checks `transforms.json`, or else `transforms_train.json`, `transforms_val.json` and
-    /// `transforms_test.json` together. Pictures are looked for but not decoded.
+    /// `transforms_test.json` together. Pictures are looked for but not decoded, unless the set has several branches and
+    /// no frame says its observability: then the pictures tell it, and a warning says so.
     pub fn open(dir: &Path) -> Result<Self, DatasetError> {
         let read = transforms::read(dir, transforms::Pictures::Png)?;
         let view_count = read.frames.iter().filter_map(|f| f.view).max().map_or(0, |v| v + 1);
-        Ok(Self {
+        let mut set = Self {
             dir: dir.to_owned(),
             frames: read.frames,
             scenario: read.scenario,
             view_count,
             warnings: read.warnings,
-        })
+        };
+        let several = set.scenario.as_ref().is_some_and(|s| s.branches.len() > 1);
+        if several && set.frames.iter().all(|f| f.observability.is_none()) {
+            let told = seen::told_by_pictures(&set.frames, view_count, |i| set.load_image(i))?;
+            for (frame, observability) in set.frames.iter_mut().zip(told) {
+                frame.observability = observability;
+            }
+            set.warnings.push(
+                "no frame says its `observability`, so the pictures tell it: `none` where each other branch looks the same \
+                 at that timestamp, `full` where none does, else `partial`"
+                    .into(),
+            );
+        }
+        Ok(set)
     }
 
     /// The set's folder.

@@ -21,6 +21,7 @@ mod error;
 mod image;
 mod import;
 mod report;
+mod seen;
 pub mod sensor;
 mod split;
 mod transforms;

@@ -112,6 +112,49 @@ fn authors_form() {
     }
 }
 
+/// A set that does not say its frames' observability: what looks the same in all branches shows nothing, what looks the same
+/// in some shows a part, what looks the same in none shows all; a warning says so. What a set says stays.
+#[test]
+fn pictures_tell_observability() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut set = whole();
+    set["scenario"]["branches"] = json!(["with", "without", "late"]);
+    set["scenario"]["states"] = json!([]);
+    let mut frames = Vec::new();
+    // Three views of each branch: one tells all branches apart, one the last from the others, one none.
+    for branch in 0..3_u8 {
+        for (view, level) in [20 * branch, 20 * (branch / 2), 0].into_iter().enumerate() {
+            for timestamp in 0..2_u8 {
+                let path = format!("images/b{branch}_t{timestamp}_v{view}.png");
+                frames.push(json!({"file_path": path, "transform_matrix": IDENTITY,
+                    "scene_id": branch * 2 + timestamp, "view_index": view}));
+                std::fs::create_dir_all(dir.path().join("images")).unwrap();
+                Image::filled(8, 8, [level, 100 * timestamp, 0]).save_png(&dir.path().join(path)).unwrap();
+            }
+        }
+    }
+    set["frames"] = json!(frames);
+    let read = |set: &Value| {
+        std::fs::write(dir.path().join("transforms.json"), set.to_string()).unwrap();
+        Dataset::open(dir.path()).unwrap()
+    };
+    let dataset = read(&set);
+    for frame in dataset.frames() {
+        let wanted = match (frame.view, frame.branch) {
+            (Some(0), _) | (Some(1), Some(2)) => Observability::Full,
+            (Some(1), _) => Observability::Partial,
+            _ => Observability::None,
+        };
+        assert_eq!(frame.observability, Some(wanted), "{frame:?}");
+    }
+    assert!(dataset.warnings().iter().any(|w| w.contains("the pictures tell it")), "{:?}", dataset.warnings());
+
+    set["frames"][0]["observability"] = json!("partial");
+    let dataset = read(&set);
+    assert_eq!(dataset.frames()[0].observability, Some(Observability::Partial));
+    assert!(dataset.frames()[1..].iter().all(|f| f.observability.is_none()) && dataset.warnings().is_empty());
+}
+
 /// A plain `NeRF` set: no scenario, an angle in place of a focal length, sizes from the pictures, names without
 /// extension, three files read as one, and a frame's own intrinsics before those at top level.
 #[test]

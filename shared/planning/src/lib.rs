@@ -101,6 +101,12 @@ const RIDGE: f64 = 1e-4;
 /// Newton steps; a dozen do.
 const MOST_STEPS: usize = 200;
 
+/// The threshold where there are no trials to choose one by: half of the hazard probability of a belief that is even over the
+/// branches, which is what hazard trials have, while clear ones have next to none.
+pub fn unchosen_threshold(hazard_branches: usize, branches: usize) -> f64 {
+    0.5 * hazard_branches as f64 / branches.max(1) as f64
+}
+
 /// The threshold at which hazard and clear trials, each kind weighing the same, are equally likely: logistic regression
 /// of the right answer on the log odds of the hazard probability. Unlike the threshold with the fewest errors it does not
 /// lean on the few trials that happen to lie next to it. 0, which always halts, where higher probabilities do not speak
@@ -151,6 +157,14 @@ mod tests {
 
     fn evidence<'a>(states: &'a [Option<usize>], shows: &'a [bool], p: f64) -> Evidence<'a> {
         Evidence { states, shows_hazard: shows, hazard_probability: p }
+    }
+
+    /// With no trials, the threshold is half of what an even belief over the branches has.
+    #[test]
+    fn without_trials_half_an_even_belief() {
+        assert_eq!(unchosen_threshold(1, 2), 0.25);
+        assert!((unchosen_threshold(2, 3) - 1.0 / 3.0).abs() < 1e-12);
+        assert_eq!(unchosen_threshold(0, 0), 0.0);
     }
 
     /// The paper's rule advances only when no sample shows the actor and none is unknown.

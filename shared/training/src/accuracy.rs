@@ -16,16 +16,17 @@ pub struct Centroids {
 
 impl Centroids {
     /// Centroids of the posterior means of those pictures that show the actor's place fully and whose pose is neither
-    /// unseen nor used for calibration. `None` when a state has no such picture.
+    /// unseen nor used for calibration; of a state with no such picture, of all its pictures from these poses. `None` when a
+    /// state has none at all.
     pub fn fit(pictures: &Pictures, posteriors: &[LatentGaussian]) -> Option<Self> {
         let states = pictures.scenario.state_count();
         let mut sums = vec![[0.0_f64; LATENT_DIM]; states];
         let mut counts = vec![0_usize; states];
-        let chosen: Vec<usize> = pictures
-            .with_roles(&[PoseRole::Rest])
-            .into_iter()
-            .filter(|&i| pictures.labels[i].observability == Observability::Full)
-            .collect();
+        let rest = pictures.with_roles(&[PoseRole::Rest]);
+        let shows = |i: usize| pictures.labels[i].observability == Observability::Full;
+        let mut shown = vec![false; states];
+        rest.iter().filter(|&&i| shows(i)).for_each(|&i| shown[pictures.labels[i].state] = true);
+        let chosen: Vec<usize> = rest.into_iter().filter(|&i| shows(i) || !shown[pictures.labels[i].state]).collect();
         for &i in &chosen {
             let state = pictures.labels[i].state;
             counts[state] += 1;

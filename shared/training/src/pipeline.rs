@@ -16,7 +16,7 @@ use carff_evaluation::{Input, Models, Trial, birds_eye, planning_table, sample_a
 use carff_field::{Field, RenderBuffer, RenderOptions};
 use carff_latent::{LATENT_DIM, LatentGaussian, Sampling};
 use carff_models::stored::save_weights;
-use carff_planning::{CalibrationTrial, Rule, choose_threshold};
+use carff_planning::{CalibrationTrial, Rule, choose_threshold, unchosen_threshold};
 use carff_probing::{Calibration, Place, Prober};
 use carff_random::Key;
 use serde_json::{Value, json};
@@ -380,16 +380,22 @@ fn calibrate_threshold(
             halt_is_right: trial.kind == carff_dataset::drives::DriveKind::Hazard,
         });
     }
-    let threshold = choose_threshold(&found).ok_or_else(|| {
-        TrainingError::Unfit(
-            "the calibration poses allow no trial of one kind (hazard or clear): choose another `split_seed`".into(),
-        )
-    })?;
+    let chosen = choose_threshold(&found);
+    let threshold = chosen.unwrap_or_else(|| {
+        unchosen_threshold(pictures.scenario.hazard_branches.len(), pictures.scenario.branches.len())
+    });
+    if chosen.is_none() {
+        let line = format!(
+            "the calibration poses allow no trial of one kind (hazard or clear), so that nothing chooses the calibrated rule's \
+             threshold: {threshold} is half of an even belief; another `split_seed` may allow them"
+        );
+        (run.on_progress)(&Progress { stage: "threshold", done: 1, total: 1, line });
+    }
     let probabilities = |halt: bool| -> Vec<f64> {
         found.iter().filter(|t| t.halt_is_right == halt).map(|t| t.hazard_probability).collect()
     };
     run.metric(&json!({
-        "stage": "threshold", "threshold": threshold, "trials": found.len(),
+        "stage": "threshold", "threshold": threshold, "chosen": chosen.is_some(), "trials": found.len(),
         "hazard": probabilities(true), "clear": probabilities(false),
     }))?;
     CheckpointPlanning::new(config.split_seed, threshold).save(out).map_err(|e| unfit(&e))

@@ -532,7 +532,7 @@ pub fn evaluate(
     picture_quality: bool,
 ) -> Result<serde_json::Value, TrainingError> {
     let centroids = Centroids::fit(pictures, posteriors)
-        .ok_or_else(|| TrainingError::Unfit("some state has no view that shows the actor's place fully".into()))?;
+        .ok_or_else(|| TrainingError::Unfit("some state has no picture from a pose that is trained on".into()))?;
     let accuracy = |roles: &[PoseRole]| {
         let table = state_accuracy(pictures, posteriors, &centroids, &pictures.with_roles(roles));
         let share = |s: crate::accuracy::Share| json!({"accuracy": s.accuracy(), "raw": s.raw(), "raw_ceiling": s.ceiling(), "trials": s.trials});

@@ -1,0 +1,49 @@
+//! How much each picture shows of what tells branches apart, for a set that does not say: told by its pictures.
+
+use crate::dataset::{Frame, Observability};
+use crate::equivalence::looks_same;
+use crate::error::DatasetError;
+use crate::image::Image;
+use rayon::prelude::*;
+
+/// Observability of each frame, from the other branches' pictures at its timestamp from its view: `none` where all of
+/// them look the same as it, `full` where none does, else `partial`; `None` where there is nothing to compare it with.
+/// `load` decodes the picture of a frame; its first error is the error.
+pub(crate) fn told_by_pictures(
+    frames: &[Frame],
+    views: usize,
+    load: impl Fn(usize) -> Result<Image, DatasetError> + Sync,
+) -> Result<Vec<Option<Observability>>, DatasetError> {
+    let mut of_view: Vec<Vec<usize>> = vec![Vec::new(); views];
+    for (i, frame) in frames.iter().enumerate() {
+        if let Some(list) = frame.view.and_then(|view| of_view.get_mut(view)) {
+            list.push(i);
+        }
+    }
+    let told: Vec<Vec<(usize, Option<Observability>)>> = of_view
+        .par_iter()
+        .map(|of_view| {
+            let pictures: Vec<Image> = of_view.iter().map(|&i| load(i)).collect::<Result<_, _>>()?;
+            let frame_of = |place: usize| &frames[of_view[place]];
+            let tell = |own: usize| {
+                let (branch, timestamp) = (frame_of(own).branch, frame_of(own).timestamp);
+                let others = (0..of_view.len())
+                    .filter(|&other| frame_of(other).timestamp == timestamp && frame_of(other).branch != branch);
+                let (alike, different): (Vec<usize>, Vec<usize>) =
+                    others.partition(|&other| looks_same(&pictures[own], &pictures[other]));
+                match (alike.is_empty(), different.is_empty()) {
+                    (true, true) => None,
+                    (true, false) => Some(Observability::Full),
+                    (false, true) => Some(Observability::None),
+                    (false, false) => Some(Observability::Partial),
+                }
+            };
+            Ok((0..of_view.len()).map(|own| (of_view[own], tell(own))).collect())
+        })
+        .collect::<Result<_, DatasetError>>()?;
+    let mut all = vec![None; frames.len()];
+    for (frame, observability) in told.into_iter().flatten() {
+        all[frame] = observability;
+    }
+    Ok(all)
+}
