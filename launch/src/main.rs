@@ -1,6 +1,6 @@
 //! Every command of `carff`, its help, completions and manual pages: what `carff` becomes for all that computes.
 
-use carff::{Attach, exit_code};
+use carff::{Attach, exit_code, until_read};
 use carff_bench::BenchCommand;
 use carff_launch::ablate::AblateArgs;
 use carff_launch::backbone::BackboneCommand;
@@ -120,7 +120,11 @@ A TOML file names its schema in its first line, for editors that know taplo: #:s
 }
 
 fn main() -> ExitCode {
-    let result = match Cli::parse().command {
+    until_read(|| exit_code(run()))
+}
+
+fn run() -> anyhow::Result<ExitCode> {
+    match Cli::parse().command {
         Command::Launch(args) => carff_launch::launch::run(&args),
         Command::Attach(command) => command.run(),
         Command::Replay(args) => carff_launch::replay::run(&args),
@@ -134,12 +138,12 @@ fn main() -> ExitCode {
         Command::Doctor(args) => carff_launch::doctor::run(&args),
         Command::Schema(args) => carff_launch::schema::run(&args).map(|()| ExitCode::SUCCESS),
         Command::Completions(args) => {
-            carff_launch::shell::completions(&args, Cli::command()).map(|()| ExitCode::SUCCESS)
+            carff_launch::shell::completions(&args, Cli::command());
+            Ok(ExitCode::SUCCESS)
         }
         Command::Man(args) => carff_launch::shell::man(&args, Cli::command()).map(|()| ExitCode::SUCCESS),
         Command::Dataset(command) => carff_launch::dataset::run(command).map(|()| ExitCode::SUCCESS),
-    };
-    exit_code(result)
+    }
 }
 
 #[cfg(test)]

@@ -79,7 +79,8 @@ pub fn schema(kind: FileKind) -> Value {
 /// Prints it.
 pub fn run(args: &SchemaArgs) -> anyhow::Result<()> {
     let text = serde_json::to_string_pretty(&schema(args.kind))? + "\n";
-    Ok(crate::shell::print(text.as_bytes())?)
+    print!("{text}");
+    Ok(())
 }
 
 /// Descriptions on one line, and defaults in single precision as they are written (0.02, not 0.019999999552965164).

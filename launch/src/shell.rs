@@ -1,7 +1,6 @@
 //! `carff completions` and `carff man`: what shells and `man` show of this command, made from its own description.
 
 use anyhow::Context;
-use std::io::Write;
 use std::path::PathBuf;
 
 /// Print a shell's completions.
@@ -19,19 +18,11 @@ pub struct ManArgs {
 }
 
 /// Prints the completions of a command.
-pub fn completions(args: &CompletionsArgs, mut command: clap::Command) -> anyhow::Result<()> {
+pub fn completions(args: &CompletionsArgs, mut command: clap::Command) {
     let name = command.get_name().to_owned();
     let mut script = Vec::new();
     clap_complete::generate(args.shell, &mut command, name, &mut script);
-    Ok(print(&script)?)
-}
-
-/// Writes to standard output. A reader that has seen enough (`| head`) is no error.
-pub fn print(bytes: &[u8]) -> std::io::Result<()> {
-    match std::io::stdout().write_all(bytes) {
-        Err(error) if error.kind() != std::io::ErrorKind::BrokenPipe => Err(error),
-        _ => Ok(()),
-    }
+    print!("{}", String::from_utf8_lossy(&script));
 }
 
 /// Writes the man pages of a command and of those below it.

@@ -129,3 +129,18 @@ fn shared_memory_full_or_not_writable() {
     }
     graph.assert_nothing_left();
 }
+
+/// Standard output that nobody reads any more (`| head`) ends a command without a word, as the shell's convention for it
+/// says.
+#[test]
+fn a_reader_that_has_seen_enough() {
+    let set = tempfile::tempdir().unwrap();
+    picture_set(set.path());
+    for args in [&["dataset", "check", set.path().to_str().unwrap()][..], &["schema", "graph"]] {
+        let (reader, writer) = std::io::pipe().unwrap();
+        drop(reader);
+        let output = Command::new(program("carff")).args(args).stdout(writer).output().unwrap();
+        let said = String::from_utf8_lossy(&output.stderr);
+        assert_eq!((output.status.code(), &*said), (Some(141), ""), "{args:?}");
+    }
+}

@@ -17,6 +17,7 @@ mod vitals;
 
 use anyhow::Context;
 use clap::Subcommand;
+use std::any::Any;
 use std::ffi::OsString;
 use std::os::unix::process::CommandExt;
 use std::process::{Command, ExitCode};
@@ -83,6 +84,27 @@ pub fn exit_code(result: anyhow::Result<ExitCode>) -> ExitCode {
         eprintln!("error: {}", carff_stage::describe(&error));
         ExitCode::FAILURE
     })
+}
+
+/// Runs a program to its end. Where standard output's reader has seen enough (`| head`), that is an end like any other
+/// program's: without a word, with exit code 141.
+pub fn until_read(program: impl FnOnce() -> ExitCode) -> ExitCode {
+    let told = std::panic::take_hook();
+    std::panic::set_hook(Box::new(move |info| {
+        if !says_closed_pipe(info.payload()) {
+            told(info);
+        }
+    }));
+    std::panic::catch_unwind(std::panic::AssertUnwindSafe(program)).unwrap_or_else(|payload| {
+        if says_closed_pipe(&*payload) { ExitCode::from(141) } else { std::panic::resume_unwind(payload) }
+    })
+}
+
+/// `println!` panics with these words where nobody reads.
+fn says_closed_pipe(payload: &(dyn Any + Send)) -> bool {
+    payload
+        .downcast_ref::<String>()
+        .is_some_and(|text| text.starts_with("failed printing to stdout") && text.contains("Broken pipe"))
 }
 
 /// Becomes another program of ours, which lies beside this one; returns when it cannot be started.

@@ -1,7 +1,7 @@
 //! The `carff` command. What attaches to a run is done here; for all else this becomes `carff-launch`, which knows every
 //! command and is linked with libtorch.
 
-use carff::{Attach, become_program, exit_code};
+use carff::{Attach, become_program, exit_code, until_read};
 use clap::{Parser, Subcommand};
 use std::process::ExitCode;
 
@@ -18,5 +18,5 @@ struct Cli {
 fn main() -> ExitCode {
     let args: Vec<_> = std::env::args_os().skip(1).collect();
     let here = args.first().and_then(|word| word.to_str()).is_some_and(Attach::has_subcommand);
-    exit_code(if here { Cli::parse().command.run() } else { become_program(LAUNCH, &args) })
+    until_read(|| exit_code(if here { Cli::parse().command.run() } else { become_program(LAUNCH, &args) }))
 }

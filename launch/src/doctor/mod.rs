@@ -40,7 +40,7 @@ pub fn run(args: &DoctorArgs) -> anyhow::Result<ExitCode> {
         let colours = std::env::var_os("NO_COLOR").is_none_or(|v| v.is_empty());
         finding::text(&findings, colours && std::io::stdout().is_terminal())
     };
-    crate::shell::print(text.as_bytes())?;
+    print!("{text}");
     let failed = findings.iter().any(|f| f.level == Level::Error);
     Ok(if failed { ExitCode::FAILURE } else { ExitCode::SUCCESS })
 }
