@@ -1,12 +1,12 @@
 //! `carff ablate`: the same training with one thing changed at a time, as one table.
 
 use crate::eval;
-use crate::train::{Display, data_sets, refuse_another_configuration, stop_on_signals};
+use crate::train::{Display, data_sets, refuse_another_configuration, stop_on_signals, with_free_poses};
 use anyhow::Context;
 use carff_results::ResultsError;
 use carff_results::ablation::{AblationTable, Variant, folders, row, write_table};
 use carff_training::{TrainingError, config::TrainingConfig, run::Run};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 /// What to train, and where it goes.
@@ -43,6 +43,17 @@ pub fn run(args: &AblateArgs) -> anyhow::Result<ExitCode> {
     let threads = u16::try_from(config.threads).unwrap_or(1);
     let options = eval::options(&args.device, threads, config.seed + 1)?;
     let stop = stop_on_signals()?;
+    std::fs::create_dir_all(&args.out).with_context(|| format!("cannot make {}", args.out.display()))?;
+    refuse_another_configuration(&args.out, &config, &dataset)?;
+    let display = Display::default();
+    let report = |progress: &carff_training::run::Progress| display.show(progress);
+    let made =
+        with_free_poses(free, &config, &dataset, &Run { dir: args.out.clone(), on_progress: &report, stop: &stop });
+    display.finish();
+    let free = match made {
+        Err(TrainingError::Stopped) => return Ok(stopped(&args.out)),
+        made => made?,
+    };
     let variants = if args.only.is_empty() { Variant::ALL.to_vec() } else { args.only.clone() };
     let mut table = AblationTable {
         dataset: dataset.display().to_string(),
@@ -63,10 +74,7 @@ pub fn run(args: &AblateArgs) -> anyhow::Result<ExitCode> {
         display.finish();
         match found {
             Ok(row) => table.rows.push(row),
-            Err(ResultsError::Training(TrainingError::Stopped)) => {
-                eprintln!("stopped; the same command goes on from what is in {}", args.out.display());
-                return Ok(ExitCode::from(130));
-            }
+            Err(ResultsError::Training(TrainingError::Stopped)) => return Ok(stopped(&args.out)),
             Err(error) => return Err(error.into()),
         }
         // After each variant, so that there is a table to look at.
@@ -74,4 +82,9 @@ pub fn run(args: &AblateArgs) -> anyhow::Result<ExitCode> {
     }
     println!("table: {}", args.out.join("README.md").display());
     Ok(ExitCode::SUCCESS)
+}
+
+fn stopped(out: &Path) -> ExitCode {
+    eprintln!("stopped; the same command goes on from what is in {}", out.display());
+    ExitCode::from(130)
 }

@@ -8,6 +8,7 @@ use carff_training::{
     TrainingError,
     config::{FreePoses, TrainingConfig},
     features::FEATURES,
+    free,
     pipeline::{self, Stage},
     run::{Progress, Run},
 };
@@ -91,7 +92,8 @@ pub fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
         Some(StageName::Nerf) => Stage::Nerf,
         Some(StageName::Mdn) => Stage::Mdn,
     };
-    let result = pipeline::train(&config, &dataset, free.as_deref(), &out, stage, device, &run);
+    let result = with_free_poses(free, &config, &dataset, &run)
+        .and_then(|free| pipeline::train(&config, &dataset, free.as_deref(), &out, stage, device, &run));
     display.finish();
     match result {
         Ok(metrics) => {
@@ -141,7 +143,7 @@ fn scenario(config: &TrainingConfig) -> anyhow::Result<Scenario> {
 
 /// The set of freely drawn poses, rendered when it is missing; none for a data set that the scenario did not make.
 fn free_poses(config: &TrainingConfig, given: Option<&Path>) -> anyhow::Result<Option<PathBuf>> {
-    let FreePoses { count, seed } = config.free_poses;
+    let FreePoses { count, seed, .. } = config.free_poses;
     if count == 0 || given.is_some() || config.scenario.is_none() {
         return Ok(None);
     }
@@ -152,6 +154,19 @@ fn free_poses(config: &TrainingConfig, given: Option<&Path>) -> anyhow::Result<O
         render(&scenario(config)?.with_free_cameras(count, seed)?, &dir, Extras::None)?;
     }
     Ok(Some(dir))
+}
+
+/// The rendered set of freely drawn poses; without one that which a field shows, if the training file asks for it.
+pub fn with_free_poses(
+    rendered: Option<PathBuf>,
+    config: &TrainingConfig,
+    dataset: &Path,
+    run: &Run,
+) -> Result<Option<PathBuf>, TrainingError> {
+    match rendered {
+        Some(dir) => Ok(Some(dir)),
+        None => free::set(config, dataset, run),
+    }
 }
 
 const CONFIGURATION: &str = "configuration.json";
@@ -174,7 +189,7 @@ fn forget_another_configuration(dir: &Path, config: &TrainingConfig, dataset: &P
     if !dir.join(CONFIGURATION).is_file() || refuse_another_configuration(dir, config, dataset).is_ok() {
         return Ok(());
     }
-    let states = ["vae", "nerf", "mdn"].map(|stage| format!("{stage}.state.safetensors"));
+    let states = ["vae", "nerf", "mdn", free::STAGE].map(|stage| format!("{stage}.state.safetensors"));
     let others = ["posteriors.safetensors", FEATURES, "metrics.jsonl", CONFIGURATION].map(str::to_owned);
     for name in states.into_iter().chain(others) {
         let path = dir.join(name);
@@ -185,7 +200,13 @@ fn forget_another_configuration(dir: &Path, config: &TrainingConfig, dataset: &P
             _ => {}
         }
     }
-    Ok(())
+    let pictures = dir.join(free::FOLDER);
+    match std::fs::remove_dir_all(&pictures) {
+        Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
+            Err(error).with_context(|| format!("cannot remove {}", pictures.display()))
+        }
+        _ => Ok(()),
+    }
 }
 
 /// A run folder belongs to one configuration and one data set: going on with another would mix them.

@@ -80,16 +80,25 @@ impl Default for CalibrationConfig {
     }
 }
 
-/// Poses besides those of the data set, drawn at random from the ranges of the scenario's cameras. Encoder and
-/// forecaster train on them too, so that they do not know poses by heart; decoder, field and all figures do not. They
-/// are only there for a data set that the scenario has made.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+/// Poses besides those of the data set. Encoder and forecaster train on them too, so that they do not know poses by heart;
+/// decoder, field and all figures do not. For a data set that the scenario has made they are drawn from the ranges of the
+/// scenario's cameras and rendered. For any other they are drawn between the data set's own, and a field that is trained for
+/// this alone shows what they see.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct FreePoses {
     /// How many; 0 leaves them out.
     pub count: usize,
     /// Seed of the draw.
     pub seed: u64,
+    /// Steps of the field that shows them for a data set that the scenario has not made; 0 leaves them out there.
+    pub field_steps: u64,
+}
+
+impl Default for FreePoses {
+    fn default() -> Self {
+        Self { count: 0, seed: 0, field_steps: 8000 }
+    }
 }
 
 fn two() -> i32 {
@@ -252,6 +261,7 @@ impl TrainingConfig {
             ("mdn.steps", self.mdn.steps, 1, 1_000_000),
             ("mdn.batch", self.mdn.batch, 2, 65_536),
             ("free_poses.count", self.free_poses.count, 0, 10_000),
+            ("free_poses.field_steps", self.free_poses.field_steps as usize, 0, 1_000_000),
             ("augmentation.copies", self.augmentation.copies, 0, 64),
             ("augmentation.own_copies", self.augmentation.own_copies, 0, 64),
             ("threads", self.threads.max(0) as usize, 1, 256),

@@ -129,16 +129,29 @@ fn middle_width_m(pictures: &Pictures) -> f32 {
     widths.get(widths.len() / 2).map_or(0.0, |width| *width as f32)
 }
 
-/// Trains the field, or goes on where an earlier run stopped.
+/// Trains the field that ships, or goes on where an earlier run stopped.
 pub fn train(config: &TrainingConfig, pictures: &Pictures, clouds: &Clouds, run: &Run) -> Result<Field, TrainingError> {
+    train_stage(config, pictures, clouds, "nerf", config.nerf.trainer.steps, run)
+}
+
+/// Trains a field in `steps` steps, or goes on where an earlier run of the stage stopped.
+pub(crate) fn train_stage(
+    config: &TrainingConfig,
+    pictures: &Pictures,
+    clouds: &Clouds,
+    stage: &'static str,
+    steps: u64,
+    run: &Run,
+) -> Result<Field, TrainingError> {
     let settings = &config.nerf;
     let trainer_config = carff_field::TrainerConfig {
         seed: config.seed,
         threads: config.threads.max(1) as usize,
+        steps,
         ..settings.trainer.clone()
     };
-    let mut trainer = if let Some((done, state)) = run.load("nerf")? {
-        resume(config, trainer_config.clone(), done, &state).ok_or_else(|| damaged(&run.state_path("nerf")))?
+    let mut trainer = if let Some((done, state)) = run.load(stage)? {
+        resume(config, trainer_config.clone(), done, &state).ok_or_else(|| damaged(&run.state_path(stage)))?
     } else {
         FieldTrainer::new(Field::new(clouds.structure(config, pictures), config.seed)?, trainer_config.clone())?
     };
@@ -170,14 +183,14 @@ pub fn train(config: &TrainingConfig, pictures: &Pictures, clouds: &Clouds, run:
                 report.samples as f64 / report.rays.max(1) as f64,
                 100.0 * trainer.field().occupancy().occupied_share(),
             );
-            (run.on_progress)(&Progress { stage: "nerf", done: done as usize, total: total as usize, line });
+            (run.on_progress)(&Progress { stage, done: done as usize, total: total as usize, line });
         }
         if done.is_multiple_of(100) || done == total {
-            run.metric(&json!({"stage": "nerf", "step": done, "loss": loss, "ray_psnr_db": psnr}))?;
+            run.metric(&json!({"stage": stage, "step": done, "loss": loss, "ray_psnr_db": psnr}))?;
         }
         let stopping = run.stopped();
         if stopping || clock.is_due() || done == total {
-            save(run, &trainer)?;
+            save(run, stage, &trainer)?;
         }
         if stopping {
             return Err(TrainingError::Stopped);
@@ -239,13 +252,13 @@ fn to_rows(tensors: Tensors) -> Vec<(String, Vec<usize>, Vec<f32>)> {
         .collect()
 }
 
-fn save(run: &Run, trainer: &FieldTrainer) -> Result<(), TrainingError> {
+fn save(run: &Run, stage: &str, trainer: &FieldTrainer) -> Result<(), TrainingError> {
     let state = trainer.state();
     let mut all: Tensors = prefixed("trainer.", to_tensors(state.tensors)).collect();
     all.extend(prefixed("field.", to_tensors(trainer.field().tensors())));
     let structure = serde_json::to_string(trainer.field().config()).unwrap_or_default();
     all.insert("structure".into(), Tensor::from_slice(structure.as_bytes()));
-    run.save("nerf", state.step as usize, all)
+    run.save(stage, state.step as usize, all)
 }
 
 fn resume(

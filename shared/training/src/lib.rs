@@ -8,6 +8,7 @@ pub mod config;
 pub mod curves;
 pub mod features;
 pub mod field;
+pub mod free;
 pub mod mixture;
 pub mod pictures;
 pub mod pipeline;

@@ -1,0 +1,161 @@
+//! Contracts of freely drawn poses that a field shows: what they look like, what they are made from, and interruptions.
+
+#![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
+
+use carff_dataset::{Dataset, Equivalence, Image, PoseRole, PoseSplit};
+use carff_scenes::{Extras, RenderOptions, Scenario};
+use carff_training::{
+    TrainingError,
+    config::TrainingConfig,
+    free,
+    run::{Progress, Run},
+};
+use std::collections::BTreeMap;
+use std::ops::ControlFlow;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
+
+/// A block drives along a road, or does not; cameras look at it, or stand behind a wall.
+const SCENARIO: &str = include_str!("../../../tests/data/small-scenario.toml");
+
+const TRAINING: &str = r#"
+dataset = "set"
+out = "out"
+seed = 3
+split_seed = 5
+threads = 1
+
+[free_poses]
+count = 24
+seed = 4
+field_steps = 200
+
+[encoder]
+backbone = { kind = "efficientnet-lite0", input_px = 32 }
+
+[field]
+levels = 6
+log2_table_size = 13
+max_resolution = 128
+hidden_width = 32
+samples_across = 64.0
+occupancy_resolution = 32
+
+[nerf]
+rays = 1024
+
+[nerf.trainer]
+occupancy_warmup_steps = 100
+threads = 1
+"#;
+
+struct Place {
+    folder: tempfile::TempDir,
+    config: TrainingConfig,
+    scenario: Scenario,
+}
+
+impl Place {
+    fn new() -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("training.toml");
+        std::fs::write(&file, TRAINING).unwrap();
+        let config = TrainingConfig::load(&file).unwrap();
+        // A field that is to show other poses needs more than a few to learn from.
+        let many = SCENARIO.replace("count = 8", "count = 40").replace("count = 6", "count = 20");
+        let scenario = Scenario::parse(Path::new("small.toml"), &many).unwrap();
+        scenario.render_dataset(&folder.path().join("set"), Extras::None, |_, _| ControlFlow::Continue(())).unwrap();
+        Self { folder, config, scenario }
+    }
+
+    fn at(&self, name: &str) -> PathBuf {
+        self.folder.path().join(name)
+    }
+
+    /// Makes the set in the run folder `name`, until `stop_at` (stage, steps done), or to the end.
+    fn make(&self, name: &str, stop_at: Option<(&str, usize)>) -> Result<Option<PathBuf>, TrainingError> {
+        let stop = AtomicBool::new(false);
+        let on_progress = |progress: &Progress| {
+            if stop_at.is_some_and(|(stage, done)| progress.stage == stage && progress.done >= done) {
+                stop.store(true, Ordering::Relaxed);
+            }
+        };
+        std::fs::create_dir_all(self.at(name)).unwrap();
+        let run = Run { dir: self.at(name), on_progress: &on_progress, stop: &stop };
+        free::set(&self.config, &self.at("set"), &run)
+    }
+}
+
+/// A set's files, by name.
+fn files(dir: &Path) -> BTreeMap<String, Vec<u8>> {
+    let mut all = BTreeMap::from([("transforms".to_owned(), std::fs::read(dir.join("transforms.json")).unwrap())]);
+    for entry in std::fs::read_dir(dir.join("images")).unwrap() {
+        let path = entry.unwrap().path();
+        all.insert(path.display().to_string().split_off(dir.display().to_string().len()), std::fs::read(path).unwrap());
+    }
+    all
+}
+
+/// Every state is shown from each drawn pose, at the encoder's size, about as it looks from there; from some poses the second
+/// step's branches look the same, behind the wall, from others they do not.
+#[test]
+fn free_poses_show_what_is_there() {
+    let mut place = Place::new();
+    place.config.free_poses.field_steps = 800;
+    let set = Dataset::open(&place.make("run", None).unwrap().unwrap()).unwrap();
+    let images = set.load_all_images().unwrap();
+    assert_eq!((set.view_count(), set.state_count(), images.len()), (24, 4, 96));
+    let error = |a: &Image, b: &Image| -> f64 {
+        a.rgb.iter().zip(&b.rgb).map(|(a, b)| f64::from(a.abs_diff(*b)).powi(2)).sum()
+    };
+    let mut alike = 0;
+    for (frame, image) in set.frames().iter().zip(&images) {
+        assert_eq!((image.width_px, image.height_px), (32, 32));
+        let (branch, timestamp) = (frame.branch.unwrap(), frame.timestamp.unwrap());
+        let truth = place.scenario.render(branch, timestamp, &frame.camera, &RenderOptions::default()).unwrap().image;
+        let count = truth.rgb.len() as u64 / 3;
+        let mean =
+            [0, 1, 2].map(|c| (truth.rgb.iter().skip(c).step_by(3).map(|&v| u64::from(v)).sum::<u64>() / count) as u8);
+        alike += usize::from(error(image, &truth) < 0.5 * error(&Image::filled(32, 32, mean), &truth));
+    }
+    // From the others it sees what no picture shows, as the top of the wall.
+    assert!(alike > 64, "{alike} of 96");
+    let looks = Equivalence::from_dataset(&set, &images);
+    let hidden = (0..24).filter(|&view| looks.same(view, 1, 3)).count();
+    assert!((1..24).contains(&hidden), "{hidden} of 24");
+}
+
+/// What is made does not depend on the pictures of unseen poses: a result on these is one on what nothing was learnt from.
+#[test]
+fn unseen_poses_stay_unseen() {
+    let place = Place::new();
+    let before = files(&place.make("before", None).unwrap().unwrap());
+    let set = Dataset::open(&place.at("set")).unwrap();
+    let unseen = PoseSplit::for_dataset(&set, place.config.split_seed).views(PoseRole::Unseen);
+    let mut changed = 0;
+    for (i, frame) in set.frames().iter().enumerate().filter(|(_, f)| f.view.is_some_and(|v| unseen.contains(&v))) {
+        let image = set.load_image(i).unwrap();
+        let noise = Image::filled(image.width_px, image.height_px, [(i * 7) as u8, 0, 255]);
+        noise.save_png(&frame.image_path).unwrap();
+        changed += 1;
+    }
+    assert!(changed >= 4, "{changed}");
+    assert!(files(&place.make("after", None).unwrap().unwrap()) == before);
+}
+
+/// Interrupted while its field trains and while its pictures are made, the set ends with the same bytes; a finished one is
+/// not made again, and a configuration that wants none gets none.
+#[test]
+fn making_free_poses_resumes() {
+    let mut place = Place::new();
+    let straight = place.make("straight", None).unwrap().unwrap();
+    for stop_at in [(free::STAGE, 80), ("pictures", 5)] {
+        assert!(matches!(place.make("halting", Some(stop_at)), Err(TrainingError::Stopped)), "{stop_at:?}");
+    }
+    let halting = place.make("halting", None).unwrap().unwrap();
+    assert!(files(&straight) == files(&halting));
+    std::fs::remove_file(place.at("halting").join("free.state.safetensors")).unwrap();
+    assert_eq!(place.make("halting", None).unwrap(), Some(halting));
+    place.config.free_poses.field_steps = 0;
+    assert_eq!(place.make("none", None).unwrap(), None);
+}
