@@ -76,6 +76,8 @@ fn make(config: &TrainingConfig, pictures: &Pictures, dir: &Path, run: &Run) -> 
     let field = field::train_stage(config, pictures, &clouds, STAGE, config.free_poses.field_steps, run)?;
     let latents: Vec<[f32; LATENT_DIM]> = codes.iter().map(|code| code.mean).collect();
     let options = RenderOptions { threads: config.threads.max(1) as usize, ..RenderOptions::default() };
+    // The first is rendered by itself, all others share what does not change: specks there would tell it from them.
+    let together: Vec<[f32; LATENT_DIM]> = latents.first().into_iter().chain(&latents).copied().collect();
     let mut buffer = HypothesisBuffer::default();
 
     let cameras = cameras(config, pictures, &field, &latents, &options);
@@ -98,9 +100,9 @@ fn make(config: &TrainingConfig, pictures: &Pictures, dir: &Path, run: &Run) -> 
         });
         let records_of_view: Vec<FrameRecord> = records_of_view.collect();
         if !notes.contains(&view) {
-            field.render_hypotheses(camera, &latents, &options, &mut buffer);
+            field.render_hypotheses(camera, &together, &options, &mut buffer);
             let bytes = |rgb: &[f32]| rgb.iter().map(|v| (v.clamp(0.0, 1.0) * 255.0 + 0.5) as u8).collect();
-            let mut of_states: Vec<Vec<u8>> = buffer.pictures.iter().map(|picture| bytes(&picture.rgb)).collect();
+            let mut of_states: Vec<Vec<u8>> = buffer.pictures[1..].iter().map(|picture| bytes(&picture.rgb)).collect();
             settle(&mut of_states);
             for (record, rgb) in records_of_view.iter().zip(of_states) {
                 let image = Image { width_px: camera.width_px, height_px: camera.height_px, rgb };

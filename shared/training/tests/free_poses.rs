@@ -125,6 +125,25 @@ fn free_poses_show_what_is_there() {
     assert!((1..24).contains(&hidden), "{hidden} of 24");
 }
 
+/// States whose pictures are the same from all trained poses are shown alike, to the last bit: nothing that the field adds
+/// tells them apart.
+#[test]
+fn states_that_look_the_same_stay_the_same() {
+    let place = Place::new();
+    let set = Dataset::open(&place.at("set")).unwrap();
+    let of = |branch: usize| set.frames().iter().filter(move |f| (f.branch, f.timestamp) == (Some(branch), Some(0)));
+    for from in of(0) {
+        let to = of(1).find(|to| to.view == from.view).unwrap();
+        std::fs::copy(&from.image_path, &to.image_path).unwrap();
+    }
+    let made = files(&place.make("run", None).unwrap().unwrap());
+    let names: Vec<&String> = made.keys().filter(|name| name.contains("b0_t0")).collect();
+    assert_eq!(names.len(), 24);
+    for name in names {
+        assert!(made[name] == made[&name.replace("b0_t0", "b1_t0")], "{name}");
+    }
+}
+
 /// What is made does not depend on the pictures of unseen poses: a result on these is one on what nothing was learnt from.
 #[test]
 fn unseen_poses_stay_unseen() {
