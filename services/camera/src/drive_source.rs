@@ -45,6 +45,12 @@ impl DriveSource {
         };
         let views = PoseSplit::for_dataset(&dataset, split_seed).views(role);
         let drives = plan_drives(&dataset, &views, count as usize, graph.run.seed)?;
+        if drives.iter().any(|d| d.kind.is_none()) {
+            tracing::warn!(
+                poses = views.len(),
+                "no pose has a right answer (a hidden hazard, or a place in full view without one): no drive will be counted"
+            );
+        }
         let mut images = HashMap::new();
         for &frame in drives.iter().flat_map(|d| &d.frames) {
             if let std::collections::hash_map::Entry::Vacant(entry) = images.entry(frame) {

@@ -3,7 +3,8 @@
 //! A trial of the planner is an input view with one right answer (section 4.3 of the paper). Hazard: a hazard branch,
 //! and nothing seen tells so: the actor is not visible, or the state is one that a clear branch has as well. Clear:
 //! another branch, its place is fully visible, and the state is none of a hazard branch. The last timestamp is no input,
-//! as nothing comes after it. Where no branch is a hazard, every input is a clear one.
+//! as nothing comes after it. Where no branch is a hazard, every input is a clear one. A set that allows one kind alone,
+//! or none, is driven through all the same: what has no right answer is not counted.
 
 use crate::{Dataset, Observability, ScenarioInfo};
 use carff_random::Key;
@@ -52,10 +53,8 @@ pub struct Drive {
     pub view: usize,
     /// Hidden course of events.
     pub branch: usize,
-    /// The timestamp whose decision is counted.
-    pub eligible_timestamp: usize,
-    /// The right answer there.
-    pub kind: DriveKind,
+    /// The right answer; none where no pose of the set has one.
+    pub kind: Option<DriveKind>,
     /// Index in [`Dataset::frames`] of each timestamp's frame.
     pub frames: Vec<usize>,
 }
@@ -68,15 +67,11 @@ pub enum DrivesError {
         "this data set has no `scenario`: there is nothing to drive through; give one that has, or a folder source"
     )]
     NoScenario,
-    /// No pose allows a trial of this kind.
+    /// No pose can be driven.
     #[error(
-        "none of the {views} poses allows a {} drive: the scenario needs `hazard_branches`, and frames an \
-         `observability` of `none` (hazard) and `full` (clear) before the last timestamp",
-        kind.name()
+        "none of the {views} poses has a picture of every timestamp of a branch: give the missing frames, or a folder source"
     )]
-    NoneEligible {
-        /// Which kind.
-        kind: DriveKind,
+    NoneWhole {
         /// How many poses were looked at.
         views: usize,
     },
@@ -129,47 +124,53 @@ pub fn eligible_inputs(dataset: &Dataset, views: &[usize]) -> Result<Vec<Eligibl
 }
 
 /// Plans drives: hazard and clear ones in turn, their poses drawn by seed out of `views` without replacement while
-/// they last; clear ones alone where the scenario has no hazard. The same arguments give the same drives.
+/// they last. One kind alone where no pose allows the other; where none allows either, drives without a right answer,
+/// through any branch. The same arguments give the same drives.
 pub fn plan_drives(dataset: &Dataset, views: &[usize], count: usize, seed: u64) -> Result<Vec<Drive>, DrivesError> {
     let scenario = dataset.scenario().ok_or(DrivesError::NoScenario)?;
-    let inputs = eligible_inputs(dataset, views)?;
     let mut rng = carff_random::stream(Key { seed, frame: STREAM, step: 0, sample: 0 });
-    let mut deck = |kind: DriveKind, wanted: usize| -> Result<Vec<Drive>, DrivesError> {
-        // One entry for each pose, with all its inputs of this kind.
-        let mut poses: Vec<(usize, Vec<EligibleInput>)> = Vec::new();
-        for input in inputs.iter().filter(|i| i.kind == kind) {
-            match poses.last_mut() {
-                Some((view, list)) if *view == input.view => list.push(*input),
-                _ => poses.push((input.view, vec![*input])),
-            }
-        }
-        let mut drives = Vec::with_capacity(wanted);
-        while drives.len() < wanted {
-            let before = drives.len();
-            poses.shuffle(&mut rng);
-            for (view, list) in poses.iter().take(wanted - before) {
-                let input = list[rng.random_range(0..list.len())];
-                let frames: Option<Vec<usize>> = (0..scenario.timestamps)
-                    .map(|t| dataset.frame_index(scenario.state(input.branch, t)?, *view))
-                    .collect();
-                // A pose that lacks a timestamp cannot be driven.
-                if let Some(frames) = frames {
-                    let (branch, eligible_timestamp) = (input.branch, input.timestamp);
-                    drives.push(Drive { view: *view, branch, eligible_timestamp, kind, frames });
-                }
-            }
-            if drives.len() == before {
-                return Err(DrivesError::NoneEligible { kind, views: views.len() });
-            }
-        }
-        Ok(drives)
+    let frames = |branch: usize, view: usize| -> Option<Vec<usize>> {
+        (0..scenario.timestamps).map(|t| dataset.frame_index(scenario.state(branch, t)?, view)).collect()
     };
-    if scenario.hazard_branches.is_empty() {
-        return deck(DriveKind::Clear, count);
+    // For each kind one entry for each pose, with the branch of each of its inputs; a pose that lacks a timestamp cannot
+    // be driven.
+    type Poses = Vec<(usize, Vec<usize>)>;
+    let (mut hazard, mut clear): (Poses, Poses) = Default::default();
+    for input in eligible_inputs(dataset, views)?.iter().filter(|i| frames(i.branch, i.view).is_some()) {
+        let poses = if input.kind == DriveKind::Hazard { &mut hazard } else { &mut clear };
+        match poses.last_mut() {
+            Some((view, branches)) if *view == input.view => branches.push(input.branch),
+            _ => poses.push((input.view, vec![input.branch])),
+        }
     }
-    let wanted = count.div_ceil(2);
-    let (hazard, clear) = (deck(DriveKind::Hazard, wanted)?, deck(DriveKind::Clear, wanted)?);
-    Ok(hazard.into_iter().zip(clear).flat_map(|(h, c)| [h, c]).take(count).collect())
+    let mut deck = |kind: Option<DriveKind>, mut poses: Poses, wanted: usize| -> Vec<Drive> {
+        let mut drives = Vec::with_capacity(wanted);
+        while drives.len() < wanted && !poses.is_empty() {
+            poses.shuffle(&mut rng);
+            for (view, branches) in poses.iter().take(wanted - drives.len()) {
+                let branch = branches[rng.random_range(0..branches.len())];
+                drives.extend(frames(branch, *view).map(|frames| Drive { view: *view, branch, kind, frames }));
+            }
+        }
+        drives
+    };
+    let drives = match (hazard.is_empty(), clear.is_empty()) {
+        (false, false) => {
+            let wanted = count.div_ceil(2);
+            let hazard = deck(Some(DriveKind::Hazard), hazard, wanted);
+            let clear = deck(Some(DriveKind::Clear), clear, wanted);
+            hazard.into_iter().zip(clear).flat_map(|(h, c)| [h, c]).take(count).collect()
+        }
+        (false, true) => deck(Some(DriveKind::Hazard), hazard, count),
+        (true, false) => deck(Some(DriveKind::Clear), clear, count),
+        (true, true) => {
+            let whole =
+                |view: usize| (0..scenario.branches.len()).filter(move |b| frames(*b, view).is_some()).collect();
+            let any = views.iter().map(|v| (*v, whole(*v))).filter(|(_, branches): &(_, Vec<_>)| !branches.is_empty());
+            deck(None, any.collect(), count)
+        }
+    };
+    if drives.is_empty() && count > 0 { Err(DrivesError::NoneWhole { views: views.len() }) } else { Ok(drives) }
 }
 
 #[cfg(test)]
@@ -276,7 +277,7 @@ mod tests {
         let drives = plan_drives(&dataset, &views, 10, 1).unwrap();
         assert_eq!(drives.len(), 10);
         for (i, drive) in drives.iter().enumerate() {
-            assert_eq!(drive.kind, if i % 2 == 0 { DriveKind::Hazard } else { DriveKind::Clear });
+            assert_eq!(drive.kind, Some(if i % 2 == 0 { DriveKind::Hazard } else { DriveKind::Clear }));
             assert_eq!(drive.frames.len(), 3);
             for (timestamp, &frame) in drive.frames.iter().enumerate() {
                 let frame = &dataset.frames()[frame];
@@ -293,12 +294,31 @@ mod tests {
         assert!((2..9).any(|seed| plan_drives(&dataset, &views, 10, seed).unwrap() != drives));
     }
 
-    /// Poses that allow only one kind are an error that says which kind is missing.
+    /// Poses that allow one kind alone, or neither, are driven through all the same; the last have no right answer.
     #[test]
-    fn a_missing_kind_is_an_error() {
+    fn poses_without_trials_are_driven_too() {
         let folder = tempfile::tempdir().unwrap();
         let dataset = dataset(folder.path());
-        let error = plan_drives(&dataset, &[0, 1], 4, 1).unwrap_err();
-        assert_eq!(error, DrivesError::NoneEligible { kind: DriveKind::Clear, views: 2 });
+        for (views, kind) in [
+            ([0, 1], Some(DriveKind::Hazard)), // blind
+            ([3, 4], Some(DriveKind::Clear)),  // seeing
+            ([5, 5], None),                    // seeing in part
+        ] {
+            let drives = plan_drives(&dataset, &views, 8, 1).unwrap();
+            assert_eq!(drives.len(), 8);
+            assert!(drives.iter().all(|d| d.kind == kind && views.contains(&d.view) && d.frames.len() == 3));
+            assert_eq!(
+                (0..2).filter(|b| drives.iter().any(|d| d.branch == *b)).count(),
+                if kind.is_none() { 2 } else { 1 }
+            );
+        }
+    }
+
+    /// A pose that is not in the set cannot be driven, and the error says so.
+    #[test]
+    fn missing_pictures_are_an_error() {
+        let folder = tempfile::tempdir().unwrap();
+        let error = plan_drives(&dataset(folder.path()), &[7, 8], 4, 1).unwrap_err();
+        assert_eq!(error, DrivesError::NoneWhole { views: 2 });
     }
 }

@@ -8,7 +8,7 @@
 use crate::{
     TrainingError,
     accuracy::{Centroids, state_accuracy},
-    config::{Augmentation, TrainingConfig},
+    config::{Augmentation, TrainingConfig, VaeTraining},
     features::{self, FeatureFile},
     pictures::Pictures,
     run::{Progress, Run, SaveClock, cosine, damaged, part, prefixed},
@@ -453,12 +453,8 @@ fn reconstruction(
     let views = Tensor::from_slice(&views);
     let device = latents.device();
     let targets = pictures.targets(decoded).to_device(device);
-    let residual = &targets - pictures.pose_means.index_select(0, &views).to_device(device);
-    let changed = residual.abs().amax([1_i64].as_slice(), true).gt(12.0 / 255.0).to_kind(Kind::Float);
-    let weight = changed * (settings.foreground_weight - 1.0) + 1.0;
-    let wanted = if settings.residual { residual } else { targets };
-    let error = (vae.decoder.forward(latents, &views.to_device(device)) - wanted).square();
-    (error * weight).mean(Kind::Float) * 10.0
+    let means = pictures.pose_means.index_select(0, &views).to_device(device);
+    reconstruction_error(&vae.decoder.forward(latents, &views.to_device(device)), &targets, &means, settings)
 }
 
 /// The terms of one batch. For a decoder that learns alone the encoder is as it is used later, and out of the loss's reach.
@@ -475,7 +471,7 @@ fn losses(
     let only: Vec<usize> = chosen.iter().map(|&(i, _)| i).collect();
     let features = inputs.features(vae, chosen);
     let (mean, log_variance) = vae.encoder.posterior(&features, if decoder_alone { 0.0 } else { settings.dropout });
-    let latent = &mean + (&log_variance * 0.5).exp() * Tensor::randn_like(&mean);
+    let latent = reparameterised(&mean, &log_variance, &Tensor::randn_like(&mean));
     let latent = if decoder_alone { latent.detach() } else { latent };
     // The decoder knows the data set's poses alone, and learns of batches of them.
     let known = only.iter().all(|&i| pictures.labels[i].role.is_some());
@@ -487,8 +483,7 @@ fn losses(
     let state = (settings.state_weight > 0.0).then(|| {
         let rows: Vec<i64> = only.iter().map(|&i| i as i64).collect();
         let wanted = state_targets.index_select(0, &indices(&rows, state_targets.device()));
-        let log = vae.read_out.forward(&latent).log_softmax(-1, Kind::Float);
-        -(wanted * log).sum_dim_intlist([-1_i64].as_slice(), false, Kind::Float).mean(Kind::Float)
+        cross_entropy(&vae.read_out.forward(&latent), &wanted)
     });
     let contrastive = (settings.contrastive_weight > 0.0).then(|| {
         let states: Vec<i64> = only.iter().map(|&i| pictures.labels[i].state as i64).collect();
@@ -499,6 +494,29 @@ fn losses(
 
 fn indices(rows: &[i64], device: Device) -> Tensor {
     Tensor::from_slice(rows).to_device(device)
+}
+
+/// Draws from Gaussians with means and log-variances `[N, 8]` by standard normal `noise` `[N, 8]`, so that gradients reach
+/// both (Kingma and Welling 2014).
+pub fn reparameterised(mean: &Tensor, log_variance: &Tensor, noise: &Tensor) -> Tensor {
+    mean + (log_variance * 0.5).exp() * noise
+}
+
+/// Squared error of what a decoder made, `[N, 3, H, W]`, times ten; pixels of `targets` that differ by more than 12 of 255
+/// from `means`, the poses' mean pictures, weigh `foreground_weight`. With `residual` the difference from the mean picture is
+/// what was to be made, else the picture.
+pub fn reconstruction_error(made: &Tensor, targets: &Tensor, means: &Tensor, settings: &VaeTraining) -> Tensor {
+    let residual = targets - means;
+    let changed = residual.abs().amax([1_i64].as_slice(), true).gt(12.0 / 255.0).to_kind(Kind::Float);
+    let weight = changed * (settings.foreground_weight - 1.0) + 1.0;
+    let wanted = if settings.residual { &residual } else { targets };
+    ((made - wanted).square() * weight).mean(Kind::Float) * 10.0
+}
+
+/// Mean over the batch of the cross entropy of `logits` `[N, S]` with the `wanted` distributions `[N, S]`.
+pub fn cross_entropy(logits: &Tensor, wanted: &Tensor) -> Tensor {
+    let log = logits.log_softmax(-1, Kind::Float);
+    -(wanted * log).sum_dim_intlist([-1_i64].as_slice(), false, Kind::Float).mean(Kind::Float)
 }
 
 /// Mean over the batch of KL(N(mean, exp(log variance)) || N(0, 1)), summed over dimensions. Inputs `[N, 8]`.
