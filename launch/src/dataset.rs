@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, bail};
 use carff_dataset::{Dataset, DatasetReport, ImportOptions, SheetOptions, contact_sheet, import};
 use carff_scenes::{Extras, Scenario};
+use carff_training::places::places;
 use indicatif::{ProgressBar, ProgressStyle};
 
 /// What to do with data sets.
@@ -140,6 +141,12 @@ fn check(dir: &Path, sheet: Option<&Path>, columns: usize) -> anyhow::Result<()>
     let dataset = Dataset::open(dir)?;
     let images = dataset.load_all_images()?;
     print!("{}", DatasetReport::of(&dataset, &images));
+    if let Some(scenario) = dataset.scenario().filter(|s| s.state_count() > 1) {
+        match places(scenario) {
+            Ok(places) => println!("Places that are probed: {}", places.len()),
+            Err(problem) => println!("warning: {problem}"),
+        }
+    }
     if let Some(path) = sheet {
         contact_sheet(&dataset, &images, SheetOptions { columns, ..SheetOptions::default() }).save_png(path)?;
         println!("Contact sheet: {}", path.display());

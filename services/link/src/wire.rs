@@ -257,7 +257,7 @@ mod tests {
             ("\"width_px\":3", "\"width_px\":4294967295"),
             ("\"probability\":0.1", "\"probability\":7.1"),
             ("\"probability\":0.1", "\"probability\":1e999"),
-            ("\"schema_version\":1", "\"schema_version\":2"),
+            ("\"schema_version\":2", "\"schema_version\":3"),
             ("\"sequence\":3", "\"sequence\":-3"),
             ("\"tag\"", "\"more\":1,\"tag\""),
         ] {

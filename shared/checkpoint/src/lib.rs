@@ -20,6 +20,10 @@ use std::path::{Path, PathBuf};
 
 /// The format that this program writes and reads.
 pub const FORMAT_VERSION: u32 = 1;
+/// Most states that a checkpoint can tell apart; messages carry as many.
+pub const MAX_STATES: usize = 64;
+/// Most places that a checkpoint can probe; messages carry as many.
+pub const MAX_PLACES: usize = 64;
 /// A manifest is larger than this only by mistake.
 const MAX_MANIFEST_BYTES: u64 = 16 << 20;
 
@@ -221,8 +225,8 @@ impl Manifest {
 
     fn check(&self) -> Result<(), String> {
         let states = self.scenario.state_count();
-        if !(1..=64).contains(&states) {
-            return Err(format!("`scenario` has {states} states; 1 to 64 are allowed"));
+        if !(1..=MAX_STATES).contains(&states) {
+            return Err(format!("`scenario` has {states} states; 1 to {MAX_STATES} are allowed"));
         }
         if let Some(b) = self.scenario.hazard_branches.iter().find(|b| **b >= self.scenario.branches.len()) {
             return Err(format!(
@@ -237,8 +241,8 @@ impl Manifest {
         if !self.states.iter().all(finite) {
             return Err("`states` has a number that is not finite".into());
         }
-        if self.places.len() > 16 {
-            return Err(format!("`places` has {} entries; at most 16 are allowed", self.places.len()));
+        if self.places.len() > MAX_PLACES {
+            return Err(format!("`places` has {} entries; at most {MAX_PLACES} are allowed", self.places.len()));
         }
         Ok(())
     }

@@ -94,6 +94,24 @@ fn whole_set() {
     assert_eq!(dataset.load_all_images().unwrap().len(), 8);
 }
 
+/// The book's example is a set as it stands: read with no warning, each state with what stands in it.
+#[test]
+fn the_books_example_is_a_set() {
+    let page = include_str!("../../../docs/book/src/sets-of-pictures.md");
+    let example = page.split("```json").nth(1).and_then(|rest| rest.split("```").next()).unwrap();
+    let set: Value = serde_json::from_str(example).unwrap();
+    let dir = tempfile::tempdir().unwrap();
+    std::fs::create_dir(dir.path().join("images")).unwrap();
+    for frame in set["frames"].as_array().unwrap() {
+        Image::filled(128, 128, [7; 3]).save_png(&dir.path().join(frame["file_path"].as_str().unwrap())).unwrap();
+    }
+    std::fs::write(dir.path().join("transforms.json"), example).unwrap();
+    let set = Dataset::open(dir.path()).unwrap();
+    let states = &set.scenario().unwrap().states;
+    assert_eq!(states.iter().map(|s| s.boxes.len()).collect::<Vec<_>>(), [1, 1, 0, 0]);
+    assert!((set.state_count(), set.view_count()) == (4, 1) && set.warnings().is_empty());
+}
+
 /// The form of the CARFF authors: `scene_id` alone, `view_index` or `time_index` in place of `view_id`.
 #[test]
 fn authors_form() {

@@ -142,7 +142,7 @@ message!(Forecast);
 /// What probing found in one latent.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, ZeroCopySend)]
-#[type_name("carff.ProbeResult.v1")]
+#[type_name("carff.ProbeResult.v2")]
 pub struct ProbeResult {
     /// Index of the state; -1 for none of the known ones.
     pub state: i32,
@@ -169,7 +169,7 @@ impl ProbeResult {
 /// What the prober makes of a forecast. Entries beyond the counts mean nothing.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, ZeroCopySend)]
-#[type_name("carff.Belief.v1")]
+#[type_name("carff.Belief.v2")]
 pub struct Belief {
     /// Header, at the step of the forecast.
     pub header: Header,
@@ -177,7 +177,7 @@ pub struct Belief {
     pub horizon: u32,
     /// States of the scenario, 1..=64.
     pub state_count: u32,
-    /// Places probed, 1..=16.
+    /// Places probed, 1..=64.
     pub place_count: u32,
     /// Mixture components, 1..=4.
     pub component_count: u32,

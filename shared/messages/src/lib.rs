@@ -35,7 +35,7 @@ pub use iceoryx2::prelude::ZeroCopySend;
 use check::{at_most, equals};
 
 /// Version of all layouts in this crate. A process drops what carries another one.
-pub const SCHEMA_VERSION: u32 = 1;
+pub const SCHEMA_VERSION: u32 = 2;
 /// Dimensions of the scene latent.
 pub const LATENT_DIM: usize = 8;
 /// Most components that a mixture can have.
@@ -45,7 +45,7 @@ pub const MAX_SAMPLES: usize = 64;
 /// Most states (branch, timestamp) that a scenario can have.
 pub const MAX_STATES: usize = 64;
 /// Most boxes that are probed for density.
-pub const MAX_PLACES: usize = 16;
+pub const MAX_PLACES: usize = 64;
 /// Most steps that a forecast looks ahead.
 pub const MAX_HORIZON: u32 = 8;
 /// Largest width or height of a picture, pixels.

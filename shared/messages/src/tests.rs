@@ -145,7 +145,7 @@ fn garbage_never_panics() {
             }
             health.header = super::Header::of_frame(0, 0, 0);
             (forecast.horizon, forecast.source, forecast.component_count, forecast.sample_count) = (2, 0, 4, 64);
-            (belief.horizon, belief.state_count, belief.place_count) = (2, 64, 16);
+            (belief.horizon, belief.state_count, belief.place_count) = (2, 64, 64);
             (belief.component_count, belief.sample_count, belief.is_final) = (4, 64, 0);
         }
         assert!(forecast.validate().is_err());

@@ -9,6 +9,7 @@ use crate::{
     config::TrainingConfig,
     field::{self, Clouds},
     pictures::Pictures,
+    places::places,
     run::{Progress, Run},
 };
 use carff_dataset::{DatasetWriter, FrameRecord, Image, PoseRole, ScenarioInfo};
@@ -64,6 +65,8 @@ pub fn set(config: &TrainingConfig, dataset: &Path, run: &Run) -> Result<Option<
     if pictures.scenario.state_count() == 1 {
         return Ok(None);
     }
+    // What the forecast cannot be trained on is refused before an hour goes into it.
+    places(&pictures.scenario)?;
     let dir = run.dir.join(FOLDER);
     let there = dir.join("transforms.json").is_file() || make(config, &pictures, &dir, run)?;
     Ok(there.then_some(dir))

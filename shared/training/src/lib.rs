@@ -12,6 +12,7 @@ pub mod free;
 pub mod mixture;
 pub mod pictures;
 pub mod pipeline;
+pub mod places;
 pub mod run;
 pub mod vae;
 

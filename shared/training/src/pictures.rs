@@ -8,6 +8,9 @@ use rand::Rng;
 use std::path::Path;
 use tch::{Kind, Tensor};
 
+const NO_SCENARIO: &str = "transforms.json has no `scenario`, which says what states there are (docs/book/src/sets-of-pictures.md \
+                           shows one); a set of one scene can be imported without: `carff dataset import`";
+
 /// What is known of one picture.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Label {
@@ -49,7 +52,7 @@ impl Pictures {
     pub fn open(dir: &Path, split_seed: u64) -> Result<Self, TrainingError> {
         let dataset = Dataset::open(dir)?;
         let unfit = |what: &str| TrainingError::Unfit(format!("{}: {what}", dir.display()));
-        let scenario = dataset.scenario().cloned().ok_or_else(|| unfit("transforms.json has no `scenario`"))?;
+        let scenario = dataset.scenario().cloned().ok_or_else(|| unfit(NO_SCENARIO))?;
         let images = dataset.load_all_images()?;
         let split = PoseSplit::for_dataset(&dataset, split_seed);
         let labels = labels(&dataset, 0, |view| Some(split.role(view))).map_err(|what| unfit(&what))?;

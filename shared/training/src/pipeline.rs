@@ -6,6 +6,7 @@ use crate::{
     field::{self, Clouds},
     mixture::{self, Mdn},
     pictures::Pictures,
+    places::places,
     run::{Progress, Run, damaged},
     vae::{self, Inputs, Vae},
 };
@@ -17,7 +18,7 @@ use carff_field::{Field, RenderBuffer, RenderOptions};
 use carff_latent::{LATENT_DIM, LatentGaussian, Sampling};
 use carff_models::stored::save_weights;
 use carff_planning::{CalibrationTrial, Rule, choose_threshold, unchosen_threshold};
-use carff_probing::{Calibration, Place, Prober};
+use carff_probing::{Calibration, Prober};
 use carff_random::Key;
 use serde_json::{Value, json};
 use std::path::Path;
@@ -60,6 +61,7 @@ pub fn train(
     if states == 1 {
         return field_alone(config, &pictures, out, stage, run);
     }
+    let places = places(&pictures.scenario)?;
     let pretrained = config.pretrained_backbone.as_deref();
     let mut vae = Vae::new(config, pictures.dataset.view_count(), states, pretrained, device)?;
     let posteriors = match finished(run, "vae", config.vae.all_epochs(), |state| vae.restore_weights(state)) {
@@ -73,7 +75,7 @@ pub fn train(
     };
     let mut metrics = json!({"vae": vae::evaluate(config, &pictures, &vae, &posteriors[0], true)?});
     let clouds = Clouds::new(&pictures, &posteriors[0])?;
-    let mut manifest = Manifest { places: places(&pictures), ..begun(config, &pictures, clouds.states()) };
+    let mut manifest = Manifest { places, ..begun(config, &pictures, clouds.states()) };
     write_vae(config, &vae, out)?;
 
     // The mixture density network before the field: it is quick, and needs the posteriors alone.
@@ -255,43 +257,6 @@ fn write_vae(config: &TrainingConfig, vae: &Vae, out: &Path) -> Result<(), Train
     }
     save_weights(out, files::ENCODER, &encoder)?;
     Ok(save_weights(out, files::DECODER, &decoder)?)
-}
-
-/// Every distinct box of the states, and every candidate, with the states in which it is taken. Boxes that no state
-/// moves tell nothing and are left out.
-pub fn places(pictures: &Pictures) -> Vec<Place> {
-    let scenario = &pictures.scenario;
-    let mut places: Vec<Place> = Vec::new();
-    let all = scenario
-        .states
-        .iter()
-        .enumerate()
-        .flat_map(|(state, info)| info.boxes.iter().map(move |b| (Some(state), b)))
-        .chain(scenario.candidates.iter().map(|c| (None, &c.named_box)));
-    for (state, named) in all {
-        let b = named.oriented_box;
-        let near = |other: &Place| {
-            let o = other.oriented_box;
-            let distance: f64 = (0..3).map(|i| (o.center[i] - b.center[i]).powi(2)).sum();
-            // What is small moves by little: a hand's places lie closer than a car's.
-            let close = (0.2 * b.half_size.iter().map(|h| h * h).sum::<f64>().sqrt()).min(0.25);
-            other.name == named.name && distance.sqrt() < close && (o.yaw - b.yaw).abs() < 0.1
-        };
-        let at = places.iter().position(near).unwrap_or_else(|| {
-            places.push(Place {
-                name: named.name.clone(),
-                oriented_box: b,
-                occupied_in: vec![false; scenario.state_count()],
-            });
-            places.len() - 1
-        });
-        if let Some(state) = state {
-            places[at].occupied_in[state] = true;
-        }
-    }
-    places.retain(|p| p.occupied_in.contains(&true) && p.occupied_in.contains(&false));
-    places.truncate(16);
-    places
 }
 
 /// Latents of each known state that the prober is calibrated on.

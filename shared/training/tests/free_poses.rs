@@ -7,13 +7,14 @@ use carff_scenes::{Extras, RenderOptions, Scenario};
 use carff_training::{
     TrainingError,
     config::TrainingConfig,
-    free,
+    free, pipeline,
     run::{Progress, Run},
 };
 use std::collections::BTreeMap;
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
+use tch::Device;
 
 /// A block drives along a road, or does not; cameras look at it, or stand behind a wall.
 const SCENARIO: &str = include_str!("../../../tests/data/small-scenario.toml");
@@ -142,6 +143,27 @@ fn states_that_look_the_same_stay_the_same() {
     for name in names {
         assert!(made[name] == made[&name.replace("b0_t0", "b1_t0")], "{name}");
     }
+}
+
+/// A set whose boxes do not tell its states apart cannot be probed, and is refused before anything is made of it.
+#[test]
+fn a_set_without_boxes_is_refused_at_once() {
+    let place = Place::new();
+    let path = place.at("set").join("transforms.json");
+    let mut set: serde_json::Value = serde_json::from_str(&std::fs::read_to_string(&path).unwrap()).unwrap();
+    for key in ["states", "candidates"] {
+        set["scenario"].as_object_mut().unwrap().remove(key);
+    }
+    std::fs::write(&path, set.to_string()).unwrap();
+    let refused = place.make("run", None).unwrap_err().to_string();
+    assert!(refused.contains("`scenario.states[].boxes`"), "{refused}");
+    assert_eq!(std::fs::read_dir(place.at("run")).unwrap().count(), 0);
+    let stop = AtomicBool::new(false);
+    let run = Run { dir: place.at("run"), on_progress: &|_| {}, stop: &stop };
+    let out = place.at("out");
+    let trained = pipeline::train(&place.config, &place.at("set"), None, &out, pipeline::Stage::All, Device::Cpu, &run);
+    assert!(trained.unwrap_err().to_string().contains("`scenario.states[].boxes`"));
+    assert!(!out.exists());
 }
 
 /// What is made does not depend on the pictures of unseen poses: a result on these is one on what nothing was learnt from.
