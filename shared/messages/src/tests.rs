@@ -63,7 +63,7 @@ fn one_wrong_field_is_enough() {
     }
     let wrong_beliefs: [fn(&mut Belief); 11] = [
         |m| m.state_count = 65,
-        |m| m.place_count = 17,
+        |m| m.place_count = 65,
         |m| m.is_final = 0,
         |m| m.is_final = 7,
         |m| m.state_probability[0] = 0.2,
