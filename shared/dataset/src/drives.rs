@@ -123,6 +123,9 @@ pub fn eligible_inputs(dataset: &Dataset, views: &[usize]) -> Result<Vec<Eligibl
     Ok(inputs)
 }
 
+/// Poses that can be driven, each with the branch of each of its inputs.
+type Poses = Vec<(usize, Vec<usize>)>;
+
 /// Plans drives: hazard and clear ones in turn, their poses drawn by seed out of `views` without replacement while
 /// they last. One kind alone where no pose allows the other; where none allows either, drives without a right answer,
 /// through any branch. The same arguments give the same drives.
@@ -132,9 +135,7 @@ pub fn plan_drives(dataset: &Dataset, views: &[usize], count: usize, seed: u64) 
     let frames = |branch: usize, view: usize| -> Option<Vec<usize>> {
         (0..scenario.timestamps).map(|t| dataset.frame_index(scenario.state(branch, t)?, view)).collect()
     };
-    // For each kind one entry for each pose, with the branch of each of its inputs; a pose that lacks a timestamp cannot
-    // be driven.
-    type Poses = Vec<(usize, Vec<usize>)>;
+    // A pose that lacks a timestamp cannot be driven.
     let (mut hazard, mut clear): (Poses, Poses) = Default::default();
     for input in eligible_inputs(dataset, views)?.iter().filter(|i| frames(i.branch, i.view).is_some()) {
         let poses = if input.kind == DriveKind::Hazard { &mut hazard } else { &mut clear };
