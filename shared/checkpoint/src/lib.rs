@@ -23,7 +23,7 @@ pub const FORMAT_VERSION: u32 = 1;
 /// Most states that a checkpoint can tell apart; messages carry as many.
 pub const MAX_STATES: usize = 64;
 /// Most places that a checkpoint can probe; messages carry as many.
-pub const MAX_PLACES: usize = 64;
+pub const MAX_PLACES: usize = 48;
 /// A manifest is larger than this only by mistake.
 const MAX_MANIFEST_BYTES: u64 = 16 << 20;
 

@@ -177,7 +177,7 @@ pub struct Belief {
     pub horizon: u32,
     /// States of the scenario, 1..=64.
     pub state_count: u32,
-    /// Places probed, 1..=64.
+    /// Places probed, 1..=48.
     pub place_count: u32,
     /// Mixture components, 1..=4.
     pub component_count: u32,
@@ -215,7 +215,6 @@ pub struct Belief {
 
 impl Belief {
     /// A belief with no result yet, to be filled in.
-    #[allow(clippy::large_stack_arrays, reason = "17 KB: the message's own size, which is on the stack as well")]
     pub fn empty(header: Header, horizon: u32) -> Self {
         Self {
             header,

@@ -45,7 +45,7 @@ pub const MAX_SAMPLES: usize = 64;
 /// Most states (branch, timestamp) that a scenario can have.
 pub const MAX_STATES: usize = 64;
 /// Most boxes that are probed for density.
-pub const MAX_PLACES: usize = 64;
+pub const MAX_PLACES: usize = 48;
 /// Most steps that a forecast looks ahead.
 pub const MAX_HORIZON: u32 = 8;
 /// Largest width or height of a picture, pixels.

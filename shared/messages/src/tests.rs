@@ -63,7 +63,7 @@ fn one_wrong_field_is_enough() {
     }
     let wrong_beliefs: [fn(&mut Belief); 11] = [
         |m| m.state_count = 65,
-        |m| m.place_count = 65,
+        |m| m.place_count = 49,
         |m| m.is_final = 0,
         |m| m.is_final = 7,
         |m| m.state_probability[0] = 0.2,
@@ -145,7 +145,7 @@ fn garbage_never_panics() {
             }
             health.header = super::Header::of_frame(0, 0, 0);
             (forecast.horizon, forecast.source, forecast.component_count, forecast.sample_count) = (2, 0, 4, 64);
-            (belief.horizon, belief.state_count, belief.place_count) = (2, 64, 64);
+            (belief.horizon, belief.state_count, belief.place_count) = (2, 64, 48);
             (belief.component_count, belief.sample_count, belief.is_final) = (4, 64, 0);
         }
         assert!(forecast.validate().is_err());

@@ -156,7 +156,7 @@ fn messages_survive_their_forms() {
 #[test]
 fn what_is_no_message_is_refused() {
     let mut form = BeliefForm::from(&belief(&mut numbers()));
-    form.samples[0].densities = vec![0.0; 65];
+    form.samples[0].densities = vec![0.0; 49];
     assert!(Belief::try_from(&form).unwrap_err().to_string().contains("densities"));
     form.samples[0].densities = vec![0.0; 3];
     form.hazard_probability = 2.0;

@@ -106,12 +106,12 @@ mod tests {
     #[test]
     fn too_many_are_told() {
         let both = |t: usize| vec![named("ego", 3.0 * t as f64, false), named("truck", 3.0 * t as f64, true)];
-        assert_eq!(places(&scenario(30, both)).unwrap().len(), 60);
+        assert_eq!(places(&scenario(24, both)).unwrap().len(), 48);
         let found = places(&scenario(32, |t| [both(t), vec![named("bus", 3.0 * t as f64, false)]].concat())).unwrap();
         assert!(found.len() == 32 && found.iter().all(|p| p.name == "truck"));
         let trucks = |t: usize| ["truck", "bus", "car"].map(|name| named(name, 3.0 * t as f64, true)).to_vec();
         let told = |info: &ScenarioInfo| places(info).unwrap_err().to_string();
-        assert!(told(&scenario(32, trucks)).contains("96 different places; at most 64"));
+        assert!(told(&scenario(32, trucks)).contains("96 different places; at most 48"));
         assert!(told(&scenario(33, both)).contains("66 states"));
     }
 

@@ -1,5 +1,7 @@
 //! Contract of the loss terms: each one's gradient is how the loss really changes, by central differences.
 
+#![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
+
 use carff_checkpoint::shapes::MixtureConfig;
 use carff_models::mixture::MixtureNet;
 use carff_training::{

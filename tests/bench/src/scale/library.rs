@@ -16,7 +16,7 @@ use std::path::Path;
 
 const SIDES_PX: [u32; 7] = [32, 48, 64, 96, 128, 192, 256];
 const SIDES_PX_QUICK: [u32; 4] = [32, 64, 128, 256];
-/// Numbers of places; messages carry up to 64, the library any number.
+/// Numbers of places; messages carry up to 48, the library any number.
 const PLACES: [u32; 8] = [1, 2, 4, 8, 16, 24, 32, 64];
 const PLACES_QUICK: [u32; 4] = [1, 8, 32, 64];
 /// Hypotheses that are probed: the default number of samples.
