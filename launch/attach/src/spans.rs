@@ -1,8 +1,8 @@
 //! When each stage worked on which frame, out of its messages; as lines, and as a trace file that Perfetto and Chrome
 //! open.
 
+use carff_messages::forms::AnyMessage;
 use carff_messages::{ActionCode, Reason, Stage};
-use carff_readable::AnyMessage;
 use serde_json::{Value, json};
 
 /// A stage's work on a frame.
