@@ -5,7 +5,7 @@ use carff_messages::{
     Action, ActionCode, Belief, FrameMeta, Gaussian, Health, HealthState, Observability, Posterior, Reason, Stage,
     ViewMeta,
 };
-use carff_transport::{Node, OpenError, PictureReceiver, ReceiveError, Receiver, topics};
+use carff_transport::{Image, Node, OpenError, ReceiveError, Receiver, topics};
 use std::collections::{BTreeMap, VecDeque};
 
 /// Everything known about one camera frame. What is from the data set is -1 or `Unknown` where there is none.
@@ -221,11 +221,11 @@ impl Records {
 /// Subscribed to all topics of a run.
 #[derive(Debug)]
 pub struct Monitor {
-    frames: PictureReceiver<FrameMeta>,
+    frames: Receiver<Image<FrameMeta>>,
     posteriors: Receiver<Posterior>,
     beliefs: Receiver<Belief>,
     actions: Receiver<Action>,
-    views: PictureReceiver<ViewMeta>,
+    views: Receiver<Image<ViewMeta>>,
     healths: Vec<Receiver<Health>>,
     /// What was recorded.
     pub records: Records,
@@ -240,13 +240,13 @@ impl Monitor {
             horizon: graph.run.horizon,
             width_px: graph.renderer.width_px,
         };
-        let healths = Stage::ALL.iter().map(|&stage| Ok(node.receiver(&topics::health(stage))?.polled()));
+        let healths = Stage::ALL.iter().map(|&stage| Ok(node.receiver(topics::health(stage))?.polled()));
         Ok(Self {
-            frames: node.picture_receiver(&topics::FRAME)?.polled(),
+            frames: node.receiver(&topics::FRAME)?.polled(),
             posteriors: node.receiver(&topics::POSTERIOR)?.polled(),
             beliefs: node.receiver(&topics::BELIEF)?.polled(),
             actions: node.receiver(&topics::ACTION)?.polled(),
-            views: node.picture_receiver(&topics::VIEW)?.polled(),
+            views: node.receiver(&topics::VIEW)?.polled(),
             healths: healths.collect::<Result<_, _>>()?,
             records: Records { wanted, ..Records::default() },
         })
@@ -256,7 +256,7 @@ impl Monitor {
     pub fn drain(&mut self, mut decided: impl FnMut(&FrameRecord)) -> Result<(), ReceiveError> {
         // In the order of the data's way, so that what refers to a frame finds it.
         while let Some(frame) = self.frames.next()? {
-            self.records.take_frame(frame.meta());
+            self.records.take_frame(&frame);
         }
         while let Some(posterior) = self.posteriors.next()? {
             self.records.take_posterior(&posterior);
@@ -270,7 +270,7 @@ impl Monitor {
             }
         }
         while let Some(view) = self.views.next()? {
-            self.records.take_view(view.meta());
+            self.records.take_view(&view);
         }
         for receiver in &mut self.healths {
             while let Some(health) = receiver.next()? {

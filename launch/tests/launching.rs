@@ -42,7 +42,7 @@ fn fake_stage() {
 }
 
 fn camera(stage: &mut StageContext) -> anyhow::Result<()> {
-    let mut frames = stage.picture_output(&topics::FRAME, (SIDE * SIDE * 3) as usize)?;
+    let mut frames = stage.image_output(&topics::FRAME, (SIDE * SIDE * 3) as usize)?;
     stage.ready();
     for frame_id in 0..stage.args.frames.unwrap_or(u64::MAX) {
         if stage.wait_until(&[], monotonic_now_ns() + 20_000_000)? == Woken::Stopped {
@@ -58,7 +58,7 @@ fn camera(stage: &mut StageContext) -> anyhow::Result<()> {
         };
         let mut loan = frames.loan((SIDE * SIDE * 3) as usize)?;
         loan.bytes_mut().fill(frame_id as u8);
-        frames.send(loan, meta)?;
+        frames.send_image(loan, meta)?;
     }
     stage.wait_until(&[], monotonic_now_ns() + 300_000_000)?;
     Ok(())
@@ -67,7 +67,7 @@ fn camera(stage: &mut StageContext) -> anyhow::Result<()> {
 /// Faults: `none`; `start` fails before it is ready; `once` dies in mid-run, its first life only; `always`.
 fn encoder(stage: &mut StageContext, fault: &str) -> anyhow::Result<()> {
     anyhow::ensure!(fault != "start", "the weights are not where they should be");
-    let mut frames = stage.picture_input(&topics::FRAME)?;
+    let mut frames = stage.input(&topics::FRAME)?;
     let mut posteriors = stage.output(&topics::POSTERIOR)?;
     let mark = stage.args.graph.with_extension("died");
     stage.ready();
@@ -81,7 +81,7 @@ fn encoder(stage: &mut StageContext, fault: &str) -> anyhow::Result<()> {
         }
         let mut gaussian = Gaussian::standard();
         gaussian.mean[0] = f32::from(frame.bytes()[0]);
-        let header = frame.meta().header;
+        let header = frame.header;
         let stage_latency_ns = stage.worked(&header, monotonic_now_ns());
         posteriors.send(Posterior { header, gaussian, stage_latency_ns })?;
     }

@@ -24,14 +24,14 @@ fn a_folder_with_bad_pictures() {
     );
     let graph = TestGraph::new(Path::new("none"), Path::new("none"), &rest);
     let node = Node::open(graph.run(), "test").unwrap();
-    let mut frames = node.picture_receiver(&topics::FRAME).unwrap();
-    let mut healths = node.receiver(&topics::health(Stage::Camera)).unwrap();
+    let mut frames = node.receiver(&topics::FRAME).unwrap();
+    let mut healths = node.receiver(topics::health(Stage::Camera)).unwrap();
     let camera = graph.stage(Stage::Camera);
     let mut shown = Vec::new();
     let mut health: Option<Health> = None;
     let done = eventually(|| {
         while let Some(frame) = frames.next().unwrap() {
-            assert_eq!((frame.meta().width_px, frame.meta().height_px), (16, 8));
+            assert_eq!((frame.width_px, frame.height_px), (16, 8));
             shown.push(frame.bytes()[0]);
         }
         while let Some(latest) = healths.next().unwrap() {
@@ -87,12 +87,12 @@ fn free_drives_are_published() {
     );
     let graph = TestGraph::new(Path::new("none"), Path::new("none"), &rest);
     let node = Node::open(graph.run(), "test").unwrap();
-    let mut frames = node.picture_receiver(&topics::FRAME).unwrap();
+    let mut frames = node.receiver(&topics::FRAME).unwrap();
     let camera = graph.stage(Stage::Camera);
     let mut shown = Vec::new();
     let done = eventually(|| {
         while let Some(frame) = frames.next().unwrap() {
-            let meta = frame.meta();
+            let meta = &*frame;
             let view = meta.dataset_view;
             shown.push((view.drive, view.timestamp, view.branch, meta.world_from_camera.map(f64::to_bits)));
         }

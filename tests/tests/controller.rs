@@ -51,7 +51,7 @@ impl Controlled {
         let node = Node::open(graph.run(), "test").unwrap();
         let beliefs = node.publisher(&topics::BELIEF).unwrap();
         let actions = node.receiver(&topics::ACTION).unwrap();
-        let healths = node.receiver(&topics::health(Stage::Controller)).unwrap();
+        let healths = node.receiver(topics::health(Stage::Controller)).unwrap();
         let process = graph.stage(Stage::Controller);
         let mut controlled =
             Self { graph, process, beliefs, actions, healths, seen: Vec::new(), health: None, _node: node };

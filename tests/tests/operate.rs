@@ -2,9 +2,10 @@
 
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
-use carff_observe::{AnyReceiver, TopicId, attach};
+use carff_observe::attach;
 use carff_tests::{Finished, Process, TestGraph, WATCHDOG, eventually, program, scenario_set, shipped_checkpoint};
 use carff_transport::OpenError;
+use carff_transport::TopicId;
 use foxglove::Decode as _;
 use foxglove::messages::RawImage;
 use rustix::process::Signal;
@@ -135,7 +136,7 @@ fn probes_come_and_go() {
     let here = attach(Some(graph.run().name()), "crowd").unwrap();
     let mut crowd = Vec::new();
     let full = loop {
-        match AnyReceiver::open(&here.node, TopicId::Frame) {
+        match TopicId::FRAME.polled_receiver(&here.node) {
             Ok(receiver) => crowd.push(receiver),
             Err(error) => break error,
         }

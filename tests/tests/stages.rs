@@ -39,13 +39,13 @@ fn rogue_messages_stop_at_the_next_stage() {
     let graph = TestGraph::new(Path::new("none"), &shipped_checkpoint(), rest);
     let run_id = graph.run().id();
     let node = Node::open(graph.run(), "test").unwrap();
-    let mut frames = node.picture_publisher(&topics::FRAME, BYTES).unwrap();
+    let mut frames = node.image_publisher(&topics::FRAME, BYTES).unwrap();
     let mut posteriors = node.publisher(&topics::POSTERIOR).unwrap();
     let mut forecasts = node.publisher(&topics::FORECAST).unwrap();
     let mut beliefs = node.publisher(&topics::BELIEF).unwrap();
     let mut actions = node.receiver(&topics::ACTION).unwrap();
     let mut healths: Vec<Receiver<Health>> =
-        PATH.iter().map(|&stage| node.receiver(&topics::health(stage)).unwrap()).collect();
+        PATH.iter().map(|&stage| node.receiver(topics::health(stage)).unwrap()).collect();
     let processes: Vec<Process> = PATH.iter().map(|&stage| graph.stage(stage)).collect();
     let said = || processes.iter().map(Process::text).collect::<Vec<_>>().join("\n");
 
@@ -65,8 +65,8 @@ fn rogue_messages_stop_at_the_next_stage() {
 
     let mut blind = frame(run_id, 900);
     blind.intrinsics.fl_x_px = f64::NAN;
-    frames.send_unchecked(frames.loan(BYTES).unwrap(), blind).unwrap();
-    frames.send_unchecked(frames.loan(BYTES / 2).unwrap(), frame(run_id, 901)).unwrap();
+    frames.send_image_unchecked(frames.loan(BYTES).unwrap(), blind).unwrap();
+    frames.send_image_unchecked(frames.loan(BYTES / 2).unwrap(), frame(run_id, 901)).unwrap();
     let mut posterior =
         Posterior { header: header(run_id, 902, 0), gaussian: Gaussian::standard(), stage_latency_ns: 0 };
     posterior.gaussian.mean[5] = f32::NAN;
@@ -91,7 +91,7 @@ fn rogue_messages_stop_at_the_next_stage() {
 
     let mut loan = frames.loan(BYTES).unwrap();
     loan.bytes_mut().fill(128);
-    frames.send(loan, frame(run_id, 1)).unwrap();
+    frames.send_image(loan, frame(run_id, 1)).unwrap();
     let mut based_on = Vec::new();
     let decided = eventually(|| {
         while let Some(action) = actions.next().unwrap() {

@@ -3,8 +3,8 @@
 use crate::probe::session::{Session, SessionArgs};
 use anyhow::Context;
 use carff_checkpoint::Manifest;
-use carff_observe::TopicId;
 use carff_recording::{channels, encode};
+use carff_transport::TopicId;
 use carff_transport::monotonic_now_ns;
 use clap::Args;
 use foxglove::{ChannelBuilder, PartialMetadata, RawChannel, WebSocketServer};

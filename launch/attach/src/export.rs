@@ -1,11 +1,12 @@
 //! `carff export`: a recording as pictures, tables, a film, or a trace.
 
 use crate::film::FilmWriter;
-use crate::probe::image::view_name;
+use crate::probe::image::named_image;
 use crate::spans::{Span, trace_events};
 use anyhow::{Context, ensure};
-use carff_observe::TopicId;
-use carff_recording::{OwnedMessage, Reader};
+use carff_messages::{FrameMeta, ImageMeta};
+use carff_recording::Reader;
+use carff_transport::TopicId;
 use clap::Args;
 use serde_json::Value;
 use std::collections::{BTreeMap, BTreeSet};
@@ -73,13 +74,10 @@ fn pictures(recording: &Path, folder: &Path) -> anyhow::Result<u64> {
     let mut reader = Reader::open(recording)?;
     let mut count = 0;
     while let Some(entry) = reader.next()? {
-        let (name, width_px, height_px, rgb) = match &entry.message {
-            OwnedMessage::Frame(m, rgb) => (format!("frame-{:06}", m.header.frame_id), m.width_px, m.height_px, rgb),
-            OwnedMessage::View(m, rgb) => (view_name(m), m.width_px, m.height_px, rgb),
-            _ => continue,
-        };
+        let message = entry.message.as_message();
+        let Some((name, [width_px, height_px])) = named_image(message) else { continue };
         let path = folder.join(format!("{name}.png"));
-        image::save_buffer(&path, rgb, width_px, height_px, image::ColorType::Rgb8)
+        image::save_buffer(&path, message.bytes(), width_px, height_px, image::ColorType::Rgb8)
             .with_context(|| format!("cannot write {}", path.display()))?;
         count += 1;
     }
@@ -154,7 +152,7 @@ fn frame_rate_hz(recording: &Path) -> anyhow::Result<f64> {
     let mut reader = Reader::open(recording)?;
     let (mut before_ns, mut between) = (None, Vec::new());
     while let Some(entry) = reader.next()? {
-        if let OwnedMessage::Frame(m, _) = &entry.message {
+        if let Some(m) = entry.message.as_message().get::<FrameMeta>() {
             let at_ns = m.header.capture_time_ns;
             if let Some(before_ns) = before_ns.replace(at_ns) {
                 between.push(at_ns.saturating_sub(before_ns) as f64);
@@ -170,14 +168,15 @@ fn film(recording: &Path, file: &Path) -> anyhow::Result<u64> {
     let mut reader = Reader::open(recording)?;
     let mut film = None;
     while let Some(entry) = reader.next()? {
-        let OwnedMessage::Frame(m, rgb) = &entry.message else { continue };
-        let size_px = [m.width_px, m.height_px];
+        let message = entry.message.as_message();
+        let Some(m) = message.get::<FrameMeta>() else { continue };
+        let size_px = m.size_px();
         let film = match &mut film {
             Some(film) => film,
             None => film.insert(FilmWriter::create(file, size_px, rate_hz)?),
         };
         ensure!(film.size_px() == size_px, "frame {} has another size than the first", m.header.frame_id);
-        film.add(rgb, m.header.capture_time_ns)?;
+        film.add(message.bytes(), m.header.capture_time_ns)?;
     }
     film.with_context(|| format!("{} holds no camera frame", recording.display()))?.finish()
 }
@@ -197,7 +196,7 @@ fn spans(recording: &Path, file: &Path) -> anyhow::Result<usize> {
 mod tests {
     use super::*;
     use carff_messages::forms::AnyMessage;
-    use carff_messages::{FrameMeta, Gaussian, Header, Posterior};
+    use carff_messages::{Gaussian, Header, Posterior};
     use carff_recording::{About, Writer};
 
     fn recording(path: &Path) {
@@ -207,9 +206,9 @@ mod tests {
             let header = Header { publish_time_ns: at_ns + 1, ..Header::of_frame(frame, at_ns, 1) };
             let mut meta = FrameMeta { header, width_px: 2, height_px: 1, ..FrameMeta::default() };
             (meta.intrinsics.fl_x_px, meta.intrinsics.fl_y_px) = (1.0, 1.0);
-            writer.write(TopicId::Frame, AnyMessage::Frame(&meta, &[frame as u8; 6])).unwrap();
+            writer.write(TopicId::FRAME, AnyMessage::new(&meta, &[frame as u8; 6])).unwrap();
             let posterior = Posterior { header, gaussian: Gaussian::standard(), stage_latency_ns: frame };
-            writer.write(TopicId::Posterior, AnyMessage::Posterior(&posterior)).unwrap();
+            writer.write(TopicId::POSTERIOR, AnyMessage::new(&posterior, &[])).unwrap();
         }
         writer.finish().unwrap();
     }

@@ -4,8 +4,9 @@ use crate::probe::session::{Session, SessionArgs};
 use crate::terminal::Terminal;
 use anyhow::Context;
 use carff_checkpoint::Manifest;
-use carff_observe::{LiveRun, TopicId};
+use carff_observe::LiveRun;
 use carff_recording::{About, Limits, RecordingQueue, RotatingWriter};
+use carff_transport::TopicId;
 use carff_transport::monotonic_now_ns;
 use clap::Args;
 use std::path::PathBuf;
@@ -65,7 +66,7 @@ pub fn run(args: &RecordArgs) -> anyhow::Result<ExitCode> {
     let (mut status_ns, mut told) = (0, 0);
     let going = session.follow(
         // A writer that has failed ends it; what it failed of is told below.
-        |topic, message| Ok(queue.push(topic, message.message().into())),
+        |topic, message| Ok(queue.push(topic, message.message().to_owned())),
         || {
             let now_ns = monotonic_now_ns();
             if now_ns >= status_ns {

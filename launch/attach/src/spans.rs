@@ -1,8 +1,9 @@
 //! When each stage worked on which frame, out of its messages; as lines, and as a trace file that Perfetto and Chrome
 //! open.
 
+use crate::vitals::stage_latency_ns;
 use carff_messages::forms::AnyMessage;
-use carff_messages::{ActionCode, Reason, Stage};
+use carff_messages::{Action, ActionCode, Belief, Forecast, FrameMeta, Reason, Stage, ViewMeta};
 use serde_json::{Value, json};
 
 /// A stage's work on a frame.
@@ -25,28 +26,12 @@ impl Span {
     /// The work behind a message; none for heartbeats and for actions that are no decision.
     pub(crate) fn of(message: AnyMessage<'_>) -> Option<Self> {
         let header = message.header();
-        let (stage, took_ns, what) = match message {
-            AnyMessage::Frame(m, _) => (
-                Stage::Camera,
-                header.publish_time_ns.saturating_sub(header.capture_time_ns),
-                format!("{} x {} pixels", m.width_px, m.height_px),
-            ),
-            AnyMessage::Posterior(m) => (Stage::Encoder, m.stage_latency_ns, "posterior".to_owned()),
-            AnyMessage::Forecast(m) => (
-                Stage::Forecaster,
-                m.stage_latency_ns,
-                format!("{} samples of {} components", m.sample_count, m.component_count),
-            ),
-            AnyMessage::Belief(m) => (Stage::Prober, m.stage_latency_ns, format!("hazard {:.3}", m.hazard_probability)),
-            AnyMessage::View(m, _) => {
-                (Stage::Renderer, m.stage_latency_ns, format!("view of hypothesis {}", m.hypothesis))
-            }
-            AnyMessage::Action(m) if m.is_decision == 1 => {
-                let action = m.code().map_or("?", ActionCode::name);
-                let reason = m.reason().map_or("?", Reason::name);
-                (Stage::Controller, 0, format!("{action} ({reason}), hazard {:.3}", m.hazard_probability))
-            }
-            AnyMessage::Action(_) | AnyMessage::Health(_) => return None,
+        let (stage, took_ns) = if message.get::<FrameMeta>().is_some() {
+            (Stage::Camera, header.publish_time_ns.saturating_sub(header.capture_time_ns))
+        } else if message.get::<Action>().is_some_and(|m| m.is_decision == 1) {
+            (Stage::Controller, 0)
+        } else {
+            stage_latency_ns(message)?
         };
         let end_ns = header.publish_time_ns;
         Some(Self {
@@ -56,8 +41,27 @@ impl Span {
             capture_ns: header.capture_time_ns,
             begin_ns: end_ns.saturating_sub(took_ns),
             end_ns,
-            what,
+            what: what(message),
         })
+    }
+}
+
+/// The result that a message carries, in a few words.
+fn what(message: AnyMessage<'_>) -> String {
+    if let Some(m) = message.get::<FrameMeta>() {
+        format!("{} x {} pixels", m.width_px, m.height_px)
+    } else if let Some(m) = message.get::<Forecast>() {
+        format!("{} samples of {} components", m.sample_count, m.component_count)
+    } else if let Some(m) = message.get::<Belief>() {
+        format!("hazard {:.3}", m.hazard_probability)
+    } else if let Some(m) = message.get::<ViewMeta>() {
+        format!("view of hypothesis {}", m.hypothesis)
+    } else if let Some(m) = message.get::<Action>() {
+        let action = m.code().map_or("?", ActionCode::name);
+        let reason = m.reason().map_or("?", Reason::name);
+        format!("{action} ({reason}), hazard {:.3}", m.hazard_probability)
+    } else {
+        "posterior".to_owned()
     }
 }
 
@@ -94,7 +98,7 @@ mod tests {
     fn spans_are_where_the_messages_say() {
         let header = Header { publish_time_ns: 30_000_000, ..Header::of_frame(4, 10_000_000, 1) };
         let posterior = Posterior { header, gaussian: Gaussian::standard(), stage_latency_ns: 15_000_000 };
-        let span = Span::of(AnyMessage::Posterior(&posterior)).unwrap();
+        let span = Span::of(AnyMessage::new(&posterior, &[])).unwrap();
         assert_eq!(
             (span.stage, span.frame_id, span.begin_ns, span.end_ns),
             (Stage::Encoder, 4, 15_000_000, 30_000_000)

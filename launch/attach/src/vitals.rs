@@ -2,8 +2,10 @@
 
 use crate::probe::session::{Going, Session};
 use carff_messages::forms::AnyMessage;
-use carff_messages::{ActionCode, HealthState, Reason, Stage};
-use carff_observe::TopicId;
+use carff_messages::{
+    Action, ActionCode, Belief, Forecast, FrameMeta, Health, HealthState, Posterior, Reason, Stage, ViewMeta,
+};
+use carff_transport::TopicId;
 use carff_transport::monotonic_now_ns;
 use std::collections::{BTreeMap, VecDeque};
 
@@ -90,6 +92,15 @@ fn remember<T>(values: &mut VecDeque<T>, value: T) {
     values.push_back(value);
 }
 
+/// The stage that sent a message, and the time that it took, nanoseconds, where the message states it.
+pub(crate) fn stage_latency_ns(message: AnyMessage<'_>) -> Option<(Stage, u64)> {
+    let encoder = message.get::<Posterior>().map(|m| (Stage::Encoder, m.stage_latency_ns));
+    let forecaster = || message.get::<Forecast>().map(|m| (Stage::Forecaster, m.stage_latency_ns));
+    let prober = || message.get::<Belief>().map(|m| (Stage::Prober, m.stage_latency_ns));
+    let renderer = || message.get::<ViewMeta>().map(|m| (Stage::Renderer, m.stage_latency_ns));
+    encoder.or_else(forecaster).or_else(prober).or_else(renderer)
+}
+
 impl RunVitals {
     /// The topics that it is made of.
     pub(crate) fn topics() -> impl Iterator<Item = TopicId> {
@@ -99,47 +110,51 @@ impl RunVitals {
     /// Takes a message in.
     pub(crate) fn take(&mut self, message: AnyMessage<'_>) {
         let header = message.header();
-        let (stage, latency_ns) = match message {
-            AnyMessage::Frame(..) => {
-                self.frames = self.frames.max(header.frame_id + 1);
-                (Stage::Camera, header.publish_time_ns.saturating_sub(header.capture_time_ns))
-            }
-            AnyMessage::Posterior(m) => (Stage::Encoder, m.stage_latency_ns),
-            AnyMessage::Forecast(m) => (Stage::Forecaster, m.stage_latency_ns),
-            AnyMessage::Belief(m) => (Stage::Prober, m.stage_latency_ns),
-            AnyMessage::View(m, _) => (Stage::Renderer, m.stage_latency_ns),
-            AnyMessage::Action(m) => {
-                let (action, reason) = (m.code().map_or("?", ActionCode::name), m.reason().map_or("?", Reason::name));
-                *self.actions.entry(action).or_default() += 1;
-                if m.reason() != Ok(Reason::Belief) {
-                    *self.safe_actions.entry(reason).or_default() += 1;
-                }
-                if m.is_decision == 1 {
-                    self.decisions += 1;
-                    remember(&mut self.decided_ms, m.latency_ns as f64 / 1e6);
-                }
-                (self.hazard_probability, self.last_action) = (m.hazard_probability, Some((action, reason)));
-                (Stage::Controller, m.latency_ns)
-            }
-            AnyMessage::Health(m) => {
-                let Ok(stage) = m.stage() else { return };
-                let vitals = self.stages.entry(stage).or_default();
-                if vitals.pid != 0 && vitals.pid != m.pid {
-                    vitals.restarts += 1;
-                    vitals.cpu_seen = None;
-                }
-                vitals.state = m.state().ok();
-                vitals.late += u64::from(matches!(vitals.state, Some(HealthState::Slow | HealthState::Stale)));
-                (vitals.pid, vitals.rss_bytes, vitals.heard_ns) = (m.pid, m.rss_bytes, header.publish_time_ns);
-                vitals.counts = [m.skipped, m.invalid, m.errors];
-                vitals.max_latency_ms = m.max_latency_ns as f64 / 1e6;
-                return;
-            }
+        if let Some(health) = message.get::<Health>() {
+            return self.take_health(health);
+        }
+        let (stage, latency_ns) = if message.get::<FrameMeta>().is_some() {
+            self.frames = self.frames.max(header.frame_id + 1);
+            (Stage::Camera, header.publish_time_ns.saturating_sub(header.capture_time_ns))
+        } else if let Some(action) = message.get::<Action>() {
+            self.take_action(action);
+            (Stage::Controller, action.latency_ns)
+        } else if let Some(worked) = stage_latency_ns(message) {
+            worked
+        } else {
+            return;
         };
         let vitals = self.stages.entry(stage).or_default();
         vitals.messages += 1;
         remember(&mut vitals.published_ns, header.publish_time_ns);
         remember(&mut vitals.latency_ms, latency_ns as f64 / 1e6);
+    }
+
+    fn take_action(&mut self, m: &Action) {
+        let (action, reason) = (m.code().map_or("?", ActionCode::name), m.reason().map_or("?", Reason::name));
+        *self.actions.entry(action).or_default() += 1;
+        if m.reason() != Ok(Reason::Belief) {
+            *self.safe_actions.entry(reason).or_default() += 1;
+        }
+        if m.is_decision == 1 {
+            self.decisions += 1;
+            remember(&mut self.decided_ms, m.latency_ns as f64 / 1e6);
+        }
+        (self.hazard_probability, self.last_action) = (m.hazard_probability, Some((action, reason)));
+    }
+
+    fn take_health(&mut self, m: &Health) {
+        let Ok(stage) = m.stage() else { return };
+        let vitals = self.stages.entry(stage).or_default();
+        if vitals.pid != 0 && vitals.pid != m.pid {
+            vitals.restarts += 1;
+            vitals.cpu_seen = None;
+        }
+        vitals.state = m.state().ok();
+        vitals.late += u64::from(matches!(vitals.state, Some(HealthState::Slow | HealthState::Stale)));
+        (vitals.pid, vitals.rss_bytes, vitals.heard_ns) = (m.pid, m.rss_bytes, m.header.publish_time_ns);
+        vitals.counts = [m.skipped, m.invalid, m.errors];
+        vitals.max_latency_ms = m.max_latency_ns as f64 / 1e6;
     }
 
     /// Takes in what a run says until it is over, or `after`, called at each look, says false.
@@ -196,7 +211,7 @@ fn used_ns(stat: &str) -> Option<u64> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use carff_messages::{Action, Header, Health};
+    use carff_messages::Header;
 
     fn health(pid: u32, state: HealthState) -> Health {
         Health {
@@ -224,7 +239,7 @@ mod tests {
         for (pid, state) in
             [(5, HealthState::Ok), (5, HealthState::Slow), (6, HealthState::Stale), (6, HealthState::Ok)]
         {
-            run.take(AnyMessage::Health(&health(pid, state)));
+            run.take(AnyMessage::new(&health(pid, state), &[]));
         }
         let prober = &run.stages[&Stage::Prober];
         assert_eq!((prober.restarts, prober.late, prober.counts, prober.max_latency_ms), (1, 2, [3, 2, 1], 5.0));
@@ -249,9 +264,9 @@ mod tests {
             based_on_frame: 7,
             latency_ns: 20_000_000,
         };
-        run.take(AnyMessage::Action(&action));
+        run.take(AnyMessage::new(&action, &[]));
         (action.is_decision, action.action, action.reason) = (0, ActionCode::Halt.code(), Reason::StaleBelief.code());
-        run.take(AnyMessage::Action(&action));
+        run.take(AnyMessage::new(&action, &[]));
         assert_eq!((run.decisions, run.decided_ms.len()), (1, 1));
         assert_eq!((run.actions["advance"], run.actions["halt"], run.safe_actions["stale belief"]), (1, 1, 1));
         assert_eq!(run.last_action, Some(("halt", "stale belief")));

@@ -1,15 +1,16 @@
 //! What a replayed graph made of its frames, against what was recorded: posteriors, forecasts, beliefs and decisions.
 
 use carff_messages::forms::{ActionForm, AnyMessage, BeliefForm, ForecastForm, HeaderForm, PosteriorForm};
-use carff_observe::TopicId;
+use carff_messages::{Action, Belief, Forecast, Posterior};
 use carff_recording::Reader;
+use carff_transport::TopicId;
 use serde_json::Value;
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 use std::path::Path;
 
 /// What is compared, in the order in which a graph makes it.
-pub(super) const COMPARED: [TopicId; 4] = [TopicId::Posterior, TopicId::Forecast, TopicId::Belief, TopicId::Action];
+pub(super) const COMPARED: [TopicId; 4] = [TopicId::POSTERIOR, TopicId::FORECAST, TopicId::BELIEF, TopicId::ACTION];
 
 /// A message that is compared: its topic, its frame and its step.
 type Place = (TopicId, u64, u32);
@@ -39,33 +40,28 @@ fn without_times(header: &mut HeaderForm) {
 fn timeless(message: AnyMessage<'_>) -> Option<(Place, Value)> {
     let header = message.header();
     let (mut frame, mut step) = (header.frame_id, header.step);
-    let (topic, value) = match message {
-        AnyMessage::Posterior(m) => {
-            let mut form = PosteriorForm::from(m);
-            without_times(&mut form.header);
-            form.stage_latency_ns = 0;
-            (TopicId::Posterior, serde_json::to_value(form))
-        }
-        AnyMessage::Forecast(m) => {
-            let mut form = ForecastForm::from(m);
-            without_times(&mut form.header);
-            (form.encoder_ns, form.stage_latency_ns) = (0, 0);
-            (TopicId::Forecast, serde_json::to_value(form))
-        }
-        AnyMessage::Belief(m) => {
-            let mut form = BeliefForm::from(m);
-            without_times(&mut form.header);
-            (form.encoder_ns, form.forecaster_ns, form.stage_latency_ns) = (0, 0, 0);
-            (TopicId::Belief, serde_json::to_value(form))
-        }
-        AnyMessage::Action(m) if m.is_decision == 1 => {
-            let mut form = ActionForm::from(m);
-            without_times(&mut form.header);
-            (form.valid_until_ns, form.latency_ns) = (0, 0);
-            (frame, step) = (m.based_on_frame, 0);
-            (TopicId::Action, serde_json::to_value(form))
-        }
-        _ => return None,
+    let (topic, value) = if let Some(m) = message.get::<Posterior>() {
+        let mut form = PosteriorForm::from(m);
+        without_times(&mut form.header);
+        form.stage_latency_ns = 0;
+        (TopicId::POSTERIOR, serde_json::to_value(form))
+    } else if let Some(m) = message.get::<Forecast>() {
+        let mut form = ForecastForm::from(m);
+        without_times(&mut form.header);
+        (form.encoder_ns, form.stage_latency_ns) = (0, 0);
+        (TopicId::FORECAST, serde_json::to_value(form))
+    } else if let Some(m) = message.get::<Belief>() {
+        let mut form = BeliefForm::from(m);
+        without_times(&mut form.header);
+        (form.encoder_ns, form.forecaster_ns, form.stage_latency_ns) = (0, 0, 0);
+        (TopicId::BELIEF, serde_json::to_value(form))
+    } else {
+        let action = message.get::<Action>().filter(|action| action.is_decision == 1)?;
+        let mut form = ActionForm::from(action);
+        without_times(&mut form.header);
+        (form.valid_until_ns, form.latency_ns) = (0, 0);
+        (frame, step) = (action.based_on_frame, 0);
+        (TopicId::ACTION, serde_json::to_value(form))
     };
     Some(((topic, frame, step), value.unwrap_or_default()))
 }
@@ -83,7 +79,7 @@ impl Replayed {
         let mut frames = BTreeSet::new();
         while let Some(entry) = reader.next()? {
             let message = entry.message.as_message();
-            if entry.topic == TopicId::Frame {
+            if entry.topic == TopicId::FRAME {
                 frames.insert(message.header().frame_id);
             }
             if let Some((place, recorded)) = timeless(message).filter(|((_, frame, _), _)| frames.contains(frame)) {
@@ -119,14 +115,9 @@ impl Comparison {
     }
 }
 
-/// What a topic's message is called.
+/// The word for a topic's message.
 fn noun(topic: TopicId) -> &'static str {
-    match topic {
-        TopicId::Posterior => "posterior",
-        TopicId::Forecast => "forecast",
-        TopicId::Belief => "belief",
-        _ => "decision",
-    }
+    if topic == TopicId::ACTION { "decision" } else { topic.name().rsplit('/').next().unwrap_or_default() }
 }
 
 /// The first place where two JSON values differ.
@@ -196,8 +187,8 @@ mod tests {
                 ..FrameMeta::default()
             };
             (meta.intrinsics.fl_x_px, meta.intrinsics.fl_y_px) = (1.0, 1.0);
-            writer.write(TopicId::Frame, AnyMessage::Frame(&meta, &[1, 2, 3])).unwrap();
-            writer.write(TopicId::Belief, AnyMessage::Belief(&a_belief(frame, 0.25))).unwrap();
+            writer.write(TopicId::FRAME, AnyMessage::new(&meta, &[1, 2, 3])).unwrap();
+            writer.write(TopicId::BELIEF, AnyMessage::new(&a_belief(frame, 0.25), &[])).unwrap();
         }
         writer.finish().unwrap();
     }
@@ -213,13 +204,13 @@ mod tests {
         for frame in 0..3 {
             let mut belief = a_belief(frame, 0.25);
             (belief.header.capture_time_ns, belief.header.sequence, belief.stage_latency_ns) = (99, 77, 55);
-            replayed.take(AnyMessage::Belief(&belief));
+            replayed.take(AnyMessage::new(&belief, &[]));
         }
         let same = replayed.compare(&path).unwrap();
-        assert!(same.is_same() && same.compared[&TopicId::Belief] == 3, "{same}");
+        assert!(same.is_same() && same.compared[&TopicId::BELIEF] == 3, "{same}");
 
-        replayed.take(AnyMessage::Belief(&a_belief(1, 0.5)));
-        replayed.made.remove(&(TopicId::Belief, 2, 1));
+        replayed.take(AnyMessage::new(&a_belief(1, 0.5), &[]));
+        replayed.made.remove(&(TopicId::BELIEF, 2, 1));
         let other = replayed.compare(&path).unwrap();
         assert!(!other.is_same() && (other.different, other.missing) == (1, 1));
         let text = other.to_string();

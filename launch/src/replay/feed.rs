@@ -3,10 +3,10 @@
 use super::compare::{COMPARED, Replayed};
 use anyhow::{Context, ensure};
 use carff::terminal::Terminal;
-use carff_messages::{Action, Belief, Forecast, FrameMeta, Header, MAX_PICTURE_BYTES, Posterior, ViewMeta};
-use carff_observe::{AnyReceiver, Received, TopicId};
-use carff_recording::{Entry, OwnedMessage, Reader};
-use carff_transport::{Node, PicturePublisher, Publisher, Run, Stop, Waiter, Woken, monotonic_now_ns, topics};
+use carff_messages::forms::{AnyMessage, OwnedMessage};
+use carff_messages::{Action, Header, MAX_IMAGE_BYTES};
+use carff_recording::{Entry, Reader};
+use carff_transport::{AnyPublisher, AnyReceiver, Node, Run, Stop, TopicId, Waiter, Woken, monotonic_now_ns};
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::BufRead;
 use std::path::PathBuf;
@@ -48,75 +48,27 @@ pub(super) struct Player {
 
 /// A publisher for each topic that is played.
 #[derive(Default)]
-struct Publishers {
-    frame: Option<PicturePublisher<FrameMeta>>,
-    posterior: Option<Publisher<Posterior>>,
-    forecast: Option<Publisher<Forecast>>,
-    belief: Option<Publisher<Belief>>,
-    view: Option<PicturePublisher<ViewMeta>>,
-    action: Option<Publisher<Action>>,
-}
+struct Publishers(BTreeMap<TopicId, Box<dyn AnyPublisher>>);
 
 impl Publishers {
-    fn open(node: &Node, wanted: &BTreeSet<TopicId>, largest_bytes: [usize; 2]) -> anyhow::Result<Self> {
-        let mut all = Self::default();
-        for topic in wanted {
-            match topic {
-                TopicId::Frame => all.frame = Some(node.picture_publisher(&topics::FRAME, largest_bytes[0])?),
-                TopicId::Posterior => all.posterior = Some(node.publisher(&topics::POSTERIOR)?),
-                TopicId::Forecast => all.forecast = Some(node.publisher(&topics::FORECAST)?),
-                TopicId::Belief => all.belief = Some(node.publisher(&topics::BELIEF)?),
-                TopicId::View => all.view = Some(node.picture_publisher(&topics::VIEW, largest_bytes[1])?),
-                TopicId::Action => all.action = Some(node.publisher(&topics::ACTION)?),
-                TopicId::Health(_) => {}
-            }
-        }
-        Ok(all)
+    /// Opens the topics; `largest_bytes` holds the size of each one's largest image.
+    fn open(node: &Node, wanted: &BTreeSet<TopicId>, largest_bytes: &BTreeMap<TopicId, usize>) -> anyhow::Result<Self> {
+        let open = |topic: &TopicId| {
+            let bytes = largest_bytes.get(topic).copied().unwrap_or(0);
+            Ok((*topic, topic.publisher(node, bytes)?))
+        };
+        let flow = wanted.iter().filter(|topic| TopicId::FLOW.contains(topic));
+        Ok(Self(flow.map(open).collect::<anyhow::Result<_>>()?))
     }
 
-    fn send(&mut self, message: OwnedMessage, times: &mut Times) -> anyhow::Result<()> {
-        match message {
-            OwnedMessage::Frame(mut m, bytes) => {
-                times.renew(&mut m.header);
-                if let Some(p) = &mut self.frame {
-                    p.send_bytes(&bytes, m)?;
-                }
-            }
-            OwnedMessage::Posterior(mut m) => {
-                times.renew(&mut m.header);
-                if let Some(p) = &mut self.posterior {
-                    p.send(m)?;
-                }
-            }
-            OwnedMessage::Forecast(mut m) => {
-                times.renew(&mut m.header);
-                if let Some(p) = &mut self.forecast {
-                    p.send(*m)?;
-                }
-            }
-            OwnedMessage::Belief(mut m) => {
-                times.renew(&mut m.header);
-                if let Some(p) = &mut self.belief {
-                    p.send(*m)?;
-                }
-            }
-            OwnedMessage::View(mut m, bytes) => {
-                times.renew(&mut m.header);
-                if let Some(p) = &mut self.view {
-                    p.send_bytes(&bytes, m)?;
-                }
-            }
-            OwnedMessage::Action(mut m) => {
-                let stands_ns = m.valid_until_ns.saturating_sub(m.header.publish_time_ns);
-                times.renew(&mut m.header);
-                m.valid_until_ns = monotonic_now_ns() + stands_ns;
-                if let Some(p) = &mut self.action {
-                    p.send(m)?;
-                }
-            }
-            OwnedMessage::Health(_) => {}
+    fn send(&mut self, topic: TopicId, mut message: OwnedMessage, times: &mut Times) -> anyhow::Result<()> {
+        let Some(publisher) = self.0.get_mut(&topic) else { return Ok(()) };
+        if let Some(action) = message.get_mut::<Action>() {
+            let valid_for_ns = action.valid_until_ns.saturating_sub(action.header.publish_time_ns);
+            action.valid_until_ns = monotonic_now_ns() + valid_for_ns;
         }
-        Ok(())
+        times.renew(message.header_mut());
+        Ok(publisher.send(message.as_message())?)
     }
 }
 
@@ -140,12 +92,12 @@ impl Player {
     pub(super) fn play(self, run: &Run, stop: &Stop) -> anyhow::Result<()> {
         let node = Node::open(run, "replay")?;
         let waiter = Waiter::new(stop.clone());
-        let largest_bytes = self.largest_pictures()?;
-        let mut publishers = Publishers::open(&node, &self.topics, largest_bytes)?;
+        let largest_bytes = self.largest_images()?;
+        let mut publishers = Publishers::open(&node, &self.topics, &largest_bytes)?;
         let mut back = Vec::new();
         for topic in COMPARED {
             if !self.topics.contains(&topic) {
-                back.push(AnyReceiver::open(&node, topic)?);
+                back.push(topic.polled_receiver(&node)?);
             }
         }
         let keys = (self.pace == Pace::OnEnter).then(keys);
@@ -158,7 +110,7 @@ impl Player {
             if at_ns < self.from_ns || at_ns > self.to_ns || !self.topics.contains(&topic) {
                 continue;
             }
-            let is_frame = topic == TopicId::Frame;
+            let is_frame = topic == TopicId::FRAME;
             let go_on = match self.pace {
                 Pace::Rate(rate) => {
                     if begun_ns == 0 {
@@ -183,13 +135,14 @@ impl Player {
             if !go_on {
                 return Ok(());
             }
-            publishers.send(message, &mut times)?;
+            publishers.send(topic, message, &mut times)?;
             frames += u64::from(is_frame);
             if is_frame && self.pace == Pace::AfterEachDecision {
                 let frame = header.frame_id;
                 let until_ns = monotonic_now_ns() + PATIENCE_NS;
-                let decided =
-                    |m: &Received| matches!(m, Received::Action(a) if a.is_decision == 1 && a.based_on_frame == frame);
+                let decided = |message: AnyMessage<'_>| {
+                    message.get::<Action>().is_some_and(|a| a.is_decision == 1 && a.based_on_frame == frame)
+                };
                 if !self.look_until(&waiter, &mut back, until_ns, decided)? {
                     return Ok(());
                 }
@@ -210,15 +163,15 @@ impl Player {
     fn look_until(
         &self,
         waiter: &Waiter,
-        back: &mut [AnyReceiver],
+        back: &mut [Box<dyn AnyReceiver>],
         until_ns: u64,
-        enough: impl Fn(&Received) -> bool,
+        enough: impl Fn(AnyMessage<'_>) -> bool,
     ) -> anyhow::Result<bool> {
         loop {
             let mut is_enough = false;
             for receiver in back.iter_mut() {
                 while let Some(message) = receiver.next()? {
-                    is_enough |= enough(&message);
+                    is_enough |= enough(message.message());
                     if let Some(replayed) = &self.replayed {
                         let mut replayed = replayed.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
                         replayed.take(message.message());
@@ -238,7 +191,7 @@ impl Player {
     fn wait_for_key(
         &self,
         waiter: &Waiter,
-        back: &mut [AnyReceiver],
+        back: &mut [Box<dyn AnyReceiver>],
         keys: Option<&Receiver<()>>,
     ) -> anyhow::Result<bool> {
         let Some(keys) = keys else { return Ok(true) };
@@ -255,18 +208,16 @@ impl Player {
         }
     }
 
-    /// Bytes of the largest frame and the largest view.
-    fn largest_pictures(&self) -> anyhow::Result<[usize; 2]> {
-        let mut largest = [1; 2];
+    /// Bytes of the largest image of each topic.
+    fn largest_images(&self) -> anyhow::Result<BTreeMap<TopicId, usize>> {
+        let mut largest = BTreeMap::from([(TopicId::FRAME, 1), (TopicId::VIEW, 1)]);
         let mut reader = Reader::open(&self.recording)?;
         while let Some(entry) = reader.next().context("the recording cannot be replayed")? {
-            match &entry.message {
-                OwnedMessage::Frame(_, bytes) => largest[0] = largest[0].max(bytes.len()),
-                OwnedMessage::View(_, bytes) => largest[1] = largest[1].max(bytes.len()),
-                _ => {}
-            }
+            let bytes = entry.message.as_message().bytes().len().min(MAX_IMAGE_BYTES);
+            let known = largest.entry(entry.topic).or_default();
+            *known = bytes.max(*known);
         }
-        Ok(largest.map(|bytes| bytes.min(MAX_PICTURE_BYTES)))
+        Ok(largest)
     }
 }
 

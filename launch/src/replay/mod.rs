@@ -7,8 +7,8 @@ use crate::launch::{Ended, Feed, LaunchArgs, run_graph};
 use anyhow::{Context, ensure};
 use carff::terminal::Terminal;
 use carff_messages::Stage;
-use carff_observe::TopicId;
 use carff_recording::Reader;
+use carff_transport::TopicId;
 use clap::Args;
 use compare::Replayed;
 use feed::{Pace, Player};
@@ -69,7 +69,7 @@ fn only(text: &str) -> Result<Only, String> {
     }
     let topics = text.split(',').map(|name| name.trim().parse::<TopicId>().map_err(|e| e.to_string()));
     let topics = topics.collect::<Result<BTreeSet<_>, _>>()?;
-    if topics.iter().any(|t| matches!(t, TopicId::Health(_))) {
+    if topics.iter().any(|topic| !TopicId::FLOW.contains(topic)) {
         return Err("heartbeats are not replayed".to_owned());
     }
     Ok(Only(topics))
@@ -89,7 +89,7 @@ const WAY: [Stage; 5] = [Stage::Camera, Stage::Encoder, Stage::Forecaster, Stage
 fn replaced(topics: &BTreeSet<TopicId>) -> BTreeSet<Stage> {
     let last = WAY.iter().rposition(|&stage| topics.contains(&TopicId::of_stage(stage))).unwrap_or(0);
     let mut stages: BTreeSet<Stage> = WAY[..=last].iter().copied().collect();
-    if topics.contains(&TopicId::View) {
+    if topics.contains(&TopicId::VIEW) {
         stages.insert(Stage::Renderer);
     }
     stages
@@ -105,7 +105,7 @@ pub fn run(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
         None if std::fs::read_to_string(&about.graph).is_ok_and(|text| text == about.graph_text) => about.graph.into(),
         None => write_graph(folder.path(), &about.graph_text)?,
     };
-    let topics = args.only.clone().map_or_else(|| [TopicId::Frame].into(), |only| only.0);
+    let topics = args.only.clone().map_or_else(|| [TopicId::FRAME].into(), |only| only.0);
     ensure!(!topics.is_empty(), "name at least one topic with --only");
     let launch = LaunchArgs {
         graph,

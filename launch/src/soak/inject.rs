@@ -3,7 +3,7 @@
 use anyhow::{Context, ensure};
 use carff_messages::{Belief, Forecast, FrameMeta, Header, Posterior};
 use carff_random::{Key, stream};
-use carff_transport::{Node, PicturePublisher, Run, Stop, Waiter, Woken, monotonic_now_ns, topics};
+use carff_transport::{Image, Node, Publisher, Run, Stop, Waiter, Woken, monotonic_now_ns, topics};
 use rand::Rng;
 use rustix::process::{Signal, set_parent_process_death_signal};
 use std::time::Duration;
@@ -53,7 +53,7 @@ pub fn run(args: &InjectArgs) -> anyhow::Result<()> {
 /// Subscribes to everything, says so, reads a little, and then waits to be stopped or killed.
 fn probe(node: &Node, count: u32) -> anyhow::Result<()> {
     let waiter = Waiter::new(Stop::on_signals()?);
-    let mut frames = node.picture_receiver(&topics::FRAME)?;
+    let mut frames = node.receiver(&topics::FRAME)?;
     let mut beliefs = node.receiver(&topics::BELIEF)?;
     let mut actions = node.receiver(&topics::ACTION)?;
     println!("ready");
@@ -127,7 +127,7 @@ fn rogue(node: &Node, args: &InjectArgs) -> anyhow::Result<u32> {
 
 /// Frames that were seen before, sent again as they should not be.
 fn frames(node: &Node, args: &InjectArgs) -> anyhow::Result<()> {
-    let mut input = node.picture_receiver(&topics::FRAME)?;
+    let mut input = node.receiver(&topics::FRAME)?;
     let waiter = Waiter::new(Stop::on_signals()?);
     let mut seen: Vec<(FrameMeta, Vec<u8>)> = Vec::new();
     for _ in 0..LOOKS {
@@ -135,12 +135,12 @@ fn frames(node: &Node, args: &InjectArgs) -> anyhow::Result<()> {
             break;
         }
         while let Some(frame) = input.next()? {
-            seen.push((*frame.meta(), frame.bytes().to_vec()));
+            seen.push((*frame, frame.bytes().to_vec()));
         }
     }
     ensure!(!seen.is_empty(), "no frames to send again");
     let most = seen.iter().map(|(_, bytes)| bytes.len()).max().unwrap_or(0);
-    let mut output = node.picture_publisher(&topics::FRAME, most)?;
+    let mut output = node.image_publisher(&topics::FRAME, most)?;
     let newest = seen.len() - 1;
     match args.what.as_str() {
         "late" => {
@@ -162,10 +162,10 @@ fn frames(node: &Node, args: &InjectArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn send(output: &mut PicturePublisher<FrameMeta>, frame: &(FrameMeta, Vec<u8>), jump_ns: i64) -> anyhow::Result<()> {
+fn send(output: &mut Publisher<Image<FrameMeta>>, frame: &(FrameMeta, Vec<u8>), jump_ns: i64) -> anyhow::Result<()> {
     let (mut meta, bytes) = (frame.0, &frame.1);
     meta.header.capture_time_ns = meta.header.capture_time_ns.saturating_add_signed(jump_ns);
     let mut loan = output.loan(bytes.len())?;
     loan.bytes_mut().copy_from_slice(bytes);
-    Ok(output.send_unchecked(loan, meta)?)
+    Ok(output.send_image_unchecked(loan, meta)?)
 }

@@ -3,8 +3,8 @@
 
 use super::patience::Patience;
 use anyhow::{Context, bail, ensure};
-use carff_observe::TopicId;
 use carff_recording::Reader;
+use carff_transport::TopicId;
 use carff_transport::{Run, SHARED_MEMORY_DIR};
 use rustix::process::{Pid, Signal};
 use std::path::{Path, PathBuf};
@@ -112,7 +112,7 @@ impl Cramped {
         std::fs::create_dir(&folder)?;
         let log = std::fs::File::create(small_disk().with_extension("log"))?;
         let mut command = recorder(run, &folder.join("run.mcap"))?;
-        let topics = [TopicId::Frame, TopicId::Belief, TopicId::View].map(|topic| topic.to_string());
+        let topics = [TopicId::FRAME, TopicId::BELIEF, TopicId::VIEW].map(|topic| topic.to_string());
         let child = command.args(topics).stderr(log).spawn().context("cannot start a recorder")?;
         Ok(Self { folder, child })
     }

@@ -221,7 +221,7 @@ pub(super) struct Notes {
 
 impl Watcher {
     pub(super) fn open(node: Node, waiter: Waiter) -> anyhow::Result<Self> {
-        let healths = Stage::ALL.iter().map(|&stage| node.receiver(&topics::health(stage)));
+        let healths = Stage::ALL.iter().map(|&stage| node.receiver(topics::health(stage)));
         Ok(Self {
             beliefs: node.receiver(&topics::BELIEF)?,
             actions: node.receiver(&topics::ACTION)?,

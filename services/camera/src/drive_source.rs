@@ -78,7 +78,7 @@ impl DriveSource {
 }
 
 impl Source for DriveSource {
-    fn max_picture_bytes(&self) -> usize {
+    fn max_image_bytes(&self) -> usize {
         self.images.values().map(|i| i.rgb.len()).max().unwrap_or(0)
     }
 

@@ -74,7 +74,7 @@ impl FolderSource {
 }
 
 impl Source for FolderSource {
-    fn max_picture_bytes(&self) -> usize {
+    fn max_image_bytes(&self) -> usize {
         self.images[0].rgb.len()
     }
 
@@ -136,7 +136,7 @@ mod tests {
         assert!(errors[0].contains("b.png") && errors[1].contains("c.png"), "{errors:?}");
 
         let mut greys = Vec::new();
-        let mut picture = vec![0; source.max_picture_bytes()];
+        let mut picture = vec![0; source.max_image_bytes()];
         while let Some(meta) = source.advance().unwrap() {
             assert_eq!((meta.width_px, meta.height_px), (4, 2));
             source.write(greys.len() as u64, &mut picture).unwrap();

@@ -68,7 +68,7 @@ impl FreeDriveSource {
 }
 
 impl Source for FreeDriveSource {
-    fn max_picture_bytes(&self) -> usize {
+    fn max_image_bytes(&self) -> usize {
         self.scenario.cameras().first().map_or(0, |c| (c.camera.width_px * c.camera.height_px) as usize * 3)
     }
 

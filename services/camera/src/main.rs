@@ -14,7 +14,7 @@ fn main() -> std::process::ExitCode {
 
 fn run(stage: &mut StageContext) -> anyhow::Result<()> {
     let mut source = open_source(stage)?;
-    let mut frames = stage.picture_output(&topics::FRAME, source.max_picture_bytes())?;
+    let mut frames = stage.image_output(&topics::FRAME, source.max_image_bytes())?;
     let period_ns = (1e9 / stage.graph.run.frame_rate_hz) as u64;
     let limit = stage.args.frames.unwrap_or(u64::MAX);
     // A camera restarted in mid-run continues after the last frame of its predecessor.
@@ -32,7 +32,7 @@ fn run(stage: &mut StageContext) -> anyhow::Result<()> {
         let _span = frame_span(&meta.header);
         let mut loan = frames.loan(meta.width_px as usize * meta.height_px as usize * 3)?;
         source.write(frame_id, loan.bytes_mut())?;
-        frames.send(loan, meta)?;
+        frames.send_image(loan, meta)?;
         stage.worked(&meta.header, capture_time_ns);
         frame_id += 1;
         // A late frame delays those after it; it is never made up for by a burst.

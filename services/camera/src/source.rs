@@ -5,7 +5,7 @@ use carff_messages::FrameMeta;
 /// A source of images.
 pub trait Source {
     /// Bytes of its largest image.
-    fn max_picture_bytes(&self) -> usize;
+    fn max_image_bytes(&self) -> usize;
 
     /// Advances to the next frame and describes it (all but the header); `None` at the end. An error ends the stage.
     fn advance(&mut self) -> anyhow::Result<Option<FrameMeta>>;

@@ -7,7 +7,7 @@ use carff_checkpoint::CheckpointPlanning;
 use carff_config::GraphConfig;
 use carff_dataset::{DatasetWriter, FrameRecord, Image, Observability, ScenarioInfo};
 use carff_geometry::PinholeCamera;
-use carff_messages::{Header, Message, PictureMeta};
+use carff_messages::{Header, ImageMeta, Message};
 use std::path::Path;
 
 const VIEWS: usize = 20;
@@ -65,7 +65,7 @@ fn drives_show_timestamps_in_order_with_fresh_noise() {
             let frame_id = shots.len() as u64;
             meta.header = Header::of_frame(frame_id, 0, 1);
             meta.validate().unwrap();
-            let mut picture = vec![0; meta.picture_bytes()];
+            let mut picture = vec![0; meta.image_bytes()];
             source.write(frame_id, &mut picture).unwrap();
             shots.push((meta.dataset_view, picture));
         }

@@ -4,7 +4,7 @@
 
 use carff_camera::{FreeDriveSource, Source};
 use carff_config::GraphConfig;
-use carff_messages::{Header, Message, PictureMeta};
+use carff_messages::{Header, ImageMeta, Message};
 use std::path::Path;
 
 /// Free drives show each timestamp in order, with its truth and a valid description, hazard and clear in turn; noise is
@@ -25,10 +25,10 @@ fn free_drives_show_timestamps_in_order() {
             let frame_id = shots.len() as u64;
             meta.header = Header::of_frame(frame_id, 0, 1);
             meta.validate().unwrap();
-            assert_eq!(meta.picture_bytes(), source.max_picture_bytes());
-            let mut picture = vec![0; meta.picture_bytes()];
+            assert_eq!(meta.image_bytes(), source.max_image_bytes());
+            let mut picture = vec![0; meta.image_bytes()];
             source.write(frame_id, &mut picture).unwrap();
-            let mut other_noise = vec![0; meta.picture_bytes()];
+            let mut other_noise = vec![0; meta.image_bytes()];
             source.write(frame_id + 1, &mut other_noise).unwrap();
             assert_ne!(picture, other_noise);
             shots.push((meta, picture));

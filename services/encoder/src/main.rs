@@ -10,14 +10,14 @@ fn main() -> std::process::ExitCode {
 }
 
 fn run(stage: &mut StageContext) -> anyhow::Result<()> {
-    let mut frames = stage.picture_input(&topics::FRAME)?;
+    let mut frames = stage.input(&topics::FRAME)?;
     let mut posteriors = stage.output(&topics::POSTERIOR)?;
     let encoder = load(&stage.checkpoint, stage.threads)?;
     stage.ready();
     while stage.wait(&[&frames])? {
         let started_ns = monotonic_now_ns();
         let Some(frame) = frames.newest()? else { continue };
-        let meta = frame.meta();
+        let meta = &*frame;
         let _span = frame_span(&meta.header);
         match encode(&encoder, frame.bytes(), meta.height_px as usize, meta.width_px as usize) {
             Ok(gaussian) => {

@@ -13,7 +13,7 @@ const LEASE_MS: u32 = 2_000;
 const SOCKET_BYTES: u32 = 32 * 1024;
 const BATCH_BYTES: u16 = 16 * 1024;
 /// Longest message that is taken, bytes: the largest picture, and what describes it.
-const MAX_MESSAGE_BYTES: usize = carff_messages::MAX_PICTURE_BYTES + (1 << 20);
+const MAX_MESSAGE_BYTES: usize = carff_messages::MAX_IMAGE_BYTES + (1 << 20);
 
 /// One end listens, the other connects; which does what is no matter.
 #[derive(Clone, Debug, Args)]

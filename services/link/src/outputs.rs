@@ -2,10 +2,10 @@
 
 use crate::wire::Arrived;
 use carff_messages::{
-    Action, Belief, Forecast, FrameMeta, Health, Invalid, Message, PictureMeta, Posterior, Stage, ViewMeta,
+    Action, Belief, Forecast, FrameMeta, Health, Invalid, Message, ImageMeta, Posterior, Stage, ViewMeta,
     ZeroCopySend,
 };
-use carff_transport::{Node, OpenError, PicturePublisher, PictureTopic, Publisher, SendError, Topic, topics};
+use carff_transport::{Node, OpenError, Image, Publisher, Topic, SendError, topics};
 use std::collections::BTreeMap;
 use std::fmt::Debug;
 
@@ -25,8 +25,8 @@ pub struct Outputs<'a> {
 
 /// A publisher of pictures of at most so many bytes.
 #[derive(Debug)]
-struct Pictures<M: PictureMeta + ZeroCopySend + Debug + 'static> {
-    publisher: PicturePublisher<M>,
+struct Pictures<M: ImageMeta + ZeroCopySend + Debug + 'static> {
+    publisher: Publisher<Image<M>>,
     max_bytes: usize,
 }
 
@@ -75,7 +75,7 @@ impl<'a> Outputs<'a> {
             Arrived::Health(m) => {
                 let stage = m.stage()?;
                 let mut publisher = self.health.remove(&stage);
-                let sent = send(node, &topics::health(stage), &mut publisher, *m);
+                let sent = send(node, topics::health(stage), &mut publisher, *m);
                 self.health.extend(publisher.map(|publisher| (stage, publisher)));
                 sent
             }
@@ -99,18 +99,18 @@ where
 
 fn send_picture<M>(
     node: &Node,
-    topic: &PictureTopic<M>,
+    topic: &Topic<Image<M>>,
     slot: &mut Option<Pictures<M>>,
     meta: M,
     picture: &[u8],
 ) -> Result<(), OutputError>
 where
-    M: PictureMeta + ZeroCopySend + Debug + 'static,
+    M: ImageMeta + ZeroCopySend + Debug + 'static,
 {
     if slot.as_ref().is_none_or(|pictures| pictures.max_bytes < picture.len()) {
         // The smaller one's place is freed first.
         *slot = None;
-        let publisher = node.picture_publisher(topic, picture.len())?;
+        let publisher = node.image_publisher(topic, picture.len())?;
         *slot = Some(Pictures { publisher, max_bytes: picture.len() });
         reserve(node, slot)?;
     }
@@ -146,8 +146,8 @@ mod tests {
         {
             let node = Node::open(&run, "test").unwrap();
             let mut posteriors = node.receiver(&topics::POSTERIOR).unwrap();
-            let mut views = node.picture_receiver(&topics::VIEW).unwrap();
-            let mut hearts = node.receiver(&topics::health(Stage::Prober)).unwrap();
+            let mut views = node.receiver(&topics::VIEW).unwrap();
+            let mut hearts = node.receiver(topics::health(Stage::Prober)).unwrap();
             let mut outputs = Outputs::new(&node);
 
             let posterior = Posterior { header, gaussian: Gaussian::standard(), stage_latency_ns: 5 };

@@ -7,7 +7,8 @@ use crate::wire::{Tag, decode};
 use crate::{note, topics};
 use anyhow::{Context, anyhow};
 use carff_config::GraphConfig;
-use carff_observe::{RunLock, RunRecord, TopicId};
+use carff_observe::{RunLock, RunRecord};
+use carff_transport::{TopicId};
 use carff_transport::{Node, Run, Stop, monotonic_now_ns, remove_run_leftovers, run_id_of, runtime_dir};
 use clap::Args;
 use std::collections::BTreeMap;
@@ -237,14 +238,14 @@ mod tests {
         let mut tally = Tally::default();
         let mut count = |topic, sender, sequence| tally.count(topic, Tag { sender, sequence, sent_ns: 0 });
         for sequence in [5, 6, 9, 10] {
-            count(TopicId::Belief, 1, sequence);
+            count(TopicId::BELIEF, 1, sequence);
         }
-        count(TopicId::Action, 1, 70);
-        count(TopicId::Action, 2, 0);
-        count(TopicId::Action, 2, 2);
-        count(TopicId::Action, 2, u64::MAX);
-        count(TopicId::Action, 2, 0);
-        assert_eq!((tally.topics[&TopicId::Belief].lost, tally.topics[&TopicId::Belief].arrived), (2, 4));
-        assert_eq!(tally.topics[&TopicId::Action].lost, 1 + (u64::MAX - 3));
+        count(TopicId::ACTION, 1, 70);
+        count(TopicId::ACTION, 2, 0);
+        count(TopicId::ACTION, 2, 2);
+        count(TopicId::ACTION, 2, u64::MAX);
+        count(TopicId::ACTION, 2, 0);
+        assert_eq!((tally.topics[&TopicId::BELIEF].lost, tally.topics[&TopicId::BELIEF].arrived), (2, 4));
+        assert_eq!(tally.topics[&TopicId::ACTION].lost, 1 + (u64::MAX - 3));
     }
 }

@@ -5,7 +5,8 @@ use crate::wire::{Tag, encode};
 use crate::{note, topics};
 use anyhow::{Context, ensure};
 use carff_messages::Header;
-use carff_observe::{AnyReceiver, AttachError, Attached, Received, TopicId, attach, runs};
+use carff_observe::{AttachError, Attached, attach, runs};
+use carff_transport::{AnyReceiver, Received, TopicId};
 use carff_transport::{Run, Stop, Waiter, Woken, living_processes, monotonic_now_ns};
 use clap::Args;
 use std::collections::BTreeSet;
@@ -144,7 +145,7 @@ impl Way {
     fn declare(session: &Session, run: &str, topic: TopicId, sender: u64) -> anyhow::Result<Self> {
         // What is small overtakes pictures; on a slow link each is dropped rather than waited for.
         let priority = match topic {
-            TopicId::Frame | TopicId::View => Priority::DataLow,
+            TopicId::FRAME | TopicId::VIEW => Priority::DataLow,
             _ => Priority::DataHigh,
         };
         let publisher = session

@@ -1,7 +1,7 @@
 //! Which topics cross, and under which key.
 
 use carff_messages::Stage;
-use carff_observe::TopicId;
+use carff_transport::TopicId;
 use carff_transport::Run;
 
 /// Version of what crosses: ends of different versions do not hear each other.
@@ -11,7 +11,7 @@ const VERSION: u32 = 1;
 pub fn parse(text: &str) -> Result<Vec<TopicId>, String> {
     match text {
         "all" => Ok(TopicId::all().collect()),
-        "health" => Ok(Stage::ALL.iter().map(|&stage| TopicId::Health(stage)).collect()),
+        "health" => Ok(Stage::ALL.iter().map(|&stage| TopicId::health(stage)).collect()),
         name => name.parse().map(|topic| vec![topic]).map_err(|error: carff_observe::UnknownTopic| error.to_string()),
     }
 }
@@ -55,7 +55,7 @@ mod tests {
         assert_eq!(of_key("a", "carff/link/1/a/prober/beliefs"), None);
         assert_eq!(parse("all").map(|t| t.len()), Ok(TopicId::all().count()));
         assert_eq!(parse("health").map(|t| t.len()), Ok(Stage::ALL.len()));
-        assert_eq!(parse("belief"), Ok(vec![TopicId::Belief]));
+        assert_eq!(parse("belief"), Ok(vec![TopicId::BELIEF]));
         assert!(run_name("a").is_ok() && run_name("*").is_err() && run_name("a/b").is_err());
         assert!(parse("beleif").is_err_and(|e| e.contains("prober/belief")));
     }

@@ -1,7 +1,7 @@
 //! What crosses for each message: its form as JSON, tagged, and beside it the bytes of a picture.
 
-use carff_messages::{Action, Belief, Forecast, FrameMeta, Header, Health, Message, PictureMeta, Posterior, ViewMeta};
-use carff_observe::TopicId;
+use carff_messages::{Action, Belief, Forecast, FrameMeta, Header, Health, Message, ImageMeta, Posterior, ViewMeta};
+use carff_transport::TopicId;
 use carff_messages::forms::{ActionForm, AnyMessage, BeliefForm, ForecastForm, FormError, FrameForm, HealthForm, PosteriorForm, ViewForm};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
@@ -80,19 +80,19 @@ pub fn decode(topic: TopicId, form: &[u8], picture_bytes: usize) -> Result<(Tag,
         return Err(WireError::Length(form.len()));
     }
     let (tag, arrived, described) = match topic {
-        TopicId::Frame => {
+        TopicId::FRAME => {
             let (tag, meta) = read::<FrameForm, FrameMeta>(form)?;
-            (tag, Arrived::Frame(Box::new(meta)), meta.picture_bytes())
+            (tag, Arrived::Frame(Box::new(meta)), meta.image_bytes())
         }
-        TopicId::View => {
+        TopicId::VIEW => {
             let (tag, meta) = read::<ViewForm, ViewMeta>(form)?;
-            (tag, Arrived::View(Box::new(meta)), meta.picture_bytes())
+            (tag, Arrived::View(Box::new(meta)), meta.image_bytes())
         }
-        TopicId::Posterior => read::<PosteriorForm, _>(form).map(|(tag, m)| (tag, Arrived::Posterior(m), 0))?,
-        TopicId::Forecast => read::<ForecastForm, _>(form).map(|(tag, m)| (tag, Arrived::Forecast(Box::new(m)), 0))?,
-        TopicId::Belief => read::<BeliefForm, _>(form).map(|(tag, m)| (tag, Arrived::Belief(Box::new(m)), 0))?,
-        TopicId::Action => read::<ActionForm, _>(form).map(|(tag, m)| (tag, Arrived::Action(m), 0))?,
-        TopicId::Health(_) => read::<HealthForm, _>(form).map(|(tag, m)| (tag, Arrived::Health(m), 0))?,
+        TopicId::POSTERIOR => read::<PosteriorForm, _>(form).map(|(tag, m)| (tag, Arrived::Posterior(m), 0))?,
+        TopicId::FORECAST => read::<ForecastForm, _>(form).map(|(tag, m)| (tag, Arrived::Forecast(Box::new(m)), 0))?,
+        TopicId::BELIEF => read::<BeliefForm, _>(form).map(|(tag, m)| (tag, Arrived::Belief(Box::new(m)), 0))?,
+        TopicId::ACTION => read::<ActionForm, _>(form).map(|(tag, m)| (tag, Arrived::Action(m), 0))?,
+        TopicId::health(_) => read::<HealthForm, _>(form).map(|(tag, m)| (tag, Arrived::Health(m), 0))?,
     };
     if picture_bytes != described {
         return Err(WireError::Picture { found: picture_bytes, described });
@@ -226,13 +226,13 @@ mod tests {
         };
         let (view, belief, action, health) = (view(), belief(), action(), health());
         for (topic, message, picture_bytes, expected) in [
-            (TopicId::Frame, AnyMessage::Frame(&frame, &[0; 18]), 18, Arrived::Frame(frame.into())),
-            (TopicId::Posterior, AnyMessage::Posterior(&posterior), 0, Arrived::Posterior(posterior)),
-            (TopicId::Forecast, AnyMessage::Forecast(&forecast), 0, Arrived::Forecast(forecast.into())),
-            (TopicId::Belief, AnyMessage::Belief(&belief), 0, Arrived::Belief(belief.into())),
-            (TopicId::View, AnyMessage::View(&view, &[0; 18]), 18, Arrived::View(view.into())),
-            (TopicId::Action, AnyMessage::Action(&action), 0, Arrived::Action(action)),
-            (TopicId::Health(Stage::Prober), AnyMessage::Health(&health), 0, Arrived::Health(health)),
+            (TopicId::FRAME, AnyMessage::Frame(&frame, &[0; 18]), 18, Arrived::Frame(frame.into())),
+            (TopicId::POSTERIOR, AnyMessage::Posterior(&posterior), 0, Arrived::Posterior(posterior)),
+            (TopicId::FORECAST, AnyMessage::Forecast(&forecast), 0, Arrived::Forecast(forecast.into())),
+            (TopicId::BELIEF, AnyMessage::Belief(&belief), 0, Arrived::Belief(belief.into())),
+            (TopicId::VIEW, AnyMessage::View(&view, &[0; 18]), 18, Arrived::View(view.into())),
+            (TopicId::ACTION, AnyMessage::Action(&action), 0, Arrived::Action(action)),
+            (TopicId::health(Stage::Prober), AnyMessage::Health(&health), 0, Arrived::Health(health)),
         ] {
             let form = encode(message, TAG).unwrap();
             assert_eq!(decode(topic, &form, picture_bytes).unwrap(), (TAG, expected), "{topic}");
@@ -245,10 +245,10 @@ mod tests {
         let (view, mut belief) = (view(), belief());
         let form = encode(AnyMessage::View(&view, &[0; 18]), TAG).unwrap();
         for cut in 0..form.len() {
-            assert!(decode(TopicId::View, &form[..cut], 18).is_err(), "{cut}");
+            assert!(decode(TopicId::VIEW, &form[..cut], 18).is_err(), "{cut}");
         }
-        assert!(matches!(decode(TopicId::Frame, &form, 18), Err(WireError::Form(_))));
-        let size = decode(TopicId::View, &form, 17).unwrap_err().to_string();
+        assert!(matches!(decode(TopicId::FRAME, &form, 18), Err(WireError::Form(_))));
+        let size = decode(TopicId::VIEW, &form, 17).unwrap_err().to_string();
         assert_eq!(size, "the picture has 17 bytes, described are 18");
         let text = String::from_utf8(form).unwrap();
         for (from, to) in [
@@ -261,12 +261,12 @@ mod tests {
         ] {
             let wrong = text.replacen(from, to, 1);
             assert_ne!(wrong, text, "{from}");
-            assert!(decode(TopicId::View, wrong.as_bytes(), 18).is_err(), "{to}");
+            assert!(decode(TopicId::VIEW, wrong.as_bytes(), 18).is_err(), "{to}");
         }
-        assert!(matches!(decode(TopicId::View, &vec![b' '; MAX_FORM_BYTES + 1], 18), Err(WireError::Length(_))));
+        assert!(matches!(decode(TopicId::VIEW, &vec![b' '; MAX_FORM_BYTES + 1], 18), Err(WireError::Length(_))));
         belief.hazard_probability = 1.5;
         let form = encode(AnyMessage::Belief(&belief), TAG).unwrap();
-        assert!(matches!(decode(TopicId::Belief, &form, 0), Err(WireError::Message(_))));
+        assert!(matches!(decode(TopicId::BELIEF, &form, 0), Err(WireError::Message(_))));
     }
 
     /// A settled message has the run and the times of its new place, and all else as it was, sequence number included.

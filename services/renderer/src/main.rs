@@ -18,7 +18,7 @@ fn run(stage: &mut StageContext) -> anyhow::Result<()> {
     let bytes = settings.width_px as usize * settings.height_px as usize * 3;
     let mut forecasts = stage.input(&topics::FORECAST)?;
     let mut beliefs = stage.input(&topics::BELIEF)?;
-    let mut views = stage.picture_output(&topics::VIEW, bytes)?;
+    let mut views = stage.image_output(&topics::VIEW, bytes)?;
     let field = load(&stage.checkpoint)?;
     let mut buffer = HypothesisBuffer::default();
     let period_ns = (1e9 / settings.max_rate_hz) as u64;
@@ -71,7 +71,7 @@ fn run(stage: &mut StageContext) -> anyhow::Result<()> {
                         let mut meta = meta(&forecast, hypothesis, choice, &camera);
                         // Its share of what was rendered for all of them at once, and its own writing.
                         meta.stage_latency_ns = stage.worked(&meta.header, written_ns.saturating_sub(own_ns));
-                        views.send(loan, meta)?;
+                        views.send_image(loan, meta)?;
                     }
                     Err(error) => stage.error(&error),
                 }

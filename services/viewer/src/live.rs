@@ -9,7 +9,7 @@ use carff_messages::{
     Action, ActionCode, Belief, FrameMeta, Gaussian, Health, Observability, Posterior, Reason, Rule, Stage,
 };
 use carff_observe::{AttachError, Attached, LiveRun, attach};
-use carff_transport::{OpenError, PictureReceiver, ReceiveError, Receiver, topics};
+use carff_transport::{OpenError, ReceiveError, Receiver, topics};
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, mpsc};
@@ -162,7 +162,7 @@ fn watch(first: Watcher, watched: &Mutex<Watched>, stopped: &AtomicBool, wake: &
 /// Subscribed to a run's topics.
 struct Watcher {
     attached: Attached,
-    frames: PictureReceiver<FrameMeta>,
+    frames: Receiver<carff_transport::Image<FrameMeta>>,
     posteriors: Receiver<Posterior>,
     forecasts: Receiver<carff_messages::Forecast>,
     beliefs: Receiver<Belief>,
@@ -177,9 +177,9 @@ impl Watcher {
     fn join(run: Option<&str>) -> Result<Self, LiveError> {
         let attached = attach(run, "viewer")?;
         let node = &attached.node;
-        let healths = Stage::ALL.iter().map(|&stage| Ok(node.receiver(&topics::health(stage))?.polled()));
+        let healths = Stage::ALL.iter().map(|&stage| Ok(node.receiver(topics::health(stage))?.polled()));
         Ok(Self {
-            frames: node.picture_receiver(&topics::FRAME)?.polled(),
+            frames: node.receiver(&topics::FRAME)?.polled(),
             posteriors: node.receiver(&topics::POSTERIOR)?.polled(),
             forecasts: node.receiver(&topics::FORECAST)?.polled(),
             beliefs: node.receiver(&topics::BELIEF)?.polled(),
@@ -196,7 +196,7 @@ impl Watcher {
         let mut is_new = false;
         // In the order of the data's way, so that what belongs to a frame finds it.
         while let Some(frame) = self.frames.next()? {
-            let meta = frame.meta();
+            let meta = &*frame;
             locked(watched).frames = meta.header.frame_id + 1;
             self.assembly.frame(meta.header.frame_id, input(meta, frame.bytes()));
         }

@@ -43,7 +43,7 @@ fn watches_a_run_from_frame_to_decision() {
     };
     let path = RunRecord::path(&runtime_dir(), &name);
     std::fs::write(&path, record.to_bytes().unwrap()).unwrap();
-    let mut frames = node.picture_publisher(&topics::FRAME, 12).unwrap();
+    let mut frames = node.image_publisher(&topics::FRAME, 12).unwrap();
     let mut posteriors = node.publisher(&topics::POSTERIOR).unwrap();
     let mut forecasts = node.publisher(&topics::FORECAST).unwrap();
     let mut beliefs = node.publisher(&topics::BELIEF).unwrap();
@@ -66,7 +66,7 @@ fn watches_a_run_from_frame_to_decision() {
     };
     let mut loan = frames.loan(12).unwrap();
     loan.bytes_mut().copy_from_slice(&[7; 12]);
-    frames.send(loan, meta).unwrap();
+    frames.send_image(loan, meta).unwrap();
     // As in a graph: each message rests on one that was there before.
     wait_for(|| (feed.watched().frames == 5).then_some(()));
     posteriors.send(Posterior { header, gaussian: Gaussian::standard(), stage_latency_ns: 3_000_000 }).unwrap();

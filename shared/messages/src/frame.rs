@@ -2,7 +2,7 @@
 
 use crate::check::{at_most, finite, finite_f64, in_range, within};
 use crate::{
-    Header, Invalid, LATENT_DIM, MAX_PICTURE_BYTES, MAX_SAMPLES, MAX_SIDE_PX, MAX_STATES, Observability, PictureMeta,
+    Header, ImageMeta, Invalid, LATENT_DIM, MAX_IMAGE_BYTES, MAX_SAMPLES, MAX_SIDE_PX, MAX_STATES, Observability,
     ViewKind, message,
 };
 use iceoryx2::prelude::ZeroCopySend;
@@ -126,9 +126,9 @@ impl FrameMeta {
 
 message!(FrameMeta);
 
-impl PictureMeta for FrameMeta {
-    fn picture_bytes(&self) -> usize {
-        self.width_px as usize * self.height_px as usize * 3
+impl ImageMeta for FrameMeta {
+    fn size_px(&self) -> [u32; 2] {
+        [self.width_px, self.height_px]
     }
 }
 
@@ -177,14 +177,14 @@ impl ViewMeta {
 
 message!(ViewMeta);
 
-impl PictureMeta for ViewMeta {
-    fn picture_bytes(&self) -> usize {
-        self.width_px as usize * self.height_px as usize * 3
+impl ImageMeta for ViewMeta {
+    fn size_px(&self) -> [u32; 2] {
+        [self.width_px, self.height_px]
     }
 }
 
 fn picture_size(width_px: u32, height_px: u32) -> Result<(), Invalid> {
     in_range("width_px", width_px.into(), 1, MAX_SIDE_PX.into())?;
     in_range("height_px", height_px.into(), 1, MAX_SIDE_PX.into())?;
-    at_most("width_px * height_px * 3", u64::from(width_px) * u64::from(height_px) * 3, MAX_PICTURE_BYTES as u64)
+    at_most("width_px * height_px * 3", u64::from(width_px) * u64::from(height_px) * 3, MAX_IMAGE_BYTES as u64)
 }

@@ -36,6 +36,7 @@ pub use latent::{Belief, Forecast, Gaussian, Posterior, ProbeResult};
 pub use iceoryx2::prelude::ZeroCopySend;
 
 use check::{at_most, equals};
+use std::fmt::Debug;
 
 /// Version of all layouts in this crate. A process drops what carries another one.
 pub const SCHEMA_VERSION: u32 = 2;
@@ -54,7 +55,7 @@ pub const MAX_HORIZON: u32 = 8;
 /// Largest width or height of a picture, pixels.
 pub const MAX_SIDE_PX: u32 = 4096;
 /// Most bytes that a picture on a topic can have (RGB, 8 bit).
-pub const MAX_PICTURE_BYTES: usize = 1 << 24;
+pub const MAX_IMAGE_BYTES: usize = 1 << 24;
 
 /// What every message carries: enough to follow one frame through every stage.
 #[repr(C)]
@@ -107,8 +108,8 @@ impl Header {
     }
 }
 
-/// What the transport needs to know of a message.
-pub trait Message: Copy {
+/// A message as the transport handles it.
+pub trait Message: ZeroCopySend + Debug + Copy + Send + Sync + 'static {
     /// The header.
     fn header(&self) -> &Header;
     /// The header, to be stamped on send.
@@ -117,11 +118,16 @@ pub trait Message: Copy {
     fn validate(&self) -> Result<(), Invalid>;
 }
 
-/// A message that describes a picture in the slice that it comes with. Its default is not valid: a loan holds it until
-/// the real one is written.
-pub trait PictureMeta: Message + Default {
-    /// How many bytes the slice must have. Meaningful once [`Message::validate`] has passed.
-    fn picture_bytes(&self) -> usize;
+/// A message that describes the image it comes with. Its default is not valid: a loan holds it until the real one is
+/// written.
+pub trait ImageMeta: Message + Default {
+    /// Width and height of the image, pixels.
+    fn size_px(&self) -> [u32; 2];
+
+    /// Bytes of the image, RGB, 8 bit. Only meaningful once [`Message::validate`] has passed.
+    fn image_bytes(&self) -> usize {
+        self.size_px().iter().map(|&side| side as usize).product::<usize>() * 3
+    }
 }
 
 /// Makes a type a [`Message`]: it has a field `header: Header`, and a method `check(&self) -> Result<(), Invalid>`. Of a

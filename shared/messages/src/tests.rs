@@ -42,7 +42,7 @@ fn one_wrong_field_is_enough() {
     assert_eq!(forecast().validate(), Ok(()));
     assert_eq!(belief().validate(), Ok(()));
     assert_eq!(frame().validate(), Ok(()));
-    assert_eq!(frame().picture_bytes(), 128 * 96 * 3);
+    assert_eq!(frame().image_bytes(), 128 * 96 * 3);
 
     let wrong_forecasts: [fn(&mut Forecast); 10] = [
         |m| m.header.schema_version += 1,

@@ -2,10 +2,8 @@
 
 use crate::{StandardMessage, standard_messages};
 use carff_decision::Place;
-use carff_messages::forms::{
-    ActionForm, AnyMessage, BeliefForm, ForecastForm, FrameForm, HealthForm, PosteriorForm, ViewForm, schema,
-};
-use carff_observe::TopicId;
+use carff_messages::forms::AnyMessage;
+use carff_transport::TopicId;
 use foxglove::messages::{CameraCalibration, FrameTransform, RawImage, SceneUpdate};
 use foxglove::{Encode, Schema};
 
@@ -24,15 +22,7 @@ pub struct Channel {
 pub fn channels() -> Vec<Channel> {
     let mut channels: Vec<Channel> = TopicId::all()
         .map(|topic| {
-            let (name, schema) = match topic {
-                TopicId::Frame => ("carff.Frame", schema::<FrameForm>()),
-                TopicId::Posterior => ("carff.Posterior", schema::<PosteriorForm>()),
-                TopicId::Forecast => ("carff.Forecast", schema::<ForecastForm>()),
-                TopicId::Belief => ("carff.Belief", schema::<BeliefForm>()),
-                TopicId::View => ("carff.View", schema::<ViewForm>()),
-                TopicId::Action => ("carff.Action", schema::<ActionForm>()),
-                TopicId::Health(_) => ("carff.Health", schema::<HealthForm>()),
-            };
+            let (name, schema) = topic.schema();
             let schema = Schema::new(name, "jsonschema", schema.to_string().into_bytes());
             Channel { name: topic.name(), encoding: "json".to_owned(), schema: Some(schema) }
         })

@@ -18,7 +18,7 @@ mod writer;
 pub use about::About;
 pub use channels::{Channel, channels, encode};
 pub use queue::{QueueCounts, RecordingQueue};
-pub use reader::{Entry, OwnedMessage, Reader};
+pub use reader::{Entry, Reader};
 pub use rotation::{Limits, RotatingWriter};
 pub use standard::{StandardMessage, standard_messages};
 pub use writer::Writer;
@@ -82,12 +82,6 @@ impl RecordingError {
 
 impl From<FormError> for MessageError {
     fn from(error: FormError) -> Self {
-        Self(error.to_string())
-    }
-}
-
-impl From<serde_json::Error> for MessageError {
-    fn from(error: serde_json::Error) -> Self {
         Self(error.to_string())
     }
 }

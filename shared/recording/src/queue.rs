@@ -1,7 +1,8 @@
 //! A queue before the disk: whoever listens to the graph never waits for it.
 
-use crate::{OwnedMessage, RecordingError, RotatingWriter};
-use carff_observe::TopicId;
+use crate::{RecordingError, RotatingWriter};
+use carff_messages::forms::OwnedMessage;
+use carff_transport::TopicId;
 use crossbeam::channel::{Receiver, RecvTimeoutError, Sender, TrySendError, bounded};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};

@@ -2,13 +2,9 @@
 
 use crate::about::METADATA;
 use crate::{About, MessageError, RecordingError};
-use carff_messages::forms::{
-    ActionForm, AnyMessage, BeliefForm, ForecastForm, FrameForm, HealthForm, PosteriorForm, ViewForm,
-};
-use carff_messages::{
-    Action, Belief, Forecast, FrameMeta, Health, MAX_PICTURE_BYTES, PictureMeta, Posterior, ViewMeta,
-};
-use carff_observe::TopicId;
+use carff_messages::forms::{AnyMessage, DynMessage, OwnedMessage};
+use carff_messages::{FrameMeta, ImageMeta, MAX_IMAGE_BYTES, ViewMeta};
+use carff_transport::TopicId;
 use foxglove::Decode;
 use foxglove::messages::RawImage;
 use mcap::records::Record;
@@ -19,56 +15,15 @@ use std::io::Read;
 use std::path::{Path, PathBuf};
 
 /// Longest record that is read, bytes: a chunk with a picture of the largest size fits in.
-const MAX_RECORD_BYTES: usize = 4 * MAX_PICTURE_BYTES;
+const MAX_RECORD_BYTES: usize = 4 * MAX_IMAGE_BYTES;
 /// Most channels that are remembered.
 const MAX_CHANNELS: usize = 4096;
 
-/// A message out of a recording.
-#[derive(Clone, Debug)]
-pub enum OwnedMessage {
-    /// A camera frame.
-    Frame(FrameMeta, Vec<u8>),
-    /// A posterior.
-    Posterior(Posterior),
-    /// A forecast.
-    Forecast(Box<Forecast>),
-    /// A belief.
-    Belief(Box<Belief>),
-    /// A rendered view.
-    View(ViewMeta, Vec<u8>),
-    /// An action.
-    Action(Action),
-    /// A heartbeat.
-    Health(Health),
-}
+/// The channels that hold the images which the messages of a topic describe.
+const IMAGE_CHANNELS: [(TopicId, &str); 2] = [(TopicId::FRAME, "camera/image"), (TopicId::VIEW, "renderer/image")];
 
-impl OwnedMessage {
-    /// The message.
-    pub fn as_message(&self) -> AnyMessage<'_> {
-        match self {
-            Self::Frame(m, bytes) => AnyMessage::Frame(m, bytes),
-            Self::Posterior(m) => AnyMessage::Posterior(m),
-            Self::Forecast(m) => AnyMessage::Forecast(m),
-            Self::Belief(m) => AnyMessage::Belief(m),
-            Self::View(m, bytes) => AnyMessage::View(m, bytes),
-            Self::Action(m) => AnyMessage::Action(m),
-            Self::Health(m) => AnyMessage::Health(m),
-        }
-    }
-}
-
-impl From<AnyMessage<'_>> for OwnedMessage {
-    fn from(message: AnyMessage<'_>) -> Self {
-        match message {
-            AnyMessage::Frame(m, bytes) => Self::Frame(*m, bytes.to_vec()),
-            AnyMessage::Posterior(m) => Self::Posterior(*m),
-            AnyMessage::Forecast(m) => Self::Forecast(Box::new(*m)),
-            AnyMessage::Belief(m) => Self::Belief(Box::new(*m)),
-            AnyMessage::View(m, bytes) => Self::View(*m, bytes.to_vec()),
-            AnyMessage::Action(m) => Self::Action(*m),
-            AnyMessage::Health(m) => Self::Health(*m),
-        }
-    }
+fn image_channel(topic: TopicId) -> Option<&'static str> {
+    IMAGE_CHANNELS.into_iter().find_map(|(described, channel)| (described == topic).then_some(channel))
 }
 
 /// A message with its place.
@@ -87,8 +42,8 @@ pub struct Reader {
     inner: Box<LinearReader>,
     about: About,
     channels: BTreeMap<u16, String>,
-    /// The latest picture of each image channel, with its number.
-    pictures: BTreeMap<&'static str, (u32, Vec<u8>)>,
+    /// The latest image of each image channel, with its sequence number.
+    images: BTreeMap<&'static str, (u32, Vec<u8>)>,
     has_footer: bool,
     is_cut_off: bool,
     ended: bool,
@@ -114,7 +69,7 @@ impl Reader {
             inner: Box::new(LinearReader::new_with_options(options)),
             about: About::default(),
             channels: BTreeMap::new(),
-            pictures: BTreeMap::new(),
+            images: BTreeMap::new(),
             has_footer: false,
             is_cut_off: false,
             ended: false,
@@ -160,55 +115,37 @@ impl Reader {
 
     /// A message of a topic; `None` for what other channels hold.
     fn entry(&mut self, channel: &str, sequence: u32, data: &[u8]) -> Result<Option<Entry>, MessageError> {
-        for image in ["camera/image", "renderer/image"] {
-            if channel == image {
-                let picture = RawImage::decode(data).map_err(|e| MessageError(e.to_string()))?;
-                self.pictures.insert(image, (sequence, picture.data.to_vec()));
-                return Ok(None);
-            }
+        if let Some(channel) = IMAGE_CHANNELS.into_iter().map(|(_, image)| image).find(|image| *image == channel) {
+            let image = RawImage::decode(data).map_err(|e| MessageError(e.to_string()))?;
+            self.images.insert(channel, (sequence, image.data.to_vec()));
+            return Ok(None);
         }
         let Some(topic) = TopicId::all().find(|t| t.name() == channel) else { return Ok(None) };
-        let message = match topic {
-            TopicId::Frame => {
-                let meta = FrameMeta::try_from(&serde_json::from_slice::<FrameForm>(data)?)?;
-                let bytes = self.picture("camera/image", sequence, &meta)?;
-                OwnedMessage::Frame(meta, bytes)
-            }
-            TopicId::View => {
-                let meta = ViewMeta::try_from(&serde_json::from_slice::<ViewForm>(data)?)?;
-                let bytes = self.picture("renderer/image", sequence, &meta)?;
-                OwnedMessage::View(meta, bytes)
-            }
-            TopicId::Posterior => {
-                OwnedMessage::Posterior((&serde_json::from_slice::<PosteriorForm>(data)?).try_into()?)
-            }
-            TopicId::Forecast => {
-                OwnedMessage::Forecast(Box::new((&serde_json::from_slice::<ForecastForm>(data)?).try_into()?))
-            }
-            TopicId::Belief => {
-                OwnedMessage::Belief(Box::new((&serde_json::from_slice::<BeliefForm>(data)?).try_into()?))
-            }
-            TopicId::Action => OwnedMessage::Action((&serde_json::from_slice::<ActionForm>(data)?).try_into()?),
-            TopicId::Health(_) => OwnedMessage::Health((&serde_json::from_slice::<HealthForm>(data)?).try_into()?),
+        let message = topic.read(data)?;
+        let bytes = match image_channel(topic) {
+            Some(channel) => self.image(channel, sequence, &*message)?,
+            None => Vec::new(),
         };
+        let message = OwnedMessage::new(message, bytes);
         Ok(Some(Entry { topic, message }))
     }
 
-    /// The picture that a description goes with.
-    fn picture(
+    /// The image that a message describes.
+    fn image(
         &mut self,
         channel: &'static str,
         sequence: u32,
-        meta: &impl PictureMeta,
+        message: &dyn DynMessage,
     ) -> Result<Vec<u8>, MessageError> {
-        match self.pictures.remove(channel) {
-            Some((number, bytes)) if number == sequence && bytes.len() == meta.picture_bytes() => Ok(bytes),
-            Some((number, bytes)) if number == sequence => Err(MessageError(format!(
-                "its picture on `{channel}` has {} bytes, must have {}",
-                bytes.len(),
-                meta.picture_bytes()
-            ))),
-            _ => Err(MessageError(format!("its picture is missing on `{channel}`"))),
+        let message = AnyMessage::new(message, &[]);
+        let frame = message.get().map(FrameMeta::image_bytes);
+        let described = frame.or_else(|| message.get().map(ViewMeta::image_bytes)).unwrap_or(0);
+        match self.images.remove(channel) {
+            Some((number, bytes)) if number == sequence && bytes.len() == described => Ok(bytes),
+            Some((number, bytes)) if number == sequence => {
+                Err(MessageError(format!("its image on `{channel}` has {} bytes, must have {described}", bytes.len())))
+            }
+            _ => Err(MessageError(format!("its image is missing on `{channel}`"))),
         }
     }
 

@@ -3,7 +3,7 @@
 use crate::{About, RecordingError, Writer};
 use carff_decision::Place;
 use carff_messages::forms::AnyMessage;
-use carff_observe::TopicId;
+use carff_transport::TopicId;
 use std::collections::VecDeque;
 use std::path::{Path, PathBuf};
 

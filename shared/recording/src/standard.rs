@@ -2,7 +2,7 @@
 
 use carff_decision::Place;
 use carff_messages::forms::AnyMessage;
-use carff_messages::{FrameMeta, Intrinsics};
+use carff_messages::{Belief, FrameMeta, ImageMeta, Intrinsics, ViewMeta};
 use foxglove::messages::{
     CameraCalibration, Color, CubePrimitive, FrameTransform, Pose, Quaternion, RawImage, SceneEntity, SceneUpdate,
     Timestamp, Vector3,
@@ -32,35 +32,36 @@ pub fn standard_messages(
     wall_ns: u64,
 ) -> Vec<(&'static str, StandardMessage)> {
     let at = Some(Timestamp::new((wall_ns / 1_000_000_000) as u32, (wall_ns % 1_000_000_000) as u32));
-    match message {
-        AnyMessage::Frame(meta, bytes) => vec![
-            ("camera/image", StandardMessage::Image(image(at, "camera", meta.width_px, meta.height_px, bytes))),
+    let bytes = message.bytes();
+    if let Some(meta) = message.get::<FrameMeta>() {
+        vec![
+            ("camera/image", StandardMessage::Image(image(at, "camera", meta.size_px(), bytes))),
             ("camera/calibration", StandardMessage::Calibration(calibration(at, meta))),
             ("camera/pose", StandardMessage::Pose(pose(at, &meta.world_from_camera))),
-        ],
-        AnyMessage::View(meta, bytes) => {
-            vec![(
-                "renderer/image",
-                StandardMessage::Image(image(at, "renderer", meta.width_px, meta.height_px, bytes)),
-            )]
-        }
-        AnyMessage::Belief(belief) if !places.is_empty() => {
-            let states = belief.state_probability.iter().take(belief.state_count as usize);
-            let entities = places
-                .iter()
-                .map(|place| {
-                    let taken: f32 =
-                        states.clone().zip(&place.occupied_in).filter(|(_, taken)| **taken).map(|(p, _)| p).sum();
-                    entity(at, place, f64::from(taken.clamp(0.0, 1.0)))
-                })
-                .collect();
-            vec![("prober/boxes", StandardMessage::Boxes(SceneUpdate { deletions: Vec::new(), entities }))]
-        }
-        _ => Vec::new(),
+        ]
+    } else if let Some(meta) = message.get::<ViewMeta>() {
+        vec![("renderer/image", StandardMessage::Image(image(at, "renderer", meta.size_px(), bytes)))]
+    } else if let Some(belief) = message.get::<Belief>().filter(|_| !places.is_empty()) {
+        vec![("prober/boxes", StandardMessage::Boxes(boxes(at, belief, places)))]
+    } else {
+        Vec::new()
     }
 }
 
-fn image(at: Option<Timestamp>, frame: &str, width: u32, height: u32, bytes: &[u8]) -> RawImage {
+/// The places, each with the probability that it is taken.
+fn boxes(at: Option<Timestamp>, belief: &Belief, places: &[Place]) -> SceneUpdate {
+    let states = belief.state_probability.iter().take(belief.state_count as usize);
+    let entities = places
+        .iter()
+        .map(|place| {
+            let taken: f32 = states.clone().zip(&place.occupied_in).filter(|(_, taken)| **taken).map(|(p, _)| p).sum();
+            entity(at, place, f64::from(taken.clamp(0.0, 1.0)))
+        })
+        .collect();
+    SceneUpdate { deletions: Vec::new(), entities }
+}
+
+fn image(at: Option<Timestamp>, frame: &str, [width, height]: [u32; 2], bytes: &[u8]) -> RawImage {
     RawImage {
         timestamp: at,
         frame_id: frame.to_owned(),

@@ -1,11 +1,11 @@
 use super::*;
 use carff_decision::Place;
 use carff_geometry::OrientedBox;
-use carff_messages::forms::AnyMessage;
+use carff_messages::forms::{AnyMessage, OwnedMessage};
 use carff_messages::{
     Action, Belief, DatasetView, FrameMeta, Gaussian, Header, Intrinsics, Posterior, ProbeResult, ViewMeta,
 };
-use carff_observe::TopicId;
+use carff_transport::TopicId;
 use std::io::Write as _;
 use std::path::Path;
 
@@ -78,23 +78,16 @@ fn messages(frame_id: u64) -> Vec<(TopicId, OwnedMessage)> {
         latency_ns: 20,
     };
     vec![
-        (TopicId::Frame, OwnedMessage::Frame(meta, pixels)),
-        (TopicId::Posterior, OwnedMessage::Posterior(posterior)),
-        (TopicId::Belief, OwnedMessage::Belief(Box::new(belief))),
-        (TopicId::View, OwnedMessage::View(view, vec![frame_id as u8; 12])),
-        (TopicId::Action, OwnedMessage::Action(action)),
+        (TopicId::FRAME, OwnedMessage::new(Box::new(meta), pixels)),
+        (TopicId::POSTERIOR, OwnedMessage::new(Box::new(posterior), Vec::new())),
+        (TopicId::BELIEF, OwnedMessage::new(Box::new(belief), Vec::new())),
+        (TopicId::VIEW, OwnedMessage::new(Box::new(view), vec![frame_id as u8; 12])),
+        (TopicId::ACTION, OwnedMessage::new(Box::new(action), Vec::new())),
     ]
 }
 
 fn same(a: AnyMessage<'_>, b: AnyMessage<'_>) -> bool {
-    match (a, b) {
-        (AnyMessage::Frame(a, x), AnyMessage::Frame(b, y)) => a == b && x == y,
-        (AnyMessage::Posterior(a), AnyMessage::Posterior(b)) => a == b,
-        (AnyMessage::Belief(a), AnyMessage::Belief(b)) => a == b,
-        (AnyMessage::View(a, x), AnyMessage::View(b, y)) => a == b && x == y,
-        (AnyMessage::Action(a), AnyMessage::Action(b)) => a == b,
-        _ => false,
-    }
+    a.to_json().unwrap() == b.to_json().unwrap() && a.bytes() == b.bytes()
 }
 
 fn read(path: &Path) -> (Vec<Entry>, bool) {

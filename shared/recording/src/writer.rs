@@ -4,7 +4,7 @@ use crate::about::METADATA;
 use crate::{About, RecordingError, channels, encode};
 use carff_decision::Place;
 use carff_messages::forms::AnyMessage;
-use carff_observe::TopicId;
+use carff_transport::TopicId;
 use mcap::records::{MessageHeader, Metadata};
 use mcap::write::NoSeek;
 use mcap::{Compression, WriteOptions};

@@ -5,15 +5,12 @@ use crate::health::{Heartbeat, Vitals};
 use crate::realtime;
 use anyhow::Context;
 use carff_config::{GraphConfig, LogFormat, LogLevel};
-use carff_messages::{Header, Health, HealthState, Message, PictureMeta, Stage};
+use carff_messages::{Header, Health, HealthState, ImageMeta, Message, Stage};
 use carff_transport::{
-    Input, Node, PicturePublisher, PictureReceiver, PictureTopic, Publisher, Receiver, Run, Stop, Topic, Waiter, Woken,
-    monotonic_now_ns, topics,
+    Image, Input, Node, Payload, Publisher, Receiver, Run, Stop, Topic, Waiter, Woken, monotonic_now_ns, topics,
 };
 use clap::Parser;
-use iceoryx2::prelude::ZeroCopySend;
 use rustix::process::{Signal, getppid, set_parent_process_death_signal};
-use std::fmt::Debug;
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::sync::Arc;
@@ -92,7 +89,7 @@ impl StageContext {
         let run = Run::new(args.run.as_deref().unwrap_or(&graph.run.name), args.run_id)?;
         let node = Node::open(&run, stage.name())?;
         let vitals = Arc::new(Vitals::new());
-        let publisher: Publisher<Health> = node.publisher(&topics::health(stage))?;
+        let publisher: Publisher<Health> = node.publisher(topics::health(stage))?;
         let counters = node.counters().clone();
         let heartbeat = Heartbeat::start(stage, graph.run.seed, publisher, vitals.clone(), counters)
             .context("cannot start the heartbeat")?;
@@ -117,38 +114,24 @@ impl StageContext {
         self.graph.run.seed
     }
 
-    /// Opens a topic to receive from. Do this before [`StageContext::ready`].
-    pub fn input<M>(&self, topic: &Topic<M>) -> anyhow::Result<Receiver<M>>
-    where
-        M: Message + ZeroCopySend + Debug + 'static,
-    {
+    /// Opens a topic to receive from. Call this before [`StageContext::ready`].
+    pub fn input<P: Payload>(&self, topic: &Topic<P>) -> anyhow::Result<Receiver<P>> {
         let receiver = self.node.receiver(topic)?;
         Ok(if self.graph.run.busy_polling { receiver.polled() } else { receiver })
     }
 
-    /// Opens a topic to send on.
-    pub fn output<M>(&self, topic: &Topic<M>) -> anyhow::Result<Publisher<M>>
-    where
-        M: Message + ZeroCopySend + Debug + 'static,
-    {
+    /// Opens a topic of messages to send on.
+    pub fn output<M: Message>(&self, topic: &Topic<M>) -> anyhow::Result<Publisher<M>> {
         Ok(self.node.publisher(topic)?)
     }
 
-    /// Opens a topic of pictures to receive from.
-    pub fn picture_input<M>(&self, topic: &PictureTopic<M>) -> anyhow::Result<PictureReceiver<M>>
-    where
-        M: PictureMeta + ZeroCopySend + Debug + 'static,
-    {
-        let receiver = self.node.picture_receiver(topic)?;
-        Ok(if self.graph.run.busy_polling { receiver.polled() } else { receiver })
-    }
-
-    /// Opens a topic of pictures of at most `max_bytes` each to send on.
-    pub fn picture_output<M>(&self, topic: &PictureTopic<M>, max_bytes: usize) -> anyhow::Result<PicturePublisher<M>>
-    where
-        M: PictureMeta + ZeroCopySend + Debug + 'static,
-    {
-        Ok(self.node.picture_publisher(topic, max_bytes)?)
+    /// Opens a topic of images of at most `max_bytes` each to send on.
+    pub fn image_output<M: ImageMeta>(
+        &self,
+        topic: &Topic<Image<M>>,
+        max_bytes: usize,
+    ) -> anyhow::Result<Publisher<Image<M>>> {
+        Ok(self.node.image_publisher(topic, max_bytes)?)
     }
 
     /// Says that all topics are open and all models loaded, before any work is done. The launcher waits for it.

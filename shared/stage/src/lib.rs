@@ -13,15 +13,15 @@
 //! }
 //!
 //! fn run(stage: &mut StageContext) -> anyhow::Result<()> {
-//!     let mut frames = stage.picture_input(&topics::FRAME)?;
+//!     let mut frames = stage.input(&topics::FRAME)?;
 //!     let mut posteriors = stage.output(&topics::POSTERIOR)?;
 //!     stage.ready();
 //!     while stage.wait(&[&frames])? {
 //!         let Some(frame) = frames.newest()? else { continue };
 //!         let started_ns = monotonic_now_ns();
-//!         let _span = frame_span(&frame.meta().header);
-//!         let gaussian = Gaussian::standard(); // computed from frame.meta() and frame.bytes(), read in place
-//!         let header = frame.meta().header;
+//!         let _span = frame_span(&frame.header);
+//!         let gaussian = Gaussian::standard(); // computed from frame.image(), read in place
+//!         let header = frame.header;
 //!         let stage_latency_ns = stage.worked(&header, started_ns);
 //!         posteriors.send(Posterior { header, gaussian, stage_latency_ns })?;
 //!     }

@@ -62,7 +62,7 @@ fn heartbeat(
 fn ready_is_said_before_work_begins() {
     let fixture = Fixture::new("ready");
     let node = Node::open(&fixture.run, "test").unwrap();
-    let mut health = node.receiver(&topics::health(Stage::Camera)).unwrap();
+    let mut health = node.receiver(topics::health(Stage::Camera)).unwrap();
     let mut stage = fixture.context(Stage::Camera);
     stage.ready();
     let mut states = Vec::new();
@@ -77,7 +77,7 @@ fn ready_is_said_before_work_begins() {
 fn heartbeats_tell_state_and_counts() {
     let fixture = Fixture::new("counts");
     let node = Node::open(&fixture.run, "test").unwrap();
-    let mut health = node.receiver(&topics::health(Stage::Forecaster)).unwrap();
+    let mut health = node.receiver(topics::health(Stage::Forecaster)).unwrap();
     let mut posteriors = node.publisher(&topics::POSTERIOR).unwrap();
 
     let mut stage = fixture.context(Stage::Forecaster);
@@ -112,7 +112,7 @@ fn heartbeats_tell_state_and_counts() {
 fn the_end_is_told() {
     let fixture = Fixture::new("ends");
     let node = Node::open(&fixture.run, "test").unwrap();
-    let mut health = node.receiver(&topics::health(Stage::Prober)).unwrap();
+    let mut health = node.receiver(topics::health(Stage::Prober)).unwrap();
     let code = run_with(Stage::Prober, fixture.args(), |stage| {
         stage.ready();
         // Until somebody has connected, nobody hears the last words.

@@ -1,15 +1,13 @@
-//! Who uses which topic now, as the transport knows it.
+//! The present users of each topic, as the transport knows them.
 
-use crate::node::service_name;
-use crate::{Node, OpenError, PictureTopic, Service, Topic};
-use carff_messages::{Message, PictureMeta};
+use crate::payload::Payload;
+use crate::{Node, OpenError, Service, Topic};
 use iceoryx2::node::{NodeState, NodeView};
-use iceoryx2::prelude::{CallbackProgression, PortFactory, ZeroCopySend};
+use iceoryx2::prelude::{CallbackProgression, PortFactory};
 use iceoryx2::service::Service as _;
 use iceoryx2::service::dynamic_config::publish_subscribe::DynamicConfig;
 use iceoryx2::service::static_config::messaging_pattern::MessagingPattern;
 use std::collections::BTreeMap;
-use std::fmt::Debug;
 
 /// A process that has joined the run.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -25,18 +23,18 @@ pub struct Member {
 pub struct OpenTopic {
     /// Name within the run.
     pub name: String,
-    /// Name of the message's type; for pictures, of what describes them.
+    /// Name of the message's type; for images, of the type that describes them.
     pub message: String,
-    /// Who has it open.
+    /// The processes that have it open.
     pub members: Vec<Member>,
 }
 
 /// The ports on a topic.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Ports {
-    /// Who sends.
+    /// Publishers.
     pub publishers: Vec<Member>,
-    /// Who receives.
+    /// Subscribers.
     pub subscribers: Vec<Member>,
 }
 
@@ -85,32 +83,13 @@ impl Node {
         Ok(topics)
     }
 
-    /// The ports on a topic; none when nobody has it open.
-    pub fn ports<M>(&self, topic: &Topic<M>) -> Result<Ports, OpenError>
-    where
-        M: Message + ZeroCopySend + Debug + 'static,
-    {
+    /// The ports on a topic; none when no process has it open.
+    pub fn ports<P: Payload>(&self, topic: &Topic<P>) -> Result<Ports, OpenError> {
         let members = self.members_by_id()?;
-        let name = service_name(topic.name).map_err(|cause| unnamed(topic.name, cause))?;
-        // It fails when nobody has it open.
-        let opened = self.inner().service_builder(&name).publish_subscribe::<M>().open();
+        // Opening fails when no process has the topic open.
+        let opened = P::open(self.unopened(topic)?);
         Ok(opened.map(|service| list(service.dynamic_config(), &members)).unwrap_or_default())
     }
-
-    /// The ports on a topic of pictures; none when nobody has it open.
-    pub fn picture_ports<M>(&self, topic: &PictureTopic<M>) -> Result<Ports, OpenError>
-    where
-        M: PictureMeta + ZeroCopySend + Debug + 'static,
-    {
-        let members = self.members_by_id()?;
-        let name = service_name(topic.name).map_err(|cause| unnamed(topic.name, cause))?;
-        let opened = self.inner().service_builder(&name).publish_subscribe::<[u8]>().user_header::<M>().open();
-        Ok(opened.map(|service| list(service.dynamic_config(), &members)).unwrap_or_default())
-    }
-}
-
-fn unnamed(topic: &str, cause: String) -> OpenError {
-    OpenError::Topic { topic: topic.to_owned(), cause }
 }
 
 fn list(config: &DynamicConfig<<Service as iceoryx2::service::Service>::Bag>, members: &Members) -> Ports {

@@ -1,9 +1,10 @@
 //! The typed layer over iceoryx2: topics with their limits, sending, receiving, waiting, and cleaning up.
-//! What the messages mean lives in `carff-messages`; what a stage does with them lives in the stages.
+//!
+//! `carff-messages` holds the messages and their meaning; the stages hold what is done with them.
 //!
 //! A process opens one [`Node`] in a [`Run`]. Every topic is one row of the table in [`topics`]. Sending stamps the
-//! header and wakes whoever waits. Receiving validates, drops and counts what is not valid, and gives access to the
-//! sender's memory in place. A [`Waiter`] sleeps until one of several inputs has something, a time, or a stop.
+//! header and wakes the receivers that wait. Receiving drops and counts invalid messages, and gives access to valid ones
+//! in the sender's memory. A [`Waiter`] sleeps until one of several inputs has a message, a time, or a stop.
 //!
 //! ```
 //! use carff_messages::{Gaussian, Header, Posterior};
@@ -33,9 +34,13 @@ mod counters;
 mod descriptors;
 mod error;
 mod in_use;
+mod log;
 mod node;
+mod payload;
 mod publisher;
 mod receiver;
+mod registry;
+mod retry;
 mod run;
 mod space;
 pub mod topics;
@@ -45,18 +50,21 @@ pub use counters::Counters;
 pub use error::{CleanupError, OpenError, ReceiveError, RunNameError, SendError, WaitError};
 pub use in_use::{Member, OpenTopic, Ports};
 pub use node::{Node, make_private_dir};
-pub use publisher::{PictureLoan, PicturePublisher, Publisher};
-pub use receiver::{Picture, PictureReceiver, Receiver, Sample};
+pub use payload::{Image, Payload};
+pub use publisher::{ImageLoan, Publisher};
+pub use receiver::{Receiver, Sample};
+pub use registry::{AnyPublisher, AnyReceiver, AnyTopic, Received, TopicId, UnknownTopic};
 pub use run::{Run, cleanup_dead, living_processes, remove_run_leftovers, run_id_of, runtime_dir};
 pub use space::{SHARED_MEMORY_DIR, check_space};
-pub use topics::{Limits, PictureTopic, Topic};
+pub use topics::{Limits, Topic};
 pub use wait::{Input, Stop, Waiter, Woken};
 
-/// Now, on the clock that all headers use: `CLOCK_MONOTONIC`, nanoseconds. The same in all processes of a machine.
+/// Returns the present time of the clock that all headers use: `CLOCK_MONOTONIC`, nanoseconds, the same in all processes
+/// of a machine.
 pub fn monotonic_now_ns() -> u64 {
     let now = rustix::time::clock_gettime(rustix::time::ClockId::Monotonic);
     now.tv_sec as u64 * 1_000_000_000 + now.tv_nsec as u64
 }
 
-/// The flavour of iceoryx2 that is used: between processes, ports usable from several threads.
+/// The variant of iceoryx2 in use: between processes, with ports that several threads can use.
 pub(crate) type Service = iceoryx2::prelude::ipc_threadsafe::Service;

@@ -1,44 +1,22 @@
 //! A process's membership in a run.
 
+use crate::payload::{Image, Opened, Payload, Unopened};
+use crate::retry::retry;
 use crate::run::CLEANUP_PATIENCE;
 use crate::space::{MANAGEMENT_BYTES, SHARED_MEMORY_DIR, check_space};
 use crate::topics::Limits;
-use crate::{
-    Counters, OpenError, PicturePublisher, PictureReceiver, PictureTopic, Publisher, Receiver, Run, Service, Topic,
-};
-use carff_messages::{Message, PictureMeta};
-use iceoryx2::port::listener::Listener;
-use iceoryx2::port::notifier::Notifier;
-use iceoryx2::prelude::{
-    AllocationStrategy, BackpressureStrategy, LogLevel, NodeBuilder, NodeName, ServiceName, SignalHandlingMode,
-    ZeroCopySend, set_log_level_from_env_or,
-};
+use crate::{Counters, OpenError, Publisher, Receiver, Run, Service, Topic, log};
+use carff_messages::{ImageMeta, Message};
+use iceoryx2::port::listener::{Listener, ListenerCreateError};
+use iceoryx2::port::notifier::{Notifier, NotifierCreateError};
+use iceoryx2::port::publisher::PublisherCreateError;
+use iceoryx2::port::subscriber::SubscriberCreateError;
+use iceoryx2::prelude::{BackpressureStrategy, NodeBuilder, NodeName, ServiceName, SignalHandlingMode};
 use iceoryx2::service::port_factory::event::PortFactory as EventFactory;
-use std::fmt::Debug;
 use std::fs::Permissions;
 use std::os::unix::fs::{DirBuilderExt, MetadataExt, PermissionsExt};
 use std::path::Path;
-use std::sync::{Arc, Once};
-use std::time::{Duration, Instant};
-
-/// Applies the table's limits to a service builder and opens it.
-macro_rules! limited {
-    ($builder:expr, $limits:expr) => {
-        $builder
-            .max_subscribers($limits.max_subscribers)
-            .max_publishers($limits.max_publishers)
-            .max_nodes($limits.max_nodes)
-            .history_size($limits.history)
-            .subscriber_max_buffer_size($limits.buffer)
-            .subscriber_max_borrowed_samples($limits.borrowed)
-            .enable_safe_overflow(true)
-            .open_or_create()
-            .map_err(|e| e.to_string())
-    };
-}
-
-/// How long to try again while several processes create the same topic at once.
-const OPEN_PATIENCE: Duration = Duration::from_secs(3);
+use std::sync::Arc;
 
 /// A process's membership in a run. Open one for each process; all its ports count into its [`Counters`].
 #[derive(Debug)]
@@ -48,16 +26,10 @@ pub struct Node {
     counters: Arc<Counters>,
 }
 
-/// iceoryx2 reports what goes wrong in its results; its own log would say it twice.
-pub(crate) fn quiet() {
-    static ONCE: Once = Once::new();
-    ONCE.call_once(|| set_log_level_from_env_or(LogLevel::Fatal));
-}
-
 impl Node {
     /// Joins a run under a name that others see, and cleans up what dead processes of this run left.
     pub fn open(run: &Run, name: &str) -> Result<Self, OpenError> {
-        quiet();
+        log::quiet();
         make_private_dir(&crate::runtime_dir())?;
         make_private_dir(&run.folder())?;
         check_space(Path::new(SHARED_MEMORY_DIR), "joining the run", MANAGEMENT_BYTES)?;
@@ -93,167 +65,112 @@ impl Node {
     }
 
     /// Opens a topic to receive from.
-    pub fn receiver<M>(&self, topic: &Topic<M>) -> Result<Receiver<M>, OpenError>
-    where
-        M: Message + ZeroCopySend + Debug + 'static,
-    {
-        let (name, limits) = (topic.name, topic.limits);
-        let service = retry(name, || {
-            limited!(self.inner.service_builder(&service_name(name)?).publish_subscribe::<M>(), limits)
-        })?;
-        let subscriber = service
-            .subscriber_builder()
-            .buffer_size(limits.buffer)
-            .create()
-            .map_err(|e| port_error(name, "subscribers", limits.max_subscribers, &e))?;
-        Ok(Receiver::new(
-            (name, topic.deadline),
-            &self.run,
-            subscriber,
-            self.listener(name, limits)?,
-            self.counters.clone(),
-        ))
+    pub fn receiver<P: Payload>(&self, topic: &Topic<P>) -> Result<Receiver<P>, OpenError> {
+        let Topic { name, limits, .. } = *topic;
+        let subscriber =
+            self.service(topic)?.subscriber_builder().buffer_size(limits.buffer).create().map_err(|e| match e {
+                SubscriberCreateError::ExceedsMaxSupportedSubscribers => {
+                    too_many(name, "subscribers", limits.max_subscribers)
+                }
+                _ => failed(name, &e),
+            })?;
+        Ok(Receiver::new(topic, &self.run, subscriber, self.listener(name, limits)?, self.counters.clone()))
     }
 
-    /// Opens a topic to send on.
-    pub fn publisher<M>(&self, topic: &Topic<M>) -> Result<Publisher<M>, OpenError>
-    where
-        M: Message + ZeroCopySend + Debug + 'static,
-    {
-        let (name, limits) = (topic.name, topic.limits);
-        check_segment(name, limits, size_of::<M>())?;
-        let service = retry(name, || {
-            limited!(self.inner.service_builder(&service_name(name)?).publish_subscribe::<M>(), limits)
-        })?;
-        let publisher = service
-            .publisher_builder()
-            .max_loaned_samples(limits.loaned)
-            .backpressure_strategy(BackpressureStrategy::DiscardData)
-            .create()
-            .map_err(|e| port_error(name, "publishers", limits.max_publishers, &e))?;
-        Ok(Publisher::new(name, &self.run, publisher, self.notifier(name, limits)?, self.counters.clone()))
+    /// Opens a topic of messages to send on.
+    pub fn publisher<M: Message>(&self, topic: &Topic<M>) -> Result<Publisher<M>, OpenError> {
+        self.sized_publisher(topic, 0)
     }
 
-    /// Opens a topic of pictures to receive from.
-    pub fn picture_receiver<M>(&self, topic: &PictureTopic<M>) -> Result<PictureReceiver<M>, OpenError>
-    where
-        M: PictureMeta + ZeroCopySend + Debug + 'static,
-    {
-        let (name, limits) = (topic.name, topic.limits);
-        let service = retry(name, || {
-            limited!(
-                self.inner.service_builder(&service_name(name)?).publish_subscribe::<[u8]>().user_header::<M>(),
-                limits
-            )
-        })?;
-        let subscriber = service
-            .subscriber_builder()
-            .buffer_size(limits.buffer)
-            .create()
-            .map_err(|e| port_error(name, "subscribers", limits.max_subscribers, &e))?;
-        let listener = self.listener(name, limits)?;
-        let named = (name, topic.deadline);
-        Ok(PictureReceiver::new(named, &self.run, subscriber, listener, self.counters.clone()))
-    }
-
-    /// Opens a topic of pictures of at most `max_bytes` each to send on.
-    pub fn picture_publisher<M>(
+    /// Opens a topic of images of at most `max_bytes` each to send on.
+    pub fn image_publisher<M: ImageMeta>(
         &self,
-        topic: &PictureTopic<M>,
+        topic: &Topic<Image<M>>,
         max_bytes: usize,
-    ) -> Result<PicturePublisher<M>, OpenError>
-    where
-        M: PictureMeta + ZeroCopySend + Debug + 'static,
-    {
-        let (name, limits) = (topic.name, topic.limits);
-        check_segment(name, limits, size_of::<M>() + max_bytes)?;
-        let service = retry(name, || {
-            limited!(
-                self.inner.service_builder(&service_name(name)?).publish_subscribe::<[u8]>().user_header::<M>(),
-                limits
-            )
-        })?;
+    ) -> Result<Publisher<Image<M>>, OpenError> {
+        self.sized_publisher(topic, max_bytes)
+    }
+
+    /// Opens a topic of any payload to send on; `max_bytes` only matters for images.
+    pub(crate) fn sized_publisher<P: Payload>(
+        &self,
+        topic: &Topic<P>,
+        max_bytes: usize,
+    ) -> Result<Publisher<P>, OpenError> {
+        let Topic { name, limits, .. } = *topic;
+        let needed_bytes = topic.segment_bytes(max_bytes) + MANAGEMENT_BYTES;
+        check_space(Path::new(SHARED_MEMORY_DIR), &format!("topic `{name}`"), needed_bytes)?;
+        let service = self.service(topic)?;
         let publisher = service
             .publisher_builder()
-            .initial_max_slice_len(max_bytes)
-            .allocation_strategy(AllocationStrategy::Static)
             .max_loaned_samples(limits.loaned)
-            .backpressure_strategy(BackpressureStrategy::DiscardData)
-            .create()
-            .map_err(|e| port_error(name, "publishers", limits.max_publishers, &e))?;
+            .backpressure_strategy(BackpressureStrategy::DiscardData);
+        let publisher = P::sized(publisher, max_bytes).create().map_err(|e| match e {
+            PublisherCreateError::ExceedsMaxSupportedPublishers => too_many(name, "publishers", limits.max_publishers),
+            _ => failed(name, &e),
+        })?;
         let notifier = self.notifier(name, limits)?;
-        Ok(PicturePublisher::new(name, &self.run, publisher, notifier, self.counters.clone(), max_bytes))
+        Ok(Publisher::new(topic, &self.run, publisher, notifier, self.counters.clone(), max_bytes))
+    }
+
+    /// Describes the service of a topic to iceoryx2, without its limits.
+    pub(crate) fn unopened<P: Payload>(&self, topic: &Topic<P>) -> Result<Unopened<P>, OpenError> {
+        let builder = self.inner.service_builder(&service_name(topic.name)?);
+        Ok(builder.publish_subscribe::<P::Body>().user_header::<P::UserHeader>())
+    }
+
+    fn service<P: Payload>(&self, topic: &Topic<P>) -> Result<Opened<P>, OpenError> {
+        let limits = topic.limits;
+        let service = self
+            .unopened(topic)?
+            .max_subscribers(limits.max_subscribers)
+            .max_publishers(limits.max_publishers)
+            .max_nodes(limits.max_nodes)
+            .history_size(limits.history)
+            .subscriber_max_buffer_size(limits.buffer)
+            .subscriber_max_borrowed_samples(limits.borrowed)
+            .enable_safe_overflow(true);
+        retry(topic.name, || P::open_or_create(service.clone()))
     }
 
     fn event(&self, topic: &str, limits: Limits) -> Result<EventFactory<Service>, OpenError> {
-        retry(topic, || {
-            self.inner
-                .service_builder(&service_name(topic)?)
-                .event()
-                .max_listeners(limits.max_subscribers)
-                .max_notifiers(limits.max_publishers)
-                .max_nodes(limits.max_nodes)
-                .event_id_max_value(0)
-                .open_or_create()
-                .map_err(|e| e.to_string())
-        })
+        let service = self
+            .inner
+            .service_builder(&service_name(topic)?)
+            .event()
+            .max_listeners(limits.max_subscribers)
+            .max_notifiers(limits.max_publishers)
+            .max_nodes(limits.max_nodes)
+            .event_id_max_value(0);
+        retry(topic, || service.clone().open_or_create())
     }
 
     fn listener(&self, topic: &str, limits: Limits) -> Result<Listener<Service>, OpenError> {
-        let factory = self.event(topic, limits)?;
-        factory.listener_builder().create().map_err(|e| port_error(topic, "listeners", limits.max_subscribers, &e))
+        self.event(topic, limits)?.listener_builder().create().map_err(|e| match e {
+            ListenerCreateError::ExceedsMaxSupportedListeners => too_many(topic, "listeners", limits.max_subscribers),
+            _ => failed(topic, &e),
+        })
     }
 
     fn notifier(&self, topic: &str, limits: Limits) -> Result<Notifier<Service>, OpenError> {
-        let factory = self.event(topic, limits)?;
-        factory.notifier_builder().create().map_err(|e| port_error(topic, "notifiers", limits.max_publishers, &e))
+        self.event(topic, limits)?.notifier_builder().create().map_err(|e| match e {
+            NotifierCreateError::ExceedsMaxSupportedNotifiers => too_many(topic, "notifiers", limits.max_publishers),
+            _ => failed(topic, &e),
+        })
     }
 }
 
-fn check_segment(topic: &str, limits: Limits, message_bytes: usize) -> Result<(), OpenError> {
-    let needed = (limits.preallocated() * (message_bytes + 64)) as u64 + MANAGEMENT_BYTES;
-    check_space(Path::new(SHARED_MEMORY_DIR), &format!("topic `{topic}`"), needed)
+pub(crate) fn service_name(topic: &str) -> Result<ServiceName, OpenError> {
+    ServiceName::new(topic)
+        .map_err(|e| OpenError::Topic { topic: topic.to_owned(), cause: format!("its name is not allowed: {e:?}") })
 }
 
-pub(crate) fn service_name(topic: &str) -> Result<ServiceName, String> {
-    ServiceName::new(topic).map_err(|e| format!("name: {e:?}"))
+fn failed(topic: &str, error: &dyn std::error::Error) -> OpenError {
+    OpenError::Topic { topic: topic.to_owned(), cause: error.to_string() }
 }
 
-/// Opens or creates, again and again for a while where another process is just creating or removing the same thing.
-fn retry<T>(topic: &str, mut open: impl FnMut() -> Result<T, String>) -> Result<T, OpenError> {
-    // "DoesNotExist": it was there when it was looked for, and gone when it was opened.
-    const PASSING: [&str; 6] = [
-        "SystemInFlux",
-        "IsBeingCreated",
-        "IsMarkedForDestruction",
-        "HangsInCreation",
-        "AlreadyExists",
-        "DoesNotExist",
-    ];
-    let start = Instant::now();
-    loop {
-        let cause = match open() {
-            Ok(opened) => return Ok(opened),
-            Err(cause) => cause,
-        };
-        let topic = topic.to_owned();
-        if PASSING.iter().any(|word| cause.contains(word)) && start.elapsed() < OPEN_PATIENCE {
-            std::thread::sleep(Duration::from_millis(5));
-        } else if cause.contains("Incompatible") || cause.contains("DoesNotSupport") {
-            return Err(OpenError::Incompatible { topic, cause });
-        } else {
-            return Err(OpenError::Topic { topic, cause });
-        }
-    }
-}
-
-fn port_error(topic: &str, what: &'static str, max: usize, error: &dyn std::error::Error) -> OpenError {
-    let (topic, cause) = (topic.to_owned(), error.to_string());
-    if cause.contains("ExceedsMaxSupported") {
-        OpenError::TooMany { topic, what, max }
-    } else {
-        OpenError::Topic { topic, cause }
-    }
+fn too_many(topic: &str, what: &'static str, max: usize) -> OpenError {
+    OpenError::TooMany { topic: topic.to_owned(), what, max }
 }
 
 /// Takes away what iceoryx2 (0.10) leaves open to all users in shared memory: the counter of a run's nodes. All else it

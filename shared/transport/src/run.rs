@@ -105,7 +105,7 @@ pub fn run_id_of(name: &str, start_ns: u64) -> u64 {
 /// Removes what dead processes of a living run left behind. Returns how many were cleaned up.
 /// Wait for dead children first: a zombie still counts as alive.
 pub fn cleanup_dead(run: &Run) -> Result<u32, CleanupError> {
-    crate::node::quiet();
+    crate::log::quiet();
     let failed = |cause: String| CleanupError::List { run: run.name.clone(), cause };
     let config = run.config().map_err(failed)?;
     let mut cleaned = 0;
@@ -121,7 +121,7 @@ pub fn cleanup_dead(run: &Run) -> Result<u32, CleanupError> {
 
 /// The processes of a run that live now.
 pub fn living_processes(run: &Run) -> Result<Vec<u32>, CleanupError> {
-    crate::node::quiet();
+    crate::log::quiet();
     let failed = |cause: String| CleanupError::List { run: run.name.clone(), cause };
     let config = run.config().map_err(failed)?;
     let living = nodes(run, &config).map_err(failed)?.into_iter().filter_map(|node| match node {

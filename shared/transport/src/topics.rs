@@ -1,9 +1,9 @@
-//! The one table of topics: name, type, limits, deadline.
+//! The table of the graph's topics: name, payload, limits, deadline.
 //!
-//! Each topic has a publish-subscribe service and an event service of the same name for wake-up. Safe overflow is on
-//! everywhere: a full buffer loses its oldest message, and no subscriber can delay a publisher.
+//! Each topic has a publish-subscribe service and an event service of the same name for wake-up. Safe overflow is always
+//! on: a full buffer loses its oldest message, and no subscriber can delay a publisher.
 //!
-//! A stage of another crate has topics of its own, of messages made with [`carff_messages::message!`]:
+//! A stage of another crate declares its topics in the same way, of messages made with [`carff_messages::message!`]:
 //!
 //! ```
 //! use carff_messages::Posterior;
@@ -12,6 +12,8 @@
 //! pub const OPINION: Topic<Posterior> = Topic::new("second-encoder/posterior", topics::MESSAGES, 500);
 //! ```
 
+use crate::payload::{Image, Payload};
+use crate::registry::{AnyTopic, TopicId};
 use carff_messages::{Action, Belief, Forecast, FrameMeta, Health, Posterior, Stage, ViewMeta};
 use std::marker::PhantomData;
 use std::time::Duration;
@@ -25,7 +27,7 @@ pub struct Limits {
     pub max_publishers: usize,
     /// Processes that have the topic open.
     pub max_nodes: usize,
-    /// Messages that a subscriber who comes late is given.
+    /// Messages that a late subscriber receives.
     pub history: usize,
     /// Messages that wait for a slow subscriber before the oldest is lost.
     pub buffer: usize,
@@ -36,104 +38,101 @@ pub struct Limits {
 }
 
 impl Limits {
-    /// Messages for which a publisher sets memory aside.
+    /// Messages for which a publisher reserves memory.
     pub(crate) fn preallocated(&self) -> usize {
         self.max_subscribers * (self.buffer + self.borrowed) + self.history + self.loaned
     }
 }
 
-/// A topic of fixed-size messages.
+/// A topic: a name in the run, with the payload and the limits that all its users share.
+///
+/// `P` is a message type, or [`Image`] of the message type that describes the image.
 #[derive(Debug)]
-pub struct Topic<M> {
+pub struct Topic<P> {
     /// Name within the run.
     pub name: &'static str,
     /// Limits.
     pub limits: Limits,
-    /// How long it may be quiet, once it has begun, before whoever reads it calls it stale.
+    /// Time without a message, once the topic has begun, after which its receivers call it stale.
     pub deadline: Duration,
-    message: PhantomData<M>,
+    payload: PhantomData<fn() -> P>,
 }
 
-/// A topic of pictures: bytes, with `M` to describe them.
-#[derive(Debug)]
-pub struct PictureTopic<M> {
-    /// Name within the run.
-    pub name: &'static str,
-    /// Limits.
-    pub limits: Limits,
-    /// How long it may be quiet, once it has begun, before whoever reads it calls it stale.
-    pub deadline: Duration,
-    meta: PhantomData<M>,
+impl<P> Topic<P> {
+    /// Returns a topic. Its first user fixes the limits, and all others must have the same.
+    pub const fn new(name: &'static str, limits: Limits, deadline_ms: u64) -> Self {
+        Self { name, limits, deadline: Duration::from_millis(deadline_ms), payload: PhantomData }
+    }
 }
 
-/// Small messages of which some readers want every one.
+impl<P: Payload> Topic<P> {
+    /// Shared memory that a publisher of images of `max_bytes` (0 for messages) reserves, bytes.
+    pub(crate) fn segment_bytes(&self, max_bytes: usize) -> u64 {
+        /// iceoryx2's own header of each sample, with room to align it.
+        const SAMPLE_HEADER_BYTES: usize = 64;
+        let sample_bytes = size_of::<P::Message>() + max_bytes + SAMPLE_HEADER_BYTES;
+        (self.limits.preallocated() * sample_bytes) as u64
+    }
+}
+
+/// Small messages of which some receivers want every one.
 pub const MESSAGES: Limits =
     Limits { max_subscribers: 10, max_publishers: 2, max_nodes: 14, history: 0, buffer: 16, borrowed: 3, loaned: 2 };
-/// Pictures: fewer wait, as they are large and only the newest counts.
-pub const PICTURES: Limits =
+/// Images: fewer wait, since they are large and only the newest counts.
+pub const IMAGES: Limits =
     Limits { max_subscribers: 8, max_publishers: 2, max_nodes: 12, history: 0, buffer: 8, borrowed: 2, loaned: 2 };
-/// The latest of these tells a late reader how things stand.
+/// Status messages: a late receiver gets the latest one.
 pub const STATUS: Limits = Limits { history: 1, ..MESSAGES };
 
-macro_rules! table {
-    ($($(#[$doc:meta])* $const:ident: $kind:ident<$message:ty> = $name:literal, $limits:expr, $deadline_ms:literal;)+) => {
-        $($(#[$doc])* pub const $const: $kind<$message> = $kind::new($name, $limits, $deadline_ms);)+
+macro_rules! topics {
+    ($($(#[$doc:meta])* $const:ident: $payload:ty = $name:literal, $limits:expr, $deadline_ms:literal;)+) => {
+        $($(#[$doc])* pub const $const: Topic<$payload> = Topic::new($name, $limits, $deadline_ms);)+
+
+        /// The topics from the camera to the action, in the order of a frame's way.
+        pub(crate) const FLOW: &[&dyn AnyTopic] = &[$(&$const),+];
     };
 }
 
-table! {
+topics! {
     /// Camera to encoder.
-    FRAME: PictureTopic<FrameMeta> = "camera/frame", PICTURES, 500;
+    FRAME: Image<FrameMeta> = "camera/frame", IMAGES, 500;
     /// Encoder to forecaster.
-    POSTERIOR: Topic<Posterior> = "encoder/posterior", MESSAGES, 500;
+    POSTERIOR: Posterior = "encoder/posterior", MESSAGES, 500;
     /// Forecaster to prober and renderer.
-    FORECAST: Topic<Forecast> = "forecaster/forecast", MESSAGES, 500;
+    FORECAST: Forecast = "forecaster/forecast", MESSAGES, 500;
     /// Prober to controller, renderer, and back to the forecaster.
-    BELIEF: Topic<Belief> = "prober/belief", MESSAGES, 500;
-    /// Renderer to viewers, recorder, probes.
-    VIEW: PictureTopic<ViewMeta> = "renderer/view", PICTURES, 5000;
-    /// Controller to the car.
-    ACTION: Topic<Action> = "controller/action", STATUS, 200;
+    BELIEF: Belief = "prober/belief", MESSAGES, 500;
+    /// Renderer to viewers, recorder and probes.
+    VIEW: Image<ViewMeta> = "renderer/view", IMAGES, 5000;
+    /// Controller to the vehicle.
+    ACTION: Action = "controller/action", STATUS, 200;
 }
 
-/// The heartbeats of a stage.
-pub const fn health(stage: Stage) -> Topic<Health> {
-    let name = match stage {
-        Stage::Camera => "health/camera",
-        Stage::Encoder => "health/encoder",
-        Stage::Forecaster => "health/forecaster",
-        Stage::Prober => "health/prober",
-        Stage::Renderer => "health/renderer",
-        Stage::Controller => "health/controller",
-    };
-    Topic::new(name, STATUS, 1000)
+/// The heartbeats of each stage, in the order of [`Stage::ALL`].
+static HEALTH: [Topic<Health>; Stage::ALL.len()] = [
+    Topic::new("health/camera", STATUS, 1000),
+    Topic::new("health/encoder", STATUS, 1000),
+    Topic::new("health/forecaster", STATUS, 1000),
+    Topic::new("health/prober", STATUS, 1000),
+    Topic::new("health/renderer", STATUS, 1000),
+    Topic::new("health/controller", STATUS, 1000),
+];
+
+/// Returns the topic of a stage's heartbeats.
+pub fn health(stage: Stage) -> &'static Topic<Health> {
+    &HEALTH[stage.code() as usize - 1]
 }
 
-impl<M> Topic<M> {
-    /// A topic; whoever opens it first fixes its limits, and all others must have the same.
-    pub const fn new(name: &'static str, limits: Limits, deadline_ms: u64) -> Self {
-        Self { name, limits, deadline: Duration::from_millis(deadline_ms), message: PhantomData }
-    }
-}
-
-impl<M> PictureTopic<M> {
-    /// A topic; whoever opens it first fixes its limits, and all others must have the same.
-    pub const fn new(name: &'static str, limits: Limits, deadline_ms: u64) -> Self {
-        Self { name, limits, deadline: Duration::from_millis(deadline_ms), meta: PhantomData }
-    }
-}
-
-/// Shared memory that a whole graph takes with camera frames and rendered views of these sizes, bytes.
-/// The launcher checks it once, before it starts anything.
+/// Returns the shared memory that a whole graph reserves, bytes, with camera frames and rendered views of these sizes.
+/// The launcher checks it once, before it starts a stage.
 pub fn graph_bytes(frame_bytes: usize, view_bytes: usize) -> u64 {
-    fn of<M>(limits: Limits, payload: usize) -> u64 {
-        (limits.preallocated() * (size_of::<M>() + payload + 64)) as u64 + crate::space::MANAGEMENT_BYTES
-    }
-    of::<FrameMeta>(FRAME.limits, frame_bytes)
-        + of::<Posterior>(POSTERIOR.limits, 0)
-        + of::<Forecast>(FORECAST.limits, 0)
-        + of::<Belief>(BELIEF.limits, 0)
-        + of::<ViewMeta>(VIEW.limits, view_bytes)
-        + of::<Action>(ACTION.limits, 0)
-        + Stage::ALL.len() as u64 * of::<Health>(STATUS, 0)
+    let of = |topic: TopicId| {
+        let image_bytes = match topic {
+            _ if topic == TopicId::FRAME => frame_bytes,
+            _ if topic == TopicId::VIEW => view_bytes,
+            _ => 0,
+        };
+        topic.segment_bytes(image_bytes) + crate::space::MANAGEMENT_BYTES
+    };
+    TopicId::all().map(of).sum()
 }

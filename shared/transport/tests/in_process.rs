@@ -78,22 +78,22 @@ fn invalid_messages_are_dropped_and_counted() {
 fn pictures_must_have_the_size_they_claim() {
     let run = TestRun::new();
     let node = Node::open(&run.0, "test").unwrap();
-    let mut input = node.picture_receiver(&topics::FRAME).unwrap();
-    let mut output = node.picture_publisher(&topics::FRAME, 8 * 4 * 3).unwrap();
+    let mut input = node.receiver(&topics::FRAME).unwrap();
+    let mut output = node.image_publisher(&topics::FRAME, 8 * 4 * 3).unwrap();
     assert!(matches!(output.loan(8 * 4 * 3 + 1), Err(SendError::Size { .. })));
 
     let loan = output.loan(8 * 3 * 3).unwrap();
-    assert!(matches!(output.send(loan, frame(0, 8, 4)), Err(SendError::Size { .. })));
+    assert!(matches!(output.send_image(loan, frame(0, 8, 4)), Err(SendError::Size { .. })));
     let mut meta = frame(1, 8, 4);
     meta.header.run_id = 77;
     let loan = output.loan(8 * 3 * 3).unwrap();
-    output.send_unchecked(loan, meta).unwrap();
+    output.send_image_unchecked(loan, meta).unwrap();
 
     let mut loan = output.loan(8 * 4 * 3).unwrap();
     loan.bytes_mut()[95] = 200;
-    output.send(loan, frame(2, 8, 4)).unwrap();
+    output.send_image(loan, frame(2, 8, 4)).unwrap();
     let picture = input.newest().unwrap().unwrap();
-    assert_eq!((picture.meta().header.frame_id, picture.bytes().len(), picture.bytes()[95]), (2, 96, 200));
+    assert_eq!((picture.header.frame_id, picture.bytes().len(), picture.bytes()[95]), (2, 96, 200));
     assert_eq!(node.counters().invalid(), 1);
 }
 
@@ -140,12 +140,12 @@ fn limits_of_the_table_hold() {
     let run = TestRun::new();
     let node = Node::open(&run.0, "test").unwrap();
     let max = topics::FRAME.limits.max_subscribers;
-    let held: Vec<_> = (0..max).map(|_| node.picture_receiver(&topics::FRAME).unwrap()).collect();
-    let error = node.picture_receiver(&topics::FRAME).unwrap_err();
+    let held: Vec<_> = (0..max).map(|_| node.receiver(&topics::FRAME).unwrap()).collect();
+    let error = node.receiver(&topics::FRAME).unwrap_err();
     assert!(matches!(&error, OpenError::TooMany { .. }), "{error}");
     assert!(error.to_string().contains("camera/frame") && error.to_string().contains(&max.to_string()), "{error}");
     drop(held);
-    node.picture_receiver(&topics::FRAME).unwrap();
+    node.receiver(&topics::FRAME).unwrap();
 }
 
 /// A segment that shared memory has no room for is refused with an error before it is made.
@@ -153,7 +153,7 @@ fn limits_of_the_table_hold() {
 fn an_oversized_segment_is_refused_before_it_is_made() {
     let run = TestRun::new();
     let node = Node::open(&run.0, "test").unwrap();
-    let error = node.picture_publisher(&topics::FRAME, 1 << 50).unwrap_err();
+    let error = node.image_publisher(&topics::FRAME, 1 << 50).unwrap_err();
     assert!(matches!(&error, OpenError::SharedMemoryFull { .. }), "{error}");
     assert!(error.to_string().contains("camera/frame"), "{error}");
 }
@@ -209,13 +209,13 @@ fn polled_receivers_need_no_wake_up() {
 fn pictures_are_sent_from_elsewhere() {
     let run = TestRun::new();
     let node = Node::open(&run.0, "test").unwrap();
-    let mut input = node.picture_receiver(&topics::FRAME).unwrap();
-    let mut output = node.picture_publisher(&topics::FRAME, 1000).unwrap();
+    let mut input = node.receiver(&topics::FRAME).unwrap();
+    let mut output = node.image_publisher(&topics::FRAME, 1000).unwrap();
     let meta = frame(3, 4, 5);
     let bytes: Vec<u8> = (0..meta.width_px * meta.height_px * 3).map(|i| i as u8).collect();
     output.send_bytes(&bytes, meta).unwrap();
     let picture = input.next().unwrap().unwrap();
-    assert_eq!((picture.bytes(), picture.meta().header.frame_id), (&bytes[..], 3));
+    assert_eq!((picture.bytes(), picture.header.frame_id), (&bytes[..], 3));
     let error = output.send_bytes(&bytes[1..], meta).unwrap_err();
     assert!(matches!(error, SendError::Size { .. }), "{error}");
     let error = output.send_bytes(&[0; 1001], meta).unwrap_err();

@@ -21,17 +21,17 @@ fn role() {
     match role.as_str() {
         // Sends a picture for each line on standard input.
         "camera" => {
-            let mut output = node.picture_publisher(&topics::FRAME, BYTES).unwrap();
+            let mut output = node.image_publisher(&topics::FRAME, BYTES).unwrap();
             println!("ready");
             for (i, _) in std::io::stdin().lines().enumerate() {
                 let mut loan = output.loan(BYTES).unwrap();
                 loan.bytes_mut().fill(i as u8 + 1);
-                output.send(loan, frame(i as u64, SIDE, SIDE)).unwrap();
+                output.send_image(loan, frame(i as u64, SIDE, SIDE)).unwrap();
             }
         }
         // Holds memory in mid-loan until it is killed.
         "loaner" => {
-            let output = node.picture_publisher(&topics::FRAME, BYTES).unwrap();
+            let output = node.image_publisher(&topics::FRAME, BYTES).unwrap();
             let _loan = output.loan(BYTES).unwrap();
             println!("ready");
             waiter.wait_until(&[], in_seconds(60)).unwrap();
@@ -67,7 +67,7 @@ fn wait_for(lines: &mut impl Iterator<Item = String>, wanted: &str) {
 fn pictures_are_read_in_the_publishers_segment() {
     let run = TestRun::new();
     let node = Node::open(&run.0, "test").unwrap();
-    let mut input = node.picture_receiver(&topics::FRAME).unwrap();
+    let mut input = node.receiver(&topics::FRAME).unwrap();
     let waiter = Waiter::new(Stop::new().unwrap());
     let mut camera = Role::start("camera", &run.0);
     let mut output = lines(&mut camera);
@@ -108,7 +108,7 @@ fn mapping_of(address: usize) -> Option<Mapping> {
 fn a_publisher_killed_in_mid_loan_is_replaced() {
     let run = TestRun::new();
     let node = Node::open(&run.0, "test").unwrap();
-    let mut input = node.picture_receiver(&topics::FRAME).unwrap();
+    let mut input = node.receiver(&topics::FRAME).unwrap();
     let waiter = Waiter::new(Stop::new().unwrap());
     for _ in 0..3 {
         let mut loaner = Role::start("loaner", &run.0);

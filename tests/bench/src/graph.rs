@@ -7,8 +7,7 @@ use carff_config::GraphConfig;
 use carff_messages::{Action, Belief, Forecast, FrameMeta, Health, HealthState, Posterior, Stage};
 use carff_stage::StageArgs;
 use carff_transport::{
-    Node, PictureReceiver, Receiver, Run, Stop, Waiter, Woken, monotonic_now_ns, remove_run_leftovers, run_id_of,
-    topics,
+    Image, Node, Receiver, Run, Stop, Waiter, Woken, monotonic_now_ns, remove_run_leftovers, run_id_of, topics,
 };
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -270,12 +269,12 @@ fn listen(
 
 /// Hears all that a run says. It looks now and then: were it woken by each message, it would take a core from the stages.
 struct Listener {
-    frames_in: PictureReceiver<FrameMeta>,
+    frames_in: Receiver<Image<FrameMeta>>,
     posteriors: Receiver<Posterior>,
     forecasts: Receiver<Forecast>,
     beliefs: Receiver<Belief>,
     actions: Receiver<Action>,
-    views_in: PictureReceiver<carff_messages::ViewMeta>,
+    views_in: Receiver<carff_transport::Image<carff_messages::ViewMeta>>,
     healths: Vec<Receiver<Health>>,
     frames: BTreeMap<u64, Frame>,
     views: u64,
@@ -284,14 +283,14 @@ struct Listener {
 
 impl Listener {
     fn open(node: &Node) -> anyhow::Result<Self> {
-        let healths = Stage::ALL.iter().map(|&stage| Ok(node.receiver(&topics::health(stage))?.polled()));
+        let healths = Stage::ALL.iter().map(|&stage| Ok(node.receiver(topics::health(stage))?.polled()));
         Ok(Self {
-            frames_in: node.picture_receiver(&topics::FRAME)?.polled(),
+            frames_in: node.receiver(&topics::FRAME)?.polled(),
             posteriors: node.receiver(&topics::POSTERIOR)?.polled(),
             forecasts: node.receiver(&topics::FORECAST)?.polled(),
             beliefs: node.receiver(&topics::BELIEF)?.polled(),
             actions: node.receiver(&topics::ACTION)?.polled(),
-            views_in: node.picture_receiver(&topics::VIEW)?.polled(),
+            views_in: node.receiver(&topics::VIEW)?.polled(),
             healths: healths.collect::<Result<_, carff_transport::OpenError>>()?,
             frames: BTreeMap::new(),
             views: 0,
@@ -301,7 +300,7 @@ impl Listener {
 
     fn drain(&mut self) -> anyhow::Result<()> {
         while let Some(picture) = self.frames_in.next()? {
-            let header = &picture.meta().header;
+            let header = &picture.header;
             let frame = self.frames.entry(header.frame_id).or_default();
             (frame.captured_ns, frame.published_ns) = (header.capture_time_ns, header.publish_time_ns);
         }

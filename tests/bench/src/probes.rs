@@ -3,7 +3,7 @@
 use crate::helper::{Helper, end_with_parent, say_ready};
 use anyhow::Context;
 use carff_messages::{Action, Belief, FrameMeta};
-use carff_transport::{Node, PictureReceiver, Receiver, Run, Stop, Waiter, Woken, topics};
+use carff_transport::{Image, Node, Receiver, Run, Stop, Waiter, Woken, topics};
 
 /// The process of `scale`'s probes.
 #[derive(Clone, Debug, clap::Args)]
@@ -81,7 +81,7 @@ pub(crate) fn run(args: &ProbesArgs) -> anyhow::Result<()> {
 
 /// One probe: hears frames, beliefs and actions.
 struct Probe {
-    frames: PictureReceiver<FrameMeta>,
+    frames: Receiver<Image<FrameMeta>>,
     beliefs: Receiver<Belief>,
     actions: Receiver<Action>,
 }
@@ -89,7 +89,7 @@ struct Probe {
 impl Probe {
     fn open(node: &Node) -> anyhow::Result<Self> {
         Ok(Self {
-            frames: node.picture_receiver(&topics::FRAME)?,
+            frames: node.receiver(&topics::FRAME)?,
             beliefs: node.receiver(&topics::BELIEF)?,
             actions: node.receiver(&topics::ACTION)?,
         })
@@ -126,7 +126,7 @@ mod tests {
         let run = Run::new(&format!("bench-fit-{}", std::process::id()), 1).unwrap();
         {
             let node = Node::open(&run, "test").unwrap();
-            let frames: Vec<_> = (0..2).map(|_| node.picture_receiver(&topics::FRAME).unwrap()).collect();
+            let frames: Vec<_> = (0..2).map(|_| node.receiver(&topics::FRAME).unwrap()).collect();
             let beliefs: Vec<_> = (0..4).map(|_| node.receiver(&topics::BELIEF).unwrap()).collect();
             let action = node.receiver(&topics::ACTION).unwrap();
             let probes: Vec<_> = (0..most_probes()).map(|_| Probe::open(&node).unwrap()).collect();

@@ -11,12 +11,13 @@ use carff_dataset::{Dataset, Image, ImportOptions, import};
 use carff_field::FieldConfig;
 use carff_messages::forms::AnyMessage;
 use carff_messages::{
-    Action, Belief, Forecast, FrameMeta, Health, MAX_PICTURE_BYTES, Message, PictureMeta, Posterior, ViewMeta,
+    Action, Belief, Forecast, FrameMeta, Health, ImageMeta, MAX_IMAGE_BYTES, Message, Posterior, ViewMeta,
 };
-use carff_observe::{RunRecord, TopicId};
+use carff_observe::RunRecord;
 use carff_recording::{About, Reader as RecordingReader, Writer};
 use carff_scenes::Scenario;
 use carff_training::config::TrainingConfig;
+use carff_transport::TopicId;
 use raw::patch;
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -159,8 +160,8 @@ fn messages(bytes: &[u8], _: &Path) -> Verdict {
         }),
         3 => validated!(valid::action(), Action, |m| m.code().is_ok() && m.reason().is_ok()),
         4 => validated!(valid::health(), Health, |m| m.stage().is_ok() && m.state().is_ok()),
-        5 => validated!(valid::frame(), FrameMeta, |m| (1..=MAX_PICTURE_BYTES).contains(&m.picture_bytes())),
-        _ => validated!(valid::view(), ViewMeta, |m| (1..=MAX_PICTURE_BYTES).contains(&m.picture_bytes())),
+        5 => validated!(valid::frame(), FrameMeta, |m| (1..=MAX_IMAGE_BYTES).contains(&m.image_bytes())),
+        _ => validated!(valid::view(), ViewMeta, |m| (1..=MAX_IMAGE_BYTES).contains(&m.image_bytes())),
     }
 }
 
@@ -333,10 +334,10 @@ fn small_recording(folder: &Path) -> Vec<Vec<u8>> {
         let about = About { run: "r".into(), run_id: 5, ..About::default() };
         let mut writer = Writer::create(&path, &about, &[])?;
         let posterior = valid::posterior();
-        writer.write(TopicId::Posterior, AnyMessage::Posterior(&posterior))?;
+        writer.write(TopicId::POSTERIOR, AnyMessage::new(&posterior, &[]))?;
         let (frame, belief) = (valid::frame(), valid::belief());
-        writer.write(TopicId::Frame, AnyMessage::Frame(&frame, &vec![7; frame.picture_bytes()]))?;
-        writer.write(TopicId::Belief, AnyMessage::Belief(&belief))?;
+        writer.write(TopicId::FRAME, AnyMessage::new(&frame, &vec![7; frame.image_bytes()]))?;
+        writer.write(TopicId::BELIEF, AnyMessage::new(&belief, &[]))?;
         writer.finish()
     };
     write().unwrap_or_else(|e| panic!("{e}"));

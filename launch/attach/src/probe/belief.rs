@@ -2,8 +2,8 @@
 
 use super::session::{Session, SessionArgs, colours};
 use carff_checkpoint::Manifest;
-use carff_messages::{ActionCode, Belief};
-use carff_observe::{Received, TopicId};
+use carff_messages::{Action, ActionCode, Belief};
+use carff_transport::TopicId;
 use clap::Args;
 use std::fmt::Write as _;
 use std::io::{IsTerminal, Write as _};
@@ -24,36 +24,33 @@ pub struct BeliefArgs {
 
 pub(super) fn run(args: &BeliefArgs) -> anyhow::Result<()> {
     let mut session = Session::open(&args.session, "probe-belief")?;
-    session.listen([TopicId::Belief, TopicId::Action])?;
+    session.listen([TopicId::BELIEF, TopicId::ACTION])?;
     let names = names(Manifest::load(&session.attached.live.checkpoint).ok().as_ref());
     let live = std::io::stdout().is_terminal();
     let colour = colours();
     let (mut steps, mut decided, mut shown): (Vec<Belief>, String, u64) = (Vec::new(), String::new(), 0);
     let going = session.follow(
         |_, message| {
-            match message {
-                Received::Action(action) => {
-                    decided = match action.code() {
-                        Ok(ActionCode::Advance) => "advance".to_owned(),
-                        _ => format!("HALT ({})", action.reason().map_or("unknown", carff_messages::Reason::name)),
-                    };
+            let message = message.message();
+            if let Some(action) = message.get::<Action>() {
+                decided = match action.code() {
+                    Ok(ActionCode::Advance) => "advance".to_owned(),
+                    _ => format!("HALT ({})", action.reason().map_or("unknown", carff_messages::Reason::name)),
+                };
+            } else if let Some(belief) = message.get::<Belief>() {
+                if steps.first().is_some_and(|b| b.header.frame_id != belief.header.frame_id) {
+                    steps.clear();
                 }
-                Received::Belief(belief) => {
-                    if steps.first().is_some_and(|b| b.header.frame_id != belief.header.frame_id) {
-                        steps.clear();
-                    }
-                    steps.push(**belief);
-                    if belief.is_final == 1 {
-                        let text = picture(&steps, &names, &decided, colour);
-                        // On a terminal the picture stays in place.
-                        let begin = if live { "\x1b[H\x1b[J" } else { "" };
-                        let mut out = std::io::stdout().lock();
-                        let written = writeln!(out, "{begin}{text}").and_then(|()| out.flush());
-                        shown += 1;
-                        return Ok(written.is_ok() && args.count.is_none_or(|count| shown < count));
-                    }
+                steps.push(*belief);
+                if belief.is_final() {
+                    let text = picture(&steps, &names, &decided, colour);
+                    // On a terminal the bars stay in place.
+                    let begin = if live { "\x1b[H\x1b[J" } else { "" };
+                    let mut out = std::io::stdout().lock();
+                    let written = writeln!(out, "{begin}{text}").and_then(|()| out.flush());
+                    shown += 1;
+                    return Ok(written.is_ok() && args.count.is_none_or(|count| shown < count));
                 }
-                _ => {}
             }
             Ok(true)
         },

@@ -2,7 +2,7 @@
 
 use super::session::{Session, SessionArgs};
 use carff_messages::forms::as_text;
-use carff_observe::TopicId;
+use carff_transport::TopicId;
 use clap::Args;
 use std::io::Write;
 

@@ -4,8 +4,9 @@ use super::file_in;
 use super::inline::{Inline, columns};
 use super::session::{Session, SessionArgs, colours};
 use anyhow::{Context, bail, ensure};
-use carff_messages::{ViewKind, ViewMeta};
-use carff_observe::{Received, TopicId};
+use carff_messages::forms::AnyMessage;
+use carff_messages::{FrameMeta, ImageMeta, ViewKind, ViewMeta};
+use carff_transport::TopicId;
 use clap::Args;
 use std::io::Write as _;
 use std::path::PathBuf;
@@ -31,11 +32,11 @@ pub struct ImageArgs {
 
 pub(super) fn run(args: &ImageArgs) -> anyhow::Result<()> {
     ensure!(
-        matches!(args.topic, TopicId::Frame | TopicId::View),
-        "topic `{}` has no pictures: look at `{}` or `{}`",
+        args.topic.is_image(),
+        "topic `{}` has no images: look at `{}` or `{}`",
         args.topic,
-        TopicId::Frame,
-        TopicId::View
+        TopicId::FRAME,
+        TopicId::VIEW
     );
     ensure!(
         args.out.is_some() || args.inline != Inline::Auto || colours(),
@@ -48,14 +49,11 @@ pub(super) fn run(args: &ImageArgs) -> anyhow::Result<()> {
     let mut shown = 0;
     let going = session.follow(
         |_, message| {
-            let (name, width_px, height_px, rgb) = match message {
-                Received::Frame(p) => {
-                    let meta = p.meta();
-                    (format!("frame-{:06}", meta.header.frame_id), meta.width_px, meta.height_px, p.bytes())
-                }
-                Received::View(p) => (view_name(p.meta()), p.meta().width_px, p.meta().height_px, p.bytes()),
-                _ => bail!("no picture"),
+            let message = message.message();
+            let Some((name, [width_px, height_px])) = named_image(message) else {
+                bail!("the message is not an image")
             };
+            let rgb = message.bytes();
             if let Some(folder) = &args.out {
                 let path = file_in(folder, &format!("{name}.png"))?;
                 image::save_buffer(&path, rgb, width_px, height_px, image::ColorType::Rgb8)
@@ -74,8 +72,14 @@ pub(super) fn run(args: &ImageArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// What a rendered view is called: frame, step, hypothesis, camera.
-pub(crate) fn view_name(meta: &ViewMeta) -> String {
-    let kind = ViewKind::try_from(meta.kind).map_or("view", ViewKind::name);
-    format!("view-{:06}-step{}-{:02}-{kind}", meta.header.frame_id, meta.header.step, meta.hypothesis)
+/// The file name, without an ending, and the size of a camera frame or a rendered view.
+pub(crate) fn named_image(message: AnyMessage<'_>) -> Option<(String, [u32; 2])> {
+    if let Some(frame) = message.get::<FrameMeta>() {
+        return Some((format!("frame-{:06}", frame.header.frame_id), frame.size_px()));
+    }
+    let view = message.get::<ViewMeta>()?;
+    let kind = ViewKind::try_from(view.kind).map_or("view", ViewKind::name);
+    let ViewMeta { header, hypothesis, .. } = view;
+    let name = format!("view-{:06}-step{}-{hypothesis:02}-{kind}", header.frame_id, header.step);
+    Some((name, view.size_px()))
 }

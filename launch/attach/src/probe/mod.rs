@@ -12,7 +12,7 @@ mod trace;
 
 pub use session::SessionArgs;
 
-use carff_observe::TopicId;
+use carff_transport::TopicId;
 use clap::{Args, Subcommand};
 use std::path::PathBuf;
 use std::process::ExitCode;

@@ -2,8 +2,8 @@
 
 use anyhow::Context;
 use carff_messages::Header;
-use carff_observe::{AnyReceiver, Attached, Received, TopicId, attach};
-use carff_transport::{Stop, Waiter, monotonic_now_ns};
+use carff_observe::{Attached, attach};
+use carff_transport::{AnyReceiver, Received, Stop, TopicId, Waiter, monotonic_now_ns};
 use clap::Args;
 
 /// Time between two looks: short enough that no buffer (8 pictures) overflows at 400 messages a second.
@@ -44,7 +44,7 @@ pub(crate) enum Going {
 #[derive(Debug)]
 pub(crate) struct Session {
     // Dropped in this order: ports before the node.
-    receivers: Vec<(TopicId, AnyReceiver)>,
+    receivers: Vec<(TopicId, Box<dyn AnyReceiver>)>,
     pub(crate) attached: Attached,
     stop: Stop,
     waiter: Waiter,
@@ -71,25 +71,25 @@ impl Session {
     /// Opens topics, to be looked at now and then.
     pub(crate) fn listen(&mut self, topics: impl IntoIterator<Item = TopicId>) -> anyhow::Result<()> {
         for topic in topics {
-            self.receivers.push((topic, AnyReceiver::open(&self.attached.node, topic)?));
+            self.receivers.push((topic, topic.polled_receiver(&self.attached.node)?));
         }
         Ok(())
     }
 
     /// Opens a topic whose messages wake this process.
     pub(crate) fn listen_woken(&mut self, topic: TopicId) -> anyhow::Result<()> {
-        self.receivers.push((topic, AnyReceiver::open_woken(&self.attached.node, topic)?));
+        self.receivers.push((topic, topic.receiver(&self.attached.node)?));
         Ok(())
     }
 
     /// What has arrived since the last look, topic by topic, oldest first.
     pub(crate) fn take(
         &mut self,
-        mut each: impl FnMut(TopicId, &Received) -> anyhow::Result<()>,
+        mut each: impl FnMut(TopicId, &dyn Received) -> anyhow::Result<()>,
     ) -> anyhow::Result<()> {
         for (topic, receiver) in &mut self.receivers {
             while let Some(message) = receiver.next()? {
-                each(*topic, &message)?;
+                each(*topic, &*message)?;
             }
         }
         Ok(())
@@ -116,7 +116,7 @@ impl Session {
     /// Looks until it is over, or `each` says false.
     pub(crate) fn follow(
         &mut self,
-        mut each: impl FnMut(TopicId, &Received) -> anyhow::Result<bool>,
+        mut each: impl FnMut(TopicId, &dyn Received) -> anyhow::Result<bool>,
         mut after: impl FnMut() -> anyhow::Result<()>,
     ) -> anyhow::Result<Going> {
         loop {

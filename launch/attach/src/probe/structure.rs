@@ -3,8 +3,8 @@
 use super::session::{Going, Session, SessionArgs};
 use anyhow::Context;
 use carff_messages::SCHEMA_VERSION;
-use carff_observe::{Received, TopicId};
 use carff_transport::{Member, monotonic_now_ns};
+use carff_transport::{Received, TopicId};
 use serde_json::{Value, json};
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write;
@@ -48,7 +48,7 @@ pub(super) fn list(args: &SessionArgs, as_json: bool) -> anyhow::Result<()> {
     let started_ns = monotonic_now_ns();
     let mut counts: BTreeMap<TopicId, u64> = BTreeMap::new();
     let going = session.follow(
-        |topic, _: &Received| {
+        |topic, _: &dyn Received| {
             *counts.entry(topic).or_default() += 1;
             Ok(true)
         },
@@ -111,7 +111,7 @@ fn in_use(session: &Session) -> anyhow::Result<Vec<TopicInUse>> {
         topics.push(found);
     }
     // The data's way first, in its order.
-    topics.sort_by_key(|t| t.name.parse::<TopicId>().ok().map_or((1, TopicId::Frame), |id| (0, id)));
+    topics.sort_by_key(|t| t.name.parse::<TopicId>().ok().map_or((1, TopicId::FRAME), |id| (0, id)));
     Ok(topics)
 }
 

@@ -5,7 +5,7 @@ use super::structure::columns;
 use crate::spans::{Span, trace_events};
 use anyhow::{Context, ensure};
 use carff_messages::Stage;
-use carff_observe::TopicId;
+use carff_transport::TopicId;
 use carff_transport::monotonic_now_ns;
 use clap::Args;
 use std::path::PathBuf;

@@ -1,65 +1,180 @@
-//! A message whose kind is only known at run time.
+//! Messages whose type is only known at run time.
 
-use super::{ActionForm, BeliefForm, ForecastForm, FrameForm, HealthForm, PosteriorForm, ViewForm};
-use crate::{Action, Belief, Forecast, FrameMeta, Header, Health, Posterior, ViewMeta};
+use super::{ActionForm, BeliefForm, ForecastForm, FormError, FrameForm, HealthForm, PosteriorForm, ViewForm};
+use crate::{Action, Belief, Forecast, FrameMeta, Header, Health, Message, Posterior, ViewMeta};
+use schemars::JsonSchema;
+use serde::Serialize;
+use serde::de::DeserializeOwned;
 use serde_json::Value;
+use std::any::Any;
+use std::fmt::Debug;
 
-/// A message of any topic; of pictures what describes them, and their bytes.
+/// A message that has a JSON form: probes, recordings and links handle it without knowing its type.
+pub trait Readable: Message {
+    /// The form.
+    type Form: Serialize + DeserializeOwned + JsonSchema + for<'a> From<&'a Self>;
+    /// Name of the form's schema, for example `carff.Belief`.
+    const SCHEMA: &'static str;
+
+    /// Converts a form into a valid message.
+    fn of_form(form: &Self::Form) -> Result<Self, FormError>;
+}
+
+macro_rules! readable {
+    ($($message:ty: $form:ty = $schema:literal;)+) => {
+        $(impl Readable for $message {
+            type Form = $form;
+            const SCHEMA: &'static str = $schema;
+
+            fn of_form(form: &$form) -> Result<Self, FormError> {
+                form.try_into()
+            }
+        })+
+    };
+}
+
+readable! {
+    FrameMeta: FrameForm = "carff.Frame";
+    Posterior: PosteriorForm = "carff.Posterior";
+    Forecast: ForecastForm = "carff.Forecast";
+    Belief: BeliefForm = "carff.Belief";
+    ViewMeta: ViewForm = "carff.View";
+    Action: ActionForm = "carff.Action";
+    Health: HealthForm = "carff.Health";
+}
+
+/// Reads a message from the JSON of its form.
+pub fn read<M: Readable>(json: &[u8]) -> Result<Box<dyn DynMessage>, FormError> {
+    Ok(Box::new(M::of_form(&serde_json::from_slice(json)?)?))
+}
+
+/// A [`Readable`] message of any type.
+pub trait DynMessage: Any + Debug + Send + Sync {
+    /// The header.
+    fn header(&self) -> &Header;
+
+    /// The header, to be changed.
+    fn header_mut(&mut self) -> &mut Header;
+
+    /// The message's size in shared memory, bytes.
+    fn size_bytes(&self) -> usize;
+
+    /// The message's form, as JSON.
+    fn to_json(&self) -> Result<Value, serde_json::Error>;
+
+    /// A copy.
+    fn boxed(&self) -> Box<dyn DynMessage>;
+}
+
+impl<M: Readable> DynMessage for M {
+    fn header(&self) -> &Header {
+        Message::header(self)
+    }
+
+    fn header_mut(&mut self) -> &mut Header {
+        Message::header_mut(self)
+    }
+
+    fn size_bytes(&self) -> usize {
+        size_of::<M>()
+    }
+
+    fn to_json(&self) -> Result<Value, serde_json::Error> {
+        serde_json::to_value(M::Form::from(self))
+    }
+
+    fn boxed(&self) -> Box<dyn DynMessage> {
+        Box::new(*self)
+    }
+}
+
+/// A borrowed message of any type, with the bytes of the image that it describes, if any.
+///
+/// ```
+/// use carff_messages::forms::AnyMessage;
+/// use carff_messages::{Action, Gaussian, Header, Posterior};
+/// let header = Header::of_frame(7, 1_000, 42);
+/// let posterior = Posterior { header, gaussian: Gaussian::standard(), stage_latency_ns: 5 };
+/// let message = AnyMessage::new(&posterior, &[]);
+/// assert_eq!(message.get::<Posterior>(), Some(&posterior));
+/// assert!(message.get::<Action>().is_none());
+/// ```
 #[derive(Clone, Copy, Debug)]
-pub enum AnyMessage<'a> {
-    /// A camera frame.
-    Frame(&'a FrameMeta, &'a [u8]),
-    /// What the encoder saw in it.
-    Posterior(&'a Posterior),
-    /// A mixture and its samples.
-    Forecast(&'a Forecast),
-    /// What probing found.
-    Belief(&'a Belief),
-    /// A rendered view.
-    View(&'a ViewMeta, &'a [u8]),
-    /// An action.
-    Action(&'a Action),
-    /// A heartbeat.
-    Health(&'a Health),
+pub struct AnyMessage<'a> {
+    message: &'a dyn DynMessage,
+    bytes: &'a [u8],
 }
 
 impl<'a> AnyMessage<'a> {
+    /// Wraps a message, and the bytes of the image that it describes.
+    pub fn new(message: &'a dyn DynMessage, bytes: &'a [u8]) -> Self {
+        Self { message, bytes }
+    }
+
+    /// The message, where it is of this type.
+    pub fn get<M: Readable>(self) -> Option<&'a M> {
+        let message: &dyn Any = self.message;
+        message.downcast_ref()
+    }
+
+    /// The image's bytes; none for a message by itself.
+    pub fn bytes(self) -> &'a [u8] {
+        self.bytes
+    }
+
     /// The header.
     pub fn header(self) -> &'a Header {
-        match self {
-            Self::Frame(m, _) => &m.header,
-            Self::Posterior(m) => &m.header,
-            Self::Forecast(m) => &m.header,
-            Self::Belief(m) => &m.header,
-            Self::View(m, _) => &m.header,
-            Self::Action(m) => &m.header,
-            Self::Health(m) => &m.header,
-        }
+        self.message.header()
     }
 
-    /// Bytes that it has in shared memory.
+    /// Its size in shared memory, bytes, image included.
     pub fn size_bytes(self) -> usize {
-        match self {
-            Self::Frame(m, bytes) => size_of_val(m) + bytes.len(),
-            Self::Posterior(m) => size_of_val(m),
-            Self::Forecast(m) => size_of_val(m),
-            Self::Belief(m) => size_of_val(m),
-            Self::View(m, bytes) => size_of_val(m) + bytes.len(),
-            Self::Action(m) => size_of_val(m),
-            Self::Health(m) => size_of_val(m),
-        }
+        self.message.size_bytes() + self.bytes.len()
     }
 
-    /// Its form, as JSON; of pictures without their bytes.
+    /// The message's form as JSON, without an image's bytes.
     pub fn to_json(self) -> Result<Value, serde_json::Error> {
-        match self {
-            Self::Frame(m, _) => serde_json::to_value(FrameForm::from(m)),
-            Self::Posterior(m) => serde_json::to_value(PosteriorForm::from(m)),
-            Self::Forecast(m) => serde_json::to_value(ForecastForm::from(m)),
-            Self::Belief(m) => serde_json::to_value(BeliefForm::from(m)),
-            Self::View(m, _) => serde_json::to_value(ViewForm::from(m)),
-            Self::Action(m) => serde_json::to_value(ActionForm::from(m)),
-            Self::Health(m) => serde_json::to_value(HealthForm::from(m)),
-        }
+        self.message.to_json()
+    }
+
+    /// A copy that owns its memory.
+    pub fn to_owned(self) -> OwnedMessage {
+        OwnedMessage { message: self.message.boxed(), bytes: self.bytes.to_vec() }
+    }
+}
+
+/// A message of any type that owns its memory.
+#[derive(Debug)]
+pub struct OwnedMessage {
+    message: Box<dyn DynMessage>,
+    bytes: Vec<u8>,
+}
+
+impl OwnedMessage {
+    /// Wraps a message, and the bytes of the image that it describes.
+    pub fn new(message: Box<dyn DynMessage>, bytes: Vec<u8>) -> Self {
+        Self { message, bytes }
+    }
+
+    /// The header, to be changed.
+    pub fn header_mut(&mut self) -> &mut Header {
+        self.message.header_mut()
+    }
+
+    /// The message, to be changed, where it is of this type.
+    pub fn get_mut<M: Readable>(&mut self) -> Option<&mut M> {
+        let message: &mut dyn Any = &mut *self.message;
+        message.downcast_mut()
+    }
+
+    /// The message, borrowed.
+    pub fn as_message(&self) -> AnyMessage<'_> {
+        AnyMessage { message: &*self.message, bytes: &self.bytes }
+    }
+}
+
+impl Clone for OwnedMessage {
+    fn clone(&self) -> Self {
+        self.as_message().to_owned()
     }
 }

@@ -24,7 +24,7 @@ mod health;
 mod latent;
 mod text;
 
-pub use any::AnyMessage;
+pub use any::{AnyMessage, DynMessage, OwnedMessage, Readable, read};
 pub use decision::ActionForm;
 pub use frame::{DatasetViewForm, FrameForm, ViewForm};
 pub use header::HeaderForm;
@@ -66,6 +66,9 @@ pub enum FormError {
         /// What was found.
         found: String,
     },
+    /// The text is not the JSON of this form.
+    #[error(transparent)]
+    Json(#[from] serde_json::Error),
     /// The message that it makes is not valid.
     #[error(transparent)]
     Invalid(#[from] Invalid),

@@ -3,9 +3,7 @@
 use super::{Receiver, Sender, Size, Waiting};
 use anyhow::Context;
 use carff_messages::{DatasetView, FrameMeta, Header, Intrinsics};
-use carff_transport::{
-    Node, PicturePublisher, PictureReceiver, Run, Stop, Waiter, monotonic_now_ns, remove_run_leftovers, topics,
-};
+use carff_transport::{Image, Node, Publisher, Run, Stop, Waiter, monotonic_now_ns, remove_run_leftovers, topics};
 use std::path::Path;
 
 /// The run that both processes join, named after the folder that they share.
@@ -22,7 +20,7 @@ pub(crate) fn clean_up(folder: &Path) -> anyhow::Result<()> {
 
 pub(crate) struct TypedSender {
     // Dropped before the node.
-    publisher: PicturePublisher<FrameMeta>,
+    publisher: Publisher<Image<FrameMeta>>,
     _node: Node,
     meta: FrameMeta,
 }
@@ -30,7 +28,7 @@ pub(crate) struct TypedSender {
 impl TypedSender {
     pub(crate) fn open(folder: &Path, size: Size) -> anyhow::Result<Self> {
         let node = Node::open(&run_of(folder)?, "sender")?;
-        let publisher = node.picture_publisher(&topics::FRAME, size.bytes())?;
+        let publisher = node.image_publisher(&topics::FRAME, size.bytes())?;
         let meta = FrameMeta {
             width_px: size.width_px,
             height_px: size.height_px,
@@ -51,7 +49,7 @@ impl Sender for TypedSender {
 
 pub(crate) struct TypedReceiver {
     // Dropped before the node.
-    receiver: Option<PictureReceiver<FrameMeta>>,
+    receiver: Option<carff_transport::Receiver<Image<FrameMeta>>>,
     polled: bool,
     node: Node,
     waiter: Waiter,
@@ -60,7 +58,7 @@ pub(crate) struct TypedReceiver {
 impl TypedReceiver {
     pub(crate) fn open(folder: &Path) -> anyhow::Result<Self> {
         let node = Node::open(&run_of(folder)?, "receiver")?;
-        let receiver = Some(node.picture_receiver(&topics::FRAME)?);
+        let receiver = Some(node.receiver(&topics::FRAME)?);
         Ok(Self { receiver, polled: false, node, waiter: Waiter::new(Stop::new()?) })
     }
 }
@@ -70,7 +68,7 @@ impl Receiver for TypedReceiver {
         let polled = waiting == Waiting::Busy;
         if self.polled != polled {
             self.receiver = None;
-            let receiver = self.node.picture_receiver(&topics::FRAME)?;
+            let receiver = self.node.receiver(&topics::FRAME)?;
             self.receiver = Some(if polled { receiver.polled() } else { receiver });
             self.polled = polled;
         }

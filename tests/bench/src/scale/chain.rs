@@ -10,7 +10,7 @@ use crate::stats::Times;
 use anyhow::{Context, ensure};
 use carff_messages::{DatasetView, FrameMeta, Header, Intrinsics};
 use carff_transport::{
-    Node, PicturePublisher, PictureReceiver, Run, Stop, Waiter, Woken, monotonic_now_ns, remove_run_leftovers, topics,
+    Image, Node, Publisher, Receiver, Run, Stop, Waiter, Woken, monotonic_now_ns, remove_run_leftovers, topics,
 };
 
 /// Relays of the longest chain.
@@ -60,33 +60,33 @@ fn route(place: usize, length: usize, relays: u64) -> To {
 
 /// A publisher and its node, which it must not outlive.
 struct Output {
-    publisher: PicturePublisher<FrameMeta>,
+    publisher: Publisher<Image<FrameMeta>>,
     _node: Node,
 }
 
 impl Output {
     fn open(run: &Run) -> anyhow::Result<Self> {
         let node = Node::open(run, "sender")?;
-        Ok(Self { publisher: node.picture_publisher(&topics::FRAME, PICTURE_BYTES)?, _node: node })
+        Ok(Self { publisher: node.image_publisher(&topics::FRAME, PICTURE_BYTES)?, _node: node })
     }
 
     fn send(&mut self, bytes: &[u8], meta: FrameMeta) -> anyhow::Result<()> {
         let mut loan = self.publisher.loan(bytes.len())?;
         loan.bytes_mut().copy_from_slice(bytes);
-        Ok(self.publisher.send(loan, meta)?)
+        Ok(self.publisher.send_image(loan, meta)?)
     }
 }
 
 /// A receiver and its node.
 struct Incoming {
-    receiver: PictureReceiver<FrameMeta>,
+    receiver: Receiver<Image<FrameMeta>>,
     _node: Node,
 }
 
 impl Incoming {
     fn open(run: &Run) -> anyhow::Result<Self> {
         let node = Node::open(run, "receiver")?;
-        Ok(Self { receiver: node.picture_receiver(&topics::FRAME)?, _node: node })
+        Ok(Self { receiver: node.receiver(&topics::FRAME)?, _node: node })
     }
 }
 
@@ -101,7 +101,7 @@ pub(crate) fn relay(args: &RelayArgs) -> anyhow::Result<()> {
     say_ready()?;
     while waiter.wait(&[&input.receiver])? != Woken::Stopped {
         while let Some(picture) = input.receiver.next()? {
-            let meta = *picture.meta();
+            let meta = *picture;
             let output = match (route(args.place, args.length, meta.header.seed), &mut next) {
                 (To::Next, Some(next)) => next,
                 _ => &mut back,
@@ -163,7 +163,7 @@ impl Chain {
         let woken = self.waiter.wait_until(&[&*back], started_ns + PATIENCE_NS)?;
         ensure!(woken != Woken::Stopped, "interrupted");
         let picture = back.newest()?.with_context(|| format!("a picture was lost on its way past {relays} relays"))?;
-        ensure!(picture.meta().header.frame_id == self.sent, "a picture came back late");
+        ensure!(picture.header.frame_id == self.sent, "a picture came back late");
         std::hint::black_box(picture.bytes().iter().fold(0_u64, |sum, byte| sum + u64::from(*byte)));
         self.sent += 1;
         Ok((monotonic_now_ns() - started_ns) as f64 / 1e6)

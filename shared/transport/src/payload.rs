@@ -1,0 +1,157 @@
+//! The two forms in which a message lies in shared memory: by itself, or as the user header of an image.
+
+use crate::{Publisher, SendError, Service};
+use carff_messages::{ImageMeta, Invalid, Message};
+use iceoryx2::port::ReceiveError;
+use iceoryx2::port::subscriber::Subscriber;
+use iceoryx2::prelude::{AllocationStrategy, IceoryxSend, ZeroCopySend};
+use iceoryx2::sample::Sample;
+use iceoryx2::service::builder::publish_subscribe::{
+    Builder, PublishSubscribeOpenError, PublishSubscribeOpenOrCreateError,
+};
+use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
+use iceoryx2::service::port_factory::publisher::PortFactoryPublisher;
+use std::fmt::Debug;
+use std::marker::PhantomData;
+
+/// The payload of an image topic: RGB bytes, with `M` to describe them.
+#[derive(Debug)]
+pub struct Image<M>(PhantomData<M>);
+
+/// The payload of a topic: a [`Message`] by itself, or an [`Image`] that a message describes.
+pub trait Payload: Debug + 'static {
+    /// The message, which carries the header.
+    type Message: Message;
+    /// The payload that iceoryx2 transports.
+    #[doc(hidden)]
+    type Body: IceoryxSend + ZeroCopySend + Debug + ?Sized;
+    /// The user header that iceoryx2 transports with it.
+    #[doc(hidden)]
+    type UserHeader: ZeroCopySend + Debug;
+
+    #[doc(hidden)]
+    const IS_IMAGE: bool;
+
+    #[doc(hidden)]
+    fn open_or_create(service: Unopened<Self>) -> Result<Opened<Self>, PublishSubscribeOpenOrCreateError>;
+
+    #[doc(hidden)]
+    fn open(service: Unopened<Self>) -> Result<Opened<Self>, PublishSubscribeOpenError>;
+
+    /// Reserves memory for images of at most `max_bytes`.
+    #[doc(hidden)]
+    fn sized(publisher: PublisherFactory<'_, Self>, max_bytes: usize) -> PublisherFactory<'_, Self>;
+
+    #[doc(hidden)]
+    fn receive(port: &Subscriber<Service, Self::Body, Self::UserHeader>) -> Received<Self>;
+
+    #[doc(hidden)]
+    fn message(sample: &Sample<Service, Self::Body, Self::UserHeader>) -> &Self::Message;
+
+    /// The bytes of an image; none of a message by itself.
+    #[doc(hidden)]
+    fn bytes(sample: &Sample<Service, Self::Body, Self::UserHeader>) -> &[u8];
+
+    /// Stamps, validates and sends a message, with a copy of the bytes of the image that it describes.
+    #[doc(hidden)]
+    fn send(publisher: &mut Publisher<Self>, message: Self::Message, bytes: &[u8]) -> Result<(), SendError>
+    where
+        Self: Sized;
+
+    /// Checks that the bytes are as many as a valid message describes.
+    #[doc(hidden)]
+    fn check_size(sample: &Sample<Service, Self::Body, Self::UserHeader>) -> Result<(), Invalid>;
+}
+
+#[doc(hidden)]
+pub type Unopened<P> = Builder<<P as Payload>::Body, <P as Payload>::UserHeader, Service>;
+#[doc(hidden)]
+pub type Opened<P> = PortFactory<Service, <P as Payload>::Body, <P as Payload>::UserHeader>;
+#[doc(hidden)]
+pub type PublisherFactory<'a, P> = PortFactoryPublisher<'a, Service, <P as Payload>::Body, <P as Payload>::UserHeader>;
+#[doc(hidden)]
+pub type Received<P> = Result<Option<Sample<Service, <P as Payload>::Body, <P as Payload>::UserHeader>>, ReceiveError>;
+
+impl<M: Message> Payload for M {
+    type Message = M;
+    type Body = M;
+    type UserHeader = ();
+
+    const IS_IMAGE: bool = false;
+
+    fn open_or_create(service: Unopened<Self>) -> Result<Opened<Self>, PublishSubscribeOpenOrCreateError> {
+        service.open_or_create()
+    }
+
+    fn open(service: Unopened<Self>) -> Result<Opened<Self>, PublishSubscribeOpenError> {
+        service.open()
+    }
+
+    fn sized(publisher: PublisherFactory<'_, Self>, _max_bytes: usize) -> PublisherFactory<'_, Self> {
+        publisher
+    }
+
+    fn receive(port: &Subscriber<Service, M, ()>) -> Received<Self> {
+        port.receive()
+    }
+
+    fn message(sample: &Sample<Service, M, ()>) -> &M {
+        sample.payload()
+    }
+
+    fn bytes(_sample: &Sample<Service, M, ()>) -> &[u8] {
+        &[]
+    }
+
+    fn send(publisher: &mut Publisher<Self>, message: M, _bytes: &[u8]) -> Result<(), SendError> {
+        publisher.send(message)
+    }
+
+    fn check_size(_sample: &Sample<Service, M, ()>) -> Result<(), Invalid> {
+        Ok(())
+    }
+}
+
+impl<M: ImageMeta> Payload for Image<M> {
+    type Message = M;
+    type Body = [u8];
+    type UserHeader = M;
+
+    const IS_IMAGE: bool = true;
+
+    fn open_or_create(service: Unopened<Self>) -> Result<Opened<Self>, PublishSubscribeOpenOrCreateError> {
+        service.open_or_create()
+    }
+
+    fn open(service: Unopened<Self>) -> Result<Opened<Self>, PublishSubscribeOpenError> {
+        service.open()
+    }
+
+    fn sized(publisher: PublisherFactory<'_, Self>, max_bytes: usize) -> PublisherFactory<'_, Self> {
+        publisher.initial_max_slice_len(max_bytes).allocation_strategy(AllocationStrategy::Static)
+    }
+
+    fn receive(port: &Subscriber<Service, [u8], M>) -> Received<Self> {
+        port.receive()
+    }
+
+    fn message(sample: &Sample<Service, [u8], M>) -> &M {
+        sample.user_header()
+    }
+
+    fn bytes(sample: &Sample<Service, [u8], M>) -> &[u8] {
+        sample.payload()
+    }
+
+    fn send(publisher: &mut Publisher<Self>, message: M, bytes: &[u8]) -> Result<(), SendError> {
+        publisher.send_bytes(bytes, message)
+    }
+
+    fn check_size(sample: &Sample<Service, [u8], M>) -> Result<(), Invalid> {
+        let (found, expected) = (sample.payload().len(), sample.user_header().image_bytes());
+        if found == expected {
+            return Ok(());
+        }
+        Err(Invalid::Mismatch { field: "image bytes", found: found as u64, expected: expected as u64 })
+    }
+}

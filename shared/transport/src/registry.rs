@@ -1,0 +1,300 @@
+//! Topics whose payload is only known at run time: by name, for probes, recordings and links.
+
+use crate::payload::Payload;
+use crate::{Input, Node, OpenError, Ports, Publisher, ReceiveError, Receiver, Sample, SendError, Topic, topics};
+use carff_messages::Stage;
+use carff_messages::forms::{AnyMessage, DynMessage, FormError, Readable, read, schema};
+use serde_json::Value;
+use std::cmp::Ordering;
+use std::fmt;
+use std::hash::{Hash, Hasher};
+use std::str::FromStr;
+
+/// A topic of any payload whose message has a JSON form. Every [`Topic`] is one, also that of a user's own stage.
+pub trait AnyTopic: fmt::Debug + Sync {
+    /// Name within the run.
+    fn name(&self) -> &'static str;
+
+    /// Whether its payload is an image.
+    fn is_image(&self) -> bool;
+
+    /// Name and JSON Schema of its message's form.
+    fn schema(&self) -> (&'static str, Value);
+
+    /// Reads a message from the JSON of its form.
+    fn read(&self, json: &[u8]) -> Result<Box<dyn DynMessage>, FormError>;
+
+    /// The present publishers and subscribers.
+    fn ports(&self, node: &Node) -> Result<Ports, OpenError>;
+
+    /// Opens the topic to receive from: each message wakes this process, at the cost of a system call to its sender.
+    fn receiver(&self, node: &Node) -> Result<Box<dyn AnyReceiver>, OpenError>;
+
+    /// Opens the topic to poll: its senders wake nobody for it.
+    fn polled_receiver(&self, node: &Node) -> Result<Box<dyn AnyReceiver>, OpenError>;
+
+    /// Opens the topic to send on; `max_bytes` is the size of its largest image, and does not matter for messages.
+    fn publisher(&self, node: &Node, max_bytes: usize) -> Result<Box<dyn AnyPublisher>, OpenError>;
+
+    /// Shared memory that a publisher of images of `max_bytes` reserves, bytes.
+    #[doc(hidden)]
+    fn segment_bytes(&self, max_bytes: usize) -> u64;
+}
+
+/// Sends on a topic of any payload.
+pub trait AnyPublisher: fmt::Debug + Send {
+    /// Stamps, validates and sends a copy of a message. A message of another type than the topic's is an error.
+    fn send(&mut self, message: AnyMessage<'_>) -> Result<(), SendError>;
+}
+
+/// Receives from a topic of any payload.
+pub trait AnyReceiver: Input + fmt::Debug + Send {
+    /// Returns the oldest valid message that waits, if any.
+    fn next(&mut self) -> Result<Option<Box<dyn Received>>, ReceiveError>;
+
+    /// The same receiver, as a wait takes it.
+    fn as_input(&self) -> &dyn Input;
+}
+
+/// A received message of any type, in its sender's memory.
+pub trait Received: fmt::Debug {
+    /// The message.
+    fn message(&self) -> AnyMessage<'_>;
+}
+
+impl<P: Payload> AnyTopic for Topic<P>
+where
+    P::Message: Readable,
+{
+    fn name(&self) -> &'static str {
+        self.name
+    }
+
+    fn is_image(&self) -> bool {
+        P::IS_IMAGE
+    }
+
+    fn schema(&self) -> (&'static str, Value) {
+        (P::Message::SCHEMA, schema::<<P::Message as Readable>::Form>())
+    }
+
+    fn read(&self, json: &[u8]) -> Result<Box<dyn DynMessage>, FormError> {
+        read::<P::Message>(json)
+    }
+
+    fn ports(&self, node: &Node) -> Result<Ports, OpenError> {
+        node.ports(self)
+    }
+
+    fn receiver(&self, node: &Node) -> Result<Box<dyn AnyReceiver>, OpenError> {
+        Ok(Box::new(node.receiver(self)?))
+    }
+
+    fn polled_receiver(&self, node: &Node) -> Result<Box<dyn AnyReceiver>, OpenError> {
+        Ok(Box::new(node.receiver(self)?.polled()))
+    }
+
+    fn publisher(&self, node: &Node, max_bytes: usize) -> Result<Box<dyn AnyPublisher>, OpenError> {
+        Ok(Box::new(node.sized_publisher(self, max_bytes)?))
+    }
+
+    fn segment_bytes(&self, max_bytes: usize) -> u64 {
+        self.segment_bytes(max_bytes)
+    }
+}
+
+impl<P: Payload> AnyPublisher for Publisher<P>
+where
+    P::Message: Readable,
+{
+    fn send(&mut self, message: AnyMessage<'_>) -> Result<(), SendError> {
+        let typed = message.get::<P::Message>().ok_or_else(|| self.of_another_type())?;
+        P::send(self, *typed, message.bytes())
+    }
+}
+
+impl<P: Payload> AnyReceiver for Receiver<P>
+where
+    P::Message: Readable,
+{
+    fn next(&mut self) -> Result<Option<Box<dyn Received>>, ReceiveError> {
+        Ok(Receiver::next(self)?.map(|sample| Box::new(sample) as Box<dyn Received>))
+    }
+
+    fn as_input(&self) -> &dyn Input {
+        self
+    }
+}
+
+impl<P: Payload> Received for Sample<P>
+where
+    P::Message: Readable,
+{
+    fn message(&self) -> AnyMessage<'_> {
+        AnyMessage::new(&**self, self.bytes())
+    }
+}
+
+/// A topic by its name. The topics of the graph come first, in the order of a frame's way.
+#[derive(Clone, Copy, Debug)]
+pub struct TopicId {
+    /// Place in the graph; larger than all for a topic of a user's own.
+    index: usize,
+    topic: &'static dyn AnyTopic,
+}
+
+/// A name that no topic has.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("there is no topic `{name}`{}. All: {}", carff_nearest::hint(name, TopicId::all().map(TopicId::name)), all_names())]
+pub struct UnknownTopic {
+    /// The name that was asked for.
+    pub name: String,
+}
+
+fn all_names() -> String {
+    TopicId::all().map(TopicId::name).collect::<Vec<_>>().join(", ")
+}
+
+impl TopicId {
+    /// `camera/frame`.
+    pub const FRAME: Self = Self::of_graph(0);
+    /// `encoder/posterior`.
+    pub const POSTERIOR: Self = Self::of_graph(1);
+    /// `forecaster/forecast`.
+    pub const FORECAST: Self = Self::of_graph(2);
+    /// `prober/belief`.
+    pub const BELIEF: Self = Self::of_graph(3);
+    /// `renderer/view`.
+    pub const VIEW: Self = Self::of_graph(4);
+    /// `controller/action`.
+    pub const ACTION: Self = Self::of_graph(5);
+    /// The topics from the camera to the action, in the order of a frame's way.
+    pub const FLOW: [Self; 6] = [Self::FRAME, Self::POSTERIOR, Self::FORECAST, Self::BELIEF, Self::VIEW, Self::ACTION];
+
+    const fn of_graph(index: usize) -> Self {
+        Self { index, topic: topics::FLOW[index] }
+    }
+
+    /// A topic of a user's own.
+    pub fn of(topic: &'static dyn AnyTopic) -> Self {
+        let known = Self::all().find(|known| known.name() == topic.name());
+        known.unwrap_or(Self { index: usize::MAX, topic })
+    }
+
+    /// The topic of a stage's heartbeats.
+    pub fn health(stage: Stage) -> Self {
+        Self { index: Self::FLOW.len() + stage.code() as usize - 1, topic: topics::health(stage) }
+    }
+
+    /// All topics of the graph.
+    pub fn all() -> impl Iterator<Item = Self> {
+        Self::FLOW.into_iter().chain(Stage::ALL.into_iter().map(Self::health))
+    }
+
+    /// The topic that a stage's results are published on.
+    pub fn of_stage(stage: Stage) -> Self {
+        match stage {
+            Stage::Camera => Self::FRAME,
+            Stage::Encoder => Self::POSTERIOR,
+            Stage::Forecaster => Self::FORECAST,
+            Stage::Prober => Self::BELIEF,
+            Stage::Renderer => Self::VIEW,
+            Stage::Controller => Self::ACTION,
+        }
+    }
+
+    /// The name within the run.
+    pub fn name(self) -> &'static str {
+        self.topic.name()
+    }
+}
+
+impl std::ops::Deref for TopicId {
+    type Target = dyn AnyTopic;
+
+    fn deref(&self) -> &Self::Target {
+        self.topic
+    }
+}
+
+impl PartialEq for TopicId {
+    fn eq(&self, other: &Self) -> bool {
+        self.name() == other.name()
+    }
+}
+
+impl Eq for TopicId {}
+
+impl Ord for TopicId {
+    fn cmp(&self, other: &Self) -> Ordering {
+        self.index.cmp(&other.index).then_with(|| self.name().cmp(other.name()))
+    }
+}
+
+impl PartialOrd for TopicId {
+    fn partial_cmp(&self, other: &Self) -> Option<Ordering> {
+        Some(self.cmp(other))
+    }
+}
+
+impl Hash for TopicId {
+    fn hash<H: Hasher>(&self, state: &mut H) {
+        self.name().hash(state);
+    }
+}
+
+impl fmt::Display for TopicId {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.pad(self.name())
+    }
+}
+
+impl FromStr for TopicId {
+    type Err = UnknownTopic;
+
+    /// Reads a topic's full name, or its last part (`belief`) where that is unique.
+    fn from_str(name: &str) -> Result<Self, UnknownTopic> {
+        let last = |topic: &Self| topic.name().rsplit('/').next().unwrap_or_default();
+        let by_name = Self::all().find(|t| t.name() == name);
+        if let Some(topic) = by_name.or_else(|| Self::FLOW.into_iter().find(|t| last(t) == name)) {
+            return Ok(topic);
+        }
+        Err(UnknownTopic { name: name.to_owned() })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use carff_messages::Posterior;
+
+    /// Every name leads back to its topic, the last part of the data's topics too; a slip is told the nearest.
+    #[test]
+    fn names_lead_to_topics() {
+        for topic in TopicId::all() {
+            assert_eq!(topic.name().parse(), Ok(topic));
+        }
+        assert_eq!("belief".parse(), Ok(TopicId::BELIEF));
+        let told = |name: &str| name.parse::<TopicId>().unwrap_err().to_string();
+        assert!(told("beleif").contains("did you mean `prober/belief`?"), "{}", told("beleif"));
+        assert!(told("health/rendrer").contains("did you mean `health/renderer`?"), "{}", told("health/rendrer"));
+    }
+
+    /// Each stage has heartbeats of its own name.
+    #[test]
+    fn every_stage_has_its_health_topic() {
+        for stage in Stage::ALL {
+            assert_eq!(topics::health(stage).name, format!("health/{stage}"));
+        }
+    }
+
+    /// A user's own topic is of the same kind as the graph's, and comes after them.
+    #[test]
+    fn a_users_topic_is_a_topic() {
+        static OPINION: Topic<Posterior> = Topic::new("second-encoder/posterior", topics::MESSAGES, 500);
+        let own = TopicId::of(&OPINION);
+        assert!(TopicId::all().all(|known| known < own && known != own));
+        assert_eq!((own.schema().0, own.is_image()), ("carff.Posterior", false));
+        assert_eq!(TopicId::of(&topics::BELIEF), TopicId::BELIEF);
+    }
+}
