@@ -1,26 +1,33 @@
-//! The encoder stage's arithmetic: from a picture in shared memory to a posterior over the scene latent.
+//! The encoder stage's arithmetic: from an image in shared memory to a posterior over the scene latent.
 
 use anyhow::Context;
 use carff_checkpoint::Manifest;
 use carff_messages::Gaussian;
 use carff_models::{borrow, encoder::Encoder};
+use ndarray::{Array3, ArrayView3};
 use std::path::Path;
 
-/// Loads the encoder and runs it once on a grey picture, so that the first frame is as fast as the others.
+/// Side of the image that warms the encoder up, pixels.
+const WARM_UP_PX: usize = 128;
+/// Runs that warm the encoder up.
+const WARM_UPS: usize = 3;
+
+/// Loads the encoder and runs it on a grey image, so that the first frame takes no longer than the others.
 pub fn load(checkpoint: &Path, threads: usize) -> anyhow::Result<Encoder> {
     carff_models::allocator::keep_large_blocks();
-    tch::set_num_threads(threads as i32);
+    carff_models::device::set_threads(threads);
     let manifest = Manifest::load(checkpoint)?;
     let encoder = carff_models::stored::load_encoder(checkpoint, &manifest)?;
-    for _ in 0..3 {
-        encode(&encoder, &vec![128; 128 * 128 * 3], 128, 128)?;
+    let grey = Array3::from_elem((WARM_UP_PX, WARM_UP_PX, 3), 128);
+    for _ in 0..WARM_UPS {
+        encode(&encoder, grey.view())?;
     }
     Ok(encoder)
 }
 
-/// The posterior of one picture: `rgb` holds height x width x 3 bytes, and is read where it lies.
-pub fn encode(encoder: &Encoder, rgb: &[u8], height_px: usize, width_px: usize) -> anyhow::Result<Gaussian> {
-    borrow::with_picture(rgb, height_px, width_px, |picture| encoder.encode_bytes(picture))
+/// Returns the posterior of one image, (height, width, channel), which is read in place.
+pub fn encode(encoder: &Encoder, image: ArrayView3<'_, u8>) -> anyhow::Result<Gaussian> {
+    borrow::with_image(image, |image| encoder.encode_bytes(image))
         .flatten()
-        .with_context(|| format!("{} bytes are not an image of {width_px} x {height_px} pixels", rgb.len()))
+        .with_context(|| format!("the encoder cannot read an image of shape {:?}", image.shape()))
 }

@@ -17,12 +17,11 @@ fn run(stage: &mut StageContext) -> anyhow::Result<()> {
     while stage.wait(&[&frames])? {
         let started_ns = monotonic_now_ns();
         let Some(frame) = frames.newest()? else { continue };
-        let meta = &*frame;
-        let _span = frame_span(&meta.header);
-        match encode(&encoder, frame.bytes(), meta.height_px as usize, meta.width_px as usize) {
+        let _span = frame_span(&frame.header);
+        match encode(&encoder, frame.image()) {
             Ok(gaussian) => {
-                let stage_latency_ns = stage.worked(&meta.header, started_ns);
-                posteriors.send(Posterior { header: meta.header, gaussian, stage_latency_ns })?;
+                let stage_latency_ns = stage.worked(&frame.header, started_ns);
+                posteriors.send(Posterior { header: frame.header, gaussian, stage_latency_ns })?;
             }
             Err(error) => stage.error(&error),
         }

@@ -25,7 +25,7 @@ impl Forecaster {
         horizon: u32,
     ) -> anyhow::Result<Self> {
         carff_models::allocator::keep_large_blocks();
-        tch::set_num_threads(threads as i32);
+        carff_models::device::set_threads(threads);
         let manifest = Manifest::load(checkpoint)?;
         let net = carff_models::stored::load_mixture(checkpoint, &manifest)?;
         for _ in 0..3 {

@@ -34,7 +34,7 @@ impl Models {
     /// Reads a checkpoint; the encoder and the forecaster will use so many threads.
     pub fn load(dir: &Path, threads: usize) -> Result<Self, CheckpointError> {
         carff_models::allocator::keep_large_blocks();
-        tch::set_num_threads(threads as i32);
+        carff_models::device::set_threads(threads);
         let manifest = Manifest::load(dir)?;
         let mixture = match load_mixture(dir, &manifest) {
             // A part that training has not made yet leaves its function out; one that is damaged is an error.
@@ -61,8 +61,7 @@ impl Models {
 
     /// The posterior of a picture, as the encoder stage computes it; `None` for a picture of no or wrong size.
     pub fn encode(&self, image: &Image) -> Option<Gaussian> {
-        let (height_px, width_px) = (image.height_px as usize, image.width_px as usize);
-        borrow::with_picture(&image.rgb, height_px, width_px, |picture| self.encoder.encode_bytes(picture)).flatten()
+        borrow::with_image(image.view()?, |image| self.encoder.encode_bytes(image)).flatten()
     }
 
     /// The field.

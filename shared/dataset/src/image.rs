@@ -8,6 +8,8 @@ use image::codecs::jpeg::JpegDecoder;
 use image::codecs::png::{PngDecoder, PngEncoder};
 use image::{ColorType, ExtendedColorType, ImageDecoder, ImageEncoder, ImageFormat, ImageReader, Limits};
 
+use ndarray::{ArrayView3, ArrayViewMut3, s};
+
 use crate::dataset::MAX_IMAGE_SIDE_PX;
 use crate::error::DatasetError;
 
@@ -28,26 +30,33 @@ impl Image {
         Self { width_px, height_px, rgb: colour.repeat(width_px as usize * height_px as usize) }
     }
 
-    /// The colour at column `x_px` and row `y_px`; `None` outside the picture.
-    pub fn pixel(&self, x_px: u32, y_px: u32) -> Option<[u8; 3]> {
-        if x_px >= self.width_px || y_px >= self.height_px {
-            return None;
-        }
-        let at = (y_px as usize * self.width_px as usize + x_px as usize) * 3;
-        self.rgb.get(at..at + 3).map(|p| [p[0], p[1], p[2]])
+    /// The image as (height, width, channel); `None` where it has another number of bytes than its size states.
+    pub fn view(&self) -> Option<ArrayView3<'_, u8>> {
+        ArrayView3::from_shape(self.shape(), &self.rgb).ok()
     }
 
-    /// Copies `other` into this picture with its top left corner at (`x_px`, `y_px`); what falls outside is cut off.
+    fn view_mut(&mut self) -> Option<ArrayViewMut3<'_, u8>> {
+        ArrayViewMut3::from_shape(self.shape(), &mut self.rgb).ok()
+    }
+
+    fn shape(&self) -> (usize, usize, usize) {
+        (self.height_px as usize, self.width_px as usize, 3)
+    }
+
+    /// The colour at column `x_px` and row `y_px`; `None` outside the image.
+    pub fn pixel(&self, x_px: u32, y_px: u32) -> Option<[u8; 3]> {
+        let image = self.view()?;
+        let channel = |c| image.get((y_px as usize, x_px as usize, c)).copied();
+        Some([channel(0)?, channel(1)?, channel(2)?])
+    }
+
+    /// Copies `other` into this image with its top left corner at (`x_px`, `y_px`), cut off at the edges.
     pub fn paste(&mut self, other: &Image, x_px: u32, y_px: u32) {
-        if x_px >= self.width_px {
-            return;
-        }
-        let columns = other.width_px.min(self.width_px - x_px) as usize * 3;
-        let rows = other.height_px.min(self.height_px.saturating_sub(y_px));
-        for row in 0..rows as usize {
-            let from = row * other.width_px as usize * 3;
-            let to = ((y_px as usize + row) * self.width_px as usize + x_px as usize) * 3;
-            self.rgb[to..to + columns].copy_from_slice(&other.rgb[from..from + columns]);
+        let columns = other.width_px.min(self.width_px.saturating_sub(x_px)) as usize;
+        let rows = other.height_px.min(self.height_px.saturating_sub(y_px)) as usize;
+        let (x, y) = (x_px as usize, y_px as usize);
+        if let (Some(mut to), Some(from), true) = (self.view_mut(), other.view(), rows * columns > 0) {
+            to.slice_mut(s![y..y + rows, x..x + columns, ..]).assign(&from.slice(s![..rows, ..columns, ..]));
         }
     }
 

@@ -17,9 +17,9 @@ pub fn parse(name: &str) -> Result<Device, ModelError> {
     }
 }
 
-/// Tells libtorch how many threads it may use in this process.
-pub fn set_threads(threads: u16) {
-    tch::set_num_threads(i32::from(threads.max(1)));
+/// Sets the number of threads that libtorch uses in this process, at least 1.
+pub fn set_threads(threads: usize) {
+    tch::set_num_threads(i32::try_from(threads.max(1)).unwrap_or(i32::MAX));
 }
 
 #[cfg(test)]

@@ -14,6 +14,7 @@ use carff_models::{
     borrow,
     encoder::{Encoder, gaussians, pictures_from_bytes},
 };
+use ndarray::ArrayView3;
 use std::path::PathBuf;
 use tch::{Device, Kind, nn::VarStore};
 
@@ -140,7 +141,7 @@ fn in_bf16(args: &EncoderArgs, manifest: &Manifest, encoder: &Encoder, rgb: &[u8
     let halved = Encoder::new(&manifest.encoder, &(backbone.root() / "backbone"), &head.root(), Some(file.as_path()))?;
     backbone.set_kind(Kind::BFloat16);
     let encode_halved = || {
-        borrow::with_picture(rgb, SIDE_PX, SIDE_PX, |picture| {
+        borrow::with_image(image(rgb)?, |picture| {
             let picture = pictures_from_bytes(&picture.unsqueeze(0)).to_kind(Kind::BFloat16);
             let (mean, log_variance) =
                 tch::no_grad(|| encoder.posterior(&halved.features(&picture).to_kind(Kind::Float), 0.0));
@@ -171,5 +172,9 @@ fn in_bf16(args: &EncoderArgs, manifest: &Manifest, encoder: &Encoder, rgb: &[u8
 
 /// From bytes to posterior, as the encoder stage does it.
 fn encode(encoder: &Encoder, rgb: &[u8]) -> Option<Gaussian> {
-    borrow::with_picture(rgb, SIDE_PX, SIDE_PX, |picture| encoder.encode_bytes(picture)).flatten()
+    borrow::with_image(image(rgb)?, |picture| encoder.encode_bytes(picture)).flatten()
+}
+
+fn image(rgb: &[u8]) -> Option<ArrayView3<'_, u8>> {
+    ArrayView3::from_shape((SIDE_PX, SIDE_PX, 3), rgb).ok()
 }
