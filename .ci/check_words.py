@@ -5,8 +5,8 @@
 - Sentences of documents that open with What, Who, Which, Whether or Of.
 - First doc lines of public Rust items that open with What, Which, Who, How, Whether, Where, When or Of.
 
-Documents are Markdown files, and the comments of TOML files and the Makefile. Rust is checked in the folders of
-HELD_RUST.
+Documents are Markdown files, and the comments of TOML files, the Makefile and Python programs. Rust is checked in the
+folders of HELD_RUST.
 
 Usage: python3 .ci/check_words.py [ROOT]            exit code 1 and one line per finding
        python3 .ci/check_words.py --count [ROOT]    findings per folder and kind, for all folders; exit code 0
@@ -18,11 +18,12 @@ import sys
 from collections import Counter
 from pathlib import Path
 
-# Folders whose Rust files are held to the rules. The others are only counted.
+# Folders whose Rust files must follow the rules. The others are only counted.
 HELD_RUST: list[str] = ["examples", "launch/attach", "launch/carff"]
 
 # Documents that are not held yet, with the reason.
 NOT_HELD = {
+    ".ci/check_words.py": "contains the banned words",
     "configs/graphs": "will be reduced to differences from the defaults",
     "configs/schemas": "generated from Rust docs",
 }
@@ -95,6 +96,18 @@ def prose_of_comments(text: str) -> str:
     return INLINE.sub(lambda m: blank(m, GAP), "\n".join(lines))
 
 
+def prose_of_python(text: str) -> str:
+    """Returns comments and docstrings; everything else is blank."""
+    keep = re.compile(r'(?P<doc>""".*?""")|(?P<text>"(?:[^"\\\n]|\\.)*")|(?P<comment>#[^\n]*)', re.DOTALL)
+    parts, end = [], 0
+    for token in keep.finditer(text):
+        parts.append(re.sub(r"[^\n]", GAP, text[end:token.start()]))
+        end = token.end()
+        parts.append(blank(token, GAP) if token["text"] else re.sub(r'"""|#', GAP, token[0]))
+    prose = "".join(parts) + re.sub(r"[^\n]", GAP, text[end:])
+    return INLINE.sub(lambda m: blank(m, GAP), prose)
+
+
 def prose_of_rust(text: str) -> str:
     """Returns docs, and strings of three words or more; everything else is blank."""
     parts, end = [], 0
@@ -108,7 +121,7 @@ def prose_of_rust(text: str) -> str:
         else:
             parts.append(blank(token, GAP))
     prose = "".join(parts) + re.sub(r"[^\n]", GAP, text[end:])
-    # A doc comment goes on in the next line: what is between is indentation.
+    # A doc comment continues in the next line after its indentation.
     prose = re.sub(rf"\n{GAP}*(?=   )", lambda m: "\n" + " " * (len(m[0]) - 1), prose)
     return INLINE.sub(lambda m: blank(m, GAP), prose)
 
@@ -135,6 +148,8 @@ def findings_of(path: str, text: str) -> list[tuple[int, str, str, str]]:
         prose = prose_of_rust(text)
     elif path.endswith(".md"):
         prose = prose_of_markdown(text)
+    elif path.endswith(".py"):
+        prose = prose_of_python(text)
     else:
         prose = prose_of_comments(text)
     found = []
@@ -167,7 +182,7 @@ def main() -> None:
     arguments = [a for a in sys.argv[1:] if a != "--count"]
     root = Path(arguments[0]) if arguments else Path(__file__).resolve().parent.parent
     listed = subprocess.run(
-        ["git", "ls-files", "--cached", "--others", "--exclude-standard", "*.md", "*.rs", "*.toml", "Makefile"],
+        ["git", "ls-files", "--cached", "--others", "--exclude-standard", "*.md", "*.rs", "*.toml", "*.py", "Makefile"],
         cwd=root, capture_output=True, text=True, check=True,
     )
     files = sorted(p for p in set(listed.stdout.splitlines()) if (root / p).is_file() and not within(p, NOT_HELD))
