@@ -3,12 +3,13 @@
 use crate::monitor::FrameRecord;
 use crate::planning::{Setup, halts};
 use anyhow::Context;
-use carff_belief::{Probe, Step};
+use carff_checkpoint::FieldProbe;
 use carff_dataset::{Image, drives::DriveKind};
+use carff_decision::Step;
 use carff_evaluation::hypotheses::{birds_eye_camera, hypotheses, state_names};
 use carff_field::{RenderBuffer, RenderOptions};
 use carff_geometry::PinholeCamera;
-use carff_messages::Reason;
+use carff_messages::{Reason, Rule};
 use carff_plots::{StripCell, StripRow};
 use std::path::Path;
 
@@ -23,7 +24,7 @@ const HAZARD: [u8; 3] = [236, 140, 20];
 /// Draws some drives of a run, each by the frame whose decision counts, into a PNG file.
 pub fn write(path: &Path, setup: &Setup, decisive: &[(FrameRecord, DriveKind)]) -> anyhow::Result<()> {
     let probe = setup.models.probe.clone();
-    let names = state_names(&setup.scenario, probe.prober().places());
+    let names = state_names(&setup.scenario, probe.layout().places());
     let mut artist = Artist { setup, names, probe, buffer: RenderBuffer::new() };
     let rows = chosen(decisive).into_iter().map(|(frame, kind)| artist.row(frame, *kind));
     let rows = rows.collect::<anyhow::Result<Vec<_>>>()?;
@@ -52,7 +53,7 @@ struct Artist<'a> {
     setup: &'a Setup,
     /// What the known states are called.
     names: Vec<String>,
-    probe: Probe,
+    probe: FieldProbe,
     buffer: RenderBuffer,
 }
 
@@ -103,13 +104,13 @@ impl Artist<'_> {
             DriveKind::Hazard => "somebody comes, hidden",
             DriveKind::Clear => "nobody comes, in full view",
         };
-        let rule = self.setup.live_rule();
+        let rule = self.setup.graph.controller.rule;
         let mut lines = vec![
             format!("Drive {} {}", frame.drive + 1, if halts(frame) { "halts" } else { "advances" }),
             format!("{verdict}: {truth}"),
             format!("hazard probability {:.2}", frame.hazard_probability),
-            match rule.as_str() {
-                "calibrated" => format!("threshold {:.2}", self.setup.threshold),
+            match rule {
+                Rule::Calibrated => format!("threshold {:.2}", self.setup.threshold),
                 _ => format!("rule: {rule}"),
             },
         ];
@@ -174,7 +175,7 @@ impl Artist<'_> {
         birds_eye_camera(&self.setup.dataset, self.probe.field())
     }
 
-    fn rendered(&mut self, camera: &PinholeCamera, latent: &[f32; carff_latent::LATENT_DIM]) -> Image {
+    fn rendered(&mut self, camera: &PinholeCamera, latent: &[f32; carff_messages::LATENT_DIM]) -> Image {
         let threads = std::thread::available_parallelism().map_or(1, std::num::NonZero::get);
         let options = RenderOptions { threads, ..RenderOptions::default() };
         self.probe.field().render(camera, latent, &options, &mut self.buffer);

@@ -10,9 +10,9 @@ use crate::supervise::{RestartBudget, Verdict};
 use anyhow::{Context, anyhow, bail, ensure};
 use carff::terminal::Terminal;
 use carff_checkpoint::{Manifest, ScenarioIdentity};
-use carff_config::{CameraSource, GraphConfig, RestartPolicy, WhenLost};
+use carff_config::{CameraSource, GraphConfig, WhenLost};
 use carff_dataset::Dataset;
-use carff_messages::{ActionCode, Stage};
+use carff_messages::{ActionCode, Observability, Stage};
 use carff_observe::{RunLock, RunRecord};
 use carff_scenes::{Extras, Scenario};
 use carff_stage::StageArgs;
@@ -129,7 +129,7 @@ pub(crate) fn run_graph(
     terminal: &Arc<Terminal>,
 ) -> anyhow::Result<(Ended, RunOutcome)> {
     let graph = GraphConfig::load(&args.graph)?;
-    terminal.set_log_format(graph.log.format);
+    terminal.set_log_format(graph.launcher.log_format);
     for warning in graph.warnings() {
         terminal.log(LAUNCHER, &format!("WARN {}: {warning}", args.graph.display()));
     }
@@ -332,7 +332,7 @@ impl Launcher<'_> {
             None => self.stages.push(Watched {
                 stage,
                 process: Some(process),
-                budget: RestartBudget::new(self.policy(stage)),
+                budget: RestartBudget::new(self.graph.stage(stage).restart),
                 health: StageHealth::started(self.limits(stage), pid, now_ns),
                 restart_at_ns: None,
             }),
@@ -345,13 +345,14 @@ impl Launcher<'_> {
         let (graph, launcher) = (self.graph, &self.graph.launcher);
         let hang_ns = launcher.hang_timeout_ms * NS_PER_MS;
         let frame_ns = 1e9 / graph.run.frame_rate_hz;
-        let (topic, deadline_ns) = match stage {
-            Stage::Camera => (topics::FRAME.deadline, frame_ns as u64),
-            Stage::Encoder => (topics::POSTERIOR.deadline, graph.encoder.deadline_ms * NS_PER_MS),
-            Stage::Forecaster => (topics::FORECAST.deadline, graph.forecaster.deadline_ms * NS_PER_MS),
-            Stage::Prober => (topics::BELIEF.deadline, graph.prober.deadline_ms * NS_PER_MS),
-            Stage::Renderer => (topics::VIEW.deadline, graph.renderer.deadline_ms * NS_PER_MS),
-            Stage::Controller => (topics::ACTION.deadline, graph.controller.deadline_ms * NS_PER_MS),
+        let deadline_ns = graph.stage_deadline_ms(stage) * NS_PER_MS;
+        let topic = match stage {
+            Stage::Camera => topics::FRAME.deadline,
+            Stage::Encoder => topics::POSTERIOR.deadline,
+            Stage::Forecaster => topics::FORECAST.deadline,
+            Stage::Prober => topics::BELIEF.deadline,
+            Stage::Renderer => topics::VIEW.deadline,
+            Stage::Controller => topics::ACTION.deadline,
         };
         // The controller has a rate of its own.
         let frames_ns = if stage == Stage::Controller { 0.0 } else { QUIET_FRAMES * frame_ns };
@@ -361,18 +362,6 @@ impl Launcher<'_> {
             hang_ns,
             standstill_ns: hang_ns.max(STANDSTILL_DEADLINES * deadline_ns),
             quiet_ns: (topic.as_nanos() as u64).max(frames_ns as u64),
-        }
-    }
-
-    fn policy(&self, stage: Stage) -> RestartPolicy {
-        let restart = &self.graph.launcher.restart;
-        match stage {
-            Stage::Camera => restart.camera,
-            Stage::Encoder => restart.encoder,
-            Stage::Forecaster => restart.forecaster,
-            Stage::Prober => restart.prober,
-            Stage::Renderer => restart.renderer,
-            Stage::Controller => restart.controller,
         }
     }
 
@@ -616,7 +605,7 @@ fn decision_line(frame: &FrameRecord, graph: &GraphConfig, drives: u32, terminal
             frame.frame_in_drive % graph.camera.frames_per_timestamp as i32 + 1,
             graph.camera.frames_per_timestamp,
             frame.view,
-            frame.observability
+            frame.observability.map_or("unknown", Observability::name)
         )
     } else {
         format!("frame {:>6}", frame.frame_id)

@@ -26,7 +26,7 @@ pub struct FrameRecord {
     /// Whether it is the last frame of its timestamp, whose decision counts.
     pub last_of_timestamp: bool,
     /// How much of the actor or its place it shows.
-    pub observability: Observability,
+    pub observability: Option<Observability>,
     /// When it was taken: monotonic clock, nanoseconds.
     pub capture_time_ns: u64,
     /// What the encoder saw.
@@ -157,7 +157,7 @@ impl Records {
             drive: view.drive,
             frame_in_drive: view.frame_in_drive,
             last_of_timestamp: view.last_of_timestamp == 1,
-            observability: Observability::try_from(view.observability).unwrap_or(Observability::Unknown),
+            observability: Observability::of_code(view.observability).ok().flatten(),
             capture_time_ns: meta.header.capture_time_ns,
             posterior: None,
             action: None,

@@ -4,17 +4,16 @@ use crate::filmstrip;
 use crate::monitor::FrameRecord;
 use crate::report::RunOutcome;
 use anyhow::Context;
-use carff_belief::{Plan, Probe, Step, decision, look_ahead};
-use carff_config::{CameraSource, CheckpointPlanning, GraphConfig};
+use carff_checkpoint::CheckpointPlanning;
+use carff_checkpoint::FieldProbe;
+use carff_config::{CameraSource, GraphConfig};
 use carff_dataset::{
     Dataset, PoseRole, PoseSplit, ScenarioInfo,
     drives::{DriveKind, EligibleInput, eligible_inputs},
-    sensor::SensorNoise,
 };
+use carff_decision::{Evidence, Plan, Policy, Step, look_ahead};
 use carff_evaluation::{Models, PlanningTable, SAMPLE_COUNTS, count, planning_table, trials};
-use carff_latent::{LatentGaussian, Sampling};
-use carff_messages::{ActionCode, Observability};
-use carff_planning::Rule;
+use carff_messages::ActionCode;
 use carff_scenes::Scenario;
 use serde_json::{Map, Value, json};
 use std::collections::BTreeMap;
@@ -114,30 +113,12 @@ impl Setup {
         })
     }
 
-    fn sampling(&self) -> Sampling {
-        match self.graph.run.sampling {
-            carff_config::Sampling::Stratified => Sampling::Stratified,
-            carff_config::Sampling::Independent => Sampling::Independent,
-        }
-    }
-
-    fn rules(&self) -> [Rule; 4] {
-        let calibrated = Rule::Calibrated { threshold: self.threshold };
-        [Rule::Underconfident, Rule::Overconfident, Rule::Paper, calibrated]
-    }
-
-    /// Name of the rule that the controller had.
-    pub fn live_rule(&self) -> String {
-        format!("{:?}", self.graph.controller.rule).to_lowercase()
-    }
-
     /// Looks ahead from what the encoder saw in a frame, with the random numbers of the run: with its number of samples
     /// these are the run's own. `None` when no posterior was recorded.
-    pub fn look_ahead(&self, probe: &mut Probe, frame: &FrameRecord, samples: usize) -> Option<Vec<Step>> {
+    pub fn look_ahead(&self, probe: &mut FieldProbe, frame: &FrameRecord, samples: usize) -> Option<Vec<Step>> {
         let posterior = frame.posterior?;
-        let posterior = LatentGaussian { mean: posterior.mean, log_variance: posterior.log_variance };
         let horizon = self.graph.run.horizon;
-        let plan = Plan { samples, sampling: self.sampling(), horizon, seed: self.seed, frame: frame.frame_id };
+        let plan = Plan { samples, sampling: self.graph.run.sampling, horizon, seed: self.seed, frame: frame.frame_id };
         Some(look_ahead(|input, _| self.models.mixture.forecast(input), probe, &posterior, plan))
     }
 }
@@ -146,25 +127,26 @@ impl Setup {
 fn drives_table(setup: &Setup, decisive: &[(FrameRecord, DriveKind)]) -> (PlanningTable, Value) {
     let mut probe = setup.models.probe.clone();
     let mut table = PlanningTable::new();
-    let (live_rule, live_samples) = (setup.live_rule(), setup.graph.run.samples as usize);
+    let (live_rule, live_samples) = (setup.graph.controller.rule, setup.graph.run.samples as usize);
     let (mut agreeing, mut compared) = (0, 0);
     for (frame, kind) in decisive {
         for samples in SAMPLE_COUNTS {
             let Some(steps) = setup.look_ahead(&mut probe, frame, samples) else { continue };
-            for rule in setup.rules() {
-                let mut halted = decision(rule, &steps).halt;
-                if rule.name() == live_rule && samples == live_samples {
+            let evidence = Evidence::of_steps(&steps);
+            for policy in Policy::all(setup.threshold) {
+                let mut halted = policy.decide(&evidence).halt;
+                if policy.rule == live_rule && samples == live_samples {
                     // What the graph did counts, not what it should have done.
                     compared += 1;
                     agreeing += usize::from(halts(frame) == halted);
                     halted = halts(frame);
                 }
-                count(&mut table, rule.name(), samples, *kind, halted == (*kind == DriveKind::Hazard));
+                count(&mut table, policy.rule.name(), samples, *kind, halted == (*kind == DriveKind::Hazard));
             }
         }
     }
     let live = json!({
-        "rule": live_rule,
+        "rule": live_rule.name(),
         "samples": live_samples,
         "compared": compared,
         "agrees_with_library": agreeing,
@@ -179,21 +161,21 @@ pub fn halts(frame: &FrameRecord) -> bool {
 
 /// Every rule over all eligible pictures of some poses; and how many those were.
 fn views_table(setup: &Setup, views: &[usize]) -> anyhow::Result<(PlanningTable, Value)> {
-    let of_camera = &setup.graph.camera.noise;
-    let noise = SensorNoise {
-        sigma: of_camera.sigma,
-        gain_sigma: of_camera.gain_sigma,
-        channel_gain_sigma: of_camera.channel_gain_sigma,
-        channel_offset_sigma: of_camera.channel_offset_sigma,
-    };
     let inputs = eligible_inputs(&setup.dataset, views)?;
     let of = |kind| inputs.iter().filter(|i: &&EligibleInput| i.kind == kind).count();
     let (hazards, clears) = (of(DriveKind::Hazard), of(DriveKind::Clear));
     let repeats = TRIALS.div_ceil(inputs.len().max(1)).min(MOST_REPEATS);
     let models = &setup.models;
-    let trials = trials(&models.encoder, &setup.dataset, &inputs, repeats, &noise, setup.seed)?;
+    let trials = trials(&models.encoder, &setup.dataset, &inputs, repeats, &setup.graph.camera.noise, setup.seed)?;
     let horizon = setup.graph.run.horizon;
-    let (table, _) = planning_table(&models.mixture, &models.probe, &trials, &setup.rules(), setup.sampling(), horizon);
+    let (table, _) = planning_table(
+        &models.mixture,
+        &models.probe,
+        &trials,
+        &Policy::all(setup.threshold),
+        setup.graph.run.sampling,
+        horizon,
+    );
     Ok((table, json!({ "hazard": hazards, "clear": clears, "repeats": repeats })))
 }
 
@@ -208,7 +190,7 @@ pub fn decisive_frames(outcome: &RunOutcome, scenario: &ScenarioInfo) -> Vec<(Fr
         if frame.drive < 0 || frame.action.is_none() {
             continue;
         }
-        let Some(kind) = scenario.trial_kind(branch, timestamp, seen(frame.observability)) else { continue };
+        let Some(kind) = scenario.trial_kind(branch, timestamp, frame.observability) else { continue };
         match by_drive.get(&frame.drive) {
             Some((there, _)) if there.timestamp < frame.timestamp => {}
             _ => {
@@ -217,16 +199,6 @@ pub fn decisive_frames(outcome: &RunOutcome, scenario: &ScenarioInfo) -> Vec<(Fr
         }
     }
     by_drive.into_values().collect()
-}
-
-/// The message's observability, as data sets have it.
-fn seen(observability: Observability) -> Option<carff_dataset::Observability> {
-    match observability {
-        Observability::Unknown => None,
-        Observability::None => Some(carff_dataset::Observability::None),
-        Observability::Partial => Some(carff_dataset::Observability::Partial),
-        Observability::Full => Some(carff_dataset::Observability::Full),
-    }
 }
 
 /// The tables as text.
@@ -286,6 +258,7 @@ fn share(count: &Value) -> String {
 #[cfg(test)]
 pub(crate) mod tests {
     use super::*;
+    use carff_messages::Observability;
 
     /// A decided frame of the first timestamp of a drive, that shows nothing of the place that matters.
     pub(crate) fn frame() -> FrameRecord {
@@ -297,7 +270,7 @@ pub(crate) mod tests {
             drive: 0,
             frame_in_drive: 0,
             last_of_timestamp: false,
-            observability: Observability::None,
+            observability: Some(Observability::None),
             capture_time_ns: 0,
             posterior: None,
             action: Some(ActionCode::Halt),
@@ -335,7 +308,7 @@ pub(crate) mod tests {
             branch,
             timestamp,
             drive,
-            observability,
+            observability: Some(observability),
             ..frame()
         };
         let undecided = FrameRecord { action: None, ..at(0, 0, 0, Observability::None) };

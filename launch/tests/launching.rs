@@ -5,7 +5,7 @@
 
 use carff_messages::{
     Action, ActionCode, Belief, DatasetView, Forecast, ForecastSource, FrameMeta, Gaussian, Header, Intrinsics,
-    Posterior, Reason, RuleCode, Stage,
+    Posterior, Reason, Rule, Stage,
 };
 use carff_stage::{StageArgs, StageContext};
 use carff_transport::{Run, Woken, living_processes, monotonic_now_ns, topics};
@@ -134,7 +134,7 @@ fn controller(stage: &mut StageContext) -> anyhow::Result<()> {
                 header: belief.header,
                 action: ActionCode::Advance.code(),
                 reason: Reason::Belief.code(),
-                rule: RuleCode::Calibrated.code(),
+                rule: Rule::Calibrated.code(),
                 sample_count: 1,
                 confidence: 1.0,
                 hazard_probability: 0.25,
@@ -169,7 +169,7 @@ impl Graph {
         let test = std::env::current_exe().unwrap();
         for stage in Stage::ALL {
             let path = folder.path().join(format!("carff-{stage}"));
-            let fault = if *stage == Stage::Encoder { fault } else { "none" };
+            let fault = if stage == Stage::Encoder { fault } else { "none" };
             let script = format!(
                 "#!/bin/sh\nCARFF_FAKE={stage}:{fault} CARFF_ARGS=\"$*\" exec {} --exact fake_stage --nocapture\n",
                 test.display()
@@ -179,7 +179,7 @@ impl Graph {
         }
         let text = format!(
             "[run]\nname = \"{name}\"\ndataset = \"none\"\ncheckpoint = \"none\"\n[camera]\nsource = \"folder\"\n\
-             [launcher.restart]\nencoder = {{ on-failure = {{ backoff_ms = 10, max_restarts = 2 }} }}\n"
+             [stages.encoder]\nrestart = {{ on-failure = {{ backoff_ms = 10, max_restarts = 2 }} }}\n"
         );
         std::fs::write(folder.path().join("graph.toml"), text).unwrap();
         Self { folder, name }

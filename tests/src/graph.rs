@@ -93,7 +93,7 @@ impl TestGraph {
         let lock = runtime_dir().join(format!("{}.run", self.run.name()));
         assert!(!lock.exists(), "{} is left", lock.display());
         for stage in Stage::ALL {
-            assert_eq!(self.stage_pid(*stage), None, "stage {stage} lives");
+            assert_eq!(self.stage_pid(stage), None, "stage {stage} lives");
         }
     }
 }

@@ -106,7 +106,7 @@ fn rogue_beliefs_never_reach_an_action() {
         |b| b.state_probability[1] = f32::NAN,
         |b| b.component_weights[0] = f32::NAN,
         |b| b.samples[0].hazard_likelihood = f32::NAN,
-        |b| b.samples[0].densities[0] = f32::INFINITY,
+        |b| b.samples[0].occupancies[0] = f32::INFINITY,
         |b| b.resolved.mean[3] = f32::NAN,
         |b| b.sample_count = 65,
         |b| b.header.schema_version += 1,

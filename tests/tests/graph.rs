@@ -82,7 +82,7 @@ fn an_interrupt_leaves_nothing() {
     let mut launcher = Process::start(&mut graph.launch(&graph.file(), &[]));
     launcher.wait_for("decision", |text| decisions(text) >= 3);
     for stage in Stage::ALL {
-        assert!(graph.stage_pid(*stage).is_some(), "stage {stage} does not run");
+        assert!(graph.stage_pid(stage).is_some(), "stage {stage} does not run");
     }
     assert!(!graph.run().shared_memory_files().unwrap().is_empty());
     launcher.signal(Signal::INT);
@@ -95,7 +95,7 @@ fn an_interrupt_leaves_nothing() {
 /// own lines among them.
 #[test]
 fn logs_are_json_where_asked_for() {
-    let more = format!("{PATIENT}[camera]\nrepeat = true\n[log]\nformat = \"json\"\n");
+    let more = format!("{PATIENT}log_format = \"json\"\n[camera]\nrepeat = true\n");
     let graph = TestGraph::new(&scenario_set(), &shipped_checkpoint(), &more);
     let mut launcher = Process::start(&mut graph.launch(&graph.file(), &[]));
     launcher.wait_for("decision", |text| decisions(text) >= 1);
@@ -139,7 +139,7 @@ fn a_service_manager_is_told() {
     }
     assert!(before_ready.iter().all(|word| word == "WATCHDOG=1"), "{before_ready:?}");
     for stage in Stage::ALL {
-        assert!(graph.stage_pid(*stage).is_some(), "stage {stage} does not run");
+        assert!(graph.stage_pid(stage).is_some(), "stage {stage} does not run");
     }
     for _ in 0..3 {
         assert_eq!(hear(), "WATCHDOG=1");
@@ -178,7 +178,7 @@ fn a_lost_camera_ends_the_run() {
     let graph = TestGraph::new(
         &scenario_set(),
         &shipped_checkpoint(),
-        &format!("{PATIENT}[camera]\nrepeat = true\n[launcher.restart]\ncamera = \"never\"\n"),
+        &format!("{PATIENT}[camera]\nrepeat = true\n[stages.camera]\nrestart = \"never\"\n"),
     );
     let mut launcher = Process::start(&mut graph.launch(&graph.file(), &[]));
     launcher.wait_for("decision", |text| decisions(text) >= 1);

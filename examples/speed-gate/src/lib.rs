@@ -45,14 +45,14 @@ message!(SpeedLimit);
 #[cfg(test)]
 mod tests {
     use super::*;
-    use carff_messages::{Message, Reason, RuleCode};
+    use carff_messages::{Message, Reason, Rule};
 
     fn action(code: ActionCode) -> Action {
         Action {
             header: Header::of_frame(7, 1_000, 42),
             action: code.code(),
             reason: Reason::Belief.code(),
-            rule: RuleCode::Calibrated.code(),
+            rule: Rule::Calibrated.code(),
             sample_count: 1,
             confidence: 1.0,
             hazard_probability: 0.0,

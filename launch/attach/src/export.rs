@@ -196,8 +196,8 @@ fn spans(recording: &Path, file: &Path) -> anyhow::Result<usize> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use carff_messages::forms::AnyMessage;
     use carff_messages::{FrameMeta, Gaussian, Header, Posterior};
-    use carff_readable::AnyMessage;
     use carff_recording::{About, Writer};
 
     fn recording(path: &Path) {

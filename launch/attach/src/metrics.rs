@@ -167,8 +167,8 @@ fn prometheus(run: &str, vitals: &RunVitals) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use carff_messages::forms::AnyMessage;
     use carff_messages::{Gaussian, Posterior};
-    use carff_readable::AnyMessage;
 
     fn vitals() -> RunVitals {
         let mut vitals = RunVitals::default();

@@ -1,8 +1,8 @@
 //! The time that each stage spent on each frame, from its messages: as lines, and as a trace file for Perfetto and
 //! Chrome.
 
+use carff_messages::forms::AnyMessage;
 use carff_messages::{ActionCode, Reason, Stage};
-use carff_readable::AnyMessage;
 use serde_json::{Value, json};
 
 /// A stage's work on a frame.

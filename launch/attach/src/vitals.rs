@@ -1,9 +1,9 @@
 //! Health, rates and resource use of a run's stages over time, for the full-screen view and the metrics.
 
 use crate::probe::session::{Going, Session};
+use carff_messages::forms::AnyMessage;
 use carff_messages::{ActionCode, HealthState, Reason, Stage};
 use carff_observe::TopicId;
-use carff_readable::AnyMessage;
 use carff_transport::monotonic_now_ns;
 use std::collections::{BTreeMap, VecDeque};
 

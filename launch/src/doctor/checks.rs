@@ -1,7 +1,8 @@
 //! From what was found on the machine to findings. Nothing here looks at the machine.
 
 use super::finding::{Area, Finding};
-use carff_config::{RealtimeConfig, StageRealtime, ThreadsConfig};
+use carff_config::{StageConfig, StagesConfig};
+use carff_messages::Stage;
 use std::path::{Path, PathBuf};
 
 /// The version that the programs are built for.
@@ -49,9 +50,9 @@ pub fn processor(name: &str, features: &[&str]) -> Finding {
 
 /// Cores against the threads of a graph: encoder, forecaster and prober take turns on a frame, the renderer works beside
 /// them.
-pub fn cores(cores: usize, threads: &ThreadsConfig) -> Finding {
-    let path = threads.encoder.max(threads.forecaster).max(threads.prober);
-    let wanted = (path + threads.renderer) as usize;
+pub fn cores(cores: usize, stages: &StagesConfig) -> Finding {
+    let path = stages.encoder.threads.max(stages.forecaster.threads).max(stages.prober.threads);
+    let wanted = (path + stages.renderer.threads) as usize;
     if cores >= wanted {
         return Finding::ok(Area::Machine, "cores", format!("{cores}, for {wanted} threads that work at a time"));
     }
@@ -60,10 +61,10 @@ pub fn cores(cores: usize, threads: &ThreadsConfig) -> Finding {
         "cores",
         format!(
             "{cores}, for {wanted} threads that work at a time ({path} on the frame, {} rendering)",
-            threads.renderer
+            stages.renderer.threads
         ),
         "stages wait for each other: frames are skipped, and actions come late",
-        "lower `threads` in the graph file, or give the machine (or container) more cores",
+        "lower `stages.*.threads` in the graph file, or give the machine (or container) more cores",
     )
 }
 
@@ -329,16 +330,16 @@ pub struct Allowed {
 }
 
 /// Limits against what a graph asks for.
-pub fn limits(allowed: &Allowed, realtime: &RealtimeConfig) -> Vec<Finding> {
+pub fn limits(allowed: &Allowed, stages: &StagesConfig) -> Vec<Finding> {
     let area = Area::Limits;
     let without = "the stage says so in its log, and goes on without";
     let raise = |line: &str, unit: &str| {
         format!("write `USER - {line}` to /etc/security/limits.d/carff.conf and log in anew; in a systemd unit: {unit}")
     };
     let show = |limit: Option<u64>, show: &dyn Fn(u64) -> String| limit.map_or_else(|| "no limit".to_owned(), show);
-    let stages = stages(realtime);
-    let asking = |asks: &dyn Fn(&StageRealtime) -> bool| {
-        stages.iter().filter(|(_, s)| asks(s)).map(|(name, _)| *name).collect::<Vec<_>>().join(", ")
+    let each = || Stage::ALL.into_iter().map(|stage| (stage.name(), stages.of(stage)));
+    let asking = |asks: &dyn Fn(&StageConfig) -> bool| {
+        each().filter(|(_, s)| asks(s)).map(|(name, _)| name).collect::<Vec<_>>().join(", ")
     };
 
     let locking = asking(&|s| s.lock_memory);
@@ -357,7 +358,7 @@ pub fn limits(allowed: &Allowed, realtime: &RealtimeConfig) -> Vec<Finding> {
         )
     };
 
-    let highest = stages.iter().filter_map(|(_, s)| s.fifo_priority).max().unwrap_or(0);
+    let highest = each().filter_map(|(_, s)| s.fifo_priority).max().unwrap_or(0);
     let priority = show(allowed.realtime_priority, &|p| p.to_string());
     let may_rise = allowed.may_schedule || allowed.realtime_priority.is_none_or(|p| p >= u64::from(highest));
     let rtprio = if may_rise {
@@ -373,7 +374,7 @@ pub fn limits(allowed: &Allowed, realtime: &RealtimeConfig) -> Vec<Finding> {
         )
     };
 
-    let lowest = stages.iter().filter_map(|(_, s)| s.nice).min().unwrap_or(0);
+    let lowest = each().filter_map(|(_, s)| s.nice).min().unwrap_or(0);
     let floor = allowed.nice.map_or(-20, |limit| 20 - limit.min(40) as i64);
     let mut findings = vec![memlock, rtprio];
     if lowest < 0 {
@@ -400,23 +401,13 @@ pub fn limits(allowed: &Allowed, realtime: &RealtimeConfig) -> Vec<Finding> {
     findings
 }
 
-fn stages(realtime: &RealtimeConfig) -> [(&'static str, &StageRealtime); 6] {
-    [
-        ("camera", &realtime.camera),
-        ("encoder", &realtime.encoder),
-        ("forecaster", &realtime.forecaster),
-        ("prober", &realtime.prober),
-        ("renderer", &realtime.renderer),
-        ("controller", &realtime.controller),
-    ]
-}
-
 /// Processors that a graph binds stages to, and that are not there.
-pub fn bound_cores(online: &[u32], realtime: &RealtimeConfig) -> Option<Finding> {
-    let missing: Vec<String> = stages(realtime)
-        .iter()
-        .flat_map(|(name, s)| {
-            s.cpus.iter().filter(|cpu| !online.contains(cpu)).map(move |cpu| format!("{name}: {cpu}"))
+pub fn bound_cores(online: &[u32], stages: &StagesConfig) -> Option<Finding> {
+    let missing: Vec<String> = Stage::ALL
+        .into_iter()
+        .flat_map(|stage| {
+            let cpus = &stages.of(stage).cpus;
+            cpus.iter().filter(|cpu| !online.contains(cpu)).map(move |cpu| format!("{stage}: {cpu}"))
         })
         .collect();
     (!missing.is_empty()).then(|| {
@@ -425,7 +416,7 @@ pub fn bound_cores(online: &[u32], realtime: &RealtimeConfig) -> Option<Finding>
             "cores",
             format!("the graph binds stages to processors that are not there ({})", missing.join(", ")),
             "the stage says so in its log, and runs anywhere",
-            "change `realtime.*.cpus` in the graph file",
+            "change `stages.*.cpus` in the graph file",
         )
     })
 }
@@ -536,8 +527,8 @@ mod tests {
 
     const MIB: u64 = 1 << 20;
 
-    fn realtime(prober: StageRealtime) -> RealtimeConfig {
-        RealtimeConfig { prober, ..RealtimeConfig::default() }
+    fn with_prober(prober: StageConfig) -> StagesConfig {
+        StagesConfig { prober, ..StagesConfig::default() }
     }
 
     fn levels(findings: &[Finding]) -> Vec<(&'static str, Level)> {
@@ -564,11 +555,12 @@ mod tests {
     /// A frame's stages take turns, the renderer works beside them: their most and its own are what cores are for.
     #[test]
     fn cores_against_threads() {
-        let threads = ThreadsConfig { total: 8, encoder: 3, forecaster: 1, prober: 2, renderer: 1 };
-        assert_level(&cores(4, &threads), Level::Ok);
-        assert_level(&cores(3, &threads), Level::Warning);
-        assert_level(&cores(2, &ThreadsConfig::default()), Level::Ok);
-        assert_level(&cores(1, &ThreadsConfig::default()), Level::Warning);
+        let mut stages = StagesConfig::default();
+        assert_level(&cores(2, &stages), Level::Ok);
+        assert_level(&cores(1, &stages), Level::Warning);
+        (stages.encoder.threads, stages.prober.threads) = (3, 2);
+        assert_level(&cores(4, &stages), Level::Ok);
+        assert_level(&cores(3, &stages), Level::Warning);
     }
 
     /// A clock that goes back is an error, a slow one a warning, any other is well.
@@ -674,31 +666,31 @@ mod tests {
             open_files: Some(20_000),
             ..Allowed::default()
         };
-        let greedy = realtime(StageRealtime {
+        let greedy = with_prober(StageConfig {
             lock_memory: true,
             fifo_priority: Some(50),
             nice: Some(-5),
-            ..StageRealtime::default()
+            ..StageConfig::default()
         });
         let all = |level| [("memlock", level), ("rtprio", level), ("nice", level), ("open files", Level::Ok)];
         let findings = limits(&low, &greedy);
         assert_eq!(levels(&findings), all(Level::Warning));
         assert!(findings[0].found.contains("prober") && findings[1].found.contains("50"), "{findings:?}");
         assert!(findings.iter().all(|f| f.level == Level::Ok || f.advice.contains("limits.d")), "{findings:?}");
-        let modest = limits(&low, &RealtimeConfig::default());
+        let modest = limits(&low, &StagesConfig::default());
         assert!(modest.iter().all(|f| f.level == Level::Ok), "{modest:?}");
         let privileged = Allowed { may_lock: true, may_schedule: true, ..low };
         assert_eq!(levels(&limits(&privileged, &greedy)), all(Level::Ok));
         let raised = Allowed { locked_bytes: None, realtime_priority: Some(99), nice: Some(25), ..low };
         assert_eq!(levels(&limits(&raised, &greedy)), all(Level::Ok));
         let few = Allowed { open_files: Some(256), ..low };
-        assert_eq!(limits(&few, &RealtimeConfig::default()).last().map(|f| f.level), Some(Level::Warning));
+        assert_eq!(limits(&few, &StagesConfig::default()).last().map(|f| f.level), Some(Level::Warning));
     }
 
     /// Stages bound to processors that are not there are named with them.
     #[test]
     fn processors_that_are_not_there() {
-        let bound = realtime(StageRealtime { cpus: vec![1, 9], ..StageRealtime::default() });
+        let bound = with_prober(StageConfig { cpus: vec![1, 9], ..StageConfig::default() });
         assert_eq!(bound_cores(&[0, 1, 9], &bound), None);
         let finding = bound_cores(&[0, 1], &bound).unwrap();
         assert_level(&finding, Level::Warning);

@@ -1,8 +1,9 @@
 //! A graph file, and whether what it names is there and fits together.
 
 use super::finding::{Area, Finding};
+use carff_checkpoint::CheckpointPlanning;
 use carff_checkpoint::{Manifest, ScenarioIdentity};
-use carff_config::{CameraSource, CheckpointPlanning, ConfigError, GraphConfig};
+use carff_config::{CameraSource, ConfigError, GraphConfig};
 use carff_dataset::Dataset;
 use carff_scenes::Scenario;
 use std::fmt::Display;

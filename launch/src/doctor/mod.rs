@@ -9,7 +9,7 @@ mod graph;
 pub use finding::{Area, Finding, Level};
 
 use anyhow::Context;
-use carff_config::{GraphConfig, RealtimeConfig, RendererConfig, ThreadsConfig};
+use carff_config::{GraphConfig, RendererConfig, StagesConfig};
 use carff_transport::topics;
 use std::io::IsTerminal;
 use std::path::PathBuf;
@@ -49,14 +49,13 @@ pub fn run(args: &DoctorArgs) -> anyhow::Result<ExitCode> {
 pub fn examine(args: &DoctorArgs) -> anyhow::Result<Vec<Finding>> {
     let graph = args.graph.as_deref().map(GraphConfig::load);
     let config = graph.as_ref().and_then(|g| g.as_ref().ok());
-    let threads = config.map_or_else(ThreadsConfig::default, |g| g.threads);
+    let stages = config.map_or_else(StagesConfig::default, |g| g.stages.clone());
     let renderer = config.map_or_else(RendererConfig::default, |g| g.renderer.clone());
-    let realtime = config.map_or_else(RealtimeConfig::default, |g| g.realtime.clone());
 
     let (name, features) = gather::processor();
     let features: Vec<&str> = features.iter().map(String::as_str).collect();
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
-    let mut findings = vec![checks::processor(&name, &features), checks::cores(cores, &threads)];
+    let mut findings = vec![checks::processor(&name, &features), checks::cores(cores, &stages)];
     findings.extend(gather::available_memory().map(checks::memory));
     findings.extend([checks::clock(&gather::clock()), checks::governor(&gather::governors())]);
     let here = std::env::current_dir().context("the current folder is gone")?;
@@ -68,8 +67,8 @@ pub fn examine(args: &DoctorArgs) -> anyhow::Result<Vec<Finding>> {
     let (runs, strays) = gather::runs()?;
     findings.extend(checks::leftovers(&runs, &strays));
 
-    findings.extend(checks::limits(&gather::allowed(), &realtime));
-    findings.extend(checks::bound_cores(&gather::online(), &realtime));
+    findings.extend(checks::limits(&gather::allowed(), &stages));
+    findings.extend(checks::bound_cores(&gather::online(), &stages));
     findings.push(checks::remove_ipc(&gather::logind()));
 
     let (library, version) = gather::libtorch();

@@ -1,7 +1,7 @@
 //! What a replayed graph made of its frames, against what was recorded: posteriors, forecasts, beliefs and decisions.
 
+use carff_messages::forms::{ActionForm, AnyMessage, BeliefForm, ForecastForm, HeaderForm, PosteriorForm};
 use carff_observe::TopicId;
-use carff_readable::{ActionForm, AnyMessage, BeliefForm, ForecastForm, HeaderForm, PosteriorForm};
 use carff_recording::Reader;
 use serde_json::Value;
 use std::collections::{BTreeMap, BTreeSet};

@@ -74,27 +74,9 @@ impl Graph {
         config.launcher.keep_frames = KEEP_FRAMES;
         // A soak kills more often than any policy for the road puts up with.
         let often = RestartPolicy::OnFailure { backoff_ms: 50, max_restarts: 1000, within_s: 60 };
-        let restart = &mut config.launcher.restart;
-        for policy in [
-            &mut restart.camera,
-            &mut restart.encoder,
-            &mut restart.forecaster,
-            &mut restart.prober,
-            &mut restart.renderer,
-            &mut restart.controller,
-        ] {
-            *policy = often;
-        }
-        let log = &mut config.log;
-        for level in [
-            &mut log.camera,
-            &mut log.encoder,
-            &mut log.forecaster,
-            &mut log.prober,
-            &mut log.renderer,
-            &mut log.controller,
-        ] {
-            *level = LogLevel::Warn;
+        for stage in Stage::ALL {
+            let process = config.stages.of_mut(stage);
+            (process.restart, process.log) = (often, LogLevel::Warn);
         }
         let graph = Self { folder, config, checkpoint, name, launcher: None };
         std::fs::write(graph.file(), toml::to_string(&graph.config)?)?;

@@ -102,7 +102,7 @@ mod tests {
             assert!(f.target.is_some() || f.kind == Kind::Stop);
         }
         for stage in Stage::ALL {
-            assert!(faults.iter().any(|f| f.target == Some(*stage)));
+            assert!(faults.iter().any(|f| f.target == Some(stage)));
         }
         assert!(faults.iter().any(|f| f.target.is_none()));
     }

@@ -3,10 +3,11 @@
 //! All that is judged of actions is judged by the times that the controller itself wrote into them.
 
 use anyhow::Context;
+use carff_checkpoint::load_policy;
 use carff_config::Contract;
-use carff_config::{CheckpointPlanning, GraphConfig};
+use carff_config::GraphConfig;
+use carff_decision::{Evidence, Policy};
 use carff_messages::{Action, ActionCode, Belief, Health, HealthState, Message, Reason, Stage};
-use carff_planning::{Evidence, Rule, decide};
 use carff_transport::{Input, Node, Receiver, Waiter, monotonic_now_ns, topics};
 use std::collections::{BTreeMap, VecDeque};
 use std::path::Path;
@@ -15,8 +16,6 @@ use std::path::Path;
 const FRAMES: usize = 64;
 /// Messages that are kept as evidence.
 const EVIDENCE: usize = 400;
-/// A sample shows the hazard from this likelihood on, as the controller has it.
-const SHOWS_HAZARD: f32 = 0.5;
 /// Longest sleep between two looks at the inputs, nanoseconds.
 const LOOK_NS: u64 = 20_000_000;
 /// When the soak itself got no time for so long, nobody else is blamed for that time.
@@ -26,7 +25,7 @@ const NS_PER_MS: f64 = 1e6;
 /// What holds of the graph's actions.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Terms {
-    pub(super) rule: Rule,
+    pub(super) policy: Policy,
     deadline_ns: u64,
     period_ns: u64,
     slack_ns: u64,
@@ -35,19 +34,8 @@ pub(super) struct Terms {
 impl Terms {
     pub(super) fn new(graph: &GraphConfig, checkpoint: &Path, contract: &Contract) -> anyhow::Result<Self> {
         let controller = &graph.controller;
-        let rule = match controller.rule {
-            carff_config::Rule::Underconfident => Rule::Underconfident,
-            carff_config::Rule::Overconfident => Rule::Overconfident,
-            carff_config::Rule::Paper => Rule::Paper,
-            carff_config::Rule::Calibrated => Rule::Calibrated {
-                threshold: match controller.threshold {
-                    Some(threshold) => threshold,
-                    None => CheckpointPlanning::load(checkpoint)?.hazard_threshold,
-                },
-            },
-        };
         Ok(Self {
-            rule,
+            policy: load_policy(controller.rule, controller.threshold, checkpoint)?,
             deadline_ns: controller.deadline_ms * 1_000_000,
             period_ns: (1e9 / controller.rate_hz) as u64,
             slack_ns: contract.slack_ms * 1_000_000,
@@ -187,16 +175,11 @@ impl Judge {
             return Ok(());
         };
         self.judged += 1;
-        let first = steps[0];
-        let states: Vec<Option<usize>> = first.samples().iter().map(|s| usize::try_from(s.state).ok()).collect();
-        let shows =
-            |i: usize| steps.iter().any(|b| b.samples().get(i).is_some_and(|s| s.hazard_likelihood >= SHOWS_HAZARD));
-        let shows_hazard: Vec<bool> = (0..states.len()).map(shows).collect();
-        let hazard_probability =
-            steps.iter().map(|b| f64::from(b.path_probability) * f64::from(b.hazard_probability)).fold(0.0, f64::max);
-        let halts =
-            decide(self.terms.rule, &Evidence { states: &states, shows_hazard: &shows_hazard, hazard_probability })
-                .halt;
+        let mut evidence = Evidence::NONE;
+        for belief in steps {
+            evidence.add_belief(belief);
+        }
+        let halts = self.terms.policy.decide(&evidence).halt;
         if halts == (action.code() == Ok(ActionCode::Advance)) {
             return wrong(format!(
                 "a wrong action: the beliefs it was given ask for {}",
@@ -341,13 +324,13 @@ impl Notes {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use carff_messages::{Header, ProbeResult, RuleCode};
+    use carff_messages::{Header, ProbeResult, Rule};
 
     const MS: u64 = 1_000_000;
 
     fn judge() -> Judge {
         Judge::new(Terms {
-            rule: Rule::Calibrated { threshold: 0.3 },
+            policy: Policy { rule: Rule::Calibrated, threshold: 0.3 },
             deadline_ns: 150 * MS,
             period_ns: 50 * MS,
             slack_ns: 50 * MS,
@@ -369,7 +352,7 @@ mod tests {
             header,
             action: code.code(),
             reason: Reason::Belief.code(),
-            rule: RuleCode::Calibrated.code(),
+            rule: Rule::Calibrated.code(),
             sample_count: 2,
             confidence: 1.0,
             hazard_probability: 0.0,

@@ -1,13 +1,13 @@
 //! Replays the views of a data set as drives.
 
-use crate::source::{Source, sensor_noise};
+use crate::source::Source;
 use anyhow::Context;
-use carff_config::{CheckpointPlanning, GraphConfig, PoseChoice};
+use carff_checkpoint::CheckpointPlanning;
+use carff_config::{GraphConfig, PoseChoice};
 use carff_dataset::drives::{Drive, plan_drives};
 use carff_dataset::sensor::{SensorNoise, apply_noise_into};
 use carff_dataset::{Dataset, Image, PoseRole, PoseSplit};
-use carff_geometry::PinholeCamera;
-use carff_messages::{DatasetView, FrameMeta, Header, Intrinsics, Observability};
+use carff_messages::{DatasetView, FrameMeta, Observability};
 use carff_random::Key;
 use std::collections::HashMap;
 use std::path::Path;
@@ -62,7 +62,7 @@ impl DriveSource {
             dataset,
             drives,
             images,
-            noise: sensor_noise(&graph.camera.noise),
+            noise: graph.camera.noise,
             seed: graph.run.seed,
             frames_per_timestamp: graph.camera.frames_per_timestamp as usize,
             repeat: graph.camera.repeat,
@@ -82,11 +82,11 @@ impl Source for DriveSource {
         self.images.values().map(|i| i.rgb.len()).max().unwrap_or(0)
     }
 
-    fn advance(&mut self) -> Option<FrameMeta> {
+    fn advance(&mut self) -> anyhow::Result<Option<FrameMeta>> {
         let frames_of = |drive: &Drive| drive.frames.len() * self.frames_per_timestamp;
         let total: usize = self.drives.iter().map(frames_of).sum();
         if total == 0 || (self.shown >= total && !self.repeat) {
-            return None;
+            return Ok(None);
         }
         let mut frame_in_drive = self.shown % total;
         let mut drive = 0;
@@ -99,7 +99,6 @@ impl Source for DriveSource {
         let timestamp = frame_in_drive / self.frames_per_timestamp;
         self.current = planned.frames[timestamp];
         let frame = &self.dataset.frames()[self.current];
-        let observability = frame.observability.map_or(Observability::Unknown, seen);
         let dataset_view = DatasetView {
             known: 1,
             view: planned.view as i32,
@@ -107,44 +106,15 @@ impl Source for DriveSource {
             timestamp: timestamp as i32,
             drive: drive as i32,
             frame_in_drive: frame_in_drive as i32,
-            observability: observability.code(),
+            observability: Observability::code_of(frame.observability),
             last_of_timestamp: u32::from((frame_in_drive + 1).is_multiple_of(self.frames_per_timestamp)),
         };
-        Some(meta(&frame.camera, dataset_view))
+        Ok(Some(FrameMeta::of_camera(&frame.camera, dataset_view)))
     }
 
     fn write(&mut self, frame_id: u64, picture: &mut [u8]) -> anyhow::Result<()> {
         let image = self.images.get(&self.current).context("no frame has been advanced to")?;
         let key = Key { seed: self.seed, frame: frame_id, step: 0, sample: 0 };
         Ok(apply_noise_into(&image.rgb, picture, &self.noise, key)?)
-    }
-}
-
-/// The set's observability, as messages have it.
-pub(crate) fn seen(observability: carff_dataset::Observability) -> Observability {
-    match observability {
-        carff_dataset::Observability::None => Observability::None,
-        carff_dataset::Observability::Partial => Observability::Partial,
-        carff_dataset::Observability::Full => Observability::Full,
-    }
-}
-
-pub(crate) fn meta(camera: &PinholeCamera, dataset_view: DatasetView) -> FrameMeta {
-    let mut world_from_camera = [0.0; 16];
-    for (to, from) in world_from_camera.iter_mut().zip(camera.world_from_camera.iter().flatten()) {
-        *to = *from;
-    }
-    FrameMeta {
-        header: Header::default(),
-        width_px: camera.width_px,
-        height_px: camera.height_px,
-        intrinsics: Intrinsics {
-            fl_x_px: camera.fl_x_px,
-            fl_y_px: camera.fl_y_px,
-            cx_px: camera.cx_px,
-            cy_px: camera.cy_px,
-        },
-        world_from_camera,
-        dataset_view,
     }
 }

@@ -1,7 +1,6 @@
 //! Shows the pictures of a folder, in the order of their names.
 
-use crate::drive_source::meta;
-use crate::source::{Source, sensor_noise};
+use crate::source::Source;
 use anyhow::{Context, anyhow, ensure};
 use carff_config::GraphConfig;
 use carff_dataset::Image;
@@ -63,7 +62,7 @@ impl FolderSource {
         );
         let source = Self {
             images,
-            noise: sensor_noise(&graph.camera.noise),
+            noise: graph.camera.noise,
             seed: graph.run.seed,
             repeat: graph.camera.repeat,
             frames_per_picture: graph.camera.frames_per_timestamp as usize,
@@ -79,10 +78,10 @@ impl Source for FolderSource {
         self.images[0].rgb.len()
     }
 
-    fn advance(&mut self) -> Option<FrameMeta> {
+    fn advance(&mut self) -> anyhow::Result<Option<FrameMeta>> {
         let total = self.images.len() * self.frames_per_picture;
         if self.shown >= total && !self.repeat {
-            return None;
+            return Ok(None);
         }
         self.current = self.shown % total / self.frames_per_picture;
         self.shown += 1;
@@ -95,7 +94,7 @@ impl Source for FolderSource {
             image.height_px,
             FIELD_OF_VIEW_DEG,
         );
-        Some(meta(&camera, DatasetView::UNKNOWN))
+        Ok(Some(FrameMeta::of_camera(&camera, DatasetView::UNKNOWN)))
     }
 
     fn write(&mut self, frame_id: u64, picture: &mut [u8]) -> anyhow::Result<()> {
@@ -138,7 +137,7 @@ mod tests {
 
         let mut greys = Vec::new();
         let mut picture = vec![0; source.max_picture_bytes()];
-        while let Some(meta) = source.advance() {
+        while let Some(meta) = source.advance().unwrap() {
             assert_eq!((meta.width_px, meta.height_px), (4, 2));
             source.write(greys.len() as u64, &mut picture).unwrap();
             greys.push(picture[0]);

@@ -1,11 +1,10 @@
 //! Renders what a moving ego sees, as it goes.
 
-use crate::drive_source::{meta, seen};
-use crate::source::{Source, sensor_noise};
+use crate::source::Source;
 use anyhow::Context;
 use carff_config::GraphConfig;
 use carff_dataset::sensor::{SensorNoise, apply_noise_into};
-use carff_messages::{DatasetView, FrameMeta, Observability};
+use carff_messages::{DatasetView, FrameMeta, Observability, Stage};
 use carff_random::Key;
 use carff_scenes::{FreeDrive, FreeFrame, Scenario};
 
@@ -38,7 +37,7 @@ impl FreeDriveSource {
         }
         Ok(Self {
             scenario,
-            noise: sensor_noise(&graph.camera.noise),
+            noise: graph.camera.noise,
             seed: graph.run.seed,
             frames_per_timestamp,
             drives: (!graph.camera.repeat).then_some(u64::from(drives)),
@@ -46,7 +45,7 @@ impl FreeDriveSource {
             drive: None,
             frame_in_drive: 0,
             current: None,
-            pool: rayon::ThreadPoolBuilder::new().num_threads(1).build()?,
+            pool: rayon::ThreadPoolBuilder::new().num_threads(graph.stage(Stage::Camera).threads as usize).build()?,
         })
     }
 
@@ -73,13 +72,9 @@ impl Source for FreeDriveSource {
         self.scenario.cameras().first().map_or(0, |c| (c.camera.width_px * c.camera.height_px) as usize * 3)
     }
 
-    fn advance(&mut self) -> Option<FrameMeta> {
-        let frame = self.render().unwrap_or_else(|error| {
-            tracing::error!(error = format!("{error:#}"), "no more drives");
-            None
-        });
-        self.current = frame;
-        let frame = self.current.as_ref()?;
+    fn advance(&mut self) -> anyhow::Result<Option<FrameMeta>> {
+        self.current = self.render()?;
+        let Some(frame) = &self.current else { return Ok(None) };
         let dataset_view = DatasetView {
             known: 1,
             view: -1,
@@ -87,10 +82,10 @@ impl Source for FreeDriveSource {
             timestamp: frame.timestamp as i32,
             drive: self.next as i32 - 1,
             frame_in_drive: self.frame_in_drive as i32,
-            observability: frame.observability.map_or(Observability::Unknown, seen).code(),
+            observability: Observability::code_of(frame.observability),
             last_of_timestamp: u32::from(frame.last_of_timestamp),
         };
-        Some(meta(&frame.camera, dataset_view))
+        Ok(Some(FrameMeta::of_camera(&frame.camera, dataset_view)))
     }
 
     fn write(&mut self, frame_id: u64, picture: &mut [u8]) -> anyhow::Result<()> {

@@ -17,13 +17,16 @@ fn run(stage: &mut StageContext) -> anyhow::Result<()> {
     let mut frames = stage.picture_output(&topics::FRAME, source.max_picture_bytes())?;
     let period_ns = (1e9 / stage.graph.run.frame_rate_hz) as u64;
     let limit = stage.args.frames.unwrap_or(u64::MAX);
-    // Started again in mid-run, it goes on where the one before it ended.
-    let mut frame_id = (0..stage.args.first_frame).take_while(|_| source.advance().is_some()).count() as u64;
+    // A camera restarted in mid-run continues after the last frame of its predecessor.
+    let mut frame_id = 0;
+    while frame_id < stage.args.first_frame && source.advance()?.is_some() {
+        frame_id += 1;
+    }
     stage.ready();
 
     let mut next_ns = monotonic_now_ns();
     while frame_id < limit && stage.wait_until(&[], next_ns)? != Woken::Stopped {
-        let Some(mut meta) = source.advance() else { break };
+        let Some(mut meta) = source.advance()? else { break };
         let capture_time_ns = monotonic_now_ns();
         meta.header = Header::of_frame(frame_id, capture_time_ns, stage.seed());
         let _span = frame_span(&meta.header);

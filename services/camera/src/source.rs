@@ -1,39 +1,16 @@
-//! The one interface of all sources of pictures; a real camera is a further one.
+//! The interface of all image sources.
 
-use carff_config::NoiseConfig;
-use carff_dataset::sensor::SensorNoise;
 use carff_messages::FrameMeta;
 
-/// A source of pictures.
+/// A source of images.
 pub trait Source {
-    /// Bytes of its largest picture.
+    /// Bytes of its largest image.
     fn max_picture_bytes(&self) -> usize;
 
-    /// Goes on to the next frame and describes it (all but the header); `None` at the end.
-    fn advance(&mut self) -> Option<FrameMeta>;
+    /// Advances to the next frame and describes it (all but the header); `None` at the end. An error ends the stage.
+    fn advance(&mut self) -> anyhow::Result<Option<FrameMeta>>;
 
-    /// Writes the current frame's picture, RGB, 8 bit, once, into memory of exactly its size: that of the topic.
+    /// Writes the current frame's image, RGB, 8 bit, once, into memory of exactly its size: that of the topic.
     /// `frame_id` names the noise.
     fn write(&mut self, frame_id: u64, picture: &mut [u8]) -> anyhow::Result<()>;
-}
-
-/// The graph file's noise, as the sensor model wants it.
-pub(crate) fn sensor_noise(noise: &NoiseConfig) -> SensorNoise {
-    SensorNoise {
-        sigma: noise.sigma,
-        gain_sigma: noise.gain_sigma,
-        channel_gain_sigma: noise.channel_gain_sigma,
-        channel_offset_sigma: noise.channel_offset_sigma,
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    /// The camera's default noise is the one that models are trained with.
-    #[test]
-    fn default_noise_is_that_of_training() {
-        assert_eq!(sensor_noise(&NoiseConfig::default()), SensorNoise::default());
-    }
 }

@@ -3,7 +3,8 @@
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
 use carff_camera::{DriveSource, Source};
-use carff_config::{CheckpointPlanning, GraphConfig};
+use carff_checkpoint::CheckpointPlanning;
+use carff_config::GraphConfig;
 use carff_dataset::{DatasetWriter, FrameRecord, Image, Observability, ScenarioInfo};
 use carff_geometry::PinholeCamera;
 use carff_messages::{Header, Message, PictureMeta};
@@ -60,7 +61,7 @@ fn drives_show_timestamps_in_order_with_fresh_noise() {
     let shoot = || {
         let mut source = DriveSource::open(folder.path(), folder.path(), &graph(), 4).unwrap();
         let mut shots = Vec::new();
-        while let Some(mut meta) = source.advance() {
+        while let Some(mut meta) = source.advance().unwrap() {
             let frame_id = shots.len() as u64;
             meta.header = Header::of_frame(frame_id, 0, 1);
             meta.validate().unwrap();

@@ -21,7 +21,7 @@ fn free_drives_show_timestamps_in_order() {
     let shoot = || {
         let mut source = FreeDriveSource::open(&graph, 2).unwrap();
         let mut shots = Vec::new();
-        while let Some(mut meta) = source.advance() {
+        while let Some(mut meta) = source.advance().unwrap() {
             let frame_id = shots.len() as u64;
             meta.header = Header::of_frame(frame_id, 0, 1);
             meta.validate().unwrap();

@@ -1,19 +1,15 @@
-//! From beliefs to actions, at any time: pure logic, without topics and without a clock of its own.
-//! The decision rules themselves live in `carff-planning`.
+//! The controller's logic: from beliefs to actions, without topics and without a clock of its own.
+//!
+//! `carff-decision` holds the decision rules; this crate decides when one is applied, and what is valid in between.
 
-use carff_messages::{
-    Action, ActionCode, Belief, Header, MAX_HORIZON, MAX_SAMPLES, Message, ProbeResult, Reason, RuleCode,
-};
-use carff_planning::{Decision, Evidence, Rule, decide};
+use carff_decision::{Decision, Evidence, Policy};
+use carff_messages::{Action, ActionCode, Belief, Header, MAX_HORIZON, Message, Reason};
 
-/// A sample shows the hazard from this likelihood on.
-const SHOWS_HAZARD: f32 = 0.5;
-
-/// What a controller is told at its start.
+/// The settings of a controller.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Settings {
-    /// The decision rule.
-    pub rule: Rule,
+    /// The decision rule and its threshold.
+    pub policy: Policy,
     /// A belief older than this since capture is not acted on, and after this long without a new one the car halts.
     pub deadline_ns: u64,
     /// Time between two ticks.
@@ -42,11 +38,6 @@ impl Step {
             is_final: belief.is_final,
         }
     }
-
-    /// Lower bound on the probability that the hazard is met at this step: the path's times the step's.
-    fn met_probability(&self) -> f64 {
-        f64::from(self.path_probability) * f64::from(self.hazard_probability)
-    }
 }
 
 /// The frame whose steps are arriving.
@@ -55,9 +46,7 @@ struct Pending {
     header: Header,
     horizon: u32,
     steps: [Option<Step>; MAX_HORIZON as usize],
-    sample_count: usize,
-    states: [Option<usize>; MAX_SAMPLES],
-    shows_hazard: [bool; MAX_SAMPLES],
+    evidence: Evidence,
 }
 
 /// The action that stands.
@@ -125,14 +114,8 @@ impl Controller {
         if age_ns > self.settings.deadline_ns {
             return Some(self.refuse(&belief.header, Reason::StaleBelief, now_ns));
         }
-        let hazard_probability = steps.iter().flatten().map(Step::met_probability).fold(0.0, f64::max);
-        let evidence = Evidence {
-            states: &pending.states[..pending.sample_count],
-            shows_hazard: &pending.shows_hazard[..pending.sample_count],
-            hazard_probability,
-        };
-        let decision = decide(self.settings.rule, &evidence);
-        let action = self.act(&pending, decision, hazard_probability, now_ns);
+        let decision = self.settings.policy.decide(&pending.evidence);
+        let action = self.act(&pending, decision, now_ns);
         self.settled = Some((captured_ns, belief.header.frame_id));
         self.standing = Some(Standing { action, decided_ns: now_ns });
         self.refused = None;
@@ -174,16 +157,16 @@ impl Controller {
         self.safe_action(reason, now_ns)
     }
 
-    fn act(&self, pending: &Pending, decision: Decision, hazard_probability: f64, now_ns: u64) -> Action {
+    fn act(&self, pending: &Pending, decision: Decision, now_ns: u64) -> Action {
         let code = if decision.halt { ActionCode::Halt } else { ActionCode::Advance };
         Action {
             header: pending.header.at_step(0),
             action: code.code(),
             reason: Reason::Belief.code(),
-            rule: rule_code(self.settings.rule).code(),
-            sample_count: pending.sample_count as u32,
+            rule: self.settings.policy.rule.code(),
+            sample_count: pending.evidence.sample_count() as u32,
             confidence: decision.confidence as f32,
-            hazard_probability: hazard_probability as f32,
+            hazard_probability: pending.evidence.hazard_probability() as f32,
             is_decision: 1,
             reserved: 0,
             valid_until_ns: now_ns.saturating_add(self.settings.deadline_ns),
@@ -197,7 +180,7 @@ impl Controller {
             header: Header::of_frame(self.settled.map_or(0, |(_, id)| id), now_ns, self.settings.seed),
             action: ActionCode::Halt.code(),
             reason: reason.code(),
-            rule: rule_code(self.settings.rule).code(),
+            rule: self.settings.policy.rule.code(),
             sample_count: 0,
             confidence: 0.0,
             hazard_probability: 1.0,
@@ -216,9 +199,7 @@ impl Pending {
             header: belief.header,
             horizon: belief.horizon,
             steps: [None; MAX_HORIZON as usize],
-            sample_count: 0,
-            states: [None; MAX_SAMPLES],
-            shows_hazard: [false; MAX_SAMPLES],
+            evidence: Evidence::NONE,
         }
     }
 
@@ -234,31 +215,8 @@ impl Pending {
             return false;
         }
         self.steps[index] = Some(step);
-        let samples = belief.samples();
-        if index == 0 {
-            self.sample_count = samples.len();
-        }
-        for (i, sample) in samples.iter().enumerate().take(self.sample_count) {
-            if index == 0 {
-                self.states[i] = state_of(sample);
-            }
-            self.shows_hazard[i] |= sample.hazard_likelihood >= SHOWS_HAZARD;
-        }
+        self.evidence.add_belief(belief);
         true
-    }
-}
-
-fn state_of(sample: &ProbeResult) -> Option<usize> {
-    usize::try_from(sample.state).ok()
-}
-
-/// The code by which messages name a rule.
-pub fn rule_code(rule: Rule) -> RuleCode {
-    match rule {
-        Rule::Underconfident => RuleCode::Underconfident,
-        Rule::Overconfident => RuleCode::Overconfident,
-        Rule::Paper => RuleCode::Paper,
-        Rule::Calibrated { .. } => RuleCode::Calibrated,
     }
 }
 

@@ -1,10 +1,9 @@
 //! The controller stage: an action for each belief, and one at each tick. It never goes quiet.
 
 use anyhow::Context;
-use carff_config::CheckpointPlanning;
+use carff_checkpoint::load_policy;
 use carff_controller::{Controller, Settings};
 use carff_messages::Stage;
-use carff_planning::Rule;
 use carff_stage::{StageContext, frame_span};
 use carff_transport::{Woken, monotonic_now_ns, topics};
 
@@ -57,24 +56,10 @@ fn run(stage: &mut StageContext) -> anyhow::Result<()> {
 
 fn settings(stage: &StageContext) -> anyhow::Result<Settings> {
     let config = &stage.graph.controller;
-    let rule =
-        match config.rule {
-            carff_config::Rule::Underconfident => Rule::Underconfident,
-            carff_config::Rule::Overconfident => Rule::Overconfident,
-            carff_config::Rule::Paper => Rule::Paper,
-            carff_config::Rule::Calibrated => Rule::Calibrated {
-                threshold: match config.threshold {
-                    Some(threshold) => threshold,
-                    None => CheckpointPlanning::load(&stage.checkpoint)
-                        .context(
-                            "no threshold for the calibrated rule: set `controller.threshold`, or give a checkpoint",
-                        )?
-                        .hazard_threshold,
-                },
-            },
-        };
+    let policy = load_policy(config.rule, config.threshold, &stage.checkpoint)
+        .context("no threshold for the calibrated rule: set `controller.threshold`, or give a checkpoint")?;
     Ok(Settings {
-        rule,
+        policy,
         deadline_ns: config.deadline_ms * 1_000_000,
         period_ns: (1e9 / config.rate_hz) as u64,
         seed: stage.seed(),

@@ -1,14 +1,16 @@
 use super::*;
+use carff_messages::{ProbeResult, Rule};
 
 const MS: u64 = 1_000_000;
 const HORIZON: u32 = 2;
 
 fn controller(rule: Rule) -> Controller {
-    Controller::new(Settings { rule, deadline_ns: 150 * MS, period_ns: 50 * MS, seed: 1 })
+    let policy = Policy { rule, threshold: 0.3 };
+    Controller::new(Settings { policy, deadline_ns: 150 * MS, period_ns: 50 * MS, seed: 1 })
 }
 
 fn calibrated() -> Controller {
-    controller(Rule::Calibrated { threshold: 0.3 })
+    controller(Rule::Calibrated)
 }
 
 /// A belief of ten samples, of which `hazardous` show the hazard, for a frame captured at `frame_id` x 100 ms.
@@ -144,7 +146,7 @@ fn every_rule_is_wired() {
         let mut controller = controller(rule);
         controller.on_belief(&belief(1, 1, hazardous as f32 / 10.0, hazardous), 110 * MS);
         let action = controller.on_belief(&belief(1, 2, 0.0, 0), 120 * MS).unwrap();
-        assert_eq!(action.rule, rule_code(rule).code());
+        assert_eq!(action.rule, rule.code());
         action.code().unwrap()
     };
     assert_eq!(run(Rule::Paper, 1), ActionCode::Halt);

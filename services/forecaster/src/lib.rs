@@ -1,7 +1,7 @@
 //! The forecaster stage's arithmetic: from a posterior, observed or fed back, to a mixture and its draws.
 
 use carff_checkpoint::Manifest;
-use carff_latent::{LatentGaussian, Sampling};
+use carff_decision::{Sampling, path_probability, set_mixture_and_draws};
 use carff_messages::{Belief, Forecast, ForecastSource, Gaussian, Header, Posterior};
 use carff_models::mixture::MixtureNet;
 use std::path::Path;
@@ -16,7 +16,7 @@ pub struct Forecaster {
 }
 
 impl Forecaster {
-    /// Loads the mixture density network and runs it once.
+    /// Loads the mixture density network and runs it a few times, so that the first frame takes no longer than the others.
     pub fn load(
         checkpoint: &Path,
         threads: usize,
@@ -29,7 +29,7 @@ impl Forecaster {
         let manifest = Manifest::load(checkpoint)?;
         let net = carff_models::stored::load_mixture(checkpoint, &manifest)?;
         for _ in 0..3 {
-            net.forecast(&LatentGaussian { mean: [0.0; 8], log_variance: [0.0; 8] });
+            net.forecast(&Gaussian::standard());
         }
         Ok(Self { net, samples, sampling, horizon })
     }
@@ -49,7 +49,7 @@ impl Forecaster {
 
     /// The forecast of a probed belief's resolved state: the next step. `None` when the belief was the frame's last.
     pub fn from_feedback(&self, belief: &Belief) -> Option<Forecast> {
-        if belief.is_final == 1 || belief.header.step >= belief.horizon {
+        if belief.is_final() || belief.header.step >= belief.horizon {
             return None;
         }
         let state = usize::try_from(belief.resolved_state).ok()?;
@@ -57,25 +57,15 @@ impl Forecaster {
         let mut forecast = Forecast::empty(header, ForecastSource::Probed, belief.horizon);
         forecast.encoder_ns = belief.encoder_ns;
         forecast.resolved_state = belief.resolved_state;
-        forecast.path_probability = (belief.path_probability * belief.state_probability[state]).clamp(0.0, 1.0);
+        forecast.path_probability = path_probability(belief.path_probability, belief.state_probability[state]);
         self.fill(&mut forecast, &belief.resolved);
         Some(forecast)
     }
 
     fn fill(&self, forecast: &mut Forecast, input: &Gaussian) {
-        let input = LatentGaussian { mean: input.mean, log_variance: input.log_variance };
-        let mixture = self.net.forecast(&input);
+        let mixture = self.net.forecast(input);
         let Header { seed, frame_id, step, .. } = forecast.header;
         let draws = mixture.draw(self.samples, self.sampling, seed, frame_id, step);
-        forecast.component_count = mixture.components.len() as u32;
-        forecast.sample_count = draws.len() as u32;
-        for (i, (weight, component)) in mixture.weights.iter().zip(&mixture.components).enumerate() {
-            forecast.weights[i] = *weight;
-            forecast.components[i] = Gaussian { mean: component.mean, log_variance: component.log_variance };
-        }
-        for (i, draw) in draws.iter().enumerate() {
-            forecast.samples[i] = draw.latent;
-            forecast.sample_component[i] = draw.component as u8;
-        }
+        set_mixture_and_draws(forecast, &mixture, &draws);
     }
 }

@@ -1,7 +1,6 @@
 //! The forecaster stage: posteriors and fed-back beliefs in, forecasts out.
 
 use carff_forecaster::Forecaster;
-use carff_latent::Sampling;
 use carff_messages::Stage;
 use carff_stage::{Overload, StageContext, frame_span};
 use carff_transport::{monotonic_now_ns, topics};
@@ -15,13 +14,14 @@ fn run(stage: &mut StageContext) -> anyhow::Result<()> {
     let mut beliefs = stage.input(&topics::BELIEF)?;
     let mut forecasts = stage.output(&topics::FORECAST)?;
     let settings = &stage.graph.run;
-    let sampling = match settings.sampling {
-        carff_config::Sampling::Stratified => Sampling::Stratified,
-        carff_config::Sampling::Independent => Sampling::Independent,
-    };
     let mut overload = Overload::new(&stage.graph);
-    let mut forecaster =
-        Forecaster::load(&stage.checkpoint, stage.threads, settings.samples as usize, sampling, settings.horizon)?;
+    let mut forecaster = Forecaster::load(
+        &stage.checkpoint,
+        stage.threads,
+        settings.samples as usize,
+        settings.sampling,
+        settings.horizon,
+    )?;
     let mut newest_frame = 0;
     stage.ready();
     while stage.wait(&[&posteriors, &beliefs])? {

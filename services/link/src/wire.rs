@@ -2,9 +2,7 @@
 
 use carff_messages::{Action, Belief, Forecast, FrameMeta, Header, Health, Message, PictureMeta, Posterior, ViewMeta};
 use carff_observe::TopicId;
-use carff_readable::{
-    ActionForm, AnyMessage, BeliefForm, ForecastForm, FormError, FrameForm, HealthForm, PosteriorForm, ViewForm,
-};
+use carff_messages::forms::{ActionForm, AnyMessage, BeliefForm, ForecastForm, FormError, FrameForm, HealthForm, PosteriorForm, ViewForm};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
@@ -143,7 +141,7 @@ impl Arrived {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use carff_messages::{ActionCode, ForecastSource, Gaussian, HealthState, Reason, RuleCode, Stage, ViewKind};
+    use carff_messages::{ActionCode, ForecastSource, Gaussian, HealthState, Reason, Rule, Stage, ViewKind};
 
     const TAG: Tag = Tag { sender: u64::MAX, sequence: 3, sent_ns: 1 << 60 };
 
@@ -180,7 +178,7 @@ mod tests {
             header: header(),
             action: ActionCode::ALL[0].code(),
             reason: Reason::ALL[0].code(),
-            rule: RuleCode::ALL[0].code(),
+            rule: Rule::ALL[0].code(),
             sample_count: 10,
             confidence: 0.9,
             hazard_probability: 0.3,

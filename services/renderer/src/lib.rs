@@ -5,7 +5,7 @@ use carff_checkpoint::Manifest;
 use carff_config::ViewChoice;
 use carff_field::{Field, HypothesisBuffer, InstructionSet, RenderBuffer, RenderOptions};
 use carff_geometry::PinholeCamera;
-use carff_messages::{Belief, Forecast, Intrinsics, LATENT_DIM, ViewKind, ViewMeta};
+use carff_messages::{Belief, Forecast, LATENT_DIM, ViewKind, ViewMeta, row_major};
 use std::path::Path;
 
 /// Loads the field, for pictures alone.
@@ -105,10 +105,6 @@ pub fn write(picture: &RenderBuffer, rgb: &mut [u8]) -> anyhow::Result<()> {
 
 /// Describes a rendered view.
 pub fn meta(forecast: &Forecast, hypothesis: &Hypothesis, choice: ViewChoice, camera: &PinholeCamera) -> ViewMeta {
-    let mut world_from_camera = [0.0; 16];
-    for (to, from) in world_from_camera.iter_mut().zip(camera.world_from_camera.iter().flatten()) {
-        *to = *from;
-    }
     ViewMeta {
         header: forecast.header,
         hypothesis: hypothesis.index,
@@ -122,13 +118,8 @@ pub fn meta(forecast: &Forecast, hypothesis: &Hypothesis, choice: ViewChoice, ca
         height_px: camera.height_px,
         probability: hypothesis.probability,
         latent: hypothesis.latent,
-        intrinsics: Intrinsics {
-            fl_x_px: camera.fl_x_px,
-            fl_y_px: camera.fl_y_px,
-            cx_px: camera.cx_px,
-            cy_px: camera.cy_px,
-        },
-        world_from_camera,
+        intrinsics: camera.into(),
+        world_from_camera: row_major(&camera.world_from_camera),
         stage_latency_ns: 0,
     }
 }

@@ -1,6 +1,5 @@
 //! The renderer stage: forecasts and beliefs in, pictures of the hypotheses out. It gives way to the decision path.
 
-use anyhow::Context;
 use carff_field::HypothesisBuffer;
 use carff_messages::Stage;
 use carff_renderer::{camera, hypotheses, load, meta, render, write};
@@ -16,7 +15,6 @@ fn main() -> std::process::ExitCode {
 
 fn run(stage: &mut StageContext) -> anyhow::Result<()> {
     let settings = stage.graph.renderer.clone();
-    rustix::process::nice(settings.nice as i32).context("cannot lower the renderer's priority")?;
     let bytes = settings.width_px as usize * settings.height_px as usize * 3;
     let mut forecasts = stage.input(&topics::FORECAST)?;
     let mut beliefs = stage.input(&topics::BELIEF)?;

@@ -3,16 +3,12 @@
 use crate::input::{Input, Truth};
 use crate::journal::{Decision, Journal};
 use crate::session::{Forecast, Moment};
-use carff_belief::{Probed, Step};
-use carff_dataset::{Image, Observability};
-use carff_geometry::PinholeCamera;
-use carff_latent::{Draw, LatentGaussian, Mixture};
+use carff_dataset::Image;
+use carff_decision::Step;
 use carff_messages::{
-    Action, ActionCode, Belief, FrameMeta, Gaussian, Health, MAX_COMPONENTS, Posterior, ProbeResult, Reason, RuleCode,
-    Stage,
+    Action, ActionCode, Belief, FrameMeta, Gaussian, Health, Observability, Posterior, Reason, Rule, Stage,
 };
 use carff_observe::{AttachError, Attached, LiveRun, attach};
-use carff_probing::{Reading, Resolved};
 use carff_transport::{OpenError, PictureReceiver, ReceiveError, Receiver, topics};
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -255,7 +251,7 @@ fn decision(action: &Action, last_safe: &mut Option<(ActionCode, Reason)>) -> Op
     } else if last_safe.replace((code, reason)) == Some((code, reason)) {
         return None;
     }
-    let rule = RuleCode::try_from(action.rule).ok()?;
+    let rule = Rule::try_from(action.rule).ok()?;
     let rests_on = match action.based_on_frame {
         u64::MAX => "no frame".to_owned(),
         frame => format!("frame {frame}"),
@@ -281,7 +277,7 @@ struct Parts {
     forecasts: BTreeMap<u32, carff_messages::Forecast>,
     moments: Vec<Moment>,
     /// What the last of them resolved to, and its posterior: what the next step is forecast from.
-    fed_back: Option<(LatentGaussian, usize)>,
+    fed_back: Option<(Gaussian, usize)>,
 }
 
 impl Assembly {
@@ -295,7 +291,7 @@ impl Assembly {
 
     fn posterior(&mut self, posterior: &Posterior) {
         if let Some(parts) = self.frames.get_mut(&posterior.header.frame_id) {
-            parts.moments = vec![Moment::of_posterior(parts.input.clone(), latent_gaussian(&posterior.gaussian))];
+            parts.moments = vec![Moment::of_posterior(parts.input.clone(), posterior.gaussian)];
         }
     }
 
@@ -315,7 +311,7 @@ impl Assembly {
         let moment = moment(before, parts.fed_back, forecast, belief);
         parts.moments.push(moment);
         let state = usize::try_from(belief.resolved_state).ok();
-        parts.fed_back = state.map(|state| (latent_gaussian(&belief.resolved), state));
+        parts.fed_back = state.map(|state| (belief.resolved, state));
         if belief.is_final == 0 {
             return None;
         }
@@ -329,13 +325,7 @@ impl Assembly {
 /// The picture of a frame.
 fn input(meta: &FrameMeta, bytes: &[u8]) -> Input {
     let view = &meta.dataset_view;
-    let (i, m) = (&meta.intrinsics, &meta.world_from_camera);
-    let observability = match carff_messages::Observability::try_from(view.observability) {
-        Ok(carff_messages::Observability::Full) => Some(Observability::Full),
-        Ok(carff_messages::Observability::Partial) => Some(Observability::Partial),
-        Ok(carff_messages::Observability::None) => Some(Observability::None),
-        _ => None,
-    };
+    let observability = Observability::of_code(view.observability).ok().flatten();
     let index = |value: i32| usize::try_from(value).ok();
     let truth = match (index(view.branch), index(view.timestamp), index(view.view)) {
         (Some(branch), Some(timestamp), Some(view)) => Some(Truth { branch, timestamp, view, observability }),
@@ -344,58 +334,22 @@ fn input(meta: &FrameMeta, bytes: &[u8]) -> Input {
     Input {
         title: format!("frame {}", meta.header.frame_id),
         image: Image { width_px: meta.width_px, height_px: meta.height_px, rgb: bytes.to_vec() },
-        camera: Some(PinholeCamera {
-            width_px: meta.width_px,
-            height_px: meta.height_px,
-            fl_x_px: i.fl_x_px,
-            fl_y_px: i.fl_y_px,
-            cx_px: i.cx_px,
-            cy_px: i.cy_px,
-            world_from_camera: std::array::from_fn(|row| std::array::from_fn(|column| m[row * 4 + column])),
-        }),
+        camera: Some(meta.camera()),
         truth: truth.filter(|_| view.known == 1),
         frame: meta.header.frame_id,
         seed: Some(meta.header.seed),
     }
 }
 
-fn latent_gaussian(gaussian: &Gaussian) -> LatentGaussian {
-    LatentGaussian { mean: gaussian.mean, log_variance: gaussian.log_variance }
-}
-
 /// A step of a frame, as the graph's messages say it. `fed_back` is the state that the step before resolved to.
 fn moment(
     before: &Moment,
-    fed_back: Option<(LatentGaussian, usize)>,
+    fed_back: Option<(Gaussian, usize)>,
     forecast: &carff_messages::Forecast,
     belief: &Belief,
 ) -> Moment {
-    let components = (forecast.component_count as usize).min(MAX_COMPONENTS);
-    let mixture = Mixture {
-        weights: forecast.weights[..components].to_vec(),
-        components: forecast.components[..components].iter().map(latent_gaussian).collect(),
-    };
-    let draws: Vec<Draw> = forecast
-        .samples()
-        .iter()
-        .zip(&forecast.sample_component)
-        .map(|(latent, component)| Draw { latent: *latent, component: usize::from(*component) })
-        .collect();
-    let places = belief.place_count as usize;
-    let probed = |result: &ProbeResult| probed(result, places);
-    let step = Step {
-        mixture: mixture.clone(),
-        draws: draws.clone(),
-        components: belief.components[..components].iter().map(probed).collect(),
-        samples: belief.samples().iter().map(probed).collect(),
-        resolved: Resolved {
-            state_probabilities: belief.state_probability[..belief.state_count as usize].to_vec(),
-            hazard_probability: belief.hazard_probability,
-            // No state has the largest number: nothing can be gone on from.
-            state: usize::try_from(belief.resolved_state).unwrap_or(usize::MAX),
-        },
-        path_probability: belief.path_probability,
-    };
+    let step = Step::of_messages(forecast, belief);
+    let (mixture, draws) = (step.mixture.clone(), step.draws.clone());
     let (source, source_state) = match fed_back {
         Some((gaussian, state)) => (gaussian, Some(state)),
         None => (before.source, before.source_state),
@@ -406,22 +360,10 @@ fn moment(
     Moment { belief: Some(step), ..Moment::of_forecast(&before, forecast.header.step, Forecast { mixture, draws }) }
 }
 
-fn probed(result: &ProbeResult, places: usize) -> Probed {
-    Probed {
-        occupancies: result.densities[..places].to_vec(),
-        reading: Reading {
-            state: usize::try_from(result.state).ok(),
-            confidence: result.confidence,
-            hazard_likelihood: result.hazard_likelihood,
-            // Messages carry the best state alone.
-            state_probabilities: Vec::new(),
-        },
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use carff_decision::Draw;
     use carff_messages::{ForecastSource, Header};
 
     fn meta(frame_id: u64) -> FrameMeta {
@@ -463,7 +405,7 @@ mod tests {
         (belief.state_count, belief.place_count, belief.component_count, belief.sample_count) = (4, 2, 2, 3);
         belief.state_probability[..4].copy_from_slice(&[0.1, 0.6, 0.2, 0.1]);
         belief.samples[2].state = 1;
-        belief.samples[2].densities[1] = 0.875;
+        belief.samples[2].occupancies[1] = 0.875;
         belief.resolved_state = 1;
         belief.resolved.mean = [9.0; 8];
         belief.path_probability = 1.0 / step as f32;
@@ -527,7 +469,7 @@ mod tests {
             header: Header::of_frame(4, 5, 77),
             action: ActionCode::Halt.code(),
             reason: reason.code(),
-            rule: RuleCode::Calibrated.code(),
+            rule: Rule::Calibrated.code(),
             sample_count: 10,
             confidence: 0.5,
             hazard_probability: 0.5,

@@ -1,18 +1,16 @@
 //! A checkpoint's models, loaded once, as the stages load them.
 
-use carff_belief::Probe;
-use carff_checkpoint::{CheckpointError, Manifest};
-use carff_config::CheckpointPlanning;
+use carff_checkpoint::{CheckpointError, FieldProbe, Manifest, load_field_probe, load_policy};
 use carff_dataset::Image;
+use carff_decision::Policy;
 use carff_field::Field;
-use carff_latent::LatentGaussian;
+use carff_messages::{Gaussian, Rule};
 use carff_models::{
     borrow,
     encoder::Encoder,
     mixture::MixtureNet,
     stored::{load_encoder, load_mixture},
 };
-use carff_planning::Rule;
 use std::path::{Path, PathBuf};
 
 /// What a checkpoint holds.
@@ -22,11 +20,11 @@ pub struct Models {
     /// What was trained, and how.
     pub manifest: Manifest,
     /// Hypothesis to state.
-    pub probe: Probe,
+    pub probe: FieldProbe,
     /// Posterior to mixture, or why there is none.
     pub mixture: Result<MixtureNet, String>,
     /// The rule that decides: calibrated where a threshold was chosen, else the paper's.
-    pub rule: Rule,
+    pub policy: Policy,
     /// What each known state is called: its branch and its step.
     pub state_names: Vec<String>,
     encoder: Encoder,
@@ -43,16 +41,15 @@ impl Models {
             Err(error @ CheckpointError::Missing { .. }) => Err(error.to_string()),
             other => Ok(other?),
         };
-        let rule = CheckpointPlanning::load(dir)
-            .map_or(Rule::Paper, |planning| Rule::Calibrated { threshold: planning.hazard_threshold });
+        let policy = load_policy(Rule::Calibrated, None, dir).unwrap_or(Policy { rule: Rule::Paper, threshold: 1.0 });
         let scenario = &manifest.scenario;
         let steps = scenario.timestamps.max(1);
         let name = |state: usize| format!("{} t{}", scenario.branches[state / steps], state % steps);
         let models = Self {
             dir: dir.to_owned(),
-            probe: Probe::load(dir, &manifest)?,
+            probe: load_field_probe(dir, &manifest)?,
             mixture,
-            rule,
+            policy,
             state_names: (0..scenario.state_count()).map(name).collect(),
             encoder: load_encoder(dir, &manifest)?,
             manifest,
@@ -63,7 +60,7 @@ impl Models {
     }
 
     /// The posterior of a picture, as the encoder stage computes it; `None` for a picture of no or wrong size.
-    pub fn encode(&self, image: &Image) -> Option<LatentGaussian> {
+    pub fn encode(&self, image: &Image) -> Option<Gaussian> {
         let (height_px, width_px) = (image.height_px as usize, image.width_px as usize);
         borrow::with_picture(&image.rgb, height_px, width_px, |picture| self.encoder.encode_bytes(picture)).flatten()
     }
@@ -92,7 +89,7 @@ impl Models {
 
     /// Whether the hazard action is right in a state.
     pub fn is_hazard(&self, state: usize) -> bool {
-        self.probe.prober().hazard_states().get(state).copied().unwrap_or(false)
+        self.probe.layout().hazard_states().get(state).copied().unwrap_or(false)
     }
 
     /// Steps that the checkpoint was calibrated to look ahead.

@@ -8,10 +8,8 @@ use crate::history::History;
 use crate::input::Input;
 use crate::journal::{Decision, Journal};
 use crate::models::Models;
-use carff_belief::{Probed, Step, decision, hazard_probability, next_path_probability};
-use carff_latent::{Draw, LATENT_DIM, LatentGaussian, Mixture, Sampling};
-use carff_messages::{MAX_HORIZON, MAX_SAMPLES};
-use carff_probing::Resolved;
+use carff_decision::{Draw, Evidence, Mixture, Probed, Resolved, Sampling, Step, path_probability};
+use carff_messages::{Gaussian, LATENT_DIM, MAX_HORIZON, MAX_SAMPLES};
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -67,7 +65,7 @@ pub struct Moment {
     /// Steps ahead of the picture.
     pub step: u32,
     /// What is forecast from: the picture's posterior, or that of a known state.
-    pub source: LatentGaussian,
+    pub source: Gaussian,
     /// That state; `None` for a picture's posterior.
     pub source_state: Option<usize>,
     /// The forecast; none at step 0.
@@ -88,7 +86,7 @@ pub struct Moment {
 
 impl Moment {
     /// A picture's posterior, nothing more.
-    pub fn of_posterior(input: Arc<Input>, posterior: LatentGaussian) -> Self {
+    pub fn of_posterior(input: Arc<Input>, posterior: Gaussian) -> Self {
         Self {
             input,
             step: 0,
@@ -270,7 +268,7 @@ impl Session {
     }
 
     /// One step's forecast, as the forecaster stage draws it for a frame of this number.
-    fn forecast(&mut self, source: &LatentGaussian, input: &Input, step: u32) -> Result<Forecast, SessionError> {
+    fn forecast(&mut self, source: &Gaussian, input: &Input, step: u32) -> Result<Forecast, SessionError> {
         let started = Instant::now();
         let net = self.models.mixture.as_ref().map_err(|why| SessionError::NoMixture(why.clone()))?;
         let mixture = net.forecast(source);
@@ -292,14 +290,14 @@ impl Session {
         find(&mut self.models, moment);
         if first && moment.belief.is_some() {
             let steps: Vec<Step> = moment.steps().cloned().collect();
-            let decided = decision(self.models.rule, &steps);
-            let hazard = hazard_probability(steps.iter().map(|s| (s.resolved.hazard_probability, s.path_probability)));
+            let evidence = Evidence::of_steps(&steps);
+            let decided = self.models.policy.decide(&evidence);
             self.journal.decided(Decision {
                 rests_on: format!("{}, {}", moment.input.title, steps_ahead(moment.step)),
                 halt: decided.halt,
                 confidence: decided.confidence as f32,
-                hazard_probability: hazard,
-                reason: self.models.rule.name().to_owned(),
+                hazard_probability: evidence.hazard_probability() as f32,
+                reason: self.models.policy.rule.name().to_owned(),
                 latency_ms: None,
             });
         }
@@ -330,7 +328,7 @@ impl Session {
                 hazard_probability: reading.hazard_likelihood,
             },
         };
-        let path_probability = next_path_probability(&resolved, moment.path_probability);
+        let path_probability = path_probability(moment.path_probability, resolved.state_probability(state));
         let step = moment.step + 1;
         let forecast = self.forecast(&source, &moment.input, step)?;
         let path = moment.steps().cloned().collect();
@@ -457,7 +455,7 @@ fn find(models: &mut Models, moment: &mut Moment) {
         _ => None,
     });
     let probed = known.unwrap_or_else(|| models.probe.probe(&latent));
-    let points = models.probe.prober().points();
+    let points = models.probe.layout().points();
     let mut densities = vec![0.0; points.len()];
     models.probe.field().density(points, &latent, &mut densities);
     moment.found = Some(Found { probed, densities });

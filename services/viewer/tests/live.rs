@@ -2,7 +2,7 @@
 
 use carff_messages::{
     Action, ActionCode, Belief, DatasetView, Forecast, ForecastSource, FrameMeta, Gaussian, Header, Intrinsics,
-    Posterior, Reason, RuleCode,
+    Posterior, Reason, Rule,
 };
 use carff_observe::RunRecord;
 use carff_transport::{Node, Run, monotonic_now_ns, remove_run_leftovers, runtime_dir, topics};
@@ -95,7 +95,7 @@ fn watches_a_run_from_frame_to_decision() {
         header,
         action: ActionCode::Halt.code(),
         reason: Reason::Belief.code(),
-        rule: RuleCode::Paper.code(),
+        rule: Rule::Paper.code(),
         sample_count: 2,
         confidence: 0.75,
         hazard_probability: 0.75,

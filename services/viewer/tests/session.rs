@@ -2,9 +2,8 @@
 
 mod common;
 
-use carff_belief::{Plan, Step, look_ahead};
 use carff_dataset::Image;
-use carff_latent::Sampling;
+use carff_decision::{Evidence, Plan, Sampling, Step, look_ahead};
 use carff_scenes::{Extras, RenderOptions};
 use carff_viewer::input::{Album, Input};
 use carff_viewer::models::Models;
@@ -26,7 +25,7 @@ fn toggle_shows_what_the_picture_shows() {
         let found = session.moment().unwrap().found.as_ref().unwrap();
         let state = session.models().state(branch, timestamp).unwrap();
         assert_eq!(found.probed.reading.state, Some(state));
-        let prober = session.models().probe.prober();
+        let prober = session.models().probe.layout();
         for (place, occupancy) in prober.places().iter().zip(&found.probed.occupancies) {
             assert_eq!(place.occupied_in[state], *occupancy > 0.5, "{} {occupancy}", place.name);
         }
@@ -65,7 +64,7 @@ fn follows_the_stages_path() {
     let steps: Vec<Step> = session.moment().unwrap().steps().cloned().collect();
     assert_eq!(steps, wanted);
     let last = session.journal.decisions().next_back().unwrap();
-    assert_eq!(last.halt, carff_belief::decision(session.models().rule, &wanted).halt);
+    assert_eq!(last.halt, session.models().policy.decide(&Evidence::of_steps(&wanted)).halt);
     assert_eq!(session.journal.decisions().len(), 3);
 }
 

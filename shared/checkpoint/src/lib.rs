@@ -6,24 +6,24 @@
 //! with libtorch.
 
 mod field;
+mod planning;
+mod probe;
 pub mod shapes;
 
 pub use field::{load_field, save_field};
+pub use planning::{CheckpointPlanning, CheckpointPlanningError, load_policy};
+pub use probe::{FieldProbe, PreparedField, load_field_probe, load_probing};
 
 use carff_dataset::ScenarioInfo;
+use carff_decision::{Calibration, Place, ProbingError};
 use carff_field::FieldConfig;
-use carff_latent::LatentGaussian;
-use carff_probing::{Calibration, Place, Prober, ProbingError};
+use carff_messages::{Gaussian, MAX_PLACES, MAX_STATES};
 use serde::{Deserialize, Serialize};
 use shapes::{DecoderConfig, EncoderConfig, MixtureConfig};
 use std::path::{Path, PathBuf};
 
 /// The format that this program writes and reads.
 pub const FORMAT_VERSION: u32 = 1;
-/// Most states that a checkpoint can tell apart; messages carry as many.
-pub const MAX_STATES: usize = 64;
-/// Most places that a checkpoint can probe; messages carry as many.
-pub const MAX_PLACES: usize = 48;
 /// A manifest is larger than this only by mistake.
 const MAX_MANIFEST_BYTES: u64 = 16 << 20;
 
@@ -169,7 +169,7 @@ pub struct Manifest {
     /// Structure of the field, once it is trained.
     pub field: Option<FieldConfig>,
     /// Per known state the posterior that stands for it: what a resolved state feeds back.
-    pub states: Vec<LatentGaussian>,
+    pub states: Vec<Gaussian>,
     /// Places to probe.
     pub places: Vec<Place>,
     /// How the places look when taken and when free, once the field is trained.
@@ -237,7 +237,7 @@ impl Manifest {
         if self.states.len() != states {
             return Err(format!("`states` has {} entries, the scenario {states}", self.states.len()));
         }
-        let finite = |g: &LatentGaussian| g.mean.iter().chain(&g.log_variance).all(|v| v.is_finite());
+        let finite = |g: &Gaussian| g.mean.iter().chain(&g.log_variance).all(|v| v.is_finite());
         if !self.states.iter().all(finite) {
             return Err("`states` has a number that is not finite".into());
         }
@@ -284,21 +284,5 @@ impl Manifest {
             return Err(show("scenario.poses", &trained.poses, &given.poses));
         }
         Ok(())
-    }
-}
-
-/// The prober of a checkpoint, and its calibration.
-pub fn load_probing(dir: &Path, manifest: &Manifest) -> Result<(Prober, Calibration), CheckpointError> {
-    let missing = || CheckpointError::Missing { path: dir.into(), part: "probe calibration", stage: "nerf" };
-    let calibration = manifest.probing.clone().ok_or_else(missing)?;
-    let prober = Prober::new(manifest.places.clone(), manifest.scenario.hazard_states())
-        .map_err(|source| CheckpointError::Probing { path: dir.into(), source })?;
-    if calibration.fits(&prober) {
-        Ok((prober, calibration))
-    } else {
-        Err(CheckpointError::Manifest {
-            path: dir.join(files::MANIFEST),
-            what: "`probing.places` and `places` differ in number".into(),
-        })
     }
 }

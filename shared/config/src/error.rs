@@ -1,64 +1,99 @@
 //! Errors that point at the line.
 
+use crate::ranges;
+use schemars::JsonSchema;
+use serde::de::DeserializeOwned;
 use std::path::{Path, PathBuf};
 use toml::de::{DeTable, DeValue};
 
-/// What is wrong with a graph or soak file.
+/// An error in a graph or soak file.
 #[derive(Debug, thiserror::Error)]
 pub enum ConfigError {
     /// The file cannot be read.
     #[error("cannot read the {what} file {path}: {source}{}", carff_nearest::beside(path))]
     Read {
-        /// What kind of file it was to be.
+        /// The kind of file.
         what: &'static str,
-        /// Which file.
+        /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: std::io::Error,
     },
-    /// It is no TOML, has an unknown key, misses one, or has one of a wrong type.
+    /// It is not valid TOML, or has an unknown, missing or wrongly typed key.
     #[error("{path}:{line}: {}{message}", key.as_ref().map(|k| format!("`{k}`: ")).unwrap_or_default())]
     Syntax {
-        /// Which file.
+        /// The file.
         path: PathBuf,
         /// Line, from 1.
         line: usize,
         /// The dotted key, where one is at fault.
         key: Option<String>,
-        /// What is wrong and what is allowed.
+        /// The problem, and the allowed values.
         message: String,
     },
-    /// A value is out of range.
-    #[error("{path}:{line}: `{key}` is {value}; allowed: {allowed}")]
-    Range {
-        /// Which file.
+    /// A key of an earlier version.
+    #[error("{path}:{line}: `{key}` is now called `{now}`")]
+    Moved {
+        /// The file.
         path: PathBuf,
         /// Line, from 1.
         line: usize,
         /// The dotted key.
         key: String,
-        /// What was found.
+        /// Its present name.
+        now: String,
+    },
+    /// A value is out of range.
+    #[error("{path}:{line}: `{key}` is {value}; allowed: {allowed}")]
+    Range {
+        /// The file.
+        path: PathBuf,
+        /// Line, from 1.
+        line: usize,
+        /// The dotted key.
+        key: String,
+        /// The value found.
         value: String,
-        /// What is allowed.
+        /// The allowed values.
         allowed: String,
     },
 }
 
-/// The text of a file, to find lines and keys in.
+/// The text of a file, in which lines and keys are found.
 pub(crate) struct Source<'a> {
     pub(crate) path: &'a Path,
     pub(crate) text: &'a str,
 }
 
-/// Reads a file; `what` kind of file it is to be, errors say.
+/// Reads a file; errors name the kind of file, `what`.
 pub(crate) fn read(path: &Path, what: &'static str) -> Result<String, ConfigError> {
     std::fs::read_to_string(path).map_err(|source| ConfigError::Read { what, path: path.into(), source })
 }
 
 impl Source<'_> {
+    /// Reads the text, and checks the ranges that the schema of `T` states.
+    pub(crate) fn read<T: DeserializeOwned + JsonSchema>(&self) -> Result<T, ConfigError> {
+        let config = toml::from_str(self.text).map_err(|e| self.syntax(&e))?;
+        let values = toml::from_str(self.text).map_err(|e| self.syntax(&e))?;
+        ranges::check(self, schemars::schema_for!(T).as_value(), &values)?;
+        Ok(config)
+    }
+
+    /// Refuses the first key that has a new name. `moved` pairs old names with new ones; a part `*` stands for any name,
+    /// which the new name repeats.
+    pub(crate) fn refuse_moved(&self, moved: &[(&str, &str)]) -> Result<(), ConfigError> {
+        let Ok(table) = self.text.parse::<toml::Table>() else { return Ok(()) };
+        for key in dotted_keys(&table, "") {
+            let Some(now) = moved.iter().find_map(|(old, new)| renamed(&key, old, new)) else { continue };
+            let line = self.offset_of(&key).map_or(1, |offset| self.line(offset));
+            return Err(ConfigError::Moved { path: self.path.into(), line, key, now });
+        }
+        Ok(())
+    }
+
     pub(crate) fn syntax(&self, error: &toml::de::Error) -> ConfigError {
         let offset = error.span().map_or(0, |span| span.start);
-        // The message's first line says what; the rest repeats the place, which is said in front already.
+        // The lines after the first one repeat the place, which this error states itself.
         let message = carff_nearest::explained(&error.message().lines().collect::<Vec<_>>().join(", "));
         ConfigError::Syntax { path: self.path.into(), line: self.line(offset), key: self.key_at(offset), message }
     }
@@ -108,4 +143,25 @@ impl Source<'_> {
         }
         search(DeTable::parse(self.text).ok()?.get_ref(), offset, "")
     }
+}
+
+/// The dotted keys of a table and of the tables in it.
+fn dotted_keys(table: &toml::Table, prefix: &str) -> Vec<String> {
+    let mut keys = Vec::new();
+    for (name, value) in table {
+        let key = format!("{prefix}{name}");
+        if let toml::Value::Table(inner) = value {
+            keys.extend(dotted_keys(inner, &format!("{key}.")));
+        }
+        keys.push(key);
+    }
+    keys
+}
+
+/// The new name of a key, where it matches the old one.
+fn renamed(key: &str, old: &str, new: &str) -> Option<String> {
+    let (parts, pattern): (Vec<_>, Vec<_>) = (key.split('.').collect(), old.split('.').collect());
+    let matches = parts.len() == pattern.len() && parts.iter().zip(&pattern).all(|(part, p)| *p == "*" || part == p);
+    let any = pattern.iter().position(|p| *p == "*").map_or("*", |i| parts.get(i).copied().unwrap_or("*"));
+    matches.then(|| new.replace('*', any))
 }

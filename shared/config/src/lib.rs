@@ -1,6 +1,6 @@
-//! The graph file: one typed, documented configuration per stage; and the soak file. Nothing is started here.
+//! The graph file and the soak file: typed, documented and checked. Nothing is started here.
 //!
-//! The doc of each field is the user's doc: what it means, its unit, what is allowed, and the default.
+//! The doc of each field is the user's doc: its meaning, unit, range and default.
 //!
 //! ```
 //! let graph = carff_config::GraphConfig::parse(
@@ -19,20 +19,19 @@
 //! # Ok::<(), carff_config::ConfigError>(())
 //! ```
 //!
-//! A relative path in a graph file is looked for in the current directory; where it is not there, it is taken from
+//! A relative path in a graph file is resolved in the current directory. Where it does not exist there, it is taken from
 //! the root of the project: the first folder above the graph file that holds a `configs` folder.
 
-mod checkpoint;
 mod error;
 mod graph;
+mod ranges;
 mod soak;
+mod stages;
 
-pub use checkpoint::{CheckpointPlanning, CheckpointPlanningError};
 pub use error::ConfigError;
 pub use graph::{
-    CameraConfig, CameraSource, ControllerConfig, EncoderConfig, ForecasterConfig, GraphConfig, LauncherConfig,
-    LogConfig, LogFormat, LogLevel, NoiseConfig, OverloadConfig, PoseChoice, ProberConfig, Quality, RealtimeConfig,
-    RendererConfig, RestartConfig, RestartPolicy, Rule, RunConfig, Sampling, StageRealtime, ThreadsConfig, ViewChoice,
-    WhenLost,
+    CameraConfig, CameraSource, ControllerConfig, GraphConfig, LauncherConfig, OverloadConfig, PoseChoice, Quality,
+    RendererConfig, RunConfig, ViewChoice, WhenLost,
 };
 pub use soak::{Contract, Kind, Pace, SoakConfig, Weights};
+pub use stages::{LogFormat, LogLevel, RestartPolicy, StageConfig, StagesConfig};

@@ -1,4 +1,4 @@
-//! The soak file: which faults, how often, and what is asked of the graph in between.
+//! The soak file: the faults, their frequency, and the contract that the graph must keep.
 
 use crate::ConfigError;
 use crate::error::{Source, read};
@@ -6,28 +6,28 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 
-/// A soak: a graph, the faults that are done to it, and its contract.
+/// A soak test: a graph, the faults injected into it, and its contract.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct SoakConfig {
     /// The graph file.
     pub graph: PathBuf,
-    /// How often each kind of fault comes, relative to the others, 0 to 1000. Those left out never come.
+    /// Relative frequency of each kind of fault, 0 to 1000. A kind that is left out never occurs.
     pub faults: Weights,
-    /// When.
+    /// The timing of the faults.
     #[serde(default)]
     pub pace: Pace,
-    /// What is asked of the graph.
+    /// The contract of the graph.
     #[serde(default)]
     pub contract: Contract,
 }
 
 macro_rules! weights {
     ($($(#[$doc:meta])* $field:ident => $kind:ident),+ $(,)?) => {
-        /// How often each kind of fault comes, relative to the others.
+        /// Relative frequency of each kind of fault.
         #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
         #[serde(deny_unknown_fields, default)]
-        pub struct Weights { $($(#[$doc])* pub $field: u32),+ }
+        pub struct Weights { $($(#[$doc])* #[schemars(range(min = 0, max = 1000))] pub $field: u32),+ }
 
         /// Kinds of faults.
         #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -93,16 +93,19 @@ weights! {
     checkpoint => Checkpoint,
 }
 
-/// When faults come.
+/// The timing of the faults.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Pace {
     /// Shortest pause between a recovery and the next fault, milliseconds, 0 to 600000. Default 300.
+    #[schemars(range(min = 0, max = 600_000))]
     pub min_pause_ms: u64,
     /// Longest one. Default 1500.
+    #[schemars(range(min = 0, max = 600_000))]
     pub max_pause_ms: u64,
     /// Longest time that a process is stopped or slowed, or that memory is full, milliseconds, 50 to 60000.
     /// Default 3000.
+    #[schemars(range(min = 50, max = 60_000))]
     pub max_hold_ms: u64,
 }
 
@@ -112,29 +115,37 @@ impl Default for Pace {
     }
 }
 
-/// What is asked of the graph. Times in which the soak itself got no processor are left out of account.
+/// The contract of the graph. Times in which the soak test itself had no processor do not count.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Contract {
     /// From the end of a fault until all stages are well and a decision has been made, milliseconds, 100 to 600000.
     /// Default 5000.
+    #[schemars(range(min = 100, max = 600_000))]
     pub recovery_ms: u64,
     /// From an interrupt to the end of everything, milliseconds, 100 to 600000. Default 5000.
+    #[schemars(range(min = 100, max = 600_000))]
     pub stop_ms: u64,
     /// From the expiry of a decision to the safe action, and beyond the period of actions, milliseconds, 1 to 60000.
     /// Default 150.
+    #[schemars(range(min = 1, max = 60_000))]
     pub slack_ms: u64,
     /// Growth of a process's memory, percent an hour, over lives of at least `memory_span_s` after `warm_up_s`, 0 to
     /// 1000. Default 1.
+    #[schemars(range(min = 0.0, max = 1000.0))]
     pub memory_growth_percent_per_hour: f64,
     /// Age from which on a process's memory counts, seconds, 0 to 86400. Default 120.
+    #[schemars(range(min = 0, max = 86_400))]
     pub warm_up_s: u64,
     /// Shortest time over which its growth is judged, seconds, 1 to 604800. Default 1800.
+    #[schemars(range(min = 1, max = 604_800))]
     pub memory_span_s: u64,
     /// The 99th percentile of the time from camera to action may grow by so much from the first to the last
     /// `p99_frames` undisturbed frames, percent, 0 to 1000. Default 20.
+    #[schemars(range(min = 0.0, max = 1000.0))]
     pub p99_drift_percent: f64,
     /// Frames in each, 100 to 1000000; with fewer than twice as many, drift is not judged. Default 1000.
+    #[schemars(range(min = 100, max = 1_000_000))]
     pub p99_frames: usize,
 }
 
@@ -162,38 +173,22 @@ impl SoakConfig {
     /// The same for a text; `path` is what errors name.
     pub fn parse(text: &str, path: &Path) -> Result<Self, ConfigError> {
         let source = Source { path, text };
-        let config: Self = toml::from_str(text).map_err(|e| source.syntax(&e))?;
+        let config: Self = source.read()?;
         config.check(&source)?;
         Ok(config)
     }
 
-    fn check(&self, source: &Source) -> Result<(), ConfigError> {
-        let (faults, pace, contract) = (&self.faults, &self.pace, &self.contract);
-        let within = |key: &str, value: u64, min: u64, max: u64| {
-            let fits = (min..=max).contains(&value);
-            if fits { Ok(()) } else { Err(source.range(key, value.to_string(), format!("{min} to {max}"))) }
-        };
-        for &kind in Kind::ALL {
-            within(&format!("faults.{}", kind.name()), faults.of(kind).into(), 0, 1000)?;
-        }
-        if Kind::ALL.iter().all(|&kind| faults.of(kind) == 0) {
+    fn check(&self, source: &Source<'_>) -> Result<(), ConfigError> {
+        if Kind::ALL.iter().all(|&kind| self.faults.of(kind) == 0) {
             return Err(source.range("faults", "without a weight".into(), "at least one weight above 0".into()));
         }
-        within("pace.max_pause_ms", pace.max_pause_ms, pace.min_pause_ms, 600_000)?;
-        within("pace.max_hold_ms", pace.max_hold_ms, 50, 60_000)?;
-        within("contract.recovery_ms", contract.recovery_ms, 100, 600_000)?;
-        within("contract.stop_ms", contract.stop_ms, 100, 600_000)?;
-        within("contract.slack_ms", contract.slack_ms, 1, 60_000)?;
-        within("contract.warm_up_s", contract.warm_up_s, 0, 86_400)?;
-        within("contract.memory_span_s", contract.memory_span_s, 1, 604_800)?;
-        within("contract.p99_frames", contract.p99_frames as u64, 100, 1_000_000)?;
-        for (key, value) in [
-            ("contract.memory_growth_percent_per_hour", contract.memory_growth_percent_per_hour),
-            ("contract.p99_drift_percent", contract.p99_drift_percent),
-        ] {
-            if !(0.0..=1000.0).contains(&value) {
-                return Err(source.range(key, value.to_string(), "0 to 1000".into()));
-            }
+        let Pace { min_pause_ms, max_pause_ms, .. } = self.pace;
+        if max_pause_ms < min_pause_ms {
+            return Err(source.range(
+                "pace.max_pause_ms",
+                max_pause_ms.to_string(),
+                format!("{min_pause_ms} to 600000"),
+            ));
         }
         Ok(())
     }

@@ -3,6 +3,7 @@
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
 use carff_config::{ConfigError, GraphConfig, RestartPolicy, ViewChoice};
+use carff_messages::Stage;
 use std::path::Path;
 
 const HEAD: &str = "[run]\nname = \"x\"\ndataset = \"d\"\ncheckpoint = \"c\"\n";
@@ -22,8 +23,7 @@ fn wrong_files_have_golden_messages() {
         ),
         (
             format!("{HEAD}[camera]\nsource = \"free-drives\"\n"),
-            "graph.toml:6: `camera.source` is \"free-drives\"; allowed: `free-drives` where `run.scenario` says what to \
-             render",
+            "graph.toml:6: `camera.source` is \"free-drives\"; allowed: `free-drives` with a `run.scenario` to render",
         ),
         (format!("{HEAD}horizon = 9\n"), "graph.toml:5: `run.horizon` is 9; allowed: 1 to 8"),
         (
@@ -40,8 +40,8 @@ fn wrong_files_have_golden_messages() {
         ),
         (format!("{HEAD}[camera.noise]\nsigma = nan\n"), "graph.toml:6: `camera.noise.sigma` is NaN; allowed: 0 to 64"),
         (
-            format!("{HEAD}[launcher.restart]\nprober = {{ on-failure = {{ backoff_ms = 1, max_restarts = 0 }} }}\n"),
-            "graph.toml:6: `launcher.restart.prober.on-failure.max_restarts` is 0; allowed: 1 to 1000",
+            format!("{HEAD}[stages.prober]\nrestart = {{ on-failure = {{ backoff_ms = 1, max_restarts = 0 }} }}\n"),
+            "graph.toml:6: `stages.prober.restart.on-failure.max_restarts` is 0; allowed: 1 to 1000",
         ),
         (
             format!("{HEAD}[overload]\norder = [\"samples\", \"samples\"]\n"),
@@ -49,8 +49,8 @@ fn wrong_files_have_golden_messages() {
              most once",
         ),
         (
-            format!("{HEAD}[realtime.prober]\nfifo_priority = 100\n"),
-            "graph.toml:6: `realtime.prober.fifo_priority` is 100; allowed: 1 to 99",
+            format!("{HEAD}[stages.prober]\nfifo_priority = 100\n"),
+            "graph.toml:6: `stages.prober.fifo_priority` is 100; allowed: 1 to 99",
         ),
         (
             "[run]\nname = \"two words\"\ndataset = \"d\"\ncheckpoint = \"c\"\n".to_owned(),
@@ -59,18 +59,45 @@ fn wrong_files_have_golden_messages() {
         ("[run]\nname = \"x\"\ncheckpoint = \"c\"\n".to_owned(), "graph.toml:1: `run`: missing field `dataset`"),
         (
             format!("{HEAD}[cameras]\n"),
-            "graph.toml:5: `cameras`: unknown field `cameras`, expected one of `run`, \
-             `threads`, `log`, `camera`, `encoder`, `forecaster`, `prober`, `renderer`, `controller`, `launcher`, \
-             `overload`, `realtime`; did you mean `camera`?",
+            "graph.toml:5: `cameras`: unknown field `cameras`, expected one of `run`, `stages`, `camera`, `renderer`, \
+             `controller`, `launcher`, `overload`; did you mean `camera`?",
         ),
         (
             format!("{HEAD}[renderer]\nviews = []\n"),
-            "graph.toml:6: `renderer.views` is []; allowed: `birds-eye`, `free`, or both",
+            "graph.toml:6: `renderer.views` is []; allowed: at least one entry",
         ),
     ];
     for (text, expected) in cases {
         assert_eq!(error(&text), expected, "for\n{text}");
     }
+}
+
+/// A key of an earlier version is refused with its present name, wherever it stood.
+#[test]
+fn keys_of_earlier_versions_name_the_present_ones() {
+    for (table, was, now) in [
+        ("[threads]\ntotal = 4\n", "threads.total", "launcher.thread_budget"),
+        ("[threads]\nprober = 2\n", "threads.prober", "stages.prober.threads"),
+        ("[log]\nformat = \"json\"\n", "log.format", "launcher.log_format"),
+        ("[log]\ncamera = \"warn\"\n", "log.camera", "stages.camera.log"),
+        ("[encoder]\ndeadline_ms = 9\n", "encoder.deadline_ms", "stages.encoder.deadline_ms"),
+        ("[renderer]\nnice = 5\n", "renderer.nice", "stages.renderer.nice"),
+        ("[realtime.prober]\ncpus = [0]\n", "realtime.prober.cpus", "stages.prober.cpus"),
+        ("[launcher.restart]\nencoder = \"never\"\n", "launcher.restart.encoder", "stages.encoder.restart"),
+    ] {
+        assert_eq!(error(&format!("{HEAD}{table}")), format!("graph.toml:6: `{was}` is now called `{now}`"));
+    }
+}
+
+/// The schema that editors read holds every range that reading checks.
+#[test]
+fn the_schema_holds_the_ranges() {
+    let schema = schemars::schema_for!(GraphConfig).to_value();
+    let run = &schema["$defs"]["RunConfig"]["properties"];
+    assert_eq!((run["samples"]["minimum"].as_f64(), run["samples"]["maximum"].as_f64()), (Some(1.0), Some(64.0)));
+    let stage = &schema["$defs"]["StageConfig"]["properties"];
+    assert_eq!(stage["nice"]["minimum"].as_f64(), Some(-20.0));
+    assert_eq!(stage["cpus"]["items"]["maximum"].as_f64(), Some(1023.0));
 }
 
 /// What is no TOML at all names the line too.
@@ -99,7 +126,7 @@ fn the_shipped_graph_is_valid() {
     assert_eq!((graph.run.samples, graph.run.horizon, graph.camera.drives), (10, 2, 60));
     assert_eq!(graph.renderer.views, [ViewChoice::BirdsEye, ViewChoice::Free]);
     assert_eq!(
-        graph.launcher.restart.camera,
+        graph.stage(Stage::Camera).restart,
         RestartPolicy::OnFailure { backoff_ms: 100, max_restarts: 5, within_s: 60 }
     );
     assert!(graph.scenario_path().unwrap().is_file());
@@ -125,7 +152,8 @@ fn every_shipped_graph_is_valid() {
 /// Odd but allowed settings are warned of.
 #[test]
 fn odd_settings_are_warned_of() {
-    let text = format!("{HEAD}[threads]\ntotal = 2\nencoder = 2\n[controller]\ndeadline_ms = 90\n");
+    let text =
+        format!("{HEAD}[launcher]\nthread_budget = 4\n[stages.encoder]\nthreads = 2\n[controller]\ndeadline_ms = 90\n");
     let warnings = GraphConfig::parse(&text, Path::new("graph.toml")).unwrap().warnings();
     assert_eq!(warnings.len(), 2, "{warnings:?}");
     assert!(warnings[0].contains("threads") && warnings[1].contains("controller.deadline_ms"), "{warnings:?}");

@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use carff_geometry::{OrientedBox, PinholeCamera};
+use carff_messages::Observability;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
@@ -16,36 +17,6 @@ pub const MAX_TRANSFORMS_BYTES: u64 = 1 << 29;
 pub const MAX_FRAMES: usize = 1_000_000;
 /// Largest width or height of a picture, pixels.
 pub const MAX_IMAGE_SIDE_PX: u32 = 8192;
-
-/// How much of the dynamic actor (or, where it is absent, of the place where it would be) a picture shows.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Observability {
-    /// At least 75 % of its pixels, and at least 12.
-    Full,
-    /// Something between.
-    Partial,
-    /// At most 2 % of its pixels.
-    None,
-}
-
-impl Observability {
-    /// All three, from most to least.
-    pub const ALL: [Self; 3] = [Self::Full, Self::Partial, Self::None];
-
-    /// The name in the file: `full`, `partial` or `none`.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Full => "full",
-            Self::Partial => "partial",
-            Self::None => "none",
-        }
-    }
-
-    pub(crate) fn from_name(name: &str) -> Option<Self> {
-        Self::ALL.into_iter().find(|o| o.name() == name)
-    }
-}
 
 /// One picture of the set.
 #[derive(Clone, Debug, PartialEq)]

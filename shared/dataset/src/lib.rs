@@ -27,9 +27,9 @@ mod split;
 mod transforms;
 mod writer;
 
+pub use carff_messages::Observability;
 pub use dataset::{
-    Candidate, Dataset, Frame, MAX_FRAMES, MAX_IMAGE_SIDE_PX, MAX_TRANSFORMS_BYTES, NamedBox, Observability,
-    ScenarioInfo, StateInfo,
+    Candidate, Dataset, Frame, MAX_FRAMES, MAX_IMAGE_SIDE_PX, MAX_TRANSFORMS_BYTES, NamedBox, ScenarioInfo, StateInfo,
 };
 pub use equivalence::{Equivalence, MAX_DIFFERENT_PIXELS, PIXEL_TOLERANCE, looks_same};
 pub use error::DatasetError;

@@ -3,9 +3,10 @@
 use std::collections::BTreeMap;
 use std::fmt;
 
-use crate::dataset::{Dataset, Observability, ScenarioInfo};
+use crate::dataset::{Dataset, ScenarioInfo};
 use crate::equivalence::Equivalence;
 use crate::image::Image;
+use carff_messages::Observability;
 
 /// A mean difference above this, of 255, between pictures that should look the same is a leak: nobody can see it,
 /// but a network can.

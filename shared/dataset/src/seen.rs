@@ -1,9 +1,10 @@
 //! How much each picture shows of what tells branches apart, for a set that does not say: told by its pictures.
 
-use crate::dataset::{Frame, Observability};
+use crate::dataset::Frame;
 use crate::equivalence::looks_same;
 use crate::error::DatasetError;
 use crate::image::Image;
+use carff_messages::Observability;
 use rayon::prelude::*;
 
 /// Observability of each frame, from the other branches' pictures at its timestamp from its view: `none` where all of

@@ -14,12 +14,16 @@ use serde::{Deserialize, Serialize};
 #[serde(deny_unknown_fields, default)]
 pub struct SensorNoise {
     /// Standard deviation of the read noise, per pixel and channel, in units of 1/255. 0 to 64.
+    #[schemars(range(min = 0.0, max = 64.0))]
     pub sigma: f32,
     /// Standard deviation of the exposure's relative error, one draw a frame. 0 to 0.5.
+    #[schemars(range(min = 0.0, max = 0.5))]
     pub gain_sigma: f32,
     /// Standard deviation of each channel's relative gain error (white balance), one draw a frame. 0 to 0.5.
+    #[schemars(range(min = 0.0, max = 0.5))]
     pub channel_gain_sigma: f32,
     /// Standard deviation of each channel's offset, one draw a frame, in units of 1/255. 0 to 64.
+    #[schemars(range(min = 0.0, max = 64.0))]
     pub channel_offset_sigma: f32,
 }
 

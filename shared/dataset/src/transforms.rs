@@ -4,11 +4,11 @@ use std::collections::HashMap;
 use std::path::{Component, Path, PathBuf};
 
 use carff_geometry::{OrientedBox, PinholeCamera};
+use carff_messages::Observability;
 use serde_json::{Map, Value};
 
 use crate::dataset::{
-    Candidate, Frame, MAX_FRAMES, MAX_IMAGE_SIDE_PX, MAX_TRANSFORMS_BYTES, NamedBox, Observability, ScenarioInfo,
-    StateInfo,
+    Candidate, Frame, MAX_FRAMES, MAX_IMAGE_SIDE_PX, MAX_TRANSFORMS_BYTES, NamedBox, ScenarioInfo, StateInfo,
 };
 use crate::error::DatasetError;
 use crate::image::dimensions;

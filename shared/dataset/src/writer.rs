@@ -10,9 +10,10 @@ use carff_geometry::PinholeCamera;
 use image::ExtendedColorType;
 use serde::{Serialize, de::DeserializeOwned};
 
-use crate::dataset::{Candidate, NamedBox, Observability, ScenarioInfo};
+use crate::dataset::{Candidate, NamedBox, ScenarioInfo};
 use crate::error::DatasetError;
 use crate::image::{Image, write_png};
+use carff_messages::Observability;
 
 /// Marks a folder as written by this program, hence free to be written again.
 const MARKER: &str = ".carff-dataset";

@@ -2,7 +2,7 @@
 
 use carff_dataset::{Dataset, DatasetError, Image};
 use carff_field::{Field, RenderBuffer, RenderOptions};
-use carff_latent::LatentGaussian;
+use carff_messages::Gaussian;
 use carff_metrics::{mean, psnr_db, psnr_where};
 use serde::{Deserialize, Serialize};
 
@@ -30,7 +30,7 @@ pub struct BirdsEye {
 /// Renders the set's bird's-eye view for each state's latent. `None` when the set names no such view.
 pub fn birds_eye(
     field: &Field,
-    states: &[LatentGaussian],
+    states: &[Gaussian],
     dataset: &Dataset,
     threads: usize,
 ) -> Result<Option<BirdsEye>, DatasetError> {

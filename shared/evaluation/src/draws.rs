@@ -13,7 +13,7 @@ impl Shown {
     pub const NOTHING: Self = Self(0);
 
     /// From a reading: the named state, and those that are as probable.
-    pub fn of(reading: &carff_probing::Reading) -> Self {
+    pub fn of(reading: &carff_decision::Reading) -> Self {
         let Some(named) = reading.state else { return Self::NOTHING };
         let most = reading.state_probabilities.get(named).copied().unwrap_or(1.0);
         let ties = reading.state_probabilities.iter().enumerate().filter(|(_, p)| **p >= 0.999 * most);
@@ -311,7 +311,7 @@ mod tests {
     /// A sample shows the state it names and those that are as probable; none names nothing.
     #[test]
     fn ties_are_shown_together() {
-        let reading = |state, p: [f32; 3]| carff_probing::Reading {
+        let reading = |state, p: [f32; 3]| carff_decision::Reading {
             state,
             confidence: 0.5,
             hazard_likelihood: 0.0,

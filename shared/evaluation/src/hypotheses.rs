@@ -1,9 +1,9 @@
 //! What hypotheses are called, how samples that show the same are put together, and the camera that looks at them.
 
 use carff_dataset::{Dataset, ScenarioInfo};
+use carff_decision::Place;
 use carff_field::Field;
 use carff_geometry::PinholeCamera;
-use carff_probing::Place;
 use std::collections::BTreeSet;
 
 /// Longest side of a rendered hypothesis, pixels.

@@ -16,8 +16,7 @@ pub use pairs::{PairMeans, pair_means};
 pub use planning::{Count, PlanningTable, SAMPLE_COUNTS, Trial, TrialOutcome, count, planning_table, trial, trials};
 pub use samples::{Input, SampleAccuracy, sample_accuracy};
 
-use carff_belief::Probe;
-use carff_checkpoint::{CheckpointError, Manifest};
+use carff_checkpoint::{CheckpointError, FieldProbe, Manifest};
 use carff_models::{encoder::Encoder, mixture::MixtureNet};
 use std::path::Path;
 
@@ -28,7 +27,7 @@ pub struct Models {
     /// Posterior to mixture.
     pub mixture: MixtureNet,
     /// Hypothesis to state.
-    pub probe: Probe,
+    pub probe: FieldProbe,
     /// What was trained, and how.
     pub manifest: Manifest,
 }
@@ -40,7 +39,7 @@ impl Models {
         Ok(Self {
             encoder: carff_models::stored::load_encoder(dir, &manifest)?,
             mixture: carff_models::stored::load_mixture(dir, &manifest)?,
-            probe: Probe::load(dir, &manifest)?,
+            probe: carff_checkpoint::load_field_probe(dir, &manifest)?,
             manifest,
         })
     }

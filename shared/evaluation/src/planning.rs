@@ -1,17 +1,17 @@
 //! The planning table (paper section 4.3): success of each decision rule over eligible input views.
 
-use carff_belief::{Plan, Probe, decision, hazard_probability, look_ahead};
+use carff_checkpoint::FieldProbe;
 use carff_dataset::{
     Dataset, DatasetError, Image,
     drives::{DriveKind, EligibleInput},
     sensor::{SensorNoise, apply_noise_into},
 };
-use carff_latent::{LatentGaussian, Sampling};
+use carff_decision::{Evidence, Plan, Policy, Sampling, look_ahead};
+use carff_messages::Gaussian;
 use carff_models::{
     encoder::{Encoder, pictures_from_bytes},
     mixture::MixtureNet,
 };
-use carff_planning::Rule;
 use carff_random::Key;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -25,7 +25,7 @@ pub const SAMPLE_COUNTS: [usize; 3] = [2, 10, 35];
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Trial {
     /// The posterior.
-    pub posterior: LatentGaussian,
+    pub posterior: Gaussian,
     /// What the right action is.
     pub kind: DriveKind,
     /// The frame's number: it names the random draws of this trial.
@@ -115,13 +115,13 @@ type Halt = (usize, usize, bool);
 /// the trials, are those of n = 10.
 pub fn planning_table(
     net: &MixtureNet,
-    probe: &Probe,
+    probe: &FieldProbe,
     trials: &[Trial],
-    rules: &[Rule],
+    policies: &[Policy],
     sampling: Sampling,
     horizon: u32,
 ) -> (PlanningTable, Vec<TrialOutcome>) {
-    let posteriors: Vec<LatentGaussian> = trials.iter().map(|t| t.posterior).collect();
+    let posteriors: Vec<Gaussian> = trials.iter().map(|t| t.posterior).collect();
     let first = if posteriors.is_empty() { Vec::new() } else { net.forecast_all(&posteriors) };
     let later = net.forecast_all(probe.states());
     let results: Vec<(Vec<Halt>, TrialOutcome)> = trials
@@ -130,17 +130,17 @@ pub fn planning_table(
         .map_init(
             || probe.clone(),
             |probe, (trial, mixture)| {
-                let mut actions = Vec::with_capacity(SAMPLE_COUNTS.len() * rules.len());
+                let mut actions = Vec::with_capacity(SAMPLE_COUNTS.len() * policies.len());
                 let mut outcome = TrialOutcome { hazard_probability: 0.0, kind: trial.kind };
                 for (column, samples) in SAMPLE_COUNTS.into_iter().enumerate() {
                     let plan = Plan { samples, sampling, horizon, seed: trial.seed, frame: trial.frame };
-                    let forecast =
-                        |_: &LatentGaussian, state: Option<usize>| state.map_or(mixture, |s| &later[s]).clone();
+                    let forecast = |_: &Gaussian, state: Option<usize>| state.map_or(mixture, |s| &later[s]).clone();
                     let steps = look_ahead(forecast, probe, &trial.posterior, plan);
-                    actions.extend(rules.iter().enumerate().map(|(r, rule)| (r, column, decision(*rule, &steps).halt)));
+                    let evidence = Evidence::of_steps(&steps);
+                    let halts = policies.iter().map(|policy| policy.decide(&evidence).halt);
+                    actions.extend(halts.enumerate().map(|(rule, halt)| (rule, column, halt)));
                     if samples == 10 {
-                        let hazard = steps.iter().map(|s| (s.resolved.hazard_probability, s.path_probability));
-                        outcome.hazard_probability = hazard_probability(hazard);
+                        outcome.hazard_probability = evidence.hazard_probability() as f32;
                     }
                 }
                 (actions, outcome)
@@ -151,7 +151,7 @@ pub fn planning_table(
     for (actions, outcome) in &results {
         for &(rule, column, halted) in actions {
             let right = halted == (outcome.kind == DriveKind::Hazard);
-            count(&mut table, rules[rule].name(), SAMPLE_COUNTS[column], outcome.kind, right);
+            count(&mut table, policies[rule].rule.name(), SAMPLE_COUNTS[column], outcome.kind, right);
         }
     }
     (table, results.into_iter().map(|(_, outcome)| outcome).collect())

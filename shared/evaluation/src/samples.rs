@@ -1,8 +1,9 @@
 //! Do the probed samples name the state that comes next?
 
-use carff_belief::Probe;
+use carff_checkpoint::FieldProbe;
 use carff_dataset::Equivalence;
-use carff_latent::{LatentGaussian, Sampling};
+use carff_decision::Sampling;
+use carff_messages::Gaussian;
 use carff_models::mixture::MixtureNet;
 use serde::{Deserialize, Serialize};
 
@@ -50,7 +51,7 @@ pub struct Input {
     /// Pose.
     pub view: usize,
     /// The posterior.
-    pub posterior: LatentGaussian,
+    pub posterior: Gaussian,
     /// Names the random draws.
     pub frame: u64,
 }
@@ -58,7 +59,7 @@ pub struct Input {
 /// Accuracy of `count` probed samples from each input whose state has a next one.
 pub fn sample_accuracy(
     net: &MixtureNet,
-    probe: &mut Probe,
+    probe: &mut FieldProbe,
     inputs: &[Input],
     timestamps: usize,
     equivalence: &Equivalence,

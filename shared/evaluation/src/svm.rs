@@ -3,7 +3,7 @@
 //! As scikit-learn's `SVC()` does it: the kernel's width is its `scale` convention, and pairs vote. The machines are
 //! linfa's.
 
-use carff_latent::LATENT_DIM;
+use carff_messages::LATENT_DIM;
 use carff_random::Key;
 use linfa::{Dataset, traits::Fit, traits::Predict};
 use linfa_svm::Svm;

@@ -2,10 +2,9 @@
 
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
-use carff_belief::{Plan, hazard_probability, look_ahead};
 use carff_dataset::Observability;
+use carff_decision::{Evidence, Plan, Sampling, look_ahead};
 use carff_evaluation::Models;
-use carff_latent::Sampling;
 use carff_scenes::{RenderOptions, Scenario};
 use std::path::Path;
 
@@ -34,8 +33,7 @@ fn hidden_views_give_an_even_belief() {
             frame: (view * 2 + branch) as u64,
         };
         let steps = look_ahead(|input, _| models.mixture.forecast(input), &mut models.probe, &posterior, plan);
-        let steps = steps.iter().map(|s| (s.resolved.hazard_probability, s.path_probability));
-        (hidden, f64::from(hazard_probability(steps)))
+        (hidden, Evidence::of_steps(&steps).hazard_probability())
     };
     let mut pairs = Vec::new();
     // Every second ego view: enough to see, and quick to render.

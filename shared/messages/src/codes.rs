@@ -1,6 +1,8 @@
 //! Numbers that stand for names, with checked conversion.
 
 use crate::Invalid;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
 
 macro_rules! codes {
     ($(#[$doc:meta])* $name:ident: $repr:ty, $field:literal { $($(#[$vdoc:meta])* $variant:ident = $code:literal $text:literal),+ $(,)? }) => {
@@ -9,12 +11,17 @@ macro_rules! codes {
         pub enum $name { $($(#[$vdoc])* $variant),+ }
 
         impl $name {
-            /// All of them, in the order of their codes.
-            pub const ALL: &[Self] = &[$(Self::$variant),+];
+            /// All of them, in the order of their declaration.
+            pub const ALL: [Self; [$($code),+].len()] = [$(Self::$variant),+];
 
             /// The number that travels.
             pub const fn code(self) -> $repr {
                 match self { $(Self::$variant => $code),+ }
+            }
+
+            /// The one of this name, if there is one.
+            pub fn from_name(name: &str) -> Option<Self> {
+                Self::ALL.into_iter().find(|known| known.name() == name)
             }
 
             /// The name in reports and logs.
@@ -90,15 +97,18 @@ codes! {
 }
 
 codes! {
-    /// The decision rule in force.
-    RuleCode: u32, "rule" {
-        /// Always halt.
+    /// A decision rule (paper section 4.3).
+    #[derive(Default, Serialize, Deserialize, JsonSchema)]
+    #[serde(rename_all = "kebab-case")]
+    Rule: u32, "rule" {
+        /// Always halt: a planner that trusts nothing it cannot see.
         Underconfident = 0 "underconfident",
-        /// Always advance.
+        /// Always advance: a planner that believes only what it sees.
         Overconfident = 1 "overconfident",
-        /// Halt when samples disagree or show the actor.
+        /// Halt when the samples disagree or any of them shows the hazard.
         Paper = 2 "paper",
-        /// Halt when the hazard probability reaches a calibrated threshold.
+        /// Halt when the hazard probability reaches the threshold.
+        #[default]
         Calibrated = 3 "calibrated",
     }
 }
@@ -114,16 +124,31 @@ codes! {
 }
 
 codes! {
-    /// How much of the dynamic actor, or of the place where it would be, a picture shows.
+    /// The share of the dynamic actor, or of the place where it would be, that an image shows.
+    #[derive(Serialize, Deserialize, JsonSchema)]
+    #[serde(rename_all = "lowercase")]
     Observability: i32, "observability" {
-        /// Not in the data set.
-        Unknown = -1 "unknown",
-        /// Hidden.
-        None = 0 "none",
-        /// In part.
-        Partial = 1 "partial",
-        /// Fully.
+        /// Fully visible: at least 75 % of its pixels, and at least 12.
         Full = 2 "full",
+        /// Visible in part.
+        Partial = 1 "partial",
+        /// Hidden: at most 2 % of its pixels show.
+        None = 0 "none",
+    }
+}
+
+impl Observability {
+    /// The code that stands for an observability that is not known.
+    pub const UNKNOWN: i32 = -1;
+
+    /// Returns the code of a known or unknown observability.
+    pub fn code_of(observability: Option<Self>) -> i32 {
+        observability.map_or(Self::UNKNOWN, Self::code)
+    }
+
+    /// Returns the observability of a code, `None` where it is not known; an error for a code without a meaning.
+    pub fn of_code(code: i32) -> Result<Option<Self>, Invalid> {
+        if code == Self::UNKNOWN { Ok(None) } else { Self::try_from(code).map(Some) }
     }
 }
 

@@ -1,7 +1,7 @@
 //! The controller's action.
 
 use crate::check::{at_most, probability};
-use crate::{ActionCode, Header, Invalid, MAX_SAMPLES, Reason, RuleCode, message};
+use crate::{ActionCode, Header, Invalid, MAX_SAMPLES, Reason, Rule, message};
 use iceoryx2::prelude::ZeroCopySend;
 
 /// What the car does until the next action, and why.
@@ -15,7 +15,7 @@ pub struct Action {
     pub action: u32,
     /// Code of a [`Reason`].
     pub reason: u32,
-    /// Code of a [`RuleCode`].
+    /// Code of a [`Rule`].
     pub rule: u32,
     /// Samples that the belief rested on.
     pub sample_count: u32,
@@ -50,7 +50,7 @@ impl Action {
         self.header.validate()?;
         ActionCode::try_from(self.action)?;
         Reason::try_from(self.reason)?;
-        RuleCode::try_from(self.rule)?;
+        Rule::try_from(self.rule)?;
         at_most("sample_count", self.sample_count.into(), MAX_SAMPLES as u64)?;
         at_most("is_decision", self.is_decision.into(), 1)?;
         probability("confidence", self.confidence)?;

@@ -6,10 +6,13 @@ use crate::{
     ViewKind, message,
 };
 use iceoryx2::prelude::ZeroCopySend;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
 
 /// An ideal pinhole camera's intrinsics, pixels.
 #[repr(C)]
-#[derive(Clone, Copy, Debug, Default, PartialEq, ZeroCopySend)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, ZeroCopySend, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
 #[type_name("carff.Intrinsics.v1")]
 pub struct Intrinsics {
     /// Focal length along x.
@@ -78,7 +81,7 @@ impl DatasetView {
     fn check(&self) -> Result<(), Invalid> {
         at_most("dataset_view.known", self.known.into(), 1)?;
         at_most("dataset_view.last_of_timestamp", self.last_of_timestamp.into(), 1)?;
-        Observability::try_from(self.observability)?;
+        Observability::of_code(self.observability)?;
         for (field, value) in [
             ("dataset_view.view", self.view),
             ("dataset_view.branch", self.branch),

@@ -6,13 +6,23 @@ use crate::{
     message,
 };
 use iceoryx2::prelude::ZeroCopySend;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
 
 /// Log-variances beyond this are an error of the sender: a standard deviation of e^-15 or e^15.
 const MAX_ABS_LOG_VARIANCE: f32 = 30.0;
 
-/// A diagonal Gaussian over the scene latent: q(z | I) = N(mean, diag exp(log-variance)).
+/// A diagonal Gaussian over the scene latent: q(z | I) = N(mean, diag exp(log-variance)) (paper section 3.1).
+///
+/// ```
+/// use carff_messages::Gaussian;
+/// let posterior = Gaussian { mean: [1.0; 8], log_variance: [4.0_f32.ln(); 8] };
+/// // One deviation above the mean: the deviation is 2.
+/// assert_eq!(posterior.at(&[1.0; 8]), [3.0; 8]);
+/// ```
 #[repr(C)]
-#[derive(Clone, Copy, Debug, PartialEq, ZeroCopySend)]
+#[derive(Clone, Copy, Debug, PartialEq, ZeroCopySend, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
 #[type_name("carff.Gaussian.v1")]
 pub struct Gaussian {
     /// Mean.
@@ -27,13 +37,18 @@ impl Gaussian {
         Self { mean: [0.0; LATENT_DIM], log_variance: [0.0; LATENT_DIM] }
     }
 
+    /// Returns mean + exp(log-variance / 2) * `unit`, for a draw `unit` from the standard normal distribution.
+    pub fn at(&self, unit: &[f32; LATENT_DIM]) -> [f32; LATENT_DIM] {
+        std::array::from_fn(|i| self.mean[i] + (0.5 * self.log_variance[i]).exp() * unit[i])
+    }
+
     fn check(&self) -> Result<(), Invalid> {
         finite("gaussian.mean", &self.mean)?;
         within("gaussian.log_variance", &self.log_variance, -MAX_ABS_LOG_VARIANCE, MAX_ABS_LOG_VARIANCE)
     }
 }
 
-/// What the encoder sees in a frame.
+/// The encoder's answer to a frame: the posterior over the scene latent.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, ZeroCopySend)]
 #[type_name("carff.Posterior.v1")]
@@ -139,7 +154,7 @@ impl Forecast {
 
 message!(Forecast);
 
-/// What probing found in one latent.
+/// The result of probing one latent.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, ZeroCopySend)]
 #[type_name("carff.ProbeResult.v2")]
@@ -150,23 +165,28 @@ pub struct ProbeResult {
     pub confidence: f32,
     /// Probability that the scene of this latent holds the hazard, 0..=1.
     pub hazard_likelihood: f32,
-    /// Density found at each place, 1/metre, at least 0.
-    pub densities: [f32; MAX_PLACES],
+    /// Occupancy of each place, 0..=1.
+    pub occupancies: [f32; MAX_PLACES],
 }
 
 impl ProbeResult {
-    /// Nothing found.
-    pub const NONE: Self = Self { state: -1, confidence: 0.0, hazard_likelihood: 0.0, densities: [0.0; MAX_PLACES] };
+    /// The known state that the scene of this latent shows, if any.
+    pub fn state(&self) -> Option<usize> {
+        usize::try_from(self.state).ok()
+    }
+
+    /// A probe that found nothing.
+    pub const NONE: Self = Self { state: -1, confidence: 0.0, hazard_likelihood: 0.0, occupancies: [0.0; MAX_PLACES] };
 
     fn check(&self, states: u32, places: u32) -> Result<(), Invalid> {
         in_range("probe.state", self.state.into(), -1, i64::from(states) - 1)?;
         probability("probe.confidence", self.confidence)?;
         probability("probe.hazard_likelihood", self.hazard_likelihood)?;
-        within("probe.densities", &self.densities[..places as usize], 0.0, f32::MAX)
+        within("probe.occupancies", &self.occupancies[..places as usize], 0.0, 1.0)
     }
 }
 
-/// What the prober makes of a forecast. Entries beyond the counts mean nothing.
+/// The prober's answer to a forecast: a belief over the known states. Entries beyond the counts mean nothing.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, ZeroCopySend)]
 #[type_name("carff.Belief.v2")]
@@ -238,6 +258,16 @@ impl Belief {
             forecaster_ns: 0,
             stage_latency_ns: 0,
         }
+    }
+
+    /// The results of the components in use.
+    pub fn components(&self) -> &[ProbeResult] {
+        &self.components[..(self.component_count as usize).min(MAX_COMPONENTS)]
+    }
+
+    /// Reports whether this is the frame's last step.
+    pub fn is_final(&self) -> bool {
+        self.is_final == 1
     }
 
     /// The results of the samples in use.

@@ -17,13 +17,16 @@
 
 pub mod check;
 mod codes;
+mod convert;
 mod decision;
+pub mod forms;
 mod frame;
 mod health;
 mod latent;
 
 pub use check::Invalid;
-pub use codes::{ActionCode, ForecastSource, HealthState, Observability, Reason, RuleCode, Stage, ViewKind};
+pub use codes::{ActionCode, ForecastSource, HealthState, Observability, Reason, Rule, Stage, ViewKind};
+pub use convert::row_major;
 pub use decision::Action;
 pub use frame::{DatasetView, FrameMeta, Intrinsics, ViewMeta};
 pub use health::Health;

@@ -70,7 +70,7 @@ fn one_wrong_field_is_enough() {
         |m| m.hazard_probability = -0.1,
         |m| m.path_probability = f32::NAN,
         |m| m.samples[9].state = 6,
-        |m| m.samples[9].densities[2] = -1.0,
+        |m| m.samples[9].occupancies[2] = -1.0,
         |m| m.components[1].confidence = 1.5,
         |m| m.resolved.mean[0] = f32::NEG_INFINITY,
     ];
@@ -103,17 +103,17 @@ fn entries_beyond_the_counts_mean_nothing() {
     assert_eq!(forecast.validate(), Ok(()));
     let mut belief = belief();
     belief.samples[10].state = 1000;
-    belief.samples[0].densities[3] = f32::NAN;
+    belief.samples[0].occupancies[3] = f32::NAN;
     assert_eq!(belief.validate(), Ok(()));
 }
 
 /// Codes survive the way there and back; others are refused.
 #[test]
 fn codes_round_trip() {
-    for &state in HealthState::ALL {
+    for state in HealthState::ALL {
         assert_eq!(HealthState::try_from(state.code()), Ok(state));
     }
-    for &observability in Observability::ALL {
+    for observability in Observability::ALL {
         assert_eq!(Observability::try_from(observability.code()), Ok(observability));
     }
     assert!(Stage::try_from(0).is_err() && Stage::try_from(7).is_err());

@@ -1,7 +1,7 @@
 //! The pose-conditional VAE's decoder: from a scene latent and a pose's number to that pose's picture (section 3.2).
 
 use carff_checkpoint::shapes::DecoderConfig;
-use carff_latent::LATENT_DIM;
+use carff_messages::LATENT_DIM;
 use tch::{Tensor, nn, nn::Module};
 
 /// Side of the decoder's pictures, pixels.

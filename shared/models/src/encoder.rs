@@ -5,7 +5,7 @@ use crate::{
     backbone::{self, Backbone},
 };
 use carff_checkpoint::shapes::EncoderConfig;
-use carff_latent::{LATENT_DIM, LatentGaussian};
+use carff_messages::{Gaussian, LATENT_DIM};
 use std::path::Path;
 use tch::{Kind, Tensor, nn, nn::Module};
 
@@ -114,7 +114,7 @@ impl Encoder {
     }
 
     /// The posteriors of pictures `[N, 3, H, W]`.
-    pub fn encode(&self, pictures: &Tensor) -> Vec<LatentGaussian> {
+    pub fn encode(&self, pictures: &Tensor) -> Vec<Gaussian> {
         tch::no_grad(|| {
             let (mean, log_variance) = self.posterior(&self.features(pictures), 0.0);
             gaussians(&mean, &log_variance)
@@ -122,7 +122,7 @@ impl Encoder {
     }
 
     /// The posterior of one picture, `[H, W, 3]` bytes.
-    pub fn encode_bytes(&self, picture: &Tensor) -> Option<LatentGaussian> {
+    pub fn encode_bytes(&self, picture: &Tensor) -> Option<Gaussian> {
         self.encode(&pictures_from_bytes(&picture.unsqueeze(0))).into_iter().next()
     }
 }
@@ -133,7 +133,7 @@ pub fn pictures_from_bytes(bytes: &Tensor) -> Tensor {
 }
 
 /// Two `[N, 8]` tensors to Gaussians.
-pub fn gaussians(mean: &Tensor, log_variance: &Tensor) -> Vec<LatentGaussian> {
+pub fn gaussians(mean: &Tensor, log_variance: &Tensor) -> Vec<Gaussian> {
     let rows = |t: &Tensor| {
         let mut flat = vec![0.0_f32; t.numel()];
         let t = t.to_device(tch::Device::Cpu).contiguous();
@@ -143,9 +143,6 @@ pub fn gaussians(mean: &Tensor, log_variance: &Tensor) -> Vec<LatentGaussian> {
     rows(mean)
         .chunks_exact(LATENT_DIM)
         .zip(rows(log_variance).chunks_exact(LATENT_DIM))
-        .map(|(m, v)| LatentGaussian {
-            mean: std::array::from_fn(|i| m[i]),
-            log_variance: std::array::from_fn(|i| v[i]),
-        })
+        .map(|(m, v)| Gaussian { mean: std::array::from_fn(|i| m[i]), log_variance: std::array::from_fn(|i| v[i]) })
         .collect()
 }

@@ -2,7 +2,8 @@
 
 use crate::{ModelError, encoder::gaussians};
 use carff_checkpoint::shapes::MixtureConfig;
-use carff_latent::{LATENT_DIM, LatentGaussian, Mixture};
+use carff_decision::Mixture;
+use carff_messages::{Gaussian, LATENT_DIM};
 use tch::{Kind, Tensor, nn, nn::Module};
 
 /// Component log-variances are kept inside this range.
@@ -77,14 +78,14 @@ impl MixtureNet {
     }
 
     /// The belief over the next latent, for one posterior.
-    pub fn forecast(&self, posterior: &LatentGaussian) -> Mixture {
+    pub fn forecast(&self, posterior: &Gaussian) -> Mixture {
         self.forecast_all(std::slice::from_ref(posterior)).remove(0)
     }
 
     /// The beliefs over the next latent, for many posteriors at once.
-    pub fn forecast_all(&self, posteriors: &[LatentGaussian]) -> Vec<Mixture> {
+    pub fn forecast_all(&self, posteriors: &[Gaussian]) -> Vec<Mixture> {
         tch::no_grad(|| {
-            let flat = |part: fn(&LatentGaussian) -> &[f32; LATENT_DIM]| {
+            let flat = |part: fn(&Gaussian) -> &[f32; LATENT_DIM]| {
                 let values: Vec<f32> = posteriors.iter().flat_map(|p| part(p).iter().copied()).collect();
                 Tensor::from_slice(&values).view([-1, LATENT_DIM as i64]).to_device(self.device())
             };
@@ -114,7 +115,7 @@ mod tests {
         tch::manual_seed(3);
         let store = VarStore::new(Device::Cpu);
         let net = MixtureNet::new(&store.root(), &MixtureConfig::default()).unwrap();
-        let posterior = LatentGaussian { mean: [0.3; 8], log_variance: [-1.0; 8] };
+        let posterior = Gaussian { mean: [0.3; 8], log_variance: [-1.0; 8] };
         let target = [0.1_f32, -0.2, 0.3, 0.0, 0.5, -0.5, 0.2, 0.9];
         let m = net.forecast(&posterior);
         let density: f64 = m

@@ -1,7 +1,7 @@
 //! Contract of weights on disk: what is read computes what was written, to the bit, where numbers fit half precision.
 
 use carff_checkpoint::{Manifest, files, shapes::BackboneKind};
-use carff_latent::LatentGaussian;
+use carff_messages::Gaussian;
 use carff_models::{
     decoder::Decoder,
     encoder::Encoder,
@@ -51,7 +51,7 @@ fn networks_come_back_as_they_were() {
             kept.extend(round(&backbone));
         }
         save_weights(dir, files::ENCODER, &kept).unwrap();
-        let read: Vec<LatentGaussian> = load_encoder(dir, &manifest).unwrap().encode(&picture);
+        let read: Vec<Gaussian> = load_encoder(dir, &manifest).unwrap().encode(&picture);
         assert_eq!(read, encoder.encode(&picture), "{kind:?}");
     }
 
@@ -65,6 +65,6 @@ fn networks_come_back_as_they_were() {
     let store = VarStore::new(Device::Cpu);
     let mixture = MixtureNet::new(&(store.root() / "mixture"), &manifest.mixture).unwrap();
     save_weights(dir, files::MIXTURE, &round(&store)).unwrap();
-    let posterior = LatentGaussian { mean: [0.3; 8], log_variance: [-1.0; 8] };
+    let posterior = Gaussian { mean: [0.3; 8], log_variance: [-1.0; 8] };
     assert_eq!(load_mixture(dir, &manifest).unwrap().forecast(&posterior), mixture.forecast(&posterior));
 }

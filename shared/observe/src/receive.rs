@@ -1,8 +1,8 @@
 //! Receiving from a topic whose kind is only known at run time.
 
 use crate::TopicId;
+use carff_messages::forms::AnyMessage;
 use carff_messages::{Action, Belief, Forecast, FrameMeta, Health, Posterior, ViewMeta};
-use carff_readable::AnyMessage;
 use carff_transport::{Input, Node, OpenError, Picture, PictureReceiver, ReceiveError, Receiver, Sample, topics};
 
 /// A message of any topic, in its sender's memory.

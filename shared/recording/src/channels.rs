@@ -1,11 +1,11 @@
 //! The channels that recordings and the live bridge have in common: names, schemas, and what a message is on each.
 
 use crate::{StandardMessage, standard_messages};
-use carff_observe::TopicId;
-use carff_probing::Place;
-use carff_readable::{
+use carff_decision::Place;
+use carff_messages::forms::{
     ActionForm, AnyMessage, BeliefForm, ForecastForm, FrameForm, HealthForm, PosteriorForm, ViewForm, schema,
 };
+use carff_observe::TopicId;
 use foxglove::messages::{CameraCalibration, FrameTransform, RawImage, SceneUpdate};
 use foxglove::{Encode, Schema};
 

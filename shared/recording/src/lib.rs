@@ -1,7 +1,7 @@
 //! Runs as MCAP files: writing them while a graph runs, reading them back message by message, and the well-known
 //! robotics schemas that other tools know pictures, calibrations and boxes by.
 //!
-//! A recording holds each message's form ([`carff_readable`]) as JSON on the channel of its topic, with its JSON Schema;
+//! A recording holds each message's form ([`carff_messages::forms`]) as JSON on the channel of its topic, with its JSON Schema;
 //! besides, for other tools, `camera/image` and `renderer/image` (`foxglove.RawImage`, which also carry the pictures),
 //! `camera/calibration` (`foxglove.CameraCalibration`), `camera/pose` (`foxglove.FrameTransform`) and `prober/boxes`
 //! (`foxglove.SceneUpdate`), all protobuf. Log times are wall-clock times; the monotonic times are in the forms' headers.
@@ -23,7 +23,7 @@ pub use rotation::{Limits, RotatingWriter};
 pub use standard::{StandardMessage, standard_messages};
 pub use writer::Writer;
 
-use carff_readable::FormError;
+use carff_messages::forms::FormError;
 use std::path::PathBuf;
 
 /// Why a recording cannot be written or read.

@@ -2,13 +2,13 @@
 
 use crate::about::METADATA;
 use crate::{About, MessageError, RecordingError};
+use carff_messages::forms::{
+    ActionForm, AnyMessage, BeliefForm, ForecastForm, FrameForm, HealthForm, PosteriorForm, ViewForm,
+};
 use carff_messages::{
     Action, Belief, Forecast, FrameMeta, Health, MAX_PICTURE_BYTES, PictureMeta, Posterior, ViewMeta,
 };
 use carff_observe::TopicId;
-use carff_readable::{
-    ActionForm, AnyMessage, BeliefForm, ForecastForm, FrameForm, HealthForm, PosteriorForm, ViewForm,
-};
 use foxglove::Decode;
 use foxglove::messages::RawImage;
 use mcap::records::Record;

@@ -1,9 +1,9 @@
 //! A recording as one file after another, each within limits.
 
 use crate::{About, RecordingError, Writer};
+use carff_decision::Place;
+use carff_messages::forms::AnyMessage;
 use carff_observe::TopicId;
-use carff_probing::Place;
-use carff_readable::AnyMessage;
 use std::collections::VecDeque;
 use std::path::{Path, PathBuf};
 

@@ -1,8 +1,8 @@
 //! The well-known robotics schemas: pictures, calibrations, poses, boxes. Shared by recordings and the live bridge.
 
+use carff_decision::Place;
+use carff_messages::forms::AnyMessage;
 use carff_messages::{FrameMeta, Intrinsics};
-use carff_probing::Place;
-use carff_readable::AnyMessage;
 use foxglove::messages::{
     CameraCalibration, Color, CubePrimitive, FrameTransform, Pose, Quaternion, RawImage, SceneEntity, SceneUpdate,
     Timestamp, Vector3,

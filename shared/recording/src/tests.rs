@@ -1,11 +1,11 @@
 use super::*;
+use carff_decision::Place;
 use carff_geometry::OrientedBox;
+use carff_messages::forms::AnyMessage;
 use carff_messages::{
     Action, Belief, DatasetView, FrameMeta, Gaussian, Header, Intrinsics, Posterior, ProbeResult, ViewMeta,
 };
 use carff_observe::TopicId;
-use carff_probing::Place;
-use carff_readable::AnyMessage;
 use std::io::Write as _;
 use std::path::Path;
 

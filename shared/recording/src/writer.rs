@@ -2,9 +2,9 @@
 
 use crate::about::METADATA;
 use crate::{About, RecordingError, channels, encode};
+use carff_decision::Place;
+use carff_messages::forms::AnyMessage;
 use carff_observe::TopicId;
-use carff_probing::Place;
-use carff_readable::AnyMessage;
 use mcap::records::{MessageHeader, Metadata};
 use mcap::write::NoSeek;
 use mcap::{Compression, WriteOptions};

@@ -3,7 +3,7 @@
 use crate::subject::{ROLES, Subject};
 use carff_dataset::PoseRole;
 use carff_evaluation::svm::{cross_validated, fit_and_name, grouped_folds, stratified_folds};
-use carff_latent::LATENT_DIM;
+use carff_messages::LATENT_DIM;
 use carff_training::{
     accuracy::{ByObservability, Centroids, Share, state_accuracy},
     vae::{DecodedQuality, decoded_quality},

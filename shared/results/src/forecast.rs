@@ -2,13 +2,14 @@
 
 use crate::subject::{ROLES, Subject};
 use crate::{FrequencyTable, ResultsError};
-use carff_belief::Probe;
+use carff_checkpoint::FieldProbe;
 use carff_dataset::{Observability, PoseRole};
+use carff_decision::{Mixture, Sampling};
 use carff_evaluation::draws::{
     Curve, OpenInput, Shown, TrialCurve, accuracy_curve, expected_recall, frequencies, met_all, recall_curve,
     right_shares,
 };
-use carff_latent::{LATENT_DIM, LatentGaussian, Mixture, Sampling};
+use carff_messages::{Gaussian, LATENT_DIM};
 use carff_plots::{Panel, Series};
 use carff_random::Key;
 use carff_training::run::Progress;
@@ -62,7 +63,7 @@ pub struct RoleCurves {
 /// One picture, taken with sensor noise.
 struct Input {
     picture: usize,
-    posterior: LatentGaussian,
+    posterior: Gaussian,
     mixture: Mixture,
     /// States that can come next, and those that are there, for all that the picture tells.
     next: Vec<usize>,
@@ -95,7 +96,7 @@ pub fn forecast(subject: &Subject, on_progress: &dyn Fn(&Progress)) -> Result<Ta
         if inputs.is_empty() {
             continue;
         }
-        let posteriors: Vec<LatentGaussian> = inputs.iter().map(|i| i.posterior).collect();
+        let posteriors: Vec<Gaussian> = inputs.iter().map(|i| i.posterior).collect();
         for (input, forecast) in inputs.iter_mut().zip(mixture.forecast_all(&posteriors)) {
             input.mixture = forecast;
         }
@@ -151,7 +152,7 @@ fn inputs(subject: &Subject, role: PoseRole) -> Vec<Input> {
 /// Draws and probes for each input, as often as it takes to make `least` trials.
 fn trials<'a>(
     subject: &Subject,
-    probe: &Probe,
+    probe: &FieldProbe,
     inputs: &[&'a Input],
     least: usize,
     with_stratified: bool,
@@ -160,7 +161,7 @@ fn trials<'a>(
     let all: Vec<(&Input, u64)> =
         inputs.iter().flat_map(|&i| (0..repeats).map(move |r| (i, (i.picture * MOST_REPEATS + r) as u64))).collect();
     let seed = subject.options.seed;
-    let run = |probe: &mut Probe, (input, frame): (&'a Input, u64)| {
+    let run = |probe: &mut FieldProbe, (input, frame): (&'a Input, u64)| {
         let mut show = |latents: &[[f32; LATENT_DIM]]| -> Vec<Shown> {
             probe.probe_all(latents).iter().map(|p| Shown::of(&p.reading)).collect()
         };
@@ -184,7 +185,7 @@ fn trials<'a>(
             }
             let latents: Vec<_> = distinct.values().copied().collect();
             let shown: BTreeMap<_, _> = distinct.into_keys().zip(show(&latents)).collect();
-            let look_up = |(i, d): (usize, &carff_latent::Draw)| shown[&(i, d.component)];
+            let look_up = |(i, d): (usize, &carff_decision::Draw)| shown[&(i, d.component)];
             stratified = sets.iter().map(|set| set.iter().enumerate().map(look_up).collect()).collect();
         }
         Trial { input, independent: show(&independent), posterior: show(&posterior), stratified }

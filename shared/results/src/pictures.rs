@@ -1,12 +1,13 @@
 //! Table 1: pictures of the field against true ones, from above and from poses it was not trained on.
 
 use crate::subject::{ROLES, Subject};
-use carff_belief::Probe;
+use carff_checkpoint::FieldProbe;
 use carff_dataset::{Image, PoseRole};
+use carff_decision::Sampling;
 use carff_evaluation::{PairMeans, pair_means};
 use carff_field::{RenderBuffer, RenderOptions};
 use carff_geometry::PinholeCamera;
-use carff_latent::{LATENT_DIM, Sampling};
+use carff_messages::LATENT_DIM;
 use carff_metrics::{mean, psnr_db, psnr_where, ssim};
 use carff_training::run::Progress;
 use serde::{Deserialize, Serialize};
@@ -133,13 +134,13 @@ pub fn spread(all: &[usize], count: usize) -> Vec<usize> {
 
 /// Renders for pictures that are compared.
 pub struct Artist<'a> {
-    probe: &'a Probe,
+    probe: &'a FieldProbe,
     options: RenderOptions,
     buffer: RenderBuffer,
 }
 
 impl<'a> Artist<'a> {
-    pub fn new(probe: &'a Probe, threads: usize) -> Self {
+    pub fn new(probe: &'a FieldProbe, threads: usize) -> Self {
         let options = RenderOptions { threads: threads.max(1), ..RenderOptions::default() };
         Self { probe, options, buffer: RenderBuffer::new() }
     }

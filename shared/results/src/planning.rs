@@ -7,10 +7,10 @@ use carff_dataset::{
     PoseRole,
     drives::{DriveKind, EligibleInput, eligible_inputs},
 };
+use carff_decision::{Policy, Sampling};
 use carff_evaluation::{PlanningTable, Trial, planning_table, trial, trials};
-use carff_latent::Sampling;
+use carff_messages::Rule;
 use carff_metrics::{Reliability, reliability};
-use carff_planning::Rule;
 use carff_plots::{Panel, Series};
 use carff_random::Key;
 use carff_training::run::Progress;
@@ -96,8 +96,11 @@ pub fn planning(subject: &Subject, on_progress: &dyn Fn(&Progress)) -> Result<Fo
     if let Some(why) = subject.probe.as_ref().err().or(subject.mixture.as_ref().err()) {
         return Ok(Err(why.clone()));
     }
-    let mut rules = vec![Rule::Underconfident, Rule::Overconfident, Rule::Paper];
-    rules.extend(subject.threshold.map(|threshold| Rule::Calibrated { threshold }));
+    let policy = |rule| match (rule, subject.threshold) {
+        (Rule::Calibrated, None) => None,
+        (rule, threshold) => Some(Policy { rule, threshold: threshold.unwrap_or(1.0) }),
+    };
+    let rules: Vec<Policy> = Rule::ALL.into_iter().filter_map(policy).collect();
     let mut results = PlanningResults { threshold: subject.threshold, ..PlanningResults::default() };
     let tell = |done, line: &str| on_progress(&Progress { stage: "planning", done, total: 5, line: line.to_owned() });
     let parts = [PoseRole::Rest, PoseRole::Calibration, PoseRole::Unseen];
@@ -166,7 +169,7 @@ fn take(subject: &Subject, inputs: &[EligibleInput], repeats: usize) -> Result<V
     Ok(trials(&subject.encoder, dataset, inputs, repeats, &subject.noise(), seed)?)
 }
 
-fn decide(subject: &Subject, trials: &[Trial], rules: &[Rule], sampling: Sampling) -> PlanningTable {
+fn decide(subject: &Subject, trials: &[Trial], rules: &[Policy], sampling: Sampling) -> PlanningTable {
     match (&subject.mixture, &subject.probe) {
         (Ok(net), Ok(probe)) => planning_table(net, probe, trials, rules, sampling, subject.horizon()).0,
         _ => PlanningTable::new(),

@@ -1,15 +1,14 @@
 //! What is judged: a checkpoint, a data set that shows its scenario, and what the encoder makes of its pictures.
 
 use crate::{About, ResultsError};
-use carff_belief::Probe;
-use carff_checkpoint::{CheckpointError, Manifest, ScenarioIdentity};
-use carff_config::CheckpointPlanning;
+use carff_checkpoint::CheckpointPlanning;
+use carff_checkpoint::{CheckpointError, FieldProbe, Manifest, ScenarioIdentity};
 use carff_dataset::{
     Image, PoseRole,
     drives::DriveKind,
     sensor::{SensorNoise, apply_noise_into},
 };
-use carff_latent::LatentGaussian;
+use carff_messages::Gaussian;
 use carff_models::{
     decoder::Decoder,
     encoder::{Encoder, pictures_from_bytes},
@@ -46,11 +45,11 @@ pub struct Subject {
     /// Posterior to mixture, or why there is none.
     pub mixture: Result<MixtureNet, String>,
     /// Hypothesis to state, or why there is none.
-    pub probe: Result<Probe, String>,
+    pub probe: Result<FieldProbe, String>,
     /// The data set.
     pub pictures: Pictures,
     /// The posterior of each picture as it is.
-    pub posteriors: Vec<LatentGaussian>,
+    pub posteriors: Vec<Gaussian>,
     /// Threshold of the calibrated rule, where one was chosen.
     pub threshold: Option<f64>,
     /// Folder of the training run, where it is at hand: its curves are drawn.
@@ -82,7 +81,7 @@ impl Subject {
             checkpoint: checkpoint.to_owned(),
             decoder: load_decoder(checkpoint, &manifest)?,
             mixture: or_why(load_mixture(checkpoint, &manifest))?,
-            probe: or_why(Probe::load(checkpoint, &manifest))?,
+            probe: or_why(carff_checkpoint::load_field_probe(checkpoint, &manifest))?,
             posteriors: Vec::with_capacity(pictures.images.len()),
             threshold: CheckpointPlanning::load(checkpoint).ok().map(|p| p.hazard_threshold),
             manifest,

@@ -4,7 +4,7 @@ use crate::StageArgs;
 use crate::health::{Heartbeat, Vitals};
 use crate::realtime;
 use anyhow::Context;
-use carff_config::{GraphConfig, LogFormat, LogLevel, StageRealtime};
+use carff_config::{GraphConfig, LogFormat, LogLevel};
 use carff_messages::{Header, Health, HealthState, Message, PictureMeta, Stage};
 use carff_transport::{
     Input, Node, PicturePublisher, PictureReceiver, PictureTopic, Publisher, Receiver, Run, Stop, Topic, Waiter, Woken,
@@ -56,7 +56,7 @@ pub fn describe(error: &anyhow::Error) -> String {
 fn start(stage: Stage, args: StageArgs) -> anyhow::Result<StageContext> {
     die_with_parent(args.parent_pid)?;
     let graph = GraphConfig::load(&args.graph)?;
-    init_log(level(&graph, stage), graph.log.format);
+    init_log(graph.stage(stage).log, graph.launcher.log_format);
     StageContext::new(stage, args, graph)
 }
 
@@ -87,7 +87,7 @@ impl StageContext {
     /// Joins the run and starts the heartbeat. [`main`] does this; tests call it in their own process.
     pub fn new(stage: Stage, args: StageArgs, graph: GraphConfig) -> anyhow::Result<Self> {
         // First of all, so that all threads inherit it.
-        realtime::schedule(settings(&graph, stage));
+        realtime::schedule(graph.stage(stage), graph.stage_nice(stage));
         let stop = Stop::on_signals().context("cannot handle signals")?;
         let run = Run::new(args.run.as_deref().unwrap_or(&graph.run.name), args.run_id)?;
         let node = Node::open(&run, stage.name())?;
@@ -96,27 +96,12 @@ impl StageContext {
         let counters = node.counters().clone();
         let heartbeat = Heartbeat::start(stage, graph.run.seed, publisher, vitals.clone(), counters)
             .context("cannot start the heartbeat")?;
-        let threads = match stage {
-            Stage::Encoder => graph.threads.encoder,
-            Stage::Forecaster => graph.threads.forecaster,
-            Stage::Prober => graph.threads.prober,
-            Stage::Renderer => graph.threads.renderer,
-            Stage::Camera | Stage::Controller => 1,
-        };
-        let deadline_ms = match stage {
-            Stage::Encoder => graph.encoder.deadline_ms,
-            Stage::Forecaster => graph.forecaster.deadline_ms,
-            Stage::Prober => graph.prober.deadline_ms,
-            Stage::Renderer => graph.renderer.deadline_ms,
-            Stage::Camera => (1000.0 / graph.run.frame_rate_hz) as u64,
-            Stage::Controller => graph.controller.deadline_ms,
-        };
         Ok(Self {
             dataset: graph.resolve(args.dataset.as_ref().unwrap_or(&graph.run.dataset)),
             checkpoint: graph.resolve(args.checkpoint.as_ref().unwrap_or(&graph.run.checkpoint)),
-            threads: threads as usize,
+            threads: graph.stage(stage).threads as usize,
             stage,
-            deadline_ns: deadline_ms.max(1) * 1_000_000,
+            deadline_ns: graph.stage_deadline_ms(stage) * 1_000_000,
             waiter: Waiter::new(stop),
             vitals,
             begun: false,
@@ -172,7 +157,7 @@ impl StageContext {
         if let Err(error) = self.node.run().reserve_shared_memory() {
             tracing::warn!(%error, "shared memory cannot be reserved; should it run full, a stage may be killed");
         }
-        realtime::settle(settings(&self.graph, self.stage));
+        realtime::settle(self.graph.stage(self.stage));
         self.vitals.set_state(HealthState::Ok);
         self.vitals.progress();
         if let Some(heartbeat) = &self.heartbeat {
@@ -246,30 +231,6 @@ fn die_with_parent(parent_pid: Option<u32>) -> anyhow::Result<()> {
     let parent = getppid().map_or(0, |pid| pid.as_raw_nonzero().get() as u32);
     anyhow::ensure!(parent == expected, "the launcher (process {expected}) has ended");
     Ok(())
-}
-
-fn settings(graph: &GraphConfig, stage: Stage) -> &StageRealtime {
-    let realtime = &graph.realtime;
-    match stage {
-        Stage::Camera => &realtime.camera,
-        Stage::Encoder => &realtime.encoder,
-        Stage::Forecaster => &realtime.forecaster,
-        Stage::Prober => &realtime.prober,
-        Stage::Renderer => &realtime.renderer,
-        Stage::Controller => &realtime.controller,
-    }
-}
-
-fn level(graph: &GraphConfig, stage: Stage) -> LogLevel {
-    let log = &graph.log;
-    match stage {
-        Stage::Camera => log.camera,
-        Stage::Encoder => log.encoder,
-        Stage::Forecaster => log.forecaster,
-        Stage::Prober => log.prober,
-        Stage::Renderer => log.renderer,
-        Stage::Controller => log.controller,
-    }
 }
 
 /// One line for each event on standard error, `LEVEL message fields` or a JSON object of them; the launcher adds time and

@@ -1,7 +1,7 @@
 //! What the graph file asks of the system for one process: processors, priority, resident memory.
 //! Whatever the system refuses is a warning; the stage goes on without.
 
-use carff_config::StageRealtime;
+use carff_config::StageConfig;
 use rustix::process::{Resource, getrlimit};
 use std::io;
 
@@ -9,11 +9,11 @@ use std::io;
 const PAGE_BYTES: usize = 4096;
 
 /// Sets processors, niceness and scheduling policy of the calling thread; threads that it starts inherit them.
-pub(crate) fn schedule(settings: &StageRealtime) {
+pub(crate) fn schedule(settings: &StageConfig, nice: Option<i32>) {
     if !settings.cpus.is_empty() {
         warn_if_refused("cpus", pin(&settings.cpus));
     }
-    if let Some(nice) = settings.nice {
+    if let Some(nice) = nice {
         warn_if_refused("nice", rustix::process::setpriority_process(None, nice).map_err(Into::into));
     }
     if let Some(priority) = settings.fifo_priority {
@@ -22,7 +22,7 @@ pub(crate) fn schedule(settings: &StageRealtime) {
 }
 
 /// Touches heap and locks memory, once all that lasts has been loaded.
-pub(crate) fn settle(settings: &StageRealtime) {
+pub(crate) fn settle(settings: &StageConfig) {
     if settings.prefault_mb > 0 {
         prefault(settings.prefault_mb as usize * (1 << 20));
     }
@@ -33,7 +33,7 @@ pub(crate) fn settle(settings: &StageRealtime) {
 
 fn warn_if_refused(what: &str, result: io::Result<()>) {
     if let Err(error) = result {
-        tracing::warn!(%error, "the system refuses `realtime` setting `{what}`: going on without");
+        tracing::warn!(%error, "the system refuses the stage's setting `{what}`; the stage continues without it");
     }
 }
 
@@ -88,14 +88,14 @@ mod tests {
         std::thread::spawn(|| {
             let all = rustix::thread::sched_getaffinity(None).unwrap();
             let first = (0..1024).find(|&cpu| all.is_set(cpu)).unwrap();
-            schedule(&StageRealtime { cpus: vec![first as u32], nice: Some(19), ..StageRealtime::default() });
+            schedule(&StageConfig { cpus: vec![first as u32], ..StageConfig::default() }, Some(19));
             let pinned = rustix::thread::sched_getaffinity(None).unwrap();
             assert_eq!((pinned.count(), pinned.is_set(first)), (1, true));
             assert_eq!(rustix::process::getpriority_process(None).unwrap(), 19);
             // No machine has this processor.
-            schedule(&StageRealtime { cpus: vec![1023], fifo_priority: Some(99), ..StageRealtime::default() });
+            schedule(&StageConfig { cpus: vec![1023], fifo_priority: Some(99), ..StageConfig::default() }, None);
             assert!(rustix::thread::sched_getaffinity(None).unwrap().is_set(first));
-            settle(&StageRealtime { prefault_mb: 2, ..StageRealtime::default() });
+            settle(&StageConfig { prefault_mb: 2, ..StageConfig::default() });
         })
         .join()
         .unwrap();

@@ -2,7 +2,7 @@
 
 use crate::pictures::Pictures;
 use carff_dataset::{Observability, PoseRole};
-use carff_latent::{LATENT_DIM, LatentGaussian};
+use carff_messages::{Gaussian, LATENT_DIM};
 use serde::{Deserialize, Serialize};
 
 /// State centroids with one pooled variance per dimension.
@@ -18,7 +18,7 @@ impl Centroids {
     /// Centroids of the posterior means of those pictures that show the actor's place fully and whose pose is neither
     /// unseen nor used for calibration; of a state with no such picture, of all its pictures from these poses. `None` when a
     /// state has none at all.
-    pub fn fit(pictures: &Pictures, posteriors: &[LatentGaussian]) -> Option<Self> {
+    pub fn fit(pictures: &Pictures, posteriors: &[Gaussian]) -> Option<Self> {
         let states = pictures.scenario.state_count();
         let mut sums = vec![[0.0_f64; LATENT_DIM]; states];
         let mut counts = vec![0_usize; states];
@@ -123,7 +123,7 @@ impl ByObservability {
 /// State accuracy of the posterior means of `chosen` pictures.
 pub fn state_accuracy(
     pictures: &Pictures,
-    posteriors: &[LatentGaussian],
+    posteriors: &[Gaussian],
     centroids: &Centroids,
     chosen: &[usize],
 ) -> ByObservability {

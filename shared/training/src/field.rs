@@ -12,7 +12,7 @@ use crate::{
 };
 use carff_dataset::PoseRole;
 use carff_field::{Field, FieldConfig, FieldTrainer, NamedTensor, RayBatch, RaySampler, TrainingView, changed_pixels};
-use carff_latent::{LATENT_DIM, LatentGaussian};
+use carff_messages::{Gaussian, LATENT_DIM};
 use carff_models::weights::Tensors;
 use carff_random::Key;
 use rand::Rng;
@@ -56,13 +56,13 @@ impl Default for FieldTraining {
 
 /// Per state, the posteriors that stand for it.
 pub struct Clouds {
-    by_state: Vec<Vec<LatentGaussian>>,
+    by_state: Vec<Vec<Gaussian>>,
 }
 
 impl Clouds {
     /// The posteriors of the views that tell each state.
-    pub fn new(pictures: &Pictures, posteriors: &[LatentGaussian]) -> Result<Self, TrainingError> {
-        let by_state: Vec<Vec<LatentGaussian>> =
+    pub fn new(pictures: &Pictures, posteriors: &[Gaussian]) -> Result<Self, TrainingError> {
+        let by_state: Vec<Vec<Gaussian>> =
             telling(pictures).into_iter().map(|views| views.into_iter().map(|i| posteriors[i]).collect()).collect();
         match by_state.iter().position(Vec::is_empty) {
             Some(state) => Err(TrainingError::Unfit(format!("no trained view of state {state} shows enough"))),
@@ -71,12 +71,12 @@ impl Clouds {
     }
 
     /// Per state one Gaussian: the mean of the means, and the mean variance.
-    pub fn states(&self) -> Vec<LatentGaussian> {
+    pub fn states(&self) -> Vec<Gaussian> {
         self.by_state
             .iter()
             .map(|cloud| {
                 let n = cloud.len() as f32;
-                LatentGaussian {
+                Gaussian {
                     mean: std::array::from_fn(|d| cloud.iter().map(|g| g.mean[d]).sum::<f32>() / n),
                     log_variance: std::array::from_fn(|d| {
                         (cloud.iter().map(|g| g.log_variance[d].exp()).sum::<f32>() / n).ln()

@@ -15,7 +15,7 @@ use crate::{
 use carff_dataset::{DatasetWriter, FrameRecord, Image, PoseRole, ScenarioInfo};
 use carff_field::{Field, HypothesisBuffer, RenderOptions};
 use carff_geometry::PinholeCamera;
-use carff_latent::{LATENT_DIM, LatentGaussian};
+use carff_messages::{Gaussian, LATENT_DIM};
 use carff_random::Key;
 use rand::Rng;
 use std::path::{Path, PathBuf};
@@ -74,7 +74,7 @@ pub fn set(config: &TrainingConfig, dataset: &Path, run: &Run) -> Result<Option<
 
 fn make(config: &TrainingConfig, pictures: &Pictures, dir: &Path, run: &Run) -> Result<bool, TrainingError> {
     let codes = codes(pictures, config.seed);
-    let of_pictures: Vec<LatentGaussian> = pictures.labels.iter().map(|label| codes[label.state]).collect();
+    let of_pictures: Vec<Gaussian> = pictures.labels.iter().map(|label| codes[label.state]).collect();
     let clouds = Clouds::new(pictures, &of_pictures)?;
     let field = field::train_stage(config, pictures, &clouds, STAGE, config.free_poses.field_steps, run)?;
     let latents: Vec<[f32; LATENT_DIM]> = codes.iter().map(|code| code.mean).collect();
@@ -139,7 +139,7 @@ fn settle(of_states: &mut [Vec<u8>]) {
 }
 
 /// A latent for each state, drawn once; states that look the same from every trained pose have one.
-fn codes(pictures: &Pictures, seed: u64) -> Vec<LatentGaussian> {
+fn codes(pictures: &Pictures, seed: u64) -> Vec<Gaussian> {
     let states = pictures.scenario.state_count();
     let mut views: Vec<usize> = pictures.trained().into_iter().map(|i| pictures.labels[i].view).collect();
     views.sort_unstable();
@@ -149,7 +149,7 @@ fn codes(pictures: &Pictures, seed: u64) -> Vec<LatentGaussian> {
             let same = |other: &usize| views.iter().all(|&view| pictures.equivalence.same(view, state, *other));
             let first = (0..state).find(same).unwrap_or(state);
             let mean = carff_random::gaussians(Key { seed, frame: first as u64, step: 0x636f_6465, sample: 0 });
-            LatentGaussian { mean, log_variance: [-10.0; LATENT_DIM] }
+            Gaussian { mean, log_variance: [-10.0; LATENT_DIM] }
         })
         .collect()
 }

@@ -33,7 +33,7 @@ pub enum TrainingError {
     Checkpoint(#[from] carff_checkpoint::CheckpointError),
     /// The scenario cannot be probed.
     #[error(transparent)]
-    Probing(#[from] carff_probing::ProbingError),
+    Probing(#[from] carff_decision::ProbingError),
     /// The curves cannot be drawn.
     #[error(transparent)]
     Plot(#[from] carff_plots::PlotError),

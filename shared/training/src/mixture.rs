@@ -10,7 +10,7 @@ use crate::{
     pictures::Pictures,
     run::{Progress, Run, SaveClock, cosine, damaged, part, prefixed},
 };
-use carff_latent::{LATENT_DIM, LatentGaussian};
+use carff_messages::{Gaussian, LATENT_DIM};
 use carff_models::{
     ModelError,
     adam::Adam,
@@ -53,7 +53,7 @@ impl Mdn {
 pub fn train(
     config: &TrainingConfig,
     pictures: &Pictures,
-    posteriors: &[Vec<LatentGaussian>],
+    posteriors: &[Vec<Gaussian>],
     mdn: &Mdn,
     run: &Run,
 ) -> Result<(), TrainingError> {
@@ -142,7 +142,7 @@ pub fn telling(pictures: &Pictures) -> Vec<Vec<usize>> {
 }
 
 /// Mean negative log-likelihood over given pairs, for tests and reports.
-pub fn likelihood(net: &MixtureNet, inputs: &[LatentGaussian], targets: &[[f32; LATENT_DIM]]) -> f64 {
+pub fn likelihood(net: &MixtureNet, inputs: &[Gaussian], targets: &[[f32; LATENT_DIM]]) -> f64 {
     let rows = |values: Vec<f32>| Tensor::from_slice(&values).view([-1, LATENT_DIM as i64]).to_device(net.device());
     tch::no_grad(|| {
         net.negative_log_likelihood(

@@ -10,15 +10,16 @@ use crate::{
     run::{Progress, Run, damaged},
     vae::{self, Inputs, Vae},
 };
+use carff_checkpoint::CheckpointPlanning;
 use carff_checkpoint::{FORMAT_VERSION, Manifest, ScenarioIdentity, SplitRecord, files, save_field};
-use carff_config::CheckpointPlanning;
 use carff_dataset::{Observability, PoseRole, drives::eligible_inputs};
+use carff_decision::{
+    Calibration, CalibrationTrial, Evidence, Policy, ProbeLayout, Sampling, choose_threshold, unchosen_threshold,
+};
 use carff_evaluation::{Input, Models, Trial, birds_eye, planning_table, sample_accuracy, trials};
 use carff_field::{Field, RenderBuffer, RenderOptions};
-use carff_latent::{LATENT_DIM, LatentGaussian, Sampling};
+use carff_messages::{Gaussian, LATENT_DIM};
 use carff_models::stored::save_weights;
-use carff_planning::{CalibrationTrial, Rule, choose_threshold, unchosen_threshold};
-use carff_probing::{Calibration, Prober};
 use carff_random::Key;
 use serde_json::{Value, json};
 use std::path::Path;
@@ -138,7 +139,7 @@ fn field_alone(
                 .into(),
         ));
     }
-    let only = LatentGaussian { mean: [0.0; LATENT_DIM], log_variance: [-10.0; LATENT_DIM] };
+    let only = Gaussian { mean: [0.0; LATENT_DIM], log_variance: [-10.0; LATENT_DIM] };
     let clouds = Clouds::new(pictures, &vec![only; pictures.images.len()])?;
     let mut field = field::train(config, pictures, &clouds, run)?;
     field.round_to_f16();
@@ -182,7 +183,7 @@ fn posteriors_of(
     pictures: &Pictures,
     vae: &mut Vae,
     run: &Run,
-) -> Result<Vec<Vec<LatentGaussian>>, TrainingError> {
+) -> Result<Vec<Vec<Gaussian>>, TrainingError> {
     match run.load_posteriors(config.augmentation.copies + 1, pictures.images.len())? {
         Some(posteriors) => Ok(posteriors),
         None => Inputs::new(config, pictures, vae, run)?.all_posteriors(vae, run),
@@ -211,7 +212,7 @@ fn finished(
 }
 
 /// What the manifest says before anything is trained but the states' latents.
-fn begun(config: &TrainingConfig, pictures: &Pictures, states: Vec<LatentGaussian>) -> Manifest {
+fn begun(config: &TrainingConfig, pictures: &Pictures, states: Vec<Gaussian>) -> Manifest {
     Manifest {
         format_version: FORMAT_VERSION,
         scenario: ScenarioIdentity::of(&pictures.scenario, pictures.dataset.view_count()),
@@ -267,8 +268,8 @@ fn calibrate_probing(
     field: &Field,
     clouds: &Clouds,
     seed: u64,
-) -> Result<(Prober, Calibration), TrainingError> {
-    let prober = Prober::new(manifest.places.clone(), manifest.scenario.hazard_states())?;
+) -> Result<(ProbeLayout, Calibration), TrainingError> {
+    let prober = ProbeLayout::new(manifest.places.clone(), manifest.scenario.hazard_states())?;
     let places = prober.places().len();
     let mut densities = vec![0.0; prober.points().len()];
     let occupancies: Vec<Vec<f32>> = (0..prober.state_count())
@@ -325,23 +326,22 @@ fn calibrate_threshold(
     }
     let mut found = Vec::with_capacity(trials.len());
     for trial in &trials {
-        let plan = carff_belief::Plan {
+        let plan = carff_decision::Plan {
             samples: settings.samples,
             sampling: Sampling::Stratified,
             horizon: settings.horizon,
             seed: trial.seed,
             frame: trial.frame,
         };
-        let steps = carff_belief::look_ahead(
+        let steps = carff_decision::look_ahead(
             |input, _| models.mixture.forecast(input),
             &mut models.probe,
             &trial.posterior,
             plan,
         );
-        let hazard =
-            carff_belief::hazard_probability(steps.iter().map(|s| (s.resolved.hazard_probability, s.path_probability)));
+        let hazard = Evidence::of_steps(&steps).hazard_probability();
         found.push(CalibrationTrial {
-            hazard_probability: f64::from(hazard),
+            hazard_probability: hazard,
             halt_is_right: trial.kind == carff_dataset::drives::DriveKind::Hazard,
         });
     }
@@ -375,7 +375,7 @@ fn figures(
 ) -> Result<Value, TrainingError> {
     let unfit = |e: &dyn std::fmt::Display| TrainingError::Unfit(e.to_string());
     let threshold = CheckpointPlanning::load(out).map_err(|e| unfit(&e))?.hazard_threshold;
-    let rules = [Rule::Underconfident, Rule::Overconfident, Rule::Paper, Rule::Calibrated { threshold }];
+    let rules = Policy::all(threshold);
     let mut planning = serde_json::Map::new();
     let tables = [
         ("all_views", PoseRole::Rest),

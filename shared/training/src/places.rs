@@ -1,9 +1,9 @@
 //! The boxes that are probed, out of what a scenario says stands where in each of its states.
 
 use crate::TrainingError;
-use carff_checkpoint::{MAX_PLACES, MAX_STATES};
 use carff_dataset::{NamedBox, ScenarioInfo};
-use carff_probing::Place;
+use carff_decision::Place;
+use carff_messages::{MAX_PLACES, MAX_STATES};
 
 /// Every distinct box of the states, and every candidate, with the states in which it is taken. Boxes that no state
 /// moves tell nothing and are left out; where there are too many, so are those that are not dynamic.

@@ -1,7 +1,7 @@
 //! What every training loop does the same way: report, save, stop.
 
 use crate::{TrainingError, curves};
-use carff_latent::{LATENT_DIM, LatentGaussian};
+use carff_messages::{Gaussian, LATENT_DIM};
 use carff_models::{
     encoder::gaussians,
     weights::{self, Tensors},
@@ -72,7 +72,7 @@ impl Run<'_> {
     }
 
     /// Keeps posteriors `[copy][picture]`, so that later stages need no picture to pass the backbone again.
-    pub fn save_posteriors(&self, posteriors: &[Vec<LatentGaussian>]) -> Result<(), TrainingError> {
+    pub fn save_posteriors(&self, posteriors: &[Vec<Gaussian>]) -> Result<(), TrainingError> {
         let all = || posteriors.iter().flatten();
         let shape = [posteriors.len() as i64, -1, LATENT_DIM as i64];
         let rows = |values: Vec<f32>| Tensor::from_slice(&values).view(shape);
@@ -84,11 +84,7 @@ impl Run<'_> {
     }
 
     /// Posteriors that were kept; `None` when there are none, or those of other pictures.
-    pub fn load_posteriors(
-        &self,
-        copies: usize,
-        pictures: usize,
-    ) -> Result<Option<Vec<Vec<LatentGaussian>>>, TrainingError> {
+    pub fn load_posteriors(&self, copies: usize, pictures: usize) -> Result<Option<Vec<Vec<Gaussian>>>, TrainingError> {
         let path = self.dir.join(POSTERIORS);
         if !path.is_file() {
             return Ok(None);

@@ -14,7 +14,7 @@ use crate::{
     run::{Progress, Run, SaveClock, cosine, damaged, part, prefixed},
 };
 use carff_dataset::{PoseRole, sensor::SensorNoise};
-use carff_latent::{LATENT_DIM, LatentGaussian};
+use carff_messages::{Gaussian, LATENT_DIM};
 use carff_models::{
     ModelError,
     adam::Adam,
@@ -227,7 +227,7 @@ impl<'a> Inputs<'a> {
     }
 
     /// The posteriors of all pictures in all copies, `[copy][picture]`; kept in the run's folder, in place of the features.
-    pub fn all_posteriors(&self, vae: &Vae, run: &Run) -> Result<Vec<Vec<LatentGaussian>>, TrainingError> {
+    pub fn all_posteriors(&self, vae: &Vae, run: &Run) -> Result<Vec<Vec<Gaussian>>, TrainingError> {
         let all: Vec<_> = (0..=self.config.augmentation.copies).map(|copy| self.posteriors(vae, copy)).collect();
         run.save_posteriors(&all)?;
         features::remove(&run.dir)?;
@@ -235,7 +235,7 @@ impl<'a> Inputs<'a> {
     }
 
     /// The posteriors of all pictures, in one copy.
-    fn posteriors(&self, vae: &Vae, copy: usize) -> Vec<LatentGaussian> {
+    fn posteriors(&self, vae: &Vae, copy: usize) -> Vec<Gaussian> {
         let all: Vec<usize> = (0..self.pictures.images.len()).collect();
         tch::no_grad(|| {
             all.chunks(FEATURE_BATCH * 4)
@@ -546,7 +546,7 @@ pub fn evaluate(
     config: &TrainingConfig,
     pictures: &Pictures,
     vae: &Vae,
-    posteriors: &[LatentGaussian],
+    posteriors: &[Gaussian],
     picture_quality: bool,
 ) -> Result<serde_json::Value, TrainingError> {
     let centroids = Centroids::fit(pictures, posteriors)

@@ -8,7 +8,8 @@ use carff_checkpoint::{
     Manifest,
     shapes::{BackboneConfig, BackboneKind, EncoderConfig},
 };
-use carff_latent::{LatentGaussian, Sampling};
+use carff_decision::Sampling;
+use carff_messages::Gaussian;
 use carff_models::{
     borrow,
     encoder::{Encoder, gaussians, pictures_from_bytes},
@@ -169,6 +170,6 @@ fn in_bf16(args: &EncoderArgs, manifest: &Manifest, encoder: &Encoder, rgb: &[u8
 }
 
 /// From bytes to posterior, as the encoder stage does it.
-fn encode(encoder: &Encoder, rgb: &[u8]) -> Option<LatentGaussian> {
+fn encode(encoder: &Encoder, rgb: &[u8]) -> Option<Gaussian> {
     borrow::with_picture(rgb, SIDE_PX, SIDE_PX, |picture| encoder.encode_bytes(picture)).flatten()
 }

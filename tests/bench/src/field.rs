@@ -5,15 +5,14 @@ use crate::limits::{matrix_product, triad};
 use crate::report::{Report, number, table};
 use crate::stats::{Contender, Ratio, Times, in_turns, timed};
 use anyhow::Context;
-use carff_belief::Probe;
-use carff_checkpoint::Manifest;
+use carff_checkpoint::{FieldProbe, Manifest, load_field_probe};
+use carff_decision::{Draw, Mixture};
 use carff_field::{
     Field, FieldConfig, FieldTrainer, HypothesisBuffer, InstructionSet, LATENT_DIM, RayBatch, RayLimits, RaySamples,
     RenderBuffer, RenderOptions, TrainerConfig,
 };
 use carff_field_reference::{Precision, Rays, ReferenceField, Samples, huber_sum};
 use carff_geometry::{PinholeCamera, Ray};
-use carff_latent::{Draw, Mixture};
 use carff_random::{Key, gaussians, uniform};
 use std::path::PathBuf;
 use std::time::Instant;
@@ -56,7 +55,7 @@ pub(crate) fn run(args: &FieldArgs) -> anyhow::Result<Report> {
     tch::set_num_threads(threads as i32);
     let manifest = Manifest::load(&args.checkpoint)?;
     let field = carff_checkpoint::load_field(&args.checkpoint, &manifest)?;
-    let mut probe = Probe::load(&args.checkpoint, &manifest)?;
+    let mut probe = load_field_probe(&args.checkpoint, &manifest)?;
     let states: Vec<[f32; LATENT_DIM]> = manifest.states.iter().map(|s| s.mean).collect();
     anyhow::ensure!(!states.is_empty(), "checkpoint {}: it knows no states", args.checkpoint.display());
     println!(
@@ -368,15 +367,15 @@ impl Bench {
     }
 
     /// Probing ten hypotheses, as the prober does it (one thread), and their densities alone.
-    fn probes(&self, probe: &mut Probe, states: &[[f32; LATENT_DIM]], report: &mut Report) {
+    fn probes(&self, probe: &mut FieldProbe, states: &[[f32; LATENT_DIM]], report: &mut Report) {
         let draws: Vec<[f32; LATENT_DIM]> = (0..HYPOTHESES)
             .map(|i| {
                 let noise = random_latent(i as u64);
                 std::array::from_fn(|k| states[i % states.len()][k] + 0.2 * noise[k])
             })
             .collect();
-        let field = probe.field().clone();
-        let points = field.prepare(probe.prober().points());
+        let field = Field::clone(probe.field());
+        let points = field.prepare(probe.layout().points());
         let mut densities = vec![0.0; points.len() * draws.len()];
         let mixture = Mixture { weights: Vec::new(), components: Vec::new() };
         let drawn = || draws.iter().map(|z| Draw { latent: *z, component: 0 }).collect::<Vec<_>>();

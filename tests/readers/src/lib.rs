@@ -4,15 +4,16 @@
 mod raw;
 mod valid;
 
+use carff_checkpoint::CheckpointPlanning;
 use carff_checkpoint::Manifest;
-use carff_config::{CheckpointPlanning, GraphConfig, Kind, SoakConfig};
+use carff_config::{GraphConfig, Kind, SoakConfig};
 use carff_dataset::{Dataset, Image, ImportOptions, import};
 use carff_field::FieldConfig;
+use carff_messages::forms::AnyMessage;
 use carff_messages::{
     Action, Belief, Forecast, FrameMeta, Health, MAX_PICTURE_BYTES, Message, PictureMeta, Posterior, ViewMeta,
 };
 use carff_observe::{RunRecord, TopicId};
-use carff_readable::AnyMessage;
 use carff_recording::{About, Reader as RecordingReader, Writer};
 use carff_scenes::Scenario;
 use carff_training::config::TrainingConfig;

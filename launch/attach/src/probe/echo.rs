@@ -1,8 +1,8 @@
 //! `carff probe echo`: shows messages as text or JSON lines.
 
 use super::session::{Session, SessionArgs};
+use carff_messages::forms::as_text;
 use carff_observe::TopicId;
-use carff_readable::as_text;
 use clap::Args;
 use std::io::Write;
 

@@ -129,7 +129,7 @@ fn rows(vitals: &RunVitals) -> Vec<Vec<String>> {
     let mut rows = vec![HEAD.map(str::to_owned).to_vec()];
     for stage in Stage::ALL {
         let none = StageVitals::default();
-        let v = vitals.stages.get(stage).unwrap_or(&none);
+        let v = vitals.stages.get(&stage).unwrap_or(&none);
         rows.push(vec![
             stage.name().to_owned(),
             v.state_name(now_ns).to_owned(),

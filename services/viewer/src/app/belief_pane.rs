@@ -3,7 +3,7 @@
 use super::scene_pane::TAKEN;
 use super::{Viewer, theme};
 use crate::session::Selection;
-use carff_belief::Step;
+use carff_decision::Step;
 use eframe::egui::{
     Align2, Color32, FontId, Rect, ScrollArea, Sense, Stroke, TextStyle, Ui, WidgetInfo, WidgetType, vec2,
 };
@@ -81,7 +81,7 @@ impl Viewer {
             ui.weak("light that each box stops");
         });
         let found = self.session.moment().and_then(|m| m.found.as_ref());
-        for (i, place) in self.session.models().probe.prober().places().iter().enumerate() {
+        for (i, place) in self.session.models().probe.layout().places().iter().enumerate() {
             let share = found.and_then(|f| f.probed.occupancies.get(i).copied());
             let taken_in: Vec<&str> = place
                 .occupied_in

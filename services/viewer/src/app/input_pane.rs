@@ -3,8 +3,8 @@
 
 use super::{Choice, Command, Viewer, theme};
 use carff_dataset::Observability;
-use carff_latent::{LatentGaussian, Sampling};
-use carff_messages::{HealthState, MAX_HORIZON, MAX_SAMPLES};
+use carff_decision::Sampling;
+use carff_messages::{Gaussian, HealthState, MAX_HORIZON, MAX_SAMPLES};
 use eframe::egui::{
     Button, ComboBox, DragValue, Grid, Image, Rect, ScrollArea, Sense, Slider, Stroke, Ui, load::SizedTexture, pos2,
     vec2,
@@ -122,7 +122,7 @@ impl Viewer {
     /// Mean and deviation of each of the latent's numbers.
     fn posterior(&self, ui: &mut Ui) {
         let Some(moment) = self.session.moment() else { return };
-        let LatentGaussian { mean, log_variance } = &moment.source;
+        let Gaussian { mean, log_variance } = &moment.source;
         let palette = theme::palette(ui.ctx());
         let name = match moment.source_state {
             None => "Posterior of the picture".to_owned(),

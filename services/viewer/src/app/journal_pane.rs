@@ -21,7 +21,7 @@ impl Viewer {
                 ui.set_min_width(width * DECISIONS);
                 ui.horizontal(|ui| {
                     ui.label(theme::heading("Decisions"));
-                    let rule = self.session.models().rule.name();
+                    let rule = self.session.models().policy.rule.name();
                     ui.weak(if watched.is_some() {
                         "of the running graph".to_owned()
                     } else {

@@ -49,7 +49,7 @@ impl Viewer {
         };
         let found = self.recent(latent).and_then(|recent| recent.found.as_ref());
         if self.overlays.boxes {
-            for (i, place) in self.session.models().probe.prober().places().iter().enumerate() {
+            for (i, place) in self.session.models().probe.layout().places().iter().enumerate() {
                 let taken = found.and_then(|f| f.probed.occupancies.get(i)).is_some_and(|o| *o >= TAKEN);
                 let corners = [[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]].map(|[x, y]| {
                     let p = place.oriented_box.point([x, y, 0.0]);

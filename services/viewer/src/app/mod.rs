@@ -210,7 +210,7 @@ impl Viewer {
         let field = session.models().field().clone();
         let bounds_m = session.models().bounds_m();
         let wake = waker.clone();
-        let places = session.models().probe.prober().places();
+        let places = session.models().probe.layout().places();
         let other_checkpoint = live.as_ref().and_then(|live| other_checkpoint(live, &session));
         let middle_m = carff_metrics::mean(&places.iter().map(|p| p.oriented_box.center[2]).collect::<Vec<_>>());
         Ok(Self {

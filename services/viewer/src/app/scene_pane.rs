@@ -75,7 +75,7 @@ impl Viewer {
         let palette = theme::on_pictures();
         let at = |p: [f64; 2]| rect.min + vec2(p[0] as f32, p[1] as f32);
         let found = self.recent(&self.drawn.view).and_then(|recent| recent.found.as_ref());
-        let prober = self.session.models().probe.prober();
+        let prober = self.session.models().probe.layout();
         if let (Some(found), true) = (found, self.overlays.densities) {
             for (point, density) in prober.points().iter().zip(&found.densities) {
                 let stopped = 1.0 - (-density.max(0.0) * POINT_LENGTH_M).exp();

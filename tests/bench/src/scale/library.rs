@@ -5,11 +5,9 @@ use super::{Axis, Law, Row};
 use crate::field::birds_eye;
 use crate::stats::{Contender, Times, in_turns, timed};
 use anyhow::ensure;
-use carff_belief::Probe;
-use carff_checkpoint::Manifest;
-use carff_field::{LATENT_DIM, RenderBuffer, RenderOptions};
-use carff_latent::{Draw, Mixture};
-use carff_probing::{Calibration, Place, Prober};
+use carff_checkpoint::{FieldProbe, Manifest, PreparedField, load_field_probe};
+use carff_decision::{Calibration, Draw, Mixture, Place, ProbeLayout};
+use carff_field::{Field, LATENT_DIM, RenderBuffer, RenderOptions};
 use rustix::time::{ClockId, clock_gettime};
 use std::cell::RefCell;
 use std::path::Path;
@@ -56,20 +54,21 @@ pub(crate) fn views(checkpoint: &Path, quick: bool) -> anyhow::Result<Axis> {
 /// Time of probing over the number of places.
 pub(crate) fn candidates(checkpoint: &Path, quick: bool) -> anyhow::Result<Axis> {
     let manifest = Manifest::load(checkpoint)?;
-    let mut base = Probe::load(checkpoint, &manifest)?;
+    let mut base = load_field_probe(checkpoint, &manifest)?;
     ensure!(!manifest.states.is_empty(), "checkpoint {}: it knows no states", checkpoint.display());
     let seen: Vec<Vec<f32>> = manifest.states.iter().map(|s| base.probe(&s.mean).occupancies).collect();
     let (counts, rounds): (&[u32], _) = if quick { (&PLACES_QUICK, 20) } else { (&PLACES, 200) };
     let latents: Vec<[f32; LATENT_DIM]> =
         (0..HYPOTHESES).map(|i| manifest.states[i % manifest.states.len()].mean).collect();
     let mut rows = measured(counts, rounds, |count| {
-        let places = repeated(base.prober().places(), count as usize);
-        let prober = Prober::new(places, base.prober().hazard_states().to_vec())?;
+        let places = repeated(base.layout().places(), count as usize);
+        let layout = ProbeLayout::new(places, base.layout().hazard_states().to_vec())?;
         // What was seen at the places that are repeated; how well it fits is of no matter for speed.
         let seen: Vec<Vec<f32>> =
             seen.iter().map(|row| row.iter().copied().cycle().take(count as usize).collect()).collect();
-        let calibration = Calibration::fit(&prober, &seen)?;
-        let mut probe = Probe::new(base.field().clone(), prober, calibration, manifest.states.clone());
+        let calibration = Calibration::fit(&layout, &seen)?;
+        let field = PreparedField::new(Field::clone(base.field()), &layout);
+        let mut probe = FieldProbe::new(field, layout, calibration, manifest.states.clone());
         let latents = &latents;
         Ok(move || {
             let mixture = Mixture { weights: Vec::new(), components: Vec::new() };
@@ -77,7 +76,7 @@ pub(crate) fn candidates(checkpoint: &Path, quick: bool) -> anyhow::Result<Axis>
             std::hint::black_box(probe.step(mixture, draws, 1.0));
         })
     })?;
-    let points_a_place = base.prober().points().len() as f64 / base.prober().places().len() as f64;
+    let points_a_place = base.layout().points().len() as f64 / base.layout().places().len() as f64;
     for row in &mut rows {
         row.more.push(("points", f64::from(row.x) * points_a_place));
     }

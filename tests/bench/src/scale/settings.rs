@@ -7,8 +7,8 @@ use crate::probes::most_probes;
 use crate::report::number;
 use crate::stats::Times;
 use anyhow::{Context, ensure};
-use carff_config::{CameraSource, NoiseConfig};
-use carff_dataset::Image;
+use carff_config::CameraSource;
+use carff_dataset::{Image, sensor::SensorNoise};
 use carff_messages::{MAX_HORIZON, MAX_SAMPLES, Stage};
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
@@ -200,8 +200,7 @@ impl GraphBench {
             graph.camera.source = CameraSource::Folder;
             graph.camera.folder = Some(pictures.join(side_px.to_string()));
             // A real sensor's noise takes no time; that of the simulated one takes the longer, the more pixels.
-            graph.camera.noise =
-                NoiseConfig { sigma: 0.0, gain_sigma: 0.0, channel_gain_sigma: 0.0, channel_offset_sigma: 0.0 };
+            graph.camera.noise = SensorNoise::OFF;
         }
         measure(&Plan {
             graph,

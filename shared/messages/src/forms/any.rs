@@ -1,7 +1,7 @@
 //! A message whose kind is only known at run time.
 
-use crate::{ActionForm, BeliefForm, ForecastForm, FrameForm, HealthForm, PosteriorForm, ViewForm};
-use carff_messages::{Action, Belief, Forecast, FrameMeta, Header, Health, Posterior, ViewMeta};
+use super::{ActionForm, BeliefForm, ForecastForm, FrameForm, HealthForm, PosteriorForm, ViewForm};
+use crate::{Action, Belief, Forecast, FrameMeta, Header, Health, Posterior, ViewMeta};
 use serde_json::Value;
 
 /// A message of any topic; of pictures what describes them, and their bytes.

@@ -1,5 +1,5 @@
 use super::*;
-use carff_messages::{
+use crate::{
     Action, Belief, DatasetView, Forecast, ForecastSource, FrameMeta, Gaussian, Header, Health, Intrinsics, Posterior,
     ProbeResult, ViewMeta,
 };
@@ -54,9 +54,9 @@ fn belief(next: &mut impl FnMut() -> f32) -> Belief {
     belief.state_probability[..6].fill_with(|| probability(next) / 6.0);
     belief.component_weights[..2].copy_from_slice(&[0.3, 0.7]);
     let mut probe = |state| {
-        let mut densities = ProbeResult::NONE.densities;
-        densities[..3].fill_with(|| next().abs());
-        ProbeResult { state, confidence: probability(next), hazard_likelihood: probability(next), densities }
+        let mut occupancies = ProbeResult::NONE.occupancies;
+        occupancies[..3].fill_with(|| probability(next));
+        ProbeResult { state, confidence: probability(next), hazard_likelihood: probability(next), occupancies }
     };
     for i in 0..7 {
         belief.samples[i] = probe(i as i32 - 1);
@@ -156,21 +156,29 @@ fn messages_survive_their_forms() {
 #[test]
 fn what_is_no_message_is_refused() {
     let mut form = BeliefForm::from(&belief(&mut numbers()));
-    form.samples[0].densities = vec![0.0; 49];
-    assert!(Belief::try_from(&form).unwrap_err().to_string().contains("densities"));
-    form.samples[0].densities = vec![0.0; 3];
+    form.samples[0].occupancies = vec![0.0; 49];
+    assert!(Belief::try_from(&form).unwrap_err().to_string().contains("occupancies"));
+    form.samples[0].occupancies = vec![0.0; 3];
     form.hazard_probability = 2.0;
     assert!(Belief::try_from(&form).unwrap_err().to_string().contains("hazard_probability"));
 
     let posterior = Posterior { header: header(), gaussian: Gaussian::standard(), stage_latency_ns: 0 };
-    let mut form = PosteriorForm::from(&posterior);
-    form.gaussian.mean.pop();
-    assert!(Posterior::try_from(&form).unwrap_err().to_string().contains("gaussian.mean"));
+    let mut form = serde_json::to_value(PosteriorForm::from(&posterior)).unwrap();
+    form["gaussian"]["mean"].as_array_mut().unwrap().pop();
+    assert!(serde_json::from_value::<PosteriorForm>(form).unwrap_err().to_string().contains("array of length 8"));
 
     let mut form = ForecastForm::from(&Forecast::empty(header().at_step(1), ForecastSource::Observed, 1));
     form.source = "guessed".to_owned();
     let error = Forecast::try_from(&form).unwrap_err().to_string();
     assert!(error.contains("source") && error.contains("observed, probed"), "{error}");
+}
+
+/// A belief recorded when occupancies were called densities is still read.
+#[test]
+fn the_old_name_of_occupancies_is_read() {
+    let belief = belief(&mut numbers());
+    let old = serde_json::to_string(&BeliefForm::from(&belief)).unwrap().replace("occupancies", "densities");
+    assert_eq!(Belief::try_from(&serde_json::from_str::<BeliefForm>(&old).unwrap()).unwrap(), belief);
 }
 
 /// Every field of a form is described by its schema.

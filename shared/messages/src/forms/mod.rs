@@ -1,12 +1,12 @@
-//! Messages as JSON, and back: what people read, what recordings hold, and what other tools understand.
+//! The JSON form of each message, and the conversions to it and back.
 //!
-//! Each message has a form of its own: codes are names, arrays end where their counts say, and "none" is `null`. A form
-//! made of a message and turned back gives the same message, bit for bit, where it means something; what lies beyond the
-//! counts is zero. [`schema`] describes a form as JSON Schema.
+//! People, recordings and other tools read these forms. A form spells codes as names, ends arrays at their counts, and
+//! writes `null` for "none". A message converted to its form and back is the same message bit for bit; entries beyond
+//! the counts become zero. [`schema`] describes a form as JSON Schema.
 //!
 //! ```
 //! use carff_messages::{Gaussian, Header, Posterior};
-//! use carff_readable::PosteriorForm;
+//! use carff_messages::forms::PosteriorForm;
 //! let header = Header::of_frame(7, 1_000, 42);
 //! let posterior = Posterior { header, gaussian: Gaussian::standard(), stage_latency_ns: 5 };
 //! let text = serde_json::to_string(&PosteriorForm::from(&posterior))?;
@@ -26,13 +26,13 @@ mod text;
 
 pub use any::AnyMessage;
 pub use decision::ActionForm;
-pub use frame::{DatasetViewForm, FrameForm, IntrinsicsForm, ViewForm};
+pub use frame::{DatasetViewForm, FrameForm, ViewForm};
 pub use header::HeaderForm;
 pub use health::HealthForm;
-pub use latent::{BeliefForm, ComponentForm, DrawForm, ForecastForm, GaussianForm, PosteriorForm, ProbeForm};
+pub use latent::{BeliefForm, ComponentForm, DrawForm, ForecastForm, PosteriorForm, ProbeForm};
 pub use text::as_text;
 
-use carff_messages::Invalid;
+use crate::Invalid;
 use schemars::JsonSchema;
 
 /// Why a form is no message.
@@ -85,9 +85,9 @@ macro_rules! name_of {
 /// The code of a name.
 macro_rules! code_of {
     ($kind:ty, $field:literal, $name:expr) => {
-        <$kind>::ALL.iter().find(|c| c.name() == $name).map(|c| c.code()).ok_or_else(|| crate::FormError::UnknownName {
+        <$kind>::from_name(&$name).map(<$kind>::code).ok_or_else(|| $crate::forms::FormError::UnknownName {
             field: $field,
-            found: $name.clone(),
+            found: $name.to_owned(),
             known: <$kind>::ALL.iter().map(|c| c.name()).collect::<Vec<_>>().join(", "),
         })
     };

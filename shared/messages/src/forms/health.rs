@@ -1,7 +1,7 @@
 //! Heartbeats.
 
-use crate::{FormError, HeaderForm, code_of, name_of};
-use carff_messages::{Health, HealthState, Message, Stage};
+use super::{FormError, HeaderForm, code_of, name_of};
+use crate::{Health, HealthState, Message, Stage};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 

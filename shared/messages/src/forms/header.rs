@@ -1,7 +1,7 @@
 //! The header.
 
-use crate::FormError;
-use carff_messages::Header;
+use super::FormError;
+use crate::Header;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 

@@ -1,48 +1,21 @@
 //! Posteriors, forecasts, beliefs.
 
-use crate::{FormError, HeaderForm, array, begin, code_of, index, name_of, signed};
-use carff_messages::{
+use super::{FormError, HeaderForm, array, begin, code_of, index, name_of, signed};
+use crate::{
     Belief, Forecast, ForecastSource, Gaussian, LATENT_DIM, MAX_COMPONENTS, MAX_PLACES, MAX_SAMPLES, Message,
     Posterior, ProbeResult,
 };
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// A Gaussian over the scene latent, independent in each dimension.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields)]
-pub struct GaussianForm {
-    /// Mean.
-    pub mean: Vec<f32>,
-    /// Natural logarithm of the variance.
-    pub log_variance: Vec<f32>,
-}
-
-impl From<&Gaussian> for GaussianForm {
-    fn from(gaussian: &Gaussian) -> Self {
-        Self { mean: gaussian.mean.to_vec(), log_variance: gaussian.log_variance.to_vec() }
-    }
-}
-
-impl TryFrom<&GaussianForm> for Gaussian {
-    type Error = FormError;
-
-    fn try_from(form: &GaussianForm) -> Result<Self, FormError> {
-        Ok(Self {
-            mean: array("gaussian.mean", &form.mean)?,
-            log_variance: array("gaussian.log_variance", &form.log_variance)?,
-        })
-    }
-}
-
-/// What the encoder sees in a frame.
+/// The encoder's answer to a frame.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct PosteriorForm {
     /// Header, at step 0.
     pub header: HeaderForm,
     /// The latent's distribution.
-    pub gaussian: GaussianForm,
+    pub gaussian: Gaussian,
     /// Time from the arrival of the frame to sending, nanoseconds.
     pub stage_latency_ns: u64,
 }
@@ -51,7 +24,7 @@ impl From<&Posterior> for PosteriorForm {
     fn from(posterior: &Posterior) -> Self {
         Self {
             header: (&posterior.header).into(),
-            gaussian: (&posterior.gaussian).into(),
+            gaussian: posterior.gaussian,
             stage_latency_ns: posterior.stage_latency_ns,
         }
     }
@@ -63,7 +36,7 @@ impl TryFrom<&PosteriorForm> for Posterior {
     fn try_from(form: &PosteriorForm) -> Result<Self, FormError> {
         let posterior = Self {
             header: (&form.header).try_into()?,
-            gaussian: (&form.gaussian).try_into()?,
+            gaussian: form.gaussian,
             stage_latency_ns: form.stage_latency_ns,
         };
         posterior.validate()?;
@@ -78,7 +51,7 @@ pub struct ComponentForm {
     /// Its weight.
     pub weight: f32,
     /// Its distribution.
-    pub gaussian: GaussianForm,
+    pub gaussian: Gaussian,
 }
 
 /// A latent drawn from a mixture.
@@ -127,7 +100,7 @@ impl From<&Forecast> for ForecastForm {
             components: f.weights[..components]
                 .iter()
                 .zip(&f.components)
-                .map(|(&weight, gaussian)| ComponentForm { weight, gaussian: gaussian.into() })
+                .map(|(&weight, &gaussian)| ComponentForm { weight, gaussian })
                 .collect(),
             samples: f
                 .samples()
@@ -146,8 +119,7 @@ impl TryFrom<&ForecastForm> for Forecast {
 
     fn try_from(form: &ForecastForm) -> Result<Self, FormError> {
         let weights: Vec<f32> = form.components.iter().map(|c| c.weight).collect();
-        let components =
-            form.components.iter().map(|c| Gaussian::try_from(&c.gaussian)).collect::<Result<Vec<_>, _>>()?;
+        let components: Vec<Gaussian> = form.components.iter().map(|c| c.gaussian).collect();
         let latents = form
             .samples
             .iter()
@@ -174,7 +146,7 @@ impl TryFrom<&ForecastForm> for Forecast {
     }
 }
 
-/// What probing found in one latent.
+/// The result of probing one latent.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ProbeForm {
@@ -188,8 +160,9 @@ pub struct ProbeForm {
     pub confidence: f32,
     /// Probability that the scene holds the hazard.
     pub hazard_likelihood: f32,
-    /// Density found at each place, 1/metre.
-    pub densities: Vec<f32>,
+    /// Occupancy of each place, 0..=1. Recordings made before this field had its name call it `densities`.
+    #[serde(alias = "densities")]
+    pub occupancies: Vec<f32>,
 }
 
 impl ProbeForm {
@@ -200,7 +173,7 @@ impl ProbeForm {
             state: index(result.state),
             confidence: result.confidence,
             hazard_likelihood: result.hazard_likelihood,
-            densities: result.densities[..places].to_vec(),
+            occupancies: result.occupancies[..places].to_vec(),
         }
     }
 
@@ -209,12 +182,12 @@ impl ProbeForm {
             state: signed(self.state),
             confidence: self.confidence,
             hazard_likelihood: self.hazard_likelihood,
-            densities: begin("densities", &self.densities, 0.0)?,
+            occupancies: begin("occupancies", &self.occupancies, 0.0)?,
         })
     }
 }
 
-/// What the prober makes of a forecast.
+/// The prober's answer to a forecast.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct BeliefForm {
@@ -239,7 +212,7 @@ pub struct BeliefForm {
     /// The most probable state, fed back as the next step's input, if it is a known one.
     pub resolved_state: Option<u32>,
     /// That state's stored posterior.
-    pub resolved: GaussianForm,
+    pub resolved: Gaussian,
     /// Time that the encoder took for this frame, nanoseconds.
     pub encoder_ns: u64,
     /// Time that the forecaster took for this step, nanoseconds.
@@ -255,7 +228,7 @@ impl From<&Belief> for BeliefForm {
         Self {
             header: (&b.header).into(),
             horizon: b.horizon,
-            is_final: b.is_final == 1,
+            is_final: b.is_final(),
             place_count: b.place_count,
             state_probability: b.state_probability.iter().take(b.state_count as usize).copied().collect(),
             hazard_probability: b.hazard_probability,
@@ -273,7 +246,7 @@ impl From<&Belief> for BeliefForm {
                 .map(|(result, component)| ProbeForm::of(result, component, None, places))
                 .collect(),
             resolved_state: index(b.resolved_state),
-            resolved: (&b.resolved).into(),
+            resolved: b.resolved,
             encoder_ns: b.encoder_ns,
             forecaster_ns: b.forecaster_ns,
             stage_latency_ns: b.stage_latency_ns,
@@ -303,7 +276,7 @@ impl TryFrom<&BeliefForm> for Belief {
         belief.samples = begin::<_, MAX_SAMPLES>("samples", &samples, ProbeResult::NONE)?;
         belief.sample_component = begin("samples", &drawn_from, 0)?;
         belief.resolved_state = signed(form.resolved_state);
-        belief.resolved = (&form.resolved).try_into()?;
+        belief.resolved = form.resolved;
         belief.encoder_ns = form.encoder_ns;
         belief.forecaster_ns = form.forecaster_ns;
         belief.stage_latency_ns = form.stage_latency_ns;

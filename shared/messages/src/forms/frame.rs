@@ -1,35 +1,9 @@
 //! What describes pictures.
 
-use crate::{FormError, HeaderForm, array, code_of, index, name_of, signed};
-use carff_messages::{DatasetView, FrameMeta, Intrinsics, Message, Observability, ViewKind, ViewMeta};
+use super::{FormError, HeaderForm, array, code_of, index, name_of, signed};
+use crate::{DatasetView, FrameMeta, Intrinsics, Message, Observability, ViewKind, ViewMeta};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-
-/// An ideal pinhole camera's intrinsics, pixels.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields)]
-pub struct IntrinsicsForm {
-    /// Focal length along x.
-    pub fl_x_px: f64,
-    /// Focal length along y.
-    pub fl_y_px: f64,
-    /// Principal point, x.
-    pub cx_px: f64,
-    /// Principal point, y.
-    pub cy_px: f64,
-}
-
-impl From<&Intrinsics> for IntrinsicsForm {
-    fn from(i: &Intrinsics) -> Self {
-        Self { fl_x_px: i.fl_x_px, fl_y_px: i.fl_y_px, cx_px: i.cx_px, cy_px: i.cy_px }
-    }
-}
-
-impl From<&IntrinsicsForm> for Intrinsics {
-    fn from(i: &IntrinsicsForm) -> Self {
-        Self { fl_x_px: i.fl_x_px, fl_y_px: i.fl_y_px, cx_px: i.cx_px, cy_px: i.cy_px }
-    }
-}
 
 /// Where in a data set a frame comes from.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
@@ -62,11 +36,26 @@ pub struct FrameForm {
     /// Rows.
     pub height_px: u32,
     /// Intrinsics for this width and height.
-    pub intrinsics: IntrinsicsForm,
+    pub intrinsics: Intrinsics,
     /// Row-major 4x4: camera space (OpenGL axes) to world space (metres).
     pub world_from_camera: Vec<f64>,
     /// Where in a data set it comes from, if known.
     pub dataset_view: Option<DatasetViewForm>,
+}
+
+/// The word for an observability that is not known.
+const UNKNOWN: &str = "unknown";
+
+fn observability_name(code: i32) -> String {
+    Observability::try_from(code).map_or(UNKNOWN, Observability::name).to_owned()
+}
+
+fn observability_code(name: &String) -> Result<i32, FormError> {
+    if name == UNKNOWN {
+        Ok(Observability::UNKNOWN)
+    } else {
+        code_of!(Observability, "dataset_view.observability", name)
+    }
 }
 
 impl From<&FrameMeta> for FrameForm {
@@ -76,7 +65,7 @@ impl From<&FrameMeta> for FrameForm {
             header: (&meta.header).into(),
             width_px: meta.width_px,
             height_px: meta.height_px,
-            intrinsics: (&meta.intrinsics).into(),
+            intrinsics: meta.intrinsics,
             world_from_camera: meta.world_from_camera.to_vec(),
             dataset_view: (view.known == 1).then(|| DatasetViewForm {
                 view: index(view.view),
@@ -84,7 +73,7 @@ impl From<&FrameMeta> for FrameForm {
                 timestamp: index(view.timestamp),
                 drive: index(view.drive),
                 frame_in_drive: index(view.frame_in_drive),
-                observability: name_of!(Observability, view.observability),
+                observability: observability_name(view.observability),
                 last_of_timestamp: view.last_of_timestamp == 1,
             }),
         }
@@ -104,7 +93,7 @@ impl TryFrom<&FrameForm> for FrameMeta {
                 timestamp: signed(view.timestamp),
                 drive: signed(view.drive),
                 frame_in_drive: signed(view.frame_in_drive),
-                observability: code_of!(Observability, "dataset_view.observability", view.observability)?,
+                observability: observability_code(&view.observability)?,
                 last_of_timestamp: view.last_of_timestamp.into(),
             },
         };
@@ -112,7 +101,7 @@ impl TryFrom<&FrameForm> for FrameMeta {
             header: (&form.header).try_into()?,
             width_px: form.width_px,
             height_px: form.height_px,
-            intrinsics: (&form.intrinsics).into(),
+            intrinsics: form.intrinsics,
             world_from_camera: array("world_from_camera", &form.world_from_camera)?,
             dataset_view,
         };
@@ -142,7 +131,7 @@ pub struct ViewForm {
     /// The latent that it was rendered from.
     pub latent: Vec<f32>,
     /// Intrinsics for this width and height.
-    pub intrinsics: IntrinsicsForm,
+    pub intrinsics: Intrinsics,
     /// Row-major 4x4: camera space (OpenGL axes) to world space (metres).
     pub world_from_camera: Vec<f64>,
     /// Time that the rendering took, nanoseconds.
@@ -160,7 +149,7 @@ impl From<&ViewMeta> for ViewForm {
             height_px: meta.height_px,
             probability: meta.probability,
             latent: meta.latent.to_vec(),
-            intrinsics: (&meta.intrinsics).into(),
+            intrinsics: meta.intrinsics,
             world_from_camera: meta.world_from_camera.to_vec(),
             stage_latency_ns: meta.stage_latency_ns,
         }
@@ -180,7 +169,7 @@ impl TryFrom<&ViewForm> for ViewMeta {
             height_px: form.height_px,
             probability: form.probability,
             latent: array("latent", &form.latent)?,
-            intrinsics: (&form.intrinsics).into(),
+            intrinsics: form.intrinsics,
             world_from_camera: array("world_from_camera", &form.world_from_camera)?,
             stage_latency_ns: form.stage_latency_ns,
         };

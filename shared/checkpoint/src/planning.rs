@@ -1,5 +1,7 @@
-//! The part of a checkpoint that stages without models need: how poses were split, and the calibrated threshold.
+//! The part of a checkpoint that stages without models read: the split of the poses and the calibrated threshold.
 
+use carff_decision::Policy;
+use carff_messages::Rule;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 
@@ -18,6 +20,17 @@ pub struct CheckpointPlanning {
     pub split_seed: u64,
     /// Hazard probability from which on the calibrated rule halts, 0 to 1; chosen on the calibration poses.
     pub hazard_threshold: f64,
+}
+
+/// Returns the policy of a rule: with `threshold` where one is given, else with that of the checkpoint, which only the
+/// calibrated rule reads.
+pub fn load_policy(rule: Rule, threshold: Option<f64>, checkpoint: &Path) -> Result<Policy, CheckpointPlanningError> {
+    let threshold = match (rule, threshold) {
+        (_, Some(threshold)) => threshold,
+        (Rule::Calibrated, None) => CheckpointPlanning::load(checkpoint)?.hazard_threshold,
+        (_, None) => 1.0,
+    };
+    Ok(Policy { rule, threshold })
 }
 
 /// Why it cannot be had.

@@ -1,7 +1,7 @@
 //! Actions.
 
-use crate::{FormError, HeaderForm, code_of, name_of};
-use carff_messages::{Action, ActionCode, Message, Reason, RuleCode};
+use super::{FormError, HeaderForm, code_of, name_of};
+use crate::{Action, ActionCode, Message, Reason, Rule};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -39,7 +39,7 @@ impl From<&Action> for ActionForm {
             header: (&action.header).into(),
             action: name_of!(ActionCode, action.action),
             reason: name_of!(Reason, action.reason),
-            rule: name_of!(RuleCode, action.rule),
+            rule: name_of!(Rule, action.rule),
             sample_count: action.sample_count,
             confidence: action.confidence,
             hazard_probability: action.hazard_probability,
@@ -59,7 +59,7 @@ impl TryFrom<&ActionForm> for Action {
             header: (&form.header).try_into()?,
             action: code_of!(ActionCode, "action", form.action)?,
             reason: code_of!(Reason, "reason", form.reason)?,
-            rule: code_of!(RuleCode, "rule", form.rule)?,
+            rule: code_of!(Rule, "rule", form.rule)?,
             sample_count: form.sample_count,
             confidence: form.confidence,
             hazard_probability: form.hazard_probability,

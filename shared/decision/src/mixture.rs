@@ -1,37 +1,25 @@
-//! The scene latent: Gaussians over it, mixtures of them, and draws.
-//!
-//! What lives here: what passes between encoder, forecaster and prober, as plain numbers. What never does: the networks
-//! that make it, and any tensor library.
+//! Mixtures of Gaussians over the scene latent, and latents drawn from them.
 
+use carff_messages::{Gaussian, LATENT_DIM};
 use carff_random::Key;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// Number of dimensions of the scene latent (paper: z in R^8).
-pub const LATENT_DIM: usize = 8;
-
-/// A Gaussian over the scene latent with diagonal covariance: an encoder posterior q(z | I).
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub struct LatentGaussian {
-    /// Mean.
-    pub mean: [f32; LATENT_DIM],
-    /// Natural logarithm of the variance, per dimension.
-    pub log_variance: [f32; LATENT_DIM],
-}
-
-impl LatentGaussian {
-    /// mean + exp(log variance / 2) * `unit`, for a draw `unit` from the standard normal distribution.
-    pub fn at(&self, unit: &[f32; LATENT_DIM]) -> [f32; LATENT_DIM] {
-        std::array::from_fn(|i| self.mean[i] + (0.5 * self.log_variance[i]).exp() * unit[i])
-    }
-}
-
-/// A mixture of Gaussians over the scene latent.
+/// A mixture of Gaussians over the scene latent (paper section 3.2).
+///
+/// ```
+/// use carff_decision::{Mixture, Sampling};
+/// use carff_messages::Gaussian;
+/// let mixture = Mixture { weights: vec![0.25, 0.75], components: vec![Gaussian::standard(); 2] };
+/// let draws = mixture.draw(8, Sampling::Stratified, 7, 0, 1);
+/// assert_eq!(draws.iter().filter(|draw| draw.component == 0).count(), 2);
+/// ```
 #[derive(Clone, Debug, PartialEq)]
 pub struct Mixture {
     /// Component weights; they sum to 1.
     pub weights: Vec<f32>,
     /// One Gaussian a component.
-    pub components: Vec<LatentGaussian>,
+    pub components: Vec<Gaussian>,
 }
 
 /// One latent drawn from a mixture.
@@ -43,13 +31,14 @@ pub struct Draw {
     pub component: usize,
 }
 
-/// How draws are spread over the components.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+/// The way in which draws are spread over the components.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum Sampling {
-    /// As in systematic resampling: each component gets its share of the draws, to within one.
+    /// Systematic resampling: each component gets its weight's share of the draws, to within one.
+    #[default]
     Stratified,
-    /// Each draw picks its component by itself.
+    /// Each draw picks its component at random.
     Independent,
 }
 
@@ -93,7 +82,7 @@ mod tests {
     use super::*;
 
     fn mixture(weights: [f32; 2]) -> Mixture {
-        let at = |x: f32| LatentGaussian { mean: [x; 8], log_variance: [-2.0; 8] };
+        let at = |x: f32| Gaussian { mean: [x; 8], log_variance: [-2.0; 8] };
         Mixture { weights: weights.to_vec(), components: vec![at(-1.0), at(1.0)] }
     }
 

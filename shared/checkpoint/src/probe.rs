@@ -1,0 +1,63 @@
+//! The density probe of a checkpoint: its field, places, calibration and state posteriors.
+
+use crate::{CheckpointError, Manifest, files, load_field};
+use carff_decision::{Calibration, DensityField, DensityProbe, ProbeLayout};
+use carff_field::{Field, PreparedPoints};
+use carff_messages::LATENT_DIM;
+use std::ops::Deref;
+use std::path::Path;
+
+/// The density probe of a trained field.
+pub type FieldProbe = DensityProbe<PreparedField>;
+
+/// A trained field with the points of one probe layout prepared.
+#[derive(Clone, Debug)]
+pub struct PreparedField {
+    field: Field,
+    points: PreparedPoints,
+}
+
+impl PreparedField {
+    /// Prepares the points of a layout.
+    pub fn new(field: Field, layout: &ProbeLayout) -> Self {
+        let points = field.prepare(layout.points());
+        Self { field, points }
+    }
+}
+
+impl Deref for PreparedField {
+    type Target = Field;
+
+    fn deref(&self) -> &Field {
+        &self.field
+    }
+}
+
+impl DensityField for PreparedField {
+    fn densities(&self, latents: &[[f32; LATENT_DIM]], densities: &mut [f32]) {
+        self.field.density_prepared(&self.points, latents, densities);
+    }
+}
+
+/// Reads the density probe of a checkpoint.
+pub fn load_field_probe(dir: &Path, manifest: &Manifest) -> Result<FieldProbe, CheckpointError> {
+    let (layout, calibration) = load_probing(dir, manifest)?;
+    let field = PreparedField::new(load_field(dir, manifest)?, &layout);
+    Ok(DensityProbe::new(field, layout, calibration, manifest.states.clone()))
+}
+
+/// Returns the probe layout of a checkpoint and its calibration.
+pub fn load_probing(dir: &Path, manifest: &Manifest) -> Result<(ProbeLayout, Calibration), CheckpointError> {
+    let missing = || CheckpointError::Missing { path: dir.into(), part: "probe calibration", stage: "nerf" };
+    let calibration = manifest.probing.clone().ok_or_else(missing)?;
+    let layout = ProbeLayout::new(manifest.places.clone(), manifest.scenario.hazard_states())
+        .map_err(|source| CheckpointError::Probing { path: dir.into(), source })?;
+    if calibration.fits(&layout) {
+        Ok((layout, calibration))
+    } else {
+        Err(CheckpointError::Manifest {
+            path: dir.join(files::MANIFEST),
+            what: "`probing.places` and `places` differ in number".into(),
+        })
+    }
+}

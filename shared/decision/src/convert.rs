@@ -1,0 +1,123 @@
+//! Conversions between a step of the belief and the messages that carry it.
+
+use crate::{Draw, Mixture, ProbeLayout, Probed, Reading, Resolved, Step};
+use carff_messages::{Belief, Forecast, Gaussian, MAX_COMPONENTS, MAX_PLACES, ProbeResult};
+
+/// Returns the mixture and the draws of a valid forecast.
+pub fn mixture_and_draws(forecast: &Forecast) -> (Mixture, Vec<Draw>) {
+    let components = (forecast.component_count as usize).min(MAX_COMPONENTS);
+    let mixture = Mixture {
+        weights: forecast.weights[..components].to_vec(),
+        components: forecast.components[..components].to_vec(),
+    };
+    let draws = forecast
+        .samples()
+        .iter()
+        .zip(&forecast.sample_component)
+        .map(|(latent, component)| Draw { latent: *latent, component: usize::from(*component) })
+        .collect();
+    (mixture, draws)
+}
+
+/// Writes a mixture and its draws into a forecast.
+pub fn set_mixture_and_draws(forecast: &mut Forecast, mixture: &Mixture, draws: &[Draw]) {
+    forecast.component_count = mixture.components.len() as u32;
+    forecast.sample_count = draws.len() as u32;
+    for (i, (weight, component)) in mixture.weights.iter().zip(&mixture.components).enumerate() {
+        forecast.weights[i] = *weight;
+        forecast.components[i] = *component;
+    }
+    for (i, draw) in draws.iter().enumerate() {
+        forecast.samples[i] = draw.latent;
+        forecast.sample_component[i] = draw.component as u8;
+    }
+}
+
+impl Step {
+    /// Returns the belief message of this step, which answers `forecast`. `posterior` represents the resolved state; without
+    /// one there is nothing to look ahead from, and the belief is the frame's last.
+    pub fn to_belief(&self, forecast: &Forecast, layout: &ProbeLayout, posterior: Option<&Gaussian>) -> Belief {
+        let mut belief = Belief::empty(forecast.header, forecast.horizon);
+        belief.encoder_ns = forecast.encoder_ns;
+        belief.forecaster_ns = forecast.stage_latency_ns;
+        belief.state_count = layout.state_count() as u32;
+        belief.place_count = layout.places().len() as u32;
+        belief.component_count = self.components.len() as u32;
+        belief.sample_count = self.samples.len() as u32;
+        copy(&mut belief.state_probability, &self.resolved.state_probabilities, |p| *p);
+        belief.hazard_probability = self.resolved.hazard_probability;
+        belief.path_probability = self.path_probability;
+        copy(&mut belief.component_weights, &self.mixture.weights, |w| *w);
+        copy(&mut belief.components, &self.components, |probed| probed.into());
+        copy(&mut belief.samples, &self.samples, |probed| probed.into());
+        copy(&mut belief.sample_component, &self.draws, |draw| draw.component as u8);
+        match posterior {
+            Some(posterior) => {
+                belief.resolved_state = self.resolved.state as i32;
+                belief.resolved = *posterior;
+            }
+            None => belief.is_final = 1,
+        }
+        belief
+    }
+
+    /// Returns the step that a valid forecast and the belief that answers it describe. Messages only carry the best state of
+    /// each sample, so that [`Reading::state_probabilities`] is empty. A belief that resolved no state has
+    /// `usize::MAX` as its resolved state.
+    pub fn of_messages(forecast: &Forecast, belief: &Belief) -> Self {
+        let (mixture, draws) = mixture_and_draws(forecast);
+        let places = (belief.place_count as usize).min(MAX_PLACES);
+        let probed = |result: &ProbeResult| Probed::of_message(result, places);
+        Self {
+            mixture,
+            draws,
+            components: belief.components().iter().map(probed).collect(),
+            samples: belief.samples().iter().map(probed).collect(),
+            resolved: Resolved {
+                state_probabilities: belief
+                    .state_probability
+                    .iter()
+                    .take(belief.state_count as usize)
+                    .copied()
+                    .collect(),
+                hazard_probability: belief.hazard_probability,
+                state: usize::try_from(belief.resolved_state).unwrap_or(usize::MAX),
+            },
+            path_probability: belief.path_probability,
+        }
+    }
+}
+
+/// Copies as many entries as fit.
+fn copy<T, S>(to: &mut [T], from: &[S], convert: impl Fn(&S) -> T) {
+    for (to, from) in to.iter_mut().zip(from) {
+        *to = convert(from);
+    }
+}
+
+impl From<&Probed> for ProbeResult {
+    fn from(probed: &Probed) -> Self {
+        let mut result = Self {
+            state: probed.reading.state.map_or(-1, |s| s as i32),
+            confidence: probed.reading.confidence.clamp(0.0, 1.0),
+            hazard_likelihood: probed.reading.hazard_likelihood,
+            ..Self::NONE
+        };
+        copy(&mut result.occupancies, &probed.occupancies, |o| *o);
+        result
+    }
+}
+
+impl Probed {
+    fn of_message(result: &ProbeResult, places: usize) -> Self {
+        Self {
+            occupancies: result.occupancies[..places].to_vec(),
+            reading: Reading {
+                state: result.state(),
+                confidence: result.confidence,
+                hazard_likelihood: result.hazard_likelihood,
+                state_probabilities: Vec::new(),
+            },
+        }
+    }
+}

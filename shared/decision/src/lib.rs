@@ -1,0 +1,31 @@
+//! The decision path as pure arithmetic: draw, probe, resolve, look ahead, decide.
+//!
+//! The stages wrap these functions in topics, and evaluations call them in a loop: a report therefore shows what a
+//! running graph would have published, bit for bit. The crate holds no network, no field, no file and no clock; the
+//! field enters as a [`DensityField`].
+//!
+//! | module | content |
+//! |---|---|
+//! | `mixture` | mixtures over the scene latent, and draws from them |
+//! | `layout`, `calibration` | from densities at the places of a scenario to the state that a latent shows |
+//! | `look_ahead` | one step of the belief, and the autoregressive loop |
+//! | `evidence`, `rule`, `threshold` | from the steps of a frame to an action |
+//! | `convert` | the same steps as messages, and back |
+
+mod calibration;
+mod convert;
+mod evidence;
+mod layout;
+mod look_ahead;
+mod mixture;
+mod rule;
+mod threshold;
+
+pub use calibration::{Calibration, Reading, Resolved, resolve};
+pub use convert::{mixture_and_draws, set_mixture_and_draws};
+pub use evidence::{Evidence, SampleEvidence, path_probability};
+pub use layout::{Place, ProbeLayout, ProbingError};
+pub use look_ahead::{DensityField, DensityProbe, Plan, Probed, Step, look_ahead};
+pub use mixture::{Draw, Mixture, Sampling};
+pub use rule::{Decision, Policy};
+pub use threshold::{CalibrationTrial, choose_threshold, unchosen_threshold};

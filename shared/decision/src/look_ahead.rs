@@ -1,0 +1,151 @@
+//! One step of the belief, and the autoregressive loop over steps (paper section 3.2).
+
+use crate::{Calibration, Draw, Mixture, ProbeLayout, Reading, Resolved, Sampling, path_probability, resolve};
+use carff_messages::{Gaussian, LATENT_DIM};
+
+/// A radiance field that reports densities at the points of one probe layout.
+pub trait DensityField {
+    /// Writes the density (1/m) at each point of the layout for each latent: `latents.len()` rows of one value a point.
+    fn densities(&self, latents: &[[f32; LATENT_DIM]], densities: &mut [f32]);
+}
+
+/// Probes latents: queries a field's density at the places of a scenario and reads which known state it shows.
+#[derive(Clone, Debug)]
+pub struct DensityProbe<F> {
+    field: F,
+    layout: ProbeLayout,
+    calibration: Calibration,
+    states: Vec<Gaussian>,
+    densities: Vec<f32>,
+}
+
+/// One probed latent.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Probed {
+    /// Occupancy of each place, 0..=1.
+    pub occupancies: Vec<f32>,
+    /// The state that the occupancies show.
+    pub reading: Reading,
+}
+
+/// One step of the belief.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Step {
+    /// The mixture over the next latent.
+    pub mixture: Mixture,
+    /// The latents drawn from it.
+    pub draws: Vec<Draw>,
+    /// The component means, probed.
+    pub components: Vec<Probed>,
+    /// The draws, probed.
+    pub samples: Vec<Probed>,
+    /// The belief over the known states.
+    pub resolved: Resolved,
+    /// Probability of the path followed up to this step's input, 0..=1; 1 at the first step.
+    pub path_probability: f32,
+}
+
+impl<F: DensityField> DensityProbe<F> {
+    /// Puts the parts together; `states` are the posteriors that represent the known states.
+    pub fn new(field: F, layout: ProbeLayout, calibration: Calibration, states: Vec<Gaussian>) -> Self {
+        Self { field, layout, calibration, states, densities: Vec::new() }
+    }
+
+    /// The places and states.
+    pub fn layout(&self) -> &ProbeLayout {
+        &self.layout
+    }
+
+    /// The field.
+    pub fn field(&self) -> &F {
+        &self.field
+    }
+
+    /// The posteriors that represent the known states.
+    pub fn states(&self) -> &[Gaussian] {
+        &self.states
+    }
+
+    /// The posterior that represents a known state.
+    pub fn state_posterior(&self, state: usize) -> Option<&Gaussian> {
+        self.states.get(state)
+    }
+
+    /// Probes one latent.
+    pub fn probe(&mut self, latent: &[f32; LATENT_DIM]) -> Probed {
+        self.probe_all(std::slice::from_ref(latent)).remove(0)
+    }
+
+    /// Probes latents, one result each.
+    pub fn probe_all(&mut self, latents: &[[f32; LATENT_DIM]]) -> Vec<Probed> {
+        let points = self.layout.points().len().max(1);
+        self.densities.resize(points * latents.len(), 0.0);
+        self.field.densities(latents, &mut self.densities);
+        let read = |densities: &[f32]| {
+            let mut occupancies = vec![0.0; self.layout.places().len()];
+            self.layout.occupancies(densities, &mut occupancies);
+            let reading = self.calibration.read(&self.layout, &occupancies);
+            Probed { occupancies, reading }
+        };
+        self.densities.chunks_exact(points).map(read).collect()
+    }
+
+    /// Probes a mixture's component means and draws, and resolves the state.
+    pub fn step(&mut self, mixture: Mixture, draws: Vec<Draw>, path_probability: f32) -> Step {
+        let latents: Vec<[f32; LATENT_DIM]> =
+            mixture.components.iter().map(|c| c.mean).chain(draws.iter().map(|d| d.latent)).collect();
+        let mut components = self.probe_all(&latents);
+        let samples = components.split_off(mixture.components.len());
+        let readings = |probed: &[Probed]| probed.iter().map(|p| p.reading.clone()).collect::<Vec<_>>();
+        let of: Vec<usize> = draws.iter().map(|d| d.component).collect();
+        let resolved = resolve(&self.layout, &mixture.weights, &readings(&components), &readings(&samples), &of);
+        Step { mixture, draws, components, samples, resolved, path_probability }
+    }
+}
+
+/// The depth and breadth of a look-ahead, and the names of its random streams.
+///
+/// ```
+/// use carff_decision::{Plan, Sampling};
+/// let plan = Plan { samples: 10, sampling: Sampling::Stratified, horizon: 2, seed: 1, frame: 0 };
+/// assert_eq!(plan.horizon, 2);
+/// ```
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Plan {
+    /// Latents drawn at each step.
+    pub samples: usize,
+    /// The way in which they are spread over the components.
+    pub sampling: Sampling,
+    /// Number of steps.
+    pub horizon: u32,
+    /// The run's seed.
+    pub seed: u64,
+    /// The frame's number.
+    pub frame: u64,
+}
+
+/// Looks ahead from one posterior: each step's resolved state feeds the next. `forecast` receives the input and the
+/// known state that it represents (`None` at the first step).
+pub fn look_ahead<F: DensityField>(
+    mut forecast: impl FnMut(&Gaussian, Option<usize>) -> Mixture,
+    probe: &mut DensityProbe<F>,
+    posterior: &Gaussian,
+    plan: Plan,
+) -> Vec<Step> {
+    let mut steps = Vec::with_capacity(plan.horizon as usize);
+    let mut input = (*posterior, None);
+    let mut path = 1.0;
+    for k in 1..=plan.horizon {
+        let mixture = forecast(&input.0, input.1);
+        let draws = mixture.draw(plan.samples, plan.sampling, plan.seed, plan.frame, k);
+        let step = probe.step(mixture, draws, path);
+        let state = step.resolved.state;
+        path = path_probability(path, step.resolved.state_probability(state));
+        steps.push(step);
+        match probe.state_posterior(state) {
+            Some(next) => input = (*next, Some(state)),
+            None => break,
+        }
+    }
+    steps
+}

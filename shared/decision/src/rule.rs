@@ -1,0 +1,101 @@
+//! The decision rules: from the evidence of one frame to an action.
+
+use crate::Evidence;
+use carff_messages::Rule;
+
+/// A rule with the threshold that it uses.
+///
+/// ```
+/// use carff_decision::{Evidence, Policy};
+/// use carff_messages::Rule;
+/// // Without evidence, every rule halts.
+/// assert!(Policy { rule: Rule::Calibrated, threshold: 0.25 }.decide(&Evidence::NONE).halt);
+/// ```
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Policy {
+    /// The rule.
+    pub rule: Rule,
+    /// The hazard probability from which on [`Rule::Calibrated`] halts, 0..=1; the other rules ignore it.
+    pub threshold: f64,
+}
+
+/// The outcome of a rule.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Decision {
+    /// Halt (`true`) or advance.
+    pub halt: bool,
+    /// Confidence of the rule in this action, 0..=1.
+    pub confidence: f64,
+}
+
+impl Policy {
+    /// Returns every rule with one threshold, in the order of [`Rule::ALL`].
+    pub fn all(threshold: f64) -> [Self; Rule::ALL.len()] {
+        Rule::ALL.map(|rule| Self { rule, threshold })
+    }
+
+    /// Applies the rule (paper section 4.3). Evidence without samples, or with a hazard probability outside 0..=1,
+    /// always halts with confidence 0.
+    pub fn decide(self, evidence: &Evidence) -> Decision {
+        let p = evidence.hazard_probability();
+        if !(0.0..=1.0).contains(&p) || evidence.sample_count() == 0 {
+            return Decision { halt: true, confidence: 0.0 };
+        }
+        match self.rule {
+            Rule::Underconfident => Decision { halt: true, confidence: 1.0 },
+            Rule::Overconfident => Decision { halt: false, confidence: 1.0 },
+            Rule::Paper => {
+                // Samples disagree when some show the hazard and some do not. A sample that shows no known state
+                // disagrees with every other.
+                let share = evidence.hazard_share();
+                let halt = share > 0.0 || evidence.has_unknown();
+                Decision { halt, confidence: if halt { share.max(1.0 - share) } else { 1.0 - share } }
+            }
+            Rule::Calibrated => {
+                let halt = p >= self.threshold;
+                Decision { halt, confidence: if halt { p } else { 1.0 - p } }
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::SampleEvidence;
+
+    /// Evidence of one step: a hazard likelihood a sample, `None` for a sample that shows no known state.
+    fn evidence(samples: &[Option<f32>], hazard_probability: f32) -> Evidence {
+        let mut evidence = Evidence::NONE;
+        let of = |s: &Option<f32>| SampleEvidence { is_known: s.is_some(), hazard_likelihood: s.unwrap_or(0.0) };
+        evidence.add_step(1, hazard_probability, 1.0, samples.iter().map(of));
+        evidence
+    }
+
+    /// The paper's rule advances only when no sample shows the hazard and none is unknown.
+    #[test]
+    fn paper_rule_halts_on_any_hazard() {
+        let paper = Policy { rule: Rule::Paper, threshold: 0.5 };
+        assert!(!paper.decide(&evidence(&[Some(0.0), Some(0.49)], 0.0)).halt);
+        assert!(paper.decide(&evidence(&[Some(0.0), Some(0.5)], 0.1)).halt);
+        assert!(paper.decide(&evidence(&[Some(0.0), None], 0.0)).halt);
+    }
+
+    /// The calibrated rule halts at its threshold and above.
+    #[test]
+    fn calibrated_rule_uses_the_threshold() {
+        let calibrated = Policy { rule: Rule::Calibrated, threshold: 0.25 };
+        assert!(calibrated.decide(&evidence(&[Some(1.0)], 0.25)).halt);
+        assert!(!calibrated.decide(&evidence(&[Some(1.0)], 0.24)).halt);
+    }
+
+    /// Every rule halts without samples, and on a probability outside 0..=1.
+    #[test]
+    fn no_evidence_halts() {
+        for policy in Policy::all(0.5) {
+            assert!(policy.decide(&Evidence::NONE).halt);
+            assert!(policy.decide(&evidence(&[Some(0.0)], f32::NAN)).halt);
+            assert!(policy.decide(&evidence(&[Some(0.0)], 1.5)).halt);
+        }
+    }
+}
