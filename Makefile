@@ -1,5 +1,5 @@
-# The whole program in a few words: `make run`, `make test`. `make help` lists all.
-# Needs: the Rust toolchain, a C++ compiler, python3 with pip, git. All is built in one profile, so that nothing is
+# Start with `make run` and `make test`; `make help` lists all targets.
+# Needs the Rust toolchain, a C++ compiler, python3 with pip, and git. All targets share one profile, so that no crate is
 # built twice.
 
 SHELL := /bin/bash
@@ -8,12 +8,12 @@ TARGET := $(or $(CARGO_TARGET_DIR),target)
 GRAPH ?= configs/graphs/approaching-intersection.toml
 REPORT ?= reports/approaching-intersection.json
 
-# A libtorch of the user's own wins over the fetched one; programs then find it by LD_LIBRARY_PATH.
+# A libtorch of the user wins over the fetched one; programs then find it by LD_LIBRARY_PATH.
 ifneq ($(LIBTORCH),)
 export LIBTORCH
 export LD_LIBRARY_PATH := $(LIBTORCH)/lib$(if $(LD_LIBRARY_PATH),:$(LD_LIBRARY_PATH))
 else ifneq ($(CARGO_TARGET_DIR),)
-# The built programs look beside ./target; with another target folder they are told.
+# Programs look for libtorch next to ./target. With another target folder they need LD_LIBRARY_PATH.
 export LD_LIBRARY_PATH := $(CURDIR)/.libtorch/lib$(if $(LD_LIBRARY_PATH),:$(LD_LIBRARY_PATH))
 endif
 
@@ -22,32 +22,32 @@ endif
 help: ## List the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
 
-run: build ## Drive the shipped model through the intersection: decisions live, then report, JSON and filmstrip
+run: build ## Drive the shipped model through the intersection; show decisions, then write report, JSON and filmstrip
 	$(TARGET)/release/carff launch $(GRAPH) --report $(REPORT)
 
 build: libtorch ## Build all programs
 	cargo build --release --locked --workspace --bins
 
-test: build ## Run all tests, whole graphs of processes among them
+test: build ## Run all tests, including whole graphs of processes
 	cargo test --release --locked --workspace
 
 deb: build ## Build a Debian package: programs, checkpoints, configs, systemd units
 	$(PYTHON) launch/build_deb.py $(TARGET)
 
-check-deb: deb ## Install that package here, drive, look at it as another user, purge it (as root)
+check-deb: deb ## Install the package here, drive, try to access it as another user, purge it (as root)
 	$(PYTHON) tests/check_deb.py $(TARGET)/carff_*.deb
 
-link: ## Build carff-link, which carries topics to another machine (zenoh: 300 crates more; nothing else needs it)
+link: ## Build carff-link, which forwards topics to another machine (optional; zenoh adds 300 crates)
 	cargo build --release --locked --manifest-path services/link/Cargo.toml --target-dir $(TARGET)/link
 	mkdir -p $(TARGET)/release
 	cp $(TARGET)/link/release/carff-link $(TARGET)/release/
 
-check-link: build link ## Test it; then drive here, look from another network, and cut the link between (as root)
+check-link: build link ## Test carff-link; then drive here, observe from another network, and cut the link (as root)
 	cargo fmt --manifest-path services/link/Cargo.toml --check
 	cargo test --release --locked --manifest-path services/link/Cargo.toml --target-dir $(TARGET)/link
 	$(PYTHON) tests/check_link.py $(TARGET)/release
 
-bench-peer: ## Build the program by which `carff bench ipc` measures zenoh as well (300 crates more; nothing else needs it)
+bench-peer: ## Build the peer with which `carff bench ipc` also measures zenoh (optional; adds 300 crates)
 	cargo build --release --locked --manifest-path tests/zenoh-peer/Cargo.toml --target-dir $(TARGET)/zenoh-peer
 	mkdir -p $(TARGET)/release
 	cp $(TARGET)/zenoh-peer/release/carff-zenoh-peer $(TARGET)/release/
@@ -65,7 +65,7 @@ miri: ## Run the kernels of the field (portable path) and the messages' tests un
 	cargo +nightly miri test --locked --lib --target-dir $(TARGET)/miri -p carff-field -- dispatch::
 	cargo +nightly miri test --locked --lib --target-dir $(TARGET)/miri -p carff-messages
 
-# Instrumentation as libFuzzer wants it.
+# Instrumentation for libFuzzer.
 FUZZ_FLAGS := --cfg fuzzing -Ccodegen-units=1 -Cpasses=sancov-module -Cllvm-args=-sanitizer-coverage-level=4 \
 	-Cllvm-args=-sanitizer-coverage-inline-8bit-counters -Cllvm-args=-sanitizer-coverage-pc-table \
 	-Cllvm-args=-sanitizer-coverage-trace-compares
@@ -85,14 +85,14 @@ fuzz: libtorch ## Feed each of READERS (default: all) with RUNS inputs (default 
 			2> $(FUZZ)/$$reader.log || { tail -40 $(FUZZ)/$$reader.log; exit 1; }; \
 		printf '%-11s' $$reader; grep -h "stat::number_of_executed_units" $(FUZZ)/$$reader.log; done
 
-soak: build ## Soak the shipped graph for MINUTES (default 10) with SEED (default 1) under every kind of fault
+soak: build ## Run the shipped graph for MINUTES (default 10) with SEED (default 1) under every kind of fault
 	$(TARGET)/release/carff soak configs/soak/all.toml --minutes $(or $(MINUTES),10) --seed $(or $(SEED),1) --json reports/soak.json
 
-sbom: ## Write what the programs are built of, as CycloneDX JSON (needs cargo-cyclonedx)
+sbom: ## Write the bill of materials of the programs, as CycloneDX JSON (needs cargo-cyclonedx)
 	$(PYTHON) launch/build_sbom.py $(TARGET)/carff.cdx.json
 
-fmt: ## Format
+fmt: ## Format all Rust sources
 	cargo fmt --all
 
-libtorch: ## Fetch libtorch once (a LIBTORCH of your own wins)
+libtorch: ## Fetch libtorch once (your own LIBTORCH wins)
 	@$(PYTHON) launch/fetch_libtorch.py

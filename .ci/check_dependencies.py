@@ -1,8 +1,9 @@
 #!/usr/bin/env python3
-"""Checks dependencies and house rules without network, once the crates are fetched.
+"""Checks dependencies and house rules without network, after the crates are fetched.
 
-Dependencies, as deny.toml says: licences, banned crates, duplicate versions, sources; and the direction of arrows
-between our own crates. House rules: no unfinished code, no paths of one machine, `unsafe` in named modules only.
+The rules of deny.toml cover licences, banned crates, duplicate versions and sources. This program also checks the
+direction of dependencies between our crates. House rules: no unfinished code, no paths of one machine, `unsafe` in named
+modules only.
 
 Usage: python3 .ci/check_dependencies.py      (from anywhere; exit code 1 and one line per finding)
 """
@@ -21,9 +22,9 @@ except ImportError:  # Python before 3.11: pip brings a reader along.
 ROOT = Path(__file__).resolve().parent.parent
 TARGET = "x86_64-unknown-linux-gnu"
 
-# The only modules with `unsafe`, and what for.
+# The only modules with `unsafe`, each with its reason.
 UNSAFE_MODULES = {
-    "shared/field/src/bf16.rs": "a kernel in instructions of its own, AVX-512 BF16",
+    "shared/field/src/bf16.rs": "a kernel in AVX-512 BF16 instructions",
     "shared/field/src/dispatch.rs": "calls kernels compiled for an instruction set that was found at run time",
     "shared/messages/src/tests.rs": "makes messages out of arbitrary bytes",
     "shared/models/src/allocator.rs": "mallopt",
@@ -40,7 +41,7 @@ UNFINISHED = re.compile(r"\b(?:todo|unimplemented)!|\bdbg!\(|\b(?:FIXME|TODO|XXX
 MACHINE_PATH = re.compile(r"(?<![\w.}$])/(?:home|root|work|Users|mnt|media|tmp)/")
 UNSAFE = re.compile(r"\bunsafe\s*(?:\{|fn\b|impl\b|extern\b|trait\b)")
 TEXT = {".rs", ".toml", ".py", ".md", ".json", ".sh", ".yml"}
-# How far above an `unsafe` block its SAFETY line may stand: macros put arguments in between.
+# Largest distance of a SAFETY line above its `unsafe` block; macro arguments may be in between.
 SAFETY_LINES = 4
 
 findings: list[str] = []
@@ -58,7 +59,7 @@ def run(*command: str) -> str:
 
 
 def licence_allowed(expression: str, allowed: set[str]) -> bool:
-    """Whether an SPDX expression can be met by allowed licences alone. `/` is the old way to write OR."""
+    """Returns true if allowed licences satisfy an SPDX expression. `/` is the old form of OR."""
     tokens = re.findall(r"[()]|[^\s()]+", expression.replace("/", " OR "))
     place = 0
 
@@ -100,12 +101,12 @@ def licence_allowed(expression: str, allowed: set[str]) -> bool:
 
 
 def version_matches(version: str, wanted: str) -> bool:
-    """Whether a version begins with what a `crate@version` entry says."""
+    """Returns true if a version starts with the version of a `crate@version` entry."""
     return version == wanted or version.startswith((wanted + ".", wanted + "+"))
 
 
 def named(entry: object) -> tuple[str, str]:
-    """Crate and version (may be empty) of a deny.toml entry."""
+    """Returns crate and version (may be empty) of a deny.toml entry."""
     text = entry["crate"] if isinstance(entry, dict) else str(entry)
     name, _, version = text.partition("@")
     return name, version
@@ -157,7 +158,7 @@ def check_crates(metadata: dict, deny: dict) -> None:
 
 
 def check_arrows(metadata: dict) -> None:
-    """services and launch may use shared; shared uses shared; no service uses another; messages uses nothing of ours."""
+    """Checks the directions: services and launch use shared, shared uses shared, and messages uses none of our crates."""
     room = {}
     for package in metadata["packages"]:
         if package["source"] is None:
@@ -171,11 +172,11 @@ def check_arrows(metadata: dict) -> None:
             if used not in room or (name, used) in EXCEPTED_ARROWS:
                 continue
             if room[used] != "shared" and room[name] != "tests":
-                find(f"{name} ({room[name]}/) depends on {used} ({room[used]}/): arrows point to shared/ alone")
+                find(f"{name} ({room[name]}/) depends on {used} ({room[used]}/): crates may only depend on shared/")
             if room[used] == "tests":
                 find(f"{name} depends on {used}: nothing depends on tests/")
             if name == "carff-messages" and dependency["kind"] is None:
-                find(f"carff-messages depends on {used}: it may use nothing of ours")
+                find(f"carff-messages depends on {used}: it may use none of our crates")
 
 
 def check_sources() -> None:
@@ -221,7 +222,7 @@ def main() -> None:
         print(f"error: {text}", file=sys.stderr)
     if findings:
         sys.exit(f"{len(findings)} findings")
-    print("dependencies and house rules: all well")
+    print("dependencies and house rules: passed")
 
 
 if __name__ == "__main__":

@@ -1,13 +1,18 @@
 #!/usr/bin/env python3
-"""Builds a Debian package out of the built programs.
+"""Builds a Debian package from the built programs.
 
 Usage: python3 launch/build_deb.py [TARGET] [OUT]     (default: target, target/carff_VERSION_ARCH.deb)
 
-Programs go to /usr/lib/carff/bin with libtorch beside them (carff-link among them where it was built), what they read to
-/usr/share/carff/configs, the graph of the service to /etc/carff/vehicle.toml, units to
-/lib/systemd/system, manual pages and completions to where they belong. Needs
-dpkg-deb; with cargo-cyclonedx too, a bill of materials is among the documents. The
-package is the same for the same files: times are those of the last commit.
+| content | path |
+|---|---|
+| programs (carff-link only if it was built), libtorch | /usr/lib/carff/bin, /usr/lib/carff/lib |
+| checkpoints, graphs, scenarios, schemas | /usr/share/carff/configs |
+| graph file of the service | /etc/carff/vehicle.toml |
+| units | /lib/systemd/system |
+| manual pages, completions, documents | the system's usual paths |
+
+Needs dpkg-deb. With cargo-cyclonedx, the documents include a bill of materials. Equal files give an equal package: its
+times are those of the last commit.
 """
 
 import gzip
@@ -24,13 +29,13 @@ import build_sbom
 ROOT = Path(__file__).resolve().parent.parent
 PROGRAMS = ["carff", "carff-launch", "carff-camera", "carff-encoder", "carff-forecaster", "carff-prober", "carff-renderer",
             "carff-controller", "carff-viewer"]
-# Where it was built: `make link`.
+# Included if it was built with `make link`.
 OPTIONAL = ["carff-link"]
-# What a program that was built in the project is linked with, and what takes its place.
+# The run path of a program built in the project, and its replacement in the package.
 BUILT_RUNPATH = b"$ORIGIN/../../.libtorch/lib:$ORIGIN/../../../.libtorch/lib"
 INSTALLED_RUNPATH = b"$ORIGIN/../lib"
 DEPENDS = "libc6 (>= 2.34), libgcc-s1, libstdc++6, libgomp1, passwd"
-# The window alone needs a display's libraries.
+# Only the window needs the libraries of a display.
 SUGGESTS = "libgl1, libxkbcommon0, libwayland-client0, ffmpeg"
 
 
@@ -47,8 +52,8 @@ def put(source: Path, target: Path, mode: int = 0o644) -> None:
 def put_program(source: Path, target: Path) -> None:
     data = source.read_bytes()
     if data.count(BUILT_RUNPATH) != 1:
-        sys.exit(f"{source}: its run path is not the one of .cargo/config.toml; build it with `make build`")
-    # Shorter, and zeros after it: a string of the dynamic section ends at the first zero.
+        sys.exit(f"{source}: its run path is not that of .cargo/config.toml: build it with `make build`")
+    # Shorter, and padded with zeros: a string of the dynamic section ends at the first zero.
     data = data.replace(BUILT_RUNPATH, INSTALLED_RUNPATH.ljust(len(BUILT_RUNPATH), b"\0"))
     target.parent.mkdir(parents=True, exist_ok=True)
     target.write_bytes(data)
@@ -88,7 +93,7 @@ def fill(tree: Path, target: Path) -> None:
         (doc / "carff.cdx.json").write_text(build_sbom.build(), encoding="utf-8")
         (doc / "carff.cdx.json").chmod(0o644)
     else:
-        print("no bill of materials is in it: cargo-cyclonedx is not installed (see `make sbom`)")
+        print("the package has no bill of materials: cargo-cyclonedx is not installed (see `make sbom`)")
     debian = ROOT / "launch/debian"
     put(debian / "vehicle.toml", tree / "etc/carff/vehicle.toml")
     for unit in ["carff.service", "carff.target"]:
@@ -116,10 +121,10 @@ def control(tree: Path, version: str, architecture: str) -> None:
     (folder / "control").write_text(
         f"Package: carff\nVersion: {version}\nArchitecture: {architecture}\nMaintainer: The CARFF engineers\n"
         f"Installed-Size: {kilobytes}\nDepends: {DEPENDS}\nSuggests: {SUGGESTS}\nSection: science\nPriority: optional\n"
-        "Description: act on what a camera cannot see\n"
-        " From one camera image, perhaps with its view blocked: a belief over the 3D scenes that could be there,\n"
-        " forecasts of each, and a decision to advance or to halt. Processes over shared memory, with probes,\n"
-        " recordings and a service for systemd.\n"
+        "Description: driving decisions from one camera image under occlusion\n"
+        " CARFF computes a belief over the possible 3D scenes of a camera image, forecasts them, and decides to\n"
+        " advance or to halt. It runs as processes over shared memory, with probes, recordings and a systemd\n"
+        " service.\n"
     )
     for script in ["postinst", "prerm", "postrm"]:
         put(ROOT / "launch/debian" / script, folder / script, 0o755)

@@ -1,11 +1,11 @@
 #!/usr/bin/env python3
-"""Writes what the programs that ship are built of: one bill of materials, CycloneDX 1.5, JSON.
+"""Writes the bill of materials of the shipped programs as CycloneDX 1.5 JSON.
 
 Usage: python3 launch/build_sbom.py [OUT]     (default: target/carff.cdx.json; needs cargo-cyclonedx)
 
-cargo-cyclonedx describes each crate of the workspace, in a file beside its manifest: so it works on a copy. What it says
-of the programs' crates becomes one document, each crate once, and libtorch joins it, which no lock file knows. The
-same sources give the same bytes: the time is that of the last commit.
+cargo-cyclonedx writes one file per crate into the source folders, so this program runs it on a copy. It merges the files
+of the programs into one document with each crate once, and adds libtorch, which is in no lock file. Equal sources give
+equal bytes: the time is that of the last commit.
 """
 
 import importlib.util
@@ -36,12 +36,12 @@ def run(*command: str, **kwargs) -> str:
 
 
 def is_there() -> bool:
-    """Whether the tool is installed."""
+    """Returns true if cargo-cyclonedx is installed."""
     return shutil.which("cargo-cyclonedx") is not None
 
 
 def describe() -> list[dict]:
-    """What the tool says of each program's crate."""
+    """Returns the tool's description of each program's crate."""
     listed = run("git", "ls-files", "-z", "--cached", "--others", "--exclude-standard", "*.toml", "*.rs", "Cargo.lock",
                  cwd=ROOT)
     environment = {**os.environ, "SOURCE_DATE_EPOCH": run("git", "log", "-1", "--format=%ct", cwd=ROOT)}
@@ -54,12 +54,12 @@ def describe() -> list[dict]:
         run(*TOOL, "--format", "json", "--spec-version", "1.5", "--target", TARGET, "--override-filename", "bom", "--quiet",
             cwd=copy, env=environment)
         texts = [(copy / program / "bom.json").read_text(encoding="utf-8") for program in PROGRAMS]
-    # Paths say where the copy lay.
+    # Remove the path of the copy.
     return [json.loads(text.replace(str(copy), "")) for text in texts]
 
 
 def libtorch() -> list[dict]:
-    """libtorch: the parts that launch/fetch_libtorch.py takes, or the user's own."""
+    """Returns the parts of libtorch that launch/fetch_libtorch.py fetches, or the user's libtorch."""
     if own := os.environ.get("LIBTORCH"):
         version = (Path(own) / "build-version").read_text(encoding="utf-8").strip()
         return [{"type": "library", "bom-ref": "libtorch", "name": "libtorch", "version": version}]
@@ -81,7 +81,7 @@ def libtorch() -> list[dict]:
 
 
 def merge(bills: list[dict]) -> dict:
-    """One bill of all, each component once, in the order of their names."""
+    """Merges all bills into one, with each component once, sorted by name."""
     components: dict[str, dict] = {}
     uses: dict[str, set[str]] = {}
     programs = []
@@ -89,7 +89,7 @@ def merge(bills: list[dict]) -> dict:
         program = bill["metadata"]["component"]
         programs.append(program["bom-ref"])
         for component in [program, *bill.get("components", [])]:
-            # A crate that is both a program and another's library is the program.
+            # A crate that is both a program and a library counts as the program.
             if component["type"] == "application" or component["bom-ref"] not in components:
                 components[component["bom-ref"]] = component
         for entry in bill.get("dependencies", []):
@@ -120,14 +120,14 @@ def merge(bills: list[dict]) -> dict:
 
 
 def build() -> str:
-    """The bill, as text."""
+    """Returns the bill as text."""
     return json.dumps(merge(describe()), indent=1) + "\n"
 
 
 def main() -> None:
     out = Path(sys.argv[1] if len(sys.argv) > 1 else ROOT / "target/carff.cdx.json")
     if not is_there():
-        sys.exit("cargo-cyclonedx is not installed: `cargo install --locked cargo-cyclonedx`, then again")
+        sys.exit("cargo-cyclonedx is not installed: run `cargo install --locked cargo-cyclonedx`, then repeat")
     text = build()
     out.parent.mkdir(parents=True, exist_ok=True)
     out.write_text(text, encoding="utf-8")

@@ -1,14 +1,14 @@
 #!/usr/bin/env python3
-"""Fetches the pinned, hash-checked CPU half of libtorch into .libtorch/ (once).
+"""Fetches the pinned, hash-checked CPU part of libtorch into .libtorch/ (once).
 
 Usage: python3 launch/fetch_libtorch.py [TARGET]     (default TARGET: .libtorch)
 
-Why from Python wheels: the tch crate wants libtorch 2.11.0, and the package index
-that every machine with pip reaches carries it. Only the CPU libraries are kept:
-libtorch_cpu.so needs from CUDA no more than two small runtime libraries.
+The source is Python wheels: the tch crate requires libtorch 2.11.0, which pip's package
+index provides. Only the CPU libraries are kept, with the two small CUDA runtime libraries
+that libtorch_cpu.so links.
 
-Safe to interrupt and repeat: everything is made in TARGET.partial, and renamed into
-place when it is whole. If LIBTORCH is set, nothing is fetched: the user's copy wins.
+You can interrupt and repeat the program: it works in TARGET.partial and renames the folder
+at the end. If LIBTORCH is set, nothing is fetched: the user's copy wins.
 """
 
 import os
@@ -22,7 +22,7 @@ from pathlib import Path
 
 BUILD_VERSION = "2.11.0"
 
-# name, version, sha256, what to take: (prefix in the wheel, suffix, target folder)
+# name, version, sha256, files to keep: (prefix in the wheel, target folder)
 WHEELS = [
     (
         "torch",
@@ -68,7 +68,7 @@ def folder_mb(folder: Path) -> float:
 
 
 def download(partial: Path) -> Path:
-    """Downloads the wheels with pip, hashes checked by pip itself; shows one progress line."""
+    """Downloads the wheels with pip, which checks the hashes, and shows one progress line."""
     wheels = partial / "wheels"
     wheels.mkdir(parents=True, exist_ok=True)
     scratch = partial / "tmp"
@@ -111,7 +111,7 @@ def download(partial: Path) -> Path:
     if process.returncode != 0:
         sys.stderr.write("".join(output))
         raise SystemExit(
-            "libtorch: the download failed (pip's message is above). Check that pip reaches its package index, "
+            "libtorch: the download failed (see pip's message above). Check that pip reaches its package index, "
             "or set LIBTORCH to the folder of a libtorch " + BUILD_VERSION + " you already have."
         )
     return wheels
@@ -141,15 +141,15 @@ def extract(wheels: Path, stage: Path) -> None:
                         shutil.copyfileobj(source, sink, 1 << 20)
     for library in ["libtorch_cpu.so", "libc10.so", "libgomp.so.1", "libcudart.so.13", "libcupti.so.13"]:
         if not (stage / "lib" / library).is_file():
-            raise SystemExit(f"libtorch: the wheels did not hold {library}")
-    # tch links against `torch`; the CPU library is all that it needs.
+            raise SystemExit(f"libtorch: the wheels do not contain {library}")
+    # tch links against `torch`, and needs only the CPU library.
     (stage / "lib" / "libtorch.so").write_text("INPUT ( libtorch_cpu.so )\n")
     (stage / "build-version").write_text(BUILD_VERSION + "\n")
 
 
 def main() -> None:
     if os.environ.get("LIBTORCH"):
-        say(f"using LIBTORCH={os.environ['LIBTORCH']} as it is")
+        say(f"using LIBTORCH={os.environ['LIBTORCH']}")
         return
     target = Path(sys.argv[1] if len(sys.argv) > 1 else ".libtorch").absolute()
     marker = target / "build-version"
@@ -175,4 +175,4 @@ if __name__ == "__main__":
     try:
         main()
     except KeyboardInterrupt:
-        raise SystemExit("libtorch: interrupted; run the same command again to go on")
+        raise SystemExit("libtorch: interrupted; repeat the command to continue")

@@ -1,11 +1,13 @@
 #!/usr/bin/env python3
-"""Installs the Debian package, drives from the installed paths as its user, looks as another user, and removes it.
+"""Installs the Debian package, drives as its user, tries to access the run as another user, and removes the package.
 
 Usage (as root, on a machine where carff is not installed): python3 tests/check_deb.py PACKAGE.deb
 
-What must hold: the units are valid; the doctor finds no error; a drive ends with exit code 0 as user carff; while it
-runs, another user (nobody) can neither read nor write any of its files; after a purge no file, user or shared memory
-of the package is left.
+Requirements:
+- The units are valid, and the doctor finds no error.
+- A drive as user carff ends with exit code 0.
+- During the drive another user (nobody) can neither read nor write any of its files.
+- After a purge no file, user or shared memory of the package is left.
 """
 
 import json
@@ -35,14 +37,14 @@ def run(*command: str, user: str | None = None, check: bool = True) -> subproces
 
 
 def run_files(uid: int) -> list[Path]:
-    """All that a run keeps: shared memory, and small files with sockets among them."""
+    """Returns all files of runs: shared memory, small files and sockets."""
     shared = [p for p in Path("/dev/shm").iterdir() if p.name.startswith("carff") and p.lstat().st_uid == uid]
     folder = Path("/tmp") / f"carff-{uid}"
     return shared + ([folder, *folder.rglob("*")] if folder.exists() else [])
 
 
 def look_as_nobody(files: list[Path]) -> None:
-    # The names are known to whoever lists /dev/shm; what is in them must not be.
+    # Every user can list the names in /dev/shm, but must not read the content.
     script = (
         'for f in "$@"; do '
         'if head -c 1 "$f" > /dev/null 2>&1; then echo "reads $f"; fi; '
@@ -72,7 +74,7 @@ def main() -> None:
                   "--report", report]
         with tempfile.NamedTemporaryFile("w", suffix=".log", encoding="utf-8") as log:
             launcher = subprocess.Popen(launch, stdout=log, stderr=log, cwd="/var/lib/carff")
-            # The first launch renders the data set.
+            # The first launch renders the dataset.
             while launcher.poll() is None and "hazard " not in Path(log.name).read_text(encoding="utf-8"):
                 time.sleep(0.2)
             files = run_files(uid)

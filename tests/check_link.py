@@ -1,20 +1,20 @@
 #!/usr/bin/env python3
-"""Drives on one host, looks from another, with nothing but carff-link between them.
+"""Drives on one host and observes from another, connected only by carff-link.
 
 Usage (as root): python3 tests/check_link.py [FOLDER OF THE PROGRAMS]     (default: target/release)
 
-Two hosts on one machine: each has a network, shared memory and a folder of runs of its own; a pair of virtual network
-cards joins them, and the second one's monotonic clock is ahead by a million seconds. What must hold:
+Both hosts are on one machine. Each has its own network, shared memory and folder of runs. A pair of virtual network
+cards connects them, and the second host's monotonic clock is ahead by a million seconds. Requirements:
 
-- beliefs, actions and views arrive as they were, but for the run and the times, which are moved by the clocks'
-  difference; probes and recorder work there as on any run;
-- on the vehicle no link publishes, and nothing listens; on the desk the link listens where it was told, and nowhere else;
-- a slow link loses messages and says so; a cut one brings none, and brings them again when it is whole; meanwhile, and
-  when the sending end is killed, the vehicle goes on deciding;
-- a renderer on the desk renders the vehicle's beliefs;
-- in the end nothing is left in shared memory, on either host.
+- Beliefs, actions and views arrive unchanged, except for the run and the times, which move by the clocks' difference.
+  Probes and recorder work on the desk.
+- On the vehicle no link publishes, and nothing listens. On the desk the link listens only on the given address.
+- A slow link loses and reports messages. A cut link delivers none, and delivers again when it is restored. The vehicle
+  continues to decide meanwhile, and when the sender is killed.
+- A renderer on the desk renders the vehicle's beliefs.
+- At the end nothing is left in shared memory on either host.
 
-Where the system allows no such hosts it says so, and that nothing was checked.
+If the system does not allow such hosts, the program reports that nothing was checked.
 """
 
 import json
@@ -34,7 +34,7 @@ RUNS = Path("/tmp") / f"carff-{os.geteuid()}"
 VEHICLE, DESK, PORT = "10.77.0.1", "10.77.0.2", 7447
 AHEAD_S = 1_000_000
 PATIENCE_S = 120
-# What has another value on another machine.
+# Header fields whose values differ between machines.
 OF_THE_PLACE = {"read_ns", "run_id", "capture_time_ns", "publish_time_ns", "valid_until_ns", "last_progress_ns"}
 
 
@@ -77,12 +77,12 @@ class Host:
         return Path(f"/proc/{self.pid}/root")
 
     def shared(self) -> list[str]:
-        """All files that runs keep on this host."""
+        """Returns all files of runs on this host."""
         folders = [self.root() / "dev/shm", self.root() / RUNS.relative_to("/")]
         return sorted(str(p) for folder in folders for p in folder.rglob("*"))
 
     def listening(self) -> set[str]:
-        """Addresses that something listens on."""
+        """Returns the addresses with listeners."""
         lines = Path(f"/proc/{self.pid}/net/tcp").read_text().splitlines()[1:]
         lines += Path(f"/proc/{self.pid}/net/tcp6").read_text().splitlines()[1:]
         found = [line.split()[1].split(":") for line in lines if line.split()[3] == "0A"]
@@ -96,7 +96,7 @@ class Host:
 
 
 class Process:
-    """A program of ours on a host; what it says is kept."""
+    """A program on a host, with its output."""
 
     def __init__(self, host: Host, program: str, args: tuple[str, ...]):
         self.name, self.lines, self.messages = f"{host.name}: {program} {' '.join(args)}", [], []
@@ -118,7 +118,7 @@ class Process:
         return next((line for line in list(self.lines) if words in line), None)
 
     def end(self) -> int:
-        """Ends it as Ctrl-C does."""
+        """Ends the program like Ctrl-C."""
         self.popen.send_signal(signal.SIGINT)
         code = self.popen.wait(PATIENCE_S)
         self.reader.join()
@@ -130,7 +130,7 @@ class Process:
 
 
 class Check:
-    """The two hosts, and what is asked of them."""
+    """The two hosts and the checks on them."""
 
     def __init__(self, vehicle: Host, desk: Host):
         self.vehicle, self.desk = vehicle, desk
@@ -199,7 +199,7 @@ class Check:
         before, after = self.pictures
         self.until("pictures are on both hosts", lambda: len(both(before, after)) >= 5)
         names = both(before, after)
-        # The last one of each may be in the making.
+        # The last file of each folder may be incomplete.
         same = [n for n in names[:-1] if (before / n).read_bytes() == (after / n).read_bytes()]
         self.must("pictures are as they were", len(same) == len(names) - 1)
         say(f"views: {len(same)} pictures as they were, byte for byte")
@@ -220,7 +220,7 @@ class Check:
         return list(getattr(self, host)["action"].messages)
 
     def goes_on(self, while_what: str, since: int, count: int) -> None:
-        """The vehicle publishes so many more actions, decisions on new frames among them."""
+        """Waits until the vehicle has published `count` more actions, including decisions on new frames."""
         new = lambda: self.actions()[since:]
         numbers = lambda: [a["header"]["sequence"] for a in new()]
         self.until(f"the vehicle acts on, {while_what}", lambda: new() and numbers()[-1] - numbers()[0] >= count)
@@ -295,7 +295,7 @@ class Check:
 
 
 def of_any_place(message: dict) -> dict:
-    """A message without what is of one machine."""
+    """Returns a message without the fields that differ between machines."""
     header = {k: v for k, v in message["header"].items() if k not in OF_THE_PLACE}
     return {k: v for k, v in message.items() if k not in OF_THE_PLACE} | {"header": header}
 

@@ -1,12 +1,13 @@
 #!/usr/bin/env python3
-"""Measures what probes that come and go cost a running graph.
+"""Measures the cost of attaching and detaching probes for a running graph.
 
 Usage: python3 tests/measure_probes.py [--rounds N] [--drives N] [--per-second R] [FOLDER OF THE PROGRAMS]
 
-In each round (4) the shipped graph drives (60 times) twice, in turns: once alone, and once while probes attach, hear a
-message, and detach or are killed with -9, R (4) of them a second, at most three at a time. Printed are both ways'
-latencies from camera to action, how many probes heard something, and the ratio of the medians of the p99s. In the end
-nothing may be left of any run. For a machine with nothing else to do; no test, since it measures times.
+In each round (default 4) the shipped graph drives 60 times without and 60 times with probes, in alternating order. R
+probes per second (default 4), at most three at a time, attach, receive a message, and detach or are killed with -9. The
+program prints the latencies from camera to action of both, the number of probes that received a message, and the ratio
+of the medians of the p99s. At the end nothing may be left of any run. Use an idle machine. This is not a test, because
+it measures times.
 """
 
 import argparse
@@ -30,7 +31,7 @@ PATIENCE_S = 60
 
 
 class Storm:
-    """Probes that come and go until they are told to stop."""
+    """Probes that attach and detach until a stop is requested."""
 
     def __init__(self, carff: Path, run: str, per_second: float):
         self.carff, self.run = carff, run
@@ -52,7 +53,7 @@ class Storm:
                 [self.carff, "probe", "echo", topic, "--json", "--run", self.run, *count],
                 stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
             )
-            # A probe that finds no run ends without a word.
+            # A probe without a run ends without output.
             heard = bool(probe.stdout.readline())
             if kill:
                 probe.send_signal(signal.SIGKILL)
@@ -74,12 +75,12 @@ class Storm:
 
 
 def held() -> set[Path]:
-    """What runs hold of the system."""
+    """Returns the system resources that runs hold."""
     return {p for folder in (RUNS, Path("/dev/shm")) if folder.is_dir() for p in folder.iterdir()}
 
 
 def drive(carff: Path, run: str, drives: int, per_second: float | None) -> tuple[dict, int, int]:
-    """The latencies of one launch, milliseconds, and the probes that heard something, and those of them that were killed."""
+    """Returns a launch's latencies in milliseconds, and the numbers of probes with a message and of killed probes."""
     before, record = held(), RUNS / f"{run}.run"
     with tempfile.TemporaryDirectory() as folder:
         report = Path(folder) / "report.json"
@@ -115,17 +116,17 @@ def main() -> None:
     ways: dict[bool, list[dict]] = {False: [], True: []}
     heard = killed = 0
     for number in range(args.rounds):
-        # The second of two is the first of the next two: none is always the one after the other.
+        # The second variant of a pair is the first of the next pair, so that no variant always follows the other.
         for storms in [False, True] if number % 2 == 0 else [True, False]:
             latency, more, ended = drive(carff, f"measured{number}{int(storms)}", args.drives,
                                           args.per_second if storms else None)
             ways[storms].append(latency)
             heard, killed = heard + more, killed + ended
-            print(f"round {number + 1}, {'probes' if storms else 'alone':6}: {json.dumps(latency)}", flush=True)
+            print(f"round {number + 1}, {'probes' if storms else 'none':6}: {json.dumps(latency)}", flush=True)
     p99 = {way: [latency["p99"] for latency in found] for way, found in ways.items()}
     ratio = statistics.median(p99[True]) / statistics.median(p99[False])
-    print(f"{heard} probes heard a message, {killed} of them were killed with -9")
-    print(f"p99, ms: alone {p99[False]}, with probes {p99[True]}; ratio of medians {ratio:.3f}")
+    print(f"{heard} probes received a message, {killed} of them were killed with -9")
+    print(f"p99, ms: without probes {p99[False]}, with probes {p99[True]}; ratio of medians {ratio:.3f}")
 
 
 if __name__ == "__main__":

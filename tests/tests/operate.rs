@@ -264,7 +264,7 @@ fn a_full_disk_ends_the_recording_alone() {
         return;
     }
     let recorder = on_small_disk(&format!("{back}\"$@\"; code=$?; cp disk/run.mcap kept.mcap; exit $code"));
-    recorder.assert_one_error(&["disk/run.mcap", "No space left", "can be read"]);
+    recorder.assert_one_error(&["disk/run.mcap", "No space left", "is readable"]);
 
     let before = decisions(&launcher.text());
     launcher.wait_for("further decisions", |text| decisions(text) > before);

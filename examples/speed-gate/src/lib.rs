@@ -1,31 +1,31 @@
-//! An example of a stage of a user's own: how fast the car may go, from the action and from how much of the scene is
-//! known. It uses the public crates alone, and joins whatever graph runs. The book's chapter "Write a stage" leads
-//! through it.
+//! An example of a stage outside the shipped graph. It computes a speed limit from the controller's action and from the
+//! share of the scene that is known. It uses public crates only and joins any running graph. The book's chapter "Write a
+//! stage" explains it.
 
 use carff_messages::{Action, ActionCode, Belief, Header, Invalid, ZeroCopySend, check, message};
 use carff_transport::{Topic, topics};
 
-/// The limit when all is known and nothing speaks against going on, metres a second.
+/// The limit for a known scene and the action to advance, metres per second.
 pub const FREE_M_S: f32 = 8.0;
 
-/// How fast the car may go.
+/// A speed limit, published for each action.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, ZeroCopySend)]
 #[type_name("speed-gate.SpeedLimit.v1")]
 pub struct SpeedLimit {
     /// Header of the action's frame.
     pub header: Header,
-    /// Metres a second, 0 to [`FREE_M_S`].
+    /// Speed limit, metres per second, 0 to [`FREE_M_S`].
     pub limit_m_s: f32,
-    /// Probability of all known states together, 0 to 1; what is missing is a scene that the models do not know.
+    /// Probability of all known states together, 0 to 1; the rest is the probability of an unknown scene.
     pub known: f32,
 }
 
-/// Where limits are published.
+/// Topic of the speed limits.
 pub const SPEED_LIMIT: Topic<SpeedLimit> = Topic::new("speed-gate/limit", topics::MESSAGES, 500);
 
 impl SpeedLimit {
-    /// Standstill while the action is to halt; else the slower, the less of the scene is known.
+    /// Returns 0 while the action is to halt, and otherwise a limit in proportion to the known probability.
     pub fn of(action: &Action, belief: Option<&Belief>) -> Self {
         let states = |b: &Belief| b.state_probability.iter().take(b.state_count as usize).sum::<f32>();
         let known = belief.map_or(0.0, states).clamp(0.0, 1.0);
@@ -71,7 +71,7 @@ mod tests {
         belief
     }
 
-    /// Halt is standstill; otherwise what is not known takes its share of the speed, and without a belief nothing is.
+    /// The limit is 0 on halt, proportional to the known probability on advance, and 0 without a belief.
     #[test]
     fn limits() {
         let limit = |code, belief: Option<Belief>| SpeedLimit::of(&action(code), belief.as_ref()).limit_m_s;
@@ -81,7 +81,7 @@ mod tests {
         assert_eq!(limit(ActionCode::Advance, None), 0.0);
     }
 
-    /// What is sent is valid and keeps the frame; a limit out of range or not finite is refused.
+    /// A limit is valid and keeps its frame; a limit out of range or not finite is refused.
     #[test]
     fn validation() {
         let limit = SpeedLimit::of(&action(ActionCode::Advance), Some(&belief([1.0, 0.0])));

@@ -1,10 +1,10 @@
-//! Joins a running graph and publishes how fast the car may go: `speed-gate [RUN]`.
+//! Joins a running graph and publishes a speed limit: `speed-gate [RUN]`.
 
 use carff_observe::{Attached, attach};
 use carff_transport::{Stop, Waiter, Woken, monotonic_now_ns, topics};
 use speed_gate::{SPEED_LIMIT, SpeedLimit};
 
-/// How long to sleep at most before looking whether the run still lives.
+/// Longest sleep before a check that the run is alive.
 const PATIENCE_NS: u64 = 1_000_000_000;
 
 fn main() -> anyhow::Result<()> {

@@ -1,4 +1,4 @@
-//! `carff bridge`: the run's topics over the Foxglove WebSocket protocol, for headless vehicles. Read-only.
+//! `carff bridge`: serves the run's topics over the Foxglove WebSocket protocol, read-only, for headless vehicles.
 
 use crate::probe::session::{Session, SessionArgs};
 use anyhow::Context;
@@ -14,26 +14,26 @@ use std::process::ExitCode;
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
-/// Longest time that clients get to hear of the end.
+/// Longest time to notify clients of the end.
 const FAREWELL: Duration = Duration::from_secs(1);
 
 /// Serve a run's topics.
 #[derive(Clone, Debug, Args)]
 pub struct BridgeArgs {
-    /// Address and port to listen at: of this machine alone, unless --remote is given. Port 0: any that is free.
+    /// Address and port to listen on; other than loopback only with --remote. Port 0 selects a free port.
     #[arg(long, default_value = "127.0.0.1:8765")]
     pub listen: SocketAddr,
-    /// Allow an address that other machines reach: whoever reaches it sees what the camera sees.
+    /// Allow an address that other machines can reach. Every host that reaches it can see the camera's images.
     #[arg(long)]
     pub remote: bool,
-    /// Topics; all when none is named.
+    /// Topics to serve; all by default.
     pub topics: Vec<TopicId>,
-    /// Which run, and for how long.
+    /// The run, and the time limit.
     #[command(flatten)]
     pub session: SessionArgs,
 }
 
-/// Serves until it is told to stop, the time is over, or the run ends.
+/// Serves until a stop is requested, the time is over, or the run ends.
 pub fn run(args: &BridgeArgs) -> anyhow::Result<ExitCode> {
     crate::metrics::refuse_remote(args.listen, args.remote)?;
     let mut session = Session::open(&args.session, "bridge")?;
@@ -41,13 +41,13 @@ pub fn run(args: &BridgeArgs) -> anyhow::Result<ExitCode> {
     session.listen(topics)?;
     let live = session.attached.live.clone();
     let places = Manifest::load(&live.checkpoint).map(|m| m.places).unwrap_or_default();
-    // No capabilities are announced: clients can look, and nothing else.
+    // Without capabilities, clients can only read.
     let server = WebSocketServer::new()
         .name(format!("carff run {}", live.name))
         .bind(args.listen.ip().to_string(), args.listen.port())
         .capabilities([])
         .start_blocking()
-        .with_context(|| format!("cannot listen at {}", args.listen))?;
+        .with_context(|| format!("cannot listen on {}", args.listen))?;
     println!("ws://{}:{}", args.listen.ip(), server.port());
     let mut open: BTreeMap<&'static str, Arc<RawChannel>> = BTreeMap::new();
     for channel in channels() {
@@ -59,7 +59,7 @@ pub fn run(args: &BridgeArgs) -> anyhow::Result<ExitCode> {
     let offset_ns = wall_ns.saturating_sub(monotonic_now_ns());
     let going = session.follow(
         |topic, message| {
-            // Nothing is encoded while nobody looks.
+            // Nothing is encoded without a client.
             if server.client_count() > 0 {
                 let message = message.message();
                 let at_ns = message.header().publish_time_ns.saturating_add(offset_ns);
@@ -73,12 +73,12 @@ pub fn run(args: &BridgeArgs) -> anyhow::Result<ExitCode> {
         },
         || Ok(()),
     )?;
-    // The server waits for its clients, and one that no longer reads would hold it up for ever.
+    // The server waits for its clients, and a client that does not read would block it indefinitely.
     let stopping = server.stop();
     let (stopped, wait) = std::sync::mpsc::sync_channel(1);
     std::thread::spawn(move || {
         stopping.wait_blocking();
-        // Nobody waits any longer when the time is over.
+        // The receiver is gone after the time limit.
         let _ = stopped.send(());
     });
     let _ = wait.recv_timeout(FAREWELL);

@@ -1,4 +1,4 @@
-//! `carff export`: a recording as pictures, tables, a film, or a trace.
+//! `carff export`: converts a recording to images, tables, a film or a trace.
 
 use crate::film::FilmWriter;
 use crate::probe::image::named_image;
@@ -13,23 +13,23 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
-/// Rate of a film whose recording holds one frame alone, frames a second.
+/// Rate of a film from a recording with only one frame, frames per second.
 const LONE_FRAME_HZ: f64 = 10.0;
 
 /// Export a recording.
 #[derive(Clone, Debug, Args)]
 #[group(required = true, multiple = true)]
 pub struct Outputs {
-    /// Camera frames and rendered views as PNG files in this folder.
+    /// Write camera frames and rendered views as PNG files into this folder.
     #[arg(long, value_name = "DIR")]
     pub png: Option<PathBuf>,
-    /// A table for each topic as a CSV file in this folder, with a column for each field.
+    /// Write a CSV file per topic into this folder, with a column per field.
     #[arg(long, value_name = "DIR")]
     pub csv: Option<PathBuf>,
-    /// The camera's frames as a film (H.264), each shown from the time of its capture to that of the next one.
+    /// Write the camera's frames as a film (H.264). Each frame is shown from its capture until the next one.
     #[arg(long, value_name = "FILE")]
     pub mp4: Option<PathBuf>,
-    /// When each stage worked on which frame, in the trace event format that ui.perfetto.dev opens.
+    /// Write the times of all stages and frames in the trace event format, for ui.perfetto.dev.
     #[arg(long, value_name = "FILE")]
     pub trace: Option<PathBuf>,
 }
@@ -37,19 +37,19 @@ pub struct Outputs {
 /// Export a recording.
 #[derive(Clone, Debug, Args)]
 pub struct ExportArgs {
-    /// The recording.
+    /// Recording to export.
     pub recording: PathBuf,
-    /// What to make of it.
+    /// Outputs to write.
     #[command(flatten)]
     pub outputs: Outputs,
 }
 
-/// Exports.
+/// Runs the command.
 pub fn run(args: &ExportArgs) -> anyhow::Result<ExitCode> {
     let Outputs { png, csv, mp4, trace } = &args.outputs;
     let path = &args.recording;
     if let Some(folder) = png {
-        println!("{}: {} pictures", folder.display(), pictures(path, folder)?);
+        println!("{}: {} images", folder.display(), pictures(path, folder)?);
     }
     if let Some(folder) = csv {
         for (file, rows) in tables(path, folder)? {
@@ -66,7 +66,7 @@ pub fn run(args: &ExportArgs) -> anyhow::Result<ExitCode> {
 }
 
 fn make_folder(folder: &Path) -> anyhow::Result<()> {
-    std::fs::create_dir_all(folder).with_context(|| format!("cannot make the folder {}", folder.display()))
+    std::fs::create_dir_all(folder).with_context(|| format!("cannot create the folder {}", folder.display()))
 }
 
 fn pictures(recording: &Path, folder: &Path) -> anyhow::Result<u64> {
@@ -84,7 +84,7 @@ fn pictures(recording: &Path, folder: &Path) -> anyhow::Result<u64> {
     Ok(count)
 }
 
-/// A JSON value as cells, each named by its path.
+/// Flattens a JSON value into cells, each named by its path.
 fn flatten(path: &str, value: &Value, cells: &mut BTreeMap<String, String>) {
     let below = |key: &str| if path.is_empty() { key.to_owned() } else { format!("{path}.{key}") };
     match value {
@@ -98,7 +98,7 @@ fn flatten(path: &str, value: &Value, cells: &mut BTreeMap<String, String>) {
     }
 }
 
-/// `a.10` after `a.9`.
+/// Returns a sort key that orders `a.10` after `a.9`.
 fn natural(column: &str) -> Vec<(bool, u64, String)> {
     column
         .split('.')
@@ -147,7 +147,7 @@ fn tables(recording: &Path, folder: &Path) -> anyhow::Result<Vec<(PathBuf, u64)>
     Ok(written)
 }
 
-/// Frames a second, from the median time between them.
+/// Returns the frames per second, from the median time between frames.
 fn frame_rate_hz(recording: &Path) -> anyhow::Result<f64> {
     let mut reader = Reader::open(recording)?;
     let (mut before_ns, mut between) = (None, Vec::new());
@@ -175,10 +175,10 @@ fn film(recording: &Path, file: &Path) -> anyhow::Result<u64> {
             Some(film) => film,
             None => film.insert(FilmWriter::create(file, size_px, rate_hz)?),
         };
-        ensure!(film.size_px() == size_px, "frame {} has another size than the first", m.header.frame_id);
+        ensure!(film.size_px() == size_px, "frame {} does not have the size of the first frame", m.header.frame_id);
         film.add(message.bytes(), m.header.capture_time_ns)?;
     }
-    film.with_context(|| format!("{} holds no camera frame", recording.display()))?.finish()
+    film.with_context(|| format!("{} contains no camera frame", recording.display()))?.finish()
 }
 
 fn spans(recording: &Path, file: &Path) -> anyhow::Result<usize> {
@@ -213,8 +213,8 @@ mod tests {
         writer.finish().unwrap();
     }
 
-    /// Pictures have their bytes, tables a row for each message and a column for each field, films every frame, traces a
-    /// span each; without frames there is no film.
+    /// Images have their bytes, tables a row per message and a column per field, films every frame, and traces a span
+    /// per message. Without frames there is no film.
     #[test]
     fn recordings_become_files() {
         let folder = tempfile::tempdir().unwrap();
@@ -242,7 +242,7 @@ mod tests {
         assert!(error.contains("no camera frame") && !folder.path().join("none.mp4").exists(), "{error}");
     }
 
-    /// Columns of lists are in the order of their numbers.
+    /// Columns of lists are in numerical order.
     #[test]
     fn columns_are_in_natural_order() {
         let mut columns = ["a.10.x", "a.9.x", "b", "a.9.b"];

@@ -1,4 +1,4 @@
-//! Films: pictures as H.264 in an MP4 file, each shown from its own time until the next one's.
+//! Films: images as H.264 in an MP4 file, each shown from its own time until the next image.
 
 use anyhow::{Context, ensure};
 use openh264::OpenH264API;
@@ -16,15 +16,15 @@ use std::io::{BufWriter, Seek, SeekFrom, Write};
 use std::num::NonZeroU32;
 use std::path::{Path, PathBuf};
 
-/// The film's clock: a whole number of ticks for each of the usual frame rates.
+/// Ticks per second of the film's clock: a multiple of each usual frame rate.
 const TICKS_HZ: NonZeroU32 = NonZeroU32::new(90_000).unwrap();
-/// How coarse pictures may become, of 0 to 51: one has to look hard to see it.
+/// Coarsest quantization, of 0 to 51; its effect is hardly visible.
 const COARSENESS: QpRange = QpRange::new(12, 16);
-/// Time between pictures that stand for themselves, seconds: players jump to these.
+/// Time between key images, seconds; players seek to these.
 const WHOLE_PICTURE_EVERY_S: f64 = 2.0;
-/// Shortest side that the encoder takes.
+/// Shortest side that the encoder accepts.
 const MIN_SIDE_PX: u32 = 16;
-/// Frame rates that the encoder knows, hertz.
+/// Frame rates that the encoder accepts, hertz.
 const RATES_HZ: std::ops::RangeInclusive<f64> = 1.0..=60.0;
 
 /// A film that is being written.
@@ -34,22 +34,22 @@ pub(crate) struct FilmWriter {
     encoder: Encoder,
     muxer: Mp4FileMuxer,
     size_px: [u32; 2],
-    /// Where the next bytes go.
+    /// Position of the next bytes in the file.
     position: u64,
     begun_ns: Option<u64>,
-    /// The last picture and when it comes, in ticks; how long it stays is known when the next one comes.
+    /// The last image and its time, in ticks. The next image determines its duration.
     last: Option<(Sample, u64)>,
-    /// How long the very last picture stays.
+    /// Duration of the last image of the film.
     period_ticks: u32,
     count: u64,
 }
 
 impl FilmWriter {
-    /// Makes the file. `rate_hz` is about how many pictures a second will come.
+    /// Creates the file. `rate_hz` is the approximate rate of images.
     pub(crate) fn create(path: &Path, size_px: [u32; 2], rate_hz: f64) -> anyhow::Result<Self> {
         let config = EncoderConfig::new()
             .profile(Profile::Baseline)
-            // As fine as that, however many bytes it takes; and no picture is left out.
+            // Constant quality at any size, and no image is skipped.
             .rate_control_mode(RateControlMode::Bufferbased)
             .qp(COARSENESS)
             .skip_frames(false)
@@ -57,7 +57,7 @@ impl FilmWriter {
             .max_frame_rate(FrameRate::from_hz(rate_hz.clamp(*RATES_HZ.start(), *RATES_HZ.end()) as f32))
             .intra_frame_period(IntraFramePeriod::from_num_frames((WHOLE_PICTURE_EVERY_S * rate_hz).max(1.0) as u32))
             .num_threads(1)
-            // The matrix that pictures are converted with, and what they are.
+            // The colour conversion, and the colour space.
             .vui(
                 VuiConfig::bt601()
                     .color_primaries(ColorPrimaries::Bt709)
@@ -83,25 +83,25 @@ impl FilmWriter {
         Ok(film)
     }
 
-    /// Width and height of its pictures.
+    /// Returns width and height of its images.
     pub(crate) fn size_px(&self) -> [u32; 2] {
         self.size_px
     }
 
-    /// Adds a picture, RGB bytes row by row, that was taken at this time.
+    /// Adds an image, RGB bytes row by row, captured at this time.
     pub(crate) fn add(&mut self, rgb: &[u8], at_ns: u64) -> anyhow::Result<()> {
         let (rgb, [width_px, height_px]) = fitting(rgb, self.size_px);
         let picture = RgbSliceU8::new(&rgb, (width_px as usize, height_px as usize));
         let stream = self
             .encoder
             .encode(&YUVBuffer::from_rgb8_source(picture))
-            .with_context(|| format!("cannot encode pictures of {width_px} x {height_px} pixels"))?;
+            .with_context(|| format!("cannot encode images of {width_px} x {height_px} pixels"))?;
         let keyframe = stream.frame_type() == FrameType::IDR;
         let (mut sequence, mut pictures, mut data) = (Vec::new(), Vec::new(), Vec::new());
         for layer in (0..stream.num_layers()).filter_map(|i| stream.layer(i)) {
             for unit in (0..layer.nal_count()).filter_map(|i| layer.nal_unit(i)) {
                 let unit = unit.strip_prefix(&[0, 0, 0, 1]).or_else(|| unit.strip_prefix(&[0, 0, 1])).unwrap_or(unit);
-                // Parameters of the sequence and of its pictures stand once in the file's index; the rest is the picture.
+                // The file's index contains the parameter sets once; the rest is the image.
                 match unit.first().map(|byte| byte & 0x1f) {
                     Some(7) => sequence.push(unit.to_vec()),
                     Some(8) => pictures.push(unit.to_vec()),
@@ -112,7 +112,7 @@ impl FilmWriter {
                 }
             }
         }
-        ensure!(!data.is_empty(), "the film's encoder left picture {} out", self.count);
+        ensure!(!data.is_empty(), "the film's encoder skipped image {}", self.count);
         let entry = match self.last {
             None => Some(sample_entry([width_px, height_px], sequence, pictures)?),
             Some(_) => None,
@@ -140,7 +140,7 @@ impl FilmWriter {
         self.write(&data)
     }
 
-    /// Writes the index. Returns the number of pictures.
+    /// Writes the index. Returns the number of images.
     pub(crate) fn finish(mut self) -> anyhow::Result<u64> {
         if let Some((last, _)) = self.last.take() {
             self.muxer.append_sample(&last)?;
@@ -162,7 +162,7 @@ impl FilmWriter {
     }
 }
 
-/// How the pictures are encoded, for the index.
+/// Returns the description of the encoding, for the index.
 fn sample_entry(size_px: [u32; 2], sequence: Vec<Vec<u8>>, pictures: Vec<Vec<u8>>) -> anyhow::Result<SampleEntry> {
     let [width, height] = size_px.map(u16::try_from);
     let profile = sequence.first().and_then(|unit| unit.get(1..4)).context("the film's encoder gave no parameters")?;
@@ -193,8 +193,8 @@ fn sample_entry(size_px: [u32; 2], sequence: Vec<Vec<u8>>, pictures: Vec<Vec<u8>
     }))
 }
 
-/// A picture whose sides are as the encoder wants them, even and not too short: where they are not, the last column and
-/// row stand more than once.
+/// Returns an image with sides that the encoder accepts: even and long enough. The last column and row are repeated if
+/// necessary.
 fn fitting(rgb: &[u8], [width_px, height_px]: [u32; 2]) -> (Cow<'_, [u8]>, [u32; 2]) {
     let fitting_px = [width_px, height_px].map(|side_px| side_px.next_multiple_of(2).max(MIN_SIDE_PX));
     if fitting_px == [width_px, height_px] {
@@ -213,7 +213,7 @@ mod tests {
     use openh264::formats::YUVSource;
     use shiguredo_mp4::demux::{Input, Mp4FileDemuxer};
 
-    /// A picture in which everything moves.
+    /// Returns an image in which everything moves.
     fn picture([width_px, height_px]: [u32; 2], number: u32) -> Vec<u8> {
         let pixel = |x: u32, y: u32| {
             let wave = ((x + 3 * number) as f32 / 20.0).sin() + (y as f32 / 15.0).cos();
@@ -222,7 +222,8 @@ mod tests {
         (0..height_px).flat_map(|y| (0..width_px).flat_map(move |x| pixel(x, y))).collect()
     }
 
-    /// What a player finds in a file: sides, whole pictures' numbers, times in ticks, length in ticks, decoded pictures.
+    /// The content of a file for a player: sides, numbers of key images, times in ticks, length in ticks, decoded
+    /// images.
     struct Played {
         size_px: [u32; 2],
         whole: Vec<usize>,
@@ -266,7 +267,7 @@ mod tests {
                 played.whole.push(played.times.len());
             }
             played.times.push(sample.timestamp);
-            let decoded = decoder.decode(&stream).unwrap().expect("each sample is a picture");
+            let decoded = decoder.decode(&stream).unwrap().expect("each sample is an image");
             let (width, height) = decoded.dimensions();
             assert_eq!([width as u32, height as u32], played.size_px);
             let mut rgb = vec![0; width * height * 3];
@@ -276,13 +277,13 @@ mod tests {
         played
     }
 
-    /// A film has every picture, nearly as it was, shown at its own time; players can jump to one of each two seconds.
+    /// A film shows every image, nearly unchanged, at its own time; players can seek to one image every two seconds.
     #[test]
     fn films_show_what_was_filmed() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("film.mp4");
         let size_px = [128, 72];
-        // Ten a second, with a gap of a second after the 30th.
+        // Ten images per second, with a gap of a second after the 30th.
         let at_ns = |number: u32| 7_000 + u64::from(number) * 100_000_000 + u64::from(number > 29) * 1_000_000_000;
         let mut film = FilmWriter::create(&path, size_px, 10.0).unwrap();
         for number in 0..50 {
@@ -300,11 +301,11 @@ mod tests {
             let [found, wanted] = [decoded, &picture(size_px, number as u32)]
                 .map(|p| p.iter().map(|&byte| f32::from(byte) / 255.0).collect::<Vec<_>>());
             let psnr_db = carff_metrics::psnr_db(&found, &wanted).unwrap();
-            assert!(psnr_db > 35.0, "picture {number}: {psnr_db} dB");
+            assert!(psnr_db > 35.0, "image {number}: {psnr_db} dB");
         }
     }
 
-    /// Pictures with odd sides and small ones are shown with the last column and row more than once.
+    /// In images with odd or short sides the last column and row are repeated.
     #[test]
     fn films_have_fitting_sides() {
         let folder = tempfile::tempdir().unwrap();

@@ -1,7 +1,7 @@
-//! What attaches to a run from outside, or reads what was taken home of one: probes, recorder, exports, bridge, metrics.
+//! The commands that observe a run or read a recording: probes, recorder, exports, bridge, metrics.
 //!
-//! What lives here: the commands that need no model, and what the terminal shows. What never does: a model, and whatever
-//! links libtorch, which would make a probe's start thirty times as dear.
+//! This crate contains commands without a model, and the terminal's output. It never links libtorch, which would make
+//! the start of a probe thirty times as expensive.
 
 pub mod bridge;
 pub mod export;
@@ -22,41 +22,39 @@ use std::ffi::OsString;
 use std::os::unix::process::CommandExt;
 use std::process::{Command, ExitCode};
 
-/// The commands of this room.
+/// The commands of this crate.
 #[derive(Debug, Subcommand)]
 pub enum Attach {
-    /// Look at a running graph from another terminal.
+    /// Observe a running graph from another terminal.
     #[command(
         subcommand,
-        after_help = "Example: what runs, and how each stage does
+        after_help = "Example: list the topics; show all stages
   carff probe list
   carff probe top"
     )]
     Probe(probe::ProbeCommand),
-    /// Open the live window: each hypothesis from any camera.
-    #[command(after_help = "Example: on the run that lives, or on a checkpoint alone
+    /// Open the live window: each forecast scene from any camera.
+    #[command(after_help = "Example: on the running graph, or on a checkpoint only
   carff view
   carff view --checkpoint configs/checkpoints/approaching-intersection")]
     View(view::ViewArgs),
     /// Record a running graph into an MCAP file.
-    #[command(
-        after_help = "Example: a minute of everything; actions and beliefs alone, in files of 10 minutes of which 6 are kept
+    #[command(after_help = "Example: all topics for a minute; only beliefs and actions, in six files of ten minutes
   carff record -o run.mcap --seconds 60
-  carff record belief action -o drive.mcap --file-seconds 600 --keep 6"
-    )]
+  carff record belief action -o drive.mcap --file-seconds 600 --keep 6")]
     Record(record::RecordArgs),
-    /// Make pictures, tables, a film, or a trace of a recording.
+    /// Export images, tables, a film or a trace from a recording.
     #[command(after_help = "Example:
-  carff export run.mcap --png pictures --csv tables --trace trace.json")]
+  carff export run.mcap --png images --csv tables --trace trace.json")]
     Export(export::ExportArgs),
-    /// Serve a run's topics over the Foxglove WebSocket protocol, read-only, on this machine alone.
+    /// Serve a run's topics over the Foxglove WebSocket protocol, read-only and on loopback by default.
     #[command(
-        after_help = "Example: on the vehicle, and through a tunnel to the desk, where Foxglove opens ws://localhost:8765
+        after_help = "Example: on the vehicle; then a tunnel from the desk, where Foxglove opens ws://localhost:8765
   carff bridge
   ssh -L 8765:localhost:8765 vehicle"
     )]
     Bridge(bridge::BridgeArgs),
-    /// Serve a run's numbers over HTTP, for Prometheus, on this machine alone.
+    /// Serve a run's metrics over HTTP for Prometheus, on loopback by default.
     #[command(after_help = "Example:
   carff metrics --listen 127.0.0.1:9464
   curl http://127.0.0.1:9464/metrics
@@ -65,7 +63,7 @@ pub enum Attach {
 }
 
 impl Attach {
-    /// Does what is asked for.
+    /// Runs the command.
     pub fn run(&self) -> anyhow::Result<ExitCode> {
         match self {
             Self::Probe(command) => probe::run(command),
@@ -78,7 +76,7 @@ impl Attach {
     }
 }
 
-/// A program's exit code; an error is told in one sentence.
+/// Returns a program's exit code, and prints an error as one sentence.
 pub fn exit_code(result: anyhow::Result<ExitCode>) -> ExitCode {
     result.unwrap_or_else(|error| {
         eprintln!("error: {}", carff_stage::describe(&error));
@@ -86,8 +84,8 @@ pub fn exit_code(result: anyhow::Result<ExitCode>) -> ExitCode {
     })
 }
 
-/// Runs a program to its end. Where standard output's reader has seen enough (`| head`), that is an end like any other
-/// program's: without a word, with exit code 141.
+/// Runs a program to its end. If the reader of standard output closes the pipe (`| head`), the program ends like others
+/// do: without a message and with exit code 141.
 pub fn until_read(program: impl FnOnce() -> ExitCode) -> ExitCode {
     let told = std::panic::take_hook();
     std::panic::set_hook(Box::new(move |info| {
@@ -100,14 +98,14 @@ pub fn until_read(program: impl FnOnce() -> ExitCode) -> ExitCode {
     })
 }
 
-/// `println!` panics with these words where nobody reads.
+/// Returns true for the panic of `println!` on a closed pipe.
 fn says_closed_pipe(payload: &(dyn Any + Send)) -> bool {
     payload
         .downcast_ref::<String>()
         .is_some_and(|text| text.starts_with("failed printing to stdout") && text.contains("Broken pipe"))
 }
 
-/// Becomes another program of ours, which lies beside this one; returns when it cannot be started.
+/// Replaces this process with another program of this project from the same folder; returns if that fails.
 pub fn become_program(name: &str, args: &[OsString]) -> anyhow::Result<ExitCode> {
     let program = std::env::current_exe()?.with_file_name(name);
     let error = Command::new(&program).args(args).exec();

@@ -1,4 +1,4 @@
-//! One line of the log: what a stage or the launcher says, as text or as JSON.
+//! One line of the log of a stage or the launcher, as text or as JSON.
 
 use carff_config::LogFormat;
 use serde_json::{Map, Value};
@@ -6,8 +6,8 @@ use serde_json::{Map, Value};
 /// Levels as stages write them, in text and in JSON.
 const LEVELS: [&str; 5] = ["ERROR", "WARN", "INFO", "DEBUG", "TRACE"];
 
-/// A line as it goes out. `source` is a stage's name or `launcher`; `said` is what it wrote: a JSON object, or text that
-/// may begin with a level. `time` is written in JSON alone.
+/// Formats a line for output. `source` is a stage's name or `launcher`. `said` is the line that it wrote: a JSON
+/// object, or text that may begin with a level. Only JSON contains `time`.
 pub(crate) fn formatted(format: LogFormat, time: &str, source: &str, said: &str) -> String {
     match format {
         LogFormat::Text => format!("[{source}] {said}"),
@@ -20,14 +20,15 @@ pub(crate) fn formatted(format: LogFormat, time: &str, source: &str, said: &str)
     }
 }
 
-/// What went wrong, if that is what the line says.
+/// Returns the message of a line that reports an error.
 pub fn error_in(said: &str) -> Option<String> {
     let fields = fields(said);
     let text = |key: &str| fields.get(key).and_then(Value::as_str).unwrap_or_default();
     (text("level") == "ERROR" || text("message").contains("panicked at")).then(|| text("message").to_owned())
 }
 
-/// Level, message and fields of a line. What has no level, such as a panic or the words of a library, is a warning.
+/// Returns level, message and fields of a line. A line without a level, such as a panic or a library's output, is a
+/// warning.
 fn fields(said: &str) -> Map<String, Value> {
     if let Ok(Value::Object(fields)) = serde_json::from_str(said) {
         return fields;
@@ -48,8 +49,8 @@ mod tests {
         serde_json::from_str(&formatted(LogFormat::Json, "2026-01-01T00:00:00Z", "encoder", said)).unwrap()
     }
 
-    /// Text is passed on as it is; in JSON every line is an object with time, source, level and message, whatever was
-    /// said, and a stage's own fields stay.
+    /// Text is passed on unchanged. In JSON every line is an object with time, source, level and message, and keeps the
+    /// fields of the stage.
     #[test]
     fn every_line_has_its_form() {
         assert_eq!(
@@ -74,7 +75,7 @@ mod tests {
         }
     }
 
-    /// Errors are found in both forms, and nothing else is one.
+    /// Errors are found in both forms, and no other line is an error.
     #[test]
     fn errors_are_found_in_both_forms() {
         assert_eq!(error_in("ERROR no weights"), Some("no weights".into()));

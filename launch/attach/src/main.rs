@@ -1,11 +1,11 @@
-//! The `carff` command. What attaches to a run is done here; for all else this becomes `carff-launch`, which knows every
-//! command and is linked with libtorch.
+//! The `carff` command. It runs the commands that observe a run, and executes `carff-launch` for all others.
+//! `carff-launch` knows every command and links libtorch.
 
 use carff::{Attach, become_program, exit_code, until_read};
 use clap::{Parser, Subcommand};
 use std::process::ExitCode;
 
-/// The program of the other commands, beside this one.
+/// The program of the other commands, in the same folder.
 const LAUNCH: &str = "carff-launch";
 
 #[derive(Debug, Parser)]

@@ -1,4 +1,4 @@
-//! `carff metrics`: a run's numbers over HTTP, for Prometheus and for scripts. Nothing listens unless this is started.
+//! `carff metrics`: serves a run's metrics over HTTP, for Prometheus and for scripts.
 
 use crate::probe::session::{Session, SessionArgs};
 use crate::vitals::{RunVitals, StageVitals};
@@ -13,24 +13,24 @@ use std::net::SocketAddr;
 use std::process::ExitCode;
 use tiny_http::{Header, Method, Response, Server};
 
-/// Serve a run's numbers.
+/// Serve a run's metrics.
 #[derive(Clone, Debug, Args)]
 pub struct MetricsArgs {
-    /// Address and port to listen at: of this machine alone, unless --remote is given. Port 0: any that is free.
+    /// Address and port to listen on; other than loopback only with --remote. Port 0 selects a free port.
     #[arg(long, default_value = "127.0.0.1:9464")]
     pub listen: SocketAddr,
-    /// Allow an address that other machines reach: whoever reaches it can read the numbers.
+    /// Allow an address that other machines can reach. Every host that reaches it can read the metrics.
     #[arg(long)]
     pub remote: bool,
-    /// Print the status once, as JSON, after listening for 3 seconds (or --seconds), and serve nothing.
+    /// Print the status once, as JSON, after 3 seconds (or --seconds), and serve nothing.
     #[arg(long)]
     pub once: bool,
-    /// Which run, and for how long.
+    /// The run, and the time limit.
     #[command(flatten)]
     pub session: SessionArgs,
 }
 
-/// Serves until it is told to stop, the time is over, or the run ends.
+/// Serves until a stop is requested, the time is over, or the run ends.
 pub fn run(args: &MetricsArgs) -> anyhow::Result<ExitCode> {
     refuse_remote(args.listen, args.remote)?;
     let mut session_args = args.session.clone();
@@ -42,7 +42,7 @@ pub fn run(args: &MetricsArgs) -> anyhow::Result<ExitCode> {
     let server = if args.once {
         None
     } else {
-        let server = Server::http(args.listen).map_err(|e| anyhow!("cannot listen at {}: {e}", args.listen))?;
+        let server = Server::http(args.listen).map_err(|e| anyhow!("cannot listen on {}: {e}", args.listen))?;
         println!("http://{}/metrics and /status", server.server_addr());
         Some(server)
     };
@@ -55,7 +55,7 @@ pub fn run(args: &MetricsArgs) -> anyhow::Result<ExitCode> {
             if let Ok(header) = Header::from_bytes("Content-Type", kind) {
                 response = response.with_header(header);
             }
-            // Whoever asked may have gone.
+            // The client may have closed the connection.
             let _ = request.respond(response);
         }
         Ok(true)
@@ -67,21 +67,21 @@ pub fn run(args: &MetricsArgs) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-/// Nothing listens to other machines by mistake.
+/// Refuses an address that other machines can reach without `--remote`.
 pub(crate) fn refuse_remote(listen: SocketAddr, remote: bool) -> anyhow::Result<()> {
     ensure!(
         remote || listen.ip().is_loopback(),
-        "{listen} can be reached from other machines: say --remote if that is meant, or listen at 127.0.0.1"
+        "other machines can reach {listen}: add --remote to allow this, or listen on 127.0.0.1"
     );
     Ok(())
 }
 
-/// Status, type and text of the answer to a request.
+/// Returns status, content type and text of the response to a request.
 fn answer(method: &Method, url: &str, run: &str, vitals: &RunVitals) -> (u16, &'static str, String) {
     match (method, url.split('?').next().unwrap_or_default()) {
         (Method::Get, "/metrics") => (200, "text/plain; version=0.0.4; charset=utf-8", prometheus(run, vitals)),
         (Method::Get, "/status") => (200, "application/json", status(run, vitals).to_string()),
-        (Method::Get, _) => (404, "text/plain", "there is /metrics and /status\n".to_owned()),
+        (Method::Get, _) => (404, "text/plain", "try /metrics or /status\n".to_owned()),
         _ => (405, "text/plain", "only GET\n".to_owned()),
     }
 }
@@ -116,7 +116,7 @@ fn status(run: &str, vitals: &RunVitals) -> Value {
     })
 }
 
-/// The text format that Prometheus reads.
+/// Returns the metrics in the Prometheus text format.
 fn prometheus(run: &str, vitals: &RunVitals) -> String {
     let mut text = String::new();
     let mut family = |name: &str, kind: &str, help: &str, samples: &[(String, String)]| {
@@ -131,7 +131,7 @@ fn prometheus(run: &str, vitals: &RunVitals) -> String {
     let labelled = |label: &str, counts: &std::collections::BTreeMap<&'static str, u64>| -> Vec<(String, String)> {
         counts.iter().map(|(name, count)| (format!("{label}=\"{name}\""), count.to_string())).collect()
     };
-    family("frames_total", "counter", "Frames that the camera took.", &one(&vitals.frames));
+    family("frames_total", "counter", "Frames from the camera.", &one(&vitals.frames));
     family("decisions_total", "counter", "Decisions on a frame.", &one(&vitals.decisions));
     family("actions_total", "counter", "Actions published.", &labelled("action", &vitals.actions));
     family("safe_actions_total", "counter", "Safe actions by reason.", &labelled("reason", &vitals.safe_actions));
@@ -141,7 +141,7 @@ fn prometheus(run: &str, vitals: &RunVitals) -> String {
         .iter()
         .filter_map(|&q| percentile(&decided, q).map(|ms| (format!("quantile=\"{q}\""), (ms / 1e3).to_string())))
         .collect();
-    family("camera_to_action_seconds", "gauge", "From capture to decision, of the latest decisions.", &quantiles);
+    family("camera_to_action_seconds", "gauge", "Time from capture to decision of the latest decisions.", &quantiles);
     let now_ns = monotonic_now_ns();
     let mut of_stages = |name: &str, kind: &str, help: &str, value: &dyn Fn(&StageVitals) -> String| {
         let samples: Vec<(String, String)> =
@@ -150,17 +150,17 @@ fn prometheus(run: &str, vitals: &RunVitals) -> String {
     };
     of_stages("stage_up", "gauge", "1 when the stage is ok.", &|v| u8::from(v.state_name(now_ns) == "ok").to_string());
     of_stages("stage_messages_total", "counter", "Messages seen on the stage's topic.", &|v| v.messages.to_string());
-    of_stages("stage_rate_hertz", "gauge", "Messages a second, lately.", &|v| v.rate_hz(now_ns).to_string());
-    of_stages("stage_latency_seconds", "gauge", "What the latest output took.", &|v| {
+    of_stages("stage_rate_hertz", "gauge", "Recent rate of messages.", &|v| v.rate_hz(now_ns).to_string());
+    of_stages("stage_latency_seconds", "gauge", "Latency of the latest output.", &|v| {
         (v.latency_ms.back().copied().unwrap_or(0.0) / 1e3).to_string()
     });
     of_stages("stage_cpu_cores", "gauge", "Cores in use.", &|v| v.cpu.to_string());
     of_stages("stage_resident_bytes", "gauge", "Resident memory.", &|v| v.rss_bytes.to_string());
     of_stages("stage_skipped_total", "counter", "Inputs skipped for newer ones.", &|v| v.counts[0].to_string());
     of_stages("stage_invalid_total", "counter", "Invalid inputs dropped.", &|v| v.counts[1].to_string());
-    of_stages("stage_errors_total", "counter", "Errors of the stage's own.", &|v| v.counts[2].to_string());
+    of_stages("stage_errors_total", "counter", "Errors of the stage.", &|v| v.counts[2].to_string());
     of_stages("stage_restarts_total", "counter", "New processes seen.", &|v| v.restarts.to_string());
-    of_stages("stage_late_total", "counter", "Heartbeats that said slow or stale.", &|v| v.late.to_string());
+    of_stages("stage_late_total", "counter", "Heartbeats that reported slow or stale.", &|v| v.late.to_string());
     text
 }
 
@@ -178,7 +178,7 @@ mod tests {
         vitals
     }
 
-    /// Each line is a comment or a sample with labels and a number; the stage that spoke is there.
+    /// Each line is a comment or a sample with labels and a number; the stage with messages is included.
     #[test]
     fn metrics_are_in_the_text_format() {
         let text = prometheus("r", &vitals());
@@ -190,7 +190,7 @@ mod tests {
         assert!(text.contains("carff_stage_latency_seconds{run=\"r\",stage=\"encoder\"} 0.015"), "{text}");
     }
 
-    /// An address that other machines reach is refused unless it is meant.
+    /// An address that other machines can reach is refused without `--remote`.
     #[test]
     fn nothing_listens_to_others_by_mistake() {
         assert!(refuse_remote("127.0.0.1:1".parse().unwrap(), false).is_ok());
@@ -199,7 +199,7 @@ mod tests {
         assert!(refuse_remote("0.0.0.0:1".parse().unwrap(), true).is_ok());
     }
 
-    /// What is not there and what is not asked for as it should be are refused.
+    /// Unknown paths and other methods than GET are refused.
     #[test]
     fn other_requests_are_refused() {
         assert_eq!(answer(&Method::Get, "/metrics?x=1", "r", &vitals()).0, 200);

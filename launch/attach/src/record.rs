@@ -1,4 +1,4 @@
-//! `carff record`: a running graph into an MCAP file.
+//! `carff record`: writes the messages of a running graph into an MCAP file.
 
 use crate::probe::session::{Session, SessionArgs};
 use crate::terminal::Terminal;
@@ -19,29 +19,30 @@ const STATUS_NS: u64 = 1_000_000_000;
 /// Record a run.
 #[derive(Clone, Debug, Args)]
 pub struct RecordArgs {
-    /// Topics; all when none is named.
+    /// Topics to record; all by default.
     pub topics: Vec<TopicId>,
-    /// The file; it must not exist.
+    /// File to write; it must not exist.
     #[arg(short, long)]
     pub out: PathBuf,
-    /// Begin another file when one is as large as this, megabytes.
+    /// Begin another file at this size, megabytes.
     #[arg(long, value_parser = clap::value_parser!(u64).range(1..))]
     pub file_mb: Option<u64>,
-    /// Begin another file after so many seconds.
+    /// Begin another file after this time, seconds.
     #[arg(long, value_parser = clap::value_parser!(u64).range(1..))]
     pub file_seconds: Option<u64>,
-    /// Keep so many files: the oldest is removed.
+    /// Number of files to keep; the oldest is removed.
     #[arg(long, value_parser = clap::value_parser!(u64).range(1..))]
     pub keep: Option<u64>,
-    /// Memory for what a slow disk has not taken yet, megabytes; when it is full, whole messages are dropped and counted.
+    /// Memory for messages that a slow disk has not written yet, megabytes. If it is full, whole messages are dropped
+    /// and counted.
     #[arg(long, default_value_t = 64, value_parser = clap::value_parser!(u64).range(1..))]
     pub queue_mb: u64,
-    /// Which run, and for how long.
+    /// The run, and the time limit.
     #[command(flatten)]
     pub session: SessionArgs,
 }
 
-/// Records until it is told to stop, the time is over, or the run ends.
+/// Records until a stop is requested, the time is over, or the run ends.
 pub fn run(args: &RecordArgs) -> anyhow::Result<ExitCode> {
     let mut session = Session::open(&args.session, "recorder")?;
     let topics: Vec<TopicId> = if args.topics.is_empty() { TopicId::all().collect() } else { args.topics.clone() };
@@ -65,7 +66,7 @@ pub fn run(args: &RecordArgs) -> anyhow::Result<ExitCode> {
     let name = live.name.clone();
     let (mut status_ns, mut told) = (0, 0);
     let going = session.follow(
-        // A writer that has failed ends it; what it failed of is told below.
+        // A failed writer ends the recording; its error is reported below.
         |topic, message| Ok(queue.push(topic, message.message().to_owned())),
         || {
             let now_ns = monotonic_now_ns();
@@ -75,7 +76,7 @@ pub fn run(args: &RecordArgs) -> anyhow::Result<ExitCode> {
                 terminal.status(format!("recording {name}: {} messages, {} dropped", counts.written, counts.dropped));
                 if counts.dropped > told {
                     terminal.note(&format!(
-                        "the disk is too slow: {} messages dropped so far (--queue-mb gives it more time)",
+                        "the disk is too slow: {} messages dropped so far (a larger --queue-mb bridges longer delays)",
                         counts.dropped
                     ));
                     told = counts.dropped;
@@ -85,7 +86,7 @@ pub fn run(args: &RecordArgs) -> anyhow::Result<ExitCode> {
         },
     )?;
     terminal.status(String::new());
-    let counts = queue.finish().context("the recording ends early; what is in the file can be read")?;
+    let counts = queue.finish().context("the recording ended early; its file is readable")?;
     println!("{}: {} messages of run {name}, {} dropped", args.out.display(), counts.written, counts.dropped);
     session.say_end(going);
     Ok(ExitCode::SUCCESS)

@@ -1,5 +1,5 @@
-//! When each stage worked on which frame, out of its messages; as lines, and as a trace file that Perfetto and Chrome
-//! open.
+//! The time that each stage spent on each frame, from its messages: as lines, and as a trace file for Perfetto and
+//! Chrome.
 
 use crate::vitals::stage_latency_ns;
 use carff_messages::forms::AnyMessage;
@@ -12,18 +12,18 @@ pub(crate) struct Span {
     pub(crate) stage: Stage,
     pub(crate) frame_id: u64,
     pub(crate) step: u32,
-    /// When the frame was taken.
+    /// Capture time of the frame.
     pub(crate) capture_ns: u64,
-    /// When its input had arrived; of the controller, and of stages that do not say, when it was done.
+    /// Arrival time of the input. For the controller, and for stages that do not report it, the end of the work.
     pub(crate) begin_ns: u64,
-    /// When its output was published.
+    /// Publish time of the output.
     pub(crate) end_ns: u64,
-    /// What came of it.
+    /// Short description of the output.
     pub(crate) what: String,
 }
 
 impl Span {
-    /// The work behind a message; none for heartbeats and for actions that are no decision.
+    /// Returns the work behind a message; none for heartbeats and for actions that are not decisions.
     pub(crate) fn of(message: AnyMessage<'_>) -> Option<Self> {
         let header = message.header();
         let (stage, took_ns) = if message.get::<FrameMeta>().is_some() {
@@ -65,7 +65,7 @@ fn what(message: AnyMessage<'_>) -> String {
     }
 }
 
-/// Spans in the trace event format: one row a stage, times in microseconds.
+/// Returns spans in the trace event format, with one row per stage and times in microseconds.
 pub(crate) fn trace_events(run: &str, spans: &[Span]) -> Value {
     let names = Stage::ALL.iter().map(|stage| {
         json!({ "name": "thread_name", "ph": "M", "pid": 1, "tid": stage.code(), "args": { "name": stage.name() } })
@@ -80,7 +80,7 @@ pub(crate) fn trace_events(run: &str, spans: &[Span]) -> Value {
             "pid": 1,
             "tid": span.stage.code(),
             "ts": span.begin_ns as f64 / 1e3,
-            // What took no time is still to be seen.
+            // A span of no duration must stay visible.
             "dur": (span.end_ns - span.begin_ns).max(1_000) as f64 / 1e3,
             "args": { "frame": span.frame_id, "step": span.step, "what": span.what },
         })
@@ -93,7 +93,8 @@ mod tests {
     use super::*;
     use carff_messages::{Gaussian, Header, Posterior};
 
-    /// A span ends when its message was published and is as long as the stage says; a trace has one event for each.
+    /// A span ends at its message's publish time and has the length that the stage reports. A trace has one event per
+    /// span.
     #[test]
     fn spans_are_where_the_messages_say() {
         let header = Header { publish_time_ns: 30_000_000, ..Header::of_frame(4, 10_000_000, 1) };

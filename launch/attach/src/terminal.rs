@@ -1,4 +1,4 @@
-//! Lines and one status line on the terminal; plain lines alone where it is none.
+//! Lines and one status line on the terminal; only plain lines if the output is not a terminal.
 
 use crate::log_line;
 use carff_config::LogFormat;
@@ -11,19 +11,19 @@ pub struct Terminal {
     live: bool,
     colour: bool,
     status: Mutex<String>,
-    /// Of the log; text until it is set.
+    /// Format of the log; text until it is set.
     format: OnceLock<LogFormat>,
 }
 
 impl Terminal {
-    /// Looks at what the process has. `NO_COLOR` turns colours off.
+    /// Creates the terminal from the process's streams. `NO_COLOR` turns colours off.
     pub fn new() -> Self {
         let live = std::io::stdout().is_terminal() && std::io::stderr().is_terminal();
         let colour = live && std::env::var_os("NO_COLOR").is_none_or(|v| v.is_empty());
         Self { live, colour, status: Mutex::default(), format: OnceLock::new() }
     }
 
-    /// A line on standard output.
+    /// Prints a line on standard output.
     pub fn line(&self, text: &str) {
         let status = self.lock();
         self.clear();
@@ -32,20 +32,20 @@ impl Terminal {
         self.draw(&status);
     }
 
-    /// Chooses how the log looks, once.
+    /// Sets the log's format, once.
     pub fn set_log_format(&self, format: LogFormat) {
-        // A second choice would be another graph's; there is one graph a process.
+        // A process runs one graph, so there is no second choice.
         let _ = self.format.set(format);
     }
 
-    /// A line of the log, on standard error: who said it (a stage, or `launcher`), and what, with its level in front or as
-    /// a JSON object.
+    /// Prints a line of the log on standard error: its source (a stage or `launcher`) and its text, which starts with a
+    /// level or is a JSON object.
     pub fn log(&self, source: &str, said: &str) {
         let format = self.format.get().copied().unwrap_or_default();
         self.note(&log_line::formatted(format, &jiff::Timestamp::now().to_string(), source, said));
     }
 
-    /// A line on standard error that is no part of the log.
+    /// Prints a line on standard error that is not part of the log.
     pub fn note(&self, text: &str) {
         let status = self.lock();
         self.clear();
@@ -61,7 +61,7 @@ impl Terminal {
         self.draw(&status);
     }
 
-    /// `text` in red or green where colours are shown.
+    /// Returns `text` in red or green if colours are enabled.
     pub fn alarm(&self, text: &str, red: bool) -> String {
         if self.colour { format!("\x1b[{}m{text}\x1b[0m", if red { 31 } else { 32 }) } else { text.to_owned() }
     }
@@ -78,7 +78,7 @@ impl Terminal {
 
     fn draw(&self, status: &str) {
         if self.live && !status.is_empty() {
-            // No wider than the narrowest usual terminal, since a wrapped line cannot be taken back.
+            // No wider than the narrowest usual terminal, because a wrapped line cannot be erased.
             let text: String = status.chars().take(118).collect();
             let _ = write!(std::io::stderr(), "{text}");
             let _ = std::io::stderr().flush();

@@ -1,4 +1,4 @@
-//! What the stages of a run say and use, gathered over time: for the full-screen view and the metrics.
+//! Health, rates and resource use of a run's stages over time, for the full-screen view and the metrics.
 
 use crate::probe::session::{Going, Session};
 use carff_messages::forms::AnyMessage;
@@ -9,37 +9,37 @@ use carff_transport::TopicId;
 use carff_transport::monotonic_now_ns;
 use std::collections::{BTreeMap, VecDeque};
 
-/// Latencies that are remembered of each stage, and of the whole loop.
+/// Number of latencies kept for each stage and for the whole loop.
 const REMEMBERED: usize = 240;
-/// Time over which rates are counted, nanoseconds.
+/// Time window of rates, nanoseconds.
 const RATE_NS: u64 = 3_000_000_000;
-/// Time between two looks at the processors, nanoseconds.
+/// Time between two readings of the processor times, nanoseconds.
 const PROCESSORS_NS: u64 = 1_000_000_000;
 
-/// A stage.
+/// Health, rates and resource use of one stage.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct StageVitals {
-    /// Its state, as it last said.
+    /// The state that it last reported.
     pub(crate) state: Option<HealthState>,
     /// Process id; 0 before the first heartbeat.
     pub(crate) pid: u32,
-    /// When it last spoke: monotonic clock, nanoseconds.
+    /// Time of its last message: monotonic clock, nanoseconds.
     pub(crate) heard_ns: u64,
-    /// Messages on its topic.
+    /// Number of messages on its topic.
     pub(crate) messages: u64,
-    /// When its latest messages were published.
+    /// Publish times of its latest messages.
     published_ns: VecDeque<u64>,
-    /// What its latest outputs took, milliseconds.
+    /// Latencies of its latest outputs, milliseconds.
     pub(crate) latency_ms: VecDeque<f64>,
-    /// Longest time that an output took, milliseconds.
+    /// Longest latency of an output, milliseconds.
     pub(crate) max_latency_ms: f64,
     /// Resident memory, bytes.
     pub(crate) rss_bytes: u64,
-    /// Inputs skipped, invalid inputs, errors: since its start.
+    /// Skipped inputs, invalid inputs and errors since its start.
     pub(crate) counts: [u64; 3],
-    /// New processes seen since this was begun.
+    /// Number of new processes since the observation started.
     pub(crate) restarts: u64,
-    /// Heartbeats that said `slow` or `stale`.
+    /// Number of heartbeats that reported `slow` or `stale`.
     pub(crate) late: u64,
     /// Share of a core, 0 to the number of cores.
     pub(crate) cpu: f64,
@@ -47,14 +47,14 @@ pub(crate) struct StageVitals {
 }
 
 impl StageVitals {
-    /// Messages a second, lately.
+    /// Returns the recent rate of messages, hertz.
     pub(crate) fn rate_hz(&self, now_ns: u64) -> f64 {
         let from_ns = now_ns.saturating_sub(RATE_NS);
         let recent = self.published_ns.iter().filter(|&&at| at >= from_ns).count();
         recent as f64 / (RATE_NS as f64 / 1e9)
     }
 
-    /// Its state, with silence taken into account.
+    /// Returns the reported state, or `silent` if heartbeats are missing.
     pub(crate) fn state_name(&self, now_ns: u64) -> &'static str {
         match self.state {
             None => "unknown",
@@ -65,19 +65,19 @@ impl StageVitals {
     }
 }
 
-/// A run.
+/// Health, decisions and resource use of one run.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct RunVitals {
     pub(crate) stages: BTreeMap<Stage, StageVitals>,
-    /// Frames taken by the camera: the latest number, and one.
+    /// Number of frames from the camera: the latest frame number plus one.
     pub(crate) frames: u64,
-    /// Actions by name.
+    /// Number of actions by name.
     pub(crate) actions: BTreeMap<&'static str, u64>,
-    /// Safe actions by reason.
+    /// Number of safe actions by reason.
     pub(crate) safe_actions: BTreeMap<&'static str, u64>,
-    /// Decisions on a frame.
+    /// Number of decisions on a frame.
     pub(crate) decisions: u64,
-    /// Camera to action, of the latest decisions, milliseconds.
+    /// Time from camera to action of the latest decisions, milliseconds.
     pub(crate) decided_ms: VecDeque<f64>,
     /// Hazard probability of the latest action.
     pub(crate) hazard_probability: f32,
@@ -102,12 +102,12 @@ pub(crate) fn stage_latency_ns(message: AnyMessage<'_>) -> Option<(Stage, u64)> 
 }
 
 impl RunVitals {
-    /// The topics that it is made of.
+    /// The topics that it reads.
     pub(crate) fn topics() -> impl Iterator<Item = TopicId> {
         TopicId::all()
     }
 
-    /// Takes a message in.
+    /// Adds a message.
     pub(crate) fn take(&mut self, message: AnyMessage<'_>) {
         let header = message.header();
         if let Some(health) = message.get::<Health>() {
@@ -157,7 +157,8 @@ impl RunVitals {
         vitals.max_latency_ms = m.max_latency_ns as f64 / 1e6;
     }
 
-    /// Takes in what a run says until it is over, or `after`, called at each look, says false.
+    /// Adds a run's messages until the run is over, or until `after`, which is called after each reading, returns
+    /// false.
     pub(crate) fn gather(
         &mut self,
         session: &mut Session,
@@ -184,7 +185,7 @@ impl RunVitals {
         }
     }
 
-    /// Looks at what each process has used of the processor since the last look.
+    /// Updates the processor use of each process since the last reading.
     fn look_at_processors(&mut self) {
         let now_ns = monotonic_now_ns();
         for vitals in self.stages.values_mut().filter(|v| v.pid != 0) {
@@ -200,9 +201,9 @@ impl RunVitals {
     }
 }
 
-/// Processor time out of a process's `stat` file, nanoseconds.
+/// Returns the processor time in a process's `stat` file, nanoseconds.
 fn used_ns(stat: &str) -> Option<u64> {
-    // The name, in brackets, may hold anything.
+    // The name, in brackets, may contain any character.
     let fields: Vec<&str> = stat.rsplit_once(')')?.1.split_whitespace().collect();
     let ticks: u64 = fields.get(11)?.parse::<u64>().ok()? + fields.get(12)?.parse::<u64>().ok()?;
     Some(ticks * (1_000_000_000 / rustix::param::clock_ticks_per_second().max(1)))
@@ -232,7 +233,7 @@ mod tests {
         }
     }
 
-    /// A new process is a restart, slow and stale heartbeats are late ones, and silence is told.
+    /// A new process counts as a restart, slow and stale heartbeats count as late, and silence is reported.
     #[test]
     fn heartbeats_are_gathered() {
         let mut run = RunVitals::default();
@@ -246,7 +247,7 @@ mod tests {
         assert_eq!((prober.state_name(2_000), prober.state_name(1_000 + 2 * RATE_NS)), ("ok", "silent"));
     }
 
-    /// Decisions count once, safe actions by their reason.
+    /// Each decision counts once; safe actions count by their reason.
     #[test]
     fn actions_are_counted() {
         let mut run = RunVitals::default();
@@ -272,7 +273,7 @@ mod tests {
         assert_eq!(run.last_action, Some(("halt", "stale belief")));
     }
 
-    /// Processor time is read whatever the process is called.
+    /// Processor time is read for any process name.
     #[test]
     fn processor_time_is_read() {
         let stat = "12 (a ) b) S 1 12 12 0 -1 4194560 100 0 0 0 30 20 0 0 20 0 1 0 5 1 1";

@@ -1,4 +1,4 @@
-//! `carff probe belief`: the belief over states as bars.
+//! `carff probe belief`: shows the belief over states as bars.
 
 use super::session::{Session, SessionArgs, colours};
 use carff_checkpoint::Manifest;
@@ -14,10 +14,10 @@ const BAR: usize = 40;
 /// Show the belief over states.
 #[derive(Clone, Debug, Args)]
 pub struct BeliefArgs {
-    /// Stop after so many frames.
+    /// Stop after this number of frames.
     #[arg(long)]
     pub count: Option<u64>,
-    /// Which run, and for how long.
+    /// The run, and the time limit.
     #[command(flatten)]
     pub session: SessionArgs,
 }
@@ -60,7 +60,7 @@ pub(super) fn run(args: &BeliefArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// The names of the states; none without a manifest.
+/// Returns the names of the states; none without a manifest.
 pub(crate) fn names(manifest: Option<&Manifest>) -> Vec<String> {
     let Some(scenario) = manifest.map(|m| &m.scenario) else { return Vec::new() };
     scenario.branches.iter().flat_map(|b| (0..scenario.timestamps).map(move |t| format!("{b}, t{t}"))).collect()
@@ -72,7 +72,7 @@ fn bar(probability: f32) -> String {
     format!("{}{part}", "\u{2588}".repeat(eighths / 8))
 }
 
-/// A frame's beliefs, step by step.
+/// Formats a frame's beliefs, step by step.
 fn picture(steps: &[Belief], names: &[String], decided: &str, colour: bool) -> String {
     let paint = |text: &str, code: &str| if colour { format!("\x1b[{code}m{text}\x1b[0m") } else { text.to_owned() };
     let mut text = String::new();
@@ -114,7 +114,7 @@ mod tests {
     use super::*;
     use carff_messages::{Header, ProbeResult};
 
-    /// Each state has its name, probability and a dot for each of its samples; what is missing to 1 is unknown.
+    /// Each state has its name, probability and a dot for each of its samples; the rest of the probability is unknown.
     #[test]
     fn beliefs_are_drawn() {
         let mut belief = Belief::empty(Header::of_frame(12, 1, 1).at_step(1), 1);

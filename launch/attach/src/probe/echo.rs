@@ -1,4 +1,4 @@
-//! `carff probe echo`: messages as text or JSON lines.
+//! `carff probe echo`: shows messages as text or JSON lines.
 
 use super::session::{Session, SessionArgs};
 use carff_messages::forms::as_text;
@@ -9,18 +9,18 @@ use std::io::Write;
 /// Show a topic's messages.
 #[derive(Clone, Debug, Args)]
 pub struct EchoArgs {
-    /// The topic: `prober/belief`, or `belief` for short. Of pictures, what describes them is shown.
+    /// Topic: `prober/belief`, or `belief` for short. For images, only their description is shown.
     pub topic: TopicId,
-    /// One line of JSON for each message.
+    /// Print one line of JSON per message.
     #[arg(long)]
     pub json: bool,
-    /// Every N-th message alone.
+    /// Show only every N-th message.
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..))]
     pub every: u64,
-    /// Stop after so many messages shown.
+    /// Stop after this number of shown messages.
     #[arg(long)]
     pub count: Option<u64>,
-    /// Which run, and for how long.
+    /// The run, and the time limit.
     #[command(flatten)]
     pub session: SessionArgs,
 }
@@ -37,7 +37,7 @@ pub(super) fn run(args: &EchoArgs) -> anyhow::Result<()> {
                 return Ok(true);
             }
             let value = message.message().to_json()?;
-            // A reader that has gone (`| head`) is an end, not an error.
+            // A closed pipe (`| head`) is the end, not an error.
             let written = if args.json { writeln!(out, "{value}") } else { writeln!(out, "{}---", as_text(&value)) };
             shown += 1;
             Ok(written.and_then(|()| out.flush()).is_ok() && args.count.is_none_or(|count| shown < count))

@@ -1,4 +1,4 @@
-//! `carff probe image`: pictures to files, or into the terminal.
+//! `carff probe image`: writes images to files, or shows them in the terminal.
 
 use super::file_in;
 use super::inline::{Inline, columns};
@@ -11,21 +11,21 @@ use clap::Args;
 use std::io::Write as _;
 use std::path::PathBuf;
 
-/// Show pictures.
+/// Show images.
 #[derive(Clone, Debug, Args)]
 pub struct ImageArgs {
-    /// The topic: `camera/frame` or `renderer/view`.
+    /// Topic: `camera/frame` or `renderer/view`.
     pub topic: TopicId,
-    /// Folder for PNG files; without it pictures go into the terminal.
+    /// Folder for PNG files; without it images are shown in the terminal.
     #[arg(short, long)]
     pub out: Option<PathBuf>,
-    /// How pictures are shown in the terminal.
+    /// Protocol for images in the terminal.
     #[arg(long = "as", value_name = "WAY", value_enum, default_value_t, conflicts_with = "out")]
     pub inline: Inline,
-    /// Stop after so many pictures.
+    /// Stop after this number of images.
     #[arg(long)]
     pub count: Option<u64>,
-    /// Which run, and for how long.
+    /// The run, and the time limit.
     #[command(flatten)]
     pub session: SessionArgs,
 }
@@ -33,14 +33,14 @@ pub struct ImageArgs {
 pub(super) fn run(args: &ImageArgs) -> anyhow::Result<()> {
     ensure!(
         args.topic.is_image(),
-        "topic `{}` has no images: look at `{}` or `{}`",
+        "topic `{}` has no images: use `{}` or `{}`",
         args.topic,
         TopicId::FRAME,
         TopicId::VIEW
     );
     ensure!(
         args.out.is_some() || args.inline != Inline::Auto || colours(),
-        "this is no terminal with colours: give a folder for PNG files with -o, or a way to show them with --as"
+        "the output is not a terminal with colours: name a folder for PNG files with -o, or a protocol with --as"
     );
     let inline = if args.out.is_some() { args.inline } else { args.inline.resolved() };
     let columns = columns();

@@ -1,4 +1,4 @@
-//! Pictures inline: the ways that terminals understand, and which of them this one does.
+//! Inline images: the protocols of terminals, and the detection of the terminal's protocol.
 
 use anyhow::Context;
 use base64::prelude::{BASE64_STANDARD, Engine as _};
@@ -14,30 +14,30 @@ use std::fs::File;
 use std::io::{IsTerminal as _, Read as _, Write as _};
 use std::time::{Duration, Instant};
 
-/// Widest picture, columns.
+/// Maximum width of an image, columns.
 const MAX_COLUMNS: u32 = 80;
-/// Width of a column, where pictures are drawn in pixels.
+/// Width of a column for protocols with pixels.
 const COLUMN_PX: u32 = 8;
-/// How much larger such a picture becomes at most: a small one need not fill the screen.
+/// Largest enlargement of such an image, so that a small image does not fill the screen.
 const MAX_SCALE: u32 = 3;
-/// Longest time that a terminal may take to say what it can.
+/// Longest time to wait for the terminal's answer.
 const ANSWER: Duration = Duration::from_millis(300);
-/// Longest answer that is read, bytes.
+/// Maximum length of the answer, bytes.
 const MAX_ANSWER_BYTES: usize = 256;
-/// Most of an encoded picture that kitty takes at once, bytes.
+/// Maximum length of one part of an encoded image in kitty's protocol, bytes.
 const KITTY_CHUNK_BYTES: usize = 4096;
-/// Colours of a sixel picture.
+/// Number of colours of a sixel image.
 const SIXEL_COLOURS: usize = 256;
 
-/// A way to show pictures in a terminal.
+/// A protocol for images in a terminal.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
 pub enum Inline {
-    /// The best of those below that the terminal says it can.
+    /// The best protocol that the terminal supports.
     #[default]
     Auto,
     /// Kitty's graphics protocol: kitty, Ghostty, Konsole.
     Kitty,
-    /// Inline images as iTerm2 has them: iTerm2, wezterm.
+    /// iTerm2's inline images: iTerm2, wezterm.
     Iterm,
     /// Sixels, in 256 colours: foot, xterm, mlterm, Windows Terminal.
     Sixel,
@@ -46,8 +46,7 @@ pub enum Inline {
 }
 
 impl Inline {
-    /// The way itself: by what the terminal says, if it is left open. Asks the terminal, and so belongs before anything
-    /// that reads from it.
+    /// Resolves `Auto` by asking the terminal. Call this before anything else reads from the terminal.
     pub(super) fn resolved(self) -> Self {
         match self {
             Self::Auto => {
@@ -58,15 +57,15 @@ impl Inline {
         }
     }
 
-    /// A picture, RGB bytes row by row, as what a terminal with room for so many columns is sent, up to the next line's
-    /// begin.
+    /// Encodes an image, RGB bytes row by row, for a terminal with this number of columns. The text ends at the start
+    /// of the next line.
     pub(super) fn encode(self, rgb: &[u8], [width_px, height_px]: [u32; 2], columns: u32) -> anyhow::Result<String> {
         let drawn_columns = columns.min((width_px * MAX_SCALE).div_ceil(COLUMN_PX)).max(1);
         Ok(match self {
             Self::Kitty => in_kitty(&png(rgb, [width_px, height_px])?, drawn_columns),
             Self::Iterm => in_iterm(&png(rgb, [width_px, height_px])?, drawn_columns),
             Self::Sixel => {
-                let picture = RgbImage::from_raw(width_px, height_px, rgb.to_vec()).context("no picture")?;
+                let picture = RgbImage::from_raw(width_px, height_px, rgb.to_vec()).context("no image")?;
                 let wide_px = drawn_columns * COLUMN_PX;
                 let high_px = (height_px * wide_px / width_px.max(1)).max(1);
                 in_sixels(&resize(&picture, wide_px, high_px, FilterType::Triangle))
@@ -76,19 +75,19 @@ impl Inline {
     }
 }
 
-/// Room for a picture, columns.
+/// Returns the space for an image, columns.
 pub(super) fn columns() -> u32 {
     let wide = if std::io::stdout().is_terminal() { terminal::size().ok() } else { None };
-    // Some terminals say 0, which is to say that they do not know.
+    // Some terminals report 0 for an unknown width.
     wide.map(|(columns, _)| columns.into())
         .filter(|&columns| columns > 0)
         .map_or(MAX_COLUMNS, |c: u32| c.min(MAX_COLUMNS))
 }
 
-/// What the terminal says by variables; `None` where it has to be asked.
+/// Returns the protocol by environment variables; `None` if the terminal must be asked.
 fn from_environment(variable: impl Fn(&str) -> Option<String>) -> Option<Inline> {
     let holds = |name: &str, words: &[&str]| variable(name).is_some_and(|v| words.iter().any(|word| v.contains(word)));
-    // Within a multiplexer the variables are those of the terminal that it was started in, which sees none of this.
+    // Inside a multiplexer the variables describe the outer terminal, which does not receive this output.
     if holds("TERM", &["tmux", "screen"]) || variable("TMUX").is_some() {
         return None;
     }
@@ -98,26 +97,26 @@ fn from_environment(variable: impl Fn(&str) -> Option<String>) -> Option<Inline>
     {
         return Some(Inline::Kitty);
     }
-    // The second variable goes along to other machines.
+    // ssh forwards the second variable to other machines.
     (holds("TERM_PROGRAM", &["iTerm", "WezTerm"]) || holds("LC_TERMINAL", &["iTerm"])).then_some(Inline::Iterm)
 }
 
-/// Whether the terminal names sixels among its attributes when it is asked for them.
+/// Asks the terminal for its attributes, and returns true if they include sixels.
 fn says_sixel() -> bool {
     attributes().is_ok_and(|answer| has_sixel(&answer))
 }
 
-/// `ESC [ ? a ; b ; ... c`, of which 4 stands for sixels.
+/// Returns true for an answer `ESC [ ? a ; b ; ... c` that contains 4, the number of sixels.
 fn has_sixel(answer: &[u8]) -> bool {
     let answer = String::from_utf8_lossy(answer);
     let attributes = answer.split_once("\x1b[?").and_then(|(_, rest)| rest.split_once('c'));
     attributes.is_some_and(|(list, _)| list.split(';').any(|attribute| attribute == "4"))
 }
 
-/// Asks the terminal for its attributes; what it answered within the time.
+/// Asks the terminal for its attributes, and returns its answer within the time limit.
 fn attributes() -> std::io::Result<Vec<u8>> {
     let mut tty = File::options().read(true).write(true).open("/dev/tty")?;
-    // Else the answer would stand on the screen, and be held back until the next line's end.
+    // Otherwise the answer would appear on the screen, and be delayed until the end of the line.
     terminal::enable_raw_mode()?;
     let mut answer = Vec::new();
     let result = (|| {
@@ -146,11 +145,12 @@ fn png(rgb: &[u8], [width_px, height_px]: [u32; 2]) -> anyhow::Result<Vec<u8>> {
     let mut png = Vec::new();
     PngEncoder::new(&mut png)
         .write_image(rgb, width_px, height_px, ExtendedColorType::Rgb8)
-        .context("cannot encode the picture")?;
+        .context("cannot encode the image")?;
     Ok(png)
 }
 
-/// <https://sw.kovidgoyal.net/kitty/graphics-protocol/>: a PNG, shown at once over so many columns, answered by nothing.
+/// Encodes a PNG for kitty, shown over these columns without an answer:
+/// <https://sw.kovidgoyal.net/kitty/graphics-protocol/>
 fn in_kitty(png: &[u8], columns: u32) -> String {
     let data = BASE64_STANDARD.encode(png);
     let (mut text, mut rest) = (String::new(), data.as_str());
@@ -164,15 +164,15 @@ fn in_kitty(png: &[u8], columns: u32) -> String {
     text + "\n"
 }
 
-/// <https://iterm2.com/documentation-images.html>
+/// Encodes a PNG for iTerm2: <https://iterm2.com/documentation-images.html>
 fn in_iterm(png: &[u8], columns: u32) -> String {
     let data = BASE64_STANDARD.encode(png);
     let size = png.len();
     format!("\x1b]1337;File=inline=1;size={size};width={columns};preserveAspectRatio=1:{data}\x07\n")
 }
 
-/// Six rows at a time, one colour after another: each character is a column of six pixels, of which those with a bit have
-/// the colour. <https://vt100.net/docs/vt3xx-gp/chapter14.html>
+/// Encodes sixels: six rows at a time, one colour after another. Each character is a column of six pixels, with a bit
+/// for each pixel of the colour. <https://vt100.net/docs/vt3xx-gp/chapter14.html>
 fn in_sixels(picture: &RgbImage) -> String {
     let rgba: Vec<u8> = picture.pixels().flat_map(|p| [p[0], p[1], p[2], u8::MAX]).collect();
     let palette = NeuQuant::new(1, SIXEL_COLOURS, &rgba);
@@ -206,7 +206,7 @@ fn in_sixels(picture: &RgbImage) -> String {
     text + "\x1b\\\n"
 }
 
-/// Half blocks: each character is two pixels, one above the other.
+/// Encodes half blocks: each character is two pixels, one above the other.
 fn in_blocks(rgb: &[u8], [width_px, height_px]: [u32; 2], columns: u32) -> String {
     let rows = (height_px * columns / width_px.max(1)).max(1);
     let pixel = |column: u32, row: u32| {
@@ -231,7 +231,7 @@ mod tests {
 
     const SIZE_PX: [u32; 2] = [61, 40];
 
-    /// Noise over a slope: long when compressed, and of more colours than a palette has.
+    /// Returns noise over a gradient: long when compressed, and with more colours than a palette.
     fn picture() -> Vec<u8> {
         let [width_px, height_px] = SIZE_PX;
         let pixel = |x: u32, y: u32| [x * 4, y * 6, (x * 7919 + y * 104_729) % 97].map(|part| part as u8);
@@ -244,8 +244,8 @@ mod tests {
         (picture.into_raw(), size_px)
     }
 
-    /// Out of what kitty is sent comes the same picture, bit for bit: parts that are no longer than it takes, all but the
-    /// last with a sign that more comes, and the way to show it in the first alone.
+    /// The output for kitty decodes to the image, bit for bit. Parts have at most the maximum length, all but the last
+    /// announce more, and only the first has the display options.
     #[test]
     fn kitty_is_sent_the_picture() {
         let text = Inline::Kitty.encode(&picture(), SIZE_PX, 80).unwrap();
@@ -263,7 +263,7 @@ mod tests {
         assert_eq!(pixels_of(&BASE64_STANDARD.decode(data).unwrap()), (picture(), SIZE_PX));
     }
 
-    /// Out of what iTerm2 is sent comes the same picture, bit for bit, with its size in bytes.
+    /// The output for iTerm2 decodes to the image, bit for bit, and contains its size in bytes.
     #[test]
     fn iterm_is_sent_the_picture() {
         let text = Inline::Iterm.encode(&picture(), SIZE_PX, 80).unwrap();
@@ -274,7 +274,7 @@ mod tests {
         assert_eq!(pixels_of(&png), (picture(), SIZE_PX));
     }
 
-    /// A terminal's side of sixels: colours in hundredths, repeats, returns and new bands.
+    /// Decodes sixels like a terminal: colours in hundredths, repeats, returns and new bands.
     fn drawn(text: &str) -> RgbImage {
         let body = text.strip_prefix("\x1bP0;1q\"").unwrap().strip_suffix("\x1b\\\n").unwrap();
         let mut bytes = body.bytes().peekable();
@@ -321,7 +321,7 @@ mod tests {
         picture
     }
 
-    /// Sixels paint every pixel once, in a colour that is near the picture's.
+    /// Sixels paint every pixel once, in a colour close to the image's.
     #[test]
     fn sixels_paint_the_picture() {
         let picture = RgbImage::from_raw(SIZE_PX[0], SIZE_PX[1], picture()).unwrap();
@@ -333,7 +333,7 @@ mod tests {
         assert!(text.starts_with("\x1bP0;1q\"1;1;160;104#"), "{}", &text[..40]);
     }
 
-    /// A picture of two rows is one line of blocks, the upper pixel before the lower; wide ones are made narrower.
+    /// An image of two rows is one line of blocks, the upper pixel before the lower; wide images are reduced.
     #[test]
     fn two_pixels_make_a_block() {
         let text = Inline::Blocks.encode(&[1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12], [2, 2], 80).unwrap();
@@ -342,7 +342,7 @@ mod tests {
         assert_eq!(in_blocks(&vec![0; 200 * 100 * 3], [200, 100], 80).lines().count(), 20);
     }
 
-    /// Terminals are known by what they say of themselves; one within a multiplexer has to be asked.
+    /// Environment variables identify terminals; inside a multiplexer the terminal must be asked.
     #[test]
     fn terminals_say_what_they_can() {
         let found = |variables: &[(&str, &str)]| {

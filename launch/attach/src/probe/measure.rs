@@ -1,4 +1,4 @@
-//! `carff probe hz`, `bw` and `delay`: a topic in numbers.
+//! `carff probe hz`, `bw` and `delay`: measure a topic.
 
 use super::TopicArgs;
 use super::session::{Session, since_capture_ms};
@@ -7,12 +7,12 @@ use crate::terminal::Terminal;
 use carff_metrics::{mean, percentile_of_sorted};
 use carff_transport::monotonic_now_ns;
 
-/// What is measured.
+/// The measured quantity.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Quantity {
-    /// Messages a second, and the time between them.
+    /// Messages per second, and the time between messages.
     Rate,
-    /// Bytes a second.
+    /// Bytes per second.
     Bandwidth,
     /// Age on arrival, and time since capture.
     Delay,
@@ -20,10 +20,10 @@ pub(super) enum Quantity {
 
 /// Time between two lines, nanoseconds.
 const LINE_NS: u64 = 1_000_000_000;
-/// Most values that are kept for the percentiles: an hour at 100 Hz.
+/// Maximum number of values for the percentiles: an hour at 100 Hz.
 const KEPT: usize = 360_000;
 
-/// A topic's messages, as far as they are measured.
+/// The measured values of a topic's messages.
 #[derive(Clone, Debug, Default)]
 struct Series {
     published_ns: Option<u64>,
@@ -50,7 +50,7 @@ impl Series {
         self.since_capture_ms.push(since_capture_ms);
     }
 
-    /// One line about the values since the last one.
+    /// Returns one line about the values since the last line.
     fn line(&self, quantity: Quantity, from: &Series, seconds: f64) -> String {
         let new = |all: &[f64], old: &[f64]| all[old.len().min(all.len())..].to_vec();
         let messages = self.messages - from.messages;
@@ -69,7 +69,7 @@ impl Series {
             Quantity::Bandwidth => {
                 let bytes: f64 = new(&self.size_bytes, &from.size_bytes).iter().sum();
                 format!(
-                    "{:>12} a second   {:.1} messages a second",
+                    "{:>12} per second   {:.1} messages per second",
                     in_bytes(bytes / seconds),
                     messages as f64 / seconds
                 )
@@ -89,7 +89,7 @@ impl Series {
         }
     }
 
-    /// Percentiles of all values.
+    /// Returns the percentiles of all values.
     fn summary(&self, quantity: Quantity) -> String {
         let rows: Vec<(&str, &[f64])> = match quantity {
             Quantity::Rate => vec![("between messages, ms", &self.interval_ms)],
@@ -128,7 +128,7 @@ pub(super) fn run(args: &TopicArgs, quantity: Quantity) -> anyhow::Result<()> {
     } else {
         session.listen([args.topic])?;
     }
-    // What was waiting for late comers has waited for long.
+    // Messages from the topic's history have an old age.
     session.take(|_, _| Ok(()))?;
     let terminal = Terminal::new();
     let series = std::cell::RefCell::new(Series::default());
@@ -161,7 +161,7 @@ pub(super) fn run(args: &TopicArgs, quantity: Quantity) -> anyhow::Result<()> {
 mod tests {
     use super::*;
 
-    /// Rate, jitter, bytes a second and ages are those of the messages, new ones alone in a line, all in the summary.
+    /// Rate, jitter, bytes per second and ages match the messages: only new ones in a line, all in the summary.
     #[test]
     fn a_series_in_numbers() {
         let mut series = Series::default();
@@ -175,7 +175,7 @@ mod tests {
         let rate = series.line(Quantity::Rate, &before, 1.0);
         assert!(rate.contains("18.18 Hz") && rate.contains("50.00 to 100.00 ms"), "{rate}");
         let bandwidth = series.line(Quantity::Bandwidth, &before, 2.0);
-        assert!(bandwidth.contains("10.00 kB a second") && bandwidth.contains("5.0 messages"), "{bandwidth}");
+        assert!(bandwidth.contains("10.00 kB per second") && bandwidth.contains("5.0 messages"), "{bandwidth}");
         let delay = series.line(Quantity::Delay, &before, 1.0);
         assert!(delay.contains("max 1.500 ms") && delay.contains("mean 40.00 ms"), "{delay}");
         let summary = series.summary(Quantity::Delay);

@@ -1,4 +1,5 @@
-//! `carff probe`: looking at a running graph from another terminal, without a config and without disturbing it.
+//! `carff probe`: observes a running graph from another terminal, without a configuration and without delaying the
+//! graph.
 
 mod belief;
 mod echo;
@@ -17,74 +18,74 @@ use clap::{Args, Subcommand};
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-/// What to look at.
+/// The commands of `carff probe`.
 #[derive(Clone, Debug, Subcommand)]
 pub enum ProbeCommand {
-    /// The topics of the run: type, schema version, who sends, who receives, messages a second.
+    /// List the run's topics: type, schema version, publishers, subscribers, rate.
     #[command(after_help = "Example:\n  carff probe list --seconds 3")]
     List {
-        /// Which run, and for how long the rates are counted.
+        /// The run, and the time over which rates are measured.
         #[command(flatten)]
         session: SessionArgs,
-        /// As JSON.
+        /// Print JSON.
         #[arg(long)]
         json: bool,
     },
-    /// Processes and topics as a graph, from what runs.
+    /// Print the running processes and topics as a graph.
     #[command(
-        after_help = "Example: a picture of what runs (dot is Graphviz's)\n  carff probe graph --format dot | dot -Tsvg > graph.svg"
+        after_help = "Example: an image of the graph (dot is part of Graphviz)\n  carff probe graph --format dot | dot -Tsvg > graph.svg"
     )]
     Graph {
-        /// Which run.
+        /// The run.
         #[command(flatten)]
         session: SessionArgs,
-        /// How it is written.
+        /// Format of the graph.
         #[arg(long, value_enum, default_value_t)]
         format: structure::GraphFormat,
     },
-    /// A topic's messages, as text or JSON lines.
+    /// Show a topic's messages as text or JSON lines.
     #[command(
         after_help = "Example: every tenth belief, for another program\n  carff probe echo belief --json --every 10 | jq .hazard_probability"
     )]
     Echo(echo::EchoArgs),
-    /// A topic's rate and its jitter, live; on exit percentiles of the time between messages.
-    #[command(after_help = "Example: ten seconds of it\n  carff probe hz controller/action --seconds 10")]
+    /// Measure a topic's rate and jitter, live; on exit print percentiles of the time between messages.
+    #[command(after_help = "Example: for ten seconds\n  carff probe hz controller/action --seconds 10")]
     Hz(TopicArgs),
-    /// A topic's bytes a second, live; on exit percentiles of the message's size.
+    /// Measure a topic's bytes per second, live; on exit print percentiles of the message size.
     #[command(after_help = "Example:\n  carff probe bw camera/frame --seconds 10")]
     Bw(TopicArgs),
-    /// Age of a topic's messages on arrival, and time from the camera's capture to here, live; on exit percentiles.
+    /// Measure the age of a topic's messages on arrival and since the capture, live; on exit print percentiles.
     #[command(after_help = "Example:\n  carff probe delay controller/action --seconds 10")]
     Delay(TopicArgs),
-    /// Camera frames or rendered views, to PNG files, or into the terminal, as well as it can show them.
+    /// Write camera frames or rendered views to PNG files, or show them in the terminal.
     #[command(
-        after_help = "Example: the next five views, as files; and a frame, here\n  carff probe image renderer/view -o views --count 5\n  carff probe image camera/frame --count 1"
+        after_help = "Example: the next five views as files; a frame in the terminal\n  carff probe image renderer/view -o views --count 5\n  carff probe image camera/frame --count 1"
     )]
     Image(image::ImageArgs),
-    /// The belief over states, live, with the samples behind it.
-    #[command(after_help = "Example: one look, for a log\n  carff probe belief --count 1")]
+    /// Show the belief over states, live, with its samples.
+    #[command(after_help = "Example: once, for a log\n  carff probe belief --count 1")]
     Belief(belief::BeliefArgs),
-    /// One frame's way: when it entered and left each stage, and what was decided.
+    /// Trace one frame: the times at which it entered and left each stage, and the decision.
     #[command(
         after_help = "Example: the next frame, and a minute of frames for ui.perfetto.dev\n  carff probe trace next\n  carff probe trace next --seconds 60 --perfetto trace.json"
     )]
     Trace(trace::TraceArgs),
-    /// Stages, state, rate, latency, CPU, memory, restarts, missed deadlines: a full-screen view.
-    #[command(after_help = "Example: once, without a terminal of its own\n  carff probe top --once")]
+    /// Show all stages on one screen: state, rate, latency, CPU, memory, restarts, missed deadlines.
+    #[command(after_help = "Example: once, as plain text\n  carff probe top --once")]
     Top(top::TopArgs),
 }
 
-/// A topic, and how long to look at it.
+/// A topic, and the time limit.
 #[derive(Clone, Debug, Args)]
 pub struct TopicArgs {
-    /// The topic: `prober/belief`, or `belief` for short.
+    /// Topic: `prober/belief`, or `belief` for short.
     pub topic: TopicId,
-    /// Which run, and for how long.
+    /// The run, and the time limit.
     #[command(flatten)]
     pub session: SessionArgs,
 }
 
-/// Looks, until it is told to stop, the time is over, or the run ends.
+/// Runs the command until a stop is requested, the time is over, or the run ends.
 pub fn run(command: &ProbeCommand) -> anyhow::Result<ExitCode> {
     match command {
         ProbeCommand::List { session, json } => structure::list(session, *json),
@@ -101,9 +102,9 @@ pub fn run(command: &ProbeCommand) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-/// A file of an output folder, which is made when it is missing.
+/// Returns the path of a file in an output folder, and creates the folder if it is missing.
 fn file_in(folder: &std::path::Path, name: &str) -> anyhow::Result<PathBuf> {
     use anyhow::Context;
-    std::fs::create_dir_all(folder).with_context(|| format!("cannot make the folder {}", folder.display()))?;
+    std::fs::create_dir_all(folder).with_context(|| format!("cannot create the folder {}", folder.display()))?;
     Ok(folder.join(name))
 }

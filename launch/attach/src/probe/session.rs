@@ -1,4 +1,4 @@
-//! What all probes share: joining, looking now and then, and knowing when it is over.
+//! The common part of all probes: joining a run, reading at intervals, and detecting the end.
 
 use anyhow::Context;
 use carff_messages::Header;
@@ -6,18 +6,18 @@ use carff_observe::{Attached, attach};
 use carff_transport::{AnyReceiver, Received, Stop, TopicId, Waiter, monotonic_now_ns};
 use clap::Args;
 
-/// Time between two looks: short enough that no buffer (8 pictures) overflows at 400 messages a second.
+/// Time between two readings: short enough that no buffer (8 images) overflows at 400 messages per second.
 const LOOK_NS: u64 = 10_000_000;
-/// Time between two looks at whether the run lives.
+/// Time between two checks that the run is alive.
 const ALIVE_NS: u64 = 200_000_000;
 
-/// Which run, and how long.
+/// The run, and the time limit.
 #[derive(Clone, Debug, Default, Args)]
 pub struct SessionArgs {
-    /// The run's name; not needed when only one runs.
+    /// Name of the run; optional if only one runs.
     #[arg(long)]
     pub run: Option<String>,
-    /// Stop after so many seconds.
+    /// Stop after this time, seconds.
     #[arg(long, value_parser = positive)]
     pub seconds: Option<f64>,
 }
@@ -29,12 +29,12 @@ fn positive(text: &str) -> Result<f64, String> {
     }
 }
 
-/// Whether to look on.
+/// The result of a wait.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Going {
-    /// Look again.
+    /// Read again.
     On,
-    /// Told to stop, or the time is over.
+    /// A stop was requested, or the time is over.
     Done,
     /// The run has ended.
     RunEnded,
@@ -53,7 +53,7 @@ pub(crate) struct Session {
 }
 
 impl Session {
-    /// Joins a run, as something that is told by `name`.
+    /// Joins a run under the name `name`.
     pub(crate) fn open(args: &SessionArgs, name: &str) -> anyhow::Result<Self> {
         let attached = attach(args.run.as_deref(), name)?;
         let stop = Stop::on_signals().context("cannot handle signals")?;
@@ -68,7 +68,7 @@ impl Session {
         })
     }
 
-    /// Opens topics, to be looked at now and then.
+    /// Opens topics that are read at intervals.
     pub(crate) fn listen(&mut self, topics: impl IntoIterator<Item = TopicId>) -> anyhow::Result<()> {
         for topic in topics {
             self.receivers.push((topic, topic.polled_receiver(&self.attached.node)?));
@@ -82,7 +82,7 @@ impl Session {
         Ok(())
     }
 
-    /// What has arrived since the last look, topic by topic, oldest first.
+    /// Returns the messages since the last reading, topic by topic, oldest first.
     pub(crate) fn take(
         &mut self,
         mut each: impl FnMut(TopicId, &dyn Received) -> anyhow::Result<()>,
@@ -95,7 +95,7 @@ impl Session {
         Ok(())
     }
 
-    /// Sleeps until it is time for another look, or a message of a woken topic is there.
+    /// Sleeps until the next reading, or until a message of a waking topic arrives.
     pub(crate) fn pause(&mut self) -> anyhow::Result<Going> {
         let woken = self.receivers.iter().map(|(_, r)| r.as_input()).filter(|i| i.descriptor().is_some());
         let inputs: Vec<_> = woken.collect();
@@ -113,7 +113,7 @@ impl Session {
         Ok(Going::On)
     }
 
-    /// Looks until it is over, or `each` says false.
+    /// Reads until the end, or until `each` returns false.
     pub(crate) fn follow(
         &mut self,
         mut each: impl FnMut(TopicId, &dyn Received) -> anyhow::Result<bool>,
@@ -138,7 +138,7 @@ impl Session {
         }
     }
 
-    /// Says on standard error that the run has ended, if it has.
+    /// Reports the end of the run on standard error.
     pub(crate) fn say_end(&self, going: Going) {
         if going == Going::RunEnded {
             eprintln!("run `{}` has ended", self.attached.live.name);
@@ -146,12 +146,12 @@ impl Session {
     }
 }
 
-/// Time since a header's capture, at another time, milliseconds.
+/// Returns the time from a header's capture to another time, milliseconds.
 pub(crate) fn since_capture_ms(header: &Header, at_ns: u64) -> f64 {
     at_ns.saturating_sub(header.capture_time_ns) as f64 / 1e6
 }
 
-/// Whether standard output takes colours: a terminal, and no `NO_COLOR`.
+/// Returns true if standard output is a terminal and `NO_COLOR` is not set.
 pub(crate) fn colours() -> bool {
     use std::io::IsTerminal;
     std::io::stdout().is_terminal() && std::env::var_os("NO_COLOR").is_none_or(|v| v.is_empty())

@@ -1,4 +1,4 @@
-//! `carff probe list` and `graph`: which topics there are, and who uses them.
+//! `carff probe list` and `graph`: the topics of a run and the processes that use them.
 
 use super::session::{Going, Session, SessionArgs};
 use anyhow::Context;
@@ -9,31 +9,31 @@ use serde_json::{Value, json};
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write;
 
-/// How long rates are counted when nothing else is asked for, seconds.
+/// Default time over which rates are measured, seconds.
 const COUNT_S: f64 = 2.0;
 
-/// How a graph is written.
+/// The format of a graph.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
 pub enum GraphFormat {
-    /// Lines for people.
+    /// Plain text.
     #[default]
     Text,
     /// Graphviz.
     Dot,
-    /// Mermaid, as Markdown viewers draw it.
+    /// Mermaid, for Markdown viewers.
     Mermaid,
 }
 
-/// A topic of a run, as it is used now.
+/// A topic of a run and its current users.
 #[derive(Clone, Debug, PartialEq)]
 struct TopicInUse {
     name: String,
     message: String,
     publishers: Vec<String>,
     subscribers: Vec<String>,
-    /// Members whose direction is not known: those of topics that are not the graph's own.
+    /// Members of unknown direction: those of topics outside the shipped graph.
     users: Vec<String>,
-    /// Messages a second; none where nobody counted.
+    /// Messages per second; none if not measured.
     rate_hz: Option<f64>,
 }
 
@@ -43,7 +43,7 @@ pub(super) fn list(args: &SessionArgs, as_json: bool) -> anyhow::Result<()> {
     let mut topics = in_use(&session)?;
     let ours: Vec<TopicId> = topics.iter().filter_map(|t| t.name.parse().ok()).collect();
     session.listen(ours)?;
-    // What was waiting for late comers is not part of the rate.
+    // Messages from the topic's history are not part of the rate.
     session.take(|_, _| Ok(()))?;
     let started_ns = monotonic_now_ns();
     let mut counts: BTreeMap<TopicId, u64> = BTreeMap::new();
@@ -82,7 +82,7 @@ pub(super) fn graph(args: &SessionArgs, format: GraphFormat) -> anyhow::Result<(
     Ok(())
 }
 
-/// The name under which these commands join: they leave themselves out of what they show.
+/// The name under which these commands join a run; their output omits it.
 const PROBE: &str = "probe-list";
 
 fn in_use(session: &Session) -> anyhow::Result<Vec<TopicInUse>> {
@@ -110,7 +110,7 @@ fn in_use(session: &Session) -> anyhow::Result<Vec<TopicInUse>> {
         }
         topics.push(found);
     }
-    // The data's way first, in its order.
+    // The data path first, in its order.
     topics.sort_by_key(|t| t.name.parse::<TopicId>().ok().map_or((1, TopicId::FRAME), |id| (0, id)));
     Ok(topics)
 }
@@ -129,7 +129,7 @@ impl TopicInUse {
     }
 }
 
-/// Rows with columns as wide as their widest entry.
+/// Formats rows with columns as wide as their widest entry.
 pub(super) fn columns(rows: &[Vec<String>]) -> String {
     let count = rows.iter().map(Vec::len).max().unwrap_or(0);
     let widths: Vec<usize> = (0..count)
@@ -233,7 +233,7 @@ mod tests {
         ]
     }
 
-    /// Each form names every process and topic, with arrows from sender to topic to receiver.
+    /// Each format names every process and topic, with arrows from publisher to topic to subscriber.
     #[test]
     fn graphs_show_who_sends_to_whom() {
         let dot = dot(&two());

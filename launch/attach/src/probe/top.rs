@@ -1,4 +1,4 @@
-//! `carff probe top`: the stages, full screen.
+//! `carff probe top`: shows all stages on one screen.
 
 use super::session::{Session, SessionArgs};
 use super::structure::columns;
@@ -19,11 +19,11 @@ use std::collections::VecDeque;
 use std::io::IsTerminal;
 use std::time::Duration;
 
-/// Time between two pictures, nanoseconds.
+/// Time between two screens, nanoseconds.
 const DRAW_NS: u64 = 250_000_000;
-/// How long `--once` listens, seconds.
+/// Default time that `--once` listens, seconds.
 const ONCE_S: f64 = 3.0;
-/// Latencies in a sparkline.
+/// Number of latencies in a sparkline.
 const SPARKS: usize = 24;
 
 const HEAD: [&str; 13] = [
@@ -32,7 +32,7 @@ const HEAD: [&str; 13] = [
     "rate",
     "latency",
     "max",
-    "latency, lately",
+    "recent latency",
     "CPU",
     "memory",
     "skipped",
@@ -45,10 +45,10 @@ const HEAD: [&str; 13] = [
 /// Show the stages.
 #[derive(Clone, Debug, Args)]
 pub struct TopArgs {
-    /// Print it once, as plain text, after listening for 3 seconds (or --seconds).
+    /// Print the screen once, as plain text, after 3 seconds (or --seconds).
     #[arg(long)]
     pub once: bool,
-    /// Which run, and for how long.
+    /// The run, and the time limit.
     #[command(flatten)]
     pub session: SessionArgs,
 }
@@ -58,7 +58,7 @@ pub(super) fn run(args: &TopArgs) -> anyhow::Result<()> {
     if args.once {
         session_args.seconds = session_args.seconds.or(Some(ONCE_S));
     }
-    ensure!(args.once || std::io::stdout().is_terminal(), "this is no terminal: print the view once with --once");
+    ensure!(args.once || std::io::stdout().is_terminal(), "the output is not a terminal: use --once");
     let mut session = Session::open(&session_args, "probe-top")?;
     session.listen(RunVitals::topics())?;
     let mut vitals = RunVitals::default();
@@ -69,7 +69,7 @@ pub(super) fn run(args: &TopArgs) -> anyhow::Result<()> {
         session.say_end(going);
         return Ok(());
     }
-    let mut terminal = ratatui::try_init().context("cannot take over the terminal")?;
+    let mut terminal = ratatui::try_init().context("cannot initialise the terminal")?;
     let live = session.attached.live.clone();
     let mut draw_ns = 0;
     let result = vitals.gather(&mut session, |vitals| {
@@ -85,7 +85,7 @@ pub(super) fn run(args: &TopArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Whether a key says so.
+/// Returns true if a key asks to quit.
 fn wants_out() -> anyhow::Result<bool> {
     while event::poll(Duration::ZERO)? {
         if let Event::Key(key) = event::read()? {
@@ -177,7 +177,7 @@ fn draw(frame: &mut Frame<'_>, live: &LiveRun, vitals: &RunVitals) {
         .block(Block::bordered().title(" stages "));
     frame.render_widget(table, areas[1]);
     frame.render_widget(
-        Paragraph::new("q quits   late: heartbeats that said slow or stale").style(colour(Color::DarkGray)),
+        Paragraph::new("q quits   late: heartbeats that reported slow or stale").style(colour(Color::DarkGray)),
         areas[2],
     );
 }
@@ -200,7 +200,7 @@ mod tests {
         }
     }
 
-    /// The screen names the run, every stage and its state, on a terminal of usual size and on a tiny one.
+    /// The screen names the run, every stage and its state, on a terminal of usual size and on a small one.
     #[test]
     fn the_screen_shows_every_stage() {
         let mut terminal = Terminal::new(TestBackend::new(140, 20)).unwrap();

@@ -1,4 +1,4 @@
-//! `carff probe trace`: one frame's way through the stages.
+//! `carff probe trace`: follows one frame through the stages.
 
 use super::session::{Session, SessionArgs};
 use super::structure::columns;
@@ -11,17 +11,17 @@ use clap::Args;
 use std::path::PathBuf;
 use std::str::FromStr;
 
-/// How long to wait for a frame's views once it has been decided on, nanoseconds.
+/// Time to wait for a frame's views after its decision, nanoseconds.
 const AFTER_DECISION_NS: u64 = 300_000_000;
-/// Width of the drawing of a frame's way, characters.
+/// Width of the chart, characters.
 const WIDTH: usize = 50;
 
-/// Which frame.
+/// The frame to trace.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Frame {
-    /// The next one.
+    /// The next frame.
     Next,
-    /// The one of this number.
+    /// The frame with this number.
     Number(u64),
 }
 
@@ -36,16 +36,16 @@ impl FromStr for Frame {
     }
 }
 
-/// Show one frame's way.
+/// Trace one frame.
 #[derive(Clone, Debug, Args)]
 pub struct TraceArgs {
-    /// The frame's number, or `next`.
+    /// Number of the frame, or `next`.
     #[arg(default_value = "next")]
     pub frame: Frame,
-    /// Write all frames' spans here, in the trace event format that ui.perfetto.dev opens.
+    /// Write the times of all frames to this file, in the trace event format, for ui.perfetto.dev.
     #[arg(long)]
     pub perfetto: Option<PathBuf>,
-    /// Which run, and for how long.
+    /// The run, and the time limit.
     #[command(flatten)]
     pub session: SessionArgs,
 }
@@ -69,11 +69,11 @@ pub(super) fn run(args: &TraceArgs) -> anyhow::Result<()> {
             }
             if let Some(frame) = wanted.get() {
                 let mine = span.frame_id == frame;
-                // A decision on a later frame: this one was passed over, and comes no more.
+                // A decision on a later frame: this frame was skipped and will not arrive.
                 if span.stage == Stage::Controller && span.frame_id >= frame {
                     decided_ns.get_or_insert_with(monotonic_now_ns);
                 }
-                // Frames are taken in order: one that has not come before a later one comes no more.
+                // Frames are captured in order: a frame that did not arrive before a later one will not arrive.
                 let is_mine_seen = mine || all.iter().any(|s| s.frame_id == frame);
                 if span.stage == Stage::Camera && span.frame_id > frame && !is_mine_seen {
                     missed = Some(span.frame_id);
@@ -83,7 +83,7 @@ pub(super) fn run(args: &TraceArgs) -> anyhow::Result<()> {
                     all.push(span);
                 }
             }
-            // With a file the time that was asked for goes on; without one the frame is enough.
+            // With a file the trace lasts for the requested time; without one the frame is enough.
             let waited = decided_ns.is_some_and(|at_ns| monotonic_now_ns() > at_ns + AFTER_DECISION_NS);
             Ok(!waited || (to_file && args.session.seconds.is_some()))
         },
@@ -94,22 +94,22 @@ pub(super) fn run(args: &TraceArgs) -> anyhow::Result<()> {
         std::fs::write(path, trace).with_context(|| format!("cannot write {}", path.display()))?;
         println!("{}: {} spans; open it at ui.perfetto.dev or chrome://tracing", path.display(), all.len());
     }
-    let frame = wanted.get().context("no frame came by: is the camera running? See `carff probe list`")?;
+    let frame = wanted.get().context("no frame arrived: check with `carff probe list` that the camera runs")?;
     let mut spans: Vec<Span> = all.into_iter().filter(|s| s.frame_id == frame).collect();
     session.say_end(going);
     if let (Some(later), true) = (missed, spans.is_empty()) {
-        ensure!(to_file, "frame {frame} has passed: the camera is at {later} already; name a later one, or `next`");
+        ensure!(to_file, "frame {frame} has passed, and the camera is at frame {later}: name a later frame, or `next`");
     }
-    ensure!(!spans.is_empty(), "frame {frame} did not come by");
+    ensure!(!spans.is_empty(), "frame {frame} did not arrive");
     spans.sort_by_key(|s| (s.end_ns, s.stage));
     print!("{}", way(frame, &spans));
     if !spans.iter().any(|s| s.stage == Stage::Controller) {
-        println!("nothing was decided on it: a later frame was there before it was worked on");
+        println!("no decision: a later frame arrived before this one was processed");
     }
     Ok(())
 }
 
-/// A frame's way as a table with a drawing, milliseconds since capture.
+/// Formats a frame's spans as a table with a chart, milliseconds since capture.
 fn way(frame: u64, spans: &[Span]) -> String {
     let capture_ns = spans.iter().map(|s| s.capture_ns).min().unwrap_or(0);
     let ms = |at_ns: u64| at_ns.saturating_sub(capture_ns) as f64 / 1e6;
@@ -161,7 +161,7 @@ mod tests {
         assert!(line("controller").ends_with("halt"), "{text}");
     }
 
-    /// A frame is a number or the next one.
+    /// A frame is a number or `next`.
     #[test]
     fn frames_are_numbers_or_next() {
         assert_eq!("next".parse(), Ok(Frame::Next));

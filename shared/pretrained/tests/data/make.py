@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Writes the state dicts of these tests as `torch.save` does, without torch.
+"""Writes the state dicts of these tests in the format of `torch.save`, without torch.
 
 Usage: python3 make.py      (writes archive.pth, as PyTorch 1.6 and later do, and stream.pth, as earlier ones did)
 """

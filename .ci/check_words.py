@@ -1,0 +1,218 @@
+#!/usr/bin/env python3
+"""Checks the words of documents and of Rust docs and strings, by the rules in CONTRIBUTING.md, "Words".
+
+- Banned words, and words for which the glossary (ARCHITECTURE.md) has another.
+- Sentences of documents that open with What, Who, Which, Whether or Of.
+- First doc lines of public Rust items that open with What, Which, Who, How, Whether, Where, When or Of.
+
+Documents are Markdown files, and the comments of TOML files, the Makefile and Python programs. Rust is checked in the
+folders of HELD_RUST.
+
+Usage: python3 .ci/check_words.py [ROOT]            exit code 1 and one line per finding
+       python3 .ci/check_words.py --count [ROOT]    findings per folder and kind, for all folders; exit code 0
+"""
+
+import re
+import subprocess
+import sys
+from collections import Counter
+from pathlib import Path
+
+# Folders whose Rust files must follow the rules. The others are only counted.
+HELD_RUST: list[str] = ["examples", "launch/attach", "launch/carff"]
+
+# Documents that are not held yet, with the reason.
+NOT_HELD = {
+    ".ci/check_words.py": "contains the banned words",
+    "configs/graphs": "will be reduced to differences from the defaults",
+    "configs/schemas": "generated from Rust docs",
+}
+
+# kind: (pattern, suggestion). A space also matches a line break.
+BANNED = {
+    "is no": (r"(?<!there\s)\b(?:is|are|was|were) no (?!longer\b|more\b|such\b)", "is not a, has no"),
+    "alone": (r"(?<!let\s)(?<!stand-)\balone\b", "only"),
+    "beside": (r"\bbesides?\b", "next to, in addition to"),
+    "whoever": (r"\b(?:whoever|whatever|whomever)\b", "a named subject"),
+    "as it is": (r"\bas (?:it is|they are|it stands)(?=[,.;:)\"]|$)", "unchanged"),
+    "for ever": (r"\bfor ever\b", "forever, indefinitely"),
+    "in turns": (r"\bin turns\b", "alternately"),
+    "by heart": (r"\bby heart\b", "memorised"),
+    "lies": (r"\b(?:lies?|lay) (?:in|beside|there|together|apart)\b", "is in, is stored in"),
+    "stands": (r"\b(?:stands?|stood) (?:beside|above|below|around|there)\b", "is"),
+    "goes on": (r"\b(?:go|goes|went|going|gone) on\b", "continues"),
+    "says": (r"\b(?:says?|said)\b", "reports, states, contains"),
+    "tells": (r"\b(?:tells?|told)\b(?!(?: \w+){0,4} apart\b)", "shows, reports"),
+}
+TERMS = {
+    "picture": (r"\bpictures?\b", "image"),
+    "data set": (r"\bdata sets?\b", "dataset"),
+    "course of events": (r"\bcourses? of events\b", "branch"),
+    "unseen": (r"\bunseen\b", "held-out"),
+    "telling view": (r"\btelling (?:views?|images?|pictures?)\b", "unambiguous view"),
+}
+OPENING = r"(?:^|(?<=[.!?] )|(?<=[.!?]\n))(?:What|Who|Which|Whether|Of)\b(?![^.?!]*\?)"
+FIRST_LINE = re.compile(r"(?:What|Which|Who|How|Whether|Where|When|Of)\b")
+
+# (file, matched text): reason. An entry that matches nothing is a finding.
+ALLOWED: dict[tuple[str, str], str] = {
+    ("docs/VIEWER.md", "picture"): "name of a pane",
+}
+
+FENCE = re.compile(r"^```.*?^```|<!--.*?-->", re.MULTILINE | re.DOTALL)
+INLINE = re.compile(r"`[^`\n]*(?:\n[^`\n]*)?`|\]\([^)]*\)|https?://\S+")
+HEADING = re.compile(r"^#.*$", re.MULTILINE)
+TOKEN = re.compile(
+    r"""(?P<doc>//[/!](?!/)[^\n]*)|//[^\n]*|/\*.*?\*/|(?P<raw>r(?P<hash>\#*)".*?"(?P=hash))"""
+    r"""|(?P<text>"(?:[^"\\]|\\.)*")|'(?:\\.[^']*|[^'\\])'""",
+    re.DOTALL,
+)
+PRIVATE = re.compile(r"(?:async |unsafe |const |extern )*(?:fn|struct|enum|const|static|type|trait|mod|impl|use|let)\b|macro_rules!")
+GAP = "\x00"
+
+PATTERNS = {
+    kind: (re.compile(pattern.replace(" ", r"[ \n]+"), re.IGNORECASE | re.MULTILINE), advice)
+    for kind, (pattern, advice) in {**BANNED, **TERMS}.items()
+}
+
+
+def blank(found: re.Match, filler: str = " ") -> str:
+    """Replaces all but the line breaks of a match."""
+    return re.sub(r"[^\n]", filler, found[0])
+
+
+def prose_of_markdown(text: str) -> str:
+    text = FENCE.sub(lambda m: blank(m, GAP), text)
+    return INLINE.sub(lambda m: re.sub(r"[^\n]", GAP, m[0]), text)
+
+
+def prose_of_comments(text: str) -> str:
+    """Returns the comments of a TOML file or a Makefile, and the reasons of deny.toml."""
+    lines = []
+    for line in text.splitlines():
+        found = re.match(r"\s*#(?!:schema)(.*)", line) or re.match(r".*?(?: ## ?|\s# )(.*)", line)
+        reason = re.search(r'reason = "(.*)"', line)
+        lines.append((found or reason)[1] if found or reason else GAP)
+    return INLINE.sub(lambda m: blank(m, GAP), "\n".join(lines))
+
+
+def prose_of_python(text: str) -> str:
+    """Returns comments and docstrings; everything else is blank."""
+    keep = re.compile(r'(?P<doc>""".*?""")|(?P<text>"(?:[^"\\\n]|\\.)*")|(?P<comment>#[^\n]*)', re.DOTALL)
+    parts, end = [], 0
+    for token in keep.finditer(text):
+        parts.append(re.sub(r"[^\n]", GAP, text[end:token.start()]))
+        end = token.end()
+        parts.append(blank(token, GAP) if token["text"] else re.sub(r'"""|#', GAP, token[0]))
+    prose = "".join(parts) + re.sub(r"[^\n]", GAP, text[end:])
+    return INLINE.sub(lambda m: blank(m, GAP), prose)
+
+
+def prose_of_rust(text: str) -> str:
+    """Returns docs, and strings of three words or more; everything else is blank."""
+    parts, end = [], 0
+    for token in TOKEN.finditer(text):
+        parts.append(re.sub(r"[^\n]", GAP, text[end:token.start()]))
+        end = token.end()
+        if token["doc"]:
+            parts.append("   " + token["doc"][3:])
+        elif (token["text"] or token["raw"]) and len(re.findall(r"[A-Za-z]+ ", token[0])) >= 2:
+            parts.append(re.sub(r"\\\n", " \n", token[0]).replace('"', GAP, 1))
+        else:
+            parts.append(blank(token, GAP))
+    prose = "".join(parts) + re.sub(r"[^\n]", GAP, text[end:])
+    # A doc comment continues in the next line after its indentation.
+    prose = re.sub(rf"\n{GAP}*(?=   )", lambda m: "\n" + " " * (len(m[0]) - 1), prose)
+    return INLINE.sub(lambda m: blank(m, GAP), prose)
+
+
+def first_lines(text: str) -> list[tuple[int, str]]:
+    """Returns number and text of the first doc line of each public item, field and variant."""
+    lines, found, number = text.splitlines(), [], 0
+    while number < len(lines):
+        if not re.match(r"\s*///(?!/)", lines[number]):
+            number += 1
+            continue
+        first = number
+        while number < len(lines) and re.match(r"\s*(?:///|#\[|#!\[)", lines[number]):
+            number += 1
+        item = lines[number].strip() if number < len(lines) else ""
+        if not PRIVATE.match(item):
+            found.append((first + 1, re.sub(r"^\s*/// ?", "", lines[first])))
+    return found
+
+
+def findings_of(path: str, text: str) -> list[tuple[int, str, str, str]]:
+    """Returns line, kind, matched text and advice of each finding of a file."""
+    if path.endswith(".rs"):
+        prose = prose_of_rust(text)
+    elif path.endswith(".md"):
+        prose = prose_of_markdown(text)
+    elif path.endswith(".py"):
+        prose = prose_of_python(text)
+    else:
+        prose = prose_of_comments(text)
+    found = []
+    for kind, (pattern, advice) in PATTERNS.items():
+        for match in pattern.finditer(prose):
+            found.append((prose.count("\n", 0, match.start()) + 1, kind, re.sub(r"\s+", " ", match[0]).strip(), advice))
+    if path.endswith(".rs"):
+        for number, line in first_lines(text):
+            if FIRST_LINE.match(line):
+                found.append((number, "first line", line[:40], "what the item is or does, in the third person"))
+    else:
+        for match in re.finditer(OPENING, HEADING.sub(blank, prose) if path.endswith(".md") else prose, re.MULTILINE):
+            found.append((prose.count("\n", 0, match.start()) + 1, "opening", match[0], "a subject that is named"))
+    return sorted(found)
+
+
+def folder_of(path: str) -> str:
+    """Returns a crate's folder for a Rust file, `documents` for all others."""
+    if not path.endswith(".rs"):
+        return "documents"
+    parts = path.split("/")
+    return "/".join(parts[: parts.index("src")] if "src" in parts and parts.index("src") else parts[:2])
+
+
+def within(path: str, folders) -> bool:
+    return any(path == folder or path.startswith(folder.rstrip("/") + "/") for folder in folders)
+
+
+def main() -> None:
+    arguments = [a for a in sys.argv[1:] if a != "--count"]
+    root = Path(arguments[0]) if arguments else Path(__file__).resolve().parent.parent
+    listed = subprocess.run(
+        ["git", "ls-files", "--cached", "--others", "--exclude-standard", "*.md", "*.rs", "*.toml", "*.py", "Makefile"],
+        cwd=root, capture_output=True, text=True, check=True,
+    )
+    files = sorted(p for p in set(listed.stdout.splitlines()) if (root / p).is_file() and not within(p, NOT_HELD))
+    counts: dict[str, Counter] = {}
+    held, unused = [], set(ALLOWED)
+    for path in files:
+        for number, kind, text, advice in findings_of(path, (root / path).read_text(encoding="utf-8")):
+            counts.setdefault(folder_of(path), Counter())[kind] += 1
+            key = (path, text.lower())
+            if key in ALLOWED:
+                unused.discard(key)
+            elif not path.endswith(".rs") or within(path, HELD_RUST):
+                held.append(f"{path}:{number}: {kind}: `{text}`; write: {advice}")
+    if "--count" in sys.argv:
+        total: Counter = Counter()
+        for folder in sorted(counts):
+            if folder != "documents":
+                total += counts[folder]
+            kinds = ", ".join(f"{kind} {count}" for kind, count in counts[folder].most_common())
+            print(f"{folder:24} {counts[folder].total():5}  {kinds}")
+        print(f"{'all Rust':24} {total.total():5}  " + ", ".join(f"{kind} {count}" for kind, count in total.most_common()))
+        return
+    held += [f".ci/check_words.py: the allowed `{text}` of {path} does not occur" for path, text in sorted(unused)]
+    print(f"words: {len(files)} files, Rust of {len(HELD_RUST)} folders held")
+    for text in held:
+        print(f"error: {text}", file=sys.stderr)
+    if held:
+        sys.exit(f"{len(held)} findings")
+    print("words: passed")
+
+
+if __name__ == "__main__":
+    main()
