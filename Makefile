@@ -1,6 +1,5 @@
 # Start with `make run` and `make test`; `make help` lists all targets.
-# Needs the Rust toolchain, a C++ compiler, python3 with pip, and git. All targets share one profile, so that no crate is
-# built twice.
+# Needs the Rust toolchain, a C++ compiler, python3 with pip, and git. All targets share one profile.
 
 SHELL := /bin/bash
 PYTHON ?= python3
@@ -22,7 +21,11 @@ endif
 help: ## List the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
 
-run: build ## Drive the shipped model through the intersection; show decisions, then write report, JSON and filmstrip
+# The programs of a run. `make run` leaves out the window, the benchmarks, films and the bridge.
+RUNNING := carff carff-launch carff-camera carff-encoder carff-forecaster carff-prober carff-renderer carff-controller
+
+run: libtorch ## Drive the shipped model through the intersection; show decisions, then write report, JSON and filmstrip
+	cargo build --release --locked --bins --no-default-features $(addprefix -p ,$(RUNNING))
 	$(TARGET)/release/carff launch $(GRAPH) --report $(REPORT)
 
 build: libtorch ## Build all programs

@@ -1,6 +1,7 @@
 //! Every command of `carff`, its help, completions and manual pages: what `carff` becomes for all that computes.
 
 use carff::{Attach, exit_code, until_read};
+#[cfg(feature = "bench")]
 use carff_bench::BenchCommand;
 use carff_launch::ablate::AblateArgs;
 use carff_launch::backbone::BackboneCommand;
@@ -88,7 +89,12 @@ Exit code: 1 when --verify finds a difference.")]
         after_help = "Example: from camera to action, in a minute
   carff bench loop --quick"
     )]
+    #[cfg(feature = "bench")]
     Bench(BenchCommand),
+    /// Measure the program's parts (not part of this build).
+    #[cfg(not(feature = "bench"))]
+    #[command(hide = true)]
+    Bench(carff::NotBuilt),
     /// Run a graph under a seeded schedule of faults, and hold it to its contract.
     #[command(after_help = "Example: ten minutes of every kind of fault
   carff soak configs/soak/all.toml --minutes 10 --seed 7 --json reports/soak.json")]
@@ -132,7 +138,10 @@ fn run() -> anyhow::Result<ExitCode> {
         Command::Eval(args) => carff_launch::eval::run(&args),
         Command::Ablate(args) => carff_launch::ablate::run(&args),
         Command::Backbone(command) => carff_launch::backbone::run(&command),
+        #[cfg(feature = "bench")]
         Command::Bench(command) => carff_bench::run(command),
+        #[cfg(not(feature = "bench"))]
+        Command::Bench(args) => args.run("carff bench"),
         Command::Soak(args) => carff_launch::soak::run(&args),
         Command::SoakInject(args) => carff_launch::soak::inject(&args).map(|()| ExitCode::SUCCESS),
         Command::Doctor(args) => carff_launch::doctor::run(&args),

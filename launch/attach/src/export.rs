@@ -1,10 +1,10 @@
 //! `carff export`: converts a recording to images, tables, a film or a trace.
 
-use crate::film::FilmWriter;
+#[cfg(feature = "film")]
+use crate::film;
 use crate::probe::image::named_image;
 use crate::spans::{Span, trace_events};
-use anyhow::{Context, ensure};
-use carff_messages::{FrameMeta, ImageMeta};
+use anyhow::Context;
 use carff_recording::Reader;
 use carff_transport::TopicId;
 use clap::Args;
@@ -12,9 +12,6 @@ use serde_json::Value;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
-
-/// Rate of a film from a recording with only one frame, frames per second.
-const LONE_FRAME_HZ: f64 = 10.0;
 
 /// Export a recording.
 #[derive(Clone, Debug, Args)]
@@ -57,7 +54,10 @@ pub fn run(args: &ExportArgs) -> anyhow::Result<ExitCode> {
         }
     }
     if let Some(file) = mp4 {
-        println!("{}: {} frames", file.display(), film(path, file)?);
+        #[cfg(feature = "film")]
+        println!("{}: {} frames", file.display(), film::export(path, file)?);
+        #[cfg(not(feature = "film"))]
+        anyhow::bail!("{}: films are not part of this build, which `make run` made: run `make build`", file.display());
     }
     if let Some(file) = trace {
         println!("{}: {} spans; open it at ui.perfetto.dev or chrome://tracing", file.display(), spans(path, file)?);
@@ -147,40 +147,6 @@ fn tables(recording: &Path, folder: &Path) -> anyhow::Result<Vec<(PathBuf, u64)>
     Ok(written)
 }
 
-/// Returns the frames per second, from the median time between frames.
-fn frame_rate_hz(recording: &Path) -> anyhow::Result<f64> {
-    let mut reader = Reader::open(recording)?;
-    let (mut before_ns, mut between) = (None, Vec::new());
-    while let Some(entry) = reader.next()? {
-        if let Some(m) = entry.message.as_message().get::<FrameMeta>() {
-            let at_ns = m.header.capture_time_ns;
-            if let Some(before_ns) = before_ns.replace(at_ns) {
-                between.push(at_ns.saturating_sub(before_ns) as f64);
-            }
-        }
-    }
-    let median_ns = carff_metrics::percentile(&between, 0.5).filter(|&ns| ns > 0.0);
-    Ok(median_ns.map_or(LONE_FRAME_HZ, |ns| 1e9 / ns))
-}
-
-fn film(recording: &Path, file: &Path) -> anyhow::Result<u64> {
-    let rate_hz = frame_rate_hz(recording)?;
-    let mut reader = Reader::open(recording)?;
-    let mut film = None;
-    while let Some(entry) = reader.next()? {
-        let message = entry.message.as_message();
-        let Some(m) = message.get::<FrameMeta>() else { continue };
-        let size_px = m.size_px();
-        let film = match &mut film {
-            Some(film) => film,
-            None => film.insert(FilmWriter::create(file, size_px, rate_hz)?),
-        };
-        ensure!(film.size_px() == size_px, "frame {} does not have the size of the first frame", m.header.frame_id);
-        film.add(message.bytes(), m.header.capture_time_ns)?;
-    }
-    film.with_context(|| format!("{} contains no camera frame", recording.display()))?.finish()
-}
-
 fn spans(recording: &Path, file: &Path) -> anyhow::Result<usize> {
     let mut reader = Reader::open(recording)?;
     let mut spans = Vec::new();
@@ -192,11 +158,11 @@ fn spans(recording: &Path, file: &Path) -> anyhow::Result<usize> {
     Ok(spans.len())
 }
 
-#[cfg(test)]
+#[cfg(all(test, feature = "film"))]
 mod tests {
     use super::*;
     use carff_messages::forms::AnyMessage;
-    use carff_messages::{Gaussian, Header, Posterior};
+    use carff_messages::{FrameMeta, Gaussian, Header, Posterior};
     use carff_recording::{About, Writer};
 
     fn recording(path: &Path) {
@@ -232,13 +198,13 @@ mod tests {
         assert_eq!(text.lines().nth(3).unwrap().split(',').nth(column), Some("2"));
         assert!(head.contains(&"gaussian.mean.7") && head.contains(&"header.frame_id"), "{head:?}");
 
-        assert_eq!(film(&path, &folder.path().join("film.mp4")).unwrap(), 3);
+        assert_eq!(film::export(&path, &folder.path().join("film.mp4")).unwrap(), 3);
         assert_eq!(spans(&path, &folder.path().join("trace.json")).unwrap(), 6);
-        assert!((frame_rate_hz(&path).unwrap() - 20.0).abs() < 1e-9);
+        assert!((film::frame_rate_hz(&path).unwrap() - 20.0).abs() < 1e-9);
 
         let empty = folder.path().join("empty.mcap");
         Writer::create(&empty, &About::default(), &[]).unwrap().finish().unwrap();
-        let error = film(&empty, &folder.path().join("none.mp4")).unwrap_err().to_string();
+        let error = film::export(&empty, &folder.path().join("none.mp4")).unwrap_err().to_string();
         assert!(error.contains("no camera frame") && !folder.path().join("none.mp4").exists(), "{error}");
     }
 

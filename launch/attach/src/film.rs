@@ -1,6 +1,8 @@
 //! Films: images as H.264 in an MP4 file, each shown from its own time until the next image.
 
 use anyhow::{Context, ensure};
+use carff_messages::{FrameMeta, ImageMeta};
+use carff_recording::Reader;
 use openh264::OpenH264API;
 use openh264::encoder::{
     ColorPrimaries, Encoder, EncoderConfig, FrameRate, FrameType, IntraFramePeriod, Profile, QpRange, RateControlMode,
@@ -26,6 +28,9 @@ const WHOLE_PICTURE_EVERY_S: f64 = 2.0;
 const MIN_SIDE_PX: u32 = 16;
 /// Frame rates that the encoder accepts, hertz.
 const RATES_HZ: std::ops::RangeInclusive<f64> = 1.0..=60.0;
+
+/// Rate of a film from a recording with only one frame, frames per second.
+const LONE_FRAME_HZ: f64 = 10.0;
 
 /// A film that is being written.
 pub(crate) struct FilmWriter {
@@ -204,6 +209,41 @@ fn fitting(rgb: &[u8], [width_px, height_px]: [u32; 2]) -> (Cow<'_, [u8]>, [u32;
     let pixel = |x: u32, y: u32| (y.min(last(height_px)) * width_px + x.min(last(width_px))) as usize * 3;
     let places = (0..fitting_px[1]).flat_map(|y| (0..fitting_px[0]).map(move |x| pixel(x, y)));
     (places.flat_map(|at| &rgb[at..at + 3]).copied().collect(), fitting_px)
+}
+
+/// Returns the frames per second, from the median time between frames.
+pub(crate) fn frame_rate_hz(recording: &Path) -> anyhow::Result<f64> {
+    let mut reader = Reader::open(recording)?;
+    let (mut before_ns, mut between) = (None, Vec::new());
+    while let Some(entry) = reader.next()? {
+        if let Some(m) = entry.message.as_message().get::<FrameMeta>() {
+            let at_ns = m.header.capture_time_ns;
+            if let Some(before_ns) = before_ns.replace(at_ns) {
+                between.push(at_ns.saturating_sub(before_ns) as f64);
+            }
+        }
+    }
+    let median_ns = carff_metrics::percentile(&between, 0.5).filter(|&ns| ns > 0.0);
+    Ok(median_ns.map_or(LONE_FRAME_HZ, |ns| 1e9 / ns))
+}
+
+/// Writes the camera's frames of a recording as a film. Returns their number.
+pub(crate) fn export(recording: &Path, file: &Path) -> anyhow::Result<u64> {
+    let rate_hz = frame_rate_hz(recording)?;
+    let mut reader = Reader::open(recording)?;
+    let mut film = None;
+    while let Some(entry) = reader.next()? {
+        let message = entry.message.as_message();
+        let Some(m) = message.get::<FrameMeta>() else { continue };
+        let size_px = m.size_px();
+        let film = match &mut film {
+            Some(film) => film,
+            None => film.insert(FilmWriter::create(file, size_px, rate_hz)?),
+        };
+        ensure!(film.size_px() == size_px, "frame {} does not have the size of the first frame", m.header.frame_id);
+        film.add(message.bytes(), m.header.capture_time_ns)?;
+    }
+    film.with_context(|| format!("{} contains no camera frame", recording.display()))?.finish()
 }
 
 #[cfg(test)]

@@ -3,17 +3,22 @@
 //! This crate contains commands without a model, and the terminal's output. It never links libtorch, which would make
 //! the start of a probe thirty times as expensive.
 
+#[cfg(feature = "bridge")]
 pub mod bridge;
 pub mod export;
+#[cfg(feature = "film")]
 mod film;
 pub mod log_line;
 pub mod metrics;
+mod not_built;
 pub mod probe;
 pub mod record;
 mod spans;
 pub mod terminal;
 pub mod view;
 mod vitals;
+
+pub use not_built::NotBuilt;
 
 use anyhow::Context;
 use clap::Subcommand;
@@ -53,7 +58,12 @@ pub enum Attach {
   carff bridge
   ssh -L 8765:localhost:8765 vehicle"
     )]
+    #[cfg(feature = "bridge")]
     Bridge(bridge::BridgeArgs),
+    /// Serve a run's topics over the Foxglove WebSocket protocol (not part of this build).
+    #[cfg(not(feature = "bridge"))]
+    #[command(hide = true)]
+    Bridge(NotBuilt),
     /// Serve a run's metrics over HTTP for Prometheus, on loopback by default.
     #[command(after_help = "Example:
   carff metrics --listen 127.0.0.1:9464
@@ -70,7 +80,10 @@ impl Attach {
             Self::View(args) => view::run(args),
             Self::Record(args) => record::run(args),
             Self::Export(args) => export::run(args),
+            #[cfg(feature = "bridge")]
             Self::Bridge(args) => bridge::run(args),
+            #[cfg(not(feature = "bridge"))]
+            Self::Bridge(args) => args.run("carff bridge"),
             Self::Metrics(args) => metrics::run(args),
         }
     }
