@@ -23,8 +23,9 @@ TARGET = "x86_64-unknown-linux-gnu"
 
 # The only modules with `unsafe`, and what for.
 UNSAFE_MODULES = {
-    "shared/field/src/bf16.rs": "a kernel in instructions of its own, AVX-512 BF16",
-    "shared/field/src/dispatch.rs": "calls kernels compiled for an instruction set that was found at run time",
+    "shared/field/src/kernels/bf16.rs": "a kernel in instructions of its own, AVX-512 BF16",
+    "shared/field/src/kernels/dispatch.rs": "calls kernels compiled for an instruction set that was found at run time",
+    "shared/field/src/kernels/prefetch.rs": "the prefetch instruction",
     "shared/messages/src/tests.rs": "makes messages out of arbitrary bytes",
     "shared/models/src/allocator.rs": "mallopt",
     "shared/models/src/borrow.rs": "tensors that borrow shared memory",

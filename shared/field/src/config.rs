@@ -11,7 +11,7 @@ pub(crate) const MAX_HIDDEN_WIDTH: usize = 256;
 /// Most cells along the side of the occupancy grid.
 pub(crate) const MAX_GRID_RESOLUTION: usize = 512;
 
-/// Why a field cannot be made or loaded.
+/// The reason why a field or a trainer cannot be made or loaded.
 #[derive(Debug, thiserror::Error, PartialEq)]
 pub enum FieldError {
     /// A value of the configuration is out of its range.
@@ -19,9 +19,9 @@ pub enum FieldError {
     Config {
         /// Name of the value.
         key: &'static str,
-        /// What it is.
+        /// Its value.
         value: String,
-        /// What it may be.
+        /// The allowed values.
         allowed: &'static str,
     },
     /// Tensors do not fit the configuration.
@@ -109,17 +109,13 @@ impl Default for FieldConfig {
     }
 }
 
+fn check(ok: bool, key: &'static str, value: impl std::fmt::Debug, allowed: &'static str) -> Result<(), FieldError> {
+    if ok { Ok(()) } else { Err(FieldError::Config { key, value: format!("{value:?}"), allowed }) }
+}
+
 impl FieldConfig {
     /// Checks every value; the error names the first that is out of range.
     pub fn validate(&self) -> Result<(), FieldError> {
-        fn check(
-            ok: bool,
-            key: &'static str,
-            value: impl std::fmt::Debug,
-            allowed: &'static str,
-        ) -> Result<(), FieldError> {
-            if ok { Ok(()) } else { Err(FieldError::Config { key, value: format!("{value:?}"), allowed }) }
-        }
         let [low, high] = self.bounds_m;
         let box_ok = (0..3).all(|i| low[i].is_finite() && high[i].is_finite() && high[i] - low[i] > 1e-3);
         check(box_ok, "bounds_m", self.bounds_m, "finite, each upper corner above the lower one")?;
@@ -278,6 +274,34 @@ pub struct TrainerConfig {
     pub occupancy_threshold: f32,
     /// Also compute the gradient of the loss by each latent of the batch.
     pub latent_gradient: bool,
+}
+
+impl TrainerConfig {
+    /// Checks the values; the error names the first that is out of range.
+    pub fn validate(&self) -> Result<(), FieldError> {
+        for (value, key) in [
+            (self.threads, "threads"),
+            (self.gradient_shards, "gradient_shards"),
+            (self.max_samples_per_ray, "max_samples_per_ray"),
+        ] {
+            check(value >= 1, key, value, "1 or more")?;
+        }
+        for (value, key) in [
+            (self.learning_rate_table, "learning_rate_table"),
+            (self.learning_rate_networks, "learning_rate_networks"),
+            (self.huber_delta, "huber_delta"),
+            (self.min_keep, "min_keep"),
+            (self.target_samples_per_ray, "target_samples_per_ray"),
+            (self.most_step_scale, "most_step_scale"),
+            (self.final_factor, "final_factor"),
+        ] {
+            check(value.is_finite() && value > 0.0, key, value, "above zero, finite")?;
+        }
+        for (value, key) in [(self.beta1, "beta1"), (self.beta2, "beta2")] {
+            check((0.0..1.0).contains(&value), key, value, "0..1")?;
+        }
+        Ok(())
+    }
 }
 
 impl Default for TrainerConfig {
