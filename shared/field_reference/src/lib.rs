@@ -128,7 +128,7 @@ impl ReferenceField {
         self.activate(&self.geometry(points_m, None, latent))
     }
 
-    /// Computes density `[N]` and colour `[N, 3]` (0..=1) at `points_m` `[N, 3]` seen along unit `directions` `[N, 3]`.
+    /// Computes density `[N]` and colour `[N, 3]` (0..=1) at `points_m` `[N, 3]` for unit viewing `directions` `[N, 3]`.
     pub fn density_and_color(&self, points_m: &Tensor, directions: &Tensor, latent: &Tensor) -> (Tensor, Tensor) {
         let geometry = self.geometry(points_m, None, latent);
         let harmonics = spherical_harmonics(directions, self.config.direction_degree);

@@ -93,9 +93,9 @@ fn values_agree_in_f32() {
             let (want_density, want_rgb) = tch::no_grad(|| {
                 reference.density_and_color(&rows(&points), &rows(&directions), &Tensor::from_slice(&z))
             });
-            let alone = tch::no_grad(|| reference.density(&rows(&points), &Tensor::from_slice(&z)));
-            let (want_density, want_rgb, alone) = (values(&want_density), values(&want_rgb), values(&alone));
-            assert_eq!(want_density, alone);
+            let separate = tch::no_grad(|| reference.density(&rows(&points), &Tensor::from_slice(&z)));
+            let (want_density, want_rgb, separate) = (values(&want_density), values(&want_rgb), values(&separate));
+            assert_eq!(want_density, separate);
             for set in [InstructionSet::portable(), InstructionSet::detect()] {
                 field.set_instruction_set(set);
                 let (mut density, mut rgb) = (vec![0.0; points.len()], vec![[0.0; 3]; points.len()]);
@@ -175,13 +175,13 @@ fn rays(count: usize, seed: u64) -> Vec<Ray> {
 /// Images agree pixel by pixel, including volume rendering, background, occupancy and early ends, with pixels of no width
 /// and of some width.
 #[test]
-fn pictures_agree() {
+fn images_agree() {
     for point_width_m in [0.0, 0.1] {
-        pictures_agree_with(&FieldConfig { point_width_m, ..config() });
+        images_agree_with(&FieldConfig { point_width_m, ..config() });
     }
 }
 
-fn pictures_agree_with(config: &FieldConfig) {
+fn images_agree_with(config: &FieldConfig) {
     let tensors: Vec<_> = rough_field(config.clone(), 6)
         .tensors()
         .into_iter()
@@ -218,9 +218,9 @@ fn pictures_agree_with(config: &FieldConfig) {
     let rays = Rays::new(&rays, config.direction_degree);
     let min_weight = f64::from(options.min_weight);
     for chunk in [100, 1 << 20] {
-        let picture =
+        let image =
             values(&reference.render(&rays, &Samples::new(&samples), &Tensor::from_slice(&z), min_weight, chunk));
-        let largest = picture.iter().zip(&buffer.rgb).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+        let largest = image.iter().zip(&buffer.rgb).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
         assert!(largest < 1e-4, "{largest}");
     }
 }

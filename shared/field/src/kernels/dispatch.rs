@@ -93,7 +93,7 @@ impl InstructionSet {
     }
 }
 
-/// Whether the portable path uses fused multiply-add: where the architecture always has it.
+/// True where the architecture always has fused multiply-add: the portable path then uses it.
 const PORTABLE_FMA: bool = cfg!(any(target_arch = "aarch64", target_feature = "fma"));
 
 /// Compiles one generic body for each instruction set, and makes the function that picks one of these versions.

@@ -13,7 +13,7 @@ pub(crate) struct Level {
     pub first: usize,
     /// Number of entries.
     pub entries: usize,
-    /// Whether entries are addressed by coordinates (else by hash; then `entries` is a power of two).
+    /// True when entries are addressed by coordinates (else by hash, and `entries` is a power of two).
     pub dense: bool,
 }
 

@@ -9,7 +9,7 @@ use crate::space::occupancy::{COARSE, OccupancyGrid};
 
 /// Rays of one packet.
 pub(crate) const PACKET: usize = 8;
-/// Stands for 1 / 0.
+/// Replaces 1 / 0.
 const VAST: f32 = 1e30;
 
 /// Eight rays that traverse the grid side by side; lanes without a ray are past their end.
@@ -35,7 +35,7 @@ pub(crate) struct SamplePoints {
     pub points: Vec<[f32; 3]>,
     /// Distances from the rays' origins, metres.
     pub distance_m: Vec<f32>,
-    /// Lengths of ray that the samples stand for, metres.
+    /// Lengths of ray that the samples represent, metres.
     pub delta_m: Vec<f32>,
     /// Numbers of the samples' rays.
     pub ray: Vec<u32>,

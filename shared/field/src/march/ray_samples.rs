@@ -16,11 +16,11 @@ pub struct RaySamples {
     pub ray: Vec<u32>,
     /// Distance from the ray's origin, metres.
     pub distance_m: Vec<f32>,
-    /// Delta: the length of ray that the sample stands for, metres.
+    /// Delta: the length of ray that the sample represents, metres.
     pub delta_m: Vec<f32>,
     /// Weight: the share of the ray's light that comes from the sample, 0..=1.
     pub weight: Vec<f32>,
-    /// Transmittance of each ray behind all of its samples, 0..=1.
+    /// Transmittance of each ray after all of its samples, 0..=1.
     pub transmittance: Vec<f32>,
 }
 

@@ -12,7 +12,7 @@ use crate::model::network::{Hidden, Input};
 
 /// Samples of all rays together that are evaluated before transmittances are updated: enough to fill blocks.
 const WAVE: usize = 256;
-/// The fewest and the most samples of one ray in a wave: samples behind the point where it turns opaque are wasted.
+/// The fewest and the most samples of one ray in a wave: samples after the point where it turns opaque are wasted.
 const WAVE_OF_RAY: std::ops::RangeInclusive<usize> = 4..=16;
 /// Marks a lane that fills up a block.
 pub(crate) const NO_RAY: u32 = u32::MAX;
@@ -43,20 +43,20 @@ pub(crate) struct March<'a> {
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct RayState {
     pub transmittance: f32,
-    /// Whether the transmittance is still high enough for further samples to count.
+    /// True while the transmittance is high enough for further samples to count.
     active: bool,
 }
 
 /// Densities and weights of the samples under one latent. All lists but the last two have one entry for each sample.
 #[derive(Debug, Default)]
 pub(crate) struct LatentSamples {
-    /// Each sample's ray; `NO_RAY` for samples behind the ray's end, and for lanes that fill up a block.
+    /// Each sample's ray; `NO_RAY` for samples after the ray's end, and for lanes that fill up a block.
     pub ray: Vec<u32>,
     /// Density, 1/metre.
     pub sigma: Vec<f32>,
     /// Share of the ray's light that comes from the sample: alpha times the transmittance in front of it.
     pub weight: Vec<f32>,
-    /// Transmittance of the ray from its origin to behind the sample.
+    /// Transmittance of the ray from its origin to the sample's far end.
     pub transmittance: Vec<f32>,
     /// Outputs of the density network.
     pub geometry: BlockBuffer,

@@ -208,7 +208,7 @@ impl Field {
         }
     }
 
-    /// Computes density (1/metre) and colour (0..=1) at world points (metres) seen along unit `directions`, under one
+    /// Computes density (1/metre) and colour (0..=1) at world points (metres) for unit viewing `directions`, under one
     /// latent, for as many points as all four slices have.
     pub fn density_and_color(
         &self,

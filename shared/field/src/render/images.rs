@@ -162,8 +162,8 @@ mod tests {
         for threads in [1, 2] {
             let options = RenderOptions { threads, ..options };
             field.render_hypotheses(&camera(), &latents, &options, &mut buffer);
-            for (picture, single) in buffer.pictures.iter().zip(&single) {
-                assert!(largest_difference(&picture.rgb, single) < 1e-5);
+            for (image, single) in buffer.pictures.iter().zip(&single) {
+                assert!(largest_difference(&image.rgb, single) < 1e-5);
             }
         }
         field.changing.set_from(|i| i % 16 < 8);
@@ -171,19 +171,19 @@ mod tests {
         let changing = buffer.pictures[0].changing.clone();
         let share = changing.iter().filter(|c| **c).count();
         assert!(share > 20 && share + 20 < changing.len(), "{share} of {}", changing.len());
-        for (k, picture) in buffer.pictures.iter().enumerate() {
+        for (k, image) in buffer.pictures.iter().enumerate() {
             let mut apart = 0;
-            for (i, pixel) in picture.rgb.chunks_exact(3).enumerate() {
+            for (i, pixel) in image.rgb.chunks_exact(3).enumerate() {
                 let first = &single[0][3 * i..3 * i + 3];
                 assert!(changing[i] || pixel == first);
                 apart += usize::from(largest_difference(pixel, first) > 1e-3);
             }
-            assert!(if k == 0 { apart == 0 } else { apart > 20 }, "{apart} pixels of picture {k}");
+            assert!(if k == 0 { apart == 0 } else { apart > 20 }, "{apart} pixels of image {k}");
         }
         field.changing.set_from(|_| false);
         field.render_hypotheses(&camera(), &latents, &options, &mut buffer);
-        for picture in &buffer.pictures {
-            assert_eq!(largest_difference(&picture.rgb, &single[0]), 0.0);
+        for image in &buffer.pictures {
+            assert_eq!(largest_difference(&image.rgb, &single[0]), 0.0);
         }
         field.render_hypotheses(&camera(), &[], &options, &mut buffer);
         assert!(buffer.pictures.is_empty());

@@ -68,7 +68,7 @@ impl TileGradients {
         let work = Backward { gradient: &mut *gradient, folded_gradient: &mut folded.color, hidden: &mut self.hidden };
         l.color.backward(weights, pass, dy.into_blocks(), work, Some(d_inputs.reborrow()));
         for (at, k) in kept.iter().enumerate() {
-            // The density's clamp passes the gradient above its limit too.
+            // The clamp of the raw density passes the gradient through, as instant-ngp's does.
             *d_inputs.at_mut(at, 0) += k.sigma_gradient;
         }
         let pass = (tile.features.blocks(l.features, count), &tile.density_hidden);

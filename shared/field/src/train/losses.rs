@@ -1,23 +1,12 @@
 //! Losses of pixels and samples, and their gradients by raw colours and raw densities.
 
-use super::shard::{Job, Pixels, Shard};
+use super::shard::{Job, Pixels, RaySums, Shard};
 use crate::config::TrainerConfig;
 
 /// Transmittances are clamped to this distance from 0 and 1 for the entropy.
 const ENTROPY_MARGIN: f32 = 1e-3;
 /// Colour channels.
 const CHANNELS: f32 = 3.0;
-
-/// Sums over the samples of a ray in front of a sample (prefix) or behind it (suffix).
-#[derive(Clone, Copy, Debug, Default)]
-pub(super) struct RaySums {
-    /// Weights.
-    weight: f32,
-    /// Weights times positions.
-    moment: f32,
-    /// Weights times the loss's gradients by them.
-    gradient: f32,
-}
 
 impl Shard {
     /// Composites the pixels, and computes their loss with its gradient.

@@ -86,6 +86,17 @@ pub(super) struct Pixels {
     pub transmittance_gradient: Vec<f32>,
 }
 
+/// Sums over the samples of a ray before a sample (prefix) or after it (suffix).
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct RaySums {
+    /// Weights.
+    pub weight: f32,
+    /// Weights times positions.
+    pub moment: f32,
+    /// Weights times the loss's gradients by them.
+    pub gradient: f32,
+}
+
 /// Sums of a shard over its rays.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Sums {
@@ -103,17 +114,17 @@ pub(super) struct Shard {
     pub network_gradient: Vec<f32>,
     pub latent_gradient: Vec<[f32; LATENT_DIM]>,
     pub sums: Sums,
-    pub(super) rays: Vec<Ray>,
-    pub(super) targets: Vec<[f32; 3]>,
-    pub(super) folded: Folded,
-    pub(super) samples: Samples,
-    pub(super) kept: Vec<KeptSample>,
-    pub(super) tiles: Vec<Tile>,
-    pub(super) background: Background,
-    pub(super) pixels: Pixels,
-    pub(super) tile_gradients: TileGradients,
-    pub(super) folded_gradients: FoldedGradients,
-    pub(super) ray_sums: Vec<super::losses::RaySums>,
+    pub rays: Vec<Ray>,
+    pub targets: Vec<[f32; 3]>,
+    pub folded: Folded,
+    pub samples: Samples,
+    pub kept: Vec<KeptSample>,
+    pub tiles: Vec<Tile>,
+    pub background: Background,
+    pub pixels: Pixels,
+    pub tile_gradients: TileGradients,
+    pub folded_gradients: FoldedGradients,
+    pub ray_sums: Vec<RaySums>,
     scratch: MarchScratch,
 }
 

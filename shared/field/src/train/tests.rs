@@ -60,7 +60,7 @@ fn random_batch(count: usize, latents: usize, seed: u64) -> RayBatch {
     }
 }
 
-/// A field whose tables are large enough for gradients to stand out of rounding.
+/// Makes a field with values large enough for gradients to exceed rounding errors.
 fn rough_field(seed: u64) -> Field {
     let mut field = Field::new(FieldConfig { density_offset: -2.0, ..small_config() }, seed).unwrap();
     for (i, v) in field.table.iter_mut().enumerate() {
