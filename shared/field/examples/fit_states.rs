@@ -1,4 +1,4 @@
-//! Trains a field on a posed picture set with one fixed random latent for each state, and says how well it does.
+//! Trains a field on a posed image dataset with one fixed random latent for each state, and prints its image quality.
 //!
 //! ```text
 //! cargo run --release -p carff-field --example fit_states -- DATASET --out DIR [--seconds 300] [--rays 4096]
@@ -15,34 +15,34 @@ use carff_field::{
 use carff_geometry::PinholeCamera;
 use serde_json::Value;
 
-struct Picture {
+struct PosedImage {
     camera: PinholeCamera,
     state: usize,
     view: usize,
     rgb: Vec<u8>,
 }
 
-struct Set {
-    pictures: Vec<Picture>,
+struct Dataset {
+    images: Vec<PosedImage>,
     states: usize,
     bev_view: usize,
     bounds_m: [[f32; 3]; 2],
 }
 
-fn load(dir: &Path) -> Result<Set> {
+fn load(dir: &Path) -> Result<Dataset> {
     let text = std::fs::read_to_string(dir.join("transforms.json")).context("reading transforms.json")?;
     let json: Value = serde_json::from_str(&text)?;
     let number = |frame: &Value, key: &str| {
         frame[key].as_f64().or(json[key].as_f64()).with_context(|| format!("`{key}` is missing"))
     };
-    let mut pictures = Vec::new();
+    let mut images = Vec::new();
     for frame in json["frames"].as_array().context("`frames`")? {
         let file = dir.join(frame["file_path"].as_str().context("`file_path`")?);
-        let picture = image::open(&file).with_context(|| format!("{}", file.display()))?.to_rgb8();
+        let image = image::open(&file).with_context(|| format!("{}", file.display()))?.to_rgb8();
         let m: [[f64; 4]; 4] = serde_json::from_value(frame["transform_matrix"].clone())?;
         let camera = PinholeCamera {
-            width_px: picture.width(),
-            height_px: picture.height(),
+            width_px: image.width(),
+            height_px: image.height(),
             fl_x_px: number(frame, "fl_x")?,
             fl_y_px: number(frame, "fl_y")?,
             cx_px: number(frame, "cx")?,
@@ -50,17 +50,17 @@ fn load(dir: &Path) -> Result<Set> {
             world_from_camera: m,
         };
         camera.validate()?;
-        pictures.push(Picture {
+        images.push(PosedImage {
             camera,
             state: frame["scene_id"].as_u64().unwrap_or(0) as usize,
             view: frame["view_id"].as_u64().context("`view_id`")? as usize,
-            rgb: picture.into_raw(),
+            rgb: image.into_raw(),
         });
     }
     let bounds: [[f32; 3]; 2] = serde_json::from_value(json["scenario"]["bounds"].clone())?;
-    let states = pictures.iter().map(|p| p.state).max().unwrap_or(0) + 1;
+    let states = images.iter().map(|p| p.state).max().unwrap_or(0) + 1;
     let bev_view = json["scenario"]["bev_view"].as_u64().unwrap_or(0) as usize;
-    Ok(Set { pictures, states, bev_view, bounds_m: bounds })
+    Ok(Dataset { images, states, bev_view, bounds_m: bounds })
 }
 
 /// Standard normal numbers by the sum of twelve uniform ones.
@@ -79,10 +79,10 @@ fn normals(seed: u64) -> [f32; LATENT_DIM] {
     })
 }
 
-fn squared_error(rendered: &[f32], picture: &[u8], pixels: Option<&[u32]>) -> (f64, usize) {
-    let error = |i: usize| f64::from(rendered[i].clamp(0.0, 1.0) - f32::from(picture[i]) / 255.0).powi(2);
+fn squared_error(rendered: &[f32], image: &[u8], pixels: Option<&[u32]>) -> (f64, usize) {
+    let error = |i: usize| f64::from(rendered[i].clamp(0.0, 1.0) - f32::from(image[i]) / 255.0).powi(2);
     match pixels {
-        None => ((0..picture.len()).map(error).sum(), picture.len()),
+        None => ((0..image.len()).map(error).sum(), image.len()),
         Some(p) => (p.iter().flat_map(|p| (0..3).map(move |c| *p as usize * 3 + c)).map(error).sum(), p.len() * 3),
     }
 }
@@ -93,7 +93,7 @@ fn psnr((sum, count): (f64, usize)) -> f64 {
 
 fn save_png(path: &Path, rgb: &[f32], width: u32, height: u32) -> Result<()> {
     let bytes = rgb.iter().map(|v| (v.clamp(0.0, 1.0) * 255.0 + 0.5) as u8).collect();
-    image::RgbImage::from_raw(width, height, bytes).context("picture size")?.save(path)?;
+    image::RgbImage::from_raw(width, height, bytes).context("image size")?.save(path)?;
     Ok(())
 }
 
@@ -112,7 +112,7 @@ struct Score {
 }
 
 fn evaluate(
-    set: &Set,
+    set: &Dataset,
     views: &[TrainingView],
     field: &Field,
     codes: &[[f32; LATENT_DIM]],
@@ -126,9 +126,9 @@ fn evaluate(
         total.1 += part.1;
     };
     let mut strip: Vec<f32> = Vec::new();
-    for (i, p) in set.pictures.iter().enumerate() {
+    for (i, p) in set.images.iter().enumerate() {
         let is_bev = p.view == set.bev_view;
-        // Beside the bird's eye view, a tenth of the others.
+        // The bird's eye view and a tenth of the other views.
         if !is_bev && (p.view % 10 != 4 || out.is_none()) {
             continue;
         }
@@ -152,11 +152,11 @@ fn evaluate(
         }
         add(&mut matching, squared_error(&buffer.rgb, &p.rgb, None));
         add(&mut changed, squared_error(&buffer.rgb, &p.rgb, Some(&views[i].changed)));
-        for q in set.pictures.iter().filter(|q| q.view == set.bev_view && q.state != p.state) {
+        for q in set.images.iter().filter(|q| q.view == set.bev_view && q.state != p.state) {
             add(&mut unmatching, squared_error(&buffer.rgb, &q.rgb, None));
         }
     }
-    if let (Some(dir), Some(p)) = (out, set.pictures.first()) {
+    if let (Some(dir), Some(p)) = (out, set.images.first()) {
         let width = p.camera.width_px * 2;
         save_png(&dir.join("bev.png"), &strip, width, strip.len() as u32 / 3 / width)?;
     }
@@ -188,15 +188,15 @@ fn main() -> Result<()> {
             other => bail!("unknown option {other}"),
         }
     }
-    let set = load(&dataset.context("which data set?")?)?;
+    let set = load(&dataset.context("which dataset?")?)?;
     field_config.bounds_m = set.bounds_m;
     std::fs::create_dir_all(&out)?;
 
     let views: Vec<TrainingView> = set
-        .pictures
+        .images
         .iter()
         .map(|p| {
-            let same: Vec<&[u8]> = set.pictures.iter().filter(|q| q.view == p.view).map(|q| &q.rgb[..]).collect();
+            let same: Vec<&[u8]> = set.images.iter().filter(|q| q.view == p.view).map(|q| &q.rgb[..]).collect();
             TrainingView { camera: p.camera, rgb: p.rgb.clone(), changed: changed_pixels(&same, 12) }
         })
         .collect();
@@ -207,20 +207,20 @@ fn main() -> Result<()> {
         // Two independent unit normal 8-d codes are 4 apart on average; the noise is a share of that, over 8 numbers.
         std::array::from_fn(|k| codes[state][k] + noise / (LATENT_DIM as f32).sqrt() * n[k])
     };
-    let clouds: Vec<Vec<[f32; LATENT_DIM]>> = (0..set.states)
+    let posteriors: Vec<Vec<[f32; LATENT_DIM]>> = (0..set.states)
         .map(|s| std::iter::once(codes[s]).chain((1..16).map(|i| jittered(s, (s * 100 + i) as u64))).collect())
         .collect();
 
     let field = Field::new(field_config, config.seed)?;
     println!("{} numbers, {}", field.parameter_count(), field.instruction_set().name());
     let mut trainer = FieldTrainer::new(field, config)?;
-    trainer.set_state_latents(&clouds);
+    trainer.set_state_latents(&posteriors);
     let mut sampler = RaySampler::new(views.clone(), changed_share, 1);
     let mut batch = RayBatch::default();
     let (mut cpu, mut spent, mut next, mut total_rays, mut psnr_mean) = (0.0, 0.0, every, 0_usize, 0.0);
     while cpu < seconds * 2.0 && trainer.step_count() < 10_000_000 {
         let (t, c) = (Instant::now(), cpu_seconds());
-        sampler.next_batch(rays, &mut batch, |v, draw| jittered(set.pictures[v].state, draw));
+        sampler.next_batch(rays, &mut batch, |v, draw| jittered(set.images[v].state, draw));
         let report = trainer.step(&batch);
         spent += t.elapsed().as_secs_f64();
         cpu += cpu_seconds() - c;
@@ -266,7 +266,7 @@ fn main() -> Result<()> {
         "final: bev {:.2} unmatching {:.2} changed {:.2} others {:.2} dB; in f16: bev {:.2} changed {:.2} others {:.2}",
         s.matching, s.unmatching, s.changed, s.other, half.matching, half.changed, half.other
     );
-    let bev = set.pictures.iter().find(|p| p.view == set.bev_view).context("bird's eye view")?;
+    let bev = set.images.iter().find(|p| p.view == set.bev_view).context("bird's eye view")?;
     let mut buffer = RenderBuffer::new();
     for threads in [1, 2] {
         let options = RenderOptions { threads, ..RenderOptions::default() };

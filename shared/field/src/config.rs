@@ -1,4 +1,4 @@
-//! The field's structure and the options of its use: one documented struct each, which is also the file format.
+//! The field's structure, and the options of rendering and training: documented structs that are also the file format.
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -11,7 +11,7 @@ pub(crate) const MAX_HIDDEN_WIDTH: usize = 256;
 /// Most cells along the side of the occupancy grid.
 pub(crate) const MAX_GRID_RESOLUTION: usize = 512;
 
-/// Why a field cannot be made or loaded.
+/// The reason why a field or a trainer cannot be made or loaded.
 #[derive(Debug, thiserror::Error, PartialEq)]
 pub enum FieldError {
     /// A value of the configuration is out of its range.
@@ -19,9 +19,9 @@ pub enum FieldError {
     Config {
         /// Name of the value.
         key: &'static str,
-        /// What it is.
+        /// Its value.
         value: String,
-        /// What it may be.
+        /// The allowed values.
         allowed: &'static str,
     },
     /// Tensors do not fit the configuration.
@@ -36,8 +36,8 @@ pub enum FieldError {
 #[derive(Serialize, Deserialize, JsonSchema, Clone, PartialEq, Debug)]
 #[serde(deny_unknown_fields, default)]
 pub struct FieldConfig {
-    /// The box that matters, [[x0, y0, z0], [x1, y1, z1]], metres, world space. It maps to the inner half of the
-    /// unit cube along its longest axis; all that lies outside is contracted smoothly.
+    /// The bounds of the scene, [[x0, y0, z0], [x1, y1, z1]], metres, world space. They map to the inner half of the
+    /// unit cube along the longest axis; space outside is contracted smoothly.
     pub bounds_m: [[f32; 3]; 2],
     /// Half extent of an axis is at least this share of the longest one, so that grid cells stay close to cubes. 0..=1.
     pub min_axis_ratio: f32,
@@ -53,8 +53,8 @@ pub struct FieldConfig {
     pub max_resolution: u32,
     /// Neurons of each hidden layer of the density and the colour network; a multiple of 4, 8..=256.
     pub hidden_width: usize,
-    /// Features that the density network hands to the colour network beside the raw density; this plus one is a
-    /// multiple of 4.
+    /// Features that the density network passes to the colour network in addition to the raw density; this plus one
+    /// is a multiple of 4.
     pub geometry_features: usize,
     /// Degree of the spherical harmonics that encode the viewing direction, 1..=4 (degree squared numbers).
     pub direction_degree: usize,
@@ -71,10 +71,10 @@ pub struct FieldConfig {
     pub cone_angle: f32,
     /// Rays start this far from the camera, metres.
     pub near_m: f32,
-    /// Rays end here, metres; what lies beyond is background.
+    /// Rays end at this distance, metres; the background is beyond.
     pub far_m: f32,
-    /// Above 0, what a sample of a ray sees is as wide as its pixel is there: levels of the grid whose cells are narrower
-    /// count less. Points that no ray asks about are taken to be this wide, metres. At 0 all levels count in full.
+    /// Above 0, samples of rays are as wide as their pixel at that distance, and levels of the grid with narrower cells
+    /// count less. Points without a ray are this wide, metres. At 0 all levels count in full.
     pub point_width_m: f32,
     /// Subtracted from each latent before use.
     pub latent_mean: [f32; LATENT_DIM],
@@ -109,17 +109,21 @@ impl Default for FieldConfig {
     }
 }
 
+fn check(ok: bool, key: &'static str, value: impl std::fmt::Debug, allowed: &'static str) -> Result<(), FieldError> {
+    if ok { Ok(()) } else { Err(FieldError::Config { key, value: format!("{value:?}"), allowed }) }
+}
+
 impl FieldConfig {
     /// Checks every value; the error names the first that is out of range.
+    ///
+    /// ```
+    /// use carff_field::FieldConfig;
+    /// let config = FieldConfig { levels: 4, ..FieldConfig::default() };
+    /// assert!(config.validate().is_ok());
+    /// let error = FieldConfig { levels: 0, ..config }.validate().unwrap_err();
+    /// assert_eq!(error.to_string(), "field configuration: `levels` is 0; allowed: 1..=16");
+    /// ```
     pub fn validate(&self) -> Result<(), FieldError> {
-        fn check(
-            ok: bool,
-            key: &'static str,
-            value: impl std::fmt::Debug,
-            allowed: &'static str,
-        ) -> Result<(), FieldError> {
-            if ok { Ok(()) } else { Err(FieldError::Config { key, value: format!("{value:?}"), allowed }) }
-        }
         let [low, high] = self.bounds_m;
         let box_ok = (0..3).all(|i| low[i].is_finite() && high[i].is_finite() && high[i] - low[i] > 1e-3);
         check(box_ok, "bounds_m", self.bounds_m, "finite, each upper corner above the lower one")?;
@@ -187,18 +191,18 @@ impl FieldConfig {
     }
 }
 
-/// How rays are rendered.
+/// The options of rendering.
 #[derive(Serialize, Deserialize, Clone, Copy, PartialEq, Debug)]
 #[serde(deny_unknown_fields, default)]
 pub struct RenderOptions {
     /// Threads used, at least 1.
     pub threads: usize,
-    /// A ray ends after so many samples.
+    /// A ray ends after this number of samples.
     pub max_samples_per_ray: usize,
-    /// A ray ends when less than this share of light passes.
+    /// A ray ends when its transmittance falls below this.
     pub min_transmittance: f32,
-    /// Samples that weigh less than this in their pixel are given no colour of their own, but the mean of the others'
-    /// (the heaviest one always has its own).
+    /// Samples of less weight than this take the mean colour of their ray's other samples (the heaviest sample always has
+    /// its own colour).
     pub min_weight: f32,
 }
 
@@ -208,7 +212,7 @@ impl Default for RenderOptions {
     }
 }
 
-/// How a field is trained.
+/// The options of a field's training.
 #[derive(Serialize, Deserialize, JsonSchema, Clone, PartialEq, Debug)]
 #[serde(deny_unknown_fields, default)]
 pub struct TrainerConfig {
@@ -243,13 +247,13 @@ pub struct TrainerConfig {
     pub huber_delta: f32,
     /// Most samples of a ray.
     pub max_samples_per_ray: usize,
-    /// A step stops taking rays once so many samples were evaluated (early on, when all of space is thin fog, a ray has
-    /// ten times as many samples as later).
+    /// A step takes no more rays after this number of samples (at first, when all of space is thin fog, a ray has ten
+    /// times the samples that it has later).
     pub samples_per_step: usize,
-    /// A ray ends when less than this share of light passes.
+    /// A ray ends when its transmittance falls below this.
     pub min_transmittance: f32,
-    /// Samples that weigh less than this are kept only by chance (probability in proportion to the weight, not below
-    /// `min_keep`), with their gradient scaled up accordingly. 0 keeps all.
+    /// Samples of less weight than this are kept by chance (with a probability in proportion to the weight, at least
+    /// `min_keep`), and their gradient is scaled up accordingly. 0 keeps all.
     pub roulette_weight: f32,
     /// Least probability of being kept.
     pub min_keep: f32,
@@ -257,27 +261,54 @@ pub struct TrainerConfig {
     pub jitter: bool,
     /// Weight of the opacity regulariser: pushes each ray's opacity to 0 or 1.
     pub opacity_entropy: f32,
-    /// Weight of the distortion loss (mip-NeRF 360, eq. 15): draws what a ray sees together into thin surfaces. Distances
-    /// t count as t / (t + half the longest extent of the bounds).
+    /// Weight of the distortion loss (mip-NeRF 360, eq. 15), which contracts the weights along a ray to thin surfaces.
+    /// Distances t count as t / (t + half the longest extent of the bounds).
     pub distortion: f32,
     /// Steps between two refreshes of the occupancy grid.
     pub occupancy_interval: u64,
     /// Up to this step all of space counts as occupied.
     pub occupancy_warmup_steps: u64,
     /// While rays have more samples than this on average, steps along them are stretched (up to `most_step_scale`
-    /// times): thin fog needs no fine steps, and by the time that surfaces stand out the occupancy grid keeps rays
-    /// short.
+    /// times): thin fog needs no fine steps, and once there are surfaces the occupancy grid keeps rays short.
     pub target_samples_per_ray: f32,
-    /// See `target_samples_per_ray`; also the stretch to start with. 1 switches stretching off.
+    /// Largest stretch of steps (see `target_samples_per_ray`), also the first. 1 switches stretching off.
     pub most_step_scale: f32,
-    /// Cells looked at in each refresh, half of them among the occupied ones.
+    /// Cells that each refresh evaluates, half of them among the occupied ones.
     pub occupancy_cells: usize,
-    /// Kept share of a cell's density at each look.
+    /// Share of a cell's density that each evaluation keeps.
     pub occupancy_decay: f32,
     /// A cell is occupied when its density times the step inside the bounds is above this (or above the mean).
     pub occupancy_threshold: f32,
     /// Also compute the gradient of the loss by each latent of the batch.
     pub latent_gradient: bool,
+}
+
+impl TrainerConfig {
+    /// Checks the values; the error names the first that is out of range.
+    pub fn validate(&self) -> Result<(), FieldError> {
+        for (value, key) in [
+            (self.threads, "threads"),
+            (self.gradient_shards, "gradient_shards"),
+            (self.max_samples_per_ray, "max_samples_per_ray"),
+        ] {
+            check(value >= 1, key, value, "1 or more")?;
+        }
+        for (value, key) in [
+            (self.learning_rate_table, "learning_rate_table"),
+            (self.learning_rate_networks, "learning_rate_networks"),
+            (self.huber_delta, "huber_delta"),
+            (self.min_keep, "min_keep"),
+            (self.target_samples_per_ray, "target_samples_per_ray"),
+            (self.most_step_scale, "most_step_scale"),
+            (self.final_factor, "final_factor"),
+        ] {
+            check(value.is_finite() && value > 0.0, key, value, "above zero, finite")?;
+        }
+        for (value, key) in [(self.beta1, "beta1"), (self.beta2, "beta2")] {
+            check((0.0..1.0).contains(&value), key, value, "0..1")?;
+        }
+        Ok(())
+    }
 }
 
 impl Default for TrainerConfig {

@@ -3,7 +3,7 @@
 use carff_field::FieldConfig;
 use tch::{Kind, Tensor};
 
-/// Levels whose entries are found in the same way, gathered together.
+/// Levels whose entries are addressed in the same way, gathered together.
 #[derive(Debug)]
 struct Group {
     /// Cells along a side, `[L, 1]`, f32.
@@ -12,15 +12,15 @@ struct Group {
     first: Tensor,
     /// Multiplies whole coordinates: `[L, 3]`, i32.
     factors: Tensor,
-    /// Entries less one where entries are found by hash, a power of two less one; `None` where by coordinates.
+    /// Entries less one (a power of two less one) where entries are addressed by hash; `None` for coordinates.
     mask: Option<i64>,
 }
 
-/// From world points to features.
+/// The hash grid's encoding of world points.
 #[derive(Debug)]
 pub(crate) struct Encoding {
     point_width_m: f32,
-    /// Sides of the unit cube a metre, along the bounds' longest side.
+    /// Sides of the unit cube per metre, along the bounds' longest side.
     cubes_a_metre: f64,
     center: Tensor,
     inverse_half: Tensor,
@@ -53,7 +53,7 @@ impl Encoding {
                     sizes.push(resolutions[level] as f32);
                     firsts.push(first as i32);
                     first += if mask.is_some() { most } else { side.pow(3) };
-                    // Products of 32-bit numbers wrap, as the hash wants them to (primes of Teschner et al. 2003).
+                    // The hash's products wrap at 32 bits (primes of Teschner et al. 2003).
                     factors.extend(match mask {
                         Some(_) => [1, 2_654_435_761_u32 as i32, 805_459_861],
                         None => [1, side as i32, (side * side) as i32],
@@ -77,7 +77,7 @@ impl Encoding {
         }
     }
 
-    /// World metres to the unit cube: linear inside the bounds, squeezed by 2 - 1/u outside, axis by axis.
+    /// Maps world metres to the unit cube: linear inside the bounds, squeezed by 2 - 1/u outside, axis by axis.
     fn contract(&self, points_m: &Tensor) -> Tensor {
         let u = (points_m - &self.center) * &self.inverse_half;
         let a = u.abs();
@@ -85,8 +85,8 @@ impl Encoding {
         squeezed.copysign(&u) * 0.25 + 0.5
     }
 
-    /// Features `[N, levels x features per level]` of world points `[N, 3]`, from the table `[entries, features]`; of
-    /// points that are `widths_m` `[N]` wide (see [`FieldConfig::point_width_m`]).
+    /// Computes the features `[N, levels x features per level]` of world points `[N, 3]`, `widths_m` `[N]` wide (see
+    /// [`FieldConfig::point_width_m`]), from the table `[entries, features]`.
     pub(crate) fn features(&self, table: &Tensor, points_m: &Tensor, widths_m: Option<&Tensor>) -> Tensor {
         let (indices, weights): (Vec<Tensor>, Vec<Tensor>) = tch::no_grad(|| {
             let q = self.contract(points_m).clamp(0.0, 1.0).unsqueeze(1);
@@ -109,7 +109,7 @@ impl Encoding {
 }
 
 impl Group {
-    /// Entry numbers (i32) and blend weights of the eight corners of each point's cell, both `[N, L, 8]`.
+    /// Computes the entry numbers (i32) and blend weights of the eight corners of each point's cell, both `[N, L, 8]`.
     /// `q` is `[N, 1, 3]` in the unit cube.
     fn corners(&self, q: &Tensor) -> (Tensor, Tensor) {
         let n = q.size()[0];
@@ -133,7 +133,7 @@ impl Group {
     }
 }
 
-/// Real spherical harmonics of unit vectors `[N, 3]` up to a degree of 1 to 4: `[N, degree x degree]`.
+/// Computes the real spherical harmonics of unit vectors `[N, 3]` up to a degree of 1 to 4: `[N, degree x degree]`.
 pub fn spherical_harmonics(directions: &Tensor, degree: usize) -> Tensor {
     let [x, y, z] = [0, 1, 2].map(|i| directions.select(1, i));
     let (x2, y2, z2) = (x.square(), y.square(), z.square());

@@ -1,9 +1,9 @@
-//! The field in plain tensor operations: the yardstick for the native kernels.
+//! The field in plain tensor operations: the reference for the native kernels.
 //!
 //! The same latent-conditioned hash grid and networks as [`carff_field::Field`], built from its tensors, with gradients
-//! by automatic differentiation. It is what one would write with a tensor library, and written with care: no operation
-//! that is not needed, the latent's share folded into the first layers' biases, all levels of the grid gathered at once.
-//! Parity tests hold the native kernels against it, and the benchmarks measure both side by side. Nothing else uses it.
+//! by automatic differentiation. It does no operation that is not needed: the latent's share is folded into the first
+//! layers' biases, and all levels of the grid are gathered at once. Parity tests compare the native kernels with it, and
+//! the benchmarks measure both.
 //!
 //! Shapes: N points or samples, R rays. All tensors are on the processor.
 
@@ -17,12 +17,12 @@ use tch::{Device, Kind, Tensor, nn};
 pub use encoding::spherical_harmonics;
 pub use rays::{Rays, Samples, huber_sum};
 
-/// In which arithmetic the networks run. Grid features, densities and sums along rays are f32 always.
+/// The arithmetic of the networks. Grid features, densities and sums along rays are always f32.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Precision {
     /// Networks in f32.
     F32,
-    /// Weights and activations in bf16, as the tensor library does it.
+    /// Weights and activations in bf16, as the tensor library computes them.
     Bf16,
 }
 
@@ -44,13 +44,13 @@ struct Layer {
 }
 
 impl Layer {
-    /// y = W x + b, x in the networks' arithmetic.
+    /// Computes y = W x + b, x in the networks' arithmetic.
     fn forward(&self, x: &Tensor) -> Tensor {
         let kind = x.kind();
         x.linear(&self.weight.to_kind(kind), Some(self.bias.to_kind(kind)))
     }
 
-    /// The same for a layer that sees the latent `z`, `[8]` for all rows or `[N, 8]`.
+    /// Computes a layer that takes the latent `z`, `[8]` for all rows or `[N, 8]`.
     fn forward_with(&self, x: &Tensor, z: &Tensor) -> Tensor {
         let kind = x.kind();
         let inputs = self.weight.size()[1] - self.latents;
@@ -76,7 +76,7 @@ pub struct ReferenceField {
 }
 
 impl ReferenceField {
-    /// A copy of `field`'s weights, all of them trainable.
+    /// Copies `field`'s weights, all of them trainable.
     pub fn new(field: &Field, precision: Precision) -> Self {
         let store = nn::VarStore::new(Device::Cpu);
         let config = field.config().clone();
@@ -113,50 +113,50 @@ impl ReferenceField {
         }
     }
 
-    /// All weights by the names of [`Field::tensors`], for optimisers and for reading gradients.
+    /// Returns all weights by the names of [`Field::tensors`], for optimisers and for reading gradients.
     pub fn store(&self) -> &nn::VarStore {
         &self.store
     }
 
-    /// Its structure.
+    /// Returns the field's structure.
     pub fn config(&self) -> &FieldConfig {
         &self.config
     }
 
-    /// Density, 1/metre, `[N]`, at `points_m` `[N, 3]`; `latent` is `[8]` for all or `[N, 8]`.
+    /// Computes the density, 1/metre, `[N]`, at `points_m` `[N, 3]`; `latent` is `[8]` for all or `[N, 8]`.
     pub fn density(&self, points_m: &Tensor, latent: &Tensor) -> Tensor {
         self.activate(&self.geometry(points_m, None, latent))
     }
 
-    /// Density `[N]` and colour `[N, 3]` (0..=1) at `points_m` `[N, 3]` seen along unit `directions` `[N, 3]`.
+    /// Computes density `[N]` and colour `[N, 3]` (0..=1) at `points_m` `[N, 3]` for unit viewing `directions` `[N, 3]`.
     pub fn density_and_color(&self, points_m: &Tensor, directions: &Tensor, latent: &Tensor) -> (Tensor, Tensor) {
         let geometry = self.geometry(points_m, None, latent);
         let harmonics = spherical_harmonics(directions, self.config.direction_degree);
         (self.activate(&geometry), self.color(&geometry, &harmonics, latent))
     }
 
-    /// Outputs of the density network `[N, 1 + geometry features]`, raw density first, in the networks' arithmetic. Each
-    /// point is as wide as `widths_m` `[N]` says, or with none as the configuration says.
+    /// Computes the density network's outputs `[N, 1 + geometry features]`, raw density first, in the networks' arithmetic.
+    /// Points are `widths_m` `[N]` wide; without them, as wide as in the configuration.
     pub(crate) fn geometry(&self, points_m: &Tensor, widths_m: Option<&Tensor>, latent: &Tensor) -> Tensor {
         let features = self.encoding.features(&self.table, points_m, widths_m).to_kind(self.precision.kind());
         let hidden = self.density[0].forward_with(&features, &self.normalized(latent)).relu();
         self.density[2].forward(&self.density[1].forward(&hidden).relu())
     }
 
-    /// Density from raw outputs.
+    /// Computes densities from raw outputs.
     pub(crate) fn activate(&self, geometry: &Tensor) -> Tensor {
         let raw = geometry.select(1, 0).to_kind(Kind::Float);
         (raw + f64::from(self.config.density_offset)).clamp_max(15.0).exp()
     }
 
-    /// Colour from outputs of the density network and direction harmonics.
+    /// Computes colours from outputs of the density network and direction harmonics.
     pub(crate) fn color(&self, geometry: &Tensor, harmonics: &Tensor, latent: &Tensor) -> Tensor {
         let input = Tensor::cat(&[geometry, &harmonics.to_kind(geometry.kind())], 1);
         let hidden = self.color[0].forward_with(&input, &self.normalized(latent)).relu();
         self.color[2].forward(&self.color[1].forward(&hidden).relu()).to_kind(Kind::Float).sigmoid()
     }
 
-    /// Colour of what lies beyond the bounds, `[R, 3]`, from direction harmonics.
+    /// Computes the background's colour, `[R, 3]`, from direction harmonics.
     pub(crate) fn background(&self, harmonics: &Tensor, latent: &Tensor) -> Tensor {
         let input = harmonics.to_kind(self.precision.kind());
         let hidden = self.background[0].forward_with(&input, &self.normalized(latent)).relu();

@@ -15,7 +15,7 @@ pub struct Rays {
 }
 
 impl Rays {
-    /// `degree` is the field's `direction_degree`.
+    /// Converts rays; `degree` is the field's `direction_degree`.
     pub fn new(rays: &[Ray], degree: usize) -> Self {
         let flat = |part: fn(&Ray) -> &[f32; 3]| {
             let values: Vec<f32> = rays.iter().flat_map(|r| part(r).iter().copied()).collect();
@@ -31,7 +31,7 @@ impl Rays {
         }
     }
 
-    /// How many.
+    /// Returns the number of rays.
     pub fn count(&self) -> i64 {
         self.origins_m.size()[0]
     }
@@ -42,13 +42,13 @@ impl Rays {
 pub struct Samples {
     ray: Tensor,
     distance_m: Tensor,
-    length_m: Tensor,
-    /// For each sample the place of its ray's first one.
+    delta_m: Tensor,
+    /// For each sample the index of its ray's first sample.
     start: Tensor,
 }
 
 impl Samples {
-    /// The samples that the native field chose: the tensor library is given where they lie.
+    /// Converts the samples that the native field chose; the tensor library does not march.
     pub fn new(samples: &RaySamples) -> Self {
         let mut start = Vec::with_capacity(samples.ray.len());
         for (i, ray) in samples.ray.iter().enumerate() {
@@ -59,32 +59,32 @@ impl Samples {
         Self {
             ray: Tensor::from_slice(&ray),
             distance_m: Tensor::from_slice(&samples.distance_m),
-            length_m: Tensor::from_slice(&samples.length_m),
+            delta_m: Tensor::from_slice(&samples.delta_m),
             start: Tensor::from_slice(&start),
         }
     }
 
-    /// How many.
+    /// Returns the number of samples.
     pub fn count(&self) -> i64 {
         self.ray.size()[0]
     }
 
-    /// World points of samples `first..first + count`, `[count, 3]`.
+    /// Computes the world points of samples `first..first + count`, `[count, 3]`.
     fn points_m(&self, rays: &Rays, first: i64, count: i64) -> Tensor {
         let ray = self.ray.narrow(0, first, count);
         let distance = self.distance_m.narrow(0, first, count).unsqueeze(1);
         rays.origins_m.index_select(0, &ray) + distance * rays.directions.index_select(0, &ray)
     }
 
-    /// Widths of the same samples, `[count]`.
+    /// Computes the widths of samples `first..first + count`, metres, `[count]`.
     fn widths_m(&self, rays: &Rays, first: i64, count: i64) -> Tensor {
         let ray = self.ray.narrow(0, first, count);
         self.distance_m.narrow(0, first, count) * rays.spreads.index_select(0, &ray)
     }
 
-    /// Weight of each sample and transmittance of each ray (Max 1995), from densities.
+    /// Computes the weight of each sample and the transmittance of each ray (Max 1995) from densities.
     fn weights(&self, density: &Tensor, rays: i64) -> (Tensor, Tensor) {
-        let depth = (density * &self.length_m).to_kind(Kind::Double);
+        let depth = (density * &self.delta_m).to_kind(Kind::Double);
         let before = depth.cumsum(0, Kind::Double) - &depth;
         let in_front = &before - before.index_select(0, &self.start);
         let weight = in_front.neg().exp().to_kind(Kind::Float) * depth.neg().expm1().neg().to_kind(Kind::Float);
@@ -94,7 +94,7 @@ impl Samples {
 }
 
 impl ReferenceField {
-    /// Pixels `[R, 3]`, with gradients. `latent` is `[8]` for all rays or `[R, 8]`.
+    /// Computes pixels `[R, 3]`, with gradients. `latent` is `[8]` for all rays or `[R, 8]`.
     pub fn pixels(&self, rays: &Rays, samples: &Samples, latent: &Tensor) -> Tensor {
         let of_samples = if latent.dim() == 1 { latent.shallow_clone() } else { latent.index_select(0, &samples.ray) };
         let (points_m, widths_m) =
@@ -106,8 +106,8 @@ impl ReferenceField {
         beyond.index_add(0, &samples.ray, &(color * weight.unsqueeze(1)))
     }
 
-    /// A picture `[R, 3]` without gradients, `chunk` samples at a time; samples that weigh no more than `min_weight`
-    /// get no colour of their own but the mean of their ray's others (the heaviest one always has its own).
+    /// Renders pixels `[R, 3]` without gradients, `chunk` samples at a time. Samples of weight `min_weight` or less take the
+    /// mean colour of their ray's other samples (the heaviest sample always has its own colour).
     pub fn render(&self, rays: &Rays, samples: &Samples, latent: &Tensor, min_weight: f64, chunk: i64) -> Tensor {
         let chunks = |count: i64| (0..count).step_by(chunk.max(1) as usize).map(move |at| (at, chunk.min(count - at)));
         tch::no_grad(|| {
@@ -146,7 +146,7 @@ impl ReferenceField {
     }
 }
 
-/// Sum of the Huber loss over pixels and channels: 0.5 e^2 up to `delta`, linear beyond.
+/// Computes the sum of the Huber loss over pixels and channels: 0.5 e^2 up to `delta`, linear beyond.
 pub fn huber_sum(pixels: &Tensor, targets: &Tensor, delta: f64) -> Tensor {
     let error = (pixels - targets).abs();
     let near = error.clamp_max(delta);

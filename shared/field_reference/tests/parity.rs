@@ -1,4 +1,4 @@
-//! The native kernels against the same field in plain tensor operations: values, pictures, gradients.
+//! The native kernels against the same field in plain tensor operations: values, images, gradients.
 
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
@@ -19,7 +19,7 @@ fn latent(seed: u64) -> [f32; LATENT_DIM] {
     normals(seed, 7)
 }
 
-/// A field as the default one, with values as large as training makes them.
+/// Makes a field with values as large as training makes them.
 fn rough_field(config: FieldConfig, seed: u64) -> Field {
     let field = Field::new(config.clone(), seed).unwrap();
     let tensors: Vec<_> = field
@@ -78,7 +78,7 @@ fn values(t: &Tensor) -> Vec<f32> {
 
 /// Densities agree to 1e-4 of their value and colours to 1e-4, in f32, for dense and hashed levels, 2, 4 and 8
 /// features, each degree of the directions, points with and without a width, several latents, and every instruction set
-/// here.
+/// of this processor.
 #[test]
 fn values_agree_in_f32() {
     for (seed, (features_per_level, levels, direction_degree)) in
@@ -93,9 +93,9 @@ fn values_agree_in_f32() {
             let (want_density, want_rgb) = tch::no_grad(|| {
                 reference.density_and_color(&rows(&points), &rows(&directions), &Tensor::from_slice(&z))
             });
-            let alone = tch::no_grad(|| reference.density(&rows(&points), &Tensor::from_slice(&z)));
-            let (want_density, want_rgb, alone) = (values(&want_density), values(&want_rgb), values(&alone));
-            assert_eq!(want_density, alone);
+            let separate = tch::no_grad(|| reference.density(&rows(&points), &Tensor::from_slice(&z)));
+            let (want_density, want_rgb, separate) = (values(&want_density), values(&want_rgb), values(&separate));
+            assert_eq!(want_density, separate);
             for set in [InstructionSet::portable(), InstructionSet::detect()] {
                 field.set_instruction_set(set);
                 let (mut density, mut rgb) = (vec![0.0; points.len()], vec![[0.0; 3]; points.len()]);
@@ -113,7 +113,7 @@ fn values_agree_in_f32() {
     }
 }
 
-/// A latent for each point gives what each latent gives alone.
+/// A latent for each point gives the same values as one latent at a time.
 #[test]
 fn latents_by_point() {
     let field = rough_field(config(), 3);
@@ -128,8 +128,8 @@ fn latents_by_point() {
     }
 }
 
-/// With networks in bf16, here or there, the raw density (its logarithm) is off by less than 0.1 and colour by less than
-/// 0.03. (Here where the processor has the instruction.)
+/// With networks in bf16 in either implementation, the logarithm of the density is off by less than 0.1 and colour by less
+/// than 0.03. (In the native one where the processor has the instruction.)
 #[test]
 fn values_in_bf16_are_near() {
     let (points, directions) = points(500, 20);
@@ -172,16 +172,16 @@ fn rays(count: usize, seed: u64) -> Vec<Ray> {
         .collect()
 }
 
-/// Pictures agree pixel by pixel: volume rendering, background, occupancy and early ends included, with pixels of no width
-/// and of some.
+/// Images agree pixel by pixel, including volume rendering, background, occupancy and early ends, with pixels of no width
+/// and of some width.
 #[test]
-fn pictures_agree() {
+fn images_agree() {
     for point_width_m in [0.0, 0.1] {
-        pictures_agree_with(&FieldConfig { point_width_m, ..config() });
+        images_agree_with(&FieldConfig { point_width_m, ..config() });
     }
 }
 
-fn pictures_agree_with(config: &FieldConfig) {
+fn images_agree_with(config: &FieldConfig) {
     let tensors: Vec<_> = rough_field(config.clone(), 6)
         .tensors()
         .into_iter()
@@ -200,7 +200,7 @@ fn pictures_agree_with(config: &FieldConfig) {
     let (rays, z) = (rays(300, 4), latent(5));
     let options = RenderOptions::default();
     let mut buffer = RenderBuffer::new();
-    field.render_rays(&rays, &[z], &options, &mut buffer);
+    field.render_rays(&rays, &z, &options, &mut buffer);
     let mut samples = RaySamples::default();
     let limits = RayLimits {
         max_samples: options.max_samples_per_ray,
@@ -218,9 +218,9 @@ fn pictures_agree_with(config: &FieldConfig) {
     let rays = Rays::new(&rays, config.direction_degree);
     let min_weight = f64::from(options.min_weight);
     for chunk in [100, 1 << 20] {
-        let picture =
+        let image =
             values(&reference.render(&rays, &Samples::new(&samples), &Tensor::from_slice(&z), min_weight, chunk));
-        let largest = picture.iter().zip(&buffer.rgb).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+        let largest = image.iter().zip(&buffer.rgb).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
         assert!(largest < 1e-4, "{largest}");
     }
 }
@@ -235,7 +235,7 @@ fn small_config() -> FieldConfig {
         geometry_features: 7,
         background_width: 8,
         samples_across: 32.0,
-        // Thin enough that light passes: the background has a gradient too.
+        // Thin fog: the background has a gradient too.
         density_offset: -5.0,
         far_m: 60.0,
         ..config()
@@ -266,7 +266,7 @@ fn batch(count: usize, seed: u64) -> RayBatch {
     }
 }
 
-/// Mean loss of a batch by tensor operations, at the samples that the native trainer takes.
+/// Computes the mean loss of a batch by tensor operations, at the native trainer's samples.
 fn reference_loss(reference: &ReferenceField, trainer: &FieldTrainer, batch: &RayBatch, latents: &Tensor) -> Tensor {
     let mut samples = RaySamples::default();
     trainer.field().samples_along(&batch.rays, &batch.latents[0], &trainer.limits(), &mut samples);
@@ -312,7 +312,7 @@ fn gradients_agree(config: FieldConfig) {
     }
     near("latents", report.latent_gradient.as_flattened(), &latents.grad());
 
-    // Asked again, the trainer gives the same: nothing was left in its sums, and no step was taken.
+    // A second call gives the same: nothing was left in the trainer's sums, and no step was taken.
     let again = trainer.gradients(&batch);
     assert_eq!(again.1, gradients);
     assert_eq!(trainer.step_count(), 0);

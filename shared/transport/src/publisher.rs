@@ -118,9 +118,11 @@ impl<M: ImageMeta> Publisher<Image<M>> {
     /// Sends an image that lies elsewhere: its bytes are copied once, over memory that is not cleared first.
     pub fn send_bytes(&mut self, bytes: &[u8], mut meta: M) -> Result<(), SendError> {
         self.stamp(&mut meta)?;
-        let described = meta.image_bytes();
-        if bytes.len() > self.max_bytes || bytes.len() != described {
-            return Err(self.size(bytes.len(), described.min(self.max_bytes)));
+        if bytes.len() > self.max_bytes {
+            return Err(self.size(bytes.len(), self.max_bytes));
+        }
+        if bytes.len() != meta.image_bytes() {
+            return Err(self.size(bytes.len(), meta.image_bytes()));
         }
         let sample = self.port.loan_slice_uninit(bytes.len()).map_err(|e| self.failed(&e))?;
         self.send_image_unchecked(ImageLoan { sample: sample.write_from_slice(bytes) }, meta)

@@ -338,7 +338,7 @@ impl Bench {
                     }
                 }),
                 timed(|| {
-                    field.render_rays(&up, &[*z], &RenderOptions { max_samples_per_ray: 1, ..options }, &mut nothing);
+                    field.render_rays(&up, z, &RenderOptions { max_samples_per_ray: 1, ..options }, &mut nothing);
                 }),
             ],
         );
@@ -534,7 +534,7 @@ fn pieces(batch: &RayBatch, samples: &RaySamples, size: usize, degree: usize) ->
             let own = RaySamples {
                 ray: samples.ray[from..to].iter().map(|r| r - first as u32).collect(),
                 distance_m: samples.distance_m[from..to].to_vec(),
-                length_m: samples.length_m[from..to].to_vec(),
+                delta_m: samples.delta_m[from..to].to_vec(),
                 ..RaySamples::default()
             };
             let latents = batch.latent_index[range.clone()].iter().flat_map(|l| batch.latents[*l as usize]).collect();

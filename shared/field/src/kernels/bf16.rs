@@ -1,5 +1,4 @@
-//! Dense layers with bf16 products and f32 sums, on processors that have an instruction for pairs of them (AVX-512 BF16,
-//! VDPBF16PS). With `dispatch`, the only module of this crate with `unsafe`.
+//! Dense layers with bf16 products and f32 sums, on processors with the instruction for it (AVX-512 BF16, VDPBF16PS).
 //!
 //! A 32-bit lane of the instruction holds two neighbouring inputs of one sample, and two weights: the products of both
 //! are added to the lane's f32 sum.
@@ -7,7 +6,9 @@
 #![allow(unsafe_code)]
 
 #[cfg(target_arch = "x86_64")]
-use crate::kernels::LANES;
+use super::block::{Blocks, BlocksMut, LANES};
+#[cfg(target_arch = "x86_64")]
+use super::dense::Activation;
 #[cfg(target_arch = "x86_64")]
 use std::arch::x86_64::{
     __m512, __m512bh, __m512i, _mm512_cvtne2ps_pbh, _mm512_dpbf16_ps, _mm512_loadu_ps, _mm512_max_ps,
@@ -15,15 +16,23 @@ use std::arch::x86_64::{
     _mm512_storeu_ps,
 };
 
-/// Pairs of inputs that are packed at once: what is packed stays in the first-level cache.
+/// Pairs of inputs that are packed at once: they stay in the first-level cache.
 #[cfg(target_arch = "x86_64")]
 const PAIRS: usize = 32;
 /// Outputs that are summed together.
 #[cfg(target_arch = "x86_64")]
 const TILE: usize = 4;
 
-/// Weights `[inputs][outputs]` as pairs `[inputs / 2][outputs]`, the even input in the low half, rounded to nearest even;
-/// an odd last input has a zero beside it.
+/// The weights of a layer as [`pack`] leaves them, and its biases.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct PackedAffine<'a> {
+    pub pairs: &'a [u32],
+    pub inputs: usize,
+    pub bias: &'a [f32],
+}
+
+/// Packs weights `[inputs][outputs]` to pairs `[inputs / 2][outputs]`, the even input in the low half, rounded to
+/// nearest even. An odd last input is paired with zero.
 pub(crate) fn pack(weights: &[f32], outputs: usize, pairs: &mut [u32]) {
     let rounded = |v: f32| {
         let bits = v.to_bits();
@@ -37,46 +46,35 @@ pub(crate) fn pack(weights: &[f32], outputs: usize, pairs: &mut [u32]) {
     }
 }
 
-/// [`crate::kernels::dense_forward`] with weights as [`pack`] leaves them.
+/// As [`super::dense::forward`], with packed weights.
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx512f,avx512bw,avx512bf16")]
-#[allow(clippy::too_many_arguments)]
-pub(crate) fn dense_forward(
-    pairs: &[u32],
-    inputs: usize,
-    bias: &[f32],
-    x: &[f32],
-    x_stride: usize,
-    y: &mut [f32],
-    y_stride: usize,
-    relu: bool,
-) {
-    let blocks = (x.len() / x_stride).min(y.len() / y_stride);
+pub(crate) fn forward(layer: PackedAffine<'_>, x: Blocks<'_>, mut y: BlocksMut<'_>, activation: Activation) {
+    let (x_stride, y_stride) = (x.stride(), y.stride());
+    let blocks = x.count().min(y.count());
+    let (x, y) = (x.as_slice(), y.as_mut_slice());
     let mut at = 0;
     while at < blocks {
-        let (x, y) = (&x[at * x_stride..], &mut y[at * y_stride..]);
+        let (x, y) = ((&x[at * x_stride..], x_stride), (&mut y[at * y_stride..], y_stride));
         at += match blocks - at {
-            1 => tile::<1>(pairs, inputs, bias, x, x_stride, y, y_stride, relu),
-            2 | 3 => tile::<2>(pairs, inputs, bias, x, x_stride, y, y_stride, relu),
-            _ => tile::<4>(pairs, inputs, bias, x, x_stride, y, y_stride, relu),
+            1 => tile::<1>(layer, x, y, activation),
+            2 | 3 => tile::<2>(layer, x, y, activation),
+            _ => tile::<4>(layer, x, y, activation),
         };
     }
 }
 
-/// The same for `B` blocks; returns `B`.
+/// The same for `B` blocks, given with their strides; returns `B`.
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx512f,avx512bw,avx512bf16")]
-#[allow(clippy::too_many_arguments)]
 fn tile<const B: usize>(
-    pairs: &[u32],
-    inputs: usize,
-    bias: &[f32],
-    x: &[f32],
-    x_stride: usize,
-    y: &mut [f32],
-    y_stride: usize,
-    relu: bool,
+    layer: PackedAffine<'_>,
+    (x, x_stride): (&[f32], usize),
+    (y, y_stride): (&mut [f32], usize),
+    activation: Activation,
 ) -> usize {
+    let PackedAffine { pairs, inputs, bias } = layer;
+    let relu = activation == Activation::Relu;
     let outputs = bias.len();
     let mut packed = [[_mm512_setzero_si512(); B]; PAIRS];
     let mut done = 0;
@@ -121,7 +119,7 @@ fn tile<const B: usize>(
     B
 }
 
-/// Two rows rounded to bf16, lane by lane beside each other: the first in the low halves.
+/// Rounds two rows to bf16 and interleaves them lane by lane, the first in the low halves.
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx512f,avx512bw,avx512bf16")]
 fn pair_up(even: __m512, odd: __m512) -> __m512i {

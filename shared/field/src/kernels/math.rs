@@ -1,6 +1,6 @@
 //! Small arithmetic: exponential, spherical harmonics, counter-based random numbers.
 
-/// Fused multiply-add where the instruction exists, a product and a sum elsewhere (a library call would be far slower).
+/// Fused multiply-add where the instruction exists, else a product and a sum (a library call would be far slower).
 #[inline(always)]
 pub(crate) fn fma<const FMA: bool>(a: f32, b: f32, c: f32) -> f32 {
     if FMA { a.mul_add(b, c) } else { a * b + c }
@@ -56,7 +56,7 @@ pub(crate) fn spherical_harmonics(direction: [f32; 3]) -> [f32; 16] {
     ]
 }
 
-/// One well-mixed number for each (seed, a, b): draws never depend on how many went before.
+/// Returns one well-mixed number for each (seed, a, b): no draw depends on earlier ones.
 #[inline]
 pub(crate) fn hash(seed: u64, a: u64, b: u64) -> u64 {
     let mut h = seed ^ 0x9e37_79b9_7f4a_7c15;
@@ -69,13 +69,13 @@ pub(crate) fn hash(seed: u64, a: u64, b: u64) -> u64 {
     h
 }
 
-/// Uniform in [0, 1) from 24 bits of a hash.
+/// Maps 24 bits of a hash to a uniform number in [0, 1).
 #[inline]
 pub(crate) fn unit(bits: u64) -> f32 {
     (bits >> 40) as f32 * (1.0 / 16_777_216.0)
 }
 
-/// Nearest half-precision value, as f32; values beyond its range become the largest finite one.
+/// Rounds to the nearest half-precision value; values beyond its range become the largest finite one.
 pub(crate) fn round_to_f16(value: f32) -> f32 {
     let bits = value.to_bits();
     let magnitude = f32::from_bits(bits & 0x7fff_ffff);

@@ -1,33 +1,38 @@
-//! Batches of rays drawn from posed pictures of several states, with more of the pixels that change among states.
+//! Batches of rays drawn from posed images of several states, with more rays through pixels that differ among states.
 
 use carff_geometry::PinholeCamera;
 
+use super::batch::RayBatch;
 use crate::config::LATENT_DIM;
-use crate::math::hash;
-use crate::train::RayBatch;
+use crate::kernels::math::hash;
 
-/// Rays of one batch that come from one picture and share its latent.
+/// Rays of a batch that come from one image and share its latent.
 pub const RAYS_PER_GROUP: usize = 32;
 
-/// One posed picture.
+/// One posed image.
 #[derive(Clone, Debug)]
 pub struct TrainingView {
-    /// Where it was taken from.
+    /// The camera that took the image.
     pub camera: PinholeCamera,
     /// RGB, row by row, 8 bit, width x height x 3.
     pub rgb: Vec<u8>,
-    /// Pixels (y * width + x) that change among states; see [`changed_pixels`]. May be empty.
+    /// Pixels (y * width + x) that differ among states ([`changed_pixels`]); may be empty.
     pub changed: Vec<u32>,
 }
 
-/// Pixels that differ by more than `threshold` (0..=255) in any channel between any two of the pictures (RGB of equal
-/// size, one for each state of one view).
-pub fn changed_pixels(pictures: &[&[u8]], threshold: u8) -> Vec<u32> {
-    let pixels = pictures.iter().map(|p| p.len() / 3).min().unwrap_or(0);
+/// Returns the pixels that differ by more than `threshold` (0..=255) in any channel between any two images: RGB of equal
+/// size, one for each state of one view.
+///
+/// ```
+/// let (black, red) = ([0; 6], [0, 0, 0, 255, 0, 0]);
+/// assert_eq!(carff_field::changed_pixels(&[&black, &red], 12), [1]);
+/// ```
+pub fn changed_pixels(images: &[&[u8]], threshold: u8) -> Vec<u32> {
+    let pixels = images.iter().map(|p| p.len() / 3).min().unwrap_or(0);
     (0..pixels)
         .filter(|i| {
             (0..3).any(|c| {
-                let values = pictures.iter().map(|p| p[i * 3 + c]);
+                let values = images.iter().map(|p| p[i * 3 + c]);
                 let (low, high) = values.fold((u8::MAX, 0), |(l, h), v| (l.min(v), h.max(v)));
                 high.saturating_sub(low) > threshold
             })
@@ -36,7 +41,18 @@ pub fn changed_pixels(pictures: &[&[u8]], threshold: u8) -> Vec<u32> {
         .collect()
 }
 
-/// Draws batches: groups of rays, each group from one picture. Draw number n depends on the seed and n alone.
+/// Draws batches: groups of rays, each group from one image. Draw number n only depends on the seed and n.
+///
+/// ```
+/// use carff_field::{RAYS_PER_GROUP, RayBatch, RaySampler, TrainingView};
+/// use carff_geometry::PinholeCamera;
+/// let camera = PinholeCamera::look_at([0.0, -5.0, 1.0], [0.0; 3], [0.0, 0.0, 1.0], 4, 4, 60.0);
+/// let view = TrainingView { camera, rgb: vec![255; 4 * 4 * 3], changed: Vec::new() };
+/// let mut sampler = RaySampler::new(vec![view], 0.5, 1);
+/// let mut batch = RayBatch::default();
+/// sampler.next_batch(2 * RAYS_PER_GROUP, &mut batch, |_view, _draw| [0.0; 8]);
+/// assert_eq!((batch.rays.len(), batch.latents.len()), (2 * RAYS_PER_GROUP, 2));
+/// ```
 #[derive(Clone, Debug)]
 pub struct RaySampler {
     views: Vec<TrainingView>,
@@ -46,8 +62,8 @@ pub struct RaySampler {
 }
 
 impl RaySampler {
-    /// A sampler over `views`; `changed_share` (0..=1) of each group's rays go through changed pixels where there are
-    /// any. Views whose picture does not fit their camera are left out.
+    /// Makes a sampler over `views`. A share `changed_share` (0..=1) of each group's rays goes through changed pixels where
+    /// there are any. Views whose image does not fit their camera are left out.
     pub fn new(views: Vec<TrainingView>, changed_share: f32, seed: u64) -> Self {
         let mut views = views;
         views.retain(|v| {
@@ -57,23 +73,23 @@ impl RaySampler {
         Self { views, changed_share: changed_share.clamp(0.0, 1.0), seed, drawn: 0 }
     }
 
-    /// The pictures in use.
+    /// Returns the views in use.
     pub fn views(&self) -> &[TrainingView] {
         &self.views
     }
 
-    /// Batches drawn so far; set it to go on after a resumed training.
+    /// Sets the number of batches drawn so far, to continue a resumed training.
     pub fn set_drawn(&mut self, drawn: u64) {
         self.drawn = drawn;
     }
 
-    /// Batches drawn so far.
+    /// Returns the number of batches drawn so far.
     pub fn drawn(&self) -> u64 {
         self.drawn
     }
 
-    /// Fills `batch` with `rays` rays (rounded up to whole groups). `latent_of(view index, draw)` gives the latent of a
-    /// group; `draw` is a number of its own for each group, to seed noise with.
+    /// Fills `batch` with `rays` rays (rounded up to whole groups). `latent_of(view index, draw)` returns the latent of a
+    /// group; `draw` is a different number for each group, which may seed noise.
     pub fn next_batch(
         &mut self,
         rays: usize,

@@ -1,10 +1,14 @@
 //! Contracts of the trainer.
 
-use super::*;
-use crate::config::FieldConfig;
-use crate::layout::Layer;
-use crate::math::sigmoid;
-use crate::{InstructionSet, RenderBuffer, RenderOptions};
+use carff_geometry::Ray;
+
+use crate::kernels::math::{hash, sigmoid, unit};
+use crate::model::network::Dense;
+use crate::space::marcher::Marcher;
+use crate::{
+    Field, FieldConfig, FieldTrainer, InstructionSet, LATENT_DIM, NamedTensor, RayBatch, RenderBuffer, RenderOptions,
+    TrainerConfig,
+};
 
 fn small_config() -> FieldConfig {
     FieldConfig {
@@ -56,7 +60,7 @@ fn random_batch(count: usize, latents: usize, seed: u64) -> RayBatch {
     }
 }
 
-/// A field whose tables are large enough for gradients to stand out of rounding.
+/// Makes a field with values large enough for gradients to exceed rounding errors.
 fn rough_field(seed: u64) -> Field {
     let mut field = Field::new(FieldConfig { density_offset: -2.0, ..small_config() }, seed).unwrap();
     for (i, v) in field.table.iter_mut().enumerate() {
@@ -91,8 +95,8 @@ fn loss_of(field: &Field, batch: &RayBatch) -> f64 {
     FieldTrainer::new(field.clone(), exact_config()).unwrap().accumulate(batch).loss
 }
 
-/// The loss's change along each parameter group's gradient is what the gradient says (central differences), for
-/// tables, every layer's weights, latent columns and biases, and the latents; with samples of no width and of some.
+/// Central differences of the loss along each parameter group's gradient agree with the gradient: for tables, every
+/// layer's weights, latent columns and biases, and the latents; with points of no width and of some width.
 #[test]
 fn gradients_agree_with_finite_differences() {
     for point_width_m in [0.0, 0.1] {
@@ -117,14 +121,14 @@ fn gradients_agree(point_width_m: f32) {
         }
     }
     let check = |name: &str, norm2: f64, at: &dyn Fn(f64) -> f64| {
-        assert!(norm2 > 1e-12, "{name}: no gradient at all");
+        assert!(norm2 > 1e-12, "{name}: no gradient");
         let step = 1e-2 / norm2.sqrt();
         let slope = (at(step) - at(-step)) / (2.0 * step);
         assert!((slope - norm2).abs() < 0.02 * norm2, "{name}: slope {slope}, squared gradient {norm2}");
     };
     let squared = |g: &[f32]| g.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>();
 
-    for level in &field.layout.levels {
+    for level in &field.layout.grid.levels {
         let f = field.config.features_per_level;
         let range = level.first * f..(level.first + level.entries) * f;
         check(&format!("level {}", level.resolution), squared(&table[range.clone()]), &|step| {
@@ -145,7 +149,7 @@ fn gradients_agree(point_width_m: f32) {
         });
     };
     for (name, layer) in field.layout.named_layers() {
-        let Layer { inputs, latents, outputs, weight, bias, .. } = layer;
+        let Dense { inputs, latents, outputs, weight, bias, .. } = layer;
         group(format!("{name} weight"), weight..weight + inputs * outputs);
         if latents > 0 {
             group(format!("{name} latent columns"), weight + inputs * outputs..bias);
@@ -163,16 +167,16 @@ fn gradients_agree(point_width_m: f32) {
     }
 }
 
-/// A slab of constant density has opacity 1 - exp(-density x thickness) and shows its own colour over the background's.
+/// A slab of constant density has opacity 1 - exp(-density x thickness), and its colour is over the background's.
 #[test]
 fn constant_density_renders_as_beer_and_lambert_say() {
     let mut field = Field::new(small_config(), 5).unwrap();
     field.networks.fill(0.0);
     let density = 0.4_f32;
-    let raw = field.layout.density[2].bias;
+    let raw = field.layout.density.layers[2].bias;
     field.networks[raw] = density.ln();
     // Colour logits 2, -1, 0; the background's are 0.
-    let color = field.layout.color[2].bias;
+    let color = field.layout.color.layers[2].bias;
     field.networks[color] = 2.0;
     field.networks[color + 1] = -1.0;
     // Matter only in two layers of cells: z in [8, 10) of 16, which is a slab of known thickness.
@@ -188,8 +192,8 @@ fn constant_density_renders_as_beer_and_lambert_say() {
     let mut config = fine.config.clone();
     config.samples_across = 4000.0;
     config.cone_angle = 0.0;
-    fine.marcher = crate::march::Marcher::new(&config, *field.contraction());
-    fine.render_rays(&[ray], &[[0.0; LATENT_DIM]], &options, &mut out);
+    fine.marcher = Marcher::new(&config, *field.contraction());
+    fine.render_rays(&[ray], &[0.0; LATENT_DIM], &options, &mut out);
     let opacity = 1.0 - (-density * (top - bottom)).exp();
     assert!((out.opacity[0] - opacity).abs() < 2e-3, "{} {opacity}", out.opacity[0]);
     for (ch, logit) in [2.0_f32, -1.0, 0.0].iter().enumerate() {
@@ -239,7 +243,7 @@ fn training_is_reproducible() {
     assert_eq!(one.field.occupancy, resumed.field.occupancy);
 }
 
-/// State of another configuration is refused with every key that differs.
+/// The error on a state of another configuration lists every key that differs.
 #[test]
 fn foreign_state_is_refused() {
     let trainer = FieldTrainer::new(Field::new(small_config(), 1).unwrap(), exact_config()).unwrap();
@@ -258,8 +262,8 @@ fn foreign_state_is_refused() {
     }
 }
 
-/// A ball that exists in one of four states alone is learned: it is seen in its state, in no other, and its place is
-/// occupied.
+/// A ball that only exists in one of four states is learned: it is visible in that state and in no other, and its cell
+/// is occupied.
 #[test]
 fn occupancy_keeps_what_exists_in_any_state() {
     let states: Vec<[f32; LATENT_DIM]> = (0..4).map(|s| latent(70 + s)).collect();
@@ -298,29 +302,29 @@ fn occupancy_keeps_what_exists_in_any_state() {
     let opacity = |state: usize| {
         let rays: Vec<Ray> = random_rays(400, 5).into_iter().filter(hits).collect();
         let mut out = RenderBuffer::new();
-        field.render_rays(&rays, &[states[state]], &RenderOptions::default(), &mut out);
+        field.render_rays(&rays, &states[state], &RenderOptions::default(), &mut out);
         let red = out.rgb.chunks_exact(3).filter(|p| p[0] > p[2]).count();
         red as f32 / rays.len() as f32
     };
-    assert!(opacity(2) > 0.8, "the ball is seen in its state: {}", opacity(2));
+    assert!(opacity(2) > 0.8, "the ball is visible in its state: {}", opacity(2));
     for state in [0, 1, 3] {
         assert!(opacity(state) < 0.1, "and in no other: {}", opacity(state));
     }
     let center = field.contraction().contract(center);
     assert!(field.occupancy().contains(center));
-    // When training ends, the ball's place is known to change.
+    // When training ends, the ball's cell is marked as changing.
     let field = trainer.into_field();
     assert!(field.occupancy().contains(center) && field.changing().contains(center));
 }
 
-/// Matter that one of four latents alone makes keeps its cells occupied; without that state among the registered ones
-/// the same refresh empties them. When training ends, cells are known to change where one state's matter is not all
-/// states'. (Weights set by hand: density depends on the latent only.)
+/// Matter of only one of four states keeps its cells occupied; without that state the same refresh empties them. When
+/// training ends, cells are marked as changing where not all states have matter. (Weights are set by hand: density only
+/// depends on the latent.)
 #[test]
 fn occupancy_is_the_maximum_over_states() {
     let mut field = Field::new(small_config(), 2).unwrap();
     field.networks.fill(0.0);
-    let [d0, d1, d2] = field.layout.density;
+    let [d0, d1, d2] = field.layout.density.layers;
     // raw density = 12 relu(z0 - 1) - 6.
     field.networks[d0.weight + d0.inputs * d0.outputs] = 1.0;
     field.networks[d0.bias] = -1.0;
@@ -347,7 +351,7 @@ fn occupancy_is_the_maximum_over_states() {
     assert_eq!(share(&[state(0.0), state(0.5), state(-1.0)]), [0.0, 0.0]);
 }
 
-/// Both paths of the kernels give the same gradients and losses up to rounding.
+/// The portable and the dispatched kernels give the same gradients and losses up to rounding.
 #[test]
 fn portable_and_dispatched_paths_agree() {
     let field = rough_field(11);
@@ -371,7 +375,7 @@ fn portable_and_dispatched_paths_agree() {
     }
 }
 
-/// Batches with lists of unequal length, numbers that are not finite, unknown latents, or nothing at all do no harm.
+/// Batches with lists of unequal length, numbers that are not finite, unknown latents or no rays do no harm.
 #[test]
 fn bad_batches_are_left_out() {
     let mut trainer = FieldTrainer::new(Field::new(small_config(), 1).unwrap(), exact_config()).unwrap();

@@ -1,0 +1,5 @@
+//! Rendering: images of colour, expected depth and opacity.
+
+pub(crate) mod buffers;
+mod compositor;
+mod images;
