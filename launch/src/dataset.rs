@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, bail};
 use carff_dataset::{Dataset, DatasetReport, ImportOptions, SheetOptions, contact_sheet, import};
 use carff_scenes::{Extras, Scenario};
-use carff_training::places::places;
+use carff_training::places;
 use indicatif::{ProgressBar, ProgressStyle};
 
 /// What to do with data sets.

@@ -105,8 +105,9 @@ fn report(args: &LaunchArgs, outcome: &Arc<RunOutcome>, terminal: &Terminal) -> 
     if stop.is_stopped() {
         return Ok(ExitCode::from(INTERRUPTED));
     }
-    let report = report::json(outcome, planning.as_ref().map(Planning::tables).unwrap_or_default());
-    let text = format!("{}\n{}", summary(&report), planning::text(&report));
+    let tables = planning.as_ref().map(Planning::tables).transpose()?.unwrap_or_default();
+    let report = report::json(outcome, tables);
+    let text = format!("{}\n{}", summary(&report), planning.as_ref().map_or("", Planning::text));
     terminal.line(&text);
     if let Some(path) = &args.report {
         write(path, &(serde_json::to_string_pretty(&report)? + "\n"))?;
@@ -224,7 +225,7 @@ fn evaluate(outcome: &Arc<RunOutcome>, stop: &Stop, terminal: &Terminal) -> anyh
         std::thread::sleep(Duration::from_millis(50));
     }
     terminal.status(String::new());
-    work.join().map_err(|_| anyhow!("the computation of the planning table broke off"))?
+    work.join().map_err(|_| anyhow!("the computation of the planning table failed"))?
 }
 
 /// How a run ended that did not fail.

@@ -6,7 +6,6 @@ pub mod backbone;
 pub mod dataset;
 pub mod doctor;
 pub mod eval;
-mod filmstrip;
 pub mod health;
 pub mod launch;
 pub mod monitor;

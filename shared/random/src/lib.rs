@@ -26,6 +26,43 @@ pub struct Key {
     pub sample: u32,
 }
 
+impl Key {
+    /// Key of one purpose's stream: its step is the purpose's name, at most four ASCII characters.
+    ///
+    /// ```
+    /// let key = carff_random::Key::named("mdn", 7, 3);
+    /// assert_eq!((key.seed, key.frame, key.step, key.sample), (7, 3, 0x6d64_6e00, 0));
+    /// ```
+    ///
+    /// # Panics
+    ///
+    /// A longer name panics, or is a compile error in a constant.
+    pub const fn named(purpose: &str, seed: u64, frame: u64) -> Self {
+        assert!(purpose.len() <= 4, "a purpose in a key's step has at most four characters");
+        Self { seed, frame, step: (tag(purpose) >> 32) as u32, sample: 0 }
+    }
+}
+
+/// Number of a purpose's name: at most eight ASCII characters, the first in the highest byte.
+///
+/// ```
+/// assert_eq!(carff_random::tag("svm fold"), 0x7376_6d20_666f_6c64);
+/// ```
+///
+/// # Panics
+///
+/// A longer name panics, or is a compile error in a constant.
+pub const fn tag(purpose: &str) -> u64 {
+    let name = purpose.as_bytes();
+    assert!(name.len() <= 8, "a purpose has at most eight characters");
+    let (mut number, mut i) = (0, 0);
+    while i < 8 {
+        number = number << 8 | if i < name.len() { name[i] as u64 } else { 0 };
+        i += 1;
+    }
+    number
+}
+
 /// The stream of a key.
 pub fn stream(key: Key) -> ChaCha8Rng {
     let mut seed = [0_u8; 32];

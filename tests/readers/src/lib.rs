@@ -15,7 +15,7 @@ use carff_observe::{RunRecord, TopicId};
 use carff_readable::AnyMessage;
 use carff_recording::{About, Reader as RecordingReader, Writer};
 use carff_scenes::Scenario;
-use carff_training::config::TrainingConfig;
+use carff_training::TrainingConfig;
 use raw::patch;
 use std::fs;
 use std::path::{Path, PathBuf};
