@@ -62,7 +62,7 @@ lint: libtorch ## Check format and lints
 sanitize: libtorch ## Run the tests around `unsafe` under the address sanitizer (needs a nightly toolchain)
 	RUSTFLAGS=-Zsanitizer=address LD_LIBRARY_PATH=$(CURDIR)/.libtorch/lib cargo +nightly test --locked --lib --tests \
 		--target x86_64-unknown-linux-gnu --target-dir $(TARGET)/sanitize \
-		-p carff-field -p carff-messages -p carff-models -p carff-transport
+		-p carff-field -p carff-messages -p carff-networks -p carff-transport
 
 miri: ## Run the kernels of the field (portable path) and the messages' tests under Miri (nightly with miri and rust-src)
 	cargo +nightly miri test --locked --lib --target-dir $(TARGET)/miri -p carff-field -- dispatch::

@@ -28,9 +28,9 @@ UNSAFE_MODULES = {
     "shared/field/src/kernels/dispatch.rs": "calls kernels compiled for an instruction set that was found at run time",
     "shared/field/src/kernels/prefetch.rs": "the prefetch instruction",
     "shared/messages/src/tests.rs": "makes messages out of arbitrary bytes",
-    "shared/models/src/allocator.rs": "mallopt",
-    "shared/models/src/borrow.rs": "tensors that borrow shared memory",
-    "shared/stage/src/realtime.rs": "sched_setscheduler",
+    "shared/networks/src/allocator.rs": "mallopt",
+    "shared/networks/src/borrow.rs": "tensors that borrow shared memory",
+    "shared/runtime/src/realtime.rs": "sched_setscheduler",
     "tests/readers/src/raw.rs": "overwrites bytes of messages",
     "shared/transport/src/descriptors.rs": "file descriptors of iceoryx2's listeners",
 }

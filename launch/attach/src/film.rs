@@ -223,7 +223,7 @@ pub(crate) fn frame_rate_hz(recording: &Path) -> anyhow::Result<f64> {
             }
         }
     }
-    let median_ns = carff_metrics::percentile(&between, 0.5).filter(|&ns| ns > 0.0);
+    let median_ns = carff_base::statistics::percentile(&between, 0.5).filter(|&ns| ns > 0.0);
     Ok(median_ns.map_or(LONE_FRAME_HZ, |ns| 1e9 / ns))
 }
 
@@ -340,7 +340,7 @@ mod tests {
         for (number, decoded) in played.pictures.iter().enumerate() {
             let [found, wanted] = [decoded, &picture(size_px, number as u32)]
                 .map(|p| p.iter().map(|&byte| f32::from(byte) / 255.0).collect::<Vec<_>>());
-            let psnr_db = carff_metrics::psnr_db(&found, &wanted).unwrap();
+            let psnr_db = carff_base::statistics::psnr_db(&found, &wanted).unwrap();
             assert!(psnr_db > 35.0, "image {number}: {psnr_db} dB");
         }
     }

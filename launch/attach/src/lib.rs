@@ -92,7 +92,7 @@ impl Attach {
 /// Returns a program's exit code, and prints an error as one sentence.
 pub fn exit_code(result: anyhow::Result<ExitCode>) -> ExitCode {
     result.unwrap_or_else(|error| {
-        eprintln!("error: {}", carff_stage::describe(&error));
+        eprintln!("error: {}", carff_base::errors::sentence(&*error));
         ExitCode::FAILURE
     })
 }

@@ -3,8 +3,8 @@
 use crate::probe::session::{Session, SessionArgs};
 use crate::vitals::{RunVitals, StageVitals};
 use anyhow::{Context, anyhow, ensure};
+use carff_base::statistics::percentile;
 use carff_messages::Stage;
-use carff_metrics::percentile;
 use carff_transport::monotonic_now_ns;
 use clap::Args;
 use serde_json::{Value, json};

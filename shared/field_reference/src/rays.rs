@@ -1,8 +1,8 @@
 //! Rays, the samples along them, and pixels: volume rendering and the loss, with gradients.
 
 use crate::{ReferenceField, spherical_harmonics};
+use carff_base::geometry::Ray;
 use carff_field::RaySamples;
-use carff_geometry::Ray;
 use tch::{Device, Kind, Tensor};
 
 /// Rays as tensors.

@@ -2,13 +2,13 @@
 
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
+use carff_base::geometry::Ray;
+use carff_base::random::{Key, gaussians};
 use carff_field::{
     Field, FieldConfig, FieldTrainer, InstructionSet, LATENT_DIM, RayBatch, RayLimits, RaySamples, RenderBuffer,
     RenderOptions, TrainerConfig,
 };
 use carff_field_reference::{Precision, Rays, ReferenceField, Samples, huber_sum};
-use carff_geometry::Ray;
-use carff_random::{Key, gaussians};
 use tch::Tensor;
 
 fn normals<const N: usize>(seed: u64, i: usize) -> [f32; N] {

@@ -10,7 +10,7 @@ use carff_checkpoint::{
 };
 use carff_decision::Sampling;
 use carff_messages::Gaussian;
-use carff_models::{
+use carff_networks::{
     borrow,
     encoder::{Encoder, gaussians, pictures_from_bytes},
 };
@@ -40,10 +40,10 @@ pub struct EncoderArgs {
 }
 
 pub(crate) fn run(args: &EncoderArgs) -> anyhow::Result<Report> {
-    carff_models::allocator::keep_large_blocks();
+    carff_networks::allocator::keep_large_blocks();
     let manifest = Manifest::load(&args.checkpoint)?;
-    let encoder = carff_models::stored::load_encoder(&args.checkpoint, &manifest)?;
-    let net = carff_models::stored::load_mixture(&args.checkpoint, &manifest)?;
+    let encoder = carff_networks::stored::load_encoder(&args.checkpoint, &manifest)?;
+    let net = carff_networks::stored::load_mixture(&args.checkpoint, &manifest)?;
     let rgb: Vec<u8> = (0..SIDE_PX * SIDE_PX * 3).map(|i| ((i * 2_654_435_761) >> 13) as u8).collect();
     let posterior = encode(&encoder, &rgb).context("the encoder gives no posterior")?;
 

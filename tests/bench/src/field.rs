@@ -5,6 +5,8 @@ use crate::limits::{matrix_product, triad};
 use crate::report::{Report, number, table};
 use crate::stats::{Contender, Ratio, Times, in_turns, timed};
 use anyhow::Context;
+use carff_base::geometry::{PinholeCamera, Ray};
+use carff_base::random::{Key, gaussians, uniform};
 use carff_checkpoint::{FieldProbe, Manifest, load_field_probe};
 use carff_decision::{Draw, Mixture};
 use carff_field::{
@@ -12,8 +14,6 @@ use carff_field::{
     RenderBuffer, RenderOptions, TrainerConfig,
 };
 use carff_field_reference::{Precision, Rays, ReferenceField, Samples, huber_sum};
-use carff_geometry::{PinholeCamera, Ray};
-use carff_random::{Key, gaussians, uniform};
 use std::path::PathBuf;
 use std::time::Instant;
 use tch::{Kind, Tensor, nn::OptimizerConfig};
@@ -49,7 +49,7 @@ pub struct FieldArgs {
 }
 
 pub(crate) fn run(args: &FieldArgs) -> anyhow::Result<Report> {
-    carff_models::allocator::keep_large_blocks();
+    carff_networks::allocator::keep_large_blocks();
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
     let threads = args.threads.unwrap_or(cores).max(1);
     tch::set_num_threads(threads as i32);
@@ -261,7 +261,7 @@ impl Bench {
                     all.extend_from_slice(&buffer.rgb);
                 }
             }
-            let db = carff_metrics::psnr_db(&here, &exact).unwrap_or(f64::INFINITY);
+            let db = carff_base::statistics::psnr_db(&here, &exact).unwrap_or(f64::INFINITY);
             println!("native kernels with bf16 products are {ratio} as fast as in f32; {} dB against it", number(db));
             report.set("field.render_f32_ms", Times::new(in_f32).median() * 1e3);
             report.set("field.render_bf16_vs_f32", ratio.of_medians);

@@ -5,7 +5,7 @@ use crate::probes::Probes;
 use anyhow::{Context, bail, ensure};
 use carff_config::GraphConfig;
 use carff_messages::{Action, Belief, Forecast, FrameMeta, Health, HealthState, Posterior, Stage};
-use carff_stage::StageArgs;
+use carff_runtime::StageArgs;
 use carff_transport::{
     Image, Node, Receiver, Run, Stop, Waiter, Woken, monotonic_now_ns, remove_run_leftovers, run_id_of, topics,
 };

@@ -4,7 +4,7 @@ use super::TopicArgs;
 use super::session::{Session, since_capture_ms};
 use super::structure::columns;
 use crate::terminal::Terminal;
-use carff_metrics::{mean, percentile_of_sorted};
+use carff_base::statistics::{mean, percentile_of_sorted};
 use carff_transport::monotonic_now_ns;
 
 /// The measured quantity.

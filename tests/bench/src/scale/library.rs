@@ -139,7 +139,7 @@ fn process_cpu_s() -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use carff_geometry::OrientedBox;
+    use carff_base::geometry::OrientedBox;
 
     /// Any number of places: the given ones first, then the same at another place each time.
     #[test]

@@ -110,7 +110,7 @@ impl Row {
 }
 
 pub(crate) fn run(args: &ScaleArgs) -> anyhow::Result<Report> {
-    carff_models::allocator::keep_large_blocks();
+    carff_networks::allocator::keep_large_blocks();
     let names: Vec<AxisName> =
         AxisName::ALL.into_iter().filter(|name| args.axes.is_empty() || args.axes.contains(name)).collect();
     let subject = args.subject.load()?;
