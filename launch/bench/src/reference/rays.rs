@@ -1,6 +1,6 @@
 //! Rays, the samples along them, and pixels: volume rendering and the loss, with gradients.
 
-use crate::{ReferenceField, spherical_harmonics};
+use super::{ReferenceField, spherical_harmonics};
 use carff_base::geometry::Ray;
 use carff_field::RaySamples;
 use tch::{Device, Kind, Tensor};

@@ -8,7 +8,7 @@ use carff_field::{
     Field, FieldConfig, FieldTrainer, InstructionSet, LATENT_DIM, RayBatch, RayLimits, RaySamples, RenderBuffer,
     RenderOptions, TrainerConfig,
 };
-use carff_field_reference::{Precision, Rays, ReferenceField, Samples, huber_sum};
+use carff_bench::reference::{Precision, Rays, ReferenceField, Samples, huber_sum};
 use tch::Tensor;
 
 fn normals<const N: usize>(seed: u64, i: usize) -> [f32; N] {

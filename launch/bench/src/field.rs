@@ -13,7 +13,7 @@ use carff_field::{
     Field, FieldConfig, FieldTrainer, HypothesisBuffer, InstructionSet, LATENT_DIM, RayBatch, RayLimits, RaySamples,
     RenderBuffer, RenderOptions, TrainerConfig,
 };
-use carff_field_reference::{Precision, Rays, ReferenceField, Samples, huber_sum};
+use crate::reference::{Precision, Rays, ReferenceField, Samples, huber_sum};
 use std::path::PathBuf;
 use std::time::Instant;
 use tch::{Kind, Tensor, nn::OptimizerConfig};

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Fetches the pinned, hash-checked CPU part of libtorch into .libtorch/ (once).
 
-Usage: python3 launch/fetch_libtorch.py [TARGET]     (default TARGET: .libtorch)
+Usage: python3 launch/packaging/fetch_libtorch.py [TARGET]     (default TARGET: .libtorch)
 
 The source is Python wheels: the tch crate requires libtorch 2.11.0, which pip's package
 index provides. Only the CPU libraries are kept, with the two small CUDA runtime libraries

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Measures the cost of attaching and detaching probes for a running graph.
 
-Usage: python3 tests/measure_probes.py [--rounds N] [--drives N] [--per-second R] [FOLDER OF THE PROGRAMS]
+Usage: python3 tests/scripts/measure_probes.py [--rounds N] [--drives N] [--per-second R] [FOLDER OF THE PROGRAMS]
 
 In each round (default 4) the shipped graph drives 60 times without and 60 times with probes, in alternating order. R
 probes per second (default 4), at most three at a time, attach, receive a message, and detach or are killed with -9. The
@@ -22,7 +22,7 @@ import threading
 import time
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 GRAPH = "configs/graphs/approaching-intersection.toml"
 TOPICS = ["prober/belief", "controller/action", "camera/frame"]
 AT_ONCE = 3

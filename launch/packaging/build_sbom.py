@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Writes the bill of materials of the shipped programs as CycloneDX 1.5 JSON.
 
-Usage: python3 launch/build_sbom.py [OUT]     (default: target/carff.cdx.json; needs cargo-cyclonedx)
+Usage: python3 launch/packaging/build_sbom.py [OUT]     (default: target/carff.cdx.json; needs cargo-cyclonedx)
 
 cargo-cyclonedx writes one file per crate into the source folders, so this program runs it on a copy. It merges the files
 of the programs into one document with each crate once, and adds libtorch, which is in no lock file. Equal sources give
@@ -19,9 +19,9 @@ import tempfile
 import uuid
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 TARGET = "x86_64-unknown-linux-gnu"
-PROGRAMS = ["launch", "launch/attach", "services/camera", "services/encoder", "services/forecaster", "services/prober",
+PROGRAMS = ["launch", "launch/carff", "services/camera", "services/encoder", "services/forecaster", "services/prober",
             "services/renderer", "services/controller", "services/viewer"]
 TOOL = ["cargo", "cyclonedx"]
 # The crate that links with libtorch.
@@ -59,11 +59,11 @@ def describe() -> list[dict]:
 
 
 def libtorch() -> list[dict]:
-    """Returns the parts of libtorch that launch/fetch_libtorch.py fetches, or the user's libtorch."""
+    """Returns the parts of libtorch that launch/packaging/fetch_libtorch.py fetches, or the user's libtorch."""
     if own := os.environ.get("LIBTORCH"):
         version = (Path(own) / "build-version").read_text(encoding="utf-8").strip()
         return [{"type": "library", "bom-ref": "libtorch", "name": "libtorch", "version": version}]
-    spec = importlib.util.spec_from_file_location("fetch_libtorch", ROOT / "launch/fetch_libtorch.py")
+    spec = importlib.util.spec_from_file_location("fetch_libtorch", ROOT / "launch/packaging/fetch_libtorch.py")
     module = importlib.util.module_from_spec(spec)
     sys.dont_write_bytecode = True
     spec.loader.exec_module(module)

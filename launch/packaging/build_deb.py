@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Builds a Debian package from the built programs.
 
-Usage: python3 launch/build_deb.py [TARGET] [OUT]     (default: target, target/carff_VERSION_ARCH.deb)
+Usage: python3 launch/packaging/build_deb.py [TARGET] [OUT]     (default: target, target/carff_VERSION_ARCH.deb)
 
 | content | path |
 |---|---|
@@ -26,7 +26,7 @@ from pathlib import Path
 
 import build_sbom
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 PROGRAMS = ["carff", "carff-launch", "carff-camera", "carff-encoder", "carff-forecaster", "carff-prober", "carff-renderer",
             "carff-controller", "carff-viewer"]
 # Included if it was built with `make link`.
@@ -94,7 +94,7 @@ def fill(tree: Path, target: Path) -> None:
         (doc / "carff.cdx.json").chmod(0o644)
     else:
         print("the package has no bill of materials: cargo-cyclonedx is not installed (see `make sbom`)")
-    debian = ROOT / "launch/debian"
+    debian = ROOT / "launch/packaging/debian"
     put(debian / "vehicle.toml", tree / "etc/carff/vehicle.toml")
     for unit in ["carff.service", "carff.target"]:
         put(debian / unit, tree / "lib/systemd/system" / unit)
@@ -127,8 +127,8 @@ def control(tree: Path, version: str, architecture: str) -> None:
         " service.\n"
     )
     for script in ["postinst", "prerm", "postrm"]:
-        put(ROOT / "launch/debian" / script, folder / script, 0o755)
-    put(ROOT / "launch/debian/conffiles", folder / "conffiles")
+        put(ROOT / "launch/packaging/debian" / script, folder / script, 0o755)
+    put(ROOT / "launch/packaging/debian/conffiles", folder / "conffiles")
 
 
 def main() -> None:

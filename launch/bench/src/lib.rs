@@ -13,6 +13,7 @@ mod ipc;
 mod limits;
 mod machine;
 mod probes;
+pub mod reference;
 mod report;
 mod scale;
 mod stats;

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Drives on one host and observes from another, connected only by carff-link.
 
-Usage (as root): python3 tests/check_link.py [FOLDER OF THE PROGRAMS]     (default: target/release)
+Usage (as root): python3 tests/scripts/check_link.py [FOLDER OF THE PROGRAMS]     (default: target/release)
 
 Both hosts are on one machine. Each has its own network, shared memory and folder of runs. A pair of virtual network
 cards connects them, and the second host's monotonic clock is ahead by a million seconds. Requirements:
@@ -27,7 +27,7 @@ import threading
 import time
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 PROGRAMS = Path(sys.argv[1] if len(sys.argv) > 1 else ROOT / "target/release").resolve()
 GRAPH = "configs/graphs/approaching-intersection.toml"
 RUNS = Path("/tmp") / f"carff-{os.geteuid()}"

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Installs the Debian package, drives as its user, tries to access the run as another user, and removes the package.
 
-Usage (as root, on a machine where carff is not installed): python3 tests/check_deb.py PACKAGE.deb
+Usage (as root, on a machine where carff is not installed): python3 tests/scripts/check_deb.py PACKAGE.deb
 
 Requirements:
 - The units are valid, and the doctor finds no error.
