@@ -95,7 +95,7 @@ fn forecaster(stage: &mut StageContext) -> anyhow::Result<()> {
     stage.ready();
     while stage.wait(&[&posteriors, &beliefs])? {
         let observed = posteriors.newest()?.map(|p| (p.header.at_step(1), ForecastSource::Observed));
-        let probed = beliefs.newest()?.filter(|b| b.is_final == 0);
+        let probed = beliefs.newest()?.filter(|b| !b.is_final());
         let probed = probed.map(|b| (b.header.at_step(b.header.step + 1), ForecastSource::Probed));
         for (header, source) in [observed, probed].into_iter().flatten() {
             let mut forecast = Forecast::empty(header, source, HORIZON);
@@ -127,7 +127,7 @@ fn controller(stage: &mut StageContext) -> anyhow::Result<()> {
     stage.ready();
     while stage.wait(&[&beliefs])? {
         while let Some(belief) = beliefs.next()? {
-            if belief.is_final == 0 {
+            if !belief.is_final() {
                 continue;
             }
             actions.send(Action {

@@ -5,21 +5,12 @@
 use carff_dataset::Image;
 use carff_messages::Stage;
 use carff_tests::{
-    Process, TestGraph, WATCHDOG, copy_checkpoint, eventually, project_root, scenario_set, shipped_checkpoint,
+    PATIENT, Process, TestGraph, WATCHDOG, copy_checkpoint, decisions, eventually, project_root, scenario_set,
+    shipped_checkpoint,
 };
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
 use std::os::unix::net::UnixDatagram;
-
-/// Decisions shown so far: each is one line.
-fn decisions(text: &str) -> usize {
-    text.lines().filter(|line| line.contains("hazard ") && line.trim_end().ends_with(" ms")).count()
-}
-
-/// Settings under which the pace of the machine changes no decision: nothing is stale on a machine that is busy with
-/// something else.
-const PATIENT: &str = "[controller]\nrate_hz = 4.0\ndeadline_ms = 60000\n[launcher]\nstart_timeout_ms = 600000\n\
-                       stop_timeout_ms = 30000\n";
 
 /// The shipped graph file drives the shipped checkpoint: it ends with exit code 0, its report has every promised key,
 /// and neither a process nor a file in shared memory is left.

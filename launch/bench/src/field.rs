@@ -2,6 +2,7 @@
 
 use crate::OutputArgs;
 use crate::limits::{matrix_product, triad};
+use crate::reference::{Precision, Rays, ReferenceField, Samples, huber_sum};
 use crate::report::{Report, number, table};
 use crate::stats::{Contender, Ratio, Times, in_turns, timed};
 use anyhow::Context;
@@ -13,7 +14,6 @@ use carff_field::{
     Field, FieldConfig, FieldTrainer, HypothesisBuffer, InstructionSet, LATENT_DIM, RayBatch, RayLimits, RaySamples,
     RenderBuffer, RenderOptions, TrainerConfig,
 };
-use crate::reference::{Precision, Rays, ReferenceField, Samples, huber_sum};
 use std::path::PathBuf;
 use std::time::Instant;
 use tch::{Kind, Tensor, nn::OptimizerConfig};

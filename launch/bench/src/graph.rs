@@ -321,7 +321,7 @@ impl Listener {
             }
         }
         while let Some(m) = self.actions.next()? {
-            if m.is_decision == 1
+            if m.is_decision()
                 && let Some(frame) = self.frames.get_mut(&m.based_on_frame)
             {
                 frame.decided_ns = Some(m.header.publish_time_ns);

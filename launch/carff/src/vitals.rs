@@ -136,7 +136,7 @@ impl RunVitals {
         if m.reason() != Ok(Reason::Belief) {
             *self.safe_actions.entry(reason).or_default() += 1;
         }
-        if m.is_decision == 1 {
+        if m.is_decision() {
             self.decisions += 1;
             remember(&mut self.decided_ms, m.latency_ns as f64 / 1e6);
         }

@@ -7,12 +7,12 @@
 //! or none, is driven through all the same: what has no right answer is not counted.
 
 use crate::{Dataset, Observability, ScenarioInfo};
-use carff_base::random::Key;
+use carff_base::random::{Key, tag};
 use rand::Rng;
 use rand::seq::SliceRandom;
 
 /// Names this use of the run's seed, so that no other draw of the same run shares the stream.
-const STREAM: u64 = 0x6472_6976_6573_2031;
+const STREAM: u64 = tag("drives 1");
 
 /// What the right action is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]

@@ -3,7 +3,7 @@
 //! One function serves the camera stage and training alike, so that a model meets in use what it was trained on.
 //! All draws come from the counter-based stream of a key: the same key gives the same bytes.
 
-use carff_base::random::Key;
+use carff_base::random::{Key, tag};
 use rand::Rng;
 use rand_distr::StandardNormal;
 use schemars::JsonSchema;
@@ -57,7 +57,7 @@ pub enum SensorError {
 }
 
 /// Names this use of the run's seed, so that no other draw of the same run shares the stream.
-const STREAM: u64 = 0x7365_6e73_6f72_6e7a;
+const STREAM: u64 = tag("sensornz");
 
 impl SensorNoise {
     /// No noise at all.

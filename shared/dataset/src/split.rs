@@ -1,6 +1,6 @@
 //! Which poses are kept away from training, and which choose thresholds.
 
-use carff_base::random::Key;
+use carff_base::random::{Key, tag};
 use rand::seq::SliceRandom;
 
 use crate::dataset::Dataset;
@@ -23,7 +23,7 @@ pub struct PoseSplit {
 }
 
 /// Names this use of the run's seed, so that no other draw of the same run shares the stream.
-const STREAM: u64 = 0x706f_7365_7370_6c74;
+const STREAM: u64 = tag("posesplt");
 
 impl PoseSplit {
     /// Splits `view_count` poses. Those in `always_train` are always in [`PoseRole::Rest`].

@@ -73,7 +73,7 @@ impl Overload {
         if !seen_all {
             self.last_frame = None;
         }
-        if belief.is_final == 0 {
+        if !belief.is_final() {
             return false;
         }
         let skipped = match self.last_frame {

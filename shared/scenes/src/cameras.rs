@@ -286,7 +286,7 @@ impl Mount {
 }
 
 /// Names this use of a seed.
-const FREE_STREAM: u32 = 0x6672_6565;
+const FREE_STREAM: u32 = Key::named("free", 0, 0).step;
 
 enum Group<'a> {
     Orbit(&'a OrbitConfig),

@@ -6,7 +6,7 @@
 //! state that shows it. The camera sits on the ego's roof; where no view from there is a trial of the wanted kind (no
 //! place that a building hides is seen to be clear), it is drawn from all of the scenario's ranges and drifts along.
 //!
-//! All that is drawn for drive `n` comes from the streams (seed, frame `n`, step `0x6472_7666`, sample `try`): drives can
+//! All that is drawn for drive `n` comes from the streams (seed, frame `n`, step `drvf`, sample `try`): drives can
 //! be made one by one, in any order. A drive is a trial of its kind as [`carff_dataset::ScenarioInfo::trial_kind`] says, which is judged
 //! on pictures of a third of the width and height.
 //!
@@ -38,7 +38,7 @@ use crate::movers::Pose;
 use crate::scenario::{Placement, Scenario};
 
 /// Names this use of a seed.
-const STREAM: u32 = 0x6472_7666;
+const STREAM: u32 = Key::named("drvf", 0, 0).step;
 /// Drives drawn before giving up.
 const MAX_TRIES: u32 = 400;
 /// So many of them look for a trial from the ego's roof alone.
