@@ -2,11 +2,11 @@
 //! training and judging, data sets. What the stages compute lives in the stages; what looks at a run, in `carff`.
 
 pub mod ablate;
+#[cfg(feature = "import")]
 pub mod backbone;
 pub mod dataset;
 pub mod doctor;
 pub mod eval;
-mod filmstrip;
 pub mod health;
 pub mod launch;
 pub mod monitor;

@@ -1,6 +1,6 @@
 //! Contracts of `carff backbone import`: what it writes is what went in, and nothing that is there is replaced unasked.
 
-use carff_models::weights;
+use carff_networks::weights;
 use std::{
     path::Path,
     process::{Command, Output},

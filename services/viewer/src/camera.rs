@@ -1,6 +1,6 @@
 //! The camera that a hand moves: orbit, pan and zoom about a point, and where points of the world fall in its picture.
 
-use carff_geometry::{OrientedBox, PinholeCamera};
+use carff_base::geometry::{OrientedBox, PinholeCamera};
 
 /// Degrees that dragging across the picture's shorter side turns by.
 const ORBIT_DEG_PER_SIDE: f64 = 180.0;

@@ -1,9 +1,9 @@
 //! What is looked at: a picture of a data set, of a file, or of a running camera; and the data set to choose from.
 
 use crate::models::Models;
+use carff_base::geometry::PinholeCamera;
 use carff_checkpoint::{CheckpointError, ScenarioIdentity};
 use carff_dataset::{Dataset, DatasetError, Image, Observability};
-use carff_geometry::PinholeCamera;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 

@@ -1,6 +1,6 @@
 //! What happened, for the window's lists and plots: decisions, and how long things took.
 
-use carff_metrics::Spread;
+use carff_base::statistics::Spread;
 use std::collections::VecDeque;
 
 /// Decisions that are kept.

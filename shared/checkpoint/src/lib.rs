@@ -2,7 +2,7 @@
 //!
 //! A checkpoint is a folder: `manifest.json` says what was trained, on what, how and how well; the weights lie beside
 //! it as safetensors. Nothing in it is code. What does not fit is an error that names the key. The field's weights are
-//! read here; those of the networks in tch are read in `carff_models`, so that whoever needs none of them is not linked
+//! read here; those of the networks in tch are read in `carff_networks`, so that whoever needs none of them is not linked
 //! with libtorch.
 
 mod field;
@@ -33,7 +33,7 @@ pub enum CheckpointError {
     /// A file could not be read or written.
     #[error(
         "checkpoint {path}: {source}; train it with `carff train`, or name another with --checkpoint{}",
-        carff_nearest::beside(path)
+        carff_base::names::beside(path)
     )]
     File {
         /// Which file.

@@ -7,7 +7,7 @@
 //! or none, is driven through all the same: what has no right answer is not counted.
 
 use crate::{Dataset, Observability, ScenarioInfo};
-use carff_random::Key;
+use carff_base::random::Key;
 use rand::Rng;
 use rand::seq::SliceRandom;
 
@@ -131,7 +131,7 @@ type Poses = Vec<(usize, Vec<usize>)>;
 /// through any branch. The same arguments give the same drives.
 pub fn plan_drives(dataset: &Dataset, views: &[usize], count: usize, seed: u64) -> Result<Vec<Drive>, DrivesError> {
     let scenario = dataset.scenario().ok_or(DrivesError::NoScenario)?;
-    let mut rng = carff_random::stream(Key { seed, frame: STREAM, step: 0, sample: 0 });
+    let mut rng = carff_base::random::stream(Key { seed, frame: STREAM, step: 0, sample: 0 });
     let frames = |branch: usize, view: usize| -> Option<Vec<usize>> {
         (0..scenario.timestamps).map(|t| dataset.frame_index(scenario.state(branch, t)?, view)).collect()
     };
@@ -178,7 +178,7 @@ pub fn plan_drives(dataset: &Dataset, views: &[usize], count: usize, seed: u64) 
 mod tests {
     use super::*;
     use crate::{DatasetWriter, FrameRecord, Image};
-    use carff_geometry::PinholeCamera;
+    use carff_base::geometry::PinholeCamera;
 
     /// Two branches (0 holds the hazard) x three timestamps x six poses: pose 0 to 2 see nothing of the actor,
     /// pose 3 and 4 see its place fully, pose 5 in part.
@@ -240,7 +240,7 @@ mod tests {
         let at = |x: f64| NamedBox {
             name: "actor".into(),
             role: None,
-            oriented_box: carff_geometry::OrientedBox { center: [x, 0.0, 1.0], half_size: [1.0; 3], yaw: 0.0 },
+            oriented_box: carff_base::geometry::OrientedBox { center: [x, 0.0, 1.0], half_size: [1.0; 3], yaw: 0.0 },
             dynamic: true,
         };
         let places = [[0.0, 6.0, 12.0], [0.0, 3.0, 6.0]];

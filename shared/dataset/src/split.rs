@@ -1,6 +1,6 @@
 //! Which poses are kept away from training, and which choose thresholds.
 
-use carff_random::Key;
+use carff_base::random::Key;
 use rand::seq::SliceRandom;
 
 use crate::dataset::Dataset;
@@ -49,7 +49,7 @@ impl PoseSplit {
     }
 
     fn stratified(strata: &[usize], seed: u64, always_train: &[usize]) -> Self {
-        let mut rng = carff_random::stream(Key { seed, frame: STREAM, step: 0, sample: 0 });
+        let mut rng = carff_base::random::stream(Key { seed, frame: STREAM, step: 0, sample: 0 });
         let mut roles = vec![PoseRole::Rest; strata.len()];
         let stratum_count = strata.iter().max().map_or(0, |s| s + 1);
         let mut groups: Vec<Vec<usize>> = vec![Vec::new(); stratum_count];

@@ -4,11 +4,11 @@
 
 use std::path::Path;
 
+use carff_base::geometry::{OrientedBox, PinholeCamera};
 use carff_dataset::{
     Candidate, Dataset, DatasetReport, DatasetWriter, Equivalence, FrameRecord, Image, NamedBox, Observability,
     PoseRole, PoseSplit, ScenarioInfo, SheetOptions, StateInfo, contact_sheet,
 };
-use carff_geometry::{OrientedBox, PinholeCamera};
 use serde_json::{Value, json};
 
 const IDENTITY: [[f64; 4]; 4] =

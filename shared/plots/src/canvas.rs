@@ -1,4 +1,4 @@
-//! What is drawn on: twice the size of the finished picture, so that lines and letters become smooth when it is halved.
+//! Canvas of twice the size of the finished image: halving it makes lines and letters smooth.
 
 use crate::{MAX_SIDE_PX, PlotError};
 use carff_dataset::Image;
@@ -7,22 +7,22 @@ use plotters::prelude::{BitMapBackend, DrawingArea, IntoDrawingArea, RGBColor};
 use plotters::style::{FontDesc, FontFamily, FontStyle, IntoFont, TextStyle, register_font};
 use std::sync::OnceLock;
 
-/// Pixels drawn for one pixel of the finished picture, along each side.
+/// Drawn pixels for one pixel of the finished image, along each side.
 pub const OVERSAMPLING: u32 = 2;
-/// Background of every picture.
+/// Background of every image.
 pub const PAPER: RGBColor = RGBColor(252, 252, 250);
-/// Headings and captions.
+/// Colour of headings and captions.
 pub const INK: RGBColor = RGBColor(34, 38, 46);
-/// What is said aside.
+/// Colour of secondary text.
 pub const FAINT_INK: RGBColor = RGBColor(104, 110, 122);
 /// Height of a line of text, in font sizes.
 const LINE_HEIGHT: f64 = 1.3;
-/// Where the drawing library is told to put a line's text, in font sizes below the line's top.
+/// Offset of a line's text for the drawing library, in font sizes below the line's top.
 const TEXT_OFFSET: f64 = 0.38;
-/// The name that the font goes by.
+/// Name of the font.
 const FAMILY: &str = "carff";
 
-/// An error of the drawing library, whatever its type.
+/// An error of the drawing library, of any type.
 pub fn drawing(error: impl std::fmt::Display) -> PlotError {
     PlotError::Drawing(error.to_string())
 }
@@ -36,7 +36,7 @@ pub enum Weight {
     Bold,
 }
 
-/// A font of a size in pixels of the finished picture.
+/// Font with its size in pixels of the finished image.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Font {
     /// Size, pixels.
@@ -67,7 +67,7 @@ impl Font {
         Ok(width.div_ceil(OVERSAMPLING))
     }
 
-    /// Breaks a text between words, and within one that is too long, into lines that are no wider than `width_px`.
+    /// Wraps a text into lines that are no wider than `width_px`, between words, or within a word that is too long.
     pub fn wrapped(self, text: &str, width_px: u32) -> Result<Vec<String>, PlotError> {
         let mut lines = Vec::new();
         let mut line = String::new();
@@ -94,7 +94,7 @@ impl Font {
         Ok(lines)
     }
 
-    /// For the drawing library, at the size it is drawn in.
+    /// Font for the drawing library, in drawn pixels.
     pub fn style(self, colour: RGBColor) -> Result<TextStyle<'static>, PlotError> {
         Ok(self.description()?.color(&colour))
     }
@@ -116,7 +116,7 @@ impl Font {
     }
 }
 
-/// A rectangle in pixels of the finished picture: left, top, width, height.
+/// Rectangle in pixels of the finished image: left, top, width, height.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Area {
     /// Left edge.
@@ -129,7 +129,7 @@ pub struct Area {
     pub height: u32,
 }
 
-/// A picture in the making.
+/// An image that is being drawn.
 pub struct Canvas {
     width_px: u32,
     height_px: u32,
@@ -147,7 +147,7 @@ impl Canvas {
         Ok(Self { width_px, height_px, rgb: [PAPER.0, PAPER.1, PAPER.2].repeat(pixels) })
     }
 
-    /// All of it, for the drawing library, in the size that is drawn in.
+    /// The whole canvas for the drawing library, in drawn pixels.
     pub fn drawing_area(&mut self) -> DrawingArea<BitMapBackend<'_>, Shift> {
         let size = (self.width_px * OVERSAMPLING, self.height_px * OVERSAMPLING);
         BitMapBackend::with_buffer(&mut self.rgb, size).into_drawing_area()
@@ -161,7 +161,7 @@ impl Canvas {
         self.drawing_area().draw_text(text, &style, at).map_err(drawing)
     }
 
-    /// Fills a rectangle; what lies outside the page is cut off.
+    /// Fills a rectangle, clipped to the page.
     pub fn fill(&mut self, area: Area, RGBColor(r, g, b): RGBColor) {
         let row = (self.width_px * OVERSAMPLING) as usize * 3;
         let (left, right) = (area.x.min(self.width_px), (area.x + area.width).min(self.width_px));
@@ -172,7 +172,7 @@ impl Canvas {
         }
     }
 
-    /// The finished picture.
+    /// Returns the finished image.
     pub fn finish(self) -> Image {
         let row = (self.width_px * OVERSAMPLING) as usize * 3;
         let step = OVERSAMPLING as usize;
@@ -195,7 +195,7 @@ impl Canvas {
 mod tests {
     use super::*;
 
-    /// The rows and columns of a picture that hold anything but paper: `[left, top, right, bottom]`, ends included.
+    /// Bounds of all pixels of an image that are not background: `[left, top, right, bottom]`, inclusive.
     fn inked(image: &Image) -> Option<[u32; 4]> {
         let paper = [PAPER.0, PAPER.1, PAPER.2];
         let inked = (0..image.height_px)
@@ -207,8 +207,8 @@ mod tests {
         })
     }
 
-    /// A line of text stays within its line and its measured width (a pixel of italic or rounding aside), so that what
-    /// is laid out without overlap is drawn without overlap.
+    /// A line of text stays within its line and its measured width, up to one pixel: a layout without overlap is drawn
+    /// without overlap.
     #[test]
     fn text_stays_in_its_line() {
         for font in [Font::regular(12.0), Font::bold(15.0), Font::bold(26.0)] {
@@ -223,7 +223,7 @@ mod tests {
         }
     }
 
-    /// Wrapped lines fit, and hold the whole text in order.
+    /// Wrapped lines fit, and have the whole text in order.
     #[test]
     fn wrapped_text_fits_and_is_whole() {
         let font = Font::regular(12.0);
@@ -237,7 +237,7 @@ mod tests {
         assert!(font.wrapped(" \n", 90).unwrap().is_empty());
     }
 
-    /// Fills exactly what it is told to, and a page too large to be meant is refused.
+    /// A filled rectangle has exactly its pixels; a page that is too large is refused.
     #[test]
     fn fills_exactly() {
         let mut canvas = Canvas::new(20, 10).unwrap();

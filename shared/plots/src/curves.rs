@@ -15,15 +15,15 @@ use std::path::Path;
 pub struct Panel {
     /// Heading.
     pub title: String,
-    /// What is along x, with its unit.
+    /// Name of the x axis, with its unit.
     pub x_label: String,
-    /// What is along y, with its unit.
+    /// Name of the y axis, with its unit.
     pub y_label: String,
     /// Logarithmic x axis; points at or below zero are left out.
     pub log_x: bool,
     /// Logarithmic y axis; points at or below zero are left out.
     pub log_y: bool,
-    /// The y axis holds zero, so that heights can be compared. Without effect on a logarithmic one.
+    /// Whether the y axis includes zero, so that heights can be compared. Without effect on a logarithmic axis.
     pub from_zero: bool,
     /// The lines.
     pub series: Vec<Series>,
@@ -34,21 +34,21 @@ pub struct Panel {
 pub struct Series {
     /// Name in the legend.
     pub name: String,
-    /// Points `(x, y)` in the order of the line; it is broken where one is not finite.
+    /// Points `(x, y)` in the order of the line. The line is interrupted at points that are not finite.
     pub points: Vec<(f64, f64)>,
     /// A band behind the line, `(x, low, high)` in the order of x.
     pub band: Vec<(f64, f64, f64)>,
-    /// How points are shown.
+    /// Marks of the points.
     pub marks: Marks,
 }
 
-/// How a series' points are shown.
+/// Marks of the points of a series.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Marks {
-    /// Joined by a line.
+    /// A line through the points.
     #[default]
     Line,
-    /// Each by itself.
+    /// One dot for each point.
     Dots,
 }
 
@@ -59,17 +59,17 @@ const TITLE: Font = Font::bold(24.0);
 const PANEL_TITLE: Font = Font::bold(15.0);
 const LEGEND: Font = Font::regular(12.5);
 const LABEL: Font = Font::regular(12.0);
-/// Space for the y axis' numbers and name, and for those of the x axis.
+/// Space for numbers and name of the y axis, and of the x axis.
 const Y_LABELS: u32 = 74;
 const X_LABELS: u32 = 42;
 /// A legend's line, and the space around it.
 const SWATCH: u32 = 18;
 const LEGEND_GAP: u32 = 14;
-/// Lines with at most so many points show each of them.
+/// Largest number of points of a line that shows each point.
 const FEW_POINTS: usize = 30;
-/// Values beyond this are no figures.
+/// Largest absolute value that is drawn.
 const LARGEST: f64 = 1e100;
-/// Colours that colour-blind readers can tell apart (Okabe and Ito), the yellow left out: paper is too bright for it.
+/// Colours for colour-blind readers (Okabe and Ito), without yellow, which is hard to see on white.
 const COLOURS: [RGBColor; 7] = [
     RGBColor(0, 114, 178),
     RGBColor(213, 94, 0),
@@ -82,12 +82,12 @@ const COLOURS: [RGBColor; 7] = [
 
 type Page<'a> = DrawingArea<BitMapBackend<'a>, Shift>;
 
-/// Draws charts into a PNG file, side by side as a grid. A panel without any point says so.
+/// Draws charts into a PNG file as a grid. A panel without points has a note.
 pub fn curves(path: &Path, title: &str, panels: &[Panel]) -> Result<(), PlotError> {
     Ok(draw(title, panels)?.save_png(path)?)
 }
 
-/// Panels side by side for so many panels.
+/// Number of columns for a number of panels.
 fn columns(panels: usize) -> u32 {
     match panels {
         0 | 1 => 1,
@@ -119,13 +119,13 @@ fn draw(title: &str, panels: &[Panel]) -> Result<Image, PlotError> {
     Ok(canvas.finish())
 }
 
-/// The part of the page within left, top, right, bottom, pixels of the finished picture.
+/// Part of the page between left, top, right and bottom, pixels of the finished image.
 fn shrunk<'a>(area: &Page<'a>, [left, top, right, bottom]: [u32; 4]) -> Page<'a> {
     let [left, top, right, bottom] = [left, top, right, bottom].map(|v| v * OVERSAMPLING);
     area.clone().shrink((left, top), (right - left, bottom - top))
 }
 
-/// Writes the names of the lines in their colours, in as many rows as they need; returns their height.
+/// Writes the names of the lines in their colours, in one or several rows. Returns the height.
 fn legend(canvas: &mut Canvas, series: &[Series], left: u32, top: u32, width: u32) -> Result<u32, PlotError> {
     let (mut x, mut y) = (left, top);
     for (one, colour) in series.iter().zip(COLOURS.iter().cycle()) {
@@ -148,7 +148,7 @@ fn plot(area: &Page, panel: &Panel) -> Result<(), PlotError> {
     let all = || lines.iter().flatten().flatten();
     let bands: Vec<Vec<(f64, f64)>> = panel.series.iter().map(|s| outline(&s.band, panel)).collect();
     let any = || all().chain(bands.iter().flatten());
-    // Lines begin at the axis; dots keep away from it.
+    // Lines begin at the axis; dots keep a distance from it.
     let aside = if panel.series.iter().any(|s| s.marks == Marks::Dots) { 0.04 } else { 0.0 };
     let (Some(x), Some(mut y)) = (range(any().map(|p| p.0), aside), range(any().map(|p| p.1), 0.06)) else {
         return empty(area);
@@ -184,7 +184,7 @@ fn plot(area: &Page, panel: &Panel) -> Result<(), PlotError> {
     }
     for (i, (pieces, colour)) in lines.iter().zip(COLOURS.iter().cycle()).enumerate() {
         if panel.series[i].marks == Marks::Dots {
-            // Colours that come a second time are rings.
+            // Repeated colours are drawn as rings.
             let style = ShapeStyle { filled: i < COLOURS.len(), ..colour.stroke_width(OVERSAMPLING) };
             let dot = |p: &(f64, f64)| Circle::new(*p, 3 * OVERSAMPLING, style);
             chart.draw_series(pieces.iter().flatten().map(dot)).map_err(drawing)?;
@@ -212,7 +212,7 @@ fn empty(area: &Page) -> Result<(), PlotError> {
     area.draw_text(text, &LABEL.style(FAINT_INK)?, (left, height as i32 / 2)).map_err(drawing)
 }
 
-/// An axis with its numbers: where each stands, and how it is written.
+/// Axis with its numbers: position and text of each.
 struct Axis {
     range: Range<f64>,
     ticks: Vec<(f64, String)>,
@@ -246,7 +246,7 @@ impl ValueFormatter<f64> for Axis {
     }
 }
 
-/// The pieces of a line between points that cannot be shown; as it is drawn, for a logarithmic axis the logarithm.
+/// Pieces of a line between points that cannot be drawn, in drawing coordinates (logarithms for a logarithmic axis).
 fn pieces(points: &[(f64, f64)], panel: &Panel) -> Vec<Vec<(f64, f64)>> {
     let shown = |v: f64| v.is_finite() && v.abs() < LARGEST;
     let drawn = |v: f64, log: bool| if log { v.log10() } else { v };
@@ -254,7 +254,7 @@ fn pieces(points: &[(f64, f64)], panel: &Panel) -> Vec<Vec<(f64, f64)>> {
     points.split(|&(x, y)| !(shown(x) && shown(y))).filter(|piece| !piece.is_empty()).map(<[_]>::to_vec).collect()
 }
 
-/// The outline of a band as a polygon, as it is drawn; empty without any point that can be shown.
+/// Outline of a band as a polygon in drawing coordinates; empty without points that can be drawn.
 fn outline(band: &[(f64, f64, f64)], panel: &Panel) -> Vec<(f64, f64)> {
     let edge =
         |of: fn(&(f64, f64, f64)) -> (f64, f64)| pieces(&band.iter().map(of).collect::<Vec<_>>(), panel).concat();
@@ -263,7 +263,7 @@ fn outline(band: &[(f64, f64, f64)], panel: &Panel) -> Vec<(f64, f64)> {
     [low, high].concat()
 }
 
-/// From the least to the largest value, with a share of that added at both ends; `None` for no values.
+/// Range of values, extended by a share at both ends; `None` for no values.
 fn range(values: impl Iterator<Item = f64>, padding: f64) -> Option<Range<f64>> {
     let (low, high) = values.fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), v| (l.min(v), h.max(v)));
     if low > high {
@@ -278,7 +278,7 @@ fn range(values: impl Iterator<Item = f64>, padding: f64) -> Option<Range<f64>> 
     Some(low - pad..high + pad)
 }
 
-/// Round numbers within a range, about `count`, and how they are written.
+/// About `count` round numbers within a range, with their texts.
 fn linear_ticks(range: &Range<f64>, count: u32) -> Vec<(f64, String)> {
     let rough = (range.end - range.start) / f64::from(count);
     let power = 10_f64.powf(rough.log10().floor());
@@ -291,7 +291,7 @@ fn linear_ticks(range: &Range<f64>, count: u32) -> Vec<(f64, String)> {
         .collect()
 }
 
-/// Round numbers for a range of decimal logarithms: as logarithm, and how the number is written.
+/// Round numbers for a range of decimal logarithms: logarithm and text of the number.
 fn logarithmic_ticks(range: &Range<f64>) -> Vec<(f64, String)> {
     let decades = range.end - range.start;
     if decades < 1.2 {
@@ -312,7 +312,7 @@ fn logarithmic_ticks(range: &Range<f64>) -> Vec<(f64, String)> {
         .collect()
 }
 
-/// A number, exact to the digit of `unit`.
+/// Text of a number, rounded to the digit of `unit`.
 fn written(value: f64, unit: f64) -> String {
     let place = |v: f64| (v.abs().log10() + 1e-9).floor();
     if value != 0.0 && !(1e-4..1e6).contains(&value.abs()) {
@@ -362,8 +362,8 @@ mod tests {
         assert!(matches!(curves(&path, "", &too_many), Err(PlotError::TooLarge { .. })));
     }
 
-    /// No points, one point, points that are no numbers, not positive on a logarithmic axis, equal, or huge: all make
-    /// a picture.
+    /// No points, one point, and points that are not finite, not positive on a logarithmic axis, equal, or huge: all
+    /// are drawn without an error.
     #[test]
     fn odd_points_are_drawn_or_left_out() {
         let odd = [
@@ -389,8 +389,8 @@ mod tests {
         assert_eq!(pieces(&broken, &Panel { log_x: true, ..Panel::default() }).len(), 1);
     }
 
-    /// Between the outermost points of a line that is a power of x, all lie on a straight line when both axes are
-    /// logarithmic; with an axis that holds zero, a line far above zero is drawn near the top.
+    /// A power of x is a straight line when both axes are logarithmic. With an axis that includes zero, a line far
+    /// above zero is drawn near the top.
     #[test]
     fn axes_are_as_asked_for() {
         let power: Vec<(f64, f64)> =
@@ -413,7 +413,7 @@ mod tests {
         assert!(lowest(high) + PANEL_HEIGHT / 2 < lowest(without));
     }
 
-    /// A rising line is drawn rising: its points are where its values say, left to right and low to high.
+    /// A rising line is drawn as a rising line, from left to right and from low to high.
     #[test]
     fn a_rising_line_rises() {
         let image = draw("", &[panel((0..100).map(|i| (f64::from(i), f64::from(i))).collect(), false)]).unwrap();
@@ -428,7 +428,7 @@ mod tests {
         }
     }
 
-    /// Ticks lie in the range, in order, at least two of them, and their texts differ.
+    /// Ticks are in the range and in order, at least two, with different texts.
     #[test]
     fn ticks_are_round_and_differ() {
         for (low, high) in [(0.0, 100.0), (-3.2, 17.9), (0.991, 0.9987), (1e-5, 3e-5), (12.0, 4e6), (27.3, 27.9)] {
@@ -450,7 +450,7 @@ mod tests {
         );
     }
 
-    /// A band is drawn between its edges and the axes hold it; dots are not joined.
+    /// A band is drawn between its edges, inside the axes; dots are not joined.
     #[test]
     fn bands_and_dots() {
         let of = |series: Series| draw("", &[Panel { series: vec![series], ..Panel::default() }]).unwrap();

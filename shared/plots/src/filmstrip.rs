@@ -1,4 +1,4 @@
-//! Rows of captioned pictures, one row a drive.
+//! Filmstrips: rows of captioned images.
 
 use crate::canvas::{Area, Canvas, FAINT_INK, Font, INK};
 use crate::{MAX_SIDE_PX, PlotError};
@@ -6,23 +6,23 @@ use carff_dataset::Image;
 use plotters::style::RGBColor;
 use std::path::Path;
 
-/// One row: what it is about, and its pictures from left to right.
+/// One row: its caption, and its images from left to right.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct StripRow {
-    /// Left of the pictures; the first line stands out.
+    /// Caption left of the images; its first line is emphasised.
     pub caption: Vec<String>,
-    /// The pictures.
+    /// Images of the row.
     pub cells: Vec<StripCell>,
 }
 
-/// One picture with what is said below it.
+/// One image with its caption.
 #[derive(Clone, Debug, PartialEq)]
 pub struct StripCell {
-    /// The picture; a small one is shown twice as large.
+    /// The image; a small image is enlarged by two.
     pub image: Image,
-    /// Below it; the first line stands out.
+    /// Caption below the image; its first line is emphasised.
     pub caption: Vec<String>,
-    /// Colour of a frame around it, RGB.
+    /// Colour of the frame, RGB.
     pub emphasis: Option<[u8; 3]>,
 }
 
@@ -31,16 +31,16 @@ const TITLE: Font = Font::bold(26.0);
 const SUBTITLE: Font = Font::regular(14.0);
 const CAPTION_HEAD: Font = Font::bold(14.0);
 const CAPTION: Font = Font::regular(13.0);
-/// Width of the text left of the pictures.
+/// Width of the text left of the images.
 const CAPTION_WIDTH: u32 = 230;
-/// Pictures with no side as long as this are shown twice as large.
+/// Images with all sides shorter than this are enlarged by two.
 const SMALL_SIDE: u32 = 160;
-/// Space between pictures, and between a picture and its frame's outer edge.
+/// Space between images, and width of a frame.
 const GAP: u32 = 18;
 const FRAME: u32 = 4;
-/// Between a picture and its caption.
+/// Space between an image and its caption.
 const CAPTION_GAP: u32 = 9;
-/// Above and below the line between rows.
+/// Space above and below the line between rows.
 const ROW_GAP: u32 = 18;
 const RULE: RGBColor = RGBColor(224, 226, 230);
 
@@ -86,7 +86,7 @@ fn scale(image: &Image) -> u32 {
     if image.width_px.max(image.height_px) < SMALL_SIDE { 2 } else { 1 }
 }
 
-/// Each pixel as a square of `factor` pixels: nothing is shown that was not there.
+/// Enlarges each pixel to a square of `factor` pixels, without interpolation.
 fn enlarged(image: &Image, factor: u32) -> Image {
     let factor = factor as usize;
     let mut rgb = Vec::with_capacity(image.rgb.len() * factor * factor);
@@ -99,7 +99,7 @@ fn enlarged(image: &Image, factor: u32) -> Image {
     Image { width_px: image.width_px * factor as u32, height_px: image.height_px * factor as u32, rgb }
 }
 
-/// One line of text in its place.
+/// One line of text with its position.
 struct Line {
     text: String,
     area: Area,
@@ -107,14 +107,14 @@ struct Line {
     colour: RGBColor,
 }
 
-/// One picture in its place.
+/// One image with its position.
 struct Tile {
     row: usize,
     cell: usize,
     area: Area,
 }
 
-/// Where everything goes.
+/// Positions of all texts and images.
 struct Layout {
     width: u32,
     height: u32,
@@ -126,7 +126,7 @@ struct Layout {
 impl Layout {
     fn new(title: &str, subtitle: &str, rows: &[StripRow]) -> Result<Self, PlotError> {
         let cells = || rows.iter().flat_map(|r| &r.cells);
-        // All columns are as wide as the widest picture, so that rows can be compared.
+        // All columns are as wide as the widest image, so that rows can be compared.
         let tile_width = cells().map(|c| c.image.width_px * scale(&c.image)).max().unwrap_or(0).max(SMALL_SIDE);
         let columns = rows.iter().map(|r| r.cells.len()).max().unwrap_or(0) as u32;
         let text_width = CAPTION_WIDTH + columns * (GAP + tile_width);
@@ -151,7 +151,7 @@ impl Layout {
         Ok(layout)
     }
 
-    /// Places a row below what is there; returns its height.
+    /// Places a row below the earlier rows. Returns its height.
     fn row(&mut self, index: usize, row: &StripRow, tile_width: u32) -> Result<u32, PlotError> {
         let top = self.height;
         let mut height = self.paragraph(&captioned(&row.caption), MARGIN, top, CAPTION_WIDTH)?;
@@ -176,7 +176,7 @@ impl Layout {
         Ok(height)
     }
 
-    /// Places lines, broken to a width, under each other; returns their height.
+    /// Places lines, wrapped to a width, below each other. Returns their height.
     fn paragraph(&mut self, lines: &[(String, Font, RGBColor)], x: u32, y: u32, width: u32) -> Result<u32, PlotError> {
         let mut height = 0;
         for (text, font, colour) in lines {
@@ -190,7 +190,7 @@ impl Layout {
     }
 }
 
-/// The first line of a caption stands out.
+/// Font of a caption's line: the first line is emphasised.
 fn captioned(lines: &[String]) -> Vec<(String, Font, RGBColor)> {
     let styles = std::iter::once((CAPTION_HEAD, INK)).chain(std::iter::repeat((CAPTION, FAINT_INK)));
     lines.iter().zip(styles).map(|(text, (font, colour))| (text.clone(), font, colour)).collect()
@@ -223,8 +223,7 @@ mod tests {
         a.x + a.width <= b.x || b.x + b.width <= a.x || a.y + a.height <= b.y || b.y + b.height <= a.y
     }
 
-    /// Whatever sizes and captions are given, no text lies over a picture, its frame or other text, no picture over
-    /// another, and all lie within the page.
+    /// For any sizes and captions, texts, images and frames do not overlap, and all are within the page.
     #[test]
     fn nothing_overlaps() {
         let layout = Layout::new("Title", &"a long subtitle ".repeat(30), &odd_rows()).unwrap();
@@ -243,8 +242,7 @@ mod tests {
         }
     }
 
-    /// The file is a PNG of the laid-out size in which every picture stands unchanged: small ones with each pixel
-    /// twice, large ones as they are, each within its frame.
+    /// The file is a PNG of the laid-out size with every image unchanged in its frame, small images enlarged by two.
     #[test]
     fn pictures_are_shown_unchanged() {
         let dir = tempfile::tempdir().unwrap();
@@ -268,7 +266,7 @@ mod tests {
         }
     }
 
-    /// No rows at all is a page with its title; a picture whose bytes do not fit its size is named; too many rows are
+    /// A filmstrip without rows has its title; the error of an image of the wrong size names it; too many rows are
     /// refused before anything is drawn.
     #[test]
     fn odd_input() {
@@ -279,7 +277,7 @@ mod tests {
         let mut rows = odd_rows();
         rows[3].cells[1].image.rgb.pop();
         let message = filmstrip(&path, "", "", &rows).unwrap_err().to_string();
-        assert!(message.contains("row 3, image 1: 2 bytes do not make a picture of 1x1"), "{message}");
+        assert!(message.contains("row 3, image 1: 2 bytes do not match an image of 1x1"), "{message}");
         let many: Vec<StripRow> = (0..200).flat_map(|_| odd_rows()).collect();
         assert!(matches!(filmstrip(&path, "", "", &many), Err(PlotError::TooLarge { .. })));
         let nowhere = dir.path().join("missing").join("strip.png");

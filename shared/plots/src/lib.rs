@@ -1,7 +1,15 @@
-//! Pictures for people: training curves and filmstrips, as PNG files.
+//! Charts and filmstrips as PNG files: layout, axes and text.
 //!
-//! What lives here: layout, axes, text, with a font that is part of the program, so that a picture looks the same on
-//! every machine. What never does: computing what is shown.
+//! The font is part of the program, so that an image looks the same on every machine.
+//!
+//! ```
+//! use carff_plots::{Panel, Series, curves};
+//! let loss = Series { name: "loss".into(), points: vec![(1.0, 4.0), (2.0, 2.5)], ..Series::default() };
+//! let panel = Panel { title: "VAE".into(), x_label: "epoch".into(), series: vec![loss], ..Panel::default() };
+//! # let dir = tempfile::tempdir().unwrap();
+//! curves(&dir.path().join("curves.png"), "Training", &[panel])?;
+//! # Ok::<(), carff_plots::PlotError>(())
+//! ```
 
 mod canvas;
 mod curves;
@@ -10,25 +18,25 @@ mod filmstrip;
 pub use curves::{Marks, Panel, Series, curves};
 pub use filmstrip::{StripCell, StripRow, filmstrip};
 
-/// Longest side of a picture that is drawn, pixels.
+/// Longest side of a drawn image, pixels.
 pub const MAX_SIDE_PX: u32 = 8192;
 
-/// Why a picture could not be made.
+/// Reason why an image could not be drawn.
 #[derive(Debug, thiserror::Error)]
 pub enum PlotError {
     /// The file could not be written.
     #[error(transparent)]
     File(#[from] carff_dataset::DatasetError),
-    /// More was given than fits.
-    #[error("a picture of {width_px}x{height_px} pixels is too large, at most {MAX_SIDE_PX} a side: show less at once")]
+    /// The image would be too large.
+    #[error("an image of {width_px}x{height_px} pixels is too large, at most {MAX_SIDE_PX} a side: show less at once")]
     TooLarge {
-        /// Width it would have, pixels.
+        /// Width, pixels.
         width_px: u32,
-        /// Height it would have, pixels.
+        /// Height, pixels.
         height_px: u32,
     },
-    /// An image's bytes are not those of its size.
-    #[error("row {row}, image {cell}: {bytes} bytes do not make a picture of {width_px}x{height_px} pixels")]
+    /// The number of bytes of an image does not match its size.
+    #[error("row {row}, image {cell}: {bytes} bytes do not match an image of {width_px}x{height_px} pixels")]
     Image {
         /// Row of the filmstrip, from 0.
         row: usize,
@@ -41,7 +49,7 @@ pub enum PlotError {
         /// Height, pixels.
         height_px: u32,
     },
-    /// The drawing library refused.
-    #[error("cannot draw the picture: {0}")]
+    /// The drawing library failed.
+    #[error("cannot draw the image: {0}")]
     Drawing(String),
 }

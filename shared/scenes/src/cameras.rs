@@ -1,8 +1,8 @@
 //! Where a scenario's cameras stand, never inside anything: the fixed ones by evenly spread sequences, free ones at
 //! random in the same ranges.
 
-use carff_geometry::PinholeCamera;
-use carff_random::Key;
+use carff_base::geometry::PinholeCamera;
+use carff_base::random::Key;
 use parry3d::bounding_volume::Aabb;
 use rand::Rng;
 
@@ -239,7 +239,7 @@ pub(crate) fn free_cameras(
     let groups = Groups::new(config, places);
     (0..count)
         .map(|i| {
-            let mut rng = carff_random::stream(Key { seed, frame: i as u64, step: FREE_STREAM, sample: 0 });
+            let mut rng = carff_base::random::stream(Key { seed, frame: i as u64, step: FREE_STREAM, sample: 0 });
             groups.draw(config, obstacles, &mut rng)
         })
         .collect()

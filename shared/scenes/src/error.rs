@@ -8,7 +8,7 @@ use carff_dataset::DatasetError;
 #[derive(Debug, thiserror::Error)]
 pub enum ScenarioError {
     /// The file cannot be read.
-    #[error("{}: {source}{}", path.display(), carff_nearest::beside(path))]
+    #[error("{}: {source}{}", path.display(), carff_base::names::beside(path))]
     Io {
         /// The scenario file.
         path: PathBuf,
@@ -16,7 +16,7 @@ pub enum ScenarioError {
         source: std::io::Error,
     },
     /// A key that is unknown, missing, of the wrong type or out of range. Names line and column and shows the line.
-    #[error("{}: {}", path.display(), carff_nearest::explained(&.source.to_string()))]
+    #[error("{}: {}", path.display(), carff_base::names::explained(&.source.to_string()))]
     Toml {
         /// The scenario file.
         path: PathBuf,
@@ -49,7 +49,7 @@ pub enum ScenarioError {
     },
     /// A camera that cannot take pictures.
     #[error("the camera is not usable: {0}")]
-    Camera(#[from] carff_geometry::CameraError),
+    Camera(#[from] carff_base::geometry::CameraError),
     /// No place was found for a freely drawn camera.
     #[error("{}: key `{key}`: no place in these ranges stands clear of everything; widen them", path.display())]
     NoRoom {

@@ -25,10 +25,10 @@
 
 use std::f64::consts::TAU;
 
+use carff_base::geometry::PinholeCamera;
+use carff_base::random::Key;
 use carff_dataset::drives::DriveKind;
 use carff_dataset::{Image, Observability};
-use carff_geometry::PinholeCamera;
-use carff_random::Key;
 use rand::Rng;
 use rand::seq::IndexedRandom;
 
@@ -156,7 +156,7 @@ impl Scenario {
         let branches: Vec<usize> =
             (0..info.branches.len()).filter(|b| info.is_hazard(*b) == (kind == DriveKind::Hazard)).collect();
         for sample in 0..MAX_TRIES {
-            let mut rng = carff_random::stream(Key { seed, frame: number, step: STREAM, sample });
+            let mut rng = carff_base::random::stream(Key { seed, frame: number, step: STREAM, sample });
             let Some(&branch) = branches.choose(&mut rng) else { break };
             let roof = self.roof(branch, &mut rng).filter(|_| kind == DriveKind::Hazard || sample < ROOF_TRIES);
             let (view_kind, camera) = match roof {

@@ -1,7 +1,7 @@
 //! What is placed anew in each state: vehicles, and objects made of simple forms.
 
+use carff_base::geometry::OrientedBox;
 use carff_dataset::NamedBox;
-use carff_geometry::OrientedBox;
 use toml::Spanned;
 
 use crate::config::{BoxConfig, EllipsoidConfig, ObjectConfig, RodConfig, ScenarioConfig, VehicleConfig};

@@ -6,8 +6,8 @@ use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicUsize, Ordering};
 
+use carff_base::geometry::PinholeCamera;
 use carff_dataset::{Dataset, Observability};
-use carff_geometry::PinholeCamera;
 use carff_scenes::{Detail, Extras, RenderOptions, Scenario, ScenarioError};
 
 /// A block may stand behind a wall that hides half of it from the camera at -Y. Nothing else. The sun stands opposite

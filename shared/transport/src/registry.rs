@@ -164,7 +164,7 @@ pub struct TopicId {
 
 /// A name that no topic has.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("there is no topic `{name}`{}. All: {}", carff_nearest::hint(name, TopicId::all().map(TopicId::name)), all_names())]
+#[error("there is no topic `{name}`{}. All: {}", carff_base::names::hint(name, TopicId::all().map(TopicId::name)), all_names())]
 pub struct UnknownTopic {
     /// The name that was asked for.
     pub name: String,
