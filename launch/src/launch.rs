@@ -157,7 +157,7 @@ pub(crate) fn run_graph(
     }
     // From here on Ctrl-C is an orderly end; until here it may simply end the process, as no stage runs yet.
     let stop = Stop::on_signals().context("cannot handle signals")?;
-    let view_bytes = (graph.renderer.width_px * graph.renderer.height_px * 3) as usize;
+    let view_bytes = carff_messages::rgb_bytes(graph.renderer.width_px, graph.renderer.height_px);
     check_space(Path::new("/dev/shm"), "the graph", topics::graph_bytes(FRAME_BYTES, view_bytes))?;
 
     let mut stage_args = StageArgs::new(&args.graph, &name, run.id());

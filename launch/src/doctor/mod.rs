@@ -61,7 +61,7 @@ pub fn examine(args: &DoctorArgs) -> anyhow::Result<Vec<Finding>> {
     let here = std::env::current_dir().context("the current folder is gone")?;
     findings.extend(gather::free_bytes(&here).map(|bytes| checks::disk(&here, bytes)));
 
-    let view_bytes = (renderer.width_px * renderer.height_px * 3) as usize;
+    let view_bytes = carff_messages::rgb_bytes(renderer.width_px, renderer.height_px);
     let needed_bytes = topics::graph_bytes(crate::launch::FRAME_BYTES, view_bytes);
     findings.extend(checks::shared_memory(&gather::shared_memory(), needed_bytes));
     let (runs, strays) = gather::runs()?;

@@ -4,7 +4,7 @@
 use anyhow::Context;
 use carff_camera::{DriveSource, FolderSource, FreeDriveSource, Source};
 use carff_config::CameraSource;
-use carff_messages::{Header, Stage};
+use carff_messages::{Header, ImageMeta, Stage};
 use carff_runtime::{StageContext, frame_span};
 use carff_transport::{Woken, monotonic_now_ns, topics};
 
@@ -30,7 +30,7 @@ fn run(stage: &mut StageContext) -> anyhow::Result<()> {
         let capture_time_ns = monotonic_now_ns();
         meta.header = Header::of_frame(frame_id, capture_time_ns, stage.seed());
         let _span = frame_span(&meta.header);
-        let mut loan = frames.loan(meta.width_px as usize * meta.height_px as usize * 3)?;
+        let mut loan = frames.loan(meta.image_bytes())?;
         source.write(frame_id, loan.bytes_mut())?;
         frames.send_image(loan, meta)?;
         stage.worked(&meta.header, capture_time_ns);

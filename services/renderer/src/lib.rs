@@ -5,7 +5,7 @@ use carff_base::geometry::PinholeCamera;
 use carff_checkpoint::Manifest;
 use carff_config::ViewChoice;
 use carff_field::{Field, HypothesisBuffer, InstructionSet, RenderBuffer, RenderOptions};
-use carff_messages::{Belief, Forecast, LATENT_DIM, ViewKind, ViewMeta, row_major};
+use carff_messages::{Belief, Forecast, Header, LATENT_DIM, ViewKind, ViewMeta, row_major};
 use std::path::Path;
 
 /// Loads the field, for pictures alone.
@@ -53,30 +53,39 @@ pub fn hypotheses(forecast: &Forecast, belief: &Belief, count: usize) -> Vec<Hyp
     all
 }
 
-/// A camera over the region that matters: straight down with the picture's up = +Y, or from a corner.
+/// Returns a camera over the field's region: straight down with +Y up in the image, or from a corner.
 pub fn camera(field: &Field, choice: ViewChoice, width_px: u32, height_px: u32) -> PinholeCamera {
-    let [low, high] = field.config().bounds_m.map(|corner| corner.map(f64::from));
-    let centre = [0, 1, 2].map(|i| f64::midpoint(low[i], high[i]));
-    let extent = (high[0] - low[0]).max(high[1] - low[1]);
-    let fov_deg = 60.0_f64;
-    let distance = extent / 2.0 / (fov_deg / 2.0).to_radians().tan();
+    let bounds_m = field.config().bounds_m.map(|corner| corner.map(f64::from));
+    let [low, high] = bounds_m;
     match choice {
-        ViewChoice::BirdsEye => PinholeCamera::look_at(
-            [centre[0], centre[1], low[2] + distance],
-            [centre[0], centre[1], low[2]],
-            [0.0, 1.0, 0.0],
-            width_px,
-            height_px,
-            fov_deg,
-        ),
+        ViewChoice::BirdsEye => PinholeCamera::above(bounds_m, width_px, height_px),
         ViewChoice::Free => PinholeCamera::look_at(
-            [high[0], low[1], low[2] + distance * 0.5],
-            [centre[0], centre[1], low[2] + 1.0],
+            [high[0], low[1], low[2] + PinholeCamera::height_above_m(bounds_m) * 0.5],
+            [f64::midpoint(low[0], high[0]), f64::midpoint(low[1], high[1]), low[2] + 1.0],
             [0.0, 0.0, 1.0],
             width_px,
             height_px,
-            fov_deg,
+            PinholeCamera::ABOVE_FOV_DEG,
         ),
+    }
+}
+
+/// The forecasts that wait for the belief which answers them.
+#[derive(Debug, Default)]
+pub struct Pairing {
+    newest: Option<Forecast>,
+}
+
+impl Pairing {
+    /// Remembers a forecast; only the newest is kept.
+    pub fn forecast(&mut self, forecast: &Forecast) {
+        self.newest = Some(*forecast);
+    }
+
+    /// Returns the forecast that a belief answers, where it is the newest one.
+    pub fn answered(&self, belief: &Belief) -> Option<&Forecast> {
+        let of = |header: &Header| (header.frame_id, header.step);
+        self.newest.as_ref().filter(|forecast| of(&forecast.header) == of(&belief.header))
     }
 }
 
@@ -121,5 +130,26 @@ pub fn meta(forecast: &Forecast, hypothesis: &Hypothesis, choice: ViewChoice, ca
         intrinsics: camera.into(),
         world_from_camera: row_major(&camera.world_from_camera),
         stage_latency_ns: 0,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use carff_messages::ForecastSource;
+
+    /// A belief is only paired with the forecast of its own frame and step, and only with the newest one.
+    #[test]
+    fn beliefs_are_paired_with_their_forecasts() {
+        let header = |frame, step| Header::of_frame(frame, frame, 1).at_step(step);
+        let mut pairing = Pairing::default();
+        let belief = |frame, step| Belief::empty(header(frame, step), 2);
+        assert!(pairing.answered(&belief(1, 1)).is_none());
+        for step in 1..=2 {
+            pairing.forecast(&Forecast::empty(header(1, step), ForecastSource::Observed, 2));
+        }
+        assert!(pairing.answered(&belief(1, 1)).is_none());
+        assert_eq!(pairing.answered(&belief(1, 2)).map(|f| f.header.step), Some(2));
+        assert!(pairing.answered(&belief(2, 2)).is_none());
     }
 }

@@ -1,10 +1,10 @@
 //! The renderer stage: forecasts and beliefs in, pictures of the hypotheses out. It gives way to the decision path.
 
 use carff_field::HypothesisBuffer;
-use carff_messages::Stage;
-use carff_renderer::{camera, hypotheses, load, meta, render, write};
+use carff_messages::{Stage, rgb_bytes};
+use carff_renderer::{Pairing, camera, hypotheses, load, meta, render, write};
 use carff_runtime::{Overload, StageContext, frame_span};
-use carff_transport::{Woken, monotonic_now_ns, topics};
+use carff_transport::{monotonic_now_ns, topics};
 
 /// Smallest side of a view, however little room there is, pixels.
 const MIN_SIDE_PX: u32 = 16;
@@ -15,46 +15,27 @@ fn main() -> std::process::ExitCode {
 
 fn run(stage: &mut StageContext) -> anyhow::Result<()> {
     let settings = stage.graph.renderer.clone();
-    let bytes = settings.width_px as usize * settings.height_px as usize * 3;
     let mut forecasts = stage.input(&topics::FORECAST)?;
     let mut beliefs = stage.input(&topics::BELIEF)?;
-    let mut views = stage.image_output(&topics::VIEW, bytes)?;
+    let mut views = stage.image_output(&topics::VIEW, rgb_bytes(settings.width_px, settings.height_px))?;
     let field = load(&stage.checkpoint)?;
-    let mut buffer = HypothesisBuffer::default();
     let period_ns = (1e9 / settings.max_rate_hz) as u64;
-    let mut next_ns = 0;
+    let (mut buffer, mut pairing, mut next_ns) = (HypothesisBuffer::default(), Pairing::default(), 0);
     let mut overload = Overload::new(&stage.graph);
     stage.ready();
-    loop {
-        // Views, then a rest: the rate stays below its limit, and only the newest belief is looked at.
-        while monotonic_now_ns() < next_ns {
-            if stage.wait_until(&[], next_ns)? == Woken::Stopped {
-                return Ok(());
-            }
-        }
-        if !stage.wait(&[&beliefs])? {
-            return Ok(());
-        }
-        let mut pair = None;
+    // Views, then a pause: the rate stays below its limit, and only the newest belief is rendered.
+    while stage.pause_until(next_ns)? && stage.wait(&[&beliefs])? {
         while let Some(forecast) = forecasts.next()? {
-            pair = Some(*forecast);
+            pairing.forecast(&forecast);
         }
         let newest = beliefs.newest_of(|belief| {
             overload.observe(belief);
         })?;
-        let Some(belief) = newest else { continue };
-        let belief = *belief;
-        let Some(forecast) =
-            pair.filter(|f| f.header.frame_id == belief.header.frame_id && f.header.step == belief.header.step)
-        else {
-            continue;
-        };
+        let Some((belief, forecast)) = newest.as_ref().and_then(|b| Some((b, pairing.answered(b)?))) else { continue };
         let _span = frame_span(&belief.header);
-        let hypotheses = hypotheses(&forecast, &belief, settings.hypotheses as usize);
+        let hypotheses = hypotheses(forecast, belief, settings.hypotheses as usize);
         let divisor = overload.quality().resolution_divisor;
-        let [width_px, height_px] =
-            [settings.width_px, settings.height_px].map(|side| (side / divisor).max(MIN_SIDE_PX));
-        let bytes = width_px as usize * height_px as usize * 3;
+        let [width_px, height_px] = [settings.width_px, settings.height_px].map(|px| (px / divisor).max(MIN_SIDE_PX));
         for &choice in &settings.views {
             if stage.is_stopped() {
                 return Ok(());
@@ -62,21 +43,18 @@ fn run(stage: &mut StageContext) -> anyhow::Result<()> {
             let started_ns = monotonic_now_ns();
             let camera = camera(&field, choice, width_px, height_px);
             render(&field, &camera, &hypotheses, stage.threads, &mut buffer);
-            let own_ns = (monotonic_now_ns() - started_ns) / hypotheses.len().max(1) as u64;
-            for (hypothesis, picture) in hypotheses.iter().zip(&buffer.pictures) {
+            let rendered_ns = (monotonic_now_ns() - started_ns) / hypotheses.len().max(1) as u64;
+            for (hypothesis, image) in hypotheses.iter().zip(&buffer.pictures) {
                 let written_ns = monotonic_now_ns();
-                let mut loan = views.loan(bytes)?;
-                match write(picture, loan.bytes_mut()) {
-                    Ok(()) => {
-                        let mut meta = meta(&forecast, hypothesis, choice, &camera);
-                        // Its share of what was rendered for all of them at once, and its own writing.
-                        meta.stage_latency_ns = stage.worked(&meta.header, written_ns.saturating_sub(own_ns));
-                        views.send_image(loan, meta)?;
-                    }
-                    Err(error) => stage.error(&error),
-                }
+                let mut loan = views.loan(rgb_bytes(width_px, height_px))?;
+                write(image, loan.bytes_mut())?;
+                let mut meta = meta(forecast, hypothesis, choice, &camera);
+                // A view's share of the rendering of all hypotheses, and its own writing.
+                meta.stage_latency_ns = stage.worked(&meta.header, written_ns.saturating_sub(rendered_ns));
+                views.send_image(loan, meta)?;
                 next_ns = next_ns.max(started_ns) + period_ns;
             }
         }
     }
+    Ok(())
 }

@@ -57,6 +57,25 @@ pub struct PinholeCamera {
 }
 
 impl PinholeCamera {
+    /// Field of view of [`Self::above`], degrees.
+    pub const ABOVE_FOV_DEG: f64 = 60.0;
+
+    /// Returns a camera that looks straight down on a region (two opposite corners, metres) and sees its longer side from
+    /// edge to edge. The image's up direction is +Y.
+    pub fn above(bounds_m: [[f64; 3]; 2], width_px: u32, height_px: u32) -> Self {
+        let [low, high] = bounds_m;
+        let [x, y] = [0, 1].map(|i| f64::midpoint(low[i], high[i]));
+        let height_m = Self::height_above_m(bounds_m);
+        let position_m = [x, y, low[2] + height_m];
+        Self::look_at(position_m, [x, y, low[2]], [0.0, 1.0, 0.0], width_px, height_px, Self::ABOVE_FOV_DEG)
+    }
+
+    /// Height of [`Self::above`] over the bottom of the region, metres.
+    pub fn height_above_m([low, high]: [[f64; 3]; 2]) -> f64 {
+        let extent_m = (high[0] - low[0]).max(high[1] - low[1]);
+        extent_m / 2.0 / (Self::ABOVE_FOV_DEG / 2.0).to_radians().tan()
+    }
+
     /// A camera at `eye` that looks at `target`, with a horizontal field of view in degrees and square pixels.
     /// When the view direction is parallel to `up`, another up vector is taken.
     pub fn look_at(
@@ -221,20 +240,6 @@ impl OrientedBox {
         let l = [c * d[0] + s * d[1], -s * d[0] + c * d[1], d[2]];
         (0..3).all(|i| l[i].abs() <= self.half_size[i])
     }
-
-    /// A regular lattice of `counts` points along the box's axes, shrunk to `fill` of its extent (0..=1).
-    pub fn lattice(&self, counts: [usize; 3], fill: f64) -> Vec<[f64; 3]> {
-        let at = |i: usize, n: usize| if n <= 1 { 0.0 } else { fill * (2.0 * i as f64 / (n - 1) as f64 - 1.0) };
-        let mut points = Vec::with_capacity(counts.iter().product());
-        for z in 0..counts[2] {
-            for y in 0..counts[1] {
-                for x in 0..counts[0] {
-                    points.push(self.point([at(x, counts[0]), at(y, counts[1]), at(z, counts[2])]));
-                }
-            }
-        }
-        points
-    }
 }
 
 fn sub(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
@@ -289,14 +294,24 @@ mod tests {
         assert_eq!(camera.validate(), Err(CameraError::NotFinite("transform_matrix")));
     }
 
-    /// Lattice points lie inside the box, also when it is turned.
+    /// A turned box contains its own points, and none above it.
     #[test]
-    fn lattice_lies_inside() {
+    fn a_box_contains_its_points() {
         let b = OrientedBox { center: [1.0, 2.0, 3.0], half_size: [2.0, 1.0, 0.5], yaw: 0.7 };
-        let points = b.lattice([4, 3, 2], 0.9);
-        assert_eq!(points.len(), 24);
-        assert!(points.iter().all(|&p| b.contains(p)));
+        let sides = [-0.9, 0.0, 0.9];
+        for (x, y, z) in sides.iter().flat_map(|x| sides.iter().flat_map(move |y| sides.map(|z| (*x, *y, z)))) {
+            assert!(b.contains(b.point([x, y, z])));
+        }
         assert!(!b.contains([1.0, 2.0, 3.6]));
+    }
+
+    /// A camera above a region looks straight down and sees its longer side from edge to edge.
+    #[test]
+    fn a_camera_above_sees_the_region() {
+        let camera = PinholeCamera::above([[-4.0, -1.0, 0.5], [6.0, 3.0, 2.0]], 64, 64);
+        assert!((camera.ray(32.0, 32.0).direction[2] + 1.0).abs() < 1e-6);
+        let ([x, _], _) = camera.project([6.0, 1.0, 0.5]).unwrap();
+        assert!((x - 64.0).abs() < 1e-9, "{x}");
     }
 
     /// A box is met by rays through it from any side, turned or not, and not by rays beside it, away from it, or along it.

@@ -99,24 +99,6 @@ pub fn apply_noise_into(
     Ok(())
 }
 
-/// [`apply_noise_into`], in place.
-pub fn apply_noise(rgb: &mut [u8], noise: &SensorNoise, key: Key) -> Result<(), SensorError> {
-    noise.validate()?;
-    if !rgb.len().is_multiple_of(3) {
-        return Err(SensorError::Lengths { source_len: rgb.len(), destination_len: rgb.len() });
-    }
-    if *noise == SensorNoise::OFF {
-        return Ok(());
-    }
-    let mut pixels = Noise::new(noise, key);
-    for pixel in rgb.chunks_exact_mut(3) {
-        for (channel, value) in pixel.iter_mut().enumerate() {
-            *value = pixels.next(channel, *value);
-        }
-    }
-    Ok(())
-}
-
 fn transform(source: impl Iterator<Item = u8>, destination: &mut [u8], noise: &SensorNoise, key: Key) {
     let mut pixels = Noise::new(noise, key);
     for (i, (to, from)) in destination.iter_mut().zip(source).enumerate() {
@@ -155,6 +137,12 @@ impl<R: Rng> Noise<R> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// Applies noise in place.
+    fn apply_noise(rgb: &mut [u8], noise: &SensorNoise, key: Key) -> Result<(), SensorError> {
+        let source = rgb.to_vec();
+        apply_noise_into(&source, rgb, noise, key)
+    }
 
     const KEY: Key = Key { seed: 5, frame: 17, step: 0, sample: 0 };
 

@@ -126,8 +126,14 @@ pub trait ImageMeta: Message + Default {
 
     /// Bytes of the image, RGB, 8 bit. Only meaningful once [`Message::validate`] has passed.
     fn image_bytes(&self) -> usize {
-        self.size_px().iter().map(|&side| side as usize).product::<usize>() * 3
+        let [width_px, height_px] = self.size_px();
+        rgb_bytes(width_px, height_px)
     }
+}
+
+/// Returns the bytes of an RGB image of 8 bit a channel.
+pub const fn rgb_bytes(width_px: u32, height_px: u32) -> usize {
+    width_px as usize * height_px as usize * 3
 }
 
 /// Makes a type a [`Message`]: it has a field `header: Header`, and a method `check(&self) -> Result<(), Invalid>`. Of a

@@ -161,6 +161,16 @@ impl StageContext {
         Ok(woken?)
     }
 
+    /// Sleeps until a time on the monotonic clock, nanoseconds; false when the stage shall end.
+    pub fn pause_until(&mut self, until_ns: u64) -> anyhow::Result<bool> {
+        while monotonic_now_ns() < until_ns {
+            if self.wait_until(&[], until_ns)? == Woken::Stopped {
+                return Ok(false);
+            }
+        }
+        Ok(!self.is_stopped())
+    }
+
     /// Whether the stage shall end: for loops that compute for long without waiting.
     pub fn is_stopped(&self) -> bool {
         self.waiter.stop().is_stopped()

@@ -356,8 +356,9 @@ fn the_shipped_scenario() {
     assert!((bev.ray(64.0, 64.0).direction[2] + 1.0).abs() < 1e-6);
     for state in &info.states {
         for named in &state.boxes {
-            let corners = named.oriented_box.lattice([2, 2, 2], 1.0);
-            for corner in corners {
+            for corner in 0..8 {
+                let side = |axis: usize| if corner >> axis & 1 == 1 { 1.0 } else { -1.0 };
+                let corner = named.oriented_box.point([side(0), side(1), side(2)]);
                 let ([x, y], _) = bev.project(corner).unwrap();
                 assert!((0.0..=128.0).contains(&x) && (0.0..=128.0).contains(&y), "{} {x} {y}", named.name);
             }

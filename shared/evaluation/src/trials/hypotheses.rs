@@ -65,12 +65,8 @@ pub fn birds_eye_camera(dataset: &Dataset, field: &Field) -> PinholeCamera {
 
 /// Camera that looks straight down on a field; up in the image is +Y.
 fn camera_above(field: &Field) -> PinholeCamera {
-    let [low, high] = field.config().bounds_m.map(|corner| corner.map(f64::from));
-    let [x, y] = [0, 1].map(|i| f64::midpoint(low[i], high[i]));
-    let fov_deg = 60.0_f64;
-    let distance = (high[0] - low[0]).max(high[1] - low[1]) / 2.0 / (fov_deg / 2.0).to_radians().tan();
-    let side = OWN_CAMERA_PX;
-    PinholeCamera::look_at([x, y, low[2] + distance], [x, y, low[2]], [0.0, 1.0, 0.0], side, side, fov_deg)
+    let bounds_m = field.config().bounds_m.map(|corner| corner.map(f64::from));
+    PinholeCamera::above(bounds_m, OWN_CAMERA_PX, OWN_CAMERA_PX)
 }
 
 /// The same camera with no side longer than [`MOST_PX`].
