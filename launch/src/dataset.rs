@@ -1,4 +1,4 @@
-//! `carff dataset`: renders scenarios into data sets, checks data sets, and imports plain ones.
+//! `carff dataset`: renders scenarios into datasets, checks datasets, and imports plain ones.
 
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
@@ -9,10 +9,10 @@ use carff_scenes::{Extras, Scenario};
 use carff_training::places::places;
 use indicatif::{ProgressBar, ProgressStyle};
 
-/// What to do with data sets.
+/// What to do with datasets.
 #[derive(Debug, clap::Subcommand)]
 pub enum DatasetCommand {
-    /// Render a scenario into a posed data set.
+    /// Render a scenario into a posed dataset.
     #[command(after_help = "Example: freely drawn cameras
   carff dataset render approaching-intersection --free-poses 50 --seed 3 --out data/free")]
     Render {
@@ -35,25 +35,25 @@ pub enum DatasetCommand {
     #[command(after_help = "Example: a set whose middle metres matter
   carff dataset import path/to/set --out data/mine --bounds -2,-2,0,2,2,2")]
     Import {
-        /// Folder of the set: one `transforms.json` or three (`transforms_train.json` and so on), and PNG or JPEG pictures.
+        /// Folder of the set: one `transforms.json` or three (`transforms_train.json` and so on), and PNG or JPEG images.
         dir: PathBuf,
         /// Folder to write; it must be new, empty, or a set that this program wrote.
         #[arg(long)]
         out: PathBuf,
-        /// Longest side of a picture, pixels; larger ones are scaled down.
+        /// Longest side of an image, pixels; larger ones are scaled down.
         #[arg(long, default_value_t = 256, value_parser = clap::value_parser!(u32).range(16..=8192))]
         max_side: u32,
         /// The box that matters, in the set's units: x0,y0,z0,x1,y1,z1. Default: about what the cameras look at.
         #[arg(long, value_parser = corners, allow_hyphen_values = true)]
         bounds: Option<[[f64; 3]; 2]>,
     },
-    /// Check a data set and print its statistics.
-    #[command(after_help = "Example: with a picture of all its pictures
+    /// Check a dataset and print its statistics.
+    #[command(after_help = "Example: with an image of all its images
   carff dataset check data/approaching-intersection --contact-sheet reports/contact.png")]
     Check {
         /// Folder of the set.
         dir: PathBuf,
-        /// Where to write a picture of the whole set: a row per state, a column per view.
+        /// Where to write an image of the whole set: a row per state, a column per view.
         #[arg(long)]
         contact_sheet: Option<PathBuf>,
         /// Columns of the contact sheet.
@@ -73,14 +73,14 @@ pub fn run(command: DatasetCommand) -> anyhow::Result<()> {
             }
             let extras = if depth { Extras::DepthAndMasks } else { Extras::None };
             let pictures = render(&scenario, &out, extras)?;
-            println!("{pictures} pictures in {}", out.display());
+            println!("{images} images in {}", out.display());
             Ok(())
         }
         DatasetCommand::Import { dir, out, max_side, bounds } => {
             let options = ImportOptions { max_side_px: max_side, bounds, ..ImportOptions::default() };
             let imported = import(&dir, &out, &options)?;
             println!(
-                "{} pictures in {} ({} undistorted, {} scaled down)",
+                "{} images in {} ({} undistorted, {} scaled down)",
                 imported.frames,
                 out.display(),
                 imported.undistorted,
@@ -122,7 +122,7 @@ fn find_scenario(scenario: &Path) -> anyhow::Result<PathBuf> {
     bail!("no scenario {}: there is no such file, nor {}{hint}", scenario.display(), named.display());
 }
 
-/// Renders a set, with a progress bar. Returns the number of pictures.
+/// Renders a set, with a progress bar. Returns the number of images.
 pub fn render(scenario: &Scenario, out: &Path, extras: Extras) -> anyhow::Result<u64> {
     let pictures = (scenario.cameras().len() * scenario.info().state_count()) as u64;
     let bar = ProgressBar::new(pictures);
@@ -163,7 +163,7 @@ name = "small"
 bounds_m = [[-2.0, -2.0, 0.0], [2.0, 2.0, 2.0]]
 timestamps = 1
 branches = ["only"]
-picture = { width_px = 16, height_px = 16, fov_deg = 60.0 }
+image = { width_px = 16, height_px = 16, fov_deg = 60.0 }
 
 [[overhead]]
 view_kind = "bev"

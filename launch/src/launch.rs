@@ -30,7 +30,7 @@ use std::time::{Duration, SystemTime};
 /// Stages in the order of their start: those that listen before those that speak, the camera last.
 const START_ORDER: [Stage; 6] =
     [Stage::Controller, Stage::Renderer, Stage::Prober, Stage::Forecaster, Stage::Encoder, Stage::Camera];
-/// How often messages and children are looked at: before the smallest buffer (8 pictures) fills up at 400 a second.
+/// How often messages and children are looked at: before the smallest buffer (8 images) fills up at 400 a second.
 const WATCH_NS: u64 = 20_000_000;
 /// How often what dead processes left is looked for: probes come and go, and the launcher starts none of them.
 const CLEANUP_NS: u64 = 1_000_000_000;
@@ -44,7 +44,7 @@ const QUIET_FRAMES: f64 = 3.0;
 pub(crate) const INTERRUPTED: u8 = 130;
 /// Source of the launcher's own lines in the log.
 pub(crate) const LAUNCHER: &str = "launcher";
-/// Bytes of a frame that are reckoned with when shared memory is checked, before the pictures are known.
+/// Bytes of a frame that are reckoned with when shared memory is checked, before the images are known.
 pub(crate) const FRAME_BYTES: usize = 1 << 17;
 
 /// Start a graph.
@@ -52,7 +52,7 @@ pub(crate) const FRAME_BYTES: usize = 1 << 17;
 pub struct LaunchArgs {
     /// The graph file, as in configs/graphs.
     pub graph: PathBuf,
-    /// Data set folder, in place of the graph file's.
+    /// Dataset folder, in place of the graph file's.
     #[arg(long)]
     pub dataset: Option<PathBuf>,
     /// Checkpoint folder, in place of the graph file's.
@@ -149,7 +149,7 @@ pub(crate) fn run_graph(
     let lock = RunLock::take(&runtime_dir(), &name, &record, "--run")?;
     lock.sweep(&run, "--run")?;
 
-    // A feed brings its own pictures.
+    // A feed brings its own images.
     if feed.is_none() {
         provide_dataset(&graph, args, &dataset, terminal)?;
         refuse_another_scenario(&graph, &dataset, &checkpoint)?;
@@ -541,7 +541,7 @@ impl Launcher<'_> {
     }
 }
 
-/// Renders the data set when it is missing and the graph says from which scenario.
+/// Renders the dataset when it is missing and the graph says from which scenario.
 fn provide_dataset(graph: &GraphConfig, args: &LaunchArgs, dataset: &Path, terminal: &Terminal) -> anyhow::Result<()> {
     let complete = std::fs::read_dir(dataset)
         .is_ok_and(|entries| entries.flatten().any(|e| e.file_name().to_string_lossy().starts_with("transforms")));
@@ -550,7 +550,7 @@ fn provide_dataset(graph: &GraphConfig, args: &LaunchArgs, dataset: &Path, termi
     }
     ensure!(
         args.dataset.is_none() || !dataset.exists(),
-        "{} holds no data set (no transforms.json)",
+        "{} holds no dataset (no transforms.json)",
         dataset.display()
     );
     match graph.scenario_path() {
@@ -560,7 +560,7 @@ fn provide_dataset(graph: &GraphConfig, args: &LaunchArgs, dataset: &Path, termi
             crate::dataset::render(&Scenario::load(&scenario)?, dataset, Extras::None).map(drop)
         }
         _ => bail!(
-            "data set {} is missing: give --dataset, or name its scenario in the graph file (`run.scenario`){}",
+            "dataset {} is missing: give --dataset, or name its scenario in the graph file (`run.scenario`){}",
             dataset.display(),
             carff_nearest::beside(dataset)
         ),

@@ -1,5 +1,5 @@
 //! The `carff` command's parts that start graphs or compute with models: launching and watching a graph, replays, soaks,
-//! training and judging, data sets. What the stages compute lives in the stages; what looks at a run, in `carff`.
+//! training and judging, datasets. What the stages compute lives in the stages; what looks at a run, in `carff`.
 
 pub mod ablate;
 pub mod backbone;

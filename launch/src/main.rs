@@ -56,10 +56,10 @@ enum Command {
 
 Exit code: 1 when --verify finds a difference.")]
     Replay(ReplayArgs),
-    /// Render and check data sets.
+    /// Render and check datasets.
     #[command(
         subcommand,
-        after_help = "Example: pictures of a scenario, and a look at them
+        after_help = "Example: images of a scenario, and a look at them
   carff dataset render approaching-intersection --out data/approaching-intersection
   carff dataset check data/approaching-intersection --contact-sheet reports/contact.png"
     )]
@@ -68,7 +68,7 @@ Exit code: 1 when --verify finds a difference.")]
     #[command(after_help = "Example: the models that ship, into a folder of your own
   carff train configs/training/approaching-intersection.toml --out runs/mine/checkpoint --run-dir runs/mine")]
     Train(TrainArgs),
-    /// Judge a checkpoint: every table and picture, as JSON and one page.
+    /// Judge a checkpoint: every table and image, as JSON and one page.
     #[command(after_help = "Example: the planning table alone
   carff eval configs/checkpoints/approaching-intersection --only planning --out reports/results")]
     Eval(EvalArgs),

@@ -8,14 +8,14 @@ use carff_messages::{
 use carff_transport::{Image, Node, OpenError, ReceiveError, Receiver, topics};
 use std::collections::{BTreeMap, VecDeque};
 
-/// Everything known about one camera frame. What is from the data set is -1 or `Unknown` where there is none.
+/// Everything known about one camera frame. What is from the dataset is -1 or `Unknown` where there is none.
 #[derive(Clone, Debug)]
 pub struct FrameRecord {
     /// Frame number in the run.
     pub frame_id: u64,
     /// Camera pose.
     pub view: i32,
-    /// Hidden course of events.
+    /// Hidden branch.
     pub branch: i32,
     /// Step of it.
     pub timestamp: i32,

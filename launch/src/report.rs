@@ -14,7 +14,7 @@ pub struct RunOutcome {
     pub graph: String,
     /// The run's seed.
     pub seed: u64,
-    /// Folder of the data set.
+    /// Folder of the dataset.
     pub dataset: std::path::PathBuf,
     /// Folder of the trained models.
     pub checkpoint: std::path::PathBuf,

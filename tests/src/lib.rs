@@ -1,4 +1,4 @@
-//! What the cross-process tests share: the built programs, graphs of their own, data sets, and watchdogs.
+//! What the cross-process tests share: the built programs, graphs of their own, datasets, and watchdogs.
 //!
 //! Nothing here computes what a stage computes: the tests start the programs that a user starts, and look at what a
 //! user sees. Each graph has a run name and a folder of its own, so tests run side by side; whatever outlives its

@@ -1,4 +1,4 @@
-//! Data sets and checkpoints for tests.
+//! Datasets and checkpoints for tests.
 
 use crate::{Process, program, programs, project_root, shipped_checkpoint};
 use carff_dataset::Image;
@@ -8,7 +8,7 @@ use std::hash::Hasher;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-/// The shipped scenario's data set, rendered once for this build of `carff` and kept in the target folder.
+/// The shipped scenario's dataset, rendered once for this build of `carff` and kept in the target folder.
 pub fn scenario_set() -> PathBuf {
     let scenario = project_root().join("configs/scenarios/approaching-intersection.toml");
     let mut hasher = std::collections::hash_map::DefaultHasher::new();
@@ -34,7 +34,7 @@ pub fn scenario_set() -> PathBuf {
     set
 }
 
-/// A small set of plain pictures: two branches x two timestamps x 20 poses of 8 x 8 pixels, half of the poses blind and
+/// A small set of plain images: two branches x two timestamps x 20 poses of 8 x 8 pixels, half of the poses blind and
 /// half of them clear.
 pub fn picture_set(folder: &Path) {
     let images = folder.join("images");

@@ -29,14 +29,14 @@ fn wrong_graph_files() {
     graph.assert_nothing_left();
 }
 
-/// A data set that is missing, or a folder that holds none, is named, with what to give instead.
+/// A dataset that is missing, or a folder that holds none, is named, with what to give instead.
 #[test]
 fn missing_data_sets() {
     let graph = TestGraph::new(Path::new("nowhere"), Path::new("none"), "");
     graph.launch_to_end(&[]).assert_one_error(&["nowhere", "is missing", "--dataset"]);
     let empty = graph.path("empty");
     std::fs::create_dir(&empty).unwrap();
-    graph.launch_to_end(&["--dataset", empty.to_str().unwrap()]).assert_one_error(&["empty", "holds no data set"]);
+    graph.launch_to_end(&["--dataset", empty.to_str().unwrap()]).assert_one_error(&["empty", "holds no dataset"]);
     graph.assert_nothing_left();
 }
 
@@ -77,7 +77,7 @@ fn missing_program() {
     graph.assert_nothing_left();
 }
 
-/// Wrong data sets are told which file, which frame and which key.
+/// Wrong datasets are told which file, which frame and which key.
 #[test]
 fn dataset_check_names_the_place() {
     let set = tempfile::tempdir().unwrap();

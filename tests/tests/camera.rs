@@ -1,4 +1,4 @@
-//! The camera as its own process, with pictures that cannot be used.
+//! The camera as its own process, with images that cannot be used.
 
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
@@ -8,7 +8,7 @@ use carff_tests::{TestGraph, eventually, picture_set};
 use carff_transport::{Node, topics};
 use std::path::Path;
 
-/// Unreadable and wrong-sized pictures of a folder are named, counted as errors and never shown; the others are shown.
+/// Unreadable and wrong-sized images of a folder are named, counted as errors and never shown; the others are shown.
 #[test]
 fn a_folder_with_bad_pictures() {
     let pictures = tempfile::tempdir().unwrap();
@@ -47,8 +47,8 @@ fn a_folder_with_bad_pictures() {
     assert_eq!(shown, [10, 10, 10, 90, 90, 90]);
 }
 
-/// A data set whose pictures cannot be read, or have another size than it says, ends the camera with an error that names
-/// the picture: no drive is shown with a picture left out.
+/// A dataset whose images cannot be read, or have another size than it says, ends the camera with an error that names
+/// the image: no drive is shown with an image left out.
 #[test]
 fn drives_with_bad_pictures() {
     let set = tempfile::tempdir().unwrap();

@@ -188,7 +188,7 @@ fn a_lost_camera_ends_the_run() {
     graph.assert_nothing_left();
 }
 
-/// A folder in which one picture is broken and one has another size: both are reported as errors of the camera, and the
+/// A folder in which one image is broken and one has another size: both are reported as errors of the camera, and the
 /// graph decides on the others.
 #[test]
 fn bad_pictures_are_left_out() {
@@ -215,7 +215,7 @@ fn bad_pictures_are_left_out() {
     graph.assert_nothing_left();
 }
 
-/// A checkpoint that was trained on another scenario than the data set shows is refused before anything is decided; the
+/// A checkpoint that was trained on another scenario than the dataset shows is refused before anything is decided; the
 /// error names the key that differs and both values.
 #[test]
 fn a_checkpoint_of_another_scenario() {

@@ -31,7 +31,7 @@ fn frame(run_id: u64, frame_id: u64) -> FrameMeta {
     }
 }
 
-/// A NaN in a message of any topic, and a picture of another size than it says, is dropped and counted by each stage
+/// A NaN in a message of any topic, and an image of another size than it says, is dropped and counted by each stage
 /// that reads the topic, and goes no further: no action ever rests on it, and what is valid is still decided on.
 #[test]
 fn rogue_messages_stop_at_the_next_stage() {

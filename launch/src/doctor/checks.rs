@@ -13,7 +13,7 @@ const GRAPH_BYTES: u64 = 1 << 30;
 const SLOW_CLOCKS: [&str; 4] = ["hpet", "acpi_pm", "jiffies", "refined-jiffies"];
 /// Governors that keep the processor slow until load has been there for a while.
 const SLOW_GOVERNORS: [&str; 2] = ["powersave", "conservative"];
-/// Free disk below which recordings and data sets soon have no room, and below which nothing has.
+/// Free disk below which recordings and datasets soon have no room, and below which nothing has.
 const DISK_BYTES: (u64, u64) = (2 << 30, 64 << 20);
 /// Below it, memory cannot be locked for a stage.
 const LOCKED_BYTES: u64 = 1 << 30;
@@ -140,12 +140,12 @@ pub fn governor(governors: &[String]) -> Finding {
     Finding::ok(Area::Machine, "governor", found)
 }
 
-/// Free space where this is started: data sets, reports and recordings go below it.
+/// Free space where this is started: datasets, reports and recordings go below it.
 pub fn disk(folder: &Path, free_bytes: u64) -> Finding {
     let found = format!("{} free in {}", size(free_bytes), folder.display());
     let advice = "free some, or start in another folder";
     if free_bytes < DISK_BYTES.1 {
-        return Finding::error(Area::Machine, "disk", found, "no data set, report or recording can be written", advice);
+        return Finding::error(Area::Machine, "disk", found, "no dataset, report or recording can be written", advice);
     }
     if free_bytes < DISK_BYTES.0 {
         return Finding::warning(Area::Machine, "disk", found, "a recording of some minutes fills it", advice);
@@ -177,7 +177,7 @@ pub fn shared_memory(memory: &SharedMemory, needed_bytes: u64) -> Vec<Finding> {
             area,
             "folder",
             format!("{folder} is not there"),
-            "no process can hand a picture to another",
+            "no process can hand an image to another",
             format!("sudo mount -t tmpfs -o size=512m,mode=1777 tmpfs {folder}"),
         )];
     };
@@ -187,7 +187,7 @@ pub fn shared_memory(memory: &SharedMemory, needed_bytes: u64) -> Vec<Finding> {
             area,
             "rights",
             format!("{folder} cannot be written by this user"),
-            "no process can hand a picture to another",
+            "no process can hand an image to another",
             format!("sudo chmod 1777 {folder}"),
         )
     } else if file_system == "tmpfs" {
@@ -197,7 +197,7 @@ pub fn shared_memory(memory: &SharedMemory, needed_bytes: u64) -> Vec<Finding> {
             area,
             "rights",
             format!("{folder} is {file_system}, not tmpfs"),
-            "pictures go to a disk: the loop stands still whenever it is busy",
+            "images go to a disk: the loop stands still whenever it is busy",
             format!("sudo mount -t tmpfs -o size=512m,mode=1777 tmpfs {folder}"),
         )
     });

@@ -12,7 +12,7 @@ use std::path::Path;
 /// Nothing but this refuses a launch.
 const NO_LAUNCH: &str = "`carff launch` refuses it";
 
-/// Everything about a graph, its data set and checkpoint possibly replaced.
+/// Everything about a graph, its dataset and checkpoint possibly replaced.
 pub fn check(path: &Path, graph: &GraphConfig, dataset: Option<&Path>, checkpoint: Option<&Path>) -> Vec<Finding> {
     let mut findings = vec![Finding::ok(Area::Graph, "file", path.display().to_string())];
     for warning in graph.warnings() {
@@ -56,7 +56,7 @@ fn scenario(graph: &GraphConfig, renders: bool, findings: &mut Vec<Finding>) -> 
                 Area::Graph,
                 "scenario",
                 error.to_string().as_str(),
-                "free drives and a missing data set cannot be rendered",
+                "free drives and a missing dataset cannot be rendered",
                 "correct `run.scenario` in the graph file, or the scenario file",
             ));
             None
@@ -64,7 +64,7 @@ fn scenario(graph: &GraphConfig, renders: bool, findings: &mut Vec<Finding>) -> 
     }
 }
 
-/// The pictures' source. Returns what scenario it shows.
+/// The images' source. Returns what scenario it shows.
 fn pictures(
     graph: &GraphConfig,
     dataset: &Path,
@@ -158,7 +158,7 @@ fn models(checkpoint: &Path, shown: Option<&ScenarioIdentity>, findings: &mut Ve
     match shown.map(|shown| manifest.check_scenario(checkpoint, shown)) {
         Some(Err(error)) => findings.push(bad(
             &error,
-            "take the data set and the scenario that the checkpoint was trained on, or another checkpoint",
+            "take the dataset and the scenario that the checkpoint was trained on, or another checkpoint",
         )),
         _ if whole => {
             let found = format!("{}, of {}", checkpoint.display(), manifest.scenario.name);
@@ -188,7 +188,7 @@ mod tests {
         findings.iter().filter(|f| f.level == Level::Error).map(|f| (f.subject, f.found.as_str())).collect()
     }
 
-    /// The shipped graph with its checkpoint is well, whether its data set has been rendered or not.
+    /// The shipped graph with its checkpoint is well, whether its dataset has been rendered or not.
     #[test]
     fn the_shipped_graph_is_well() {
         let (path, graph) = shipped();
@@ -200,7 +200,7 @@ mod tests {
         assert!(findings.iter().any(|f| f.subject == "checkpoint" && f.level == Level::Ok));
     }
 
-    /// A data set that cannot be made, a checkpoint that is not there or damaged, and one of another scenario are errors,
+    /// A dataset that cannot be made, a checkpoint that is not there or damaged, and one of another scenario are errors,
     /// each with what to do.
     #[test]
     fn what_is_wrong_is_said() {

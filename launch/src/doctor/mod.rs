@@ -20,7 +20,7 @@ use std::process::ExitCode;
 pub struct DoctorArgs {
     /// A graph file, as in configs/graphs: what it asks of the machine, and whether what it names is there and fits.
     pub graph: Option<PathBuf>,
-    /// Data set folder, in place of the graph file's.
+    /// Dataset folder, in place of the graph file's.
     #[arg(long, requires = "graph")]
     pub dataset: Option<PathBuf>,
     /// Checkpoint folder, in place of the graph file's.

@@ -48,7 +48,7 @@ pub struct ReplayArgs {
     /// Graph file, in place of the recorded one.
     #[arg(long)]
     pub graph: Option<PathBuf>,
-    /// Data set folder, in place of the recorded one's.
+    /// Dataset folder, in place of the recorded one's.
     #[arg(long)]
     pub dataset: Option<PathBuf>,
     /// Checkpoint folder, in place of the recorded one's.

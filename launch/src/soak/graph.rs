@@ -55,7 +55,7 @@ impl Graph {
         let dataset = config.resolve(dataset.unwrap_or(&config.run.dataset));
         ensure!(
             dataset.is_dir(),
-            "data set {} is missing: `carff launch` renders it, or give --dataset",
+            "dataset {} is missing: `carff launch` renders it, or give --dataset",
             dataset.display()
         );
         let trained = config.resolve(checkpoint.unwrap_or(&config.run.checkpoint));

@@ -64,7 +64,7 @@ pub struct SoakArgs {
     /// Write the result here, as JSON; evidence of a violation goes into a folder beside it.
     #[arg(long)]
     pub json: Option<PathBuf>,
-    /// Data set folder, in place of the graph file's.
+    /// Dataset folder, in place of the graph file's.
     #[arg(long)]
     pub dataset: Option<PathBuf>,
     /// Checkpoint folder, in place of the graph file's.

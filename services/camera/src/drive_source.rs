@@ -1,4 +1,4 @@
-//! Replays the views of a data set as drives.
+//! Replays the views of a dataset as drives.
 
 use crate::source::Source;
 use anyhow::Context;
@@ -12,7 +12,7 @@ use carff_random::Key;
 use std::collections::HashMap;
 use std::path::Path;
 
-/// Drives, with all their pictures in memory.
+/// Drives, with all their images in memory.
 #[derive(Debug)]
 pub struct DriveSource {
     dataset: Dataset,
@@ -28,7 +28,7 @@ pub struct DriveSource {
 }
 
 impl DriveSource {
-    /// Plans the drives and loads their pictures.
+    /// Plans the drives and loads their images.
     pub fn open(dataset: &Path, checkpoint: &Path, graph: &GraphConfig, count: u32) -> anyhow::Result<Self> {
         let dataset = Dataset::open(dataset)?;
         let split_seed = match graph.camera.split_seed {

@@ -22,7 +22,7 @@ pub struct FreeDriveSource {
     drive: Option<FreeDrive>,
     frame_in_drive: usize,
     current: Option<FreeFrame>,
-    /// One thread: the other cores are for the stages that wait for the picture.
+    /// One thread: the other cores are for the stages that wait for the image.
     pool: rayon::ThreadPool,
 }
 

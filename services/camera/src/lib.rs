@@ -1,4 +1,4 @@
-//! Where the camera's pictures come from. No topic is opened here.
+//! Where the camera's images come from. No topic is opened here.
 
 mod drive_source;
 mod folder_source;

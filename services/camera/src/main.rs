@@ -1,5 +1,5 @@
-//! The camera stage: takes pictures from a [`source::Source`] at a fixed rate and publishes them.
-//! What a picture means lives in the encoder.
+//! The camera stage: takes images from a [`source::Source`] at a fixed rate and publishes them.
+//! What an image means lives in the encoder.
 
 use anyhow::Context;
 use carff_camera::{DriveSource, FolderSource, FreeDriveSource, Source};
@@ -60,7 +60,7 @@ fn open_source(stage: &mut StageContext) -> anyhow::Result<Box<dyn Source>> {
                 None => stage.dataset.join("images"),
             };
             let (source, unreadable) = FolderSource::open(&folder, &stage.graph)
-                .with_context(|| format!("no pictures from {}", folder.display()))?;
+                .with_context(|| format!("no images from {}", folder.display()))?;
             for error in &unreadable {
                 stage.error(error);
             }

@@ -1,4 +1,4 @@
-//! The camera's drives through a small data set.
+//! The camera's drives through a small dataset.
 
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
@@ -14,7 +14,7 @@ const VIEWS: usize = 20;
 const GREY: u8 = 40;
 
 /// Two branches x three timestamps x twenty poses, of which half see nothing and half everything; the grey value of a
-/// picture tells its branch and timestamp.
+/// image tells its branch and timestamp.
 fn write_dataset(folder: &Path) {
     let writer = DatasetWriter::create(folder).unwrap();
     let camera = PinholeCamera::look_at([0.0, 0.0, 5.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], 8, 8, 60.0);
@@ -92,7 +92,7 @@ fn drives_show_timestamps_in_order_with_fresh_noise() {
     assert_eq!(shots, shoot());
 }
 
-/// A broken picture of a data set stops the camera before it starts, with an error that names the file.
+/// A broken image of a dataset stops the camera before it starts, with an error that names the file.
 #[test]
 fn a_broken_picture_is_named() {
     let folder = tempfile::tempdir().unwrap();

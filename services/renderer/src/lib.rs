@@ -1,4 +1,4 @@
-//! The renderer stage's arithmetic: which hypotheses to show, from where, and their pictures.
+//! The renderer stage's arithmetic: which hypotheses to show, from where, and their images.
 
 use anyhow::Context;
 use carff_checkpoint::Manifest;
@@ -8,7 +8,7 @@ use carff_geometry::PinholeCamera;
 use carff_messages::{Belief, Forecast, LATENT_DIM, ViewKind, ViewMeta, row_major};
 use std::path::Path;
 
-/// Loads the field, for pictures alone.
+/// Loads the field, for images alone.
 pub fn load(checkpoint: &Path) -> anyhow::Result<Field> {
     let mut field = carff_checkpoint::load_field(checkpoint, &Manifest::load(checkpoint)?)?;
     field.set_instruction_set(InstructionSet::detect_for_pictures());
@@ -53,7 +53,7 @@ pub fn hypotheses(forecast: &Forecast, belief: &Belief, count: usize) -> Vec<Hyp
     all
 }
 
-/// A camera over the region that matters: straight down with the picture's up = +Y, or from a corner.
+/// A camera over the region that matters: straight down with the image's up = +Y, or from a corner.
 pub fn camera(field: &Field, choice: ViewChoice, width_px: u32, height_px: u32) -> PinholeCamera {
     let [low, high] = field.config().bounds_m.map(|corner| corner.map(f64::from));
     let centre = [0, 1, 2].map(|i| f64::midpoint(low[i], high[i]));
@@ -80,7 +80,7 @@ pub fn camera(field: &Field, choice: ViewChoice, width_px: u32, height_px: u32) 
     }
 }
 
-/// Renders what one camera sees under each hypothesis, one picture each.
+/// Renders what one camera sees under each hypothesis, one image each.
 pub fn render(
     field: &Field,
     camera: &PinholeCamera,
@@ -93,7 +93,7 @@ pub fn render(
     field.render_hypotheses(camera, &latents, &options, buffer);
 }
 
-/// Writes a picture as 8-bit RGB, rows from the top.
+/// Writes an image as 8-bit RGB, rows from the top.
 pub fn write(picture: &RenderBuffer, rgb: &mut [u8]) -> anyhow::Result<()> {
     let wanted = picture.rgb.len();
     (rgb.len() == wanted).then_some(()).with_context(|| format!("{} bytes for a view of {wanted}", rgb.len()))?;

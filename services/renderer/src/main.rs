@@ -1,4 +1,4 @@
-//! The renderer stage: forecasts and beliefs in, pictures of the hypotheses out. It gives way to the decision path.
+//! The renderer stage: forecasts and beliefs in, images of the hypotheses out. It gives way to the decision path.
 
 use carff_field::HypothesisBuffer;
 use carff_messages::Stage;

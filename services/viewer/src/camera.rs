@@ -1,8 +1,8 @@
-//! The camera that a hand moves: orbit, pan and zoom about a point, and where points of the world fall in its picture.
+//! The camera that a hand moves: orbit, pan and zoom about a point, and where points of the world fall in its image.
 
 use carff_geometry::{OrientedBox, PinholeCamera};
 
-/// Degrees that dragging across the picture's shorter side turns by.
+/// Degrees that dragging across the image's shorter side turns by.
 const ORBIT_DEG_PER_SIDE: f64 = 180.0;
 /// How near straight up or down the camera comes, degrees.
 const MOST_ELEVATION_DEG: f64 = 90.0;
@@ -14,7 +14,7 @@ const DISTANCE_M: [f64; 2] = [1.0, 200.0];
 pub const FOV_DEG: [f64; 2] = [15.0, 110.0];
 /// What is nearer than this to the camera's plane is cut off, metres.
 const NEAR_M: f64 = 0.05;
-/// Widest field of view across a picture's longer side, degrees: wider ones show a smear.
+/// Widest field of view across an image's longer side, degrees: wider ones show a smear.
 const MOST_WIDE_DEG: f64 = 150.0;
 
 /// A camera that looks at a point, upright.
@@ -28,7 +28,7 @@ pub struct OrbitCamera {
     pub azimuth_deg: f64,
     /// Angle of that direction above the ground, degrees.
     pub elevation_deg: f64,
-    /// Field of view across the picture's shorter side, degrees.
+    /// Field of view across the image's shorter side, degrees.
     pub fov_deg: f64,
 }
 
@@ -41,7 +41,7 @@ impl OrbitCamera {
         Self { target_m, distance_m: 1.25 * extent_m, azimuth_deg: -50.0, elevation_deg: 38.0, fov_deg: 45.0 }
     }
 
-    /// Straight down on the region that matters, the picture's up = +Y.
+    /// Straight down on the region that matters, the image's up = +Y.
     pub fn above(bounds_m: [[f64; 3]; 2]) -> Self {
         let [low, high] = bounds_m;
         let fov_deg = 45.0_f64;
@@ -61,7 +61,7 @@ impl OrbitCamera {
         let eye_m = camera.position_m();
         let back = [m[0][2], m[1][2], m[2][2]];
         let horizontal = back[0].hypot(back[1]);
-        // Straight up or down the direction tells no azimuth: the picture's up does.
+        // Straight up or down the direction tells no azimuth: the image's up does.
         let azimuth = if horizontal > 1e-6 { back[1].atan2(back[0]) } else { (-m[1][1]).atan2(-m[0][1]) };
         let to_ground_m = if back[2] > 1e-3 { (eye_m[2] - ground_m) / back[2] } else { DISTANCE_M[1] };
         let distance_m = to_ground_m.clamp(DISTANCE_M[0], 30.0);
@@ -76,7 +76,7 @@ impl OrbitCamera {
         }
     }
 
-    /// Turns about the target as a hand drags over a picture of this size; down and right are positive.
+    /// Turns about the target as a hand drags over an image of this size; down and right are positive.
     pub fn orbit(&mut self, drag_px: [f64; 2], picture_px: [f64; 2]) {
         let deg_per_px = ORBIT_DEG_PER_SIDE / picture_px[0].min(picture_px[1]).max(1.0);
         self.azimuth_deg = (self.azimuth_deg - drag_px[0] * deg_per_px).rem_euclid(360.0);
@@ -84,7 +84,7 @@ impl OrbitCamera {
             (self.elevation_deg + drag_px[1] * deg_per_px).clamp(LEAST_ELEVATION_DEG, MOST_ELEVATION_DEG);
     }
 
-    /// Moves along the picture's plane, so that what lies at the target's distance stays under the hand.
+    /// Moves along the image's plane, so that what lies at the target's distance stays under the hand.
     pub fn pan(&mut self, drag_px: [f64; 2], picture_px: [f64; 2]) {
         let shorter_px = picture_px[0].min(picture_px[1]).max(1.0);
         let metres_per_px = 2.0 * self.distance_m * (self.fov_deg / 2.0).to_radians().tan() / shorter_px;
@@ -119,7 +119,7 @@ impl OrbitCamera {
         [0, 1, 2].map(|i| self.target_m[i] + self.distance_m * back[i])
     }
 
-    /// The pinhole camera for a picture of this size.
+    /// The pinhole camera for an image of this size.
     pub fn pinhole(&self, width_px: u32, height_px: u32) -> PinholeCamera {
         let [_, up, _] = self.axes();
         let half = (self.fov_deg.clamp(FOV_DEG[0], FOV_DEG[1]) / 2.0).to_radians().tan();
@@ -129,7 +129,7 @@ impl OrbitCamera {
     }
 }
 
-/// Where a segment of the world falls in a picture, pixels. What lies behind the camera is cut off; `None` when all
+/// Where a segment of the world falls in an image, pixels. What lies behind the camera is cut off; `None` when all
 /// does.
 pub fn project_segment(camera: &PinholeCamera, a_m: [f64; 3], b_m: [f64; 3]) -> Option<[[f64; 2]; 2]> {
     let m = &camera.world_from_camera;
@@ -173,7 +173,7 @@ mod tests {
         (a - b).abs() < 1e-6
     }
 
-    /// However it is turned, the target stays in the picture's middle and at its distance, and the pose is a rotation.
+    /// However it is turned, the target stays in the image's middle and at its distance, and the pose is a rotation.
     #[test]
     fn orbiting_keeps_target_and_distance() {
         let mut camera = OrbitCamera::over_corner(BOUNDS_M);
@@ -232,7 +232,7 @@ mod tests {
         assert!(near(camera.fov_deg, FOV_DEG[1]));
     }
 
-    /// From above, +Y is up in the picture and the whole region is in it, whatever the window's shape.
+    /// From above, +Y is up in the image and the whole region is in it, whatever the window's shape.
     #[test]
     fn above_shows_the_region() {
         let camera = OrbitCamera::above(BOUNDS_M);
@@ -247,7 +247,7 @@ mod tests {
         }
     }
 
-    /// Standing where another camera stands gives its picture: position, direction and field of view.
+    /// Standing where another camera stands gives its image: position, direction and field of view.
     #[test]
     fn takes_another_cameras_place() {
         let eyes = [([3.0, -12.0, 5.0], [-2.0, 0.0, 0.5]), ([-6.0, -7.0, 22.0], [-6.0, -7.0, 0.0])];

@@ -1,4 +1,4 @@
-//! What is looked at: a picture of a data set, of a file, or of a running camera; and the data set to choose from.
+//! What is looked at: an image of a dataset, of a file, or of a running camera; and the dataset to choose from.
 
 use crate::models::Models;
 use carff_checkpoint::{CheckpointError, ScenarioIdentity};
@@ -7,7 +7,7 @@ use carff_geometry::PinholeCamera;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-/// A picture, and what is known of it.
+/// An image, and what is known of it.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Input {
     /// What it is called in the window.
@@ -18,16 +18,16 @@ pub struct Input {
     pub camera: Option<PinholeCamera>,
     /// What it really shows, if that is known.
     pub truth: Option<Truth>,
-    /// Names the draws of forecasts that rest on it: the frame's number, or its place in the data set.
+    /// Names the draws of forecasts that rest on it: the frame's number, or its place in the dataset.
     pub frame: u64,
     /// The seed of the run that it comes from; `None`: the window's own.
     pub seed: Option<u64>,
 }
 
-/// What a picture really shows. Nothing is computed from it.
+/// What an image really shows. Nothing is computed from it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Truth {
-    /// The hidden course of events.
+    /// The hidden branch.
     pub branch: usize,
     /// Step of it.
     pub timestamp: usize,
@@ -38,19 +38,19 @@ pub struct Truth {
 }
 
 impl Input {
-    /// A picture alone: of a file, say.
+    /// An image alone: of a file, say.
     pub fn of_picture(title: impl Into<String>, image: Image) -> Arc<Self> {
         Arc::new(Self { title: title.into(), image, camera: None, truth: None, frame: 0, seed: None })
     }
 
-    /// Reads a PNG picture.
+    /// Reads a PNG image.
     pub fn load_png(path: &Path) -> Result<Arc<Self>, DatasetError> {
         let title = path.file_name().map_or_else(|| path.display().to_string(), |n| n.to_string_lossy().into_owned());
         Ok(Self::of_picture(title, Image::load_png(path)?))
     }
 }
 
-/// Why a data set cannot be chosen from.
+/// Why a dataset cannot be chosen from.
 #[derive(Debug, thiserror::Error)]
 pub enum AlbumError {
     /// It cannot be read.
@@ -59,15 +59,15 @@ pub enum AlbumError {
     /// It shows another scenario than the checkpoint knows.
     #[error(transparent)]
     Scenario(#[from] CheckpointError),
-    /// It does not say which states its pictures show.
-    #[error("{path}: transforms.json has no `scenario`, or pictures without `view_id`: nothing to choose states from")]
+    /// It does not say which states its images show.
+    #[error("{path}: transforms.json has no `scenario`, or images without `view_id`: nothing to choose states from")]
     NoScenario {
-        /// The data set's folder.
+        /// The dataset's folder.
         path: PathBuf,
     },
 }
 
-/// A data set, by state and view.
+/// A dataset, by state and view.
 #[derive(Debug)]
 pub struct Album {
     dataset: Dataset,
@@ -77,7 +77,7 @@ pub struct Album {
 }
 
 impl Album {
-    /// Opens a data set that shows the checkpoint's scenario.
+    /// Opens a dataset that shows the checkpoint's scenario.
     pub fn open(dir: &Path, models: &Models) -> Result<Self, AlbumError> {
         let dataset = Dataset::open(dir)?;
         let nothing = || AlbumError::NoScenario { path: dir.to_owned() };
@@ -99,7 +99,7 @@ impl Album {
         Ok(Self { dataset, steps, index })
     }
 
-    /// The data set.
+    /// The dataset.
     pub fn dataset(&self) -> &Dataset {
         &self.dataset
     }
@@ -119,7 +119,7 @@ impl Album {
         (view < views).then(|| self.index.get(state * views + view).copied().flatten()).flatten()
     }
 
-    /// How much of the actor or its place a picture shows, if that is known.
+    /// How much of the actor or its place an image shows, if that is known.
     pub fn observability(&self, state: usize, view: usize) -> Option<Observability> {
         self.dataset.frames()[self.frame(state, view)?].observability
     }
@@ -132,7 +132,7 @@ impl Album {
         )
     }
 
-    /// The picture of a state from a view; `None` when the set has none.
+    /// The image of a state from a view; `None` when the set has none.
     pub fn input(&self, state: usize, view: usize, models: &Models) -> Result<Option<Arc<Input>>, AlbumError> {
         let Some(index) = self.frame(state, view) else { return Ok(None) };
         let frame = &self.dataset.frames()[index];

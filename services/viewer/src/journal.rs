@@ -11,7 +11,7 @@ const MOST_TIMES: usize = 600;
 /// One decision.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Decision {
-    /// What it rests on: a picture or a frame, and how many steps.
+    /// What it rests on: an image or a frame, and how many steps.
     pub rests_on: String,
     /// Halt, or advance.
     pub halt: bool,

@@ -322,7 +322,7 @@ impl Assembly {
     }
 }
 
-/// The picture of a frame.
+/// The image of a frame.
 fn input(meta: &FrameMeta, bytes: &[u8]) -> Input {
     let view = &meta.dataset_view;
     let observability = Observability::of_code(view.observability).ok().flatten();

@@ -20,7 +20,7 @@ const MODEL_THREADS: usize = 1;
 /// How much a window that watches a graph gives way to others.
 const NICE: i32 = 5;
 
-/// A window on what a picture may mean: the scenes that it may stand for, forecast, probed, and seen from anywhere.
+/// A window on what an image may mean: the scenes that it may stand for, forecast, probed, and seen from anywhere.
 /// From files, or from a running graph, which it does not disturb.
 #[derive(Debug, Parser)]
 #[command(
@@ -32,14 +32,14 @@ struct Args {
     /// Folder of the trained models. Default: those of the run, or the shipped ones.
     #[arg(long)]
     checkpoint: Option<PathBuf>,
-    /// Folder of the data set to choose pictures from. Default: the one that the models were trained on, if it is
+    /// Folder of the dataset to choose images from. Default: the one that the models were trained on, if it is
     /// there.
     #[arg(long)]
     dataset: Option<PathBuf>,
     /// Watches a running graph: the one of this name, or, without a name, the only one.
     #[arg(long, num_args = 0..=1, default_missing_value = "", value_name = "NAME")]
     run: Option<String>,
-    /// A PNG picture to begin with.
+    /// A PNG image to begin with.
     #[arg(long, value_name = "FILE", conflicts_with = "run")]
     picture: Option<PathBuf>,
     /// What to do first; can be given several times.
@@ -168,21 +168,21 @@ fn run(args: Args) -> anyhow::Result<()> {
     }
 }
 
-/// The data set to choose pictures from; within, why there is none: the window opens all the same, unless one was asked
+/// The dataset to choose images from; within, why there is none: the window opens all the same, unless one was asked
 /// for.
 fn album(asked: Option<&Path>, of_run: Option<PathBuf>, models: &Models) -> anyhow::Result<Result<Album, String>> {
     if let Some(dir) = asked {
         return Ok(Ok(Album::open(dir, models)?));
     }
     let Some(dir) = of_run.or_else(|| models.trained_on()) else {
-        return Ok(Err("No data set: give one with --dataset, or drop a PNG picture here.".into()));
+        return Ok(Err("No dataset: give one with --dataset, or drop a PNG image here.".into()));
     };
     if !dir.is_dir() {
         let name = &models.manifest.scenario.name;
         let dir = dir.display();
         return Ok(Err(format!(
-            "Data set {dir} is not here yet. Render it with\n\ncarff dataset render {name} --out {dir}\n\nand start \
-             again, or drop a PNG picture here."
+            "Dataset {dir} is not here yet. Render it with\n\ncarff dataset render {name} --out {dir}\n\nand start \
+             again, or drop a PNG image here."
         )));
     }
     Ok(Album::open(&dir, models).map_err(|e| e.to_string()))

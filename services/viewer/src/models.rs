@@ -54,12 +54,12 @@ impl Models {
             encoder: load_encoder(dir, &manifest)?,
             manifest,
         };
-        // Once on a grey picture, so that the first one is as fast as the others.
+        // Once on a grey image, so that the first one is as fast as the others.
         models.encode(&Image::filled(128, 128, [128; 3]));
         Ok(models)
     }
 
-    /// The posterior of a picture, as the encoder stage computes it; `None` for a picture of no or wrong size.
+    /// The posterior of an image, as the encoder stage computes it; `None` for an image of no or wrong size.
     pub fn encode(&self, image: &Image) -> Option<Gaussian> {
         borrow::with_image(image.view()?, |image| self.encoder.encode_bytes(image)).flatten()
     }
@@ -97,7 +97,7 @@ impl Models {
         recorded.map_or(2, |h| h.clamp(1, u64::from(carff_messages::MAX_HORIZON)) as u32)
     }
 
-    /// The data set that it was trained on, as the training file names it.
+    /// The dataset that it was trained on, as the training file names it.
     pub fn trained_on(&self) -> Option<PathBuf> {
         self.manifest.training.pointer("/dataset").and_then(serde_json::Value::as_str).map(PathBuf::from)
     }

@@ -1,4 +1,4 @@
-//! Pictures of scenes, drawn on a thread of their own: of each kind the newest request counts, and a view comes coarse
+//! Images of scenes, drawn on a thread of their own: of each kind the newest request counts, and a view comes coarse
 //! first, then finer, so that the window stays smooth however slow the machine is.
 
 use crate::slice::density_slice;
@@ -10,15 +10,15 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 use std::time::Instant;
 
-/// What a coarse picture of a view may take, milliseconds.
+/// What a coarse image of a view may take, milliseconds.
 const COARSE_MS: f64 = 40.0;
-/// What a picture of a scene that changes by itself may take, milliseconds.
+/// What an image of a scene that changes by itself may take, milliseconds.
 const STEADY_MS: f64 = 160.0;
 /// What a pixel takes, before any has been measured, nanoseconds.
 const FIRST_PIXEL_NS: f64 = 6_000.0;
 /// Weight of the newest measurement of it.
 const NEWEST_WEIGHT: f64 = 0.3;
-/// However slow the machine is, a picture's longer side has so many pixels: of a view, and of a scene that changes by
+/// However slow the machine is, an image's longer side has so many pixels: of a view, and of a scene that changes by
 /// itself.
 const COARSEST_PX: u32 = 56;
 const COARSEST_STEADY_PX: u32 = 112;
@@ -66,11 +66,11 @@ pub enum Job {
 /// How fine a view is to be, and how soon.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Pace {
-    /// The camera is being moved: one coarse picture, at once.
+    /// The camera is being moved: one coarse image, at once.
     Moving,
-    /// The scene changes by itself: one picture, of the same fineness each time.
+    /// The scene changes by itself: one image, of the same fineness each time.
     Steady,
-    /// Nothing moves: a coarse picture, then finer ones up to the whole.
+    /// Nothing moves: a coarse image, then finer ones up to the whole.
     Resting,
 }
 
@@ -83,7 +83,7 @@ pub struct View {
     pub camera: PinholeCamera,
     /// How fine, how soon.
     pub pace: Pace,
-    /// What the sides are still to be divided by, one picture each; empty: not begun.
+    /// What the sides are still to be divided by, one image each; empty: not begun.
     pub divisors: Vec<u32>,
     number: u64,
 }
@@ -113,7 +113,7 @@ pub enum Drawn {
     View {
         /// The scene.
         latent: [f32; LATENT_DIM],
-        /// The picture, coarse or fine.
+        /// The image, coarse or fine.
         image: Image,
         /// Its camera, at the size that was asked for.
         camera: PinholeCamera,
@@ -126,23 +126,23 @@ pub enum Drawn {
     BirdsEye {
         /// The scene.
         latent: [f32; LATENT_DIM],
-        /// The picture.
+        /// The image.
         image: Image,
     },
     /// Density at a height.
     Slice {
         /// The scene.
         latent: [f32; LATENT_DIM],
-        /// The picture: brightness is the share of light that is stopped.
+        /// The image: brightness is the share of light that is stopped.
         image: Image,
     },
-    /// One of the small pictures.
+    /// One of the small images.
     Thumbnail {
         /// Which of the scenes.
         index: usize,
         /// Its latent.
         latent: [f32; LATENT_DIM],
-        /// The picture.
+        /// The image.
         image: Image,
     },
 }
@@ -226,7 +226,7 @@ impl RenderWorker {
             Arc::new(Shared { desk: Mutex::default(), called: Condvar::new(), newest_view: AtomicU64::new(0) });
         let theirs = shared.clone();
         let thread = std::thread::Builder::new().name("render".into()).spawn(move || {
-            // On Linux this is the thread's own priority, and that of the threads that it starts. Without it pictures
+            // On Linux this is the thread's own priority, and that of the threads that it starts. Without it images
             // come all the same.
             let _ = rustix::process::nice(NICE);
             Painter::new(field, threads).work(&theirs, &wake);
@@ -234,7 +234,7 @@ impl RenderWorker {
         Ok(Self { shared, thread: Some(thread) })
     }
 
-    /// Asks for a picture. One of the same kind that waits is forgotten.
+    /// Asks for an image. One of the same kind that waits is forgotten.
     pub fn ask(&self, job: Job) {
         let job = match job {
             Job::View(view) => {
@@ -252,7 +252,7 @@ impl RenderWorker {
         std::mem::take(&mut self.shared.desk().done)
     }
 
-    /// Whether small pictures that were asked for are not all drawn yet.
+    /// Whether small images that were asked for are not all drawn yet.
     pub fn owes_thumbnails(&self) -> bool {
         let desk = self.shared.desk();
         desk.working == Some(THUMBNAILS) || desk.waiting.iter().any(|(_, job)| job.kind() == THUMBNAILS)
@@ -282,7 +282,7 @@ impl Drop for RenderWorker {
     }
 }
 
-/// By what a view's sides are divided, picture by picture: the first has at most `budget_px` pixels (or is as coarse as
+/// By what a view's sides are divided, image by image: the first has at most `budget_px` pixels (or is as coarse as
 /// it gets: `coarsest_px` along the longer side), each further one is at least twice as fine, the last one is whole.
 pub fn divisors(width_px: u32, height_px: u32, coarsest_px: u32, budget_px: f64) -> Vec<u32> {
     let pixels = |divisor: u32| f64::from(width_px / divisor) * f64::from(height_px / divisor);
@@ -394,7 +394,7 @@ impl Painter {
         let divisor = left.remove(0);
         let camera = view.camera.resized((width_px / divisor).max(1), (height_px / divisor).max(1));
         let started = Instant::now();
-        // A coarse picture is finished in any case: who moves the camera without rest sees it move.
+        // A coarse image is finished in any case: who moves the camera without rest sees it move.
         let is_wanted = || !begun || shared.newest_view.load(Ordering::Relaxed) == view.number;
         let Some(image) = self.in_bands(&view.latent, &camera, is_wanted) else { return (Vec::new(), None) };
         let took_ms = started.elapsed().as_secs_f64() * 1e3;
@@ -406,7 +406,7 @@ impl Painter {
         (vec![drawn], rest)
     }
 
-    /// Renders a picture in bands, each of which takes as long as a coarse picture may; `None` when it is no longer
+    /// Renders an image in bands, each of which takes as long as a coarse image may; `None` when it is no longer
     /// wanted.
     fn in_bands(
         &mut self,
@@ -447,7 +447,7 @@ mod tests {
     use std::sync::mpsc;
     use std::time::Duration;
 
-    /// Longest wait for a picture: no limit on how long drawing may take, but on a test that hangs.
+    /// Longest wait for an image: no limit on how long drawing may take, but on a test that hangs.
     const PATIENCE: Duration = Duration::from_secs(120);
 
     fn field() -> Field {
@@ -478,7 +478,7 @@ mod tests {
         (worker, until_idle)
     }
 
-    /// The first picture fits the budget or is the coarsest, each further one is at least twice as fine, the last is
+    /// The first image fits the budget or is the coarsest, each further one is at least twice as fine, the last is
     /// whole.
     #[test]
     fn views_get_finer() {

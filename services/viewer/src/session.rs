@@ -1,6 +1,6 @@
-//! What the window is about, without a window: a picture, the scenes that it may stand for, and what follows.
+//! What the window is about, without a window: an image, the scenes that it may stand for, and what follows.
 //!
-//! *Toggle* takes a picture to its posterior. *Predict* forecasts one step: a mixture, and latents drawn from it.
+//! *Toggle* takes an image to its posterior. *Predict* forecasts one step: a mixture, and latents drawn from it.
 //! *Probe and predict* asks the shown scene what stands where, takes the posterior of the state that it shows for the
 //! next input, and forecasts from that, up to the horizon. All of it is computed by the functions that the stages use.
 
@@ -29,7 +29,7 @@ pub struct Settings {
 /// Which scene is shown.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Selection {
-    /// That of the forecast's input: the picture's posterior, or the state that was fed back.
+    /// That of the forecast's input: the image's posterior, or the state that was fed back.
     Source,
     /// That of a mixture component's mean.
     Component(usize),
@@ -60,13 +60,13 @@ pub struct Forecast {
 /// One entry of the history: an input, and what has been made of it so far.
 #[derive(Clone, Debug)]
 pub struct Moment {
-    /// The picture that all rests on.
+    /// The image that all rests on.
     pub input: Arc<Input>,
-    /// Steps ahead of the picture.
+    /// Steps ahead of the image.
     pub step: u32,
-    /// What is forecast from: the picture's posterior, or that of a known state.
+    /// What is forecast from: the image's posterior, or that of a known state.
     pub source: Gaussian,
-    /// That state; `None` for a picture's posterior.
+    /// That state; `None` for an image's posterior.
     pub source_state: Option<usize>,
     /// The forecast; none at step 0.
     pub forecast: Option<Forecast>,
@@ -85,7 +85,7 @@ pub struct Moment {
 }
 
 impl Moment {
-    /// A picture's posterior, nothing more.
+    /// An image's posterior, nothing more.
     pub fn of_posterior(input: Arc<Input>, posterior: Gaussian) -> Self {
         Self {
             input,
@@ -142,10 +142,10 @@ pub struct Scene {
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum SessionError {
     /// Nothing was toggled yet.
-    #[error("no picture yet: choose one, and press Toggle")]
+    #[error("no image yet: choose one, and press Toggle")]
     NoInput,
-    /// The encoder refused the picture.
-    #[error("`{title}` is no picture that the encoder can read: {width_px} x {height_px} pixels")]
+    /// The encoder refused the image.
+    #[error("`{title}` is no image that the encoder can read: {width_px} x {height_px} pixels")]
     Picture {
         /// What it is called.
         title: String,
@@ -221,7 +221,7 @@ impl Session {
         self.moment().ok_or(SessionError::NoInput)
     }
 
-    /// **Toggle**: the scene that a picture's posterior stands for.
+    /// **Toggle**: the scene that an image's posterior stands for.
     pub fn toggle(&mut self, input: Arc<Input>) -> Result<(), SessionError> {
         let started = Instant::now();
         let Some(posterior) = self.models.encode(&input.image) else {
@@ -232,7 +232,7 @@ impl Session {
         let moment = Moment::of_posterior(input, posterior);
         let is_last = !self.history.has_forward();
         match self.history.current_mut() {
-            // Leafing through pictures leaves no trail.
+            // Leafing through images leaves no trail.
             Some(shown) if is_last && shown.step == 0 && shown.found.is_none() => *shown = moment,
             _ => self.history.push(moment),
         }
@@ -252,7 +252,7 @@ impl Session {
         if step > self.settings.horizon { Err(SessionError::Horizon { step: step - 1 }) } else { Ok(()) }
     }
 
-    /// **Predict**: the mixture over what comes one step after the picture, and latents drawn from it. Where a step is
+    /// **Predict**: the mixture over what comes one step after the image, and latents drawn from it. Where a step is
     /// shown already, it is drawn again, with the settings as they are now.
     pub fn predict(&mut self) -> Result<(), SessionError> {
         self.can_predict()?;

@@ -1,4 +1,4 @@
-//! How dense a scene is at a height, as a picture from above.
+//! How dense a scene is at a height, as an image from above.
 
 use carff_dataset::Image;
 use carff_field::{Field, LATENT_DIM};
@@ -28,7 +28,7 @@ mod tests {
     use super::*;
     use carff_field::FieldConfig;
 
-    /// The picture has the region's shape, and each pixel is what the field says at its middle.
+    /// The image has the region's shape, and each pixel is what the field says at its middle.
     #[test]
     fn pixels_are_the_fields_densities() {
         let bounds_m = [[-4.0, -2.0, 0.0], [4.0, 2.0, 3.0]];

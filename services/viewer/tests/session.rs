@@ -15,7 +15,7 @@ fn session() -> Session {
     Session::new(models())
 }
 
-/// Toggling a picture that shows all gives a scene in which probing finds what really stands there.
+/// Toggling an image that shows all gives a scene in which probing finds what really stands there.
 #[test]
 fn toggle_shows_what_the_picture_shows() {
     let mut session = session();
@@ -202,7 +202,7 @@ fn follows_a_running_graph() {
     }
 }
 
-/// Pictures are found by state and view, leafing passes over views that show too much, and a data set of another
+/// Images are found by state and view, leafing passes over views that show too much, and a dataset of another
 /// scenario is refused with the key that differs.
 #[test]
 fn albums_are_leafed_through() {

@@ -13,13 +13,13 @@ use egui_kittest::kittest::{NodeT, Queryable};
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-/// Longest wait for a picture: no limit on how long drawing may take, but on a test that hangs.
+/// Longest wait for an image: no limit on how long drawing may take, but on a test that hangs.
 const PATIENCE: Duration = Duration::from_secs(300);
 
-/// A window with small pictures; `None`: no picture yet.
+/// A window with small images; `None`: no image yet.
 fn window(view: Option<usize>, folder: &Path) -> Harness<'static, Viewer> {
     let options = Options { threads: 1, folder: folder.to_owned(), theme: ThemePreference::Dark, one_shot: None };
-    let none = Err("No data set: drop a PNG picture here.".to_owned());
+    let none = Err("No dataset: drop a PNG image here.".to_owned());
     let mut viewer = Viewer::new(Session::new(models()), none, None, options, Waker::default()).unwrap();
     viewer.finest_px = 96;
     if let Some(view) = view {
@@ -81,7 +81,7 @@ fn buttons_look_ahead() {
     assert!(harness.state().session.moment().unwrap().forecast.is_none());
 }
 
-/// A small picture that is pressed shows its scene; so does a state of the belief; marks follow what is shown.
+/// A small image that is pressed shows its scene; so does a state of the belief; marks follow what is shown.
 #[test]
 fn scenes_are_chosen() {
     let folder = tempfile::tempdir().unwrap();
@@ -167,7 +167,7 @@ fn the_mouse_moves_the_camera() {
     assert_eq!(harness.state().camera, before);
 }
 
-/// The scene is drawn in the end, and can be saved; a window with no picture says what to do, and its functions wait.
+/// The scene is drawn in the end, and can be saved; a window with no image says what to do, and its functions wait.
 #[test]
 fn scenes_are_drawn_and_saved() {
     let folder = tempfile::tempdir().unwrap();
@@ -184,5 +184,5 @@ fn scenes_are_drawn_and_saved() {
     for label in ["Toggle", "Predict", "Probe", "Probe and predict"] {
         assert!(harness.get_by_label(label).accesskit_node().is_disabled(), "{label}");
     }
-    assert!(harness.query_by_label("No data set: drop a PNG picture here.").is_some());
+    assert!(harness.query_by_label("No dataset: drop a PNG image here.").is_some());
 }

@@ -49,8 +49,8 @@ pub enum CheckpointError {
         /// What is wrong.
         what: String,
     },
-    /// The checkpoint was trained on another scenario than the data set shows.
-    #[error("checkpoint {path} is of another scenario: `{key}` is {trained} there, and {given} in the data set")]
+    /// The checkpoint was trained on another scenario than the dataset shows.
+    #[error("checkpoint {path} is of another scenario: `{key}` is {trained} there, and {given} in the dataset")]
     Scenario {
         /// Which manifest.
         path: PathBuf,
@@ -58,7 +58,7 @@ pub enum CheckpointError {
         key: &'static str,
         /// What the checkpoint says.
         trained: String,
-        /// What the data set says.
+        /// What the dataset says.
         given: String,
     },
     /// A part is not there yet: training has not come so far.
@@ -114,7 +114,7 @@ pub struct ScenarioIdentity {
 }
 
 impl ScenarioIdentity {
-    /// The identity of a data set's scenario.
+    /// The identity of a dataset's scenario.
     pub fn of(scenario: &ScenarioInfo, poses: usize) -> Self {
         Self {
             name: scenario.name.clone(),
@@ -259,7 +259,7 @@ impl Manifest {
         std::fs::rename(&partial, &path).map_err(file)
     }
 
-    /// Checks that a data set shows the scenario that was trained; the error names the key that differs.
+    /// Checks that a dataset shows the scenario that was trained; the error names the key that differs.
     pub fn check_scenario(&self, dir: &Path, given: &ScenarioIdentity) -> Result<(), CheckpointError> {
         let trained = &self.scenario;
         let show = |key, a: &dyn std::fmt::Debug, b: &dyn std::fmt::Debug| CheckpointError::Scenario {

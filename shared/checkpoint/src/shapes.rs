@@ -41,7 +41,7 @@ pub struct BackboneConfig {
     /// Whether the weights stay as they were loaded. A small convolutional network from scratch must learn.
     #[serde(default = "yes")]
     pub frozen: bool,
-    /// Side in pixels that pictures are resized to before they enter.
+    /// Side in pixels that images are resized to before they enter.
     #[serde(default = "default_input_px")]
     pub input_px: i64,
     /// Size of a vision transformer; ignored by the others.
@@ -104,8 +104,8 @@ pub struct DecoderConfig {
     pub hidden: i64,
     /// Channels at 8x8; halved at most once on the way up.
     pub channels: i64,
-    /// Whether it is told the pose. Without, one latent has one picture, and the encoder must put the pose into it; the
-    /// residual over the pose's mean picture would tell the pose too (`vae.residual = false`).
+    /// Whether it is told the pose. Without, one latent has one image, and the encoder must put the pose into it; the
+    /// residual over the pose's mean image would tell the pose too (`vae.residual = false`).
     pub pose_condition: bool,
 }
 

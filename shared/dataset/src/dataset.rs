@@ -15,25 +15,25 @@ use crate::{seen, transforms};
 pub const MAX_TRANSFORMS_BYTES: u64 = 1 << 29;
 /// Most frames in one set.
 pub const MAX_FRAMES: usize = 1_000_000;
-/// Largest width or height of a picture, pixels.
+/// Largest width or height of an image, pixels.
 pub const MAX_IMAGE_SIDE_PX: u32 = 8192;
 
-/// One picture of the set.
+/// One image of the set.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Frame {
-    /// The picture, an absolute path or one relative to the working directory (the set's folder is part of it).
+    /// The image, an absolute path or one relative to the working directory (the set's folder is part of it).
     pub image_path: PathBuf,
     /// Intrinsics and pose.
     pub camera: PinholeCamera,
     /// State index: branch * timestamps + timestamp.
     pub state: Option<usize>,
-    /// Which course of events.
+    /// Which branch.
     pub branch: Option<usize>,
     /// Which step of it.
     pub timestamp: Option<usize>,
     /// Index of the fixed camera pose.
     pub view: Option<usize>,
-    /// How much of the actor the picture shows; where the set does not say, what [`Dataset::open`] could tell. `None`
+    /// How much of the actor the image shows; where the set does not say, what [`Dataset::open`] could tell. `None`
     /// means unknown.
     pub observability: Option<Observability>,
     /// Visible pixels over pixels that would be covered with nothing in between, 0..=1.
@@ -77,7 +77,7 @@ pub struct Candidate {
 /// One state: a branch at a timestamp, and what stands where.
 #[derive(Clone, Debug, PartialEq)]
 pub struct StateInfo {
-    /// Which course of events.
+    /// Which branch.
     pub branch: usize,
     /// Which step of it.
     pub timestamp: usize,
@@ -129,7 +129,7 @@ impl ScenarioInfo {
     }
 }
 
-/// A posed image set, described; pictures are loaded on demand.
+/// A posed image set, described; images are loaded on demand.
 #[derive(Clone, Debug)]
 pub struct Dataset {
     dir: PathBuf,
@@ -141,8 +141,8 @@ pub struct Dataset {
 
 impl Dataset {
     /// Reads and checks `transforms.json`, or else `transforms_train.json`, `transforms_val.json` and
-    /// `transforms_test.json` together. Pictures are looked for but not decoded, unless the set has several branches and
-    /// no frame says its observability: then the pictures tell it, and a warning says so.
+    /// `transforms_test.json` together. Images are looked for but not decoded, unless the set has several branches and
+    /// no frame says its observability: then the images tell it, and a warning says so.
     pub fn open(dir: &Path) -> Result<Self, DatasetError> {
         let read = transforms::read(dir, transforms::Pictures::Png)?;
         let view_count = read.frames.iter().filter_map(|f| f.view).max().map_or(0, |v| v + 1);
@@ -160,7 +160,7 @@ impl Dataset {
                 frame.observability = observability;
             }
             set.warnings.push(
-                "no frame says its `observability`, so the pictures tell it: `none` where each other branch looks the same \
+                "no frame says its `observability`, so the images tell it: `none` where each other branch looks the same \
                  at that timestamp, `full` where none does, else `partial`"
                     .into(),
             );
@@ -206,7 +206,7 @@ impl Dataset {
         &self.warnings
     }
 
-    /// Decodes one picture and checks that its size is the one its intrinsics say.
+    /// Decodes one image and checks that its size is the one its intrinsics say.
     pub fn load_image(&self, frame_index: usize) -> Result<Image, DatasetError> {
         let frame = self
             .frames
@@ -226,7 +226,7 @@ impl Dataset {
         Ok(image)
     }
 
-    /// Decodes all pictures, in parallel, in the order of the frames. The first bad one is the error.
+    /// Decodes all images, in parallel, in the order of the frames. The first bad one is the error.
     pub fn load_all_images(&self) -> Result<Vec<Image>, DatasetError> {
         let images: Vec<_> = (0..self.frames.len()).into_par_iter().map(|i| self.load_image(i)).collect();
         images.into_iter().collect()

@@ -1,4 +1,4 @@
-//! Drives through a set: a hidden course of events, seen from one pose, timestamp by timestamp.
+//! Drives through a set: a hidden branch, seen from one pose, timestamp by timestamp.
 //!
 //! A trial of the planner is an input view with one right answer (section 4.3 of the paper). Hazard: a hazard branch,
 //! and nothing seen tells so: the actor is not visible, or the state is one that a clear branch has as well. Clear:
@@ -38,7 +38,7 @@ impl DriveKind {
 pub struct EligibleInput {
     /// Camera pose.
     pub view: usize,
-    /// Course of events.
+    /// Branch.
     pub branch: usize,
     /// Step of it, at most the last but one.
     pub timestamp: usize,
@@ -51,7 +51,7 @@ pub struct EligibleInput {
 pub struct Drive {
     /// Camera pose.
     pub view: usize,
-    /// Hidden course of events.
+    /// Hidden branch.
     pub branch: usize,
     /// The right answer; none where no pose of the set has one.
     pub kind: Option<DriveKind>,
@@ -64,12 +64,12 @@ pub struct Drive {
 pub enum DrivesError {
     /// The set has no scenario.
     #[error(
-        "this data set has no `scenario`: there is nothing to drive through; give one that has, or a folder source"
+        "this dataset has no `scenario`: there is nothing to drive through; give one that has, or a folder source"
     )]
     NoScenario,
     /// No pose can be driven.
     #[error(
-        "none of the {views} poses has a picture of every timestamp of a branch: give the missing frames, or a folder source"
+        "none of the {views} poses has an image of every timestamp of a branch: give the missing frames, or a folder source"
     )]
     NoneWhole {
         /// How many poses were looked at.

@@ -1,4 +1,4 @@
-//! Which states look the same from a view, and how accurate a guess from a picture can be at best.
+//! Which states look the same from a view, and how accurate a guess from an image can be at best.
 
 use rayon::prelude::*;
 
@@ -18,7 +18,7 @@ pub struct Equivalence {
     same: Vec<bool>,
 }
 
-/// Whether two pictures are the same to the eye: same size, and at most [`MAX_DIFFERENT_PIXELS`] pixels differ by
+/// Whether two images are the same to the eye: same size, and at most [`MAX_DIFFERENT_PIXELS`] pixels differ by
 /// more than [`PIXEL_TOLERANCE`] in any channel.
 pub fn looks_same(a: &Image, b: &Image) -> bool {
     (a.width_px, a.height_px) == (b.width_px, b.height_px)
@@ -34,7 +34,7 @@ fn different_pixels<'a>(a: &'a Image, b: &'a Image) -> impl Iterator<Item = usiz
 
 impl Equivalence {
     /// Compares all pairs of states in each view. `images` are those of [`Dataset::load_all_images`]. A state with no
-    /// picture in a view is the same only as itself.
+    /// image in a view is the same only as itself.
     pub fn from_dataset(dataset: &Dataset, images: &[Image]) -> Self {
         let (views, states) = (dataset.view_count(), dataset.state_count());
         let mut pictures = vec![vec![None; states]; views];
@@ -88,7 +88,7 @@ impl Equivalence {
         self.alike(view, state).count().max(1)
     }
 
-    /// The best mean accuracy of naming the state from a picture, over the given (view, state) pairs: the mean of
+    /// The best mean accuracy of naming the state from an image, over the given (view, state) pairs: the mean of
     /// 1 / class size. `None` when there are no pairs.
     pub fn ceiling(&self, pairs: impl IntoIterator<Item = (usize, usize)>) -> Option<f64> {
         let (mut sum, mut count) = (0.0, 0_usize);

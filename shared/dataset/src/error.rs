@@ -6,7 +6,7 @@ use std::path::PathBuf;
 #[derive(Debug, thiserror::Error)]
 pub enum DatasetError {
     /// The folder does not exist or is a file.
-    #[error("{}: not a folder; a data set is a folder with transforms.json and its pictures", path.display())]
+    #[error("{}: not a folder; a dataset is a folder with transforms.json and its images", path.display())]
     NotAFolder {
         /// The folder asked for.
         path: PathBuf,
@@ -58,10 +58,10 @@ pub enum DatasetError {
         /// What is wrong and what is allowed.
         problem: String,
     },
-    /// A picture that is missing, broken, of another type or of another size than its intrinsics say.
+    /// An image that is missing, broken, of another type or of another size than its intrinsics say.
     #[error("{}: {problem}", path.display())]
     Image {
-        /// The picture.
+        /// The image.
         path: PathBuf,
         /// What is wrong and what is allowed.
         problem: String,

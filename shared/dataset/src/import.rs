@@ -1,6 +1,6 @@
 //! Import of plain sets, as nerfstudio and instant-ngp write them, into sets of one state.
 //!
-//! Pictures become opaque, undistorted PNG files no larger than asked for; cameras go with them. What such a set does
+//! Images become opaque, undistorted PNG files no larger than asked for; cameras go with them. What such a set does
 //! not say is where its scene lies: a box is put around the point that the cameras look at, unless one is given.
 
 use std::path::Path;
@@ -18,7 +18,7 @@ use crate::writer::{DatasetWriter, FrameRecord};
 /// How to import.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ImportOptions {
-    /// Longest side of a picture that is written, pixels; larger ones are scaled down.
+    /// Longest side of an image that is written, pixels; larger ones are scaled down.
     pub max_side_px: u32,
     /// What lies behind transparent pixels, sRGB.
     pub background: [u8; 3],
@@ -35,14 +35,14 @@ impl Default for ImportOptions {
 /// What was imported.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Imported {
-    /// Pictures written.
+    /// Images written.
     pub frames: usize,
     /// The box that matters: given, or else a cube about the point that the cameras' lines of sight pass nearest to, with
     /// half the cameras' median distance from it on each side.
     pub bounds: [[f64; 3]; 2],
-    /// How many pictures were undistorted.
+    /// How many images were undistorted.
     pub undistorted: usize,
-    /// How many pictures were scaled down.
+    /// How many images were scaled down.
     pub scaled: usize,
 }
 
@@ -89,7 +89,7 @@ pub fn import(from: &Path, out: &Path, options: &ImportOptions) -> Result<Import
     Ok(Imported { frames: records.len(), bounds, undistorted, scaled })
 }
 
-/// The record, whether the picture was distorted, and whether it was too large.
+/// The record, whether the image was distorted, and whether it was too large.
 fn write_frame(
     writer: &DatasetWriter,
     view: usize,
@@ -100,7 +100,7 @@ fn write_frame(
     let mut image = load_any(&frame.image_path, options.background)?;
     let mut camera = frame.camera;
     if (image.width_px, image.height_px) != (camera.width_px, camera.height_px) {
-        // Pictures that were scaled after their intrinsics were written down: the same form in another size.
+        // Images that were scaled after their intrinsics were written down: the same form in another size.
         let across = u64::from(image.width_px) * u64::from(camera.height_px);
         let down = u64::from(image.height_px) * u64::from(camera.width_px);
         if across.abs_diff(down) > u64::from(camera.width_px.max(camera.height_px)) {
@@ -136,12 +136,12 @@ fn scaled_down(image: &Image, width_px: u32, height_px: u32) -> Image {
             let rgb = resize(&buffer, width_px, height_px, FilterType::Triangle).into_raw();
             Image { width_px, height_px, rgb }
         }
-        // A picture's bytes always fit its size.
+        // An image's bytes always fit its size.
         None => image.clone(),
     }
 }
 
-/// The picture that a pinhole camera of the same intrinsics would have taken.
+/// The image that a pinhole camera of the same intrinsics would have taken.
 fn undistort(image: &Image, camera: &PinholeCamera, [k1, k2, k3, k4, p1, p2]: &Distortion, beyond: [u8; 3]) -> Image {
     let mut result = Image::filled(image.width_px, image.height_px, beyond);
     let (w, h) = (image.width_px as usize, image.height_px as usize);

@@ -1,7 +1,7 @@
 //! Posed image sets: reading, writing, checking, splitting.
 //!
 //! A set is a folder with `transforms.json` (the form of instant-ngp and nerfstudio, plus a few keys that say which
-//! course of events and which time step a picture shows) and its PNG pictures. No model and no rendering lives here.
+//! branch and which time step an image shows) and its PNG images. No model and no rendering lives here.
 //!
 //! ```no_run
 //! use carff_dataset::{Dataset, Equivalence, PoseSplit};

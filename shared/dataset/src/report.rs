@@ -8,11 +8,11 @@ use crate::equivalence::Equivalence;
 use crate::image::Image;
 use carff_messages::Observability;
 
-/// A mean difference above this, of 255, between pictures that should look the same is a leak: nobody can see it,
+/// A mean difference above this, of 255, between images that should look the same is a leak: nobody can see it,
 /// but a network can.
 const LEAK_LIMIT: f64 = 0.1;
 
-/// Pictures of one view at one timestamp in two branches, in neither of which the actor's place can be seen.
+/// Images of one view at one timestamp in two branches, in neither of which the actor's place can be seen.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct HiddenPair {
     /// Camera pose.
@@ -32,28 +32,28 @@ pub struct HiddenPair {
 pub struct DatasetReport {
     /// Where the set lies.
     pub dir: String,
-    /// Number of pictures.
+    /// Number of images.
     pub frames: usize,
     /// Number of camera poses.
     pub views: usize,
-    /// Pictures of each size (width, height), pixels.
+    /// Images of each size (width, height), pixels.
     pub image_sizes: BTreeMap<(u32, u32), usize>,
     /// Poses of each kind.
     pub view_kinds: BTreeMap<String, usize>,
     /// The scenario.
     pub scenario: Option<ScenarioInfo>,
-    /// Pictures per (branch, timestamp), by observability: full, partial, none, unknown.
+    /// Images per (branch, timestamp), by observability: full, partial, none, unknown.
     pub counts: BTreeMap<(usize, usize), [usize; 4]>,
-    /// PSNR of the mean picture of each pose against the pictures, errors pooled over all of them, decibels. It is
-    /// what a model scores that knows the pose and nothing else. `None` when no pose has two different pictures.
+    /// PSNR of the mean image of each pose against the images, errors pooled over all of them, decibels. It is
+    /// what a model scores that knows the pose and nothing else. `None` when no pose has two different images.
     pub pose_mean_psnr_db: Option<f64>,
     /// The same for the bird's-eye view alone.
     pub bev_pose_mean_psnr_db: Option<f64>,
-    /// Best possible accuracy of naming the state: over all pictures, and by observability.
+    /// Best possible accuracy of naming the state: over all images, and by observability.
     pub ceiling: Option<f64>,
     /// See `ceiling`; full, partial, none.
     pub ceiling_by_observability: [Option<f64>; 3],
-    /// Every pair of pictures that should look the same because the actor's place is hidden.
+    /// Every pair of images that should look the same because the actor's place is hidden.
     pub hidden_pairs: Vec<HiddenPair>,
     /// What looks odd.
     pub warnings: Vec<String>,
@@ -188,7 +188,7 @@ impl fmt::Display for DatasetReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let decibels = |v: Option<f64>| v.map_or_else(|| "-".to_owned(), |v| format!("{v:.2} dB"));
         let percent = |v: Option<f64>| v.map_or_else(|| "-".to_owned(), |v| format!("{:.1} %", v * 100.0));
-        writeln!(f, "Data set    {}", self.dir)?;
+        writeln!(f, "Dataset    {}", self.dir)?;
         let sizes: Vec<String> = self.image_sizes.iter().map(|((w, h), n)| format!("{n} of {w}x{h} px")).collect();
         writeln!(f, "Pictures    {} ({})", self.frames, sizes.join(", "))?;
         let kinds: Vec<String> = self.view_kinds.iter().map(|(kind, n)| format!("{n} {kind}")).collect();
@@ -223,7 +223,7 @@ impl fmt::Display for DatasetReport {
             let name = scenario.branches.get(branch).map_or("?", String::as_str);
             writeln!(f, "{name:width$}  {timestamp:>4} {:>6} {:>8} {:>6} {:>8}", row[0], row[1], row[2], row[3])?;
         }
-        writeln!(f, "\nMean picture of each pose: {}", decibels(self.pose_mean_psnr_db))?;
+        writeln!(f, "\nMean image of each pose: {}", decibels(self.pose_mean_psnr_db))?;
         writeln!(f, "  in the bird's-eye view:  {}", decibels(self.bev_pose_mean_psnr_db))?;
         writeln!(f, "Best possible state accuracy: {}", percent(self.ceiling))?;
         for (o, ceiling) in Observability::ALL.into_iter().zip(self.ceiling_by_observability) {
@@ -262,7 +262,7 @@ pub struct SheetOptions {
     pub columns: usize,
     /// States, one a row.
     pub max_rows: usize,
-    /// Space between pictures, pixels.
+    /// Space between images, pixels.
     pub gap_px: u32,
 }
 
@@ -276,8 +276,8 @@ impl Default for SheetOptions {
 const LEGEND: [[u8; 3]; 4] = [[40, 160, 60], [230, 190, 30], [205, 50, 45], [128, 128, 128]];
 const BORDER_PX: u32 = 2;
 
-/// One picture of the whole set: a row per state, a column per view, the views spread over kinds of cameras (the
-/// bird's-eye view first). Each picture's border tells its observability: green full, yellow partial, red none, grey
+/// One image of the whole set: a row per state, a column per view, the views spread over kinds of cameras (the
+/// bird's-eye view first). Each image's border tells its observability: green full, yellow partial, red none, grey
 /// unknown. A set without views is shown in the order of its frames.
 pub fn contact_sheet(dataset: &Dataset, images: &[Image], options: SheetOptions) -> Image {
     let columns = options.columns.max(1);

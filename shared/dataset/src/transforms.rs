@@ -18,7 +18,7 @@ const MAX_TIMESTAMPS: usize = 4096;
 /// Poses of one view may differ by this much among states (metres, or entries of the rotation).
 const POSE_TOLERANCE: f64 = 1e-4;
 
-/// Which pictures frames may name.
+/// Which images frames may name.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Pictures {
     /// PNG files inside the set's folder: what this program works on.
@@ -231,7 +231,7 @@ fn warn_about_distortion(path: &Path, top: &Map<String, Value>, warnings: &mut V
     for key in ["k1", "k2", "k3", "k4", "p1", "p2"] {
         if top.get(key).and_then(Value::as_f64).is_some_and(|v| v.abs() > 1e-9) {
             warnings.push(format!(
-                "{}: lens distortion (key `{key}`) is ignored; undistort the pictures first",
+                "{}: lens distortion (key `{key}`) is ignored; undistort the images first",
                 path.display()
             ));
         }
@@ -291,7 +291,7 @@ fn read_image_path(
     let name = place
         .text(frame, "file_path")?
         .filter(|name| !name.is_empty())
-        .ok_or_else(|| place.error("file_path", "is missing; it is the picture's path relative to the set's folder"))?;
+        .ok_or_else(|| place.error("file_path", "is missing; it is the image's path relative to the set's folder"))?;
     let mut relative = PathBuf::new();
     for component in Path::new(name).components() {
         match component {
@@ -311,7 +311,7 @@ fn read_image_path(
         Some(extension) => {
             return Err(place.error(
                 "file_path",
-                format!("is a .{extension} file; only .png pictures are read (`carff dataset import` also takes .jpg)"),
+                format!("is a .{extension} file; only .png images are read (`carff dataset import` also takes .jpg)"),
             ));
         }
     }

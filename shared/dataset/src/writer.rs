@@ -1,4 +1,4 @@
-//! Writing of sets: pictures first, `transforms.json` last, so that an interrupted run never looks like a whole set.
+//! Writing of sets: images first, `transforms.json` last, so that an interrupted run never looks like a whole set.
 //! Until then, notes may say what is finished, so that the next run goes on from there.
 
 use std::fs::{self, File, OpenOptions};
@@ -21,14 +21,14 @@ const MARKER: &str = ".carff-dataset";
 /// What is finished of a set that is not: first a line that says which set it is, then a line a note.
 const NOTES: &str = "unfinished.jsonl";
 
-/// What the transforms file says about one picture.
+/// What the transforms file says about one image.
 #[derive(Clone, Debug, PartialEq)]
 pub struct FrameRecord {
     /// Path relative to the set's folder, as in `images/b0_t0_v000.png`.
     pub file_path: String,
     /// Intrinsics and pose.
     pub camera: PinholeCamera,
-    /// Which course of events, and which step of it.
+    /// Which branch, and which step of it.
     pub branch_and_timestamp: Option<(usize, usize)>,
     /// Index of the fixed camera pose.
     pub view: Option<usize>,
@@ -40,14 +40,14 @@ pub struct FrameRecord {
     pub actor_px: Option<u32>,
     /// Kind of camera.
     pub view_kind: Option<String>,
-    /// Depth picture beside it (16-bit grey PNG: millimetres along the ray, 0 where nothing is hit or beyond 65.535 m).
+    /// Depth image beside it (16-bit grey PNG: millimetres along the ray, 0 where nothing is hit or beyond 65.535 m).
     pub depth_file_path: Option<String>,
     /// Actor mask beside it (8-bit grey PNG: 255 where the pixel shows the actor).
     pub mask_file_path: Option<String>,
 }
 
 impl FrameRecord {
-    /// A record with nothing but the picture's path and camera.
+    /// A record with nothing but the image's path and camera.
     pub fn new(file_path: impl Into<String>, camera: PinholeCamera) -> Self {
         Self {
             file_path: file_path.into(),
@@ -141,7 +141,7 @@ impl DatasetWriter {
         Ok(path)
     }
 
-    /// Writes a picture; `file_path` is relative to the set's folder.
+    /// Writes an image; `file_path` is relative to the set's folder.
     pub fn write_image(&self, file_path: &str, image: &Image) -> Result<(), DatasetError> {
         image.save_png(&self.place(file_path)?)
     }

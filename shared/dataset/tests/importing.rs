@@ -23,7 +23,7 @@ fn put(dir: &Path, name: &str, set: &Value) {
 }
 
 /// The layout of instant-ngp and of the `NeRF` authors' synthetic scenes: an angle for a focal length, names without
-/// extension, files for each split, transparent pictures.
+/// extension, files for each split, transparent images.
 #[test]
 fn instant_ngp_layout() {
     let (from, to) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
@@ -72,7 +72,7 @@ fn instant_ngp_layout() {
     assert!(error.contains("need not be imported"), "{error}");
 }
 
-/// The layout of nerfstudio: intrinsics with lens distortion, JPEG pictures, larger than what is worked on, and smaller
+/// The layout of nerfstudio: intrinsics with lens distortion, JPEG images, larger than what is worked on, and smaller
 /// than their intrinsics say where they were scaled down since.
 #[test]
 fn nerfstudio_layout() {
@@ -97,7 +97,7 @@ fn nerfstudio_layout() {
         &json!({"w": 200, "h": 150, "fl_x": 173.2, "fl_y": 173.0, "cx": 101.0, "cy": 74.0, "k1": -0.1, "k2": 0.01,
             "p1": 0.0, "p2": 0.0, "camera_model": "OPENCV", "frames": frames, "applied_transform": [[1, 0, 0, 0]]}),
     );
-    assert!(Dataset::open(from.path()).is_err(), "JPEG pictures are for imports alone");
+    assert!(Dataset::open(from.path()).is_err(), "JPEG images are for imports alone");
     let bounds = [[-1.0, -1.0, 0.0], [1.0, 1.0, 2.0]];
     let options = ImportOptions { max_side_px: 80, bounds: Some(bounds), ..ImportOptions::default() };
     let out = to.path().join("set");
@@ -114,7 +114,7 @@ fn nerfstudio_layout() {
     }
 }
 
-/// A picture of another form than its intrinsics say is an error that names it; so is a missing one.
+/// An image of another form than its intrinsics say is an error that names it; so is a missing one.
 #[test]
 fn wrong_pictures_are_named() {
     let (from, to) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
@@ -133,5 +133,5 @@ fn wrong_pictures_are_named() {
     assert!(error.contains("missing.jpg") && error.contains("there is no file"), "{error}");
     std::fs::write(from.path().join("broken.jpg"), "no picture").unwrap();
     let error = attempt("broken.jpg");
-    assert!(error.contains("broken.jpg") && error.contains("not a readable picture"), "{error}");
+    assert!(error.contains("broken.jpg") && error.contains("not a readable image"), "{error}");
 }

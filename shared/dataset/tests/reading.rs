@@ -50,7 +50,7 @@ fn whole() -> Value {
     })
 }
 
-/// Writes the description, and a picture wherever a frame names one inside the folder.
+/// Writes the description, and an image wherever a frame names one inside the folder.
 fn put(dir: &Path, name: &str, set: &Value) {
     std::fs::write(dir.join(name), set.to_string()).unwrap();
     for (i, frame) in set["frames"].as_array().into_iter().flatten().enumerate() {
@@ -165,7 +165,7 @@ fn pictures_tell_observability() {
         };
         assert_eq!(frame.observability, Some(wanted), "{frame:?}");
     }
-    assert!(dataset.warnings().iter().any(|w| w.contains("the pictures tell it")), "{:?}", dataset.warnings());
+    assert!(dataset.warnings().iter().any(|w| w.contains("the images tell it")), "{:?}", dataset.warnings());
 
     set["frames"][0]["observability"] = json!("partial");
     let dataset = read(&set);
@@ -173,7 +173,7 @@ fn pictures_tell_observability() {
     assert!(dataset.frames()[1..].iter().all(|f| f.observability.is_none()) && dataset.warnings().is_empty());
 }
 
-/// A plain `NeRF` set: no scenario, an angle in place of a focal length, sizes from the pictures, names without
+/// A plain `NeRF` set: no scenario, an angle in place of a focal length, sizes from the images, names without
 /// extension, three files read as one, and a frame's own intrinsics before those at top level.
 #[test]
 fn plain_set_in_three_files() {
@@ -289,11 +289,11 @@ fn golden_errors() {
         ),
         (
             at("/frames/3/file_path", json!("b.jpg")),
-            "SET/transforms.json: frame 3 (b.jpg): key `file_path`: is a .jpg file; only .png pictures are read (`carff dataset import` also takes .jpg)".into(),
+            "SET/transforms.json: frame 3 (b.jpg): key `file_path`: is a .jpg file; only .png images are read (`carff dataset import` also takes .jpg)".into(),
         ),
         (
             without("/frames/3", "file_path"),
-            "SET/transforms.json: frame 3: key `file_path`: is missing; it is the picture's path relative to the set's folder".into(),
+            "SET/transforms.json: frame 3: key `file_path`: is missing; it is the image's path relative to the set's folder".into(),
         ),
         (without("/frames/3", "transform_matrix"), format!("{f3}key `transform_matrix`: is missing")),
         (
@@ -367,7 +367,7 @@ fn golden_errors() {
     }
 }
 
-/// A folder that is missing or empty, broken JSON (with its line), a missing picture and a picture of another size
+/// A folder that is missing or empty, broken JSON (with its line), a missing image and an image of another size
 /// are told apart.
 #[test]
 fn errors_of_files() {
@@ -375,7 +375,7 @@ fn errors_of_files() {
     let message = |dir: &Path| Dataset::open(dir).unwrap_err().to_string();
     assert!(
         message(&dir.path().join("nowhere"))
-            .ends_with("nowhere: not a folder; a data set is a folder with transforms.json and its pictures")
+            .ends_with("nowhere: not a folder; a dataset is a folder with transforms.json and its images")
     );
     assert!(message(dir.path()).contains("holds none of transforms.json"));
     std::fs::write(dir.path().join("transforms.json"), "{\n  \"w\": 8,\n  oops\n}").unwrap();
@@ -430,7 +430,7 @@ fn written_scenario() -> ScenarioInfo {
     }
 }
 
-/// Writes 2 branches x 1 timestamp x `views` views; pictures come from `paint`.
+/// Writes 2 branches x 1 timestamp x `views` views; images come from `paint`.
 fn write(dir: &Path, views: usize, paint: impl Fn(usize, usize) -> Image) {
     let writer = DatasetWriter::create(dir).unwrap();
     let mut records = Vec::new();
@@ -451,7 +451,7 @@ fn write(dir: &Path, views: usize, paint: impl Fn(usize, usize) -> Image) {
     writer.finish(&records, Some(&written_scenario())).unwrap();
 }
 
-/// What is written is read back: frames, cameras, scenario, pictures.
+/// What is written is read back: frames, cameras, scenario, images.
 #[test]
 fn written_sets_are_read() {
     let dir = tempfile::tempdir().unwrap();
@@ -487,7 +487,7 @@ fn writing_is_all_or_nothing() {
     assert!(DatasetWriter::create(&set).unwrap().write_image("../x.png", &Image::filled(8, 8, [2; 3])).is_err());
 }
 
-/// The report counts, pools errors, computes ceilings, and finds a leak between hidden pictures; without a leak it
+/// The report counts, pools errors, computes ceilings, and finds a leak between hidden images; without a leak it
 /// does not warn.
 #[test]
 fn report_and_leaks() {

@@ -40,9 +40,9 @@ pub enum CameraError {
 /// An ideal pinhole camera at a known pose.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct PinholeCamera {
-    /// Picture width, pixels.
+    /// Image width, pixels.
     pub width_px: u32,
-    /// Picture height, pixels.
+    /// Image height, pixels.
     pub height_px: u32,
     /// Focal length along x, pixels.
     pub fl_x_px: f64,
@@ -97,7 +97,7 @@ impl PinholeCamera {
         [m[0][3], m[1][3], m[2][3]]
     }
 
-    /// The ray through picture coordinates (`x_px`, `y_px`); a pixel's centre is at +0.5.
+    /// The ray through image coordinates (`x_px`, `y_px`); a pixel's centre is at +0.5.
     pub fn ray(&self, x_px: f64, y_px: f64) -> Ray {
         let in_camera = [(x_px - self.cx_px) / self.fl_x_px, -(y_px - self.cy_px) / self.fl_y_px, -1.0];
         let m = &self.world_from_camera;
@@ -112,7 +112,7 @@ impl PinholeCamera {
         }
     }
 
-    /// Where a world point falls in the picture: (x, y) in pixels and the depth along the optical axis in metres;
+    /// Where a world point falls in the image: (x, y) in pixels and the depth along the optical axis in metres;
     /// `None` when it is behind the camera.
     pub fn project(&self, point_m: [f64; 3]) -> Option<([f64; 2], f64)> {
         let m = &self.world_from_camera;
@@ -123,7 +123,7 @@ impl PinholeCamera {
             .then(|| ([self.cx_px + self.fl_x_px * c[0] / depth, self.cy_px - self.fl_y_px * c[1] / depth], depth))
     }
 
-    /// The same camera with a picture of another size.
+    /// The same camera with an image of another size.
     #[must_use]
     pub fn resized(&self, width_px: u32, height_px: u32) -> Self {
         let sx = f64::from(width_px) / f64::from(self.width_px);
@@ -270,7 +270,7 @@ mod tests {
         assert!(depth > 0.0 && depth < 7.0);
     }
 
-    /// Straight down works too, and the picture's up is the given one.
+    /// Straight down works too, and the image's up is the given one.
     #[test]
     fn look_straight_down() {
         let camera = PinholeCamera::look_at([0.0, 0.0, 20.0], [0.0, 0.0, 0.0], [0.0, 1.0, 0.0], 128, 128, 60.0);

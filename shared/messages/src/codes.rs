@@ -51,15 +51,15 @@ macro_rules! codes {
 codes! {
     /// The stages of the graph, in the order in which they start: consumers before what feeds them.
     Stage: u32, "stage" {
-        /// Replays or takes pictures.
+        /// Replays or takes images.
         Camera = 1 "camera",
-        /// Picture to posterior.
+        /// Image to posterior.
         Encoder = 2 "encoder",
         /// Posterior to mixture and samples.
         Forecaster = 3 "forecaster",
         /// Samples to belief over states.
         Prober = 4 "prober",
-        /// Samples to pictures.
+        /// Samples to images.
         Renderer = 5 "renderer",
         /// Belief to action.
         Controller = 6 "controller",
@@ -116,7 +116,7 @@ codes! {
 codes! {
     /// What a forecast was made from.
     ForecastSource: u32, "source" {
-        /// The posterior of a camera picture.
+        /// The posterior of a camera image.
         Observed = 0 "observed",
         /// The posterior of the state that probing resolved.
         Probed = 1 "probed",

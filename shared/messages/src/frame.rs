@@ -42,7 +42,7 @@ impl Intrinsics {
     }
 }
 
-/// Where in a data set a frame comes from: the truth, for reports alone. No stage of the decision path reads it.
+/// Where in a dataset a frame comes from: the truth, for reports alone. No stage of the decision path reads it.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ZeroCopySend)]
 #[type_name("carff.DatasetView.v1")]
@@ -51,7 +51,7 @@ pub struct DatasetView {
     pub known: u32,
     /// Index of the camera pose.
     pub view: i32,
-    /// The hidden course of events.
+    /// The hidden branch.
     pub branch: i32,
     /// Step of it.
     pub timestamp: i32,
@@ -66,7 +66,7 @@ pub struct DatasetView {
 }
 
 impl DatasetView {
-    /// Not from a data set.
+    /// Not from a dataset.
     pub const UNKNOWN: Self = Self {
         known: 0,
         view: -1,

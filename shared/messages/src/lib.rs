@@ -52,9 +52,9 @@ pub const MAX_STATES: usize = 64;
 pub const MAX_PLACES: usize = 48;
 /// Most steps that a forecast looks ahead.
 pub const MAX_HORIZON: u32 = 8;
-/// Largest width or height of a picture, pixels.
+/// Largest width or height of an image, pixels.
 pub const MAX_SIDE_PX: u32 = 4096;
-/// Most bytes that a picture on a topic can have (RGB, 8 bit).
+/// Most bytes that an image on a topic can have (RGB, 8 bit).
 pub const MAX_IMAGE_BYTES: usize = 1 << 24;
 
 /// What every message carries: enough to follow one frame through every stage.

@@ -1,4 +1,4 @@
-//! The pose-conditional VAE's encoder: from one picture to a Gaussian over the scene latent (paper section 3.2).
+//! The pose-conditional VAE's encoder: from one image to a Gaussian over the scene latent (paper section 3.2).
 
 use crate::{
     ModelError,
@@ -85,7 +85,7 @@ impl Encoder {
         }
     }
 
-    /// The shape of one picture's features: channels, height, width.
+    /// The shape of one image's features: channels, height, width.
     pub fn feature_shape(&self) -> [i64; 3] {
         [self.backbone.channels(), self.backbone.grid(), self.backbone.grid()]
     }
@@ -113,7 +113,7 @@ impl Encoder {
         });
     }
 
-    /// The posteriors of pictures `[N, 3, H, W]`.
+    /// The posteriors of images `[N, 3, H, W]`.
     pub fn encode(&self, pictures: &Tensor) -> Vec<Gaussian> {
         tch::no_grad(|| {
             let (mean, log_variance) = self.posterior(&self.features(pictures), 0.0);
@@ -121,7 +121,7 @@ impl Encoder {
         })
     }
 
-    /// The posterior of one picture, `[H, W, 3]` bytes.
+    /// The posterior of one image, `[H, W, 3]` bytes.
     pub fn encode_bytes(&self, picture: &Tensor) -> Option<Gaussian> {
         self.encode(&pictures_from_bytes(&picture.unsqueeze(0))).into_iter().next()
     }

@@ -3,7 +3,7 @@
 //! What lives here: the encoder (backbone and head), the pose-conditional decoder, the mixture density network, and how
 //! weights lie on disk. What never does: training loops, processes, topics.
 //!
-//! Tensors are `f32`, pictures `[N, 3, H, W]` in 0..=1 unless said otherwise.
+//! Tensors are `f32`, images `[N, 3, H, W]` in 0..=1 unless said otherwise.
 
 pub mod adam;
 pub mod allocator;

@@ -15,7 +15,7 @@ pub struct LiveRun {
     pub pid: u32,
     /// The graph file.
     pub graph: PathBuf,
-    /// Folder of the data set.
+    /// Folder of the dataset.
     pub dataset: PathBuf,
     /// Folder of the trained models.
     pub checkpoint: PathBuf,

@@ -15,7 +15,7 @@ pub struct RunRecord {
     pub run_id: u64,
     /// The graph file.
     pub graph: String,
-    /// Folder of the data set.
+    /// Folder of the dataset.
     pub dataset: String,
     /// Folder of the trained models.
     pub checkpoint: String,

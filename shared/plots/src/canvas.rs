@@ -1,4 +1,4 @@
-//! What is drawn on: twice the size of the finished picture, so that lines and letters become smooth when it is halved.
+//! What is drawn on: twice the size of the finished image, so that lines and letters become smooth when it is halved.
 
 use crate::{MAX_SIDE_PX, PlotError};
 use carff_dataset::Image;
@@ -7,9 +7,9 @@ use plotters::prelude::{BitMapBackend, DrawingArea, IntoDrawingArea, RGBColor};
 use plotters::style::{FontDesc, FontFamily, FontStyle, IntoFont, TextStyle, register_font};
 use std::sync::OnceLock;
 
-/// Pixels drawn for one pixel of the finished picture, along each side.
+/// Pixels drawn for one pixel of the finished image, along each side.
 pub const OVERSAMPLING: u32 = 2;
-/// Background of every picture.
+/// Background of every image.
 pub const PAPER: RGBColor = RGBColor(252, 252, 250);
 /// Headings and captions.
 pub const INK: RGBColor = RGBColor(34, 38, 46);
@@ -36,7 +36,7 @@ pub enum Weight {
     Bold,
 }
 
-/// A font of a size in pixels of the finished picture.
+/// A font of a size in pixels of the finished image.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Font {
     /// Size, pixels.
@@ -116,7 +116,7 @@ impl Font {
     }
 }
 
-/// A rectangle in pixels of the finished picture: left, top, width, height.
+/// A rectangle in pixels of the finished image: left, top, width, height.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Area {
     /// Left edge.
@@ -129,7 +129,7 @@ pub struct Area {
     pub height: u32,
 }
 
-/// A picture in the making.
+/// An image in the making.
 pub struct Canvas {
     width_px: u32,
     height_px: u32,
@@ -172,7 +172,7 @@ impl Canvas {
         }
     }
 
-    /// The finished picture.
+    /// The finished image.
     pub fn finish(self) -> Image {
         let row = (self.width_px * OVERSAMPLING) as usize * 3;
         let step = OVERSAMPLING as usize;
@@ -195,7 +195,7 @@ impl Canvas {
 mod tests {
     use super::*;
 
-    /// The rows and columns of a picture that hold anything but paper: `[left, top, right, bottom]`, ends included.
+    /// The rows and columns of an image that hold anything but paper: `[left, top, right, bottom]`, ends included.
     fn inked(image: &Image) -> Option<[u32; 4]> {
         let paper = [PAPER.0, PAPER.1, PAPER.2];
         let inked = (0..image.height_px)

@@ -119,7 +119,7 @@ fn draw(title: &str, panels: &[Panel]) -> Result<Image, PlotError> {
     Ok(canvas.finish())
 }
 
-/// The part of the page within left, top, right, bottom, pixels of the finished picture.
+/// The part of the page within left, top, right, bottom, pixels of the finished image.
 fn shrunk<'a>(area: &Page<'a>, [left, top, right, bottom]: [u32; 4]) -> Page<'a> {
     let [left, top, right, bottom] = [left, top, right, bottom].map(|v| v * OVERSAMPLING);
     area.clone().shrink((left, top), (right - left, bottom - top))
@@ -363,7 +363,7 @@ mod tests {
     }
 
     /// No points, one point, points that are no numbers, not positive on a logarithmic axis, equal, or huge: all make
-    /// a picture.
+    /// an image.
     #[test]
     fn odd_points_are_drawn_or_left_out() {
         let odd = [

@@ -1,4 +1,4 @@
-//! Rows of captioned pictures, one row a drive.
+//! Rows of captioned images, one row a drive.
 
 use crate::canvas::{Area, Canvas, FAINT_INK, Font, INK};
 use crate::{MAX_SIDE_PX, PlotError};
@@ -6,19 +6,19 @@ use carff_dataset::Image;
 use plotters::style::RGBColor;
 use std::path::Path;
 
-/// One row: what it is about, and its pictures from left to right.
+/// One row: what it is about, and its images from left to right.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct StripRow {
-    /// Left of the pictures; the first line stands out.
+    /// Left of the images; the first line stands out.
     pub caption: Vec<String>,
-    /// The pictures.
+    /// The images.
     pub cells: Vec<StripCell>,
 }
 
-/// One picture with what is said below it.
+/// One image with what is said below it.
 #[derive(Clone, Debug, PartialEq)]
 pub struct StripCell {
-    /// The picture; a small one is shown twice as large.
+    /// The image; a small one is shown twice as large.
     pub image: Image,
     /// Below it; the first line stands out.
     pub caption: Vec<String>,
@@ -31,14 +31,14 @@ const TITLE: Font = Font::bold(26.0);
 const SUBTITLE: Font = Font::regular(14.0);
 const CAPTION_HEAD: Font = Font::bold(14.0);
 const CAPTION: Font = Font::regular(13.0);
-/// Width of the text left of the pictures.
+/// Width of the text left of the images.
 const CAPTION_WIDTH: u32 = 230;
-/// Pictures with no side as long as this are shown twice as large.
+/// Images with no side as long as this are shown twice as large.
 const SMALL_SIDE: u32 = 160;
-/// Space between pictures, and between a picture and its frame's outer edge.
+/// Space between images, and between an image and its frame's outer edge.
 const GAP: u32 = 18;
 const FRAME: u32 = 4;
-/// Between a picture and its caption.
+/// Between an image and its caption.
 const CAPTION_GAP: u32 = 9;
 /// Above and below the line between rows.
 const ROW_GAP: u32 = 18;
@@ -107,7 +107,7 @@ struct Line {
     colour: RGBColor,
 }
 
-/// One picture in its place.
+/// One image in its place.
 struct Tile {
     row: usize,
     cell: usize,
@@ -126,7 +126,7 @@ struct Layout {
 impl Layout {
     fn new(title: &str, subtitle: &str, rows: &[StripRow]) -> Result<Self, PlotError> {
         let cells = || rows.iter().flat_map(|r| &r.cells);
-        // All columns are as wide as the widest picture, so that rows can be compared.
+        // All columns are as wide as the widest image, so that rows can be compared.
         let tile_width = cells().map(|c| c.image.width_px * scale(&c.image)).max().unwrap_or(0).max(SMALL_SIDE);
         let columns = rows.iter().map(|r| r.cells.len()).max().unwrap_or(0) as u32;
         let text_width = CAPTION_WIDTH + columns * (GAP + tile_width);
@@ -210,7 +210,7 @@ mod tests {
     }
 
     fn odd_rows() -> Vec<StripRow> {
-        let long = "a caption that is much longer than the picture above it is wide, and so must be broken often";
+        let long = "a caption that is much longer than the image above it is wide, and so must be broken often";
         vec![
             StripRow { caption: vec![long.repeat(12)], cells: vec![cell(8, 200, long), cell(128, 128, long)] },
             StripRow { caption: Vec::new(), cells: vec![cell(300, 20, "short")] },
@@ -223,7 +223,7 @@ mod tests {
         a.x + a.width <= b.x || b.x + b.width <= a.x || a.y + a.height <= b.y || b.y + b.height <= a.y
     }
 
-    /// Whatever sizes and captions are given, no text lies over a picture, its frame or other text, no picture over
+    /// Whatever sizes and captions are given, no text lies over an image, its frame or other text, no image over
     /// another, and all lie within the page.
     #[test]
     fn nothing_overlaps() {
@@ -243,7 +243,7 @@ mod tests {
         }
     }
 
-    /// The file is a PNG of the laid-out size in which every picture stands unchanged: small ones with each pixel
+    /// The file is a PNG of the laid-out size in which every image stands unchanged: small ones with each pixel
     /// twice, large ones as they are, each within its frame.
     #[test]
     fn pictures_are_shown_unchanged() {
@@ -268,7 +268,7 @@ mod tests {
         }
     }
 
-    /// No rows at all is a page with its title; a picture whose bytes do not fit its size is named; too many rows are
+    /// No rows at all is a page with its title; an image whose bytes do not fit its size is named; too many rows are
     /// refused before anything is drawn.
     #[test]
     fn odd_input() {
@@ -279,7 +279,7 @@ mod tests {
         let mut rows = odd_rows();
         rows[3].cells[1].image.rgb.pop();
         let message = filmstrip(&path, "", "", &rows).unwrap_err().to_string();
-        assert!(message.contains("row 3, image 1: 2 bytes do not make a picture of 1x1"), "{message}");
+        assert!(message.contains("row 3, image 1: 2 bytes do not make an image of 1x1"), "{message}");
         let many: Vec<StripRow> = (0..200).flat_map(|_| odd_rows()).collect();
         assert!(matches!(filmstrip(&path, "", "", &many), Err(PlotError::TooLarge { .. })));
         let nowhere = dir.path().join("missing").join("strip.png");

@@ -1,6 +1,6 @@
-//! Pictures for people: training curves and filmstrips, as PNG files.
+//! Images for people: training curves and filmstrips, as PNG files.
 //!
-//! What lives here: layout, axes, text, with a font that is part of the program, so that a picture looks the same on
+//! What lives here: layout, axes, text, with a font that is part of the program, so that an image looks the same on
 //! every machine. What never does: computing what is shown.
 
 mod canvas;
@@ -10,17 +10,17 @@ mod filmstrip;
 pub use curves::{Marks, Panel, Series, curves};
 pub use filmstrip::{StripCell, StripRow, filmstrip};
 
-/// Longest side of a picture that is drawn, pixels.
+/// Longest side of an image that is drawn, pixels.
 pub const MAX_SIDE_PX: u32 = 8192;
 
-/// Why a picture could not be made.
+/// Why an image could not be made.
 #[derive(Debug, thiserror::Error)]
 pub enum PlotError {
     /// The file could not be written.
     #[error(transparent)]
     File(#[from] carff_dataset::DatasetError),
     /// More was given than fits.
-    #[error("a picture of {width_px}x{height_px} pixels is too large, at most {MAX_SIDE_PX} a side: show less at once")]
+    #[error("an image of {width_px}x{height_px} pixels is too large, at most {MAX_SIDE_PX} a side: show less at once")]
     TooLarge {
         /// Width it would have, pixels.
         width_px: u32,
@@ -28,7 +28,7 @@ pub enum PlotError {
         height_px: u32,
     },
     /// An image's bytes are not those of its size.
-    #[error("row {row}, image {cell}: {bytes} bytes do not make a picture of {width_px}x{height_px} pixels")]
+    #[error("row {row}, image {cell}: {bytes} bytes do not make an image of {width_px}x{height_px} pixels")]
     Image {
         /// Row of the filmstrip, from 0.
         row: usize,
@@ -42,6 +42,6 @@ pub enum PlotError {
         height_px: u32,
     },
     /// The drawing library refused.
-    #[error("cannot draw the picture: {0}")]
+    #[error("cannot draw the image: {0}")]
     Drawing(String),
 }

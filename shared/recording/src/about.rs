@@ -18,7 +18,7 @@ pub struct About {
     pub graph: String,
     /// The graph file itself.
     pub graph_text: String,
-    /// Folder of the data set.
+    /// Folder of the dataset.
     pub dataset: String,
     /// Folder of the trained models.
     pub checkpoint: String,

@@ -41,8 +41,8 @@ fn standard<M: Encode>(name: &'static str) -> Channel {
     Channel { name, encoding: M::get_message_encoding(), schema: M::get_schema() }
 }
 
-/// A message on each channel that it is part of, encoded. Pictures come before what describes them: a reader that meets
-/// the description has the picture. `wall_ns` is its time of publication, nanoseconds since 1970.
+/// A message on each channel that it is part of, encoded. Images come before what describes them: a reader that meets
+/// the description has the image. `wall_ns` is its time of publication, nanoseconds since 1970.
 pub fn encode(
     topic: TopicId,
     message: AnyMessage<'_>,

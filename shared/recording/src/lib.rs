@@ -1,8 +1,8 @@
 //! Runs as MCAP files: writing them while a graph runs, reading them back message by message, and the well-known
-//! robotics schemas that other tools know pictures, calibrations and boxes by.
+//! robotics schemas that other tools know images, calibrations and boxes by.
 //!
 //! A recording holds each message's form ([`carff_messages::forms`]) as JSON on the channel of its topic, with its JSON Schema;
-//! besides, for other tools, `camera/image` and `renderer/image` (`foxglove.RawImage`, which also carry the pictures),
+//! besides, for other tools, `camera/image` and `renderer/image` (`foxglove.RawImage`, which also carry the images),
 //! `camera/calibration` (`foxglove.CameraCalibration`), `camera/pose` (`foxglove.FrameTransform`) and `prober/boxes`
 //! (`foxglove.SceneUpdate`), all protobuf. Log times are wall-clock times; the monotonic times are in the forms' headers.
 //! The run, its graph file and its folders are in the metadata record `carff`.

@@ -1,4 +1,4 @@
-//! The well-known robotics schemas: pictures, calibrations, poses, boxes. Shared by recordings and the live bridge.
+//! The well-known robotics schemas: images, calibrations, poses, boxes. Shared by recordings and the live bridge.
 
 use carff_decision::Place;
 use carff_messages::forms::AnyMessage;
@@ -14,7 +14,7 @@ const WORLD: &str = "world";
 /// A message as other tools know it.
 #[derive(Clone, Debug, PartialEq)]
 pub enum StandardMessage {
-    /// A picture.
+    /// An image.
     Image(RawImage),
     /// A camera's intrinsics.
     Calibration(CameraCalibration),

@@ -108,7 +108,7 @@ fn matches(found: &[Entry], frames: impl Iterator<Item = u64>) -> bool {
             .all(|(f, (topic, m))| f.topic == *topic && same(f.message.as_message(), m.as_message()))
 }
 
-/// What was written is read back bit for bit, pictures and all, in order, with what the file says of its run.
+/// What was written is read back bit for bit, images and all, in order, with what the file says of its run.
 #[test]
 fn recordings_are_read_back() {
     let folder = tempfile::tempdir().unwrap();
@@ -238,7 +238,7 @@ fn queues_drop_whole_messages() {
     }
 }
 
-/// Other tools find the picture, the calibration, the pose and the boxes under their well-known names.
+/// Other tools find the image, the calibration, the pose and the boxes under their well-known names.
 #[test]
 fn other_tools_know_the_schemas() {
     let folder = tempfile::tempdir().unwrap();

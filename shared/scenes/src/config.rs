@@ -11,15 +11,15 @@ use toml::Spanned;
 #[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ScenarioConfig {
-    /// Name of the scenario, as it appears in data sets and checkpoints.
+    /// Name of the scenario, as it appears in datasets and checkpoints.
     pub name: String,
     /// Lower and upper corner of the box that matters, metres.
     #[serde(deserialize_with = "box3")]
     pub bounds_m: [[f64; 3]; 2],
-    /// Steps of each course of events, 1 to 64.
+    /// Steps of each branch, 1 to 64.
     #[serde(deserialize_with = "count")]
     pub timestamps: usize,
-    /// Names of the courses of events.
+    /// Names of the branches.
     pub branches: Vec<String>,
     /// Names of the branches in which the hazard action is right.
     #[serde(default)]
@@ -31,7 +31,7 @@ pub struct ScenarioConfig {
     /// What the actions are called.
     #[serde(default)]
     pub actions: ActionsConfig,
-    /// Size and field of view of all pictures.
+    /// Size and field of view of all images.
     #[serde(default)]
     pub picture: PictureConfig,
     /// The sun.
@@ -104,7 +104,7 @@ impl Default for ActionsConfig {
     }
 }
 
-/// Size and field of view of all pictures.
+/// Size and field of view of all images.
 #[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct PictureConfig {
@@ -551,7 +551,7 @@ pub struct ObjectCourseConfig {
 #[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct OrbitConfig {
-    /// Kind of these views, as it appears in data sets.
+    /// Kind of these views, as it appears in datasets.
     pub view_kind: String,
     /// How many, 1 to 10000.
     #[serde(deserialize_with = "many")]
@@ -567,11 +567,11 @@ pub struct OrbitConfig {
     pub elevation_deg: [f64; 2],
 }
 
-/// Cameras high above that look down. The first looks straight down from the middle; the picture's up is +Y.
+/// Cameras high above that look down. The first looks straight down from the middle; the image's up is +Y.
 #[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct OverheadConfig {
-    /// Kind of these views, as it appears in data sets.
+    /// Kind of these views, as it appears in datasets.
     pub view_kind: String,
     /// How many, 1 to 10000.
     #[serde(deserialize_with = "many")]
@@ -591,7 +591,7 @@ pub struct OverheadConfig {
 #[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct DashConfig {
-    /// Kind of these views, as it appears in data sets.
+    /// Kind of these views, as it appears in datasets.
     pub view_kind: String,
     /// Name of the vehicle.
     #[schemars(with = "String")]
@@ -617,7 +617,7 @@ pub struct DashConfig {
 #[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct StreetConfig {
-    /// Kind of these views, as it appears in data sets.
+    /// Kind of these views, as it appears in datasets.
     pub view_kind: String,
     /// How many, 1 to 10000.
     #[serde(deserialize_with = "many")]

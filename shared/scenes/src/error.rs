@@ -47,7 +47,7 @@ pub enum ScenarioError {
         /// Timestamps there are.
         timestamps: usize,
     },
-    /// A camera that cannot take pictures.
+    /// A camera that cannot take images.
     #[error("the camera is not usable: {0}")]
     Camera(#[from] carff_geometry::CameraError),
     /// No place was found for a freely drawn camera.

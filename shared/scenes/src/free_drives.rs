@@ -1,4 +1,4 @@
-//! Free drives: what a moving camera sees, from poses that no data set has.
+//! Free drives: what a moving camera sees, from poses that no dataset has.
 //!
 //! A drive goes through the timestamps of one branch, with so many frames for each. The ego moves all the time: with the
 //! last frame of a timestamp it arrives at that state's place, but for a small deviation to the side, along and in
@@ -8,7 +8,7 @@
 //!
 //! All that is drawn for drive `n` comes from the streams (seed, frame `n`, step `0x6472_7666`, sample `try`): drives can
 //! be made one by one, in any order. A drive is a trial of its kind as [`carff_dataset::ScenarioInfo::trial_kind`] says, which is judged
-//! on pictures of a third of the width and height.
+//! on images of a third of the width and height.
 //!
 //! ```no_run
 //! use carff_scenes::Scenario;
@@ -53,7 +53,7 @@ const SWAY: f64 = 0.012;
 const SWAYS: f64 = 1.5;
 /// How far a camera that is not on the ego drifts in a timestamp, along each axis, metres.
 const DRIFT_M: f64 = 0.4;
-/// Truth is judged on pictures so many times smaller, along each side: it costs up to two of them.
+/// Truth is judged on images so many times smaller, along each side: it costs up to two of them.
 const TRUTH_SHARE: u32 = 3;
 /// Least distance from things in scenarios as large as roads, metres: others are as much smaller as theirs is.
 const ROAD_CLEARANCE_M: f64 = 0.45;
@@ -95,11 +95,11 @@ enum Carrier {
 /// One frame of a drive.
 #[derive(Clone, Debug, PartialEq)]
 pub struct FreeFrame {
-    /// The picture, without sensor noise.
+    /// The image, without sensor noise.
     pub image: Image,
     /// Where it was taken.
     pub camera: PinholeCamera,
-    /// Hidden course of events.
+    /// Hidden branch.
     pub branch: usize,
     /// Step of it.
     pub timestamp: usize,
@@ -110,7 +110,7 @@ pub struct FreeFrame {
 }
 
 impl FreeDrive {
-    /// Hidden course of events.
+    /// Hidden branch.
     pub fn branch(&self) -> usize {
         self.branch
     }
@@ -222,7 +222,7 @@ impl Scenario {
         (0..drive.frame_count()).map(|frame| self.free_frame(drive, frame))
     }
 
-    /// Judged on a smaller picture, as it is a share of pixels.
+    /// Judged on a smaller image, as it is a share of pixels.
     fn free_observability(
         &self,
         placement: &Placement,

@@ -1,4 +1,4 @@
-//! Scenarios as data, the ray tracer that takes their pictures, and free drives through them.
+//! Scenarios as data, the ray tracer that takes their images, and free drives through them.
 //!
 //! A scenario is a TOML file: what stands where, who moves where in which branch, and which cameras look. Nothing
 //! here knows of models, data-set readers or processes.

@@ -1,5 +1,5 @@
 //! Colours and procedural textures. A texture fades out where its detail is finer than the pixel that looks at it, so
-//! that pictures carry no noise at the pixel scale.
+//! that images carry no noise at the pixel scale.
 
 use crate::shapes::Vec3;
 

@@ -21,21 +21,21 @@ use crate::tracer::{Scene, Setting, ray};
 
 /// A view is `full` from this visible fraction on.
 pub const FULL_FRACTION: f64 = 0.75;
-/// A view is `full` from this many visible pixels on (of a picture of 128 x 128; fewer or more in proportion).
+/// A view is `full` from this many visible pixels on (of an image of 128 x 128; fewer or more in proportion).
 pub const FULL_PIXELS: u32 = 12;
 /// A view is `none` up to this visible fraction.
 pub const NONE_FRACTION: f64 = 0.02;
-/// A `none` view's pictures with and without the actor differ by at most this mean, of 255.
+/// A `none` view's images with and without the actor differ by at most this mean, of 255.
 pub const NONE_MEAN_DIFFERENCE: f64 = 0.02;
-/// The unbounded picture, in which hidden pixels are counted, reaches this many widths beyond each edge.
+/// The unbounded image, in which hidden pixels are counted, reaches this many widths beyond each edge.
 const BEYOND: i64 = 3;
 
-/// What to work out besides the picture.
+/// What to work out besides the image.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Detail {
-    /// Picture, depth and object ids.
+    /// Image, depth and object ids.
     Picture,
-    /// Also how much of the actor is seen; costs one more picture where it is hidden.
+    /// Also how much of the actor is seen; costs one more image where it is hidden.
     Observability,
 }
 
@@ -55,7 +55,7 @@ impl Default for RenderOptions {
 /// How much of the actor a view shows.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ActorView {
-    /// Visible pixels over the pixels that it would cover in an unbounded picture with nothing in between, 0..=1.
+    /// Visible pixels over the pixels that it would cover in an unbounded image with nothing in between, 0..=1.
     pub visible_fraction: f32,
     /// Visible pixels; where the actor is absent, those its place would have.
     pub actor_px: u32,
@@ -66,7 +66,7 @@ pub struct ActorView {
 /// One rendered view.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Rendering {
-    /// The picture.
+    /// The image.
     pub image: Image,
     /// Distance along the ray through each pixel's centre, metres, row-major; infinite for the sky.
     pub depth_m: Vec<f32>,
@@ -77,10 +77,10 @@ pub struct Rendering {
     pub actor: Option<ActorView>,
 }
 
-/// What to write besides pictures.
+/// What to write besides images.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Extras {
-    /// Pictures only.
+    /// Images only.
     #[default]
     None,
     /// Also `depth/` (16-bit PNG, millimetres along the ray, 0 for the sky and beyond 65.535 m) and `masks/` (8-bit
@@ -231,7 +231,7 @@ impl Scenario {
         &self.path
     }
 
-    /// Branches, states, boxes and actions, as they are written into data sets.
+    /// Branches, states, boxes and actions, as they are written into datasets.
     pub fn info(&self) -> &ScenarioInfo {
         &self.info
     }
@@ -287,7 +287,7 @@ impl Scenario {
         places(&self.config, &self.placements, vehicle)
     }
 
-    /// The picture of a placement that need not be a state's.
+    /// The image of a placement that need not be a state's.
     pub(crate) fn picture_of(&self, placement: &Placement, camera: &PinholeCamera) -> Image {
         self.scene(placement).image(&self.setting, camera)
     }
@@ -303,7 +303,7 @@ impl Scenario {
         Some(self.actor_view(&mut shots, placement, timestamp)?.observability)
     }
 
-    /// Takes one picture from any camera.
+    /// Takes one image from any camera.
     pub fn render(
         &self,
         branch: usize,
@@ -349,7 +349,7 @@ impl Scenario {
         })
     }
 
-    /// One ray per pixel centre against the actor alone in an unbounded picture, and against everything.
+    /// One ray per pixel centre against the actor alone in an unbounded image, and against everything.
     /// `None` when nothing is dynamic.
     fn actor_view(&self, shots: &mut Shots, placement: &Placement, timestamp: usize) -> Option<ActorView> {
         let camera = shots.camera;
@@ -408,7 +408,7 @@ impl Scenario {
         Some(ActorView { visible_fraction: fraction as f32, actor_px: visible, observability })
     }
 
-    /// Renders every camera in every state into a posed data set, in parallel. `progress` is told how many pictures
+    /// Renders every camera in every state into a posed dataset, in parallel. `progress` is told how many images
     /// of how many are done, from any thread, and may stop the work. `transforms.json` is written last, so a stopped
     /// run is not mistaken for a set; the next one goes on with the cameras that are left.
     pub fn render_dataset(
@@ -467,7 +467,7 @@ impl Scenario {
         format!("{} {} {:016x}", self.info.name, env!("CARGO_PKG_VERSION"), hasher.finish())
     }
 
-    /// What the transforms file says of one camera's pictures, given what they show of the actor, by timestamp, then branch.
+    /// What the transforms file says of one camera's images, given what they show of the actor, by timestamp, then branch.
     fn records(
         &self,
         view: usize,
@@ -519,7 +519,7 @@ fn frame_name(branch: usize, timestamp: usize, view: usize) -> String {
     format!("b{branch}_t{timestamp}_v{view:03}.png")
 }
 
-/// A camera whose pictures are all written, and what they show of the actor, by timestamp, then branch.
+/// A camera whose images are all written, and what they show of the actor, by timestamp, then branch.
 #[derive(Serialize, Deserialize)]
 struct ViewNote {
     view: usize,
@@ -533,7 +533,7 @@ struct Shot {
     object_id: Vec<u16>,
 }
 
-/// The pictures that one camera has taken, by placement: states that are alike share one.
+/// The images that one camera has taken, by placement: states that are alike share one.
 struct Shots<'a> {
     scenario: &'a Scenario,
     camera: &'a PinholeCamera,

@@ -1,5 +1,5 @@
-//! Takes pictures: rays, light, anti-aliasing. Every pixel depends on nothing but the scene and the camera, by fixed
-//! sampling patterns, so pictures are the same bytes whatever the number of threads, and two scenes that differ in a
+//! Takes images: rays, light, anti-aliasing. Every pixel depends on nothing but the scene and the camera, by fixed
+//! sampling patterns, so images are the same bytes whatever the number of threads, and two scenes that differ in a
 //! vehicle give the same bytes wherever neither it nor its shadow is seen.
 
 use carff_dataset::Image;
@@ -253,7 +253,7 @@ impl Scene {
         (colour + (HORIZON - colour) * haze, object)
     }
 
-    /// A picture: RGB alone.
+    /// An image: RGB alone.
     pub fn image(&self, setting: &Setting, camera: &PinholeCamera) -> Image {
         let (w, h) = (camera.width_px as usize, camera.height_px as usize);
         let mut rgb = vec![0_u8; w * h * 3];
@@ -261,7 +261,7 @@ impl Scene {
         Image { width_px: camera.width_px, height_px: camera.height_px, rgb }
     }
 
-    /// A picture: RGB, depth along the ray through each pixel's centre (metres; infinite for the sky), and whose the
+    /// An image: RGB, depth along the ray through each pixel's centre (metres; infinite for the sky), and whose the
     /// first hit there is.
     pub fn picture(&self, setting: &Setting, camera: &PinholeCamera) -> (Image, Vec<f32>, Vec<u16>) {
         let (w, h) = (camera.width_px as usize, camera.height_px as usize);

@@ -1,4 +1,4 @@
-//! Contracts of free drives: smooth, never a pose of a data set, the same whenever asked, and with the truth beside them.
+//! Contracts of free drives: smooth, never a pose of a dataset, the same whenever asked, and with the truth beside them.
 
 #![allow(clippy::unwrap_used)] // The helpers below are parts of tests.
 

@@ -1,4 +1,4 @@
-//! Contracts of scenarios and their pictures: determinism, true geometry, what is hidden, and what mistakes are told.
+//! Contracts of scenarios and their images: determinism, true geometry, what is hidden, and what mistakes are told.
 
 #![allow(clippy::unwrap_used)] // The helpers below are parts of tests.
 
@@ -20,7 +20,7 @@ branches = ["with", "without"]
 hazard_branches = ["with"]
 bev_view = 0
 
-[picture]
+[image]
 width_px = 96
 height_px = 80
 fov_deg = 60.0
@@ -136,11 +136,11 @@ fn half_hidden_is_one_half() {
     assert_eq!((above.visible_fraction, above.observability), (1.0, Observability::Full));
 }
 
-/// What lies outside the picture counts as not visible: a camera that cuts the block's place in two sees half of it.
+/// What lies outside the image counts as not visible: a camera that cuts the block's place in two sees half of it.
 #[test]
 fn outside_the_picture_is_not_visible() {
     let scenario = small();
-    // From +Y, where no wall stands; turned aside by half its field of view, so that x = 0 is the picture's edge.
+    // From +Y, where no wall stands; turned aside by half its field of view, so that x = 0 is the image's edge.
     let turn = 10.0_f64.to_radians();
     let camera =
         PinholeCamera::look_at([0.0, 40.0, 0.5], [40.0 * turn.tan(), 0.0, 0.5], [0.0, 0.0, 1.0], 256, 128, 20.0);
@@ -148,7 +148,7 @@ fn outside_the_picture_is_not_visible() {
     assert!((actor.visible_fraction - 0.5).abs() < 0.05, "{actor:?}");
 }
 
-/// Behind the wall the actor leaves no trace: the pictures with and without it are the same bytes, and the view is
+/// Behind the wall the actor leaves no trace: the images with and without it are the same bytes, and the view is
 /// `none`. It is there, though: from the other side they differ.
 #[test]
 fn hidden_pairs_are_equal() {
@@ -200,7 +200,7 @@ fn colours_are_plausible() {
 }
 
 /// A rendered set is read back with the scenario's states, candidates and cameras; depth and masks lie beside the
-/// pictures and agree with them. A run that is stopped leaves no set.
+/// images and agree with them. A run that is stopped leaves no set.
 #[test]
 fn rendered_sets_are_read() {
     let scenario = small();
@@ -252,7 +252,7 @@ fn an_interrupted_rendering_goes_on() {
         result.map(|()| calls.into_inner())
     };
     assert_eq!(rendered(&straight, Extras::None, usize::MAX).unwrap(), 12);
-    // Three cameras of four pictures: of ten pictures, one camera's are whole.
+    // Three cameras of four images: of ten images, one camera's are whole.
     assert!(rendered(&halting, Extras::None, 10).is_err());
     let notes = halting.join("unfinished.jsonl");
     let whole = std::fs::read_to_string(&notes).unwrap();
@@ -341,7 +341,7 @@ fn golden_errors() {
     assert!(error.starts_with("nowhere.toml: "), "{error}");
 }
 
-/// The shipped scenario loads and is what the paper's data set is: two branches, three timestamps, a hundred poses,
+/// The shipped scenario loads and is what the paper's dataset is: two branches, three timestamps, a hundred poses,
 /// one bird's-eye view straight down at 50 that sees every place of actor and ego. No camera stands inside a box.
 #[test]
 fn the_shipped_scenario() {
@@ -431,7 +431,7 @@ fn every_shipped_scenario_has_seeing_and_blind_views() {
     }
 }
 
-/// Where a course of events is not decided yet at the first timestamp, both branches are one state and one picture
+/// Where a branch is not decided yet at the first timestamp, both branches are one state and one image
 /// there, and two afterwards.
 #[test]
 fn undecided_first_timestamps_look_the_same() {
@@ -463,7 +463,7 @@ name = "objects"
 bounds_m = [[-1.0, -1.0, 0.0], [1.0, 1.0, 1.0]]
 timestamps = 2
 branches = ["there", "gone"]
-picture = { width_px = 64, height_px = 64, fov_deg = 40.0 }
+image = { width_px = 64, height_px = 64, fov_deg = 40.0 }
 ground_surface = "plain"
 ground_colour = "#808080"
 clearance_m = 0.05
@@ -546,7 +546,7 @@ spread_m = 0.0
     let [r, g, b] = below(&picture(1).image, 0.22);
     assert!(b > 60 && r < b / 2 && g < b / 2, "{r} {g} {b}");
 
-    // A view that sees the tail alone is not blind: the dice's picture without the actor lacks the tail too.
+    // A view that sees the tail alone is not blind: the dice's image without the actor lacks the tail too.
     let tail_alone = PinholeCamera::look_at([-0.4, 0.0, 1.0], [-0.4, 0.0, 0.0], [0.0, 1.0, 0.0], 64, 64, 15.0);
     let view = scenario.render(0, 0, &tail_alone, &RenderOptions::default()).unwrap();
     assert_eq!(view.actor.unwrap().actor_px, 0);

@@ -17,7 +17,7 @@ pub struct StageArgs {
     /// Run id: the same for all stages of a run.
     #[arg(long, default_value_t = 0)]
     pub run_id: u64,
-    /// Data set folder, in place of the graph file's.
+    /// Dataset folder, in place of the graph file's.
     #[arg(long)]
     pub dataset: Option<PathBuf>,
     /// Checkpoint folder, in place of the graph file's.

@@ -64,7 +64,7 @@ pub struct StageContext {
     pub graph: GraphConfig,
     /// The arguments.
     pub args: StageArgs,
-    /// Folder of the data set.
+    /// Folder of the dataset.
     pub dataset: PathBuf,
     /// Folder of the trained models.
     pub checkpoint: PathBuf,

@@ -87,7 +87,7 @@ pub enum SendError {
         source: Invalid,
     },
     /// The slice is longer than what the publisher was opened for, or has another size than its description says.
-    #[error("a picture of {found} bytes on `{topic}`, which was opened for at most {max}")]
+    #[error("an image of {found} bytes on `{topic}`, which was opened for at most {max}")]
     Size {
         /// The topic.
         topic: String,

@@ -73,7 +73,7 @@ fn invalid_messages_are_dropped_and_counted() {
     assert_eq!((node.counters().invalid(), node.counters().received()), (3, 1));
 }
 
-/// A picture whose size is not what its description says is refused by the sender and dropped by the receiver.
+/// An image whose size is not what its description says is refused by the sender and dropped by the receiver.
 #[test]
 fn pictures_must_have_the_size_they_claim() {
     let run = TestRun::new();
@@ -204,7 +204,7 @@ fn polled_receivers_need_no_wake_up() {
     assert_eq!(waiter.wait(&[&polled]).unwrap(), Woken::Stopped);
 }
 
-/// A picture that is sent from elsewhere arrives whole; one of another size than its description is refused.
+/// An image that is sent from elsewhere arrives whole; one of another size than its description is refused.
 #[test]
 fn pictures_are_sent_from_elsewhere() {
     let run = TestRun::new();

@@ -19,7 +19,7 @@ fn role() {
     let waiter = Waiter::new(stop.clone());
     let node = Node::open(&run, &role).unwrap();
     match role.as_str() {
-        // Sends a picture for each line on standard input.
+        // Sends an image for each line on standard input.
         "camera" => {
             let mut output = node.image_publisher(&topics::FRAME, BYTES).unwrap();
             println!("ready");
@@ -62,7 +62,7 @@ fn wait_for(lines: &mut impl Iterator<Item = String>, wanted: &str) {
 }
 
 /// Zero copy: the address that the receiver reads lies in a mapping of the publisher's data segment, which the other
-/// process created in shared memory, and a second picture at the same address space is read in place too.
+/// process created in shared memory, and a second image at the same address space is read in place too.
 #[test]
 fn pictures_are_read_in_the_publishers_segment() {
     let run = TestRun::new();
@@ -79,7 +79,7 @@ fn pictures_are_read_in_the_publishers_segment() {
         assert!(picture.bytes().iter().all(|&b| b == i + 1));
         let (first, last) = (picture.bytes().as_ptr() as usize, &raw const picture.bytes()[BYTES - 1] as usize);
         let mapping = mapping_of(first).expect("the address is in a mapping of a file");
-        assert!(mapping.range.contains(&last), "the whole picture lies in it");
+        assert!(mapping.range.contains(&last), "the whole image lies in it");
         assert!(mapping.file.contains(&run.0.shared_memory_prefix()), "{}", mapping.file);
         assert!(mapping.file.contains(".data"), "it is a data segment: {}", mapping.file);
     }

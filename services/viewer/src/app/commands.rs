@@ -5,7 +5,7 @@ use eframe::egui::{InputState, Key, KeyboardShortcut, Modifiers};
 /// What the window can be told to do.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Command {
-    /// The scene of the chosen picture's posterior.
+    /// The scene of the chosen image's posterior.
     Toggle,
     /// Forecast one step.
     Predict,
@@ -21,9 +21,9 @@ pub enum Command {
     SceneBefore,
     /// Show the scene after this one.
     SceneAfter,
-    /// Take the picture before this one.
+    /// Take the image before this one.
     PictureBefore,
-    /// Take the picture after this one.
+    /// Take the image after this one.
     PictureAfter,
     /// Follow the running graph, or hold its frame.
     Follow,
@@ -31,15 +31,15 @@ pub enum Command {
     CameraCorner,
     /// Look straight down.
     CameraAbove,
-    /// Look from where the picture was taken.
+    /// Look from where the image was taken.
     CameraPicture,
     /// Show or hide the boxes that are probed.
     Boxes,
     /// Show or hide the densities found in them.
     Densities,
-    /// Save the window as a picture.
+    /// Save the window as an image.
     Screenshot,
-    /// Save the scene as a picture.
+    /// Save the scene as an image.
     SaveView,
     /// Dark or light.
     Theme,
@@ -58,7 +58,7 @@ impl Command {
         (
             "Look ahead",
             &[
-                (Self::Toggle, Modifiers::NONE, Key::T, "Toggle: the scene that the picture stands for"),
+                (Self::Toggle, Modifiers::NONE, Key::T, "Toggle: the scene that the image stands for"),
                 (Self::Predict, Modifiers::NONE, Key::P, "Predict: forecast one step, or draw it again"),
                 (Self::Probe, Modifiers::NONE, Key::O, "Probe: what stands where, and the belief"),
                 (Self::ProbeAndPredict, Modifiers::NONE, Key::N, "Probe and predict: go on from the shown scene"),
@@ -81,7 +81,7 @@ impl Command {
             &[
                 (Self::CameraCorner, Modifiers::NONE, Key::Num1, "Look from over a corner"),
                 (Self::CameraAbove, Modifiers::NONE, Key::Num2, "Look straight down"),
-                (Self::CameraPicture, Modifiers::NONE, Key::Num3, "Look from where the picture was taken"),
+                (Self::CameraPicture, Modifiers::NONE, Key::Num3, "Look from where the image was taken"),
                 (Self::Boxes, Modifiers::NONE, Key::B, "Boxes that are probed"),
                 (Self::Densities, Modifiers::NONE, Key::D, "Densities found in them"),
             ],

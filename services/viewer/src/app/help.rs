@@ -5,9 +5,9 @@ use eframe::egui::{Align2, Context, Grid, Window};
 
 const MOUSE: [(&str, &str); 4] = [
     ("drag", "turn about the scene"),
-    ("right drag, Shift+drag", "move along the picture"),
+    ("right drag, Shift+drag", "move along the image"),
     ("wheel, pinch", "nearer, farther"),
-    ("drop a PNG file", "toggle that picture"),
+    ("drop a PNG file", "toggle that image"),
 ];
 
 /// Shows it; `is_open` becomes false when it is closed.

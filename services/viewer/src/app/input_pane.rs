@@ -1,4 +1,4 @@
-//! The pane on the left: the picture that all rests on, how to choose it, what the encoder makes of it, and how to
+//! The pane on the left: the image that all rests on, how to choose it, what the encoder makes of it, and how to
 //! look ahead from it.
 
 use super::{Choice, Command, Viewer, theme};
@@ -38,7 +38,7 @@ impl Viewer {
             let (rect, _) = ui.allocate_exact_size(vec2(width, width * 0.75), Sense::hover());
             ui.painter().rect_filled(rect, 8.0, palette.ground);
             let hint = match &self.album {
-                Ok(_) => "Choose a picture below, and press Toggle.".to_owned(),
+                Ok(_) => "Choose an image below, and press Toggle.".to_owned(),
                 Err(why) => why.clone(),
             };
             let mut inner = ui.new_child(eframe::egui::UiBuilder::new().max_rect(rect.shrink(12.0)));
@@ -125,7 +125,7 @@ impl Viewer {
         let Gaussian { mean, log_variance } = &moment.source;
         let palette = theme::palette(ui.ctx());
         let name = match moment.source_state {
-            None => "Posterior of the picture".to_owned(),
+            None => "Posterior of the image".to_owned(),
             Some(state) => format!("Fed back: {}", self.session.models().state_name(Some(state))),
         };
         ui.add_space(4.0);

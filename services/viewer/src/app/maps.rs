@@ -63,7 +63,7 @@ impl Viewer {
                 outline(&painter, &corners, stroke);
             }
         }
-        // Where the picture was taken from, and where the scene is looked at from.
+        // Where the image was taken from, and where the scene is looked at from.
         if let Some(camera) = self.session.moment().and_then(|m| m.input.camera) {
             let m = &camera.world_from_camera;
             sight(&painter, camera.position_m(), [-m[0][2], -m[1][2]], palette.ego, at);

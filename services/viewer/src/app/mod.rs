@@ -32,9 +32,9 @@ use std::sync::{Arc, OnceLock};
 use std::time::{Duration, Instant};
 use textures::Textures;
 
-/// Sides of a small picture of a scene, pixels.
+/// Sides of a small image of a scene, pixels.
 const THUMBNAIL_PX: [u32; 2] = [80, 60];
-/// Longest side of the picture from above, pixels.
+/// Longest side of the image from above, pixels.
 const BIRDS_EYE_PX: u32 = 128;
 /// Points along the longer side of a slice.
 const SLICE_PX: u32 = 160;
@@ -43,7 +43,7 @@ const FOLLOW_VIEW: Duration = Duration::from_millis(200);
 const FOLLOW_REST: Duration = Duration::from_secs(1);
 /// The camera rests once it has not been moved for so long.
 const REST: Duration = Duration::from_millis(150);
-/// Scenes whose pictures may still come.
+/// Scenes whose images may still come.
 const MOST_RECENT: usize = 64;
 /// How long news of a running graph may wait to be drawn.
 const SOON: Duration = Duration::from_millis(100);
@@ -55,13 +55,13 @@ const WATCH: Duration = Duration::from_millis(500);
 /// How the window is set up.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Options {
-    /// Threads for pictures.
+    /// Threads for images.
     pub threads: usize,
     /// Where screenshots go.
     pub folder: PathBuf,
     /// Dark, light, or as the system says.
     pub theme: ThemePreference,
-    /// Saves one picture of the window and ends: where, and after how long at the earliest.
+    /// Saves one image of the window and ends: where, and after how long at the earliest.
     pub one_shot: Option<(PathBuf, Duration)>,
 }
 
@@ -85,10 +85,10 @@ impl Waker {
     }
 }
 
-/// Which picture of the data set is chosen.
+/// Which image of the dataset is chosen.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Choice {
-    /// The hidden course of events.
+    /// The hidden branch.
     pub branch: usize,
     /// Step of it.
     pub timestamp: usize,
@@ -113,7 +113,7 @@ struct Recent {
     found: Option<Found>,
 }
 
-/// Of which scenes the pictures are that are seen.
+/// Of which scenes the images are that are seen.
 #[derive(Default)]
 struct DrawnOf {
     view: Latent,
@@ -159,7 +159,7 @@ pub struct Viewer {
     pub session: Session,
     /// The camera that a hand moves.
     pub camera: OrbitCamera,
-    /// Which picture of the data set is chosen.
+    /// Which image of the dataset is chosen.
     pub choice: Choice,
     /// What is drawn over the scene.
     pub overlays: Overlays,
@@ -186,9 +186,9 @@ pub struct Viewer {
     asked_birds_eye: Asked<(Latent, PinholeCamera)>,
     asked_slice: Asked<(Latent, f32)>,
     asked_thumbnails: Asked<(Vec<Latent>, PinholeCamera)>,
-    /// Of which scenes the pictures are that are seen.
+    /// Of which scenes the images are that are seen.
     drawn: DrawnOf,
-    /// Scenes that were shown last, the newest at the end: pictures come later than what they are of.
+    /// Scenes that were shown last, the newest at the end: images come later than what they are of.
     recent: VecDeque<Recent>,
     /// The newest view, and what drawing it took.
     view: Option<(Image, f64)>,
@@ -199,7 +199,7 @@ pub struct Viewer {
 }
 
 impl Viewer {
-    /// A window on a session. `album` is the data set to choose pictures from, or why there is none.
+    /// A window on a session. `album` is the dataset to choose images from, or why there is none.
     pub fn new(
         session: Session,
         album: Result<Album, String>,
@@ -345,18 +345,18 @@ impl Viewer {
         match command {
             Command::Toggle => {
                 let any = self.album.is_ok() || self.session.moment().is_some();
-                is(any, "no picture yet: drop a PNG picture here, give --dataset, or attach to a run")
+                is(any, "no image yet: drop a PNG image here, give --dataset, or attach to a run")
             }
             Command::Predict => self.session.can_predict().map_err(|e| e.to_string()),
-            Command::Probe => is(self.session.moment().is_some(), "no picture yet: press Toggle"),
+            Command::Probe => is(self.session.moment().is_some(), "no image yet: press Toggle"),
             Command::ProbeAndPredict => self.session.can_advance().map_err(|e| e.to_string()),
             Command::Back => is(history.has_back(), "this is the beginning"),
             Command::Forward => is(history.has_forward(), "this is the end"),
-            Command::PictureBefore | Command::PictureAfter => is(self.album.is_ok(), "no data set to choose from"),
+            Command::PictureBefore | Command::PictureAfter => is(self.album.is_ok(), "no dataset to choose from"),
             Command::Follow => is(self.live.is_some(), "no running graph is attached"),
             Command::CameraPicture => {
                 let known = self.session.moment().is_some_and(|m| m.input.camera.is_some());
-                is(known, "nobody knows where this picture was taken")
+                is(known, "nobody knows where this image was taken")
             }
             Command::SaveView => is(self.view.is_some(), "no scene is drawn yet"),
             _ => Ok(()),
@@ -443,7 +443,7 @@ impl Viewer {
         }
     }
 
-    /// The scene of the picture that is shown, before any forecast; of the chosen one where none is shown yet.
+    /// The scene of the image that is shown, before any forecast; of the chosen one where none is shown yet.
     fn toggle(&mut self) -> Result<(), String> {
         if std::mem::take(&mut self.is_following) {
             // The posterior is the graph's own.
@@ -456,10 +456,10 @@ impl Viewer {
         }
     }
 
-    /// The scene of the picture that is chosen from the data set.
+    /// The scene of the image that is chosen from the dataset.
     fn toggle_chosen(&mut self) -> Result<(), String> {
         let Choice { branch, timestamp, view, .. } = self.choice;
-        let none = || format!("the data set has no picture of branch {branch}, t{timestamp}, view {view}");
+        let none = || format!("the dataset has no image of branch {branch}, t{timestamp}, view {view}");
         let album = self.album.as_ref().map_err(Clone::clone)?;
         let models = self.session.models();
         let state = models.state(branch, timestamp).ok_or_else(none)?;
@@ -467,7 +467,7 @@ impl Viewer {
         self.toggle_input(input)
     }
 
-    /// Begins with a picture that hides what may come, where the data set has one.
+    /// Begins with an image that hides what may come, where the dataset has one.
     pub fn begin(&mut self) {
         if let Ok(album) = &self.album {
             let state = self.session.models().state(0, 0).unwrap_or(0);
@@ -479,7 +479,7 @@ impl Viewer {
         }
     }
 
-    /// The scene of a picture.
+    /// The scene of an image.
     pub fn toggle_input(&mut self, input: Arc<Input>) -> Result<(), String> {
         self.is_following = false;
         self.session.toggle(input).map_err(|e| e.to_string())
@@ -510,7 +510,7 @@ impl Viewer {
         self.session.select(scene.selection).map_err(|e| e.to_string())
     }
 
-    /// The next picture of the data set that shows as much as is asked.
+    /// The next image of the dataset that shows as much as is asked.
     fn leaf(&mut self, forwards: bool) -> Result<(), String> {
         let Ok(album) = &self.album else { return Ok(()) };
         let Choice { branch, timestamp, view, shows } = self.choice;
@@ -561,7 +561,7 @@ impl Viewer {
         }
     }
 
-    /// Remembers what is shown, so that a picture of it that comes later is marked with what belongs to it.
+    /// Remembers what is shown, so that an image of it that comes later is marked with what belongs to it.
     fn remember(&mut self) {
         let Some(scene) = self.session.shown() else { return };
         let found = self.session.moment().and_then(|m| m.found.clone());
@@ -572,12 +572,12 @@ impl Viewer {
         }
     }
 
-    /// What is known of the scene that a picture is of.
+    /// What is known of the scene that an image is of.
     fn recent(&self, latent: &Latent) -> Option<&Recent> {
         self.recent.iter().rev().find(|recent| recent.scene.latent == *latent)
     }
 
-    /// Pictures that were dropped on the window.
+    /// Images that were dropped on the window.
     fn take_files(&mut self, ctx: &Context) {
         let paths: Vec<PathBuf> =
             ctx.input(|input| input.raw.dropped_files.iter().filter_map(|file| file.path.clone()).collect());
@@ -589,7 +589,7 @@ impl Viewer {
         }
     }
 
-    /// Whether all pictures of the shown scene are drawn, or there is none; while a graph is followed, whether any is.
+    /// Whether all images of the shown scene are drawn, or there is none; while a graph is followed, whether any is.
     pub fn is_drawn(&self) -> bool {
         if self.is_following {
             return self.view.is_some();
@@ -602,7 +602,7 @@ impl Viewer {
         self.moved.is_some_and(|at| at.elapsed() < REST)
     }
 
-    /// Asks for the pictures that are missing.
+    /// Asks for the images that are missing.
     fn ask(&mut self, ctx: &Context) {
         let Some(scene) = self.session.shown() else { return };
         let latent = scene.latent;
@@ -665,7 +665,7 @@ impl Viewer {
         camera.pinhole(width_px, height_px)
     }
 
-    /// Saves the picture of the window that was asked for; asks for the only one of a window that was opened for it.
+    /// Saves the image of the window that was asked for; asks for the only one of a window that was opened for it.
     fn take_shot(&mut self, ctx: &Context) {
         let arrived = shots::arrived(ctx);
         if let Some((path, after)) = self.options.one_shot.clone() {

@@ -16,7 +16,7 @@ const SCROLL_PER_DOUBLING: f32 = 240.0;
 /// A point is drawn when so much light is stopped by this length of what is there, metres.
 const LEAST_STOPPED: f32 = 0.04;
 const POINT_LENGTH_M: f32 = 0.25;
-/// Least and most that the finest picture's longest side can be set to, pixels.
+/// Least and most that the finest image's longest side can be set to, pixels.
 const FINEST_PX: [u32; 2] = [96, 1536];
 
 impl Viewer {
@@ -38,7 +38,7 @@ impl Viewer {
             let camera = self.camera.pinhole(rect.width() as u32, rect.height() as u32);
             self.overlay(&painter, rect, &camera);
         } else {
-            let text = "Toggle a picture to see the scene that it may stand for";
+            let text = "Toggle an image to see the scene that it may stand for";
             painter.text(rect.center(), Align2::CENTER_CENTER, text, FontId::proportional(14.0), palette.weak);
         }
         self.captions(ui, rect);
@@ -155,7 +155,7 @@ impl Viewer {
                     self.moved = Some(Instant::now());
                 }
                 ui.add(DragValue::new(&mut self.finest_px).range(FINEST_PX[0]..=FINEST_PX[1]).suffix(" px").speed(4))
-                    .on_hover_text("Longest side of the finest picture (drag): coarser ones come first");
+                    .on_hover_text("Longest side of the finest image (drag): coarser ones come first");
                 ui.separator();
                 ui.checkbox(&mut self.overlays.boxes, "boxes");
                 ui.checkbox(&mut self.overlays.densities, "densities");
@@ -164,7 +164,7 @@ impl Viewer {
     }
 }
 
-/// Text with a dark ground, readable on any picture.
+/// Text with a dark ground, readable on any image.
 fn caption(painter: &Painter, at: eframe::egui::Pos2, align: Align2, text: &str, color: Color32, size: f32) {
     let galley = painter.layout_no_wrap(text.to_owned(), FontId::proportional(size), color);
     let rect = align.anchor_size(at, galley.size());

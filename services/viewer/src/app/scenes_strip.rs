@@ -1,4 +1,4 @@
-//! The strip below the scene: all scenes of the step as small pictures; the one that is pressed is shown.
+//! The strip below the scene: all scenes of the step as small images; the one that is pressed is shown.
 
 use super::{Viewer, theme};
 use crate::session::{Scene, steps_ahead};
@@ -16,7 +16,7 @@ impl Viewer {
         ui.horizontal(|ui| {
             ui.label(theme::heading("Scenes"));
             let text = match self.session.moment() {
-                None => "what the picture may stand for, once there is one".to_owned(),
+                None => "what the image may stand for, once there is one".to_owned(),
                 Some(moment) if moment.forecast.is_none() => "press Predict to forecast what comes next".to_owned(),
                 Some(moment) => {
                     let drawn = moment.forecast.as_ref().map_or(0, |f| f.draws.len());

@@ -1,4 +1,4 @@
-//! Pictures of the window and of the scene, as PNG files.
+//! Images of the window and of the scene, as PNG files.
 
 use carff_dataset::Image;
 use eframe::egui::{ColorImage, Context, Event, UserData, ViewportCommand};
@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 /// Numbers that are tried for a new file's name.
 const MOST_FILES: u32 = 10_000;
 
-/// Why a picture could not be saved.
+/// Why an image could not be saved.
 #[derive(Debug, thiserror::Error)]
 pub enum ShotError {
     /// The file could not be written.
@@ -26,12 +26,12 @@ pub enum ShotError {
     },
 }
 
-/// Asks for a picture of the window; it comes with one of the next frames.
+/// Asks for an image of the window; it comes with one of the next frames.
 pub fn request(ctx: &Context) {
     ctx.send_viewport_cmd(ViewportCommand::Screenshot(UserData::default()));
 }
 
-/// The picture of the window that was asked for, once it is there.
+/// The image of the window that was asked for, once it is there.
 pub fn arrived(ctx: &Context) -> Option<std::sync::Arc<ColorImage>> {
     ctx.input(|input| {
         input.events.iter().find_map(|event| match event {
@@ -49,14 +49,14 @@ pub fn free_name(folder: &Path, kind: &str) -> Result<PathBuf, ShotError> {
         .ok_or_else(|| ShotError::Full { folder: folder.to_owned() })
 }
 
-/// Saves a picture of the window.
+/// Saves an image of the window.
 pub fn save_window(window: &ColorImage, path: &Path) -> Result<(), ShotError> {
     let [width, height] = window.size.map(|side| side as u32);
     let rgb: Vec<u8> = window.pixels.iter().flat_map(|p| [p.r(), p.g(), p.b()]).collect();
     save(&rgb, width, height, path)
 }
 
-/// Saves a picture of a scene.
+/// Saves an image of a scene.
 pub fn save_image(image: &Image, path: &Path) -> Result<(), ShotError> {
     save(&image.rgb, image.width_px, image.height_px, path)
 }

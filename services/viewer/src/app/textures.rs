@@ -1,10 +1,10 @@
-//! Pictures on their way to the screen.
+//! Images on their way to the screen.
 
 use super::theme;
 use carff_dataset::Image;
 use eframe::egui::{ColorImage, Context, TextureHandle, TextureId, TextureOptions, Theme};
 
-/// The window's pictures.
+/// The window's images.
 #[derive(Default)]
 pub struct Textures {
     view: Option<TextureHandle>,
@@ -33,7 +33,7 @@ impl Textures {
         set(ctx, &mut self.view, "view", colors(image), TextureOptions::LINEAR);
     }
 
-    /// A new picture from above.
+    /// A new image from above.
     pub fn set_birds_eye(&mut self, ctx: &Context, image: &Image) {
         set(ctx, &mut self.birds_eye, "birds-eye", colors(image), TextureOptions::LINEAR);
     }
@@ -52,7 +52,7 @@ impl Textures {
         set(ctx, &mut self.slice, "slice", colored, TextureOptions::LINEAR);
     }
 
-    /// A new small picture.
+    /// A new small image.
     pub fn set_thumbnail(&mut self, ctx: &Context, index: usize, image: &Image) {
         if self.thumbnails.len() <= index {
             self.thumbnails.resize_with(index + 1, || None);
@@ -65,7 +65,7 @@ impl Textures {
         self.view.as_ref().map(TextureHandle::id)
     }
 
-    /// The picture from above.
+    /// The image from above.
     pub fn birds_eye(&self) -> Option<TextureId> {
         self.birds_eye.as_ref().map(TextureHandle::id)
     }
@@ -81,12 +81,12 @@ impl Textures {
         self.slice.as_ref().map(TextureHandle::id)
     }
 
-    /// A small picture.
+    /// A small image.
     pub fn thumbnail(&self, index: usize) -> Option<TextureId> {
         self.thumbnails.get(index)?.as_ref().map(TextureHandle::id)
     }
 
-    /// The input picture, sharp: it is small, and each of its pixels is one that the encoder sees.
+    /// The input image, sharp: it is small, and each of its pixels is one that the encoder sees.
     pub fn input(&mut self, ctx: &Context, image: &Image) -> TextureId {
         match &mut self.input {
             Some((shown, texture)) if shown == image => texture.id(),

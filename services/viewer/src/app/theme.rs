@@ -81,7 +81,7 @@ pub fn palette(ctx: &Context) -> &'static Palette {
     }
 }
 
-/// The palette for what is drawn on pictures: they are the same in both themes.
+/// The palette for what is drawn on images: they are the same in both themes.
 pub fn on_pictures() -> &'static Palette {
     &DARK
 }

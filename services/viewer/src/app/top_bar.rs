@@ -1,4 +1,4 @@
-//! The bar at the top: the three functions, the history, where pictures come from.
+//! The bar at the top: the three functions, the history, where images come from.
 
 use super::{Command, Viewer, theme};
 use crate::live::LiveFeed;
@@ -87,7 +87,7 @@ impl Viewer {
         }
     }
 
-    /// Where pictures come from: files, or a running graph.
+    /// Where images come from: files, or a running graph.
     fn source(&mut self, ui: &mut Ui, commands: &mut Vec<Command>) {
         let palette = theme::palette(ui.ctx());
         let live = self.live.as_ref().map(|live| {

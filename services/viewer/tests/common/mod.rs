@@ -1,4 +1,4 @@
-//! What the viewer's tests share: the shipped checkpoint, and true pictures of its scenario.
+//! What the viewer's tests share: the shipped checkpoint, and true images of its scenario.
 #![allow(dead_code, reason = "each test program uses a part")]
 #![allow(clippy::unwrap_used, reason = "what fails here fails a test")]
 

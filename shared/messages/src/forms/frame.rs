@@ -1,17 +1,17 @@
-//! What describes pictures.
+//! What describes images.
 
 use super::{FormError, HeaderForm, array, code_of, index, name_of, signed};
 use crate::{DatasetView, FrameMeta, Intrinsics, Message, Observability, ViewKind, ViewMeta};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// Where in a data set a frame comes from.
+/// Where in a dataset a frame comes from.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct DatasetViewForm {
     /// Index of the camera pose.
     pub view: Option<u32>,
-    /// The hidden course of events.
+    /// The hidden branch.
     pub branch: Option<u32>,
     /// Step of it.
     pub timestamp: Option<u32>,
@@ -39,7 +39,7 @@ pub struct FrameForm {
     pub intrinsics: Intrinsics,
     /// Row-major 4x4: camera space (OpenGL axes) to world space (metres).
     pub world_from_camera: Vec<f64>,
-    /// Where in a data set it comes from, if known.
+    /// Where in a dataset it comes from, if known.
     pub dataset_view: Option<DatasetViewForm>,
 }
 

@@ -1,7 +1,7 @@
 //! EfficientNet-Lite0 (Tan and Le 2019, Lite variant: no squeeze-and-excite, `ReLU6`), up to stride 16.
 //!
 //! Batch normalisation is folded into the convolutions when the weights are read, also where they learn on: batches are
-//! small, and what the network is told of pictures in general shall stay.
+//! small, and what the network is told of images in general shall stay.
 
 use super::{Backbone, resize};
 use crate::{

@@ -1,4 +1,4 @@
-//! Image backbones behind one trait: from a picture to a map of spatial features.
+//! Image backbones behind one trait: from an image to a map of spatial features.
 
 mod convnet;
 mod efficientnet;
@@ -13,7 +13,7 @@ use carff_checkpoint::shapes::{BackboneConfig, BackboneKind};
 use std::path::Path;
 use tch::{Tensor, nn};
 
-/// From pictures to spatial features.
+/// From images to spatial features.
 pub trait Backbone: Send {
     /// `[N, 3, H, W]` in 0..=1, of any size, to `[N, channels, grid, grid]`.
     fn features(&self, pictures: &Tensor) -> Tensor;
@@ -62,7 +62,7 @@ pub fn build(
     })
 }
 
-/// Resizes pictures to a square of `side` pixels, bilinearly; leaves them as they are when they fit already.
+/// Resizes images to a square of `side` pixels, bilinearly; leaves them as they are when they fit already.
 pub(crate) fn resize(pictures: &Tensor, side: i64) -> Tensor {
     let size = pictures.size();
     if size[2] == side && size[3] == side {

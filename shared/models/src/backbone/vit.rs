@@ -86,7 +86,7 @@ impl VisionTransformer {
         Ok(net)
     }
 
-    /// The size of a published network, and the side of its pictures in pixels, by its tensors in timm or Hugging Face
+    /// The size of a published network, and the side of its images in pixels, by its tensors in timm or Hugging Face
     /// names. Heads leave no trace in them: there is one for each 64 of the width, as in the published sizes from tiny to
     /// large.
     pub fn shape_of(tensors: &Tensors) -> Result<(VitConfig, i64), ModelError> {
