@@ -20,7 +20,7 @@ branches = ["with", "without"]
 hazard_branches = ["with"]
 bev_view = 0
 
-[image]
+[picture]
 width_px = 96
 height_px = 80
 fov_deg = 60.0
@@ -463,7 +463,7 @@ name = "objects"
 bounds_m = [[-1.0, -1.0, 0.0], [1.0, 1.0, 1.0]]
 timestamps = 2
 branches = ["there", "gone"]
-image = { width_px = 64, height_px = 64, fov_deg = 40.0 }
+picture = { width_px = 64, height_px = 64, fov_deg = 40.0 }
 ground_surface = "plain"
 ground_colour = "#808080"
 clearance_m = 0.05

@@ -4,7 +4,7 @@ use carff_dataset::Image;
 use eframe::egui::{ColorImage, Context, Event, UserData, ViewportCommand};
 use std::path::{Path, PathBuf};
 
-/// Numbers that are tried for a new file's name.
+/// Highest number that is tried for a new file's name.
 const MOST_FILES: u32 = 10_000;
 
 /// Why an image could not be saved.
@@ -13,12 +13,12 @@ pub enum ShotError {
     /// The file could not be written.
     #[error("cannot save {path}: {source}")]
     Save {
-        /// Which file.
+        /// Path of the file.
         path: PathBuf,
-        /// What went wrong.
+        /// Error of the image library.
         source: image::ImageError,
     },
-    /// All names are taken.
+    /// All file names are taken.
     #[error("{folder} has {MOST_FILES} screenshots: remove some")]
     Full {
         /// The folder.
@@ -26,12 +26,12 @@ pub enum ShotError {
     },
 }
 
-/// Asks for an image of the window; it comes with one of the next frames.
+/// Requests an image of the window; it arrives with one of the next frames.
 pub fn request(ctx: &Context) {
     ctx.send_viewport_cmd(ViewportCommand::Screenshot(UserData::default()));
 }
 
-/// The image of the window that was asked for, once it is there.
+/// Returns the requested image of the window when it has arrived.
 pub fn arrived(ctx: &Context) -> Option<std::sync::Arc<ColorImage>> {
     ctx.input(|input| {
         input.events.iter().find_map(|event| match event {
@@ -41,7 +41,7 @@ pub fn arrived(ctx: &Context) -> Option<std::sync::Arc<ColorImage>> {
     })
 }
 
-/// A file name in `folder` that is not taken yet.
+/// Returns an unused file name in `folder`.
 pub fn free_name(folder: &Path, kind: &str) -> Result<PathBuf, ShotError> {
     (1..=MOST_FILES)
         .map(|i| folder.join(format!("carff-{kind}-{i:04}.png")))
@@ -71,7 +71,7 @@ mod tests {
     use super::*;
     use eframe::egui::Color32;
 
-    /// Names go on by number, what is saved can be read back, and an error names the file.
+    /// File names are numbered in order, saved images can be read back, and an error names the file.
     #[test]
     fn saves_under_free_names() {
         let folder = tempfile::tempdir().unwrap();
