@@ -70,7 +70,7 @@ fn told(published: &Published, out: &Path) -> Result<String, toml::ser::Error> {
         let _ = write!(
             text,
             "\n[encoder.backbone.vit]\npatch_px = {}\nwidth = {}\ndepth = {}\n\
-             # The weights do not contain this number: one per 64 of the width, as in the published sizes.\nheads = {}\n",
+             # The weights do not contain this number: one per 64 of the width, as published.\nheads = {}\n",
             vit.patch_px, vit.width, vit.depth, vit.heads
         );
     }

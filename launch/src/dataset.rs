@@ -89,7 +89,7 @@ pub fn run(command: DatasetCommand) -> anyhow::Result<()> {
                 imported.scaled
             );
             let [low, high] = imported.bounds.map(|corner| corner.map(|v| (v * 1000.0).round() / 1000.0));
-            println!("Bounds {low:?} to {high:?}; everything outside is background. Pass --bounds to change the region");
+            println!("Bounds {low:?} to {high:?}; outside is background. Pass --bounds to change it");
             Ok(())
         }
         DatasetCommand::Check { dir, contact_sheet, columns } => {
@@ -198,7 +198,7 @@ spread_m = 1.0
         std::fs::create_dir(&foreign).unwrap();
         std::fs::write(foreign.join("thesis.txt"), "irreplaceable").unwrap();
         let error = run(render_command(&scenario, &foreign)).unwrap_err();
-        assert!(format!("{error:#}").contains("not a set that this program wrote"), "{error:#}");
+        assert!(format!("{error:#}").contains("not a dataset that this program wrote"), "{error:#}");
         assert_eq!(std::fs::read_to_string(foreign.join("thesis.txt")).unwrap(), "irreplaceable");
     }
 

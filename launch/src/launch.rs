@@ -37,7 +37,7 @@ const WATCH_NS: u64 = 20_000_000;
 const CLEANUP_NS: u64 = 1_000_000_000;
 /// A longer pause of the launcher itself counts for no stage.
 const OWN_PAUSE_NS: u64 = 300_000_000;
-/// A stage's loop may stand still for so many times its own deadline.
+/// Multiple of its deadline after which a stage's loop counts as hanging.
 const STANDSTILL_DEADLINES: u64 = 10;
 /// Number of frame periods that a stage's topic may be quiet.
 const QUIET_FRAMES: f64 = 3.0;
@@ -485,7 +485,7 @@ impl Launcher<'_> {
         };
         match (stage, self.graph.launcher.when_lost) {
             // No decision depends on the renderer.
-            (Stage::Renderer, _) => self.terminal.log(LAUNCHER, &format!("ERROR {lost}: the run continues without views")),
+            (Stage::Renderer, _) => self.terminal.log(LAUNCHER, &format!("ERROR {lost}: continuing without views")),
             (Stage::Controller, _) | (_, WhenLost::End) => bail!(lost),
             (_, WhenLost::Halt) => {
                 self.terminal.log(LAUNCHER, &format!("ERROR {lost}: the safe action applies until the run is stopped"));

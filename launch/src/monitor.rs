@@ -15,13 +15,13 @@ pub struct FrameRecord {
     pub frame_id: u64,
     /// Camera pose.
     pub view: i32,
-    /// Hidden branch.
+    /// Time step of the branch.
     pub branch: i32,
     /// Step of it.
     pub timestamp: i32,
-    /// Drive number.
+    /// Number of the drive.
     pub drive: i32,
-    /// Frames of the drive before this one.
+    /// Number of earlier frames of the drive.
     pub frame_in_drive: i32,
     /// True for the last frame of its time step, whose decision counts.
     pub last_of_timestamp: bool,

@@ -212,7 +212,7 @@ pub fn shared_memory(memory: &SharedMemory, needed_bytes: u64) -> Vec<Finding> {
         (2 * needed_bytes).next_power_of_two().max(512 << 20) >> 20
     );
     findings.push(if memory.free_bytes < needed_bytes {
-        Finding::error(area, "size", found, "`carff launch` refuses to start, because full shared memory kills processes", advice)
+        Finding::error(area, "size", found, "`carff launch` refuses to start, full shared memory kills processes", advice)
     } else if memory.free_bytes < 2 * needed_bytes {
         Finding::warning(area, "size", found, "a second graph or a viewer may not find enough space", advice)
     } else {
@@ -334,7 +334,7 @@ pub fn limits(allowed: &Allowed, stages: &StagesConfig) -> Vec<Finding> {
     let area = Area::Limits;
     let without = "the stage logs a warning, and continues without it";
     let raise = |line: &str, unit: &str| {
-        format!("write `USER - {line}` to /etc/security/limits.d/carff.conf and log in again; in a systemd unit: {unit}")
+        format!("write `USER - {line}` to /etc/security/limits.d/carff.conf, log in again; in a systemd unit: {unit}")
     };
     let show = |limit: Option<u64>, show: &dyn Fn(u64) -> String| limit.map_or_else(|| "no limit".to_owned(), show);
     let each = || Stage::ALL.into_iter().map(|stage| (stage.name(), stages.of(stage)));

@@ -148,7 +148,7 @@ impl fmt::Display for Comparison {
         } else if self.compared.is_empty() {
             write!(
                 f,
-                "the recording contains no posterior, forecast, belief or decision of a recorded frame: nothing to compare"
+                "the recording has no posterior, forecast, belief or decision of a recorded frame: nothing to compare"
             )?;
         } else {
             write!(f, "{counts}: {} differ, {} are missing", self.different, self.missing)?;

@@ -423,7 +423,7 @@ impl Soak<'_> {
         })?;
         if !back && !self.waiter.stop().is_stopped() {
             self.outcome.leaked_files = found.excess(&baseline);
-            self.violated(format!("the graph uses more system resources than before: {found:?}, at first {baseline:?}"));
+            self.violated(format!("the graph uses more resources than before: {found:?}, at first {baseline:?}"));
         }
         Ok(())
     }
@@ -431,7 +431,7 @@ impl Soak<'_> {
     /// Injects rogue messages: none may reach an action, and the controller must count each rogue belief.
     fn lie(&mut self, fault: &Fault) -> anyhow::Result<()> {
         let controller = |soak: &mut Self| -> anyhow::Result<(u32, u64)> {
-            let health = soak.watcher()?.health.get(&Stage::Controller).context("the controller never sent a heartbeat")?;
+            let health = soak.watcher()?.health.get(&Stage::Controller).context("the controller sent no heartbeat")?;
             Ok((health.pid, health.invalid))
         };
         let (pid, before) = controller(self)?;

@@ -67,8 +67,8 @@ impl FlightRecorder {
         let mut patience = Patience::of_ms(LIMIT_MS);
         while recordings(self.folder.path())?.is_empty() {
             if let Some(status) = child.try_wait()? {
-                let said = std::fs::read_to_string(self.folder.path().join("recorder.log")).unwrap_or_default();
-                bail!("the recorder ended at its start ({status}): {said}");
+                let output = std::fs::read_to_string(self.folder.path().join("recorder.log")).unwrap_or_default();
+                bail!("the recorder ended at its start ({status}): {output}");
             }
             ensure!(!patience.ran_out(), "the recorder did not start within {LIMIT_MS} ms");
             std::thread::sleep(Duration::from_millis(5));
@@ -124,9 +124,9 @@ impl Cramped {
 
     /// Returns an error if the recorder did not report its full disk, or if its earlier data is not readable.
     pub(super) fn complaint(&self, status: ExitStatus) -> anyhow::Result<Option<String>> {
-        let said = std::fs::read_to_string(small_disk().with_extension("log"))?;
-        if status.code() != Some(1) || !said.contains("run.mcap") {
-            return Ok(Some(format!("a recorder on a full disk ended with {status} and printed: {said}")));
+        let output = std::fs::read_to_string(small_disk().with_extension("log"))?;
+        if status.code() != Some(1) || !output.contains("run.mcap") {
+            return Ok(Some(format!("a recorder on a full disk ended with {status} and printed: {output}")));
         }
         let mut reader = Reader::open(&self.folder.join("run.mcap"))?;
         let mut messages = 0_u64;

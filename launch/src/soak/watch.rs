@@ -398,7 +398,7 @@ mod tests {
         }
         let mut judge = judge();
         judge.given(&belief(1, 2, 0.0));
-        assert!(judge.next(action(1, ActionCode::Advance, 120)).is_ok(), "a belief that was not received proves nothing");
+        assert!(judge.next(action(1, ActionCode::Advance, 120)).is_ok(), "a belief that was not seen proves nothing");
         assert_eq!((judge.judged, judge.unjudged), (0, 1));
     }
 

@@ -366,9 +366,9 @@ impl Session {
         self.history.go_to(place)
     }
 
-    /// Shows what a running graph made of a frame, in place of all else: the same step as before, and the scene that
-    /// was chosen, as far as it is there. Where none was chosen the component is kept as long as it weighs at least
-    /// half as much as the heaviest: two that weigh about the same would take turns.
+    /// Shows a running graph's moments of a frame in place of all entries. The step and the chosen scene stay if they
+    /// exist. Without a choice, a component stays while its weight is at least half of the largest weight; otherwise
+    /// two components of similar weight would alternate.
     pub fn follow(&mut self, mut moments: Vec<Moment>) {
         let first = self.history.entries().is_empty();
         for (moment, before) in moments.iter_mut().zip(self.history.entries()) {
@@ -393,7 +393,7 @@ impl Session {
         }
     }
 
-    /// The scene that is shown.
+    /// Returns the shown scene.
     pub fn shown(&self) -> Option<Scene> {
         let moment = self.moment()?;
         let mut scene = self.scene(moment, moment.selection)?;
@@ -401,7 +401,7 @@ impl Session {
         Some(scene)
     }
 
-    /// The scenes to choose from: what was forecast from, the components, the samples.
+    /// Returns the scenes that can be shown: the forecast's input, the components, and the samples.
     pub fn scenes(&self) -> Vec<Scene> {
         let Some(moment) = self.moment() else { return Vec::new() };
         let (components, samples) =
@@ -435,7 +435,7 @@ impl Session {
     }
 }
 
-/// The latent of a scene; `None` when there is no such scene.
+/// Returns the latent of a scene; `None` if the scene does not exist.
 fn latent(models: &Models, moment: &Moment, selection: Selection) -> Option<[f32; LATENT_DIM]> {
     let forecast = moment.forecast.as_ref();
     match selection {
@@ -446,7 +446,7 @@ fn latent(models: &Models, moment: &Moment, selection: Selection) -> Option<[f32
     }
 }
 
-/// Fills in what probing the shown scene finds. What was probed with the others is not probed again.
+/// Probes the shown scene, unless it has been probed with the others.
 fn find(models: &mut Models, moment: &mut Moment) {
     let Some(latent) = latent(models, moment, moment.selection) else {
         moment.found = None;
@@ -464,7 +464,7 @@ fn find(models: &mut Models, moment: &mut Moment) {
     moment.found = Some(Found { probed, densities });
 }
 
-/// "now", "1 step ahead", "2 steps ahead".
+/// Formats a step: "now", "1 step ahead", "2 steps ahead".
 pub fn steps_ahead(step: u32) -> String {
     match step {
         0 => "now".to_owned(),
