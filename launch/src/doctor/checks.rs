@@ -212,7 +212,7 @@ pub fn shared_memory(memory: &SharedMemory, needed_bytes: u64) -> Vec<Finding> {
         (2 * needed_bytes).next_power_of_two().max(512 << 20) >> 20
     );
     findings.push(if memory.free_bytes < needed_bytes {
-        Finding::error(area, "size", found, "`carff launch` refuses to start, full shared memory kills processes", advice)
+        Finding::error(area, "size", found, "`carff launch` refuses to start: full shared memory kills stages", advice)
     } else if memory.free_bytes < 2 * needed_bytes {
         Finding::warning(area, "size", found, "a second graph or a viewer may not find enough space", advice)
     } else {

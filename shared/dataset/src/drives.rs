@@ -69,7 +69,7 @@ pub enum DrivesError {
     NoScenario,
     /// No pose can be driven.
     #[error(
-        "none of the {views} poses has an image of every timestamp of a branch: add missing frames, or use a folder source"
+        "none of the {views} poses has images of all timestamps of a branch: add missing frames, or use a folder source"
     )]
     NoneWhole {
         /// Number of poses in the dataset.

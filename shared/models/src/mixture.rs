@@ -6,10 +6,10 @@ use carff_decision::Mixture;
 use carff_messages::{Gaussian, LATENT_DIM};
 use tch::{Kind, Tensor, nn, nn::Module};
 
-/// Component log-variances are kept inside this range.
+/// Range of component log-variances.
 pub const LOG_VARIANCE_RANGE: (f64, f64) = (-7.0, 4.0);
 
-/// The network.
+/// The mixture density network.
 #[derive(Debug)]
 pub struct MixtureNet {
     first: nn::Linear,
@@ -46,7 +46,7 @@ impl MixtureNet {
         })
     }
 
-    /// Where it computes.
+    /// Returns the device of the weights.
     pub fn device(&self) -> tch::Device {
         self.first.ws.device()
     }

@@ -1,4 +1,5 @@
-//! What is drawn on: twice the size of the finished image, so that lines and letters become smooth when it is halved.
+//! The drawing surface: twice the size of the finished image, so that lines and letters become smooth when it is
+//! halved.
 
 use crate::{MAX_SIDE_PX, PlotError};
 use carff_dataset::Image;
@@ -7,22 +8,22 @@ use plotters::prelude::{BitMapBackend, DrawingArea, IntoDrawingArea, RGBColor};
 use plotters::style::{FontDesc, FontFamily, FontStyle, IntoFont, TextStyle, register_font};
 use std::sync::OnceLock;
 
-/// Pixels drawn for one pixel of the finished image, along each side.
+/// Number of drawn pixels per pixel of the finished image, along each side.
 pub const OVERSAMPLING: u32 = 2;
 /// Background of every image.
 pub const PAPER: RGBColor = RGBColor(252, 252, 250);
-/// Headings and captions.
+/// Colour of headings and captions.
 pub const INK: RGBColor = RGBColor(34, 38, 46);
-/// What is said aside.
+/// Colour of secondary text.
 pub const FAINT_INK: RGBColor = RGBColor(104, 110, 122);
 /// Height of a line of text, in font sizes.
 const LINE_HEIGHT: f64 = 1.3;
-/// Where the drawing library is told to put a line's text, in font sizes below the line's top.
+/// Vertical text offset for the drawing library, in font sizes below the line's top.
 const TEXT_OFFSET: f64 = 0.38;
-/// The name that the font goes by.
+/// Name of the font.
 const FAMILY: &str = "carff";
 
-/// An error of the drawing library, whatever its type.
+/// Wraps any error of the drawing library.
 pub fn drawing(error: impl std::fmt::Display) -> PlotError {
     PlotError::Drawing(error.to_string())
 }
@@ -30,13 +31,13 @@ pub fn drawing(error: impl std::fmt::Display) -> PlotError {
 /// Weight of letters.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Weight {
-    /// For captions.
+    /// Weight of captions.
     Regular,
-    /// For headings.
+    /// Weight of headings.
     Bold,
 }
 
-/// A font of a size in pixels of the finished image.
+/// A font with its size in pixels of the finished image.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Font {
     /// Size, pixels.
@@ -46,28 +47,28 @@ pub struct Font {
 }
 
 impl Font {
-    /// Regular letters.
+    /// Returns a regular font.
     pub const fn regular(size_px: f64) -> Self {
         Self { size_px, weight: Weight::Regular }
     }
 
-    /// Bold letters.
+    /// Returns a bold font.
     pub const fn bold(size_px: f64) -> Self {
         Self { size_px, weight: Weight::Bold }
     }
 
-    /// Height of one line, pixels.
+    /// Returns the height of one line, pixels.
     pub fn line_px(self) -> u32 {
         (self.size_px * LINE_HEIGHT).ceil() as u32
     }
 
-    /// Width of a text on one line, pixels.
+    /// Returns the width of a text on one line, pixels.
     pub fn width_px(self, text: &str) -> Result<u32, PlotError> {
         let (width, _) = self.description()?.box_size(text).map_err(drawing)?;
         Ok(width.div_ceil(OVERSAMPLING))
     }
 
-    /// Breaks a text between words, and within one that is too long, into lines that are no wider than `width_px`.
+    /// Breaks a text between words, and inside words that are too long, into lines of at most `width_px`.
     pub fn wrapped(self, text: &str, width_px: u32) -> Result<Vec<String>, PlotError> {
         let mut lines = Vec::new();
         let mut line = String::new();
@@ -94,7 +95,7 @@ impl Font {
         Ok(lines)
     }
 
-    /// For the drawing library, at the size it is drawn in.
+    /// Returns the style for the drawing library, at the drawn size.
     pub fn style(self, colour: RGBColor) -> Result<TextStyle<'static>, PlotError> {
         Ok(self.description()?.color(&colour))
     }
@@ -129,7 +130,7 @@ pub struct Area {
     pub height: u32,
 }
 
-/// An image in the making.
+/// An image that is being drawn.
 pub struct Canvas {
     width_px: u32,
     height_px: u32,
@@ -137,7 +138,7 @@ pub struct Canvas {
 }
 
 impl Canvas {
-    /// An empty page of the finished size.
+    /// Returns an empty page of the finished size.
     pub fn new(width_px: u32, height_px: u32) -> Result<Self, PlotError> {
         if width_px.max(height_px) > MAX_SIDE_PX {
             return Err(PlotError::TooLarge { width_px, height_px });
@@ -147,13 +148,13 @@ impl Canvas {
         Ok(Self { width_px, height_px, rgb: [PAPER.0, PAPER.1, PAPER.2].repeat(pixels) })
     }
 
-    /// All of it, for the drawing library, in the size that is drawn in.
+    /// Returns the whole page for the drawing library, at the drawn size.
     pub fn drawing_area(&mut self) -> DrawingArea<BitMapBackend<'_>, Shift> {
         let size = (self.width_px * OVERSAMPLING, self.height_px * OVERSAMPLING);
         BitMapBackend::with_buffer(&mut self.rgb, size).into_drawing_area()
     }
 
-    /// Writes one line, with the top left corner of the line at (`x_px`, `y_px`).
+    /// Draws one line, with its top left corner at (`x_px`, `y_px`).
     pub fn text(&mut self, text: &str, x_px: u32, y_px: u32, font: Font, colour: RGBColor) -> Result<(), PlotError> {
         let style = font.style(colour)?;
         let y = f64::from(y_px) + TEXT_OFFSET * font.size_px;
@@ -161,7 +162,7 @@ impl Canvas {
         self.drawing_area().draw_text(text, &style, at).map_err(drawing)
     }
 
-    /// Fills a rectangle; what lies outside the page is cut off.
+    /// Fills a rectangle; parts outside the page are cut off.
     pub fn fill(&mut self, area: Area, RGBColor(r, g, b): RGBColor) {
         let row = (self.width_px * OVERSAMPLING) as usize * 3;
         let (left, right) = (area.x.min(self.width_px), (area.x + area.width).min(self.width_px));
@@ -172,7 +173,7 @@ impl Canvas {
         }
     }
 
-    /// The finished image.
+    /// Returns the finished image.
     pub fn finish(self) -> Image {
         let row = (self.width_px * OVERSAMPLING) as usize * 3;
         let step = OVERSAMPLING as usize;
@@ -195,7 +196,7 @@ impl Canvas {
 mod tests {
     use super::*;
 
-    /// The rows and columns of an image that hold anything but paper: `[left, top, right, bottom]`, ends included.
+    /// Returns the bounds of all pixels that are not paper: `[left, top, right, bottom]`, inclusive.
     fn inked(image: &Image) -> Option<[u32; 4]> {
         let paper = [PAPER.0, PAPER.1, PAPER.2];
         let inked = (0..image.height_px)
@@ -207,8 +208,8 @@ mod tests {
         })
     }
 
-    /// A line of text stays within its line and its measured width (a pixel of italic or rounding aside), so that what
-    /// is laid out without overlap is drawn without overlap.
+    /// A line of text stays within its line and its measured width, with a tolerance of one pixel. So text that is laid
+    /// out without overlap is drawn without overlap.
     #[test]
     fn text_stays_in_its_line() {
         for font in [Font::regular(12.0), Font::bold(15.0), Font::bold(26.0)] {
@@ -223,7 +224,7 @@ mod tests {
         }
     }
 
-    /// Wrapped lines fit, and hold the whole text in order.
+    /// Wrapped lines fit, and contain the whole text in order.
     #[test]
     fn wrapped_text_fits_and_is_whole() {
         let font = Font::regular(12.0);
@@ -237,7 +238,7 @@ mod tests {
         assert!(font.wrapped(" \n", 90).unwrap().is_empty());
     }
 
-    /// Fills exactly what it is told to, and a page too large to be meant is refused.
+    /// Fills cover exactly their rectangle, and a page that is too large is refused.
     #[test]
     fn fills_exactly() {
         let mut canvas = Canvas::new(20, 10).unwrap();

@@ -1,4 +1,4 @@
-//! Rows of captioned images, one row a drive.
+//! Filmstrips: rows of captioned images, one row per drive.
 
 use crate::canvas::{Area, Canvas, FAINT_INK, Font, INK};
 use crate::{MAX_SIDE_PX, PlotError};
@@ -6,21 +6,21 @@ use carff_dataset::Image;
 use plotters::style::RGBColor;
 use std::path::Path;
 
-/// One row: what it is about, and its images from left to right.
+/// A row: its caption, and its images from left to right.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct StripRow {
-    /// Left of the images; the first line stands out.
+    /// Caption left of the images; the first line is emphasised.
     pub caption: Vec<String>,
-    /// The images.
+    /// Images of the row.
     pub cells: Vec<StripCell>,
 }
 
-/// One image with what is said below it.
+/// An image with its caption.
 #[derive(Clone, Debug, PartialEq)]
 pub struct StripCell {
-    /// The image; a small one is shown twice as large.
+    /// The image; a small image is drawn twice as large.
     pub image: Image,
-    /// Below it; the first line stands out.
+    /// Caption below it; the first line is emphasised.
     pub caption: Vec<String>,
     /// Colour of a frame around it, RGB.
     pub emphasis: Option<[u8; 3]>,
@@ -33,14 +33,14 @@ const CAPTION_HEAD: Font = Font::bold(14.0);
 const CAPTION: Font = Font::regular(13.0);
 /// Width of the text left of the images.
 const CAPTION_WIDTH: u32 = 230;
-/// Images with no side as long as this are shown twice as large.
+/// Images with both sides shorter than this are drawn twice as large.
 const SMALL_SIDE: u32 = 160;
 /// Space between images, and between an image and its frame's outer edge.
 const GAP: u32 = 18;
 const FRAME: u32 = 4;
-/// Between an image and its caption.
+/// Space between an image and its caption.
 const CAPTION_GAP: u32 = 9;
-/// Above and below the line between rows.
+/// Space above and below the line between rows.
 const ROW_GAP: u32 = 18;
 const RULE: RGBColor = RGBColor(224, 226, 230);
 
@@ -86,7 +86,7 @@ fn scale(image: &Image) -> u32 {
     if image.width_px.max(image.height_px) < SMALL_SIDE { 2 } else { 1 }
 }
 
-/// Each pixel as a square of `factor` pixels: nothing is shown that was not there.
+/// Returns the image with each pixel as a square of `factor` pixels, without interpolation.
 fn enlarged(image: &Image, factor: u32) -> Image {
     let factor = factor as usize;
     let mut rgb = Vec::with_capacity(image.rgb.len() * factor * factor);
@@ -99,7 +99,7 @@ fn enlarged(image: &Image, factor: u32) -> Image {
     Image { width_px: image.width_px * factor as u32, height_px: image.height_px * factor as u32, rgb }
 }
 
-/// One line of text in its place.
+/// A positioned line of text.
 struct Line {
     text: String,
     area: Area,
@@ -107,14 +107,14 @@ struct Line {
     colour: RGBColor,
 }
 
-/// One image in its place.
+/// A positioned image.
 struct Tile {
     row: usize,
     cell: usize,
     area: Area,
 }
 
-/// Where everything goes.
+/// Positions of all elements.
 struct Layout {
     width: u32,
     height: u32,
@@ -151,7 +151,7 @@ impl Layout {
         Ok(layout)
     }
 
-    /// Places a row below what is there; returns its height.
+    /// Places a row below the existing ones; returns its height.
     fn row(&mut self, index: usize, row: &StripRow, tile_width: u32) -> Result<u32, PlotError> {
         let top = self.height;
         let mut height = self.paragraph(&captioned(&row.caption), MARGIN, top, CAPTION_WIDTH)?;
@@ -176,7 +176,7 @@ impl Layout {
         Ok(height)
     }
 
-    /// Places lines, broken to a width, under each other; returns their height.
+    /// Places lines, broken to a width, below each other; returns their height.
     fn paragraph(&mut self, lines: &[(String, Font, RGBColor)], x: u32, y: u32, width: u32) -> Result<u32, PlotError> {
         let mut height = 0;
         for (text, font, colour) in lines {
@@ -190,7 +190,7 @@ impl Layout {
     }
 }
 
-/// The first line of a caption stands out.
+/// Emphasises the first line of a caption.
 fn captioned(lines: &[String]) -> Vec<(String, Font, RGBColor)> {
     let styles = std::iter::once((CAPTION_HEAD, INK)).chain(std::iter::repeat((CAPTION, FAINT_INK)));
     lines.iter().zip(styles).map(|(text, (font, colour))| (text.clone(), font, colour)).collect()
@@ -223,8 +223,8 @@ mod tests {
         a.x + a.width <= b.x || b.x + b.width <= a.x || a.y + a.height <= b.y || b.y + b.height <= a.y
     }
 
-    /// Whatever sizes and captions are given, no text lies over an image, its frame or other text, no image over
-    /// another, and all lie within the page.
+    /// For any sizes and captions, text does not overlap an image, its frame or other text, images do not overlap, and
+    /// everything is within the page.
     #[test]
     fn nothing_overlaps() {
         let layout = Layout::new("Title", &"a long subtitle ".repeat(30), &odd_rows()).unwrap();
@@ -268,8 +268,8 @@ mod tests {
         }
     }
 
-    /// No rows at all is a page with its title; an image whose bytes do not fit its size is named; too many rows are
-    /// refused before anything is drawn.
+    /// A filmstrip without rows is a page with its title; an image whose bytes do not match its size is named; too many
+    /// rows are refused before drawing starts.
     #[test]
     fn odd_input() {
         let dir = tempfile::tempdir().unwrap();

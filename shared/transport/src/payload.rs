@@ -1,4 +1,4 @@
-//! The two forms in which a message lies in shared memory: by itself, or as the user header of an image.
+//! The two forms of a message in shared memory: by itself, or as the user header of an image.
 
 use crate::{Publisher, SendError, Service};
 use carff_messages::{ImageMeta, Invalid, Message};
@@ -48,7 +48,7 @@ pub trait Payload: Debug + 'static {
     #[doc(hidden)]
     fn message(sample: &Sample<Service, Self::Body, Self::UserHeader>) -> &Self::Message;
 
-    /// The bytes of an image; none of a message by itself.
+    /// Returns the bytes of an image; empty for a message by itself.
     #[doc(hidden)]
     fn bytes(sample: &Sample<Service, Self::Body, Self::UserHeader>) -> &[u8];
 
@@ -58,7 +58,7 @@ pub trait Payload: Debug + 'static {
     where
         Self: Sized;
 
-    /// Checks that the bytes are as many as a valid message describes.
+    /// Checks that the number of bytes matches the description.
     #[doc(hidden)]
     fn check_size(sample: &Sample<Service, Self::Body, Self::UserHeader>) -> Result<(), Invalid>;
 }
