@@ -1,4 +1,4 @@
-//! The camera as its own process, with images that cannot be used.
+//! Tests of the camera process with unusable images.
 
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
@@ -47,8 +47,8 @@ fn a_folder_with_bad_pictures() {
     assert_eq!(shown, [10, 10, 10, 90, 90, 90]);
 }
 
-/// A dataset whose images cannot be read, or have another size than it says, ends the camera with an error that names
-/// the image: no drive is shown with an image left out.
+/// A dataset with unreadable images, or with images of another size than its description, ends the camera with an error
+/// that names the image: no drive is shown without it.
 #[test]
 fn drives_with_bad_pictures() {
     let set = tempfile::tempdir().unwrap();
@@ -75,8 +75,7 @@ fn drives_with_bad_pictures() {
     assert!(wrong_sized.text.contains("4x4") && wrong_sized.text.contains("8x8"), "{}", wrong_sized.text);
 }
 
-/// Free drives are rendered and published as they go: every frame of each drive, with its truth, at poses of which no two
-/// are the same.
+/// Free drives are rendered during the run: every frame of each drive is published with its truth, at distinct poses.
 #[test]
 fn free_drives_are_published() {
     let scenario = carff_tests::project_root().join("configs/scenarios/approaching-intersection");

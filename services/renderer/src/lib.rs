@@ -1,4 +1,4 @@
-//! The renderer stage's arithmetic: which hypotheses to show, from where, and their images.
+//! The renderer stage's arithmetic: the choice of hypotheses and cameras, and their images.
 
 use anyhow::Context;
 use carff_checkpoint::Manifest;
@@ -8,27 +8,27 @@ use carff_geometry::PinholeCamera;
 use carff_messages::{Belief, Forecast, LATENT_DIM, ViewKind, ViewMeta, row_major};
 use std::path::Path;
 
-/// Loads the field, for images alone.
+/// Loads the field for rendering.
 pub fn load(checkpoint: &Path) -> anyhow::Result<Field> {
     let mut field = carff_checkpoint::load_field(checkpoint, &Manifest::load(checkpoint)?)?;
     field.set_instruction_set(InstructionSet::detect_for_pictures());
     Ok(field)
 }
 
-/// One hypothesis to render.
+/// A hypothesis to render.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Hypothesis {
-    /// Its index: a mixture component's, or the number of components plus a sample's.
+    /// Index: a mixture component's, or the number of components plus a sample's.
     pub index: u32,
-    /// The latent.
+    /// Latent of the hypothesis.
     pub latent: [f32; LATENT_DIM],
-    /// The state that probing found in it; -1 for none of the known ones.
+    /// The state that probing found; -1 for none of the known ones.
     pub state: i32,
-    /// Its probability, 0..=1.
+    /// Probability of the hypothesis, 0..=1.
     pub probability: f32,
 }
 
-/// The hypotheses of a forecast and its belief, the most probable first, at most `count`: the component means, then
+/// Returns at most `count` hypotheses of a forecast and its belief, the most probable first: the component means, then
 /// the samples.
 pub fn hypotheses(forecast: &Forecast, belief: &Belief, count: usize) -> Vec<Hypothesis> {
     let components = forecast.component_count as usize;
@@ -53,7 +53,7 @@ pub fn hypotheses(forecast: &Forecast, belief: &Belief, count: usize) -> Vec<Hyp
     all
 }
 
-/// A camera over the region that matters: straight down with the image's up = +Y, or from a corner.
+/// Returns a camera above the region of interest: straight down with +Y up in the image, or from a corner.
 pub fn camera(field: &Field, choice: ViewChoice, width_px: u32, height_px: u32) -> PinholeCamera {
     let [low, high] = field.config().bounds_m.map(|corner| corner.map(f64::from));
     let centre = [0, 1, 2].map(|i| f64::midpoint(low[i], high[i]));
@@ -80,7 +80,7 @@ pub fn camera(field: &Field, choice: ViewChoice, width_px: u32, height_px: u32) 
     }
 }
 
-/// Renders what one camera sees under each hypothesis, one image each.
+/// Renders one image per hypothesis from one camera.
 pub fn render(
     field: &Field,
     camera: &PinholeCamera,

@@ -1,4 +1,4 @@
-//! The renderer stage: forecasts and beliefs in, images of the hypotheses out. It gives way to the decision path.
+//! The renderer stage: forecasts and beliefs in, images of the hypotheses out. The decision path has priority.
 
 use carff_field::HypothesisBuffer;
 use carff_messages::Stage;
@@ -6,7 +6,7 @@ use carff_renderer::{camera, hypotheses, load, meta, render, write};
 use carff_stage::{Overload, StageContext, frame_span};
 use carff_transport::{Woken, monotonic_now_ns, topics};
 
-/// Smallest side of a view, however little room there is, pixels.
+/// Minimum side of a view under overload, pixels.
 const MIN_SIDE_PX: u32 = 16;
 
 fn main() -> std::process::ExitCode {
@@ -26,7 +26,7 @@ fn run(stage: &mut StageContext) -> anyhow::Result<()> {
     let mut overload = Overload::new(&stage.graph);
     stage.ready();
     loop {
-        // Views, then a rest: the rate stays below its limit, and only the newest belief is looked at.
+        // Views, then a pause: the rate stays below its limit, and only the newest belief is used.
         while monotonic_now_ns() < next_ns {
             if stage.wait_until(&[], next_ns)? == Woken::Stopped {
                 return Ok(());
@@ -69,7 +69,7 @@ fn run(stage: &mut StageContext) -> anyhow::Result<()> {
                 match write(picture, loan.bytes_mut()) {
                     Ok(()) => {
                         let mut meta = meta(&forecast, hypothesis, choice, &camera);
-                        // Its share of what was rendered for all of them at once, and its own writing.
+                        // The view's share of the common rendering time, and its own writing.
                         meta.stage_latency_ns = stage.worked(&meta.header, written_ns.saturating_sub(own_ns));
                         views.send_image(loan, meta)?;
                     }

@@ -34,7 +34,7 @@ impl LiveRun {
 #[derive(Debug, thiserror::Error)]
 pub enum AttachError {
     /// No graph is running.
-    #[error("no graph is running: start one with `carff launch` (as the same user: runs of other users are not visible)")]
+    #[error("no graph is running: start one with `carff launch` (as the same user: other users' runs are hidden)")]
     NoRun,
     /// No run of this name is alive.
     #[error("no run `{name}` is alive; there {}", there_are(.living))]

@@ -40,7 +40,7 @@ pub enum Weight {
 /// A font with its size in pixels of the finished image.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Font {
-    /// Size, pixels.
+    /// Weight of the letters.
     pub size_px: f64,
     /// Weight.
     pub weight: Weight,

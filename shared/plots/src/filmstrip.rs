@@ -243,8 +243,8 @@ mod tests {
         }
     }
 
-    /// The file is a PNG of the laid-out size in which every image stands unchanged: small ones with each pixel
-    /// twice, large ones as they are, each within its frame.
+    /// The file is a PNG of the layout's size that contains every image unchanged within its frame: small images at
+    /// twice their size, large ones at their own.
     #[test]
     fn pictures_are_shown_unchanged() {
         let dir = tempfile::tempdir().unwrap();

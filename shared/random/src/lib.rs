@@ -1,7 +1,7 @@
 //! Counter-based random streams, one for each draw that a run makes.
 //!
-//! A stream is named by (run seed, frame, step, sample), so a draw never depends on how many draws went before it,
-//! in which thread or process it is made, or whether a frame was skipped.
+//! A stream is named by (run seed, frame, step, sample). So a draw does not depend on earlier draws, on its thread or
+//! process, or on skipped frames.
 //!
 //! ```
 //! let a = carff_random::gaussians::<8>(carff_random::Key { seed: 7, frame: 3, step: 1, sample: 0 });
@@ -13,7 +13,7 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::StandardNormal;
 
-/// Names one stream.
+/// Name of a stream.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub struct Key {
     /// The run's seed.
@@ -26,7 +26,7 @@ pub struct Key {
     pub sample: u32,
 }
 
-/// The stream of a key.
+/// Returns the stream of a key.
 pub fn stream(key: Key) -> ChaCha8Rng {
     let mut seed = [0_u8; 32];
     seed[0..8].copy_from_slice(&key.seed.to_le_bytes());
@@ -36,13 +36,13 @@ pub fn stream(key: Key) -> ChaCha8Rng {
     ChaCha8Rng::from_seed(seed)
 }
 
-/// `N` independent draws from the standard normal distribution.
+/// Returns `N` independent draws from the standard normal distribution.
 pub fn gaussians<const N: usize>(key: Key) -> [f32; N] {
     let mut rng = stream(key);
     std::array::from_fn(|_| rng.sample(StandardNormal))
 }
 
-/// One uniform draw in [0, 1).
+/// Returns a uniform draw in [0, 1).
 pub fn uniform(key: Key) -> f64 {
     stream(key).random()
 }

@@ -48,7 +48,7 @@ pub fn standard_messages(
     }
 }
 
-/// The places, each with the probability that it is taken.
+/// Returns the places, each with its occupancy probability.
 fn boxes(at: Option<Timestamp>, belief: &Belief, places: &[Place]) -> SceneUpdate {
     let states = belief.state_probability.iter().take(belief.state_count as usize);
     let entities = places
