@@ -35,10 +35,10 @@ test: build ## Run all tests, including whole graphs of processes
 	cargo test --release --locked --workspace
 
 deb: build ## Build a Debian package: programs, checkpoints, configs, systemd units
-	$(PYTHON) launch/build_deb.py $(TARGET)
+	$(PYTHON) launch/packaging/build_deb.py $(TARGET)
 
 check-deb: deb ## Install the package here, drive, try to access it as another user, purge it (as root)
-	$(PYTHON) tests/check_deb.py $(TARGET)/carff_*.deb
+	$(PYTHON) tests/scripts/check_deb.py $(TARGET)/carff_*.deb
 
 link: ## Build carff-link, which forwards topics to another machine (optional; zenoh adds 300 crates)
 	cargo build --release --locked --manifest-path services/link/Cargo.toml --target-dir $(TARGET)/link
@@ -48,7 +48,7 @@ link: ## Build carff-link, which forwards topics to another machine (optional; z
 check-link: build link ## Test carff-link; then drive here, observe from another network, and cut the link (as root)
 	cargo fmt --manifest-path services/link/Cargo.toml --check
 	cargo test --release --locked --manifest-path services/link/Cargo.toml --target-dir $(TARGET)/link
-	$(PYTHON) tests/check_link.py $(TARGET)/release
+	$(PYTHON) tests/scripts/check_link.py $(TARGET)/release
 
 bench-peer: ## Build the peer with which `carff bench ipc` also measures zenoh (optional; adds 300 crates)
 	cargo build --release --locked --manifest-path tests/zenoh-peer/Cargo.toml --target-dir $(TARGET)/zenoh-peer
@@ -62,7 +62,7 @@ lint: libtorch ## Check format and lints
 sanitize: libtorch ## Run the tests around `unsafe` under the address sanitizer (needs a nightly toolchain)
 	RUSTFLAGS=-Zsanitizer=address LD_LIBRARY_PATH=$(CURDIR)/.libtorch/lib cargo +nightly test --locked --lib --tests \
 		--target x86_64-unknown-linux-gnu --target-dir $(TARGET)/sanitize \
-		-p carff-field -p carff-messages -p carff-models -p carff-transport
+		-p carff-field -p carff-messages -p carff-networks -p carff-transport
 
 miri: ## Run the kernels of the field (portable path) and the messages' tests under Miri (nightly with miri and rust-src)
 	cargo +nightly miri test --locked --lib --target-dir $(TARGET)/miri -p carff-field -- dispatch::
@@ -92,10 +92,10 @@ soak: build ## Run the shipped graph for MINUTES (default 10) with SEED (default
 	$(TARGET)/release/carff soak configs/soak/all.toml --minutes $(or $(MINUTES),10) --seed $(or $(SEED),1) --json reports/soak.json
 
 sbom: ## Write the bill of materials of the programs, as CycloneDX JSON (needs cargo-cyclonedx)
-	$(PYTHON) launch/build_sbom.py $(TARGET)/carff.cdx.json
+	$(PYTHON) launch/packaging/build_sbom.py $(TARGET)/carff.cdx.json
 
 fmt: ## Format all Rust sources
 	cargo fmt --all
 
 libtorch: ## Fetch libtorch once (your own LIBTORCH wins)
-	@$(PYTHON) launch/fetch_libtorch.py
+	@$(PYTHON) launch/packaging/fetch_libtorch.py

@@ -1,29 +1,28 @@
-//! `carff ablate`: the same training with one thing changed at a time, as one table.
+//! `carff ablate`: one training with one setting changed at a time, as one table.
 
 use crate::eval;
-use crate::train::{Display, data_sets, refuse_another_configuration, stop_on_signals, with_free_poses};
+use crate::train::{Display, datasets, refuse_another_configuration, stop_on_signals, with_random_poses};
 use anyhow::Context;
-use carff_results::ResultsError;
-use carff_results::ablation::{AblationTable, Variant, folders, row, write_table};
-use carff_training::{TrainingError, config::TrainingConfig, run::Run};
+use carff_training::ablation::{AblationTable, Variant, folders, row, write_table};
+use carff_training::{Progress, Run, Training, TrainingConfig, TrainingError};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
-/// What to train, and where it goes.
+/// Options of `carff ablate`.
 #[derive(Debug, clap::Args)]
 pub struct AblateArgs {
     /// The training file, for example configs/training/approaching-intersection-ablation.toml.
     config: PathBuf,
-    /// Data set to train on, in place of the training file's.
+    /// Dataset to train on, instead of the training file's.
     #[arg(long)]
     dataset: Option<PathBuf>,
-    /// These variants alone, by the name of their folder: full, stem, conv-net, unfrozen, transformer, no-pose.
+    /// Train only these variants, by the name of their folder: full, stem, conv-net, unfrozen, transformer, no-pose.
     #[arg(long, value_parser = variant)]
     only: Vec<Variant>,
-    /// Where training and scoring compute: `auto`, `cpu` or `cuda:N`.
+    /// Device of training and scoring: `auto`, `cpu` or `cuda:N`.
     #[arg(long, default_value = "auto")]
     device: String,
-    /// Folder for ablation.json, README.md, and a folder for each variant. The same command goes on where it stopped.
+    /// Folder for ablation.json, README.md, and a folder for each variant. The same command resumes a stopped run.
     #[arg(long)]
     out: PathBuf,
 }
@@ -31,7 +30,7 @@ pub struct AblateArgs {
 fn variant(name: &str) -> Result<Variant, String> {
     let names = || Variant::ALL.map(Variant::name).join(", ");
     Variant::ALL.into_iter().find(|v| v.name() == name).ok_or_else(|| {
-        let hint = carff_nearest::hint(name, Variant::ALL.map(Variant::name));
+        let hint = carff_base::names::hint(name, Variant::ALL.map(Variant::name));
         format!("one of {} is wanted{hint}", names())
     })
 }
@@ -39,18 +38,18 @@ fn variant(name: &str) -> Result<Variant, String> {
 /// Runs the command.
 pub fn run(args: &AblateArgs) -> anyhow::Result<ExitCode> {
     let config = TrainingConfig::load(&args.config)?;
-    let (dataset, free) = data_sets(&config, args.dataset.as_deref())?;
+    let (dataset, rendered) = datasets(&config, args.dataset.as_deref())?;
     let threads = u16::try_from(config.threads).unwrap_or(1);
     let options = eval::options(&args.device, threads, config.seed + 1)?;
     let stop = stop_on_signals()?;
     std::fs::create_dir_all(&args.out).with_context(|| format!("cannot make {}", args.out.display()))?;
     refuse_another_configuration(&args.out, &config, &dataset)?;
     let display = Display::default();
-    let report = |progress: &carff_training::run::Progress| display.show(progress);
-    let made =
-        with_free_poses(free, &config, &dataset, &Run { dir: args.out.clone(), on_progress: &report, stop: &stop });
+    let report = |progress: &Progress| display.show(progress);
+    let run = Run { dir: args.out.clone(), on_progress: &report, stop: &stop };
+    let made = with_random_poses(rendered, &config, &dataset, &run);
     display.finish();
-    let free = match made {
+    let random_poses = match made {
         Err(TrainingError::Stopped) => return Ok(stopped(&args.out)),
         made => made?,
     };
@@ -58,9 +57,16 @@ pub fn run(args: &AblateArgs) -> anyhow::Result<ExitCode> {
     let mut table = AblationTable {
         dataset: dataset.display().to_string(),
         epochs: config.vae.epochs,
-        free_poses: free.as_ref().map_or(0, |_| config.free_poses.count),
+        free_poses: random_poses.as_ref().map_or(0, |_| config.free_poses.count),
         seed: config.seed,
         rows: Vec::new(),
+    };
+    let training = Training {
+        config: &config,
+        dataset: &dataset,
+        random_poses: random_poses.as_deref(),
+        out: &args.out,
+        device: options.device,
     };
     for variant in variants {
         eprintln!("{}: {}", variant.name(), variant.description(&config));
@@ -68,16 +74,16 @@ pub fn run(args: &AblateArgs) -> anyhow::Result<ExitCode> {
         std::fs::create_dir_all(&dir).with_context(|| format!("cannot make {}", dir.display()))?;
         refuse_another_configuration(&dir, &variant.apply(&config), &dataset)?;
         let display = Display::default();
-        let report = |progress: &carff_training::run::Progress| display.show(progress);
+        let report = |progress: &Progress| display.show(progress);
         let run = Run { dir, on_progress: &report, stop: &stop };
-        let found = row(&config, variant, &dataset, free.as_deref(), &args.out, &run, options);
+        let found = row(&training, variant, &run, options);
         display.finish();
         match found {
             Ok(row) => table.rows.push(row),
-            Err(ResultsError::Training(TrainingError::Stopped)) => return Ok(stopped(&args.out)),
+            Err(TrainingError::Stopped) => return Ok(stopped(&args.out)),
             Err(error) => return Err(error.into()),
         }
-        // After each variant, so that there is a table to look at.
+        // After each variant, so that the table is available early.
         write_table(&table, &args.out)?;
     }
     println!("table: {}", args.out.join("README.md").display());
@@ -85,6 +91,6 @@ pub fn run(args: &AblateArgs) -> anyhow::Result<ExitCode> {
 }
 
 fn stopped(out: &Path) -> ExitCode {
-    eprintln!("stopped; the same command goes on from what is in {}", out.display());
+    eprintln!("stopped; the same command resumes from the states in {}", out.display());
     ExitCode::from(130)
 }

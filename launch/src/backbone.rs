@@ -2,7 +2,7 @@
 
 use anyhow::{Context, bail};
 use carff_checkpoint::shapes::{BackboneConfig, BackboneKind};
-use carff_pretrained::Published;
+use carff_networks::pretrained::Published;
 use std::{
     fmt::Write,
     path::{Path, PathBuf},
@@ -43,12 +43,13 @@ pub fn run(command: &BackboneCommand) -> anyhow::Result<ExitCode> {
     if args.out.exists() && !args.force {
         bail!("{} exists: name another file with --out, or replace it with --force", args.out.display());
     }
-    let tensors = carff_pretrained::read(&args.source)?;
-    let published = carff_pretrained::backbone(&tensors).with_context(|| args.source.display().to_string())?;
+    let tensors = carff_networks::pretrained::read(&args.source)?;
+    let published =
+        carff_networks::pretrained::backbone(&tensors).with_context(|| args.source.display().to_string())?;
     if let Some(folder) = args.out.parent() {
         std::fs::create_dir_all(folder).with_context(|| format!("cannot create {}", folder.display()))?;
     }
-    carff_pretrained::write(&args.out, &published)?;
+    carff_networks::pretrained::write(&args.out, &published)?;
     print!("{}", told(&published, &args.out)?);
     Ok(ExitCode::SUCCESS)
 }

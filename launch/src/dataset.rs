@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, bail};
 use carff_dataset::{Dataset, DatasetReport, ImportOptions, SheetOptions, contact_sheet, import};
 use carff_scenes::{Extras, Scenario};
-use carff_training::places::places;
+use carff_training::places;
 use indicatif::{ProgressBar, ProgressStyle};
 
 /// Commands for datasets.
@@ -120,7 +120,7 @@ fn find_scenario(scenario: &Path) -> anyhow::Result<PathBuf> {
     if named.is_file() {
         return Ok(named);
     }
-    let hint = carff_nearest::beside(&named);
+    let hint = carff_base::names::beside(&named);
     bail!("no scenario {}: neither this file nor {} exists{hint}", scenario.display(), named.display());
 }
 

@@ -1,36 +1,37 @@
-//! `carff eval`: every table and picture of a checkpoint, as JSON and one page.
+//! `carff eval`: every table and image of a checkpoint, as JSON and one page.
 
 use crate::dataset::render;
 use crate::train::Display;
 use anyhow::{Context, bail};
 use carff_checkpoint::Manifest;
 use carff_dataset::{Image, drives::DriveKind};
-use carff_results::{EvalOptions, Subject, Table, evaluate};
+use carff_evaluation::{EvalOptions, Progress, Subject, Table, evaluate};
 use carff_scenes::{Extras, Scenario};
-use carff_training::run::Progress;
+use carff_training::training_curves;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 /// Frames of a free drive between two states.
 const FRAMES_PER_TIMESTAMP: usize = 6;
-/// Cameras that are no further apart, metres, are the same.
+/// Largest distance of two cameras that count as the same, metres.
 const SAME_PLACE_M: f64 = 1e-3;
 
-/// What to judge, and where the results go.
+/// Options of `carff eval`.
 #[derive(Debug, clap::Args)]
 pub struct EvalArgs {
-    /// The checkpoint's folder.
+    /// Folder of the checkpoint.
     checkpoint: PathBuf,
-    /// Data set to judge it on, in place of the one it was trained on.
+    /// Dataset of the evaluation, instead of the training dataset.
     #[arg(long)]
     dataset: Option<PathBuf>,
-    /// This table alone; may be given several times.
+    /// Compute only this table; may be given several times.
     #[arg(long, value_enum, value_name = "TABLE")]
     only: Vec<TableName>,
-    /// Where the encoder computes: `auto`, `cpu` or `cuda:N`.
+    /// Device of the encoder: `auto`, `cpu` or `cuda:N`.
     #[arg(long, default_value = "auto")]
     device: String,
-    /// Folder of the training run, for its curves; else runs/NAME or the checkpoint's parent, where they have any.
+    /// Folder of the training run, for its curves. Default: runs/NAME or the checkpoint's parent, where they have
+    /// metrics.
     #[arg(long)]
     run_dir: Option<PathBuf>,
     /// Threads that render and probe.
@@ -39,19 +40,18 @@ pub struct EvalArgs {
     /// Seed of sensor noise, draws, folds and free drives.
     #[arg(long, default_value_t = 2)]
     seed: u64,
-    /// Free drives to judge planning by, half of them with a hazard; rendered, where the data set's scenario file is at
-    /// hand.
+    /// Number of free drives for planning, half of them with a hazard. They need the scenario file of the dataset.
     #[arg(long, default_value_t = 400, value_parser = clap::value_parser!(u32).range(0..=100_000))]
     free_drives: u32,
-    /// Folder for results.json, README.md and pictures; files of an earlier evaluation are written over.
+    /// Folder for results.json, README.md and images; files of an earlier evaluation are overwritten.
     #[arg(long)]
     out: PathBuf,
 }
 
-/// The tables.
+/// A table.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 enum TableName {
-    /// PSNR matrices from above, and other poses.
+    /// PSNR matrices from above, and novel views.
     Psnr,
     /// Decoder, support vector machine, state accuracy.
     Encoder,
@@ -59,7 +59,7 @@ enum TableName {
     Recall,
     /// Every decision rule, and the reliability of the hazard probability.
     Planning,
-    /// How often each outcome is drawn where several are open.
+    /// Frequency of each outcome where several are open.
     Frequencies,
     /// t-SNE, reconstructions, curves, beliefs, density.
     Pictures,
@@ -81,8 +81,8 @@ impl From<TableName> for Table {
 /// Runs the command.
 pub fn run(args: &EvalArgs) -> anyhow::Result<ExitCode> {
     let options = options(&args.device, args.threads, args.seed)?;
-    // A picture at a time gains little from a second thread, and loses much where cores are taken.
-    carff_models::device::set_threads(1);
+    // One image at a time gains little from a second thread, and loses much on busy cores.
+    carff_networks::device::set_threads(1);
     let manifest = Manifest::load(&args.checkpoint)?;
     let dataset = match &args.dataset {
         Some(dataset) => dataset.clone(),
@@ -90,7 +90,9 @@ pub fn run(args: &EvalArgs) -> anyhow::Result<ExitCode> {
     };
     let display = Display::default();
     let mut subject = Subject::load(&args.checkpoint, &dataset, options, &|p| display.show(p))?;
-    subject.run_dir = run_dir(args);
+    if let Some(run_dir) = run_dir(args) {
+        subject.training_curves = training_curves(&run_dir)?;
+    }
     let asked: Vec<Table> = args.only.iter().map(|t| Table::from(*t)).collect();
     let tables = if asked.is_empty() { Table::ALL.to_vec() } else { asked };
     if tables.contains(&Table::Planning)
@@ -98,11 +100,11 @@ pub fn run(args: &EvalArgs) -> anyhow::Result<ExitCode> {
     {
         subject.free_drives = free_drives(&scenario, args.free_drives, args.seed, &display)?;
     }
-    let results = evaluate(&mut subject, &tables, &args.out, &|p| display.show(p))?;
+    let results = evaluate(&subject, &tables, &args.out, &|p| display.show(p))?;
     display.finish();
     for target in &results.targets {
         let verdict = if target.reached { "reached" } else { "missed " };
-        println!("{verdict}  {}: {} (wanted: {})", target.what, target.found, target.wanted);
+        println!("{verdict}  {}: {} (target: {})", target.what, target.found, target.wanted);
     }
     for (table, why) in &results.left_out {
         println!("no {table}: {why}");
@@ -112,35 +114,34 @@ pub fn run(args: &EvalArgs) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-/// Sets up the allocator, and says how to evaluate.
+/// Sets up the allocator, and returns the settings of the evaluation.
 pub fn options(device: &str, threads: u16, seed: u64) -> anyhow::Result<EvalOptions> {
-    carff_models::allocator::keep_large_blocks();
-    Ok(EvalOptions { device: carff_models::device::parse(device)?, threads: usize::from(threads), seed })
+    carff_networks::allocator::keep_large_blocks();
+    Ok(EvalOptions { device: carff_networks::device::parse(device)?, threads: usize::from(threads), seed })
 }
 
-/// The data set that a checkpoint was trained on, rendered when it is missing and its scenario is at hand.
+/// Training dataset of a checkpoint, rendered when it is missing and its scenario file is available.
 fn trained_on(manifest: &Manifest) -> anyhow::Result<PathBuf> {
     let path = |key: &str| manifest.training.get(key).and_then(|v| v.as_str()).map(PathBuf::from);
-    let dataset =
-        path("dataset").context("the checkpoint does not say what it was trained on: name it with --dataset")?;
+    let dataset = path("dataset").context("the checkpoint has no training dataset: name a dataset with --dataset")?;
     let there = ["transforms.json", "transforms_train.json"].iter().any(|f| dataset.join(f).is_file());
     if !there {
         match path("scenario").filter(|scenario| scenario.is_file()) {
             Some(scenario) => {
                 render(&Scenario::load(&scenario)?, &dataset, Extras::None)?;
             }
-            None => bail!("no data set in {}: name the one to judge on with --dataset", dataset.display()),
+            None => bail!("no dataset in {}: name a dataset with --dataset", dataset.display()),
         }
     }
     Ok(dataset)
 }
 
-/// The scenario that the data set was rendered from: the checkpoint's, when its cameras stand where the set's do.
+/// Scenario from which the dataset was rendered: that of the checkpoint, when its cameras are those of the dataset.
 fn shown_scenario(subject: &Subject) -> Option<Scenario> {
     let path = subject.manifest.training.get("scenario").and_then(|v| v.as_str()).map(PathBuf::from)?;
     let scenario = Scenario::load(&path).ok()?;
-    let dataset = &subject.pictures.dataset;
-    let stands = |view: usize, there: &carff_scenes::ScenarioCamera| {
+    let dataset = &subject.posed.dataset;
+    let same_place = |view: usize, there: &carff_scenes::ScenarioCamera| {
         let frame = dataset.frame_index(0, view).and_then(|i| dataset.frames().get(i));
         frame.is_some_and(|frame| {
             let (a, b) = (frame.camera.position_m(), there.camera.position_m());
@@ -148,11 +149,11 @@ fn shown_scenario(subject: &Subject) -> Option<Scenario> {
         })
     };
     let same = scenario.cameras().len() == dataset.view_count()
-        && scenario.cameras().iter().enumerate().all(|(view, there)| stands(view, there));
+        && scenario.cameras().iter().enumerate().all(|(view, there)| same_place(view, there));
     same.then_some(scenario)
 }
 
-/// Of each free drive the picture whose decision counts, and what is right.
+/// Decisive image and correct action of each free drive.
 fn free_drives(
     scenario: &Scenario,
     count: u32,
@@ -165,7 +166,7 @@ fn free_drives(
     let total = count as usize;
     (0..total)
         .map(|done| {
-            display.show(&Progress { stage: "free drives", done, total, line: String::new() });
+            display.show(&Progress { phase: "free drives", done, total, line: String::new() });
             let drive = scenario.free_drive(done as u64, FRAMES_PER_TIMESTAMP, seed)?;
             let frame = scenario.free_frame(&drive, drive.decisive_frame())?;
             Ok((frame.image, drive.kind()))
@@ -173,7 +174,7 @@ fn free_drives(
         .collect()
 }
 
-/// The folder with the run's metrics: the one named, or where `carff train` puts it.
+/// Folder of the training run: the given one, or the default of `carff train`.
 fn run_dir(args: &EvalArgs) -> Option<PathBuf> {
     let has_metrics = |dir: &PathBuf| dir.join("metrics.jsonl").is_file();
     let by_name = args.checkpoint.file_name().map(|name| Path::new("runs").join(name));

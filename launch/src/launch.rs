@@ -14,8 +14,8 @@ use carff_config::{CameraSource, GraphConfig, WhenLost};
 use carff_dataset::Dataset;
 use carff_messages::{ActionCode, Observability, Stage};
 use carff_observe::{RunLock, RunRecord};
+use carff_runtime::StageArgs;
 use carff_scenes::{Extras, Scenario};
-use carff_stage::StageArgs;
 use carff_transport::{
     Node, Run, Stop, Waiter, Woken, check_space, monotonic_now_ns, remove_run_leftovers, run_id_of, runtime_dir, topics,
 };
@@ -106,8 +106,9 @@ fn report(args: &LaunchArgs, outcome: &Arc<RunOutcome>, terminal: &Terminal) -> 
     if stop.is_stopped() {
         return Ok(ExitCode::from(INTERRUPTED));
     }
-    let report = report::json(outcome, planning.as_ref().map(Planning::tables).unwrap_or_default());
-    let text = format!("{}\n{}", summary(&report), planning::text(&report));
+    let tables = planning.as_ref().map(Planning::tables).transpose()?.unwrap_or_default();
+    let report = report::json(outcome, tables);
+    let text = format!("{}\n{}", summary(&report), planning.as_ref().map_or("", Planning::text));
     terminal.line(&text);
     if let Some(path) = &args.report {
         write(path, &(serde_json::to_string_pretty(&report)? + "\n"))?;
@@ -447,7 +448,7 @@ impl Launcher<'_> {
             } else if watched.restart_at_ns.is_some_and(|at_ns| now_ns >= at_ns)
                 && let Err(error) = self.start(stage)
             {
-                self.judge(i, &carff_stage::describe(&error), now_ns)?;
+                self.judge(i, &carff_base::errors::sentence(&*error), now_ns)?;
             }
         }
         if now_ns >= self.cleanup_ns {
@@ -515,7 +516,7 @@ impl Launcher<'_> {
         if let Some(feed) = self.feed.take() {
             self.waiter.stop().stop();
             if let Ok(Err(error)) = feed.join() {
-                self.terminal.log(LAUNCHER, &format!("ERROR {}", carff_stage::describe(&error)));
+                self.terminal.log(LAUNCHER, &format!("ERROR {}", carff_base::errors::sentence(&*error)));
             }
         }
         let limit = Duration::from_millis(self.graph.launcher.stop_timeout_ms);
@@ -538,7 +539,7 @@ impl Launcher<'_> {
         }
         // Their last heartbeats contain the final counts. A failure here has no consequences.
         if let Err(error) = self.collect() {
-            self.terminal.log(LAUNCHER, &format!("ERROR {}", carff_stage::describe(&error)));
+            self.terminal.log(LAUNCHER, &format!("ERROR {}", carff_base::errors::sentence(&*error)));
         }
     }
 }
@@ -564,7 +565,7 @@ fn provide_dataset(graph: &GraphConfig, args: &LaunchArgs, dataset: &Path, termi
         _ => bail!(
             "dataset {} is missing: pass --dataset, or name its scenario in the graph file (`run.scenario`){}",
             dataset.display(),
-            carff_nearest::beside(dataset)
+            carff_base::names::beside(dataset)
         ),
     }
 }

@@ -2,11 +2,11 @@
 //! evaluation and datasets. The crate `carff` contains the commands that observe a run.
 
 pub mod ablate;
+#[cfg(feature = "import")]
 pub mod backbone;
 pub mod dataset;
 pub mod doctor;
 pub mod eval;
-mod filmstrip;
 pub mod health;
 pub mod launch;
 pub mod monitor;

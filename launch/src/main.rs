@@ -4,6 +4,7 @@ use carff::{Attach, exit_code, until_read};
 #[cfg(feature = "bench")]
 use carff_bench::BenchCommand;
 use carff_launch::ablate::AblateArgs;
+#[cfg(feature = "import")]
 use carff_launch::backbone::BackboneCommand;
 use carff_launch::dataset::DatasetCommand;
 use carff_launch::doctor::DoctorArgs;
@@ -82,7 +83,12 @@ Exit code: 1 when --verify finds a difference.")]
         after_help = "Example: a vision transformer, as timm and Hugging Face publish them
   carff backbone import model.safetensors --out runs/vit.safetensors"
     )]
+    #[cfg(feature = "import")]
     Backbone(BackboneCommand),
+    /// Import published weights (not part of this build).
+    #[cfg(not(feature = "import"))]
+    #[command(hide = true)]
+    Backbone(carff::NotBuilt),
     /// Measure the program's parts and the whole loop on this machine.
     #[command(
         subcommand,
@@ -137,7 +143,10 @@ fn run() -> anyhow::Result<ExitCode> {
         Command::Train(args) => carff_launch::train::run(&args),
         Command::Eval(args) => carff_launch::eval::run(&args),
         Command::Ablate(args) => carff_launch::ablate::run(&args),
+        #[cfg(feature = "import")]
         Command::Backbone(command) => carff_launch::backbone::run(&command),
+        #[cfg(not(feature = "import"))]
+        Command::Backbone(args) => args.run("carff backbone"),
         #[cfg(feature = "bench")]
         Command::Bench(command) => carff_bench::run(command),
         #[cfg(not(feature = "bench"))]

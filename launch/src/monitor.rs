@@ -156,7 +156,7 @@ impl Records {
             timestamp: view.timestamp,
             drive: view.drive,
             frame_in_drive: view.frame_in_drive,
-            last_of_timestamp: view.last_of_timestamp == 1,
+            last_of_timestamp: view.is_last_of_timestamp(),
             observability: Observability::of_code(view.observability).ok().flatten(),
             capture_time_ns: meta.header.capture_time_ns,
             posterior: None,
@@ -205,7 +205,7 @@ impl Records {
         if reason != Reason::Belief {
             *self.safe_actions.entry(reason.name()).or_default() += 1;
         }
-        if action.is_decision == 0 {
+        if !action.is_decision() {
             return None;
         }
         let frame = self.frames.get_mut(&action.based_on_frame)?;

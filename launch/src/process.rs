@@ -4,7 +4,7 @@ use anyhow::Context;
 use carff::log_line;
 use carff::terminal::Terminal;
 use carff_messages::Stage;
-use carff_stage::StageArgs;
+use carff_runtime::StageArgs;
 use rustix::process::{Pid, Signal, kill_process};
 use std::io::{BufRead, BufReader, Read};
 use std::os::unix::process::CommandExt;

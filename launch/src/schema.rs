@@ -3,7 +3,7 @@
 
 use carff_config::{GraphConfig, SoakConfig};
 use carff_scenes::config::ScenarioConfig;
-use carff_training::config::TrainingConfig;
+use carff_training::TrainingConfig;
 use schemars::generate::SchemaSettings;
 use serde_json::Value;
 

@@ -5,12 +5,7 @@ use anyhow::{Context, bail};
 use carff_checkpoint::Manifest;
 use carff_scenes::{Extras, Scenario};
 use carff_training::{
-    TrainingError,
-    config::{FreePoses, TrainingConfig},
-    features::FEATURES,
-    free,
-    pipeline::{self, Stage},
-    run::{Progress, Run},
+    FreePoses, Phases, Progress, Run, Training, TrainingConfig, TrainingError, forget_run, render_random_poses,
 };
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde_json::Value;
@@ -26,33 +21,32 @@ use std::{
     time::{Duration, Instant},
 };
 
-/// What to train, and where it goes.
+/// Options of `carff train`.
 #[derive(Debug, clap::Args)]
 pub struct TrainArgs {
     /// The training file, for example configs/training/approaching-intersection.toml.
     config: PathBuf,
-    /// Data set to train on, in place of the training file's.
+    /// Dataset to train on, instead of the training file's.
     #[arg(long)]
     dataset: Option<PathBuf>,
-    /// Folder for the finished checkpoint, in place of the training file's.
+    /// Folder for the finished checkpoint, instead of the training file's.
     #[arg(long)]
     out: Option<PathBuf>,
-    /// Train one model alone; those before it must be there.
+    /// Train only one model; the models before it must be finished.
     #[arg(long, value_enum)]
     stage: Option<StageName>,
-    /// Where the VAE and the mixture density network are trained: `auto`, `cpu` or `cuda:N`. The field has kernels of its
-    /// own, for the processor.
+    /// Device of the VAE and the mixture density network: `auto`, `cpu` or `cuda:N`. The field is trained on the CPU.
     #[arg(long, default_value = "auto")]
     device: String,
     /// Folder for saved states, metrics and curves.
     #[arg(long)]
     run_dir: Option<PathBuf>,
-    /// Replace a finished checkpoint, and forget saved states of another configuration.
+    /// Replace a finished checkpoint, and remove saved states of another configuration.
     #[arg(long)]
     force: bool,
 }
 
-/// The models, in the order of training.
+/// A model to train.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 enum StageName {
     /// The pose-conditional VAE.
@@ -68,9 +62,9 @@ pub fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
     let config = TrainingConfig::load(&args.config)?;
     let out = args.out.clone().unwrap_or_else(|| config.out.clone());
     if args.dataset.is_some() && args.out.is_none() {
-        bail!("--dataset without --out would overwrite {}: say where this checkpoint goes", config.out.display());
+        bail!("--dataset without --out would overwrite {}: name the folder of this checkpoint", config.out.display());
     }
-    let (dataset, free) = data_sets(&config, args.dataset.as_deref())?;
+    let (dataset, rendered) = datasets(&config, args.dataset.as_deref())?;
     let name = out.file_name().map_or_else(|| "training".into(), |n| n.to_string_lossy().into_owned());
     let dir = args.run_dir.clone().unwrap_or_else(|| Path::new("runs").join(name));
     std::fs::create_dir_all(&dir).with_context(|| format!("cannot make {}", dir.display()))?;
@@ -81,37 +75,39 @@ pub fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
     }
     refuse_another_configuration(&dir, &config, &dataset)?;
 
-    let device = carff_models::device::parse(&args.device)?;
+    let device = carff_networks::device::parse(&args.device)?;
     let stop = stop_on_signals()?;
     let display = Display::default();
     let report = |progress: &Progress| display.show(progress);
     let run = Run { dir: dir.clone(), on_progress: &report, stop: &stop };
-    let stage = match args.stage {
-        None => Stage::All,
-        Some(StageName::Vae) => Stage::Vae,
-        Some(StageName::Nerf) => Stage::Nerf,
-        Some(StageName::Mdn) => Stage::Mdn,
+    let phases = match args.stage {
+        None => Phases::All,
+        Some(StageName::Vae) => Phases::Vae,
+        Some(StageName::Nerf) => Phases::Field,
+        Some(StageName::Mdn) => Phases::Mixture,
     };
-    let result = with_free_poses(free, &config, &dataset, &run)
-        .and_then(|free| pipeline::train(&config, &dataset, free.as_deref(), &out, stage, device, &run));
+    let result = with_random_poses(rendered, &config, &dataset, &run).and_then(|random_poses| {
+        let random_poses = random_poses.as_deref();
+        Training { config: &config, dataset: &dataset, random_poses, out: &out, device }.run(phases, &run)
+    });
     display.finish();
     match result {
-        Ok(metrics) => {
-            println!("{}", pipeline::summary(&metrics));
+        Ok(figures) => {
+            println!("{}", figures.summary());
             println!("checkpoint: {}", out.display());
             println!("metrics and saved states: {}", dir.display());
             Ok(ExitCode::SUCCESS)
         }
         Err(TrainingError::Stopped) => {
             debug_assert!(stop.load(Ordering::Relaxed));
-            eprintln!("stopped; the same command goes on from the states saved in {}", dir.display());
+            eprintln!("stopped; the same command resumes from the states saved in {}", dir.display());
             Ok(ExitCode::from(130))
         }
         Err(error) => Err(error.into()),
     }
 }
 
-/// A flag that Ctrl-C sets; the second one ends the program at once.
+/// A flag that Ctrl-C sets; a second Ctrl-C ends the program at once.
 pub fn stop_on_signals() -> anyhow::Result<Arc<AtomicBool>> {
     let stop = Arc::new(AtomicBool::new(false));
     for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
@@ -121,28 +117,28 @@ pub fn stop_on_signals() -> anyhow::Result<Arc<AtomicBool>> {
     Ok(stop)
 }
 
-/// The data set and the set of freely drawn poses, if any; what the training file's scenario can make is rendered when it
-/// is missing.
-pub fn data_sets(config: &TrainingConfig, given: Option<&Path>) -> anyhow::Result<(PathBuf, Option<PathBuf>)> {
+/// Folders of the dataset and of the dataset of random poses, if any. Missing ones are rendered from the training
+/// file's scenario.
+pub fn datasets(config: &TrainingConfig, given: Option<&Path>) -> anyhow::Result<(PathBuf, Option<PathBuf>)> {
     let dataset = given.unwrap_or(&config.dataset).to_owned();
     if !dataset.join("transforms.json").is_file() && given.is_none() {
         render(&scenario(config)?, &dataset, Extras::None)?;
     }
-    Ok((dataset, free_poses(config, given)?))
+    Ok((dataset, rendered_random_poses(config, given)?))
 }
 
 fn scenario(config: &TrainingConfig) -> anyhow::Result<Scenario> {
     match &config.scenario {
         Some(path) => Ok(Scenario::load(path)?),
         None => bail!(
-            "no data set in {}: name one with --dataset, or a `scenario` in the training file",
+            "no dataset in {}: name one with --dataset, or a `scenario` in the training file",
             config.dataset.display()
         ),
     }
 }
 
-/// The set of freely drawn poses, rendered when it is missing; none for a data set that the scenario did not make.
-fn free_poses(config: &TrainingConfig, given: Option<&Path>) -> anyhow::Result<Option<PathBuf>> {
+/// Folder of the dataset of random poses, rendered when it is missing; `None` for a dataset without a scenario file.
+fn rendered_random_poses(config: &TrainingConfig, given: Option<&Path>) -> anyhow::Result<Option<PathBuf>> {
     let FreePoses { count, seed, .. } = config.free_poses;
     if count == 0 || given.is_some() || config.scenario.is_none() {
         return Ok(None);
@@ -156,8 +152,9 @@ fn free_poses(config: &TrainingConfig, given: Option<&Path>) -> anyhow::Result<O
     Ok(Some(dir))
 }
 
-/// The rendered set of freely drawn poses; without one that which a field shows, if the training file asks for it.
-pub fn with_free_poses(
+/// Folder of the dataset of random poses: the rendered one, else one that a field renders if the training file requests
+/// it.
+pub fn with_random_poses(
     rendered: Option<PathBuf>,
     config: &TrainingConfig,
     dataset: &Path,
@@ -165,14 +162,13 @@ pub fn with_free_poses(
 ) -> Result<Option<PathBuf>, TrainingError> {
     match rendered {
         Some(dir) => Ok(Some(dir)),
-        None => free::set(config, dataset, run),
+        None => render_random_poses(config, dataset, run),
     }
 }
 
 const CONFIGURATION: &str = "configuration.json";
 
-/// A training that has just begun must not write over what another one has finished. One that goes on may: what it
-/// writes over is its own.
+/// Refuses a new training that would overwrite a finished checkpoint. A resumed training overwrites only its own files.
 fn refuse_finished(dir: &Path, out: &Path) -> anyhow::Result<()> {
     let begins = !dir.join(CONFIGURATION).is_file();
     if begins && Manifest::load(out).is_ok_and(|m| m.field.is_some()) {
@@ -184,41 +180,25 @@ fn refuse_finished(dir: &Path, out: &Path) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Removes the states of another configuration or data set.
+/// Removes the states of another configuration or dataset.
 fn forget_another_configuration(dir: &Path, config: &TrainingConfig, dataset: &Path) -> anyhow::Result<()> {
     if !dir.join(CONFIGURATION).is_file() || refuse_another_configuration(dir, config, dataset).is_ok() {
         return Ok(());
     }
-    let states = ["vae", "nerf", "mdn", free::STAGE].map(|stage| format!("{stage}.state.safetensors"));
-    let others = ["posteriors.safetensors", FEATURES, "metrics.jsonl", CONFIGURATION].map(str::to_owned);
-    for name in states.into_iter().chain(others) {
-        let path = dir.join(name);
-        match std::fs::remove_file(&path) {
-            Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
-                return Err(error).with_context(|| format!("cannot remove {}", path.display()));
-            }
-            _ => {}
-        }
-    }
-    let pictures = dir.join(free::FOLDER);
-    match std::fs::remove_dir_all(&pictures) {
-        Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
-            Err(error).with_context(|| format!("cannot remove {}", pictures.display()))
-        }
-        _ => Ok(()),
-    }
+    forget_run(dir)?;
+    std::fs::remove_file(dir.join(CONFIGURATION)).with_context(|| format!("cannot clear {}", dir.display()))
 }
 
-/// A run folder belongs to one configuration and one data set: going on with another would mix them.
+/// Refuses a run folder of another configuration or dataset: resuming with its states would mix them.
 pub fn refuse_another_configuration(dir: &Path, config: &TrainingConfig, dataset: &Path) -> anyhow::Result<()> {
     let path = dir.join(CONFIGURATION);
-    let mine = what_is_learnt(config, dataset)?;
+    let mine = relevant_settings(config, dataset)?;
     match std::fs::read_to_string(&path) {
-        // Read and written again: keys that an earlier version did not have yet take their defaults.
+        // Keys that an earlier version did not have take their defaults.
         Ok(text) if serde_json::from_str::<Value>(&text).is_ok_and(|there| completed(there) == mine) => Ok(()),
         Ok(_) => bail!(
-            "{} holds states of another training configuration or data set; name another folder with --run-dir, or forget \
-             these with --force",
+            "{} has states of another training configuration or dataset; name another folder with --run-dir, or remove \
+             these states with --force",
             dir.display()
         ),
         Err(_) => std::fs::write(&path, serde_json::to_string_pretty(&mine)?)
@@ -226,10 +206,10 @@ pub fn refuse_another_configuration(dir: &Path, config: &TrainingConfig, dataset
     }
 }
 
-/// Keys that change how fast it goes and where to, not what is learnt.
+/// Keys that change speed and output folder, not the trained models.
 const OTHER_KEYS: [&str; 2] = ["threads", "out"];
 
-fn what_is_learnt(config: &TrainingConfig, dataset: &Path) -> anyhow::Result<Value> {
+fn relevant_settings(config: &TrainingConfig, dataset: &Path) -> anyhow::Result<Value> {
     let mut value = serde_json::to_value(config)?;
     value["dataset"] = serde_json::to_value(dataset)?;
     if let Some(map) = value.as_object_mut() {
@@ -240,25 +220,25 @@ fn what_is_learnt(config: &TrainingConfig, dataset: &Path) -> anyhow::Result<Val
     Ok(value)
 }
 
-/// A saved configuration with the defaults of the keys that it lacks; as it is when it is none.
+/// A saved configuration with the defaults of missing keys; unchanged when it is not a configuration.
 fn completed(there: Value) -> Value {
     let read = || {
         let mut whole = there.clone();
-        // Where it goes has no default, and is not saved.
+        // The output folder has no default, and is not saved.
         whole.as_object_mut()?.insert("out".to_owned(), Value::from(""));
         let config: TrainingConfig = serde_json::from_value(whole).ok()?;
-        what_is_learnt(&config, &config.dataset).ok()
+        relevant_settings(&config, &config.dataset).ok()
     };
     read().unwrap_or(there)
 }
 
-/// One bar a stage on a terminal; a line now and then elsewhere.
+/// Progress display: one bar for each phase on a terminal, else a line at intervals.
 #[derive(Default)]
 pub struct Display {
     bars: Mutex<BTreeMap<String, (ProgressBar, Instant)>>,
 }
 
-/// Time between two lines where there is no terminal.
+/// Time between two lines without a terminal.
 const LINE_EVERY: Duration = Duration::from_secs(15);
 
 impl Display {
@@ -266,7 +246,7 @@ impl Display {
     pub fn show(&self, progress: &Progress) {
         let live = std::io::stderr().is_terminal();
         let Ok(mut bars) = self.bars.lock() else { return };
-        let (bar, last) = bars.entry(progress.stage.to_owned()).or_insert_with(|| {
+        let (bar, last) = bars.entry(progress.phase.to_owned()).or_insert_with(|| {
             let bar = ProgressBar::new(progress.total as u64);
             if !live {
                 bar.set_draw_target(ProgressDrawTarget::hidden());
@@ -276,21 +256,22 @@ impl Display {
             {
                 bar.set_style(style);
             }
-            bar.set_prefix(progress.stage.to_owned());
+            bar.set_prefix(progress.phase.to_owned());
             (bar, Instant::now())
         });
         bar.set_position(progress.done as u64);
         bar.set_message(progress.line.clone());
         if !live && (last.elapsed() >= LINE_EVERY || progress.done == progress.total) {
             *last = Instant::now();
-            eprintln!("{}, {:.0} s left", pipeline::plain_line(progress), bar.eta().as_secs_f64());
+            let Progress { phase, done, total, line } = progress;
+            eprintln!("{phase} {done}/{total}  {line}, {:.0} s left", bar.eta().as_secs_f64());
         }
         if progress.done == progress.total {
             bar.finish();
         }
     }
 
-    /// Leaves the bars as they are.
+    /// Stops all bars.
     pub fn finish(&self) {
         if let Ok(bars) = self.bars.lock() {
             for (bar, _) in bars.values() {
@@ -306,8 +287,8 @@ impl Display {
 mod tests {
     use super::*;
 
-    /// A folder is gone on with under the same configuration, also when it was saved before some key existed; another
-    /// setting or another data set is refused.
+    /// A folder is resumed with the same configuration, also when it was saved before some key existed; another setting
+    /// or another dataset is refused.
     #[test]
     fn a_run_folder_belongs_to_one_configuration() {
         let folder = tempfile::tempdir().unwrap();
@@ -329,7 +310,7 @@ mod tests {
         std::fs::write(&saved, "garbage").unwrap();
         assert!(refused("data/x"));
 
-        // Forced, it is begun anew; what belongs to it is kept.
+        // With force, states of another configuration are removed; own states are kept.
         let state = folder.path().join("vae.state.safetensors");
         std::fs::write(&state, "state").unwrap();
         forget_another_configuration(folder.path(), &config, Path::new("data/x")).unwrap();
@@ -339,8 +320,7 @@ mod tests {
         assert!(state.exists());
     }
 
-    /// A finished checkpoint is not written over by a training that begins; one that goes on may, and so may any where
-    /// nothing is finished.
+    /// A finished checkpoint is not overwritten by a new training. A resumed training may overwrite it.
     #[test]
     fn a_finished_checkpoint_is_kept() {
         let folder = tempfile::tempdir().unwrap();

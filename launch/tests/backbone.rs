@@ -1,7 +1,7 @@
 //! Tests of `carff backbone import`: the written tensors equal the input, and existing files are replaced only on
 //! request.
 
-use carff_models::weights;
+use carff_networks::weights;
 use std::{
     path::Path,
     process::{Command, Output},

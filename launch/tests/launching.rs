@@ -7,7 +7,7 @@ use carff_messages::{
     Action, ActionCode, Belief, DatasetView, Forecast, ForecastSource, FrameMeta, Gaussian, Header, Intrinsics,
     Posterior, Reason, Rule, Stage,
 };
-use carff_stage::{StageArgs, StageContext};
+use carff_runtime::{StageArgs, StageContext};
 use carff_transport::{Run, Woken, living_processes, monotonic_now_ns, topics};
 use clap::Parser;
 use rustix::process::{Pid, Signal, kill_process};
@@ -30,12 +30,12 @@ fn fake_stage() {
     let (stage, fault) = role.split_once(':').unwrap();
     let fault = fault.to_owned();
     let code = match stage {
-        "camera" => carff_stage::run_with(Stage::Camera, args, camera),
-        "encoder" => carff_stage::run_with(Stage::Encoder, args, |stage| encoder(stage, &fault)),
-        "forecaster" => carff_stage::run_with(Stage::Forecaster, args, forecaster),
-        "prober" => carff_stage::run_with(Stage::Prober, args, prober),
-        "renderer" => carff_stage::run_with(Stage::Renderer, args, idle),
-        "controller" => carff_stage::run_with(Stage::Controller, args, controller),
+        "camera" => carff_runtime::run_with(Stage::Camera, args, camera),
+        "encoder" => carff_runtime::run_with(Stage::Encoder, args, |stage| encoder(stage, &fault)),
+        "forecaster" => carff_runtime::run_with(Stage::Forecaster, args, forecaster),
+        "prober" => carff_runtime::run_with(Stage::Prober, args, prober),
+        "renderer" => carff_runtime::run_with(Stage::Renderer, args, idle),
+        "controller" => carff_runtime::run_with(Stage::Controller, args, controller),
         other => panic!("unknown stage {other}"),
     };
     std::process::exit(i32::from(code != ExitCode::SUCCESS));
@@ -96,7 +96,7 @@ fn forecaster(stage: &mut StageContext) -> anyhow::Result<()> {
     stage.ready();
     while stage.wait(&[&posteriors, &beliefs])? {
         let observed = posteriors.newest()?.map(|p| (p.header.at_step(1), ForecastSource::Observed));
-        let probed = beliefs.newest()?.filter(|b| b.is_final == 0);
+        let probed = beliefs.newest()?.filter(|b| !b.is_final());
         let probed = probed.map(|b| (b.header.at_step(b.header.step + 1), ForecastSource::Probed));
         for (header, source) in [observed, probed].into_iter().flatten() {
             let mut forecast = Forecast::empty(header, source, HORIZON);
@@ -128,7 +128,7 @@ fn controller(stage: &mut StageContext) -> anyhow::Result<()> {
     stage.ready();
     while stage.wait(&[&beliefs])? {
         while let Some(belief) = beliefs.next()? {
-            if belief.is_final == 0 {
+            if !belief.is_final() {
                 continue;
             }
             actions.send(Action {

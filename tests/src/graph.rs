@@ -11,7 +11,20 @@ use std::sync::atomic::{AtomicU32, Ordering};
 /// Run id of stages that a test starts by itself.
 const RUN_ID: u64 = 7;
 
-/// A graph for one test. Dropping it removes leftovers of its run.
+/// Settings under which the speed of the machine changes no decision: nothing is stale on a busy machine.
+pub const PATIENT: &str = "[controller]\nrate_hz = 4.0\ndeadline_ms = 60000\n[launcher]\nstart_timeout_ms = 600000\n\
+                           stop_timeout_ms = 30000\n";
+
+/// [`PATIENT`], with drives that continue until the run is stopped.
+pub const PATIENT_AND_ENDLESS: &str = "[camera]\nrepeat = true\n[controller]\nrate_hz = 4.0\ndeadline_ms = 60000\n\
+                                       [launcher]\nstart_timeout_ms = 600000\nstop_timeout_ms = 30000\n";
+
+/// Counts the decisions that a launcher has shown: each is one line.
+pub fn decisions(text: &str) -> usize {
+    text.lines().filter(|line| line.contains("hazard ") && line.trim_end().ends_with(" ms")).count()
+}
+
+/// A graph of a test's own. Dropped, it removes what its run may have left.
 #[derive(Debug)]
 pub struct TestGraph {
     folder: tempfile::TempDir,

@@ -13,7 +13,7 @@ mod graph;
 mod process;
 mod sets;
 
-pub use graph::TestGraph;
+pub use graph::{PATIENT, PATIENT_AND_ENDLESS, TestGraph, decisions};
 pub use process::{Finished, Process};
 pub use sets::{copy_checkpoint, picture_set, scenario_set};
 

@@ -73,7 +73,7 @@ impl Controlled {
     }
 
     fn until_decided(&mut self, frame_id: u64) -> Action {
-        let decides = |a: &&Action| a.is_decision == 1 && a.based_on_frame == frame_id;
+        let decides = |a: &&Action| a.is_decision() && a.based_on_frame == frame_id;
         self.until("it decides", |c| c.seen.iter().any(|a| decides(&a)));
         *self.seen.iter().find(decides).unwrap()
     }
@@ -146,6 +146,6 @@ fn what_is_not_valid_halts() {
     rogue.hazard_probability = f32::NAN;
     controller.beliefs.send_unchecked(rogue).unwrap();
     controller.until("it halts on an invalid belief", halts(Reason::InvalidBelief));
-    assert!(controller.seen.iter().all(|a| a.code().unwrap() == ActionCode::Halt && a.is_decision == 0));
+    assert!(controller.seen.iter().all(|a| a.code().unwrap() == ActionCode::Halt && !a.is_decision()));
     controller.stop();
 }

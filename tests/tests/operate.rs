@@ -3,7 +3,10 @@
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
 use carff_observe::attach;
-use carff_tests::{Finished, Process, TestGraph, WATCHDOG, eventually, program, scenario_set, shipped_checkpoint};
+use carff_tests::{
+    Finished, PATIENT_AND_ENDLESS, Process, TestGraph, WATCHDOG, decisions, eventually, program, scenario_set,
+    shipped_checkpoint,
+};
 use carff_transport::OpenError;
 use carff_transport::TopicId;
 use foxglove::Decode as _;
@@ -17,12 +20,8 @@ use std::process::Command;
 use tungstenite::client::IntoClientRequest as _;
 use tungstenite::{Message, WebSocket};
 
-/// Settings under which the speed of the machine changes no decision, and drives continue until they are stopped.
-const PATIENT: &str = "[camera]\nrepeat = true\n[controller]\nrate_hz = 4.0\ndeadline_ms = 60000\n[launcher]\n\
-                       start_timeout_ms = 600000\nstop_timeout_ms = 30000\n";
-
 fn running() -> (TestGraph, Process) {
-    let graph = TestGraph::new(&scenario_set(), &shipped_checkpoint(), PATIENT);
+    let graph = TestGraph::new(&scenario_set(), &shipped_checkpoint(), PATIENT_AND_ENDLESS);
     let mut launcher = Process::start(&mut graph.launch(&graph.file(), &[]));
     launcher.wait_for("decision", |text| text.contains("hazard "));
     (graph, launcher)
@@ -167,12 +166,8 @@ fn rows(path: &Path) -> usize {
     std::fs::read_to_string(path).map_or(0, |text| text.lines().count().saturating_sub(1))
 }
 
-fn decisions(text: &str) -> usize {
-    text.lines().filter(|line| line.contains("hazard ")).count()
-}
-
-/// A recording replayed through the same graph gives the same beliefs and decisions, bit for bit. A graph that draws
-/// fewer samples gives others, and the first difference is reported. The data for other tools can be exported.
+/// A recording goes through the same graph again with the same beliefs and decisions, bit for bit; through a graph that
+/// draws fewer samples it does not, and the first difference is told. What other tools are given can be exported.
 #[test]
 fn a_recording_is_decided_again_as_it_was() {
     let (graph, launcher) = running();

@@ -2,24 +2,21 @@
 
 use carff_messages::Message;
 use carff_observe::attach;
-use carff_tests::{Process, TestGraph, eventually, program, scenario_set, shipped_checkpoint};
+use carff_tests::{
+    PATIENT_AND_ENDLESS, Process, TestGraph, decisions, eventually, program, scenario_set, shipped_checkpoint,
+};
 use carff_transport::topics;
 use rustix::process::Signal;
 use speed_gate::{FREE_M_S, SPEED_LIMIT, SpeedLimit};
 use std::process::Command;
 
-/// Nothing becomes stale on a busy machine, and drives continue until they are stopped.
-const PATIENT: &str = "[camera]\nrepeat = true\n[controller]\nrate_hz = 4.0\ndeadline_ms = 60000\n[launcher]\n\
-                       start_timeout_ms = 600000\nstop_timeout_ms = 30000\n";
-
-/// The stage joins the shipped graph only by its name and publishes its own valid messages, each about the frame of an
-/// action. It leaves on request and the graph continues; another one ends by itself when the graph ends. Nothing is
-/// left.
+/// It joins the shipped graph by its name alone and publishes its own messages: valid ones, each on the frame of an
+/// action. It leaves when it is asked to and the graph goes on; another one ends by itself when the graph does. Nothing
+/// is left.
 #[test]
 fn a_stage_of_its_own_joins_and_leaves() {
-    let graph = TestGraph::new(&scenario_set(), &shipped_checkpoint(), PATIENT);
+    let graph = TestGraph::new(&scenario_set(), &shipped_checkpoint(), PATIENT_AND_ENDLESS);
     let mut launcher = Process::start(&mut graph.launch(&graph.file(), &[]));
-    let decisions = |text: &str| text.lines().filter(|line| line.contains("hazard ")).count();
     launcher.wait_for("decision", |text| decisions(text) >= 1);
     let gate = || {
         let mut gate = Process::start(Command::new(program("speed-gate")).arg(graph.run().name()));

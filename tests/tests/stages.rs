@@ -102,7 +102,10 @@ fn rogue_messages_stop_at_the_next_stage() {
         based_on.contains(&1)
     });
     assert!(decided, "{}", said());
-    assert!(based_on.iter().all(|frame| [1, u64::MAX].contains(frame)), "an action is based on a rogue message: {based_on:?}");
+    assert!(
+        based_on.iter().all(|frame| [1, u64::MAX].contains(frame)),
+        "an action is based on a rogue message: {based_on:?}"
+    );
     for process in processes {
         process.signal(Signal::TERM);
         process.end().assert_success();

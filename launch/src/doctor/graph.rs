@@ -80,7 +80,7 @@ fn pictures(
             Finding::error(
                 Area::Graph,
                 "images",
-                format!("{} is not a folder{}", folder.display(), carff_nearest::beside(&folder)),
+                format!("{} is not a folder{}", folder.display(), carff_base::names::beside(&folder)),
                 "the camera has no images",
                 "correct `camera.folder` in the graph file",
             )
@@ -98,7 +98,7 @@ fn pictures(
             None => Finding::error(
                 Area::Graph,
                 subject,
-                format!("{} does not exist{}", dataset.display(), carff_nearest::beside(dataset)),
+                format!("{} does not exist{}", dataset.display(), carff_base::names::beside(dataset)),
                 NO_LAUNCH,
                 "pass --dataset, or name its scenario in the graph file (`run.scenario`)",
             ),
@@ -146,8 +146,8 @@ fn models(checkpoint: &Path, shown: Option<&ScenarioIdentity>, findings: &mut Ve
         }
     };
     let parts = [
-        carff_models::stored::load_encoder(checkpoint, &manifest).map(drop).map_err(|e| e.to_string()),
-        carff_models::stored::load_mixture(checkpoint, &manifest).map(drop).map_err(|e| e.to_string()),
+        carff_networks::stored::load_encoder(checkpoint, &manifest).map(drop).map_err(|e| e.to_string()),
+        carff_networks::stored::load_mixture(checkpoint, &manifest).map(drop).map_err(|e| e.to_string()),
         carff_checkpoint::load_field(checkpoint, &manifest).map(drop).map_err(|e| e.to_string()),
         carff_checkpoint::load_probing(checkpoint, &manifest).map(drop).map_err(|e| e.to_string()),
         CheckpointPlanning::load(checkpoint).map(drop).map_err(|e| e.to_string()),

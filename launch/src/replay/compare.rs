@@ -56,7 +56,7 @@ fn timeless(message: AnyMessage<'_>) -> Option<(Place, Value)> {
         (form.encoder_ns, form.forecaster_ns, form.stage_latency_ns) = (0, 0, 0);
         (TopicId::BELIEF, serde_json::to_value(form))
     } else {
-        let action = message.get::<Action>().filter(|action| action.is_decision == 1)?;
+        let action = message.get::<Action>().filter(|action| action.is_decision())?;
         let mut form = ActionForm::from(action);
         without_times(&mut form.header);
         (form.valid_until_ns, form.latency_ns) = (0, 0);

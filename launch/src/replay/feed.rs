@@ -141,7 +141,7 @@ impl Player {
                 let frame = header.frame_id;
                 let until_ns = monotonic_now_ns() + PATIENCE_NS;
                 let decided = |message: AnyMessage<'_>| {
-                    message.get::<Action>().is_some_and(|a| a.is_decision == 1 && a.based_on_frame == frame)
+                    message.get::<Action>().is_some_and(|a| a.is_decision() && a.based_on_frame == frame)
                 };
                 if !self.look_until(&waiter, &mut back, until_ns, decided)? {
                     return Ok(());

@@ -2,8 +2,8 @@
 //! them.
 
 use anyhow::{Context, ensure};
+use carff_base::random::{Key, stream};
 use carff_messages::{Belief, Forecast, FrameMeta, Header, Posterior};
-use carff_random::{Key, stream};
 use carff_transport::{Image, Node, Publisher, Run, Stop, Waiter, Woken, monotonic_now_ns, topics};
 use rand::Rng;
 use rustix::process::{Signal, set_parent_process_death_signal};

@@ -1,8 +1,8 @@
 //! The schedule of faults: a pure function of the soak file and the seed.
 
+use carff_base::random::{Key, stream};
 use carff_config::{Kind, SoakConfig};
 use carff_messages::Stage;
-use carff_random::{Key, stream};
 use rand::Rng;
 use std::fmt;
 

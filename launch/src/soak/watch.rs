@@ -137,7 +137,7 @@ impl Judge {
             }
             return Ok(());
         }
-        if action.is_decision == 1 { self.decided(action, wrong) } else { self.repeated(action, wrong) }
+        if action.is_decision() { self.decided(action, wrong) } else { self.repeated(action, wrong) }
     }
 
     fn repeated(&self, action: &Action, wrong: impl Fn(String) -> Result<(), String>) -> Result<(), String> {
@@ -166,7 +166,7 @@ impl Judge {
         }
         let beliefs = self.frames.get(&captured_ns).map(Vec::as_slice).unwrap_or_default();
         let step = |step: u32| beliefs.iter().find(|b| b.header.step == step);
-        let Some(last) = beliefs.iter().find(|b| b.is_final == 1) else {
+        let Some(last) = beliefs.iter().find(|b| b.is_final()) else {
             self.unjudged += 1;
             return Ok(());
         };
@@ -181,10 +181,7 @@ impl Judge {
         }
         let halts = self.terms.policy.decide(&evidence).halt;
         if halts == (action.code() == Ok(ActionCode::Advance)) {
-            return wrong(format!(
-                "a wrong action: its beliefs require {}",
-                if halts { "halt" } else { "advance" }
-            ));
+            return wrong(format!("a wrong action: its beliefs require {}", if halts { "halt" } else { "advance" }));
         }
         Ok(())
     }
@@ -277,7 +274,7 @@ impl Watcher {
         }
         while let Some(action) = self.actions.next()? {
             notes.note(format!("{:?}", *action));
-            if action.is_decision == 1 {
+            if action.is_decision() {
                 self.decided_ns = action.header.publish_time_ns;
                 if notes.calm {
                     notes.latency_ms.push((self.decided_ns - action.header.capture_time_ns) as f64 / NS_PER_MS);

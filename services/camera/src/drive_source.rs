@@ -2,13 +2,13 @@
 
 use crate::source::Source;
 use anyhow::Context;
+use carff_base::random::Key;
 use carff_checkpoint::CheckpointPlanning;
 use carff_config::{GraphConfig, PoseChoice};
 use carff_dataset::drives::{Drive, plan_drives};
 use carff_dataset::sensor::{SensorNoise, apply_noise_into};
 use carff_dataset::{Dataset, Image, PoseRole, PoseSplit};
 use carff_messages::{DatasetView, FrameMeta, Observability};
-use carff_random::Key;
 use std::collections::HashMap;
 use std::path::Path;
 

@@ -2,12 +2,12 @@
 
 use crate::source::Source;
 use anyhow::{Context, anyhow, ensure};
+use carff_base::geometry::PinholeCamera;
+use carff_base::random::Key;
 use carff_config::GraphConfig;
 use carff_dataset::Image;
 use carff_dataset::sensor::{SensorNoise, apply_noise_into};
-use carff_geometry::PinholeCamera;
 use carff_messages::{DatasetView, FrameMeta};
-use carff_random::Key;
 use std::path::{Path, PathBuf};
 
 /// Assumed horizontal field of view, because plain images do not contain it, degrees.

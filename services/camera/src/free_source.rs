@@ -2,10 +2,10 @@
 
 use crate::source::Source;
 use anyhow::Context;
+use carff_base::random::Key;
 use carff_config::GraphConfig;
 use carff_dataset::sensor::{SensorNoise, apply_noise_into};
 use carff_messages::{DatasetView, FrameMeta, Observability, Stage};
-use carff_random::Key;
 use carff_scenes::{FreeDrive, FreeFrame, Scenario};
 
 /// Free drives through a scenario; each is planned when the previous one has ended.

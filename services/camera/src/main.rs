@@ -5,11 +5,11 @@ use anyhow::Context;
 use carff_camera::{DriveSource, FolderSource, FreeDriveSource, Source};
 use carff_config::CameraSource;
 use carff_messages::{Header, Stage};
-use carff_stage::{StageContext, frame_span};
+use carff_runtime::{StageContext, frame_span};
 use carff_transport::{Woken, monotonic_now_ns, topics};
 
 fn main() -> std::process::ExitCode {
-    carff_stage::main(Stage::Camera, run)
+    carff_runtime::main(Stage::Camera, run)
 }
 
 fn run(stage: &mut StageContext) -> anyhow::Result<()> {

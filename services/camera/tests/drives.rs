@@ -2,11 +2,11 @@
 
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
+use carff_base::geometry::PinholeCamera;
 use carff_camera::{DriveSource, Source};
 use carff_checkpoint::CheckpointPlanning;
 use carff_config::GraphConfig;
 use carff_dataset::{DatasetWriter, FrameRecord, Image, Observability, ScenarioInfo};
-use carff_geometry::PinholeCamera;
 use carff_messages::{Header, ImageMeta, Message};
 use std::path::Path;
 

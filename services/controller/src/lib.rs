@@ -103,7 +103,7 @@ impl Controller {
         if !pending.take(belief) {
             return Some(self.refuse(&belief.header, Reason::ContradictoryBelief, now_ns));
         }
-        if belief.is_final == 0 {
+        if !belief.is_final() {
             return None;
         }
         let pending = self.pending.take()?;

@@ -4,14 +4,14 @@ use anyhow::Context;
 use carff_checkpoint::load_policy;
 use carff_controller::{Controller, Settings};
 use carff_messages::Stage;
-use carff_stage::{StageContext, frame_span};
+use carff_runtime::{StageContext, frame_span};
 use carff_transport::{Woken, monotonic_now_ns, topics};
 
 /// Maximum number of beliefs between two reads of the clock, so that a flood of them delays no tick.
 const MOST_AT_ONCE: usize = 16;
 
 fn main() -> std::process::ExitCode {
-    carff_stage::main(Stage::Controller, run)
+    carff_runtime::main(Stage::Controller, run)
 }
 
 fn run(stage: &mut StageContext) -> anyhow::Result<()> {

@@ -2,16 +2,16 @@
 
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
+use carff_base::geometry::OrientedBox;
+use carff_base::random::{Key, uniform};
 use carff_controller::{Controller, Settings};
 use carff_decision::{
     Draw, Evidence, Mixture, Place, Policy, ProbeLayout, Probed, Reading, Resolved, Sampling, Step,
     set_mixture_and_draws,
 };
-use carff_geometry::OrientedBox;
 use carff_messages::{
     Action, ActionCode, Forecast, ForecastSource, Gaussian, Header, MAX_HORIZON, Message, Reason, Rule,
 };
-use carff_random::{Key, uniform};
 
 const STATES: usize = 6;
 const MS: u64 = 1_000_000;

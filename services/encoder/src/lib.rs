@@ -3,7 +3,7 @@
 use anyhow::Context;
 use carff_checkpoint::Manifest;
 use carff_messages::Gaussian;
-use carff_models::{borrow, encoder::Encoder};
+use carff_networks::{borrow, encoder::Encoder};
 use ndarray::{Array3, ArrayView3};
 use std::path::Path;
 
@@ -14,10 +14,10 @@ const WARM_UPS: usize = 3;
 
 /// Loads the encoder and runs it on a grey image, so that the first frame is as fast as later ones.
 pub fn load(checkpoint: &Path, threads: usize) -> anyhow::Result<Encoder> {
-    carff_models::allocator::keep_large_blocks();
-    carff_models::device::set_threads(threads);
+    carff_networks::allocator::keep_large_blocks();
+    carff_networks::device::set_threads(threads);
     let manifest = Manifest::load(checkpoint)?;
-    let encoder = carff_models::stored::load_encoder(checkpoint, &manifest)?;
+    let encoder = carff_networks::stored::load_encoder(checkpoint, &manifest)?;
     let grey = Array3::from_elem((WARM_UP_PX, WARM_UP_PX, 3), 128);
     for _ in 0..WARM_UPS {
         encode(&encoder, grey.view())?;

@@ -2,11 +2,11 @@
 
 use carff_encoder::{encode, load};
 use carff_messages::{Posterior, Stage};
-use carff_stage::{StageContext, frame_span};
+use carff_runtime::{StageContext, frame_span};
 use carff_transport::{monotonic_now_ns, topics};
 
 fn main() -> std::process::ExitCode {
-    carff_stage::main(Stage::Encoder, run)
+    carff_runtime::main(Stage::Encoder, run)
 }
 
 fn run(stage: &mut StageContext) -> anyhow::Result<()> {

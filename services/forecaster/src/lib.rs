@@ -3,7 +3,7 @@
 use carff_checkpoint::Manifest;
 use carff_decision::{Sampling, path_probability, set_mixture_and_draws};
 use carff_messages::{Belief, Forecast, ForecastSource, Gaussian, Header, Posterior};
-use carff_models::mixture::MixtureNet;
+use carff_networks::mixture::MixtureNet;
 use std::path::Path;
 
 /// The forecaster's model and settings.
@@ -24,10 +24,10 @@ impl Forecaster {
         sampling: Sampling,
         horizon: u32,
     ) -> anyhow::Result<Self> {
-        carff_models::allocator::keep_large_blocks();
-        carff_models::device::set_threads(threads);
+        carff_networks::allocator::keep_large_blocks();
+        carff_networks::device::set_threads(threads);
         let manifest = Manifest::load(checkpoint)?;
-        let net = carff_models::stored::load_mixture(checkpoint, &manifest)?;
+        let net = carff_networks::stored::load_mixture(checkpoint, &manifest)?;
         for _ in 0..3 {
             net.forecast(&Gaussian::standard());
         }

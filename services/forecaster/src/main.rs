@@ -2,11 +2,11 @@
 
 use carff_forecaster::Forecaster;
 use carff_messages::Stage;
-use carff_stage::{Overload, StageContext, frame_span};
+use carff_runtime::{Overload, StageContext, frame_span};
 use carff_transport::{monotonic_now_ns, topics};
 
 fn main() -> std::process::ExitCode {
-    carff_stage::main(Stage::Forecaster, run)
+    carff_runtime::main(Stage::Forecaster, run)
 }
 
 fn run(stage: &mut StageContext) -> anyhow::Result<()> {

@@ -1,35 +1,35 @@
-//! Where the two ends meet.
+//! The address at which the two ends meet.
 
 use anyhow::Context;
 use clap::Args;
 use zenoh::{Config, Session, Wait};
 
-/// Nobody else can reach this one.
+/// Only this machine can reach this address.
 const LOOPBACK: &str = "127.0.0.1:7447";
-/// After so long without a sign of life the connection is given up, and sought anew, milliseconds.
+/// Time without a sign of life after which the connection is closed and opened again, milliseconds.
 const LEASE_MS: u32 = 2_000;
-/// What the system holds for a connection in each direction, and zenoh of each priority twice, bytes: more would be a
-/// queue, in which messages grow old while the link is slow.
+/// Buffer of the system for each direction, and half of zenoh's for each priority, bytes. A larger buffer would be a
+/// queue, in which messages grow old on a slow link.
 const SOCKET_BYTES: u32 = 32 * 1024;
 const BATCH_BYTES: u16 = 16 * 1024;
-/// Longest message that is taken, bytes: the largest picture, and what describes it.
+/// Longest message that is received, bytes: the largest image and its form.
 const MAX_MESSAGE_BYTES: usize = carff_messages::MAX_IMAGE_BYTES + (1 << 20);
 
-/// One end listens, the other connects; which does what is no matter.
+/// One end listens and the other connects, in either direction.
 #[derive(Clone, Debug, Args)]
 #[group(required = true, multiple = false)]
 pub struct AddressArgs {
-    /// Connect to the other end, which listens there; again and again until it does.
+    /// Connect to the other end, which listens there; retried until it does.
     #[arg(long, value_name = "HOST:PORT", value_parser = address)]
     connect: Option<String>,
-    /// Listen for the other end. Without an address on loopback, where this machine alone and its tunnels get in.
+    /// Listen for the other end; without an address on loopback, which only this machine and its tunnels reach.
     #[arg(long, value_name = "HOST:PORT", value_parser = address, num_args = 0..=1, default_missing_value = LOOPBACK)]
     listen: Option<String>,
 }
 
-/// `HOST:PORT`; nothing else, since zenoh would read more of what stands there.
+/// Accepts `HOST:PORT` and nothing else, since zenoh would interpret more.
 fn address(text: &str) -> Result<String, String> {
-    let wrong = || format!("`{text}` is no HOST:PORT, such as {LOOPBACK}");
+    let wrong = || format!("`{text}` is not HOST:PORT, such as {LOOPBACK}");
     let (host, port) = text.rsplit_once(':').ok_or_else(wrong)?;
     let plain = |c: char| c.is_ascii_alphanumeric() || "-.:[]".contains(c);
     if host.is_empty() || !host.chars().all(plain) || port.parse::<u16>().is_err() {
@@ -50,7 +50,7 @@ impl AddressArgs {
             ("mode", "\"peer\"".to_owned()),
             ("listen/endpoints", endpoints(&self.listen)),
             ("connect/endpoints", endpoints(&self.connect)),
-            // It opens at once, and connects when it can.
+            // The session opens at once, and connects when it can.
             ("connect/timeout_ms", "-1".to_owned()),
             ("connect/exit_on_failure", "false".to_owned()),
             ("scouting/multicast/enabled", "false".to_owned()),
@@ -81,7 +81,7 @@ impl AddressArgs {
 mod tests {
     use super::*;
 
-    /// An address is host and port; what zenoh would read as a protocol or as settings is refused.
+    /// An address is host and port; a protocol or settings of zenoh are refused.
     #[test]
     fn an_address_is_host_and_port() {
         for good in [LOOPBACK, "desk:1", "[::1]:7447", "vehicle-2.local:65535"] {

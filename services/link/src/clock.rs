@@ -1,24 +1,24 @@
-//! Times of another machine, on this machine's clock.
+//! Converts times of another machine to this machine's clock.
 //!
-//! Each machine's monotonic clock counts from its own start. Every message says when it was sent, and is here a while
-//! later: the least difference between the two, of the last minute, is the difference of the clocks and the time of the
-//! quickest way. Times are moved by it, so that ages that are reckoned here lack the quickest way, and nothing else.
+//! Each machine's monotonic clock counts from its own start. Every message holds its time of sending, and arrives later.
+//! The least difference of the two in the last minute is the difference of the clocks plus the shortest transfer time.
+//! Times are moved by it, so that an age computed here lacks only the shortest transfer time.
 
-/// Half of the time that a difference is kept for, nanoseconds: clocks drift apart, some 50 us a second.
+/// Half of the time that a difference is stored for, nanoseconds: clocks drift apart by some 50 us a second.
 const WINDOW_NS: u64 = 30_000_000_000;
 
 /// Moves times of one sender at a time.
 #[derive(Clone, Debug, Default)]
 pub struct ClockDifference {
     sender: Option<u64>,
-    /// Least differences of the window before and of this one, nanoseconds: here less there.
+    /// Least differences of the previous window and of this one, nanoseconds: here minus there.
     before_ns: Option<i128>,
     this_ns: Option<i128>,
     ends_ns: u64,
 }
 
 impl ClockDifference {
-    /// Takes a message in: who sent it, when by that machine's clock, and when it was here.
+    /// Takes a message's sender, its time of sending by that machine's clock, and its time of arrival.
     pub fn observe(&mut self, sender: u64, sent_ns: u64, arrived_ns: u64) {
         if self.sender != Some(sender) {
             *self = Self { sender: Some(sender), ends_ns: arrived_ns.saturating_add(WINDOW_NS), ..Self::default() };
@@ -30,17 +30,17 @@ impl ClockDifference {
         self.this_ns = Some(self.this_ns.map_or(difference_ns, |least_ns| least_ns.min(difference_ns)));
     }
 
-    /// Whose times are moved.
+    /// Returns the sender whose times are moved.
     pub fn sender(&self) -> Option<u64> {
         self.sender
     }
 
-    /// Nanoseconds that times are moved by.
+    /// Returns the nanoseconds by which times are moved.
     pub fn difference_ns(&self) -> i128 {
         [self.before_ns, self.this_ns].into_iter().flatten().min().unwrap_or(0)
     }
 
-    /// A time of that machine on this one's clock. 0, which stands for none, stays so.
+    /// Returns a time of that machine on this one's clock. 0, which means no time, stays 0.
     pub fn here_ns(&self, there_ns: u64) -> u64 {
         match there_ns {
             0 => 0,
@@ -55,7 +55,7 @@ mod tests {
 
     const SECOND_NS: u64 = 1_000_000_000;
 
-    /// Times move by the least difference seen, so that no message comes from the future, and keep their distances.
+    /// Times move by the least difference, so that no message comes from the future, and their distances are unchanged.
     #[test]
     fn times_move_by_the_quickest_way() {
         let mut clock = ClockDifference::default();
@@ -67,7 +67,7 @@ mod tests {
         assert_eq!(clock.here_ns(0), 0);
     }
 
-    /// A clock that is ahead of this one's is moved back; no number of a message leaves the range of times.
+    /// A clock ahead of this one is moved back; every number in a message has a time in range.
     #[test]
     fn any_number_has_a_time() {
         let mut clock = ClockDifference::default();
@@ -80,7 +80,7 @@ mod tests {
         assert_eq!(clock.here_ns(u64::MAX), 1);
     }
 
-    /// A drifting clock is followed within two windows; another sender, whose clock began anew, at once.
+    /// A drifting clock is followed within two windows; another sender, with another clock, at once.
     #[test]
     fn drift_and_new_senders_are_followed() {
         let mut clock = ClockDifference::default();

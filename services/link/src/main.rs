@@ -1,10 +1,10 @@
-//! `carff-link`: topics of a run, sent to another machine and made a run again there. An optional tool: nothing that
-//! decides knows of it.
+//! `carff-link` sends topics of a run to another machine, where they are a run again. The tool is optional: no stage
+//! depends on it.
 //!
-//! The sending end looks at a run as every observer does, by spare subscriber slots that nobody waits for, and has no way
-//! in: it publishes nothing in the run, and subscribes to nothing on the network. The receiving end is a run of its own,
-//! with a name, a record and a lock, so that probes, recorder, window and a renderer work on it as on any other. Between
-//! them is one connection of zenoh's, from one named address to another; neither end looks for others.
+//! The sending end is an observer of the run, with spare subscriber slots that no sender waits for. It publishes nothing
+//! in the run, and subscribes to nothing on the network. The receiving end is a run with its own name, record and lock, so
+//! that probes, recorder, viewer and renderers work on it. One zenoh connection joins two given addresses; neither end
+//! searches for others.
 
 mod address;
 mod clock;
@@ -27,7 +27,7 @@ use clap::{Parser, Subcommand};
   carff-link receive --run intersection --graph configs/graphs/approaching-intersection.toml --listen 192.168.7.2:7447
   carff probe belief
 
-What crosses is neither encrypted nor signed: on a network that others share, put it in a tunnel (WireGuard, ssh -L).
+The data is neither encrypted nor signed: on a shared network, send it through a tunnel (WireGuard, ssh -L).
 Ctrl-C ends it; exit code 0 then, 1 after an error, 2 for wrong arguments."
 )]
 struct Cli {
@@ -37,11 +37,11 @@ struct Cli {
 
 #[derive(Debug, Subcommand)]
 enum Command {
-    /// Send topics of a run that is here. It waits for the run, and for its next launch; the run never waits for it.
+    /// Send topics of a run on this machine. The sender waits for each launch of the run; the run never waits for it.
     #[command(after_help = "Example: what an off-board renderer needs, and the actions
   carff-link send --run intersection --topics forecast,belief,action --connect 192.168.7.2:7447")]
     Send(send::SendArgs),
-    /// Receive topics, and be the run here that publishes them.
+    /// Receive topics, and publish them in a run on this machine.
     #[command(after_help = "Example: behind a tunnel, under another name than on the vehicle
   ssh -N -R 7447:127.0.0.1:7447 vehicle &
   carff-link receive --run intersection --as vehicle --graph configs/graphs/approaching-intersection.toml --listen
@@ -58,7 +58,7 @@ fn main() -> anyhow::Result<()> {
     }
 }
 
-/// One line for whoever watches; results go to standard output.
+/// Prints a line about progress; results go to standard output.
 fn note(text: &str) {
     eprintln!("carff-link: {text}");
 }
@@ -68,7 +68,7 @@ mod tests {
     use super::*;
     use clap::CommandFactory;
 
-    /// The description is sound, and every example in the helps is understood, as are those of the book.
+    /// The arguments are well defined, and every example in the helps and in the book parses.
     #[test]
     fn examples_parse() {
         Cli::command().debug_assert();
@@ -90,7 +90,7 @@ mod tests {
         assert!(lines >= 6, "{lines}");
     }
 
-    /// An end must be told where the other is: it never listens by itself.
+    /// Each end needs exactly one address: it never listens by itself.
     #[test]
     fn an_address_is_asked_for() {
         assert!(Cli::try_parse_from(["carff-link", "send", "--run", "a"]).is_err());

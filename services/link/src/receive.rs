@@ -1,15 +1,14 @@
-//! The receiving end: a run that publishes what comes off the link.
+//! The receiving end: a run that publishes the messages of the link.
 
 use crate::address::AddressArgs;
 use crate::clock::ClockDifference;
 use crate::outputs::Outputs;
-use crate::wire::{Tag, decode};
+use crate::wire::{Tag, decode, settle};
 use crate::{note, topics};
 use anyhow::{Context, anyhow};
 use carff_config::GraphConfig;
 use carff_observe::{RunLock, RunRecord};
-use carff_transport::{TopicId};
-use carff_transport::{Node, Run, Stop, monotonic_now_ns, remove_run_leftovers, run_id_of, runtime_dir};
+use carff_transport::{Node, Run, Stop, TopicId, monotonic_now_ns, remove_run_leftovers, run_id_of, runtime_dir};
 use clap::Args;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -18,28 +17,28 @@ use zenoh::Wait;
 use zenoh::handlers::RingChannel;
 use zenoh::sample::Sample;
 
-/// Messages that wait to be published; when there are more, the oldest is lost.
+/// Most messages that wait to be published; one more drops the oldest.
 const WAITING: usize = 32;
-/// Longest sleep: then it looks whether it shall stop.
+/// Longest wait for a message before a look at the stop.
 const LOOK: Duration = Duration::from_millis(100);
-/// Time between two cleanings after dead observers, and between two lines about what is lost, nanoseconds.
+/// Time between two cleanings after dead observers, and between two lines about lost messages, nanoseconds.
 const TELL_NS: u64 = 1_000_000_000;
-/// After so long without a message it says so, nanoseconds.
+/// Time without a message after which the receiver reports it, nanoseconds.
 const QUIET_NS: u64 = 2_000_000_000;
 
-/// Where it comes from, and what it is here.
+/// The run that is received, and its description on this machine.
 #[derive(Clone, Debug, Args)]
 pub struct ReceiveArgs {
-    /// The run's name where it is sent from.
+    /// The run's name on the sending machine.
     #[arg(long, value_parser = topics::run_name)]
     run: String,
-    /// Its name here. Default: the same.
+    /// The run's name on this machine. Default: the same.
     #[arg(long = "as", value_name = "NAME", value_parser = topics::run_name)]
     name: Option<String>,
-    /// The graph file, as the vehicle has it: recordings keep it, and it names data set and models.
+    /// The vehicle's graph file: recordings store it, and it names dataset and models.
     #[arg(long)]
     graph: PathBuf,
-    /// Data set folder, in place of the graph file's.
+    /// Dataset folder, in place of the graph file's.
     #[arg(long)]
     dataset: Option<PathBuf>,
     /// Checkpoint folder, in place of the graph file's.
@@ -50,7 +49,7 @@ pub struct ReceiveArgs {
     address: AddressArgs,
 }
 
-/// Receives until it is told to stop.
+/// Receives until a stop.
 pub fn run(args: &ReceiveArgs, stop: &Stop) -> anyhow::Result<()> {
     let graph = GraphConfig::load(&args.graph)?;
     let name = args.name.as_ref().unwrap_or(&args.run);
@@ -72,7 +71,7 @@ pub fn run(args: &ReceiveArgs, stop: &Stop) -> anyhow::Result<()> {
         run.id()
     ));
     let result = Node::open(&run, "link").map_err(anyhow::Error::from).and_then(|node| receive(args, &node, stop));
-    // The lock is held: what is left is of this run.
+    // The lock is held, so that all leftovers are of this run.
     remove_run_leftovers(&run)?;
     result
 }
@@ -110,7 +109,7 @@ fn receive(args: &ReceiveArgs, node: &Node, stop: &Stop) -> anyhow::Result<()> {
 }
 
 struct End<'a> {
-    /// The run's name where it is sent from.
+    /// The run's name on the sending machine.
     run: &'a str,
     node: &'a Node,
     outputs: Outputs<'a>,
@@ -120,7 +119,7 @@ struct End<'a> {
 }
 
 impl End<'_> {
-    /// Says what is new.
+    /// Reports what is new.
     fn tell(&mut self, now_ns: u64) {
         let sender = self.clock.sender();
         if std::mem::replace(&mut self.told_sender, sender) != sender {
@@ -132,7 +131,7 @@ impl End<'_> {
         self.tally.tell(now_ns);
     }
 
-    /// Publishes what has arrived, or counts why not.
+    /// Publishes a message, or counts it as refused.
     fn take(&mut self, sample: &Sample) {
         let now_ns = monotonic_now_ns();
         let key = sample.key_expr().as_str();
@@ -147,22 +146,21 @@ impl End<'_> {
     }
 
     fn publish(&mut self, topic: TopicId, sample: &Sample, now_ns: u64) -> anyhow::Result<()> {
-        let picture = sample.payload().to_bytes();
         let form = sample.attachment().map(zenoh::bytes::ZBytes::to_bytes).unwrap_or_default();
-        let (tag, mut arrived) = decode(topic, &form, picture.len())?;
+        let (tag, mut message) = decode(topic, &form, sample.payload().to_bytes().into_owned())?;
         self.clock.observe(tag.sender, tag.sent_ns, now_ns);
         self.tally.count(topic, tag);
-        arrived.settle(self.node.run().id(), |there_ns| self.clock.here_ns(there_ns));
-        Ok(self.outputs.publish(&arrived, &picture)?)
+        settle(&mut message, self.node.run().id(), |there_ns| self.clock.here_ns(there_ns));
+        self.outputs.publish(topic, message.as_message())
     }
 }
 
-/// What has come, and what has not.
+/// Counts of the messages that arrived, were lost and were refused.
 #[derive(Debug, Default)]
 struct Tally {
     topics: BTreeMap<TopicId, Line>,
     refused: u64,
-    /// When the last message came; `None` before the first.
+    /// Time of the last message; `None` before the first.
     last_ns: Option<u64>,
     quiet: bool,
     told_lost: u64,
@@ -171,7 +169,7 @@ struct Tally {
 #[derive(Debug, Default)]
 struct Line {
     sender: Option<u64>,
-    /// The number of the next message, when none is missing.
+    /// Number of the next message if none is missing.
     expected: u64,
     arrived: u64,
     lost: u64,
@@ -194,7 +192,7 @@ impl Tally {
         }
     }
 
-    /// Each is counted; a flood is told of ever more seldom.
+    /// Counts each; of a flood it reports ever fewer.
     fn refused(&mut self, key: &str, error: &anyhow::Error) {
         self.refused += 1;
         if self.refused <= 8 || self.refused.is_power_of_two() {
@@ -232,7 +230,7 @@ impl Tally {
 mod tests {
     use super::*;
 
-    /// What a topic's numbers leave out is lost; numbers of another sender begin anew, and are no loss.
+    /// A gap in a topic's numbers is a loss; the numbers of another sender start again, which is not a loss.
     #[test]
     fn gaps_are_counted() {
         let mut tally = Tally::default();

@@ -1,36 +1,35 @@
-//! The sending end: looks at a run, and puts what it sees on the link.
+//! The sending end: observes a run, and puts its messages on the link.
 
 use crate::address::AddressArgs;
 use crate::wire::{Tag, encode};
 use crate::{note, topics};
 use anyhow::{Context, ensure};
-use carff_messages::Header;
+use carff_messages::forms::AnyMessage;
 use carff_observe::{AttachError, Attached, attach, runs};
-use carff_transport::{AnyReceiver, Received, TopicId};
-use carff_transport::{Run, Stop, Waiter, Woken, living_processes, monotonic_now_ns};
+use carff_transport::{Run, Stop, TopicId, Waiter, Woken, living_processes, monotonic_now_ns};
 use clap::Args;
 use std::collections::BTreeSet;
 use zenoh::pubsub::Publisher;
 use zenoh::qos::{CongestionControl, Priority};
 use zenoh::{Session, Wait};
 
-/// Time between two looks at the run, as for all observers, nanoseconds.
+/// Time between two looks at the run, the same for all observers, nanoseconds.
 const LOOK_NS: u64 = 10_000_000;
-/// Time between two looks at who listens and whether the run lives, nanoseconds.
+/// Time between two checks for receivers and for the life of the run, nanoseconds.
 const CHECK_NS: u64 = 200_000_000;
-/// Time between two lines about what is lost, nanoseconds.
+/// Time between two lines about missed messages, nanoseconds.
 const TELL_NS: u64 = 1_000_000_000;
 /// Most messages of a topic that one look takes.
 const MAX_TAKEN: usize = 64;
 
-/// What is sent, and where to.
+/// The topics that are sent, and the address of the receiver.
 #[derive(Clone, Debug, Args)]
 pub struct SendArgs {
     /// The run, which need not have started.
     #[arg(long, value_parser = topics::run_name)]
     run: String,
-    /// Topics, with commas between: names, in full or their last part, `health` for all heartbeats, `all` for everything,
-    /// camera frames too.
+    /// Topics, separated by commas: full names or their last parts, `health` for all heartbeats, `all` for everything,
+    /// camera frames included.
     #[arg(long, default_value = "belief,action,view,health")]
     topics: String,
     /// The other end.
@@ -38,7 +37,7 @@ pub struct SendArgs {
     address: AddressArgs,
 }
 
-/// Sends until it is told to stop.
+/// Sends until a stop.
 pub fn run(args: &SendArgs, stop: &Stop) -> anyhow::Result<()> {
     let mut chosen = BTreeSet::new();
     for name in args.topics.split(',') {
@@ -46,7 +45,7 @@ pub fn run(args: &SendArgs, stop: &Stop) -> anyhow::Result<()> {
     }
     ensure!(!chosen.is_empty(), "name at least one topic with --topics");
     let session = args.address.open()?;
-    // Names this process among those that send.
+    // A number for this process among all senders.
     let sender = monotonic_now_ns() ^ (u64::from(std::process::id()) << 40);
     let declare = |topic| Way::declare(&session, &args.run, topic, sender);
     let mut ways = chosen.into_iter().map(declare).collect::<anyhow::Result<Vec<_>>>()?;
@@ -76,8 +75,8 @@ pub fn run(args: &SendArgs, stop: &Stop) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Joins a run, if there is one. Its launcher is in it once it has cleared up what an earlier one left: whoever came before
-/// would be taken for a process of that one, and stand in the way.
+/// Joins a run, if there is one. A launcher joins its run after it removed what an earlier run left. Until then an
+/// observer would count as a process of the earlier run, and block the launch.
 fn join(name: &str) -> Result<Option<Attached>, AttachError> {
     let Some(live) = runs()?.into_iter().find(|live| live.name == name) else { return Ok(None) };
     if !living_processes(&Run::new(name, live.run_id)?).is_ok_and(|living| living.contains(&live.pid)) {
@@ -89,9 +88,9 @@ fn join(name: &str) -> Result<Option<Attached>, AttachError> {
     }
 }
 
-/// Sends what a run publishes until it ends, or until a stop.
+/// Sends a run's messages until its end, or until a stop.
 fn forward(attached: &Attached, ways: &mut [Way], waiter: &Waiter) -> anyhow::Result<()> {
-    let open = |way: &Way| AnyReceiver::open(&attached.node, way.topic);
+    let open = |way: &Way| way.topic.polled_receiver(&attached.node);
     let mut receivers = ways.iter().map(open).collect::<Result<Vec<_>, _>>()?;
     let (mut check_ns, mut tell_ns, mut told) = (0, 0, 0);
     let mut heard = false;
@@ -111,8 +110,8 @@ fn forward(attached: &Attached, ways: &mut [Way], waiter: &Waiter) -> anyhow::Re
         }
         for (way, receiver) in ways.iter_mut().zip(&mut receivers) {
             for _ in 0..MAX_TAKEN {
-                let Some(message) = receiver.next()? else { break };
-                way.send(&message)?;
+                let Some(received) = receiver.next()? else { break };
+                way.send(received.message())?;
             }
         }
         let missed = ways.iter().map(|way| way.missed).sum();
@@ -126,15 +125,15 @@ fn forward(attached: &Attached, ways: &mut [Way], waiter: &Waiter) -> anyhow::Re
     }
 }
 
-/// A topic's way out.
+/// The way of a topic to the link.
 struct Way {
     topic: TopicId,
     publisher: Publisher<'static>,
-    /// Whether somebody receives.
+    /// Whether there is a receiver.
     heard: bool,
     sender: u64,
     sequence: u64,
-    /// What the next message's header says, when none is missing.
+    /// Sequence number of the next message if none is missing.
     expected: Option<u64>,
     sent: u64,
     unheard: u64,
@@ -143,11 +142,8 @@ struct Way {
 
 impl Way {
     fn declare(session: &Session, run: &str, topic: TopicId, sender: u64) -> anyhow::Result<Self> {
-        // What is small overtakes pictures; on a slow link each is dropped rather than waited for.
-        let priority = match topic {
-            TopicId::FRAME | TopicId::VIEW => Priority::DataLow,
-            _ => Priority::DataHigh,
-        };
+        // Small messages overtake images; a slow link drops messages and never blocks.
+        let priority = if topic.is_image() { Priority::DataLow } else { Priority::DataHigh };
         let publisher = session
             .declare_publisher(topics::key(run, topic))
             .congestion_control(CongestionControl::Drop)
@@ -164,32 +160,24 @@ impl Way {
         Ok(())
     }
 
-    fn send(&mut self, received: &Received) -> anyhow::Result<()> {
-        let message = received.message();
-        self.count_missed(message.header());
+    fn send(&mut self, message: AnyMessage<'_>) -> anyhow::Result<()> {
+        self.count_missed(message.header().sequence);
         let tag = Tag { sender: self.sender, sequence: self.sequence, sent_ns: monotonic_now_ns() };
         self.sequence += 1;
         if !self.heard {
             self.unheard += 1;
             return Ok(());
         }
-        let picture = match received {
-            Received::Frame(picture) => picture.bytes(),
-            Received::View(picture) => picture.bytes(),
-            _ => &[],
-        };
-        let put = self.publisher.put(picture).attachment(encode(message, tag)?);
+        let put = self.publisher.put(message.bytes()).attachment(encode(message, tag)?);
         put.wait().map_err(anyhow::Error::from_boxed).with_context(|| format!("cannot send {}", self.topic))?;
         self.sent += 1;
         Ok(())
     }
 
-    /// A publisher's numbers go up by one; those of a stage that was started again begin anew.
-    fn count_missed(&mut self, header: &Header) {
-        if let Some(expected) = self.expected {
-            self.missed += header.sequence.saturating_sub(expected);
-        }
-        self.expected = Some(header.sequence.saturating_add(1));
+    /// A publisher's numbers go up by one; those of a restarted stage begin again.
+    fn count_missed(&mut self, sequence: u64) {
+        let expected = self.expected.replace(sequence.saturating_add(1));
+        self.missed += sequence.saturating_sub(expected.unwrap_or(sequence));
     }
 }
 
@@ -199,7 +187,7 @@ mod tests {
     use carff_observe::RunRecord;
     use carff_transport::{Node, make_private_dir, remove_run_leftovers, runtime_dir};
 
-    /// A run is joined once its launcher is in it, and not before, when that one still clears up.
+    /// A run is joined after its launcher has joined it, and not while the launcher still clears up.
     #[test]
     fn the_launcher_joins_first() {
         let name = format!("link-join-{}", std::process::id());

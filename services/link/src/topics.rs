@@ -1,37 +1,36 @@
-//! Which topics cross, and under which key.
+//! The topics that are sent, and their keys.
 
 use carff_messages::Stage;
-use carff_transport::TopicId;
-use carff_transport::Run;
+use carff_transport::{Run, TopicId, UnknownTopic};
 
-/// Version of what crosses: ends of different versions do not hear each other.
+/// Version of the data on the link: ends of different versions do not receive from each other.
 const VERSION: u32 = 1;
 
-/// Topics as they are named on the command line: a name, `health` for all heartbeats, `all` for all there are.
+/// Reads topics from the command line: a name, `health` for all heartbeats, or `all`.
 pub fn parse(text: &str) -> Result<Vec<TopicId>, String> {
     match text {
         "all" => Ok(TopicId::all().collect()),
-        "health" => Ok(Stage::ALL.iter().map(|&stage| TopicId::health(stage)).collect()),
-        name => name.parse().map(|topic| vec![topic]).map_err(|error: carff_observe::UnknownTopic| error.to_string()),
+        "health" => Ok(Stage::ALL.map(TopicId::health).to_vec()),
+        name => name.parse().map(|topic| vec![topic]).map_err(|error: UnknownTopic| error.to_string()),
     }
 }
 
-/// A run's name: nothing that a key would be read otherwise for.
+/// Checks a run's name: it has no character with a meaning in keys.
 pub fn run_name(text: &str) -> Result<String, String> {
     Run::new(text, 0).map(|run| run.name().to_owned()).map_err(|error| error.to_string())
 }
 
-/// The key of a topic of the run that has this name where it is sent from.
+/// Returns the key of a topic, with the run's name on the sending machine.
 pub fn key(run: &str, topic: TopicId) -> String {
     format!("{}{topic}", prefix(run))
 }
 
-/// The keys of all its topics.
+/// Returns the pattern of the keys of all the run's topics.
 pub fn keys(run: &str) -> String {
     format!("{}**", prefix(run))
 }
 
-/// The topic of a key.
+/// Returns the topic of a key.
 pub fn of_key(run: &str, key: &str) -> Option<TopicId> {
     let name = key.strip_prefix(&prefix(run))?;
     TopicId::all().find(|topic| topic.name() == name)
@@ -45,7 +44,7 @@ fn prefix(run: &str) -> String {
 mod tests {
     use super::*;
 
-    /// Each topic's key leads back to it, in this run alone; groups stand for what they say, a slip is told the nearest.
+    /// Each topic's key leads back to it, only in this run; groups hold their topics; an unknown name gets a suggestion.
     #[test]
     fn keys_and_names_lead_to_topics() {
         for topic in TopicId::all() {

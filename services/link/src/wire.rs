@@ -1,23 +1,23 @@
-//! What crosses for each message: its form as JSON, tagged, and beside it the bytes of a picture.
+//! The parts of a message on the link: its form as tagged JSON, and the bytes of its image.
 
-use carff_messages::{Action, Belief, Forecast, FrameMeta, Header, Health, Message, ImageMeta, Posterior, ViewMeta};
+use carff_messages::forms::{AnyMessage, FormError, OwnedMessage};
+use carff_messages::{Action, Health};
 use carff_transport::TopicId;
-use carff_messages::forms::{ActionForm, AnyMessage, BeliefForm, ForecastForm, FormError, FrameForm, HealthForm, PosteriorForm, ViewForm};
-use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
+use serde_json::value::RawValue;
 
-/// Longest form that is read, bytes; that of the largest belief has a tenth of it.
+/// Longest form that is read, bytes; the largest belief has a tenth of it.
 const MAX_FORM_BYTES: usize = 1 << 20;
 
-/// Who put a message on the link.
+/// The sender of a message, and the message's place among those that it sent.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Tag {
-    /// Another one for each sending process.
+    /// Number of the sending process.
     pub sender: u64,
-    /// Counts the topic's messages, those among them that nobody was there to receive.
+    /// Counts the topic's messages, including those that had no receiver.
     pub sequence: u64,
-    /// When it was sent: the sending machine's monotonic clock, nanoseconds.
+    /// Time of sending: the sending machine's monotonic clock, nanoseconds.
     pub sent_ns: u64,
 }
 
@@ -28,120 +28,56 @@ struct Tagged<F> {
     message: F,
 }
 
-/// A valid message; of pictures what describes them.
-#[derive(Clone, Debug, PartialEq)]
-pub enum Arrived {
-    /// A camera frame.
-    Frame(Box<FrameMeta>),
-    /// What the encoder saw in it.
-    Posterior(Posterior),
-    /// A mixture and its samples.
-    Forecast(Box<Forecast>),
-    /// What probing found.
-    Belief(Box<Belief>),
-    /// A rendered view.
-    View(Box<ViewMeta>),
-    /// An action.
-    Action(Action),
-    /// A heartbeat.
-    Health(Health),
-}
-
-/// Why something that arrived is no message.
+/// Why the data that arrived is not a message.
 #[derive(Debug, thiserror::Error)]
 pub enum WireError {
-    /// There is no form, or one that nobody sends.
+    /// The form is missing or too long.
     #[error("the form has {0} bytes")]
     Length(usize),
-    /// It is not the topic's form.
-    #[error("it is not the form of this topic: {0}")]
-    Form(#[from] serde_json::Error),
-    /// The form stands for no valid message.
+    /// The data is not a tagged form.
+    #[error("it is not a tagged form: {0}")]
+    Tag(#[from] serde_json::Error),
+    /// The form is of another topic, or not that of a valid message, or describes another image.
     #[error(transparent)]
     Message(#[from] FormError),
-    /// The picture is not the one that is described.
-    #[error("the picture has {found} bytes, described are {described}")]
-    Picture {
-        /// Bytes that arrived.
-        found: usize,
-        /// Bytes that were described.
-        described: usize,
-    },
 }
 
-/// A message's form, tagged.
+/// Returns a message's form as tagged JSON.
 pub fn encode(message: AnyMessage<'_>, tag: Tag) -> Result<Vec<u8>, serde_json::Error> {
     serde_json::to_vec(&Tagged { tag, message: message.to_json()? })
 }
 
-/// A message out of its form, validated, and held against the bytes of its picture (none where it is no picture).
-pub fn decode(topic: TopicId, form: &[u8], picture_bytes: usize) -> Result<(Tag, Arrived), WireError> {
+/// Reads a message from its tagged form and the bytes of its image, if any, and validates it.
+pub fn decode(topic: TopicId, form: &[u8], bytes: Vec<u8>) -> Result<(Tag, OwnedMessage), WireError> {
     if !(1..=MAX_FORM_BYTES).contains(&form.len()) {
         return Err(WireError::Length(form.len()));
     }
-    let (tag, arrived, described) = match topic {
-        TopicId::FRAME => {
-            let (tag, meta) = read::<FrameForm, FrameMeta>(form)?;
-            (tag, Arrived::Frame(Box::new(meta)), meta.image_bytes())
-        }
-        TopicId::VIEW => {
-            let (tag, meta) = read::<ViewForm, ViewMeta>(form)?;
-            (tag, Arrived::View(Box::new(meta)), meta.image_bytes())
-        }
-        TopicId::POSTERIOR => read::<PosteriorForm, _>(form).map(|(tag, m)| (tag, Arrived::Posterior(m), 0))?,
-        TopicId::FORECAST => read::<ForecastForm, _>(form).map(|(tag, m)| (tag, Arrived::Forecast(Box::new(m)), 0))?,
-        TopicId::BELIEF => read::<BeliefForm, _>(form).map(|(tag, m)| (tag, Arrived::Belief(Box::new(m)), 0))?,
-        TopicId::ACTION => read::<ActionForm, _>(form).map(|(tag, m)| (tag, Arrived::Action(m), 0))?,
-        TopicId::health(_) => read::<HealthForm, _>(form).map(|(tag, m)| (tag, Arrived::Health(m), 0))?,
-    };
-    if picture_bytes != described {
-        return Err(WireError::Picture { found: picture_bytes, described });
-    }
-    Ok((tag, arrived))
+    let Tagged { tag, message } = serde_json::from_slice::<Tagged<&RawValue>>(form)?;
+    Ok((tag, topic.read(message.get().as_bytes(), bytes)?))
 }
 
-fn read<F, M>(form: &[u8]) -> Result<(Tag, M), WireError>
-where
-    F: DeserializeOwned,
-    M: Message + for<'a> TryFrom<&'a F, Error = FormError>,
-{
-    let Tagged { tag, message } = serde_json::from_slice::<Tagged<F>>(form)?;
-    let message = M::try_from(&message)?;
-    message.validate().map_err(FormError::from)?;
-    Ok((tag, message))
-}
-
-impl Arrived {
-    /// Makes it a message of another run, with all its times as `here_ns` says.
-    pub fn settle(&mut self, run_id: u64, here_ns: impl Fn(u64) -> u64) {
-        match self {
-            Self::Action(m) => m.valid_until_ns = here_ns(m.valid_until_ns),
-            Self::Health(m) => m.last_progress_ns = here_ns(m.last_progress_ns),
-            Self::Frame(_) | Self::Posterior(_) | Self::Forecast(_) | Self::Belief(_) | Self::View(_) => {}
-        }
-        let header = self.header_mut();
-        header.run_id = run_id;
-        header.capture_time_ns = here_ns(header.capture_time_ns);
-        header.publish_time_ns = here_ns(header.publish_time_ns);
+/// Makes a message one of another run, and changes all its times by `here_ns`.
+pub fn settle(message: &mut OwnedMessage, run_id: u64, here_ns: impl Fn(u64) -> u64) {
+    if let Some(action) = message.get_mut::<Action>() {
+        action.valid_until_ns = here_ns(action.valid_until_ns);
     }
-
-    fn header_mut(&mut self) -> &mut Header {
-        match self {
-            Self::Frame(m) => &mut m.header,
-            Self::Posterior(m) => &mut m.header,
-            Self::Forecast(m) => &mut m.header,
-            Self::Belief(m) => &mut m.header,
-            Self::View(m) => &mut m.header,
-            Self::Action(m) => &mut m.header,
-            Self::Health(m) => &mut m.header,
-        }
+    if let Some(health) = message.get_mut::<Health>() {
+        health.last_progress_ns = here_ns(health.last_progress_ns);
     }
+    let header = message.header_mut();
+    header.run_id = run_id;
+    header.capture_time_ns = here_ns(header.capture_time_ns);
+    header.publish_time_ns = here_ns(header.publish_time_ns);
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use carff_messages::{ActionCode, ForecastSource, Gaussian, HealthState, Reason, Rule, Stage, ViewKind};
+    use carff_messages::forms::Readable;
+    use carff_messages::{
+        ActionCode, Belief, Forecast, ForecastSource, FrameMeta, Gaussian, Header, HealthState, Posterior, Reason,
+        Rule, Stage, ViewKind, ViewMeta,
+    };
 
     const TAG: Tag = Tag { sender: u64::MAX, sequence: 3, sent_ns: 1 << 60 };
 
@@ -169,7 +105,7 @@ mod tests {
         (belief.state_count, belief.place_count, belief.component_count, belief.sample_count) = (3, 2, 1, 2);
         belief.state_probability[..3].copy_from_slice(&[0.1, 0.7, 1.0 / 7.0]);
         belief.component_weights[0] = 1.0;
-        belief.samples[1].densities[..2].copy_from_slice(&[1.0 / 3.0, 1e-20]);
+        belief.samples[1].occupancies[..2].copy_from_slice(&[1.0 / 3.0, 1e-20]);
         belief
     }
 
@@ -209,7 +145,13 @@ mod tests {
         }
     }
 
-    /// Messages of all kinds come out as they went in, bit for bit, with their tag.
+    fn survives<M: Readable + PartialEq>(topic: TopicId, message: M, bytes: &[u8]) {
+        let form = encode(AnyMessage::new(&message, bytes), TAG).unwrap();
+        let (tag, decoded) = decode(topic, &form, bytes.to_vec()).unwrap();
+        assert_eq!((tag, decoded.as_message().get(), decoded.as_message().bytes()), (TAG, Some(&message), bytes));
+    }
+
+    /// Messages of all kinds come out unchanged, bit for bit, with their tag.
     #[test]
     fn every_message_survives() {
         let posterior = Posterior { header: header(), gaussian: Gaussian::standard(), stage_latency_ns: 5 };
@@ -224,32 +166,27 @@ mod tests {
             world_from_camera: view().world_from_camera,
             dataset_view: carff_messages::DatasetView::UNKNOWN,
         };
-        let (view, belief, action, health) = (view(), belief(), action(), health());
-        for (topic, message, picture_bytes, expected) in [
-            (TopicId::FRAME, AnyMessage::Frame(&frame, &[0; 18]), 18, Arrived::Frame(frame.into())),
-            (TopicId::POSTERIOR, AnyMessage::Posterior(&posterior), 0, Arrived::Posterior(posterior)),
-            (TopicId::FORECAST, AnyMessage::Forecast(&forecast), 0, Arrived::Forecast(forecast.into())),
-            (TopicId::BELIEF, AnyMessage::Belief(&belief), 0, Arrived::Belief(belief.into())),
-            (TopicId::VIEW, AnyMessage::View(&view, &[0; 18]), 18, Arrived::View(view.into())),
-            (TopicId::ACTION, AnyMessage::Action(&action), 0, Arrived::Action(action)),
-            (TopicId::health(Stage::Prober), AnyMessage::Health(&health), 0, Arrived::Health(health)),
-        ] {
-            let form = encode(message, TAG).unwrap();
-            assert_eq!(decode(topic, &form, picture_bytes).unwrap(), (TAG, expected), "{topic}");
-        }
+        survives(TopicId::FRAME, frame, &[7; 18]);
+        survives(TopicId::POSTERIOR, posterior, &[]);
+        survives(TopicId::FORECAST, forecast, &[]);
+        survives(TopicId::BELIEF, belief(), &[]);
+        survives(TopicId::VIEW, view(), &[7; 18]);
+        survives(TopicId::ACTION, action(), &[]);
+        survives(TopicId::health(Stage::Prober), health(), &[]);
     }
 
-    /// What is cut off, of another topic, of another size, too long or not valid is refused, whatever it is.
+    /// A form that is cut off, of another topic, of another size, too long or not valid is refused.
     #[test]
     fn what_is_no_message_is_refused() {
         let (view, mut belief) = (view(), belief());
-        let form = encode(AnyMessage::View(&view, &[0; 18]), TAG).unwrap();
+        let form = encode(AnyMessage::new(&view, &[0; 18]), TAG).unwrap();
+        let decode = |topic, form: &[u8], bytes| decode(topic, form, vec![0; bytes]);
         for cut in 0..form.len() {
             assert!(decode(TopicId::VIEW, &form[..cut], 18).is_err(), "{cut}");
         }
-        assert!(matches!(decode(TopicId::FRAME, &form, 18), Err(WireError::Form(_))));
+        assert!(matches!(decode(TopicId::FRAME, &form, 18), Err(WireError::Message(FormError::Json(_)))));
         let size = decode(TopicId::VIEW, &form, 17).unwrap_err().to_string();
-        assert_eq!(size, "the picture has 17 bytes, described are 18");
+        assert_eq!(size, "`image bytes` is 17, expected 18");
         let text = String::from_utf8(form).unwrap();
         for (from, to) in [
             ("\"width_px\":3", "\"width_px\":4294967295"),
@@ -265,22 +202,25 @@ mod tests {
         }
         assert!(matches!(decode(TopicId::VIEW, &vec![b' '; MAX_FORM_BYTES + 1], 18), Err(WireError::Length(_))));
         belief.hazard_probability = 1.5;
-        let form = encode(AnyMessage::Belief(&belief), TAG).unwrap();
-        assert!(matches!(decode(TopicId::BELIEF, &form, 0), Err(WireError::Message(_))));
+        let form = encode(AnyMessage::new(&belief, &[]), TAG).unwrap();
+        assert!(matches!(decode(TopicId::BELIEF, &form, 0), Err(WireError::Message(FormError::Invalid(_)))));
     }
 
-    /// A settled message has the run and the times of its new place, and all else as it was, sequence number included.
+    fn settled<M: Readable>(message: M) -> M {
+        let mut settled = OwnedMessage::new(Box::new(message), Vec::new());
+        settle(&mut settled, 5, |ns| ns + 100);
+        *settled.as_message().get().unwrap()
+    }
+
+    /// A settled message has the run and the times of its new place, and is otherwise unchanged.
     #[test]
-    fn times_and_run_alone_are_settled() {
-        let mut settled = Arrived::Action(action());
-        settled.settle(5, |ns| ns + 100);
+    fn only_times_and_run_are_settled() {
         let mut expected = action();
         expected.header.run_id = 5;
         (expected.header.capture_time_ns, expected.header.publish_time_ns) = (1_600, 2_600);
         expected.valid_until_ns = 9_100;
-        assert_eq!(settled, Arrived::Action(expected));
-        let mut settled = Arrived::Health(health());
-        settled.settle(5, |ns| ns + 100);
-        assert!(matches!(settled, Arrived::Health(h) if h.last_progress_ns == 2_100 && h.pid == 1));
+        assert_eq!(settled(action()), expected);
+        let health = settled(health());
+        assert_eq!((health.last_progress_ns, health.pid), (2_100, 1));
     }
 }

@@ -2,11 +2,11 @@
 
 use carff_messages::Stage;
 use carff_prober::{believe, load};
-use carff_stage::{StageContext, frame_span};
+use carff_runtime::{StageContext, frame_span};
 use carff_transport::{monotonic_now_ns, topics};
 
 fn main() -> std::process::ExitCode {
-    carff_stage::main(Stage::Prober, run)
+    carff_runtime::main(Stage::Prober, run)
 }
 
 fn run(stage: &mut StageContext) -> anyhow::Result<()> {

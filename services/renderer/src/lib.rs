@@ -1,10 +1,10 @@
 //! The renderer stage's arithmetic: the choice of hypotheses and cameras, and their images.
 
 use anyhow::Context;
+use carff_base::geometry::PinholeCamera;
 use carff_checkpoint::Manifest;
 use carff_config::ViewChoice;
 use carff_field::{Field, HypothesisBuffer, InstructionSet, RenderBuffer, RenderOptions};
-use carff_geometry::PinholeCamera;
 use carff_messages::{Belief, Forecast, LATENT_DIM, ViewKind, ViewMeta, row_major};
 use std::path::Path;
 

@@ -3,14 +3,14 @@
 use carff_field::HypothesisBuffer;
 use carff_messages::Stage;
 use carff_renderer::{camera, hypotheses, load, meta, render, write};
-use carff_stage::{Overload, StageContext, frame_span};
+use carff_runtime::{Overload, StageContext, frame_span};
 use carff_transport::{Woken, monotonic_now_ns, topics};
 
 /// Minimum side of a view under overload, pixels.
 const MIN_SIDE_PX: u32 = 16;
 
 fn main() -> std::process::ExitCode {
-    carff_stage::main(Stage::Renderer, run)
+    carff_runtime::main(Stage::Renderer, run)
 }
 
 fn run(stage: &mut StageContext) -> anyhow::Result<()> {

@@ -1,6 +1,6 @@
 //! The user's camera: orbit, pan and zoom about a target point, and projection of world points into its image.
 
-use carff_geometry::{OrientedBox, PinholeCamera};
+use carff_base::geometry::{OrientedBox, PinholeCamera};
 
 /// Rotation for a drag across the image's shorter side, degrees.
 const ORBIT_DEG_PER_SIDE: f64 = 180.0;

@@ -1,9 +1,9 @@
 //! Input images: from a dataset, from a file, or from a running camera.
 
 use crate::models::Models;
+use carff_base::geometry::PinholeCamera;
 use carff_checkpoint::{CheckpointError, ScenarioIdentity};
 use carff_dataset::{Dataset, DatasetError, Image, Observability};
-use carff_geometry::PinholeCamera;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 

@@ -1,6 +1,6 @@
 //! The journal for the window's lists and plots: decisions and durations.
 
-use carff_metrics::Spread;
+use carff_base::statistics::Spread;
 use std::collections::VecDeque;
 
 /// Maximum number of stored decisions.

@@ -242,7 +242,7 @@ impl Watcher {
 /// Returns an entry for the first action on a frame, and for a safe action that differs from the last one.
 fn decision(action: &Action, last_safe: &mut Option<(ActionCode, Reason)>) -> Option<Decision> {
     let (code, reason) = (action.code().ok()?, action.reason().ok()?);
-    let decided = action.is_decision == 1;
+    let decided = action.is_decision();
     if reason == Reason::Belief {
         *last_safe = None;
         if !decided {
@@ -312,7 +312,7 @@ impl Assembly {
         parts.moments.push(moment);
         let state = usize::try_from(belief.resolved_state).ok();
         parts.fed_back = state.map(|state| (belief.resolved, state));
-        if belief.is_final == 0 {
+        if !belief.is_final() {
             return None;
         }
         let whole = self.frames.remove(&frame_id)?.moments;
@@ -335,7 +335,7 @@ fn input(meta: &FrameMeta, bytes: &[u8]) -> Input {
         title: format!("frame {}", meta.header.frame_id),
         image: Image { width_px: meta.width_px, height_px: meta.height_px, rgb: bytes.to_vec() },
         camera: Some(meta.camera()),
-        truth: truth.filter(|_| view.known == 1),
+        truth: truth.filter(|_| view.is_known()),
         frame: meta.header.frame_id,
         seed: Some(meta.header.seed),
     }

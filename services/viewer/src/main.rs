@@ -91,7 +91,7 @@ fn main() -> ExitCode {
     match run(Args::parse()) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("error: {}", carff_stage::describe(&error));
+            eprintln!("error: {}", carff_base::errors::sentence(&*error));
             ExitCode::FAILURE
         }
     }

@@ -5,7 +5,7 @@ use carff_dataset::Image;
 use carff_decision::Policy;
 use carff_field::Field;
 use carff_messages::{Gaussian, Rule};
-use carff_models::{
+use carff_networks::{
     borrow,
     encoder::Encoder,
     mixture::MixtureNet,
@@ -33,8 +33,8 @@ pub struct Models {
 impl Models {
     /// Reads a checkpoint; `threads` is the number of threads of encoder and forecaster.
     pub fn load(dir: &Path, threads: usize) -> Result<Self, CheckpointError> {
-        carff_models::allocator::keep_large_blocks();
-        carff_models::device::set_threads(threads);
+        carff_networks::allocator::keep_large_blocks();
+        carff_networks::device::set_threads(threads);
         let manifest = Manifest::load(dir)?;
         let mixture = match load_mixture(dir, &manifest) {
             // A missing part disables its function; a damaged part is an error.

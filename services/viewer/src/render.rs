@@ -2,9 +2,9 @@
 //! coarse first, then finer, so that the window stays responsive on a slow machine.
 
 use crate::slice::density_slice;
+use carff_base::geometry::PinholeCamera;
 use carff_dataset::Image;
 use carff_field::{Field, HypothesisBuffer, InstructionSet, LATENT_DIM, RenderBuffer, RenderOptions};
-use carff_geometry::PinholeCamera;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;

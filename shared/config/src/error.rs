@@ -10,7 +10,7 @@ use toml::de::{DeTable, DeValue};
 #[derive(Debug, thiserror::Error)]
 pub enum ConfigError {
     /// The file cannot be read.
-    #[error("cannot read the {what} file {path}: {source}{}", carff_nearest::beside(path))]
+    #[error("cannot read the {what} file {path}: {source}{}", carff_base::names::beside(path))]
     Read {
         /// Kind of file.
         what: &'static str,
@@ -94,7 +94,7 @@ impl Source<'_> {
     pub(crate) fn syntax(&self, error: &toml::de::Error) -> ConfigError {
         let offset = error.span().map_or(0, |span| span.start);
         // The lines after the first one repeat the place, which this error states itself.
-        let message = carff_nearest::explained(&error.message().lines().collect::<Vec<_>>().join(", "));
+        let message = carff_base::names::explained(&error.message().lines().collect::<Vec<_>>().join(", "));
         ConfigError::Syntax { path: self.path.into(), line: self.line(offset), key: self.key_at(offset), message }
     }
 

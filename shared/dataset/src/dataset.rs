@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use carff_geometry::{OrientedBox, PinholeCamera};
+use carff_base::geometry::{OrientedBox, PinholeCamera};
 use carff_messages::Observability;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -120,6 +120,26 @@ impl ScenarioInfo {
     /// Returns the state index of a branch at a time step.
     pub fn state(&self, branch: usize, timestamp: usize) -> Option<usize> {
         (branch < self.branches.len() && timestamp < self.timestamps).then(|| branch * self.timestamps + timestamp)
+    }
+
+    /// Returns the branch of a state.
+    pub fn branch_of(&self, state: usize) -> usize {
+        state / self.timestamps.max(1)
+    }
+
+    /// Returns the time step of a state.
+    pub fn timestamp_of(&self, state: usize) -> usize {
+        state % self.timestamps.max(1)
+    }
+
+    /// Returns the state at the next time step of the same branch. The last state of a branch follows itself.
+    pub fn next_state(&self, state: usize) -> usize {
+        if (state + 1).is_multiple_of(self.timestamps.max(1)) { state } else { state + 1 }
+    }
+
+    /// Returns the states of a branch, in the order of their time steps.
+    pub fn states_of_branch(&self, branch: usize) -> std::ops::Range<usize> {
+        branch * self.timestamps..(branch + 1) * self.timestamps
     }
 
     /// Returns true if the hazard action is right in this branch.

@@ -7,12 +7,12 @@
 //! kind, or none, can still be driven: inputs without a right answer do not count.
 
 use crate::{Dataset, Observability, ScenarioInfo};
-use carff_random::Key;
+use carff_base::random::{Key, tag};
 use rand::Rng;
 use rand::seq::SliceRandom;
 
 /// Name of the random stream, so that no other draw of the same run shares it.
-const STREAM: u64 = 0x6472_6976_6573_2031;
+const STREAM: u64 = tag("drives 1");
 
 /// Kind of a drive: its right action.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
@@ -131,7 +131,7 @@ type Poses = Vec<(usize, Vec<usize>)>;
 /// The same arguments give the same drives.
 pub fn plan_drives(dataset: &Dataset, views: &[usize], count: usize, seed: u64) -> Result<Vec<Drive>, DrivesError> {
     let scenario = dataset.scenario().ok_or(DrivesError::NoScenario)?;
-    let mut rng = carff_random::stream(Key { seed, frame: STREAM, step: 0, sample: 0 });
+    let mut rng = carff_base::random::stream(Key { seed, frame: STREAM, step: 0, sample: 0 });
     let frames = |branch: usize, view: usize| -> Option<Vec<usize>> {
         (0..scenario.timestamps).map(|t| dataset.frame_index(scenario.state(branch, t)?, view)).collect()
     };
@@ -178,7 +178,7 @@ pub fn plan_drives(dataset: &Dataset, views: &[usize], count: usize, seed: u64) 
 mod tests {
     use super::*;
     use crate::{DatasetWriter, FrameRecord, Image};
-    use carff_geometry::PinholeCamera;
+    use carff_base::geometry::PinholeCamera;
 
     /// Writes two branches (0 holds the hazard) x three time steps x six poses: poses 0 to 2 do not see the actor's
     /// place, poses 3 and 4 see it fully, pose 5 sees a part.
@@ -240,7 +240,7 @@ mod tests {
         let at = |x: f64| NamedBox {
             name: "actor".into(),
             role: None,
-            oriented_box: carff_geometry::OrientedBox { center: [x, 0.0, 1.0], half_size: [1.0; 3], yaw: 0.0 },
+            oriented_box: carff_base::geometry::OrientedBox { center: [x, 0.0, 1.0], half_size: [1.0; 3], yaw: 0.0 },
             dynamic: true,
         };
         let places = [[0.0, 6.0, 12.0], [0.0, 3.0, 6.0]];

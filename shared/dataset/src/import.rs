@@ -5,7 +5,7 @@
 
 use std::path::Path;
 
-use carff_geometry::PinholeCamera;
+use carff_base::geometry::PinholeCamera;
 use image::imageops::{FilterType, resize};
 use rayon::prelude::*;
 

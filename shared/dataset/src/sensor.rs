@@ -3,7 +3,7 @@
 //! The camera stage and the training use this function, so that models are trained on the same noise. All draws come
 //! from the counter-based stream of a key: the same key gives the same bytes.
 
-use carff_random::Key;
+use carff_base::random::{Key, tag};
 use rand::Rng;
 use rand_distr::StandardNormal;
 use schemars::JsonSchema;
@@ -57,7 +57,7 @@ pub enum SensorError {
 }
 
 /// Name of the random stream, so that no other draw of the same run shares it.
-const STREAM: u64 = 0x7365_6e73_6f72_6e7a;
+const STREAM: u64 = tag("sensornz");
 
 impl SensorNoise {
     /// Parameters without any noise.
@@ -135,7 +135,7 @@ struct Noise<R> {
 impl Noise<()> {
     #[allow(clippy::new_ret_no_self)]
     fn new(noise: &SensorNoise, key: Key) -> Noise<impl Rng> {
-        let mut rng = carff_random::stream(Key { seed: key.seed ^ STREAM, ..key });
+        let mut rng = carff_base::random::stream(Key { seed: key.seed ^ STREAM, ..key });
         let mut normal = |sigma: f32| sigma * rng.sample::<f32, _>(StandardNormal);
         let exposure = 1.0 + normal(noise.gain_sigma);
         let gain = [0; 3].map(|_| exposure * (1.0 + normal(noise.channel_gain_sigma)));

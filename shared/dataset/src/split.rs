@@ -1,6 +1,6 @@
 //! Split of poses into held-out, calibration and other training poses.
 
-use carff_random::Key;
+use carff_base::random::{Key, tag};
 use rand::seq::SliceRandom;
 
 use crate::dataset::Dataset;
@@ -23,7 +23,7 @@ pub struct PoseSplit {
 }
 
 /// Name of the random stream, so that no other draw of the same run shares it.
-const STREAM: u64 = 0x706f_7365_7370_6c74;
+const STREAM: u64 = tag("posesplt");
 
 impl PoseSplit {
     /// Splits `view_count` poses. Poses in `always_train` are always in [`PoseRole::Rest`].
@@ -49,7 +49,7 @@ impl PoseSplit {
     }
 
     fn stratified(strata: &[usize], seed: u64, always_train: &[usize]) -> Self {
-        let mut rng = carff_random::stream(Key { seed, frame: STREAM, step: 0, sample: 0 });
+        let mut rng = carff_base::random::stream(Key { seed, frame: STREAM, step: 0, sample: 0 });
         let mut roles = vec![PoseRole::Rest; strata.len()];
         let stratum_count = strata.iter().max().map_or(0, |s| s + 1);
         let mut groups: Vec<Vec<usize>> = vec![Vec::new(); stratum_count];

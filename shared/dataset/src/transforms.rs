@@ -3,7 +3,7 @@
 use std::collections::HashMap;
 use std::path::{Component, Path, PathBuf};
 
-use carff_geometry::{OrientedBox, PinholeCamera};
+use carff_base::geometry::{OrientedBox, PinholeCamera};
 use carff_messages::Observability;
 use serde_json::{Map, Value};
 
@@ -394,8 +394,10 @@ fn read_camera(
     };
     camera.validate().map_err(|error| {
         let key = match &error {
-            carff_geometry::CameraError::NotFinite(key) | carff_geometry::CameraError::NotPositive(key) => key,
-            carff_geometry::CameraError::NotARotation => "transform_matrix",
+            carff_base::geometry::CameraError::NotFinite(key) | carff_base::geometry::CameraError::NotPositive(key) => {
+                key
+            }
+            carff_base::geometry::CameraError::NotARotation => "transform_matrix",
         };
         place.error(
             key,

@@ -6,7 +6,7 @@ use std::io::{ErrorKind, Write};
 use std::path::{Component, Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 
-use carff_geometry::PinholeCamera;
+use carff_base::geometry::PinholeCamera;
 use image::ExtendedColorType;
 use serde::{Serialize, de::DeserializeOwned};
 

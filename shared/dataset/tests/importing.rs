@@ -4,8 +4,8 @@
 
 use std::path::Path;
 
+use carff_base::geometry::PinholeCamera;
 use carff_dataset::{Dataset, Image, ImportOptions, import};
-use carff_geometry::PinholeCamera;
 use serde_json::{Value, json};
 
 /// Returns cameras around the point (0, 0, 1), at a distance of 4.

@@ -4,11 +4,11 @@
 
 use std::path::Path;
 
+use carff_base::geometry::{OrientedBox, PinholeCamera};
 use carff_dataset::{
     Candidate, Dataset, DatasetReport, DatasetWriter, Equivalence, FrameRecord, Image, NamedBox, Observability,
     PoseRole, PoseSplit, ScenarioInfo, SheetOptions, StateInfo, contact_sheet,
 };
-use carff_geometry::{OrientedBox, PinholeCamera};
 use serde_json::{Value, json};
 
 const IDENTITY: [[f64; 4]; 4] =
@@ -389,7 +389,9 @@ fn errors_of_files() {
         error.ends_with("images/b0_t1_v1.png: frame 3 is 9x8 pixels, but its intrinsics (keys `w` and `h`) are 8x8"),
         "{error}"
     );
-    assert!(dataset.load_image(8).unwrap_err().to_string().contains("frame 8 does not exist; the dataset has 8 frames"));
+    assert!(
+        dataset.load_image(8).unwrap_err().to_string().contains("frame 8 does not exist; the dataset has 8 frames")
+    );
     std::fs::remove_file(picture).unwrap();
     let error = message(dir.path());
     assert!(error.contains("frame 3 (images/b0_t1_v1.png): key `file_path`: there is no file"), "{error}");

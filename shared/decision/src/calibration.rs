@@ -216,7 +216,7 @@ fn moments(values: &[f64]) -> Option<(f64, f64)> {
 mod tests {
     use super::*;
     use crate::Place;
-    use carff_geometry::OrientedBox;
+    use carff_base::geometry::OrientedBox;
 
     /// Three states: something at place 0, at place 1, nowhere.
     fn layout() -> ProbeLayout {

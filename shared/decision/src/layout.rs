@@ -4,7 +4,7 @@
 //! upright columns, and a place is as occupied as its median column is opaque: a vehicle stops light nearly everywhere,
 //! haze or a neighbour's shadow only in a few places.
 
-use carff_geometry::OrientedBox;
+use carff_base::geometry::OrientedBox;
 use serde::{Deserialize, Serialize};
 
 /// Upright columns along a box's length and its width.
@@ -58,7 +58,7 @@ pub struct Place {
 ///
 /// ```
 /// use carff_decision::{Calibration, Place, ProbeLayout};
-/// use carff_geometry::OrientedBox;
+/// use carff_base::geometry::OrientedBox;
 /// let place = |x: f64, occupied_in: Vec<bool>| Place {
 ///     name: "actor".into(),
 ///     oriented_box: OrientedBox { center: [x, 0.0, 1.0], half_size: [1.0, 1.0, 1.0], yaw: 0.0 },

@@ -1,7 +1,7 @@
 //! Mixtures of Gaussians over the scene latent, and latents drawn from them.
 
+use carff_base::random::Key;
 use carff_messages::{Gaussian, LATENT_DIM};
-use carff_random::Key;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -47,17 +47,17 @@ impl Mixture {
     /// sampling, its component depends on `count`.
     pub fn draw(&self, count: usize, sampling: Sampling, seed: u64, frame: u64, step: u32) -> Vec<Draw> {
         // Index u32::MAX: a stream that no sample uses.
-        let offset = carff_random::uniform(Key { seed, frame, step, sample: u32::MAX });
+        let offset = carff_base::random::uniform(Key { seed, frame, step, sample: u32::MAX });
         (0..count)
             .map(|i| {
                 let position = match sampling {
                     Sampling::Stratified => (i as f64 + offset) / count as f64,
                     Sampling::Independent => {
-                        carff_random::uniform(Key { seed, frame, step, sample: i as u32 | 0x8000_0000 })
+                        carff_base::random::uniform(Key { seed, frame, step, sample: i as u32 | 0x8000_0000 })
                     }
                 };
                 let component = self.component_at(position);
-                let unit = carff_random::gaussians(Key { seed, frame, step, sample: i as u32 });
+                let unit = carff_base::random::gaussians(Key { seed, frame, step, sample: i as u32 });
                 Draw { latent: self.components[component].at(&unit), component }
             })
             .collect()

@@ -1,46 +1,73 @@
-//! How well a trained scenario does: accuracy, pictures, planning.
+//! Evaluation of a trained scenario: accuracy, images and planning, as tables and as one page.
 //!
-//! What lives here: tables over views, computed with the same library functions that the stages run. What never does:
-//! training, processes. Every table says its trials; poses that were never trained on stand apart.
+//! Tables are computed with the library functions that the stages run. Every table gives its trials, and separates
+//! held-out poses from trained ones. Nothing here trains a model or chooses a setting.
+//!
+//! | module | content |
+//! |---|---|
+//! | `posed`, `accuracy`, `decoded`, `render` | the labelled images, and what the models make of them |
+//! | `trials` | trials of decision rules and samples, and the images from above |
+//! | `stats` | arithmetic on trials: recall curves, frequencies, reliability, support vector machine, SSIM |
+//! | `tables`, `report` | the tables of `carff eval`, `results.json` and its page |
+//! | `run` | planning tables and the filmstrip of a run of the graph |
+//! | `figures` | the figures in a checkpoint's manifest |
 
-mod birds_eye;
-pub mod draws;
-pub mod hypotheses;
-mod pairs;
-mod planning;
-mod samples;
-pub mod svm;
+mod accuracy;
+mod decoded;
+mod error;
+mod figures;
+mod posed;
+mod render;
+mod report;
+mod role;
+pub mod run;
+mod stats;
+mod subject;
+mod tables;
+mod trials;
 
-pub use birds_eye::{BirdsEye, birds_eye};
-pub use pairs::{PairMeans, pair_means};
-pub use planning::{Count, PlanningTable, SAMPLE_COUNTS, Trial, TrialOutcome, count, planning_table, trial, trials};
-pub use samples::{Input, SampleAccuracy, sample_accuracy};
+pub use accuracy::{Accuracy, ByObservability, Centroids, Share, state_accuracy};
+pub use decoded::{DecodedQuality, Decoding, changed_pixels};
+pub use error::EvaluationError;
+pub use figures::{
+    CheckpointFigures, PlanningFigures, ProbingFigures, SampleFigures, TrainedAndUnseen, VaeFigures, ViewFigures,
+};
+pub use posed::{Label, PosedImages};
+pub use render::{FieldRenderer, to_bytes, to_unit};
+pub use report::{About, FrequencyTable, Gallery, Results, Table, encoder_rows, evaluate};
+pub use role::{ByRole, ROLES, role_name};
+pub use stats::{
+    draws::{Curve, Frequencies, Frequency, expected_recall},
+    pairs::PairMeans,
+    reliability::{Reliability, ReliabilityBin, reliability},
+    ssim::ssim,
+};
+pub use subject::{EvalOptions, Subject};
+pub use tables::{
+    encoder::{EncoderTable, SvmScore, SvmTable, encoder_table},
+    field::{FieldPictures, NovelViews, PictureTable},
+    forecast::{ForecastTable, RoleCurves},
+    planning::{OneImage, PlanningResults, PlanningViews, ViewCounts},
+    targets::Target,
+};
+pub use trials::{
+    Models,
+    birds_eye::{BirdsEye, birds_eye},
+    planning::{
+        ByKind, BySamples, Count, NoisyEncoder, Planner, PlanningTable, SAMPLE_COUNTS, Trial, TrialOutcome, trial_frame,
+    },
+    samples::{Input, SampleAccuracy, SampleTrials},
+};
 
-use carff_checkpoint::{CheckpointError, FieldProbe, Manifest};
-use carff_models::{encoder::Encoder, mixture::MixtureNet};
-use std::path::Path;
-
-/// All that the decision path runs on.
-pub struct Models {
-    /// Picture to posterior.
-    pub encoder: Encoder,
-    /// Posterior to mixture.
-    pub mixture: MixtureNet,
-    /// Hypothesis to state.
-    pub probe: FieldProbe,
-    /// What was trained, and how.
-    pub manifest: Manifest,
-}
-
-impl Models {
-    /// Reads a checkpoint.
-    pub fn load(dir: &Path) -> Result<Self, CheckpointError> {
-        let manifest = Manifest::load(dir)?;
-        Ok(Self {
-            encoder: carff_models::stored::load_encoder(dir, &manifest)?,
-            mixture: carff_models::stored::load_mixture(dir, &manifest)?,
-            probe: carff_checkpoint::load_field_probe(dir, &manifest)?,
-            manifest,
-        })
-    }
+/// One line of progress.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Progress<'a> {
+    /// Name of the work, for example a training phase or a table.
+    pub phase: &'a str,
+    /// Steps done.
+    pub done: usize,
+    /// Steps in all.
+    pub total: usize,
+    /// The figures as text.
+    pub line: String,
 }

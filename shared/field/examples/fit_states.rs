@@ -8,11 +8,11 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use anyhow::{Context, Result, bail};
+use carff_base::geometry::PinholeCamera;
 use carff_field::{
     Field, FieldConfig, FieldTrainer, LATENT_DIM, RayBatch, RaySampler, RenderBuffer, RenderOptions, TrainerConfig,
     TrainingView, changed_pixels,
 };
-use carff_geometry::PinholeCamera;
 use serde_json::Value;
 
 struct PosedImage {

@@ -1,7 +1,7 @@
 //! Conversions between messages and the types of the libraries.
 
 use crate::{DatasetView, FrameMeta, Header, Intrinsics, ViewMeta};
-use carff_geometry::PinholeCamera;
+use carff_base::geometry::PinholeCamera;
 
 impl From<&PinholeCamera> for Intrinsics {
     fn from(camera: &PinholeCamera) -> Self {

@@ -46,6 +46,11 @@ impl Action {
         Reason::try_from(self.reason)
     }
 
+    /// Reports whether this is the first action that rests on its frame.
+    pub fn is_decision(&self) -> bool {
+        self.is_decision == 1
+    }
+
     fn check(&self) -> Result<(), Invalid> {
         self.header.validate()?;
         ActionCode::try_from(self.action)?;

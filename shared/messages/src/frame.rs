@@ -78,6 +78,16 @@ impl DatasetView {
         last_of_timestamp: 0,
     };
 
+    /// Reports whether the rest is known.
+    pub fn is_known(&self) -> bool {
+        self.known == 1
+    }
+
+    /// Reports whether this is the last frame of a time step, when a decision on it counts.
+    pub fn is_last_of_timestamp(&self) -> bool {
+        self.last_of_timestamp == 1
+    }
+
     fn check(&self) -> Result<(), Invalid> {
         at_most("dataset_view.known", self.known.into(), 1)?;
         at_most("dataset_view.last_of_timestamp", self.last_of_timestamp.into(), 1)?;

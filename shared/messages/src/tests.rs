@@ -1,5 +1,5 @@
 use super::*;
-use carff_random::{Key, stream};
+use carff_base::random::{Key, stream};
 use rand::RngCore;
 
 fn header() -> Header {

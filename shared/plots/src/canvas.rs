@@ -1,5 +1,4 @@
-//! The drawing surface: twice the size of the finished image, so that lines and letters become smooth when it is
-//! halved.
+//! Canvas of twice the size of the finished image: halving it makes lines and letters smooth.
 
 use crate::{MAX_SIDE_PX, PlotError};
 use carff_dataset::Image;
@@ -8,7 +7,7 @@ use plotters::prelude::{BitMapBackend, DrawingArea, IntoDrawingArea, RGBColor};
 use plotters::style::{FontDesc, FontFamily, FontStyle, IntoFont, TextStyle, register_font};
 use std::sync::OnceLock;
 
-/// Number of drawn pixels per pixel of the finished image, along each side.
+/// Drawn pixels for one pixel of the finished image, along each side.
 pub const OVERSAMPLING: u32 = 2;
 /// Background of every image.
 pub const PAPER: RGBColor = RGBColor(252, 252, 250);
@@ -18,12 +17,12 @@ pub const INK: RGBColor = RGBColor(34, 38, 46);
 pub const FAINT_INK: RGBColor = RGBColor(104, 110, 122);
 /// Height of a line of text, in font sizes.
 const LINE_HEIGHT: f64 = 1.3;
-/// Vertical text offset for the drawing library, in font sizes below the line's top.
+/// Offset of a line's text for the drawing library, in font sizes below the line's top.
 const TEXT_OFFSET: f64 = 0.38;
 /// Name of the font.
 const FAMILY: &str = "carff";
 
-/// Wraps any error of the drawing library.
+/// An error of the drawing library, of any type.
 pub fn drawing(error: impl std::fmt::Display) -> PlotError {
     PlotError::Drawing(error.to_string())
 }
@@ -31,44 +30,44 @@ pub fn drawing(error: impl std::fmt::Display) -> PlotError {
 /// Weight of letters.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Weight {
-    /// Weight of captions.
+    /// For captions.
     Regular,
-    /// Weight of headings.
+    /// For headings.
     Bold,
 }
 
-/// A font with its size in pixels of the finished image.
+/// Font with its size in pixels of the finished image.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Font {
-    /// Weight of the letters.
+    /// Size, pixels.
     pub size_px: f64,
     /// Weight.
     pub weight: Weight,
 }
 
 impl Font {
-    /// Returns a regular font.
+    /// Regular letters.
     pub const fn regular(size_px: f64) -> Self {
         Self { size_px, weight: Weight::Regular }
     }
 
-    /// Returns a bold font.
+    /// Bold letters.
     pub const fn bold(size_px: f64) -> Self {
         Self { size_px, weight: Weight::Bold }
     }
 
-    /// Returns the height of one line, pixels.
+    /// Height of one line, pixels.
     pub fn line_px(self) -> u32 {
         (self.size_px * LINE_HEIGHT).ceil() as u32
     }
 
-    /// Returns the width of a text on one line, pixels.
+    /// Width of a text on one line, pixels.
     pub fn width_px(self, text: &str) -> Result<u32, PlotError> {
         let (width, _) = self.description()?.box_size(text).map_err(drawing)?;
         Ok(width.div_ceil(OVERSAMPLING))
     }
 
-    /// Breaks a text between words, and inside words that are too long, into lines of at most `width_px`.
+    /// Wraps a text into lines that are no wider than `width_px`, between words, or within a word that is too long.
     pub fn wrapped(self, text: &str, width_px: u32) -> Result<Vec<String>, PlotError> {
         let mut lines = Vec::new();
         let mut line = String::new();
@@ -95,7 +94,7 @@ impl Font {
         Ok(lines)
     }
 
-    /// Returns the style for the drawing library, at the drawn size.
+    /// Font for the drawing library, in drawn pixels.
     pub fn style(self, colour: RGBColor) -> Result<TextStyle<'static>, PlotError> {
         Ok(self.description()?.color(&colour))
     }
@@ -117,7 +116,7 @@ impl Font {
     }
 }
 
-/// A rectangle in pixels of the finished image: left, top, width, height.
+/// Rectangle in pixels of the finished image: left, top, width, height.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Area {
     /// Left edge.
@@ -138,7 +137,7 @@ pub struct Canvas {
 }
 
 impl Canvas {
-    /// Returns an empty page of the finished size.
+    /// An empty page of the finished size.
     pub fn new(width_px: u32, height_px: u32) -> Result<Self, PlotError> {
         if width_px.max(height_px) > MAX_SIDE_PX {
             return Err(PlotError::TooLarge { width_px, height_px });
@@ -148,13 +147,13 @@ impl Canvas {
         Ok(Self { width_px, height_px, rgb: [PAPER.0, PAPER.1, PAPER.2].repeat(pixels) })
     }
 
-    /// Returns the whole page for the drawing library, at the drawn size.
+    /// The whole canvas for the drawing library, in drawn pixels.
     pub fn drawing_area(&mut self) -> DrawingArea<BitMapBackend<'_>, Shift> {
         let size = (self.width_px * OVERSAMPLING, self.height_px * OVERSAMPLING);
         BitMapBackend::with_buffer(&mut self.rgb, size).into_drawing_area()
     }
 
-    /// Draws one line, with its top left corner at (`x_px`, `y_px`).
+    /// Writes one line, with the top left corner of the line at (`x_px`, `y_px`).
     pub fn text(&mut self, text: &str, x_px: u32, y_px: u32, font: Font, colour: RGBColor) -> Result<(), PlotError> {
         let style = font.style(colour)?;
         let y = f64::from(y_px) + TEXT_OFFSET * font.size_px;
@@ -162,7 +161,7 @@ impl Canvas {
         self.drawing_area().draw_text(text, &style, at).map_err(drawing)
     }
 
-    /// Fills a rectangle; parts outside the page are cut off.
+    /// Fills a rectangle, clipped to the page.
     pub fn fill(&mut self, area: Area, RGBColor(r, g, b): RGBColor) {
         let row = (self.width_px * OVERSAMPLING) as usize * 3;
         let (left, right) = (area.x.min(self.width_px), (area.x + area.width).min(self.width_px));
@@ -196,7 +195,7 @@ impl Canvas {
 mod tests {
     use super::*;
 
-    /// Returns the bounds of all pixels that are not paper: `[left, top, right, bottom]`, inclusive.
+    /// Bounds of all pixels of an image that are not background: `[left, top, right, bottom]`, inclusive.
     fn inked(image: &Image) -> Option<[u32; 4]> {
         let paper = [PAPER.0, PAPER.1, PAPER.2];
         let inked = (0..image.height_px)
@@ -208,8 +207,8 @@ mod tests {
         })
     }
 
-    /// A line of text stays within its line and its measured width, with a tolerance of one pixel. So text that is laid
-    /// out without overlap is drawn without overlap.
+    /// A line of text stays within its line and its measured width, up to one pixel: a layout without overlap is drawn
+    /// without overlap.
     #[test]
     fn text_stays_in_its_line() {
         for font in [Font::regular(12.0), Font::bold(15.0), Font::bold(26.0)] {
@@ -224,7 +223,7 @@ mod tests {
         }
     }
 
-    /// Wrapped lines fit, and contain the whole text in order.
+    /// Wrapped lines fit, and have the whole text in order.
     #[test]
     fn wrapped_text_fits_and_is_whole() {
         let font = Font::regular(12.0);
@@ -238,7 +237,7 @@ mod tests {
         assert!(font.wrapped(" \n", 90).unwrap().is_empty());
     }
 
-    /// Fills cover exactly their rectangle, and a page that is too large is refused.
+    /// A filled rectangle has exactly its pixels; a page that is too large is refused.
     #[test]
     fn fills_exactly() {
         let mut canvas = Canvas::new(20, 10).unwrap();

@@ -10,45 +10,45 @@ use plotters::style::{Color, ShapeStyle};
 use std::ops::Range;
 use std::path::Path;
 
-/// A line chart.
+/// One chart.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Panel {
-    /// Heading of the chart.
+    /// Heading.
     pub title: String,
-    /// Quantity along x, with its unit.
+    /// Name of the x axis, with its unit.
     pub x_label: String,
-    /// Quantity along y, with its unit.
+    /// Name of the y axis, with its unit.
     pub y_label: String,
-    /// Uses a logarithmic x axis; points at or below zero are omitted.
+    /// Logarithmic x axis; points at or below zero are left out.
     pub log_x: bool,
-    /// Uses a logarithmic y axis; points at or below zero are omitted.
+    /// Logarithmic y axis; points at or below zero are left out.
     pub log_y: bool,
-    /// Includes zero on the y axis, so that heights can be compared. Has no effect on a logarithmic axis.
+    /// Whether the y axis includes zero, so that heights can be compared. Without effect on a logarithmic axis.
     pub from_zero: bool,
-    /// Lines of the chart.
+    /// The lines.
     pub series: Vec<Series>,
 }
 
 /// One line of a chart.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Series {
-    /// Name of the line in the legend.
+    /// Name in the legend.
     pub name: String,
-    /// Points `(x, y)` in the order of the line; the line is broken at points that are not finite.
+    /// Points `(x, y)` in the order of the line. The line is interrupted at points that are not finite.
     pub points: Vec<(f64, f64)>,
     /// A band behind the line, `(x, low, high)` in the order of x.
     pub band: Vec<(f64, f64, f64)>,
-    /// Display of the points.
+    /// Marks of the points.
     pub marks: Marks,
 }
 
-/// Display of a series' points.
+/// Marks of the points of a series.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Marks {
-    /// Points joined by a line.
+    /// A line through the points.
     #[default]
     Line,
-    /// Separate points.
+    /// One dot for each point.
     Dots,
 }
 
@@ -59,17 +59,17 @@ const TITLE: Font = Font::bold(24.0);
 const PANEL_TITLE: Font = Font::bold(15.0);
 const LEGEND: Font = Font::regular(12.5);
 const LABEL: Font = Font::regular(12.0);
-/// Space for the y axis' numbers and name, and for those of the x axis.
+/// Space for numbers and name of the y axis, and of the x axis.
 const Y_LABELS: u32 = 74;
 const X_LABELS: u32 = 42;
 /// A legend's line, and the space around it.
 const SWATCH: u32 = 18;
 const LEGEND_GAP: u32 = 14;
-/// Maximum number of points of a line that shows each point.
+/// Largest number of points of a line that shows each point.
 const FEW_POINTS: usize = 30;
-/// Larger absolute values count as missing.
+/// Largest absolute value that is drawn.
 const LARGEST: f64 = 1e100;
-/// Colours for colour-blind readers (Okabe and Ito), without the yellow, which has too little contrast on paper.
+/// Colours for colour-blind readers (Okabe and Ito), without yellow, which is hard to see on white.
 const COLOURS: [RGBColor; 7] = [
     RGBColor(0, 114, 178),
     RGBColor(213, 94, 0),
@@ -82,12 +82,12 @@ const COLOURS: [RGBColor; 7] = [
 
 type Page<'a> = DrawingArea<BitMapBackend<'a>, Shift>;
 
-/// Draws charts into a PNG file as a grid. An empty panel contains a note.
+/// Draws charts into a PNG file as a grid. A panel without points has a note.
 pub fn curves(path: &Path, title: &str, panels: &[Panel]) -> Result<(), PlotError> {
     Ok(draw(title, panels)?.save_png(path)?)
 }
 
-/// Returns the number of columns for a number of panels.
+/// Number of columns for a number of panels.
 fn columns(panels: usize) -> u32 {
     match panels {
         0 | 1 => 1,
@@ -119,13 +119,13 @@ fn draw(title: &str, panels: &[Panel]) -> Result<Image, PlotError> {
     Ok(canvas.finish())
 }
 
-/// Returns the part of the page within left, top, right, bottom, pixels of the finished image.
+/// Part of the page between left, top, right and bottom, pixels of the finished image.
 fn shrunk<'a>(area: &Page<'a>, [left, top, right, bottom]: [u32; 4]) -> Page<'a> {
     let [left, top, right, bottom] = [left, top, right, bottom].map(|v| v * OVERSAMPLING);
     area.clone().shrink((left, top), (right - left, bottom - top))
 }
 
-/// Draws the names of the lines in their colours, in as many rows as needed; returns their height.
+/// Writes the names of the lines in their colours, in one or several rows. Returns the height.
 fn legend(canvas: &mut Canvas, series: &[Series], left: u32, top: u32, width: u32) -> Result<u32, PlotError> {
     let (mut x, mut y) = (left, top);
     for (one, colour) in series.iter().zip(COLOURS.iter().cycle()) {
@@ -148,7 +148,7 @@ fn plot(area: &Page, panel: &Panel) -> Result<(), PlotError> {
     let all = || lines.iter().flatten().flatten();
     let bands: Vec<Vec<(f64, f64)>> = panel.series.iter().map(|s| outline(&s.band, panel)).collect();
     let any = || all().chain(bands.iter().flatten());
-    // Lines start at the axis; dots keep a distance from it.
+    // Lines begin at the axis; dots keep a distance from it.
     let aside = if panel.series.iter().any(|s| s.marks == Marks::Dots) { 0.04 } else { 0.0 };
     let (Some(x), Some(mut y)) = (range(any().map(|p| p.0), aside), range(any().map(|p| p.1), 0.06)) else {
         return empty(area);
@@ -212,7 +212,7 @@ fn empty(area: &Page) -> Result<(), PlotError> {
     area.draw_text(text, &LABEL.style(FAINT_INK)?, (left, height as i32 / 2)).map_err(drawing)
 }
 
-/// An axis with the positions and texts of its numbers.
+/// Axis with its numbers: position and text of each.
 struct Axis {
     range: Range<f64>,
     ticks: Vec<(f64, String)>,
@@ -246,7 +246,7 @@ impl ValueFormatter<f64> for Axis {
     }
 }
 
-/// Returns the pieces of a line between missing points, in drawn coordinates; on a logarithmic axis, the logarithm.
+/// Pieces of a line between points that cannot be drawn, in drawing coordinates (logarithms for a logarithmic axis).
 fn pieces(points: &[(f64, f64)], panel: &Panel) -> Vec<Vec<(f64, f64)>> {
     let shown = |v: f64| v.is_finite() && v.abs() < LARGEST;
     let drawn = |v: f64, log: bool| if log { v.log10() } else { v };
@@ -254,7 +254,7 @@ fn pieces(points: &[(f64, f64)], panel: &Panel) -> Vec<Vec<(f64, f64)>> {
     points.split(|&(x, y)| !(shown(x) && shown(y))).filter(|piece| !piece.is_empty()).map(<[_]>::to_vec).collect()
 }
 
-/// Returns the outline of a band as a polygon, in drawn coordinates; empty if it has no valid point.
+/// Outline of a band as a polygon in drawing coordinates; empty without points that can be drawn.
 fn outline(band: &[(f64, f64, f64)], panel: &Panel) -> Vec<(f64, f64)> {
     let edge =
         |of: fn(&(f64, f64, f64)) -> (f64, f64)| pieces(&band.iter().map(of).collect::<Vec<_>>(), panel).concat();
@@ -263,13 +263,13 @@ fn outline(band: &[(f64, f64, f64)], panel: &Panel) -> Vec<(f64, f64)> {
     [low, high].concat()
 }
 
-/// Returns the range of values with a relative padding at both ends; `None` without values.
+/// Range of values, extended by a share at both ends; `None` for no values.
 fn range(values: impl Iterator<Item = f64>, padding: f64) -> Option<Range<f64>> {
     let (low, high) = values.fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), v| (l.min(v), h.max(v)));
     if low > high {
         return None;
     }
-    // A single value still needs a range around it.
+    // A single value still needs an axis around it.
     if high - low <= low.abs().max(high.abs()) * 1e-9 {
         let around = (low.abs() * 0.1).max(0.5);
         return Some(low - around..high + around);
@@ -278,7 +278,7 @@ fn range(values: impl Iterator<Item = f64>, padding: f64) -> Option<Range<f64>> 
     Some(low - pad..high + pad)
 }
 
-/// Returns about `count` round numbers within a range, with their texts.
+/// About `count` round numbers within a range, with their texts.
 fn linear_ticks(range: &Range<f64>, count: u32) -> Vec<(f64, String)> {
     let rough = (range.end - range.start) / f64::from(count);
     let power = 10_f64.powf(rough.log10().floor());
@@ -291,7 +291,7 @@ fn linear_ticks(range: &Range<f64>, count: u32) -> Vec<(f64, String)> {
         .collect()
 }
 
-/// Returns round numbers for a range of decimal logarithms: the logarithm and the number's text.
+/// Round numbers for a range of decimal logarithms: logarithm and text of the number.
 fn logarithmic_ticks(range: &Range<f64>) -> Vec<(f64, String)> {
     let decades = range.end - range.start;
     if decades < 1.2 {
@@ -312,7 +312,7 @@ fn logarithmic_ticks(range: &Range<f64>) -> Vec<(f64, String)> {
         .collect()
 }
 
-/// Formats a number, exact to the digit of `unit`.
+/// Text of a number, rounded to the digit of `unit`.
 fn written(value: f64, unit: f64) -> String {
     let place = |v: f64| (v.abs().log10() + 1e-9).floor();
     if value != 0.0 && !(1e-4..1e6).contains(&value.abs()) {
@@ -320,7 +320,7 @@ fn written(value: f64, unit: f64) -> String {
         return format!("{value:.digits$e}");
     }
     let decimals = (-place(unit)).clamp(0.0, 9.0) as usize;
-    // Zero has no minus sign.
+    // No minus before a zero.
     format!("{:.decimals$}", value + 0.0)
 }
 
@@ -347,7 +347,7 @@ mod tests {
             .collect()
     }
 
-    /// The file is a readable PNG with one column for one panel, two for up to four, and three for more.
+    /// The file is a readable PNG, one column of panels wide for one panel, two for up to four, three for more.
     #[test]
     fn size_follows_the_number_of_panels() {
         let dir = tempfile::tempdir().unwrap();
@@ -362,7 +362,8 @@ mod tests {
         assert!(matches!(curves(&path, "", &too_many), Err(PlotError::TooLarge { .. })));
     }
 
-    /// Series without points, with one point, and with NaN, non-positive, equal or huge values all give an image.
+    /// No points, one point, and points that are not finite, not positive on a logarithmic axis, equal, or huge: all
+    /// are drawn without an error.
     #[test]
     fn odd_points_are_drawn_or_left_out() {
         let odd = [
@@ -388,8 +389,8 @@ mod tests {
         assert_eq!(pieces(&broken, &Panel { log_x: true, ..Panel::default() }).len(), 1);
     }
 
-    /// A power of x is a straight line between its ends if both axes are logarithmic. If the axis includes zero, a line
-    /// far above zero is near the top.
+    /// A power of x is a straight line when both axes are logarithmic. With an axis that includes zero, a line far
+    /// above zero is drawn near the top.
     #[test]
     fn axes_are_as_asked_for() {
         let power: Vec<(f64, f64)> =
@@ -412,11 +413,11 @@ mod tests {
         assert!(lowest(high) + PANEL_HEIGHT / 2 < lowest(without));
     }
 
-    /// A rising line is drawn rising: its points are at the positions of their values, left to right and low to high.
+    /// A rising line is drawn as a rising line, from left to right and from low to high.
     #[test]
     fn a_rising_line_rises() {
         let image = draw("", &[panel((0..100).map(|i| (f64::from(i), f64::from(i))).collect(), false)]).unwrap();
-        // The region below the legend, which has the same colour.
+        // Below the legend, which is in the same colour.
         let line: Vec<_> = coloured(&image, COLOURS[0]).into_iter().filter(|&(_, y)| y > 130).collect();
         let (left, right) = (line.iter().min().unwrap(), line.iter().max().unwrap());
         assert!(right.0 - left.0 > PANEL_WIDTH / 2 && left.1 - right.1 > PANEL_HEIGHT / 2, "{left:?} {right:?}");
@@ -427,7 +428,7 @@ mod tests {
         }
     }
 
-    /// Ticks are within the range, in order, at least two, and their texts differ.
+    /// Ticks are in the range and in order, at least two, with different texts.
     #[test]
     fn ticks_are_round_and_differ() {
         for (low, high) in [(0.0, 100.0), (-3.2, 17.9), (0.991, 0.9987), (1e-5, 3e-5), (12.0, 4e6), (27.3, 27.9)] {
@@ -449,7 +450,7 @@ mod tests {
         );
     }
 
-    /// A band is drawn between its edges and within the axes; dots are not joined.
+    /// A band is drawn between its edges, inside the axes; dots are not joined.
     #[test]
     fn bands_and_dots() {
         let of = |series: Series| draw("", &[Panel { series: vec![series], ..Panel::default() }]).unwrap();

@@ -1,4 +1,4 @@
-//! Filmstrips: rows of captioned images, one row per drive.
+//! Filmstrips: rows of captioned images.
 
 use crate::canvas::{Area, Canvas, FAINT_INK, Font, INK};
 use crate::{MAX_SIDE_PX, PlotError};
@@ -6,23 +6,23 @@ use carff_dataset::Image;
 use plotters::style::RGBColor;
 use std::path::Path;
 
-/// A row: its caption, and its images from left to right.
+/// One row: its caption, and its images from left to right.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct StripRow {
-    /// Caption left of the images; the first line is emphasised.
+    /// Caption left of the images; its first line is emphasised.
     pub caption: Vec<String>,
     /// Images of the row.
     pub cells: Vec<StripCell>,
 }
 
-/// An image with its caption.
+/// One image with its caption.
 #[derive(Clone, Debug, PartialEq)]
 pub struct StripCell {
-    /// The image; a small image is drawn twice as large.
+    /// The image; a small image is enlarged by two.
     pub image: Image,
-    /// Caption below it; the first line is emphasised.
+    /// Caption below the image; its first line is emphasised.
     pub caption: Vec<String>,
-    /// Colour of a frame around it, RGB.
+    /// Colour of the frame, RGB.
     pub emphasis: Option<[u8; 3]>,
 }
 
@@ -33,9 +33,9 @@ const CAPTION_HEAD: Font = Font::bold(14.0);
 const CAPTION: Font = Font::regular(13.0);
 /// Width of the text left of the images.
 const CAPTION_WIDTH: u32 = 230;
-/// Images with both sides shorter than this are drawn twice as large.
+/// Images with all sides shorter than this are enlarged by two.
 const SMALL_SIDE: u32 = 160;
-/// Space between images, and between an image and its frame's outer edge.
+/// Space between images, and width of a frame.
 const GAP: u32 = 18;
 const FRAME: u32 = 4;
 /// Space between an image and its caption.
@@ -86,7 +86,7 @@ fn scale(image: &Image) -> u32 {
     if image.width_px.max(image.height_px) < SMALL_SIDE { 2 } else { 1 }
 }
 
-/// Returns the image with each pixel as a square of `factor` pixels, without interpolation.
+/// Enlarges each pixel to a square of `factor` pixels, without interpolation.
 fn enlarged(image: &Image, factor: u32) -> Image {
     let factor = factor as usize;
     let mut rgb = Vec::with_capacity(image.rgb.len() * factor * factor);
@@ -99,7 +99,7 @@ fn enlarged(image: &Image, factor: u32) -> Image {
     Image { width_px: image.width_px * factor as u32, height_px: image.height_px * factor as u32, rgb }
 }
 
-/// A positioned line of text.
+/// One line of text with its position.
 struct Line {
     text: String,
     area: Area,
@@ -107,14 +107,14 @@ struct Line {
     colour: RGBColor,
 }
 
-/// A positioned image.
+/// One image with its position.
 struct Tile {
     row: usize,
     cell: usize,
     area: Area,
 }
 
-/// Positions of all elements.
+/// Positions of all texts and images.
 struct Layout {
     width: u32,
     height: u32,
@@ -151,7 +151,7 @@ impl Layout {
         Ok(layout)
     }
 
-    /// Places a row below the existing ones; returns its height.
+    /// Places a row below the earlier rows. Returns its height.
     fn row(&mut self, index: usize, row: &StripRow, tile_width: u32) -> Result<u32, PlotError> {
         let top = self.height;
         let mut height = self.paragraph(&captioned(&row.caption), MARGIN, top, CAPTION_WIDTH)?;
@@ -176,7 +176,7 @@ impl Layout {
         Ok(height)
     }
 
-    /// Places lines, broken to a width, below each other; returns their height.
+    /// Places lines, wrapped to a width, below each other. Returns their height.
     fn paragraph(&mut self, lines: &[(String, Font, RGBColor)], x: u32, y: u32, width: u32) -> Result<u32, PlotError> {
         let mut height = 0;
         for (text, font, colour) in lines {
@@ -190,7 +190,7 @@ impl Layout {
     }
 }
 
-/// Emphasises the first line of a caption.
+/// Font of a caption's line: the first line is emphasised.
 fn captioned(lines: &[String]) -> Vec<(String, Font, RGBColor)> {
     let styles = std::iter::once((CAPTION_HEAD, INK)).chain(std::iter::repeat((CAPTION, FAINT_INK)));
     lines.iter().zip(styles).map(|(text, (font, colour))| (text.clone(), font, colour)).collect()
@@ -210,7 +210,7 @@ mod tests {
     }
 
     fn odd_rows() -> Vec<StripRow> {
-        let long = "a caption that is much longer than the image above it is wide, and so must be broken often";
+        let long = "a caption that is much longer than the picture above it is wide, and so must be broken often";
         vec![
             StripRow { caption: vec![long.repeat(12)], cells: vec![cell(8, 200, long), cell(128, 128, long)] },
             StripRow { caption: Vec::new(), cells: vec![cell(300, 20, "short")] },
@@ -223,8 +223,7 @@ mod tests {
         a.x + a.width <= b.x || b.x + b.width <= a.x || a.y + a.height <= b.y || b.y + b.height <= a.y
     }
 
-    /// For any sizes and captions, text does not overlap an image, its frame or other text, images do not overlap, and
-    /// everything is within the page.
+    /// For any sizes and captions, texts, images and frames do not overlap, and all are within the page.
     #[test]
     fn nothing_overlaps() {
         let layout = Layout::new("Title", &"a long subtitle ".repeat(30), &odd_rows()).unwrap();
@@ -243,8 +242,7 @@ mod tests {
         }
     }
 
-    /// The file is a PNG of the layout's size that contains every image unchanged within its frame: small images at
-    /// twice their size, large ones at their own.
+    /// The file is a PNG of the laid-out size with every image unchanged in its frame, small images enlarged by two.
     #[test]
     fn pictures_are_shown_unchanged() {
         let dir = tempfile::tempdir().unwrap();
@@ -268,8 +266,8 @@ mod tests {
         }
     }
 
-    /// A filmstrip without rows is a page with its title; an image whose bytes do not match its size is named; too many
-    /// rows are refused before drawing starts.
+    /// A filmstrip without rows has its title; the error of an image of the wrong size names it; too many rows are
+    /// refused before anything is drawn.
     #[test]
     fn odd_input() {
         let dir = tempfile::tempdir().unwrap();
@@ -279,7 +277,7 @@ mod tests {
         let mut rows = odd_rows();
         rows[3].cells[1].image.rgb.pop();
         let message = filmstrip(&path, "", "", &rows).unwrap_err().to_string();
-        assert!(message.contains("row 3, image 1: 2 bytes do not make an image of 1x1"), "{message}");
+        assert!(message.contains("row 3, image 1: 2 bytes do not match an image of 1x1"), "{message}");
         let many: Vec<StripRow> = (0..200).flat_map(|_| odd_rows()).collect();
         assert!(matches!(filmstrip(&path, "", "", &many), Err(PlotError::TooLarge { .. })));
         let nowhere = dir.path().join("missing").join("strip.png");

@@ -1,7 +1,15 @@
-//! Images for people: training curves and filmstrips, as PNG files.
+//! Charts and filmstrips as PNG files: layout, axes and text.
 //!
-//! This crate contains layout, axes and text, with a built-in font, so that an image looks the same on every machine.
-//! It does not compute the displayed values.
+//! The font is part of the program, so that an image looks the same on every machine.
+//!
+//! ```
+//! use carff_plots::{Panel, Series, curves};
+//! let loss = Series { name: "loss".into(), points: vec![(1.0, 4.0), (2.0, 2.5)], ..Series::default() };
+//! let panel = Panel { title: "VAE".into(), x_label: "epoch".into(), series: vec![loss], ..Panel::default() };
+//! # let dir = tempfile::tempdir().unwrap();
+//! curves(&dir.path().join("curves.png"), "Training", &[panel])?;
+//! # Ok::<(), carff_plots::PlotError>(())
+//! ```
 
 mod canvas;
 mod curves;
@@ -10,7 +18,7 @@ mod filmstrip;
 pub use curves::{Marks, Panel, Series, curves};
 pub use filmstrip::{StripCell, StripRow, filmstrip};
 
-/// Maximum side of a drawn image, pixels.
+/// Longest side of a drawn image, pixels.
 pub const MAX_SIDE_PX: u32 = 8192;
 
 /// Reason why an image could not be drawn.
@@ -19,29 +27,29 @@ pub enum PlotError {
     /// The file could not be written.
     #[error(transparent)]
     File(#[from] carff_dataset::DatasetError),
-    /// The contents do not fit into the largest image.
+    /// The image would be too large.
     #[error("an image of {width_px}x{height_px} pixels is too large, at most {MAX_SIDE_PX} a side: show less at once")]
     TooLarge {
-        /// Required width, pixels.
+        /// Width, pixels.
         width_px: u32,
-        /// Required height, pixels.
+        /// Height, pixels.
         height_px: u32,
     },
-    /// An image's number of bytes does not match its size.
-    #[error("row {row}, image {cell}: {bytes} bytes do not make an image of {width_px}x{height_px} pixels")]
+    /// The number of bytes of an image does not match its size.
+    #[error("row {row}, image {cell}: {bytes} bytes do not match an image of {width_px}x{height_px} pixels")]
     Image {
         /// Row of the filmstrip, from 0.
         row: usize,
-        /// Index of the image in the row, from 0.
+        /// Image in it, from 0.
         cell: usize,
-        /// Number of bytes.
+        /// Bytes given.
         bytes: usize,
         /// Width, pixels.
         width_px: u32,
         /// Height, pixels.
         height_px: u32,
     },
-    /// The drawing library reported an error.
+    /// The drawing library failed.
     #[error("cannot draw the image: {0}")]
     Drawing(String),
 }

@@ -2,8 +2,8 @@
 
 use crate::about::METADATA;
 use crate::{About, MessageError, RecordingError};
-use carff_messages::forms::{AnyMessage, DynMessage, OwnedMessage};
-use carff_messages::{FrameMeta, ImageMeta, MAX_IMAGE_BYTES, ViewMeta};
+use carff_messages::MAX_IMAGE_BYTES;
+use carff_messages::forms::OwnedMessage;
 use carff_transport::TopicId;
 use foxglove::Decode;
 use foxglove::messages::RawImage;
@@ -14,7 +14,7 @@ use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
-/// Maximum length of a record, bytes: enough for a chunk with an image of the largest size.
+/// Longest record that is read, bytes: a chunk with an image of the largest size fits in.
 const MAX_RECORD_BYTES: usize = 4 * MAX_IMAGE_BYTES;
 /// Maximum number of channels.
 const MAX_CHANNELS: usize = 4096;
@@ -121,32 +121,17 @@ impl Reader {
             return Ok(None);
         }
         let Some(topic) = TopicId::all().find(|t| t.name() == channel) else { return Ok(None) };
-        let message = topic.read(data)?;
         let bytes = match image_channel(topic) {
-            Some(channel) => self.image(channel, sequence, &*message)?,
+            Some(channel) => self.image(channel, sequence)?,
             None => Vec::new(),
         };
-        let message = OwnedMessage::new(message, bytes);
-        Ok(Some(Entry { topic, message }))
+        Ok(Some(Entry { topic, message: topic.read(data, bytes)? }))
     }
 
-    /// Returns the image that a message describes.
-    fn image(
-        &mut self,
-        channel: &'static str,
-        sequence: u32,
-        message: &dyn DynMessage,
-    ) -> Result<Vec<u8>, MessageError> {
-        let message = AnyMessage::new(message, &[]);
-        let frame = message.get().map(FrameMeta::image_bytes);
-        let described = frame.or_else(|| message.get().map(ViewMeta::image_bytes)).unwrap_or(0);
-        match self.images.remove(channel) {
-            Some((number, bytes)) if number == sequence && bytes.len() == described => Ok(bytes),
-            Some((number, bytes)) if number == sequence => {
-                Err(MessageError(format!("its image on `{channel}` has {} bytes, must have {described}", bytes.len())))
-            }
-            _ => Err(MessageError(format!("its image is missing on `{channel}`"))),
-        }
+    /// Takes the latest image of a channel, which must have the sequence number of its message.
+    fn image(&mut self, channel: &'static str, sequence: u32) -> Result<Vec<u8>, MessageError> {
+        let image = self.images.remove(channel).filter(|(number, _)| *number == sequence);
+        image.map(|(_, bytes)| bytes).ok_or_else(|| MessageError(format!("its image is missing on `{channel}`")))
     }
 
     fn next_record(&mut self) -> Result<Option<Owned>, RecordingError> {

@@ -1,6 +1,6 @@
 use super::*;
+use carff_base::geometry::OrientedBox;
 use carff_decision::Place;
-use carff_geometry::OrientedBox;
 use carff_messages::forms::{AnyMessage, OwnedMessage};
 use carff_messages::{
     Action, Belief, DatasetView, FrameMeta, Gaussian, Header, Intrinsics, Posterior, ProbeResult, ViewMeta,

@@ -1,8 +1,8 @@
 //! Poses of a scenario's cameras, outside all solids. Fixed cameras come from evenly spread sequences, random cameras
 //! from the same ranges.
 
-use carff_geometry::PinholeCamera;
-use carff_random::Key;
+use carff_base::geometry::PinholeCamera;
+use carff_base::random::Key;
 use parry3d::bounding_volume::Aabb;
 use rand::Rng;
 
@@ -240,7 +240,7 @@ pub(crate) fn free_cameras(
     let groups = Groups::new(config, places);
     (0..count)
         .map(|i| {
-            let mut rng = carff_random::stream(Key { seed, frame: i as u64, step: FREE_STREAM, sample: 0 });
+            let mut rng = carff_base::random::stream(Key { seed, frame: i as u64, step: FREE_STREAM, sample: 0 });
             groups.draw(config, obstacles, &mut rng)
         })
         .collect()
@@ -287,7 +287,7 @@ impl Mount {
 }
 
 /// Name of the random stream.
-const FREE_STREAM: u32 = 0x6672_6565;
+const FREE_STREAM: u32 = Key::named("free", 0, 0).step;
 
 enum Group<'a> {
     Orbit(&'a OrbitConfig),

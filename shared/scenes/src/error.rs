@@ -8,16 +8,15 @@ use carff_dataset::DatasetError;
 #[derive(Debug, thiserror::Error)]
 pub enum ScenarioError {
     /// The file cannot be read.
-    #[error("{}: {source}{}", path.display(), carff_nearest::beside(path))]
+    #[error("{}: {source}{}", path.display(), carff_base::names::beside(path))]
     Io {
         /// Path of the scenario file.
         path: PathBuf,
         /// Error of the system.
         source: std::io::Error,
     },
-    /// A key is unknown, missing, of the wrong type or out of range. The message names line and column and shows the
-    /// line.
-    #[error("{}: {}", path.display(), carff_nearest::explained(&.source.to_string()))]
+    /// A key is unknown, missing, of the wrong type or out of range. The message names line, column and text.
+    #[error("{}: {}", path.display(), carff_base::names::explained(&.source.to_string()))]
     Toml {
         /// Path of the scenario file.
         path: PathBuf,
@@ -50,7 +49,7 @@ pub enum ScenarioError {
     },
     /// The camera cannot take images.
     #[error("the camera is not usable: {0}")]
-    Camera(#[from] carff_geometry::CameraError),
+    Camera(#[from] carff_base::geometry::CameraError),
     /// No position was found for a random camera.
     #[error("{}: key `{key}`: no position in these ranges is free of obstacles; widen them", path.display())]
     NoRoom {

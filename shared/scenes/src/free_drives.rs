@@ -6,9 +6,9 @@
 //! later state. The camera is on the ego's roof. If no roof view is a trial of the wanted kind, because a building
 //! hides the place, the camera is drawn from all of the scenario's ranges and drifts.
 //!
-//! All random values of drive `n` come from the streams (seed, frame `n`, step `0x6472_7666`, sample `try`), so drives
-//! can be made one by one, in any order. [`carff_dataset::ScenarioInfo::trial_kind`] defines the kind of a trial; it is
-//! evaluated on images of a third of the width and height.
+//! All that is drawn for drive `n` comes from the streams (seed, frame `n`, step `drvf`, sample `try`): drives can
+//! be made one by one, in any order. A drive is a trial of its kind as [`carff_dataset::ScenarioInfo::trial_kind`] says, which is judged
+//! on pictures of a third of the width and height.
 //!
 //! ```no_run
 //! use carff_scenes::Scenario;
@@ -25,10 +25,10 @@
 
 use std::f64::consts::TAU;
 
+use carff_base::geometry::PinholeCamera;
+use carff_base::random::Key;
 use carff_dataset::drives::DriveKind;
 use carff_dataset::{Image, Observability};
-use carff_geometry::PinholeCamera;
-use carff_random::Key;
 use rand::Rng;
 use rand::seq::IndexedRandom;
 
@@ -38,7 +38,7 @@ use crate::movers::Pose;
 use crate::scenario::{Placement, Scenario};
 
 /// Name of the random stream.
-const STREAM: u32 = 0x6472_7666;
+const STREAM: u32 = Key::named("drvf", 0, 0).step;
 /// Maximum number of drawn drives.
 const MAX_TRIES: u32 = 400;
 /// Number of tries that only use the ego's roof.
@@ -157,7 +157,7 @@ impl Scenario {
         let branches: Vec<usize> =
             (0..info.branches.len()).filter(|b| info.is_hazard(*b) == (kind == DriveKind::Hazard)).collect();
         for sample in 0..MAX_TRIES {
-            let mut rng = carff_random::stream(Key { seed, frame: number, step: STREAM, sample });
+            let mut rng = carff_base::random::stream(Key { seed, frame: number, step: STREAM, sample });
             let Some(&branch) = branches.choose(&mut rng) else { break };
             let roof = self.roof(branch, &mut rng).filter(|_| kind == DriveKind::Hazard || sample < ROOF_TRIES);
             let (view_kind, camera) = match roof {

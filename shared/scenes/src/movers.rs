@@ -1,7 +1,7 @@
 //! Movers, whose poses depend on the state: vehicles, and objects made of simple shapes.
 
+use carff_base::geometry::OrientedBox;
 use carff_dataset::NamedBox;
-use carff_geometry::OrientedBox;
 use toml::Spanned;
 
 use crate::config::{BoxConfig, EllipsoidConfig, ObjectConfig, RodConfig, ScenarioConfig, VehicleConfig};

@@ -6,8 +6,8 @@ use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 
+use carff_base::geometry::PinholeCamera;
 use carff_dataset::{Candidate, DatasetWriter, FrameRecord, Image, Observability, ScenarioInfo, StateInfo, looks_same};
-use carff_geometry::PinholeCamera;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use toml::Spanned;
@@ -664,7 +664,7 @@ fn place(
             }
             for (variant, name) in variants.iter_mut().zip(names.get_ref()) {
                 let Some(index) = known.iter().position(|k| k == name) else {
-                    let hint = carff_nearest::hint(name, known.iter().copied());
+                    let hint = carff_base::names::hint(name, known.iter().copied());
                     let problem = format!("no part has the variant `{name}`; there are {known:?}{hint}");
                     return Err(source.error_at(names, "variants", problem));
                 };
@@ -703,7 +703,7 @@ fn check(source: &Source, config: &ScenarioConfig) -> Result<Checked, ScenarioEr
     let known = || config.branches.iter().map(|b| format!("`{b}`")).collect::<Vec<_>>().join(", ");
     let branch_index = |name: &Spanned<String>, key: &str| {
         config.branches.iter().position(|b| b == name.get_ref()).ok_or_else(|| {
-            let hint = carff_nearest::hint(name.get_ref(), config.branches.iter().map(String::as_str));
+            let hint = carff_base::names::hint(name.get_ref(), config.branches.iter().map(String::as_str));
             let problem = format!("there is no branch `{}`; there are {}{hint}", name.get_ref(), known());
             source.error_at(name, key, problem)
         })
@@ -740,7 +740,8 @@ fn check(source: &Source, config: &ScenarioConfig) -> Result<Checked, ScenarioEr
         let Some(leader) = mover.follows() else { continue };
         let is_leader = |d: usize| movers(config).nth(d).is_some_and(|l| l.name() == leader.get_ref()) && d != m;
         if !dynamic.is_some_and(is_leader) {
-            let hint = carff_nearest::hint(leader.get_ref(), movers(config).filter(Mover::dynamic).map(|m| m.name()));
+            let hint =
+                carff_base::names::hint(leader.get_ref(), movers(config).filter(Mover::dynamic).map(|m| m.name()));
             let problem = format!("`{}` is not another, dynamic vehicle or object{hint}", leader.get_ref());
             return Err(source.error_at(leader, "follows", problem));
         }
@@ -749,7 +750,7 @@ fn check(source: &Source, config: &ScenarioConfig) -> Result<Checked, ScenarioEr
     let actor = dynamic.map(|dynamic| Actor { dynamic, followers });
     for group in &config.dash {
         if !config.vehicle.iter().any(|v| v.name == *group.vehicle.get_ref()) {
-            let hint = carff_nearest::hint(group.vehicle.get_ref(), config.vehicle.iter().map(|v| v.name.as_str()));
+            let hint = carff_base::names::hint(group.vehicle.get_ref(), config.vehicle.iter().map(|v| v.name.as_str()));
             let problem = format!("there is no vehicle `{}`{hint}", group.vehicle.get_ref());
             return Err(source.error_at(&group.vehicle, "vehicle", problem));
         }

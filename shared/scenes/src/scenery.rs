@@ -1,7 +1,7 @@
 //! Converts the scenario file to solids: buildings, trees, furniture and vehicles made of simple shapes.
 
+use carff_base::geometry::OrientedBox;
 use carff_dataset::NamedBox;
-use carff_geometry::OrientedBox;
 
 use crate::config::{
     BuildingConfig, PropConfig, PropKind, Roof, ScenarioConfig, SlabSurface, TreeConfig, TreeKind, VehicleConfig,

@@ -2,8 +2,8 @@
 //! sampling patterns. So images are the same bytes for any number of threads, and two scenes that differ in a vehicle
 //! give the same bytes wherever neither it nor its shadow is visible.
 
+use carff_base::geometry::PinholeCamera;
 use carff_dataset::Image;
-use carff_geometry::PinholeCamera;
 use parry3d::partitioning::{Bvh, BvhBuildStrategy};
 use parry3d::query::Ray;
 use rayon::prelude::*;

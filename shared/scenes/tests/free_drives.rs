@@ -4,9 +4,9 @@
 
 use std::path::Path;
 
+use carff_base::geometry::PinholeCamera;
 use carff_dataset::Observability;
 use carff_dataset::drives::DriveKind;
-use carff_geometry::PinholeCamera;
 use carff_scenes::{RenderOptions, Scenario};
 
 const FRAMES: usize = 6;

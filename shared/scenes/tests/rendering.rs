@@ -6,8 +6,8 @@ use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicUsize, Ordering};
 
+use carff_base::geometry::PinholeCamera;
 use carff_dataset::{Dataset, Observability};
-use carff_geometry::PinholeCamera;
 use carff_scenes::{Detail, Extras, RenderOptions, Scenario, ScenarioError};
 
 /// A scenario with one block, half of which a wall hides from the camera at -Y. The sun is opposite the camera, so

@@ -1,76 +1,77 @@
-//! The training file: what `carff train` reads.
+//! The training file of `carff train`.
 
-use crate::{TrainingError, field::FieldTraining};
+use crate::{TrainingError, augmentation::Augmentation};
 use carff_checkpoint::shapes::{DecoderConfig, EncoderConfig, MixtureConfig};
 use carff_dataset::sensor::SensorNoise;
+use carff_field::TrainerConfig;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 
-/// One training, from pictures to a checkpoint.
+/// One training, from images to a checkpoint.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct TrainingConfig {
-    /// The data set's folder, relative to the working directory; `--dataset` wins.
+    /// Folder of the dataset, relative to the working directory; `--dataset` overrides it.
     pub dataset: PathBuf,
-    /// The scenario file to render the data set from when its folder is missing.
+    /// Scenario file from which the dataset is rendered when its folder is missing.
     #[serde(default)]
     pub scenario: Option<PathBuf>,
-    /// Where the finished checkpoint goes; `--out` wins.
+    /// Folder of the finished checkpoint; `--out` overrides it.
     pub out: PathBuf,
-    /// Seed of everything random.
+    /// Seed of all random numbers, except those with a seed of their own.
     pub seed: u64,
-    /// Seed of the split of the poses into unseen (10 %), calibration (10 %) and the rest.
+    /// Seed of the split of the poses into held-out (10 %), calibration (10 %) and other poses.
     pub split_seed: u64,
-    /// Threads that training uses.
+    /// Threads of the training.
     #[serde(default = "two")]
     pub threads: i32,
-    /// Weights of the frozen backbone (safetensors); none: random.
+    /// Weights of the frozen backbone (safetensors); random weights if absent.
     #[serde(default)]
     pub pretrained_backbone: Option<PathBuf>,
-    /// The encoder's shape.
+    /// Shape of the encoder.
     #[serde(default)]
     pub encoder: EncoderConfig,
-    /// The decoder's shape.
+    /// Shape of the decoder.
     #[serde(default)]
     pub decoder: DecoderConfig,
-    /// The mixture density network's shape.
+    /// Shape of the mixture density network.
     #[serde(default)]
     pub mixture: MixtureConfig,
-    /// Poses besides those of the data set.
+    /// Random poses in addition to those of the dataset.
     #[serde(default)]
     pub free_poses: FreePoses,
-    /// What the pictures go through before the encoder sees them in training.
+    /// Augmentation of the encoder's training images.
     #[serde(default)]
     pub augmentation: Augmentation,
-    /// The pose-conditional VAE's training.
+    /// Training of the pose-conditional VAE.
     #[serde(default)]
     pub vae: VaeTraining,
-    /// The field's structure. Its bounds and the scale of its latents come from the data.
+    /// Structure of the field. Its bounds and the scale of its latents come from the data.
     #[serde(default)]
     pub field: carff_field::FieldConfig,
-    /// The field's training.
+    /// Training of the field.
     #[serde(default)]
     pub nerf: FieldTraining,
-    /// The mixture density network's training.
+    /// Training of the mixture density network.
     #[serde(default)]
     pub mdn: MdnTraining,
-    /// How the calibrated rule's threshold is chosen.
+    /// Choice of the threshold of the calibrated rule.
     #[serde(default)]
     pub calibration: CalibrationConfig,
 }
 
-/// How the calibrated rule's threshold is chosen, on the calibration poses alone.
+/// Choice of the threshold of the calibrated rule, on the calibration poses only.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct CalibrationConfig {
-    /// Times that each picture is taken, with fresh sensor noise.
+    /// Trials of each image, with fresh sensor noise.
     pub repeats: usize,
     /// Sensor noise.
     pub sensor: SensorNoise,
-    /// Samples a step.
+    /// Samples of each step.
     pub samples: usize,
-    /// Steps looked ahead.
+    /// Steps that are looked ahead.
     pub horizon: u32,
 }
 
@@ -80,18 +81,18 @@ impl Default for CalibrationConfig {
     }
 }
 
-/// Poses besides those of the data set. Encoder and forecaster train on them too, so that they do not know poses by heart;
-/// decoder, field and all figures do not. For a data set that the scenario has made they are drawn from the ranges of the
-/// scenario's cameras and rendered. For any other they are drawn between the data set's own, and a field that is trained for
-/// this alone shows what they see.
+/// Random poses in addition to those of the dataset. Only encoder and forecaster train on them, so that they do not
+/// memorise poses; decoder, field and all figures use the dataset's poses. For a dataset that was rendered from the
+/// scenario file, the poses are drawn from the ranges of the scenario's cameras and rendered. For any other dataset
+/// they are drawn between its poses, and a field that is trained only for this purpose renders their images.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct FreePoses {
-    /// How many; 0 leaves them out.
+    /// Number of poses; 0 turns them off.
     pub count: usize,
     /// Seed of the draw.
     pub seed: u64,
-    /// Steps of the field that shows them for a data set that the scenario has not made; 0 leaves them out there.
+    /// Steps of the field that renders them for a dataset without a scenario file; 0 turns them off for such datasets.
     pub field_steps: u64,
 }
 
@@ -105,57 +106,24 @@ fn two() -> i32 {
     2
 }
 
-/// What the pictures go through before the encoder sees them in training. The decoder's target is always the clean one.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields, default)]
-pub struct Augmentation {
-    /// Altered copies of each picture, besides one with sensor noise alone. With a frozen backbone their features are
-    /// computed once and kept.
-    pub copies: usize,
-    /// Further copies of the pictures that the data set's own poses are trained with: the first as it is, the others
-    /// altered. There are few of them beside those of freely drawn poses.
-    pub own_copies: usize,
-    /// Sensor noise and colour errors, on every copy.
-    pub sensor: SensorNoise,
-    /// Largest shift, as a share of the picture's side.
-    pub shift: f64,
-    /// Largest relative change of scale.
-    pub zoom: f64,
-    /// Largest rotation about the optical axis, degrees.
-    pub rotation_deg: f64,
-}
-
-impl Default for Augmentation {
-    fn default() -> Self {
-        Self {
-            copies: 11,
-            own_copies: 0,
-            sensor: SensorNoise { sigma: 2.0, gain_sigma: 0.04, channel_gain_sigma: 0.02, channel_offset_sigma: 2.0 },
-            shift: 0.1,
-            zoom: 0.15,
-            rotation_deg: 5.0,
-        }
-    }
-}
-
-/// Training of the pose-conditional VAE (paper section 3.2, with the terms that keep its latent alive).
+/// Training of the pose-conditional VAE (paper section 3.2, with terms that prevent posterior collapse).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct VaeTraining {
-    /// Passes over the training pictures.
+    /// Passes over the training images.
     pub epochs: usize,
-    /// How often each of them takes the pictures of the data set's own poses, which are few beside those of freely drawn
-    /// poses: once for encoder and decoder, further for the encoder alone.
+    /// Number of times that each pass uses the images of the dataset's own poses, which are few compared with those of
+    /// random poses: once for encoder and decoder, and further times for the encoder only.
     pub own_passes: usize,
-    /// Further passes in which the decoder learns alone, over the pictures of the data set's own poses: while the encoder
-    /// learns, the decoder runs after latents that move.
+    /// Further passes that train only the decoder, over the images of the dataset's own poses. While the encoder
+    /// learns, the decoder follows moving latents.
     pub decoder_epochs: usize,
-    /// Pictures a step.
+    /// Images of each step.
     pub batch: usize,
-    /// How many of them the decoder reconstructs, where they are of the data set's own poses: it costs twelve times as
-    /// much as the head, but of a few pictures a step it learns nothing.
+    /// Images of a step that the decoder reconstructs, where they are of the dataset's own poses. The decoder costs
+    /// twelve times as much as the head, but does not learn from a few images a step.
     pub decoder_batch: usize,
-    /// Learning rate at the start; it falls to 2 % of it along a cosine.
+    /// Initial learning rate; it decays to 2 % of this value along a cosine.
     pub learning_rate: f64,
     /// Decoupled weight decay.
     pub weight_decay: f64,
@@ -163,23 +131,23 @@ pub struct VaeTraining {
     pub dropout: f64,
     /// Weight of the KL term when it is fully on (per dimension sum, against the weighted squared error).
     pub kl_weight: f64,
-    /// Share of the training before the KL term sets in.
+    /// Share of the training before the KL term starts.
     pub kl_delay: f64,
-    /// Share of the training in which it rises linearly to its full weight.
+    /// Share of the training in which the KL term rises linearly to its full weight.
     pub kl_ramp: f64,
     /// Weight of the squared error of the reconstruction.
     pub reconstruction_weight: f64,
-    /// Whether the decoder learns the residual over the pose's mean picture (`true`) or the picture itself, as in the
-    /// paper.
+    /// Target of the decoder: the residual over the pose's mean image (`true`), or the image, as in the paper
+    /// (`false`).
     pub residual: bool,
-    /// Weight of pixels that differ from the pose's mean picture by more than 12 of 255; others weigh 1.
+    /// Weight of pixels that differ from the pose's mean image by more than 12 of 255; other pixels have the weight 1.
     pub foreground_weight: f64,
-    /// Weight of the contrastive term between views of one state; 0 leaves it out.
+    /// Weight of the contrastive term between views of one state; 0 turns it off.
     pub contrastive_weight: f64,
     /// Temperature of the contrastive term.
     pub contrastive_temperature: f64,
-    /// Weight of the state term: cross-entropy of a linear read-out of the sampled latent against the states that look
-    /// the same in that view; 0 leaves it out.
+    /// Weight of the state term: cross-entropy of a linear read-out of the sampled latent against the equivalent states
+    /// of the view; 0 turns it off.
     pub state_weight: f64,
 }
 
@@ -207,15 +175,47 @@ impl Default for VaeTraining {
     }
 }
 
+/// Training of the field (paper section 3.3).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct FieldTraining {
+    /// Rays a step.
+    pub rays: usize,
+    /// Share of the rays through pixels that change among the states, 0..=1.
+    pub changed_share: f32,
+    /// Share of rays whose latent is a draw instead of a mean, at the end of the ramp, 0..=1.
+    pub resampled_share: f64,
+    /// Share of the training in which the resampled share rises from 0.
+    pub resampled_ramp: f64,
+    /// Whether a pixel covers its own width (`true`) or a point. With `true`, `point_width_m` of the field becomes the
+    /// median width of the images' pixels in the middle of the bounds.
+    pub wide_pixels: bool,
+    /// The optimiser; `steps` is the length of the training.
+    pub trainer: TrainerConfig,
+}
+
+impl Default for FieldTraining {
+    fn default() -> Self {
+        Self {
+            rays: 4096,
+            changed_share: 0.34,
+            resampled_share: 0.7,
+            resampled_ramp: 0.3,
+            wide_pixels: false,
+            trainer: TrainerConfig::default(),
+        }
+    }
+}
+
 /// Training of the mixture density network (paper section 3.4).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct MdnTraining {
     /// Optimiser steps.
     pub steps: usize,
-    /// Pairs of a view and a neighbouring view of the next step, a step.
+    /// Pairs of a view and a view of the next time step, for each optimiser step.
     pub batch: usize,
-    /// Learning rate at the start; it falls to 2 % of it along a cosine.
+    /// Initial learning rate; it decays to 2 % of this value along a cosine.
     pub learning_rate: f64,
     /// Standard deviation of the noise on the input mean, in units of the input posterior's own deviation.
     pub input_noise: f64,
@@ -228,25 +228,39 @@ impl Default for MdnTraining {
 }
 
 impl VaeTraining {
-    /// Passes in all, those of the decoder alone among them.
+    /// Total number of passes, including those of only the decoder.
     pub fn all_epochs(&self) -> usize {
         self.epochs + self.decoder_epochs
     }
 }
 
-impl TrainingConfig {
-    /// Reads a training file; the error shows file, line and key.
-    pub fn load(path: &Path) -> Result<Self, TrainingError> {
-        let text = std::fs::read_to_string(path).map_err(|source| TrainingError::File { path: path.into(), source })?;
-        let config: Self = toml::from_str(&text).map_err(|e| {
-            let what = carff_nearest::explained(&e.to_string());
-            TrainingError::Format { path: path.into(), what }
-        })?;
-        config.validate().map_err(|what| TrainingError::Format { path: path.into(), what })?;
+impl std::str::FromStr for TrainingConfig {
+    type Err = String;
+
+    /// Reads and checks the text of a training file; the error has the line and the key.
+    fn from_str(text: &str) -> Result<Self, String> {
+        let config: Self = toml::from_str(text).map_err(|e| carff_base::names::explained(&e.to_string()))?;
+        config.validate()?;
         Ok(config)
     }
+}
 
-    /// Checks that settings are in range and agree; the error names the key.
+impl TrainingConfig {
+    /// Reads a training file; the error has the file, the line and the key.
+    ///
+    /// ```
+    /// use carff_training::TrainingConfig;
+    /// let config: TrainingConfig =
+    ///     "dataset = 'data/toy'\nout = 'runs/toy'\nseed = 1\nsplit_seed = 7\n[vae]\nepochs = 20".parse()?;
+    /// assert_eq!((config.vae.epochs, config.vae.batch), (20, 30));
+    /// # Ok::<(), String>(())
+    /// ```
+    pub fn load(path: &Path) -> Result<Self, TrainingError> {
+        let text = std::fs::read_to_string(path).map_err(|source| TrainingError::File { path: path.into(), source })?;
+        text.parse().map_err(|what| TrainingError::Format { path: path.into(), what })
+    }
+
+    /// Checks that settings are in range and consistent; the error names the key.
     pub fn validate(&self) -> Result<(), String> {
         let counts = [
             ("vae.epochs", self.vae.epochs, 1, 10_000),
@@ -299,7 +313,7 @@ impl TrainingConfig {
         }
         if self.vae.residual && !self.decoder.pose_condition {
             return Err(
-                "`vae.residual` = true tells the decoder the pose, `decoder.pose_condition` = false does not: \
+                "`vae.residual` = true gives the decoder the pose, `decoder.pose_condition` = false does not: \
                         set `vae.residual` to false"
                     .into(),
             );

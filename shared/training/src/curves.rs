@@ -1,213 +1,266 @@
-//! What a run's `metrics.jsonl` says, as a picture: `curves.png` beside it.
+//! Training curves: the metrics file of a run as an image.
 
-use crate::TrainingError;
+use crate::{
+    TrainingError,
+    records::{FieldRecord, MixtureRecord, Record, VaeRecord},
+    run::{METRICS, names},
+};
+use carff_evaluation::{Accuracy, ByObservability};
 use carff_plots::{Panel, Series};
 use serde_json::Value;
-use std::{collections::BTreeMap, path::Path};
+use std::{
+    collections::BTreeMap,
+    path::{Path, PathBuf},
+};
 
-/// One chart: its figures by their place in a record of a stage.
-struct Chart {
+/// One chart: lines over the records of a phase.
+struct Chart<R: 'static> {
     title: &'static str,
-    stage: &'static str,
-    /// Key of what is counted along x.
-    x: &'static str,
+    x_label: &'static str,
     y_label: &'static str,
     log_y: bool,
-    /// Figures are multiplied by this.
-    factor: f64,
-    /// Name and JSON pointer of each line.
-    lines: &'static [(&'static str, &'static str)],
+    /// Name and figure of each line.
+    lines: &'static [Line<R>],
 }
 
-const PLAIN: Chart = Chart { title: "", stage: "vae", x: "epoch", y_label: "", log_y: false, factor: 1.0, lines: &[] };
-const ACCURACY: Chart = Chart { y_label: "right, %", factor: 100.0, ..PLAIN };
+/// Name and figure of a line.
+type Line<R> = (&'static str, fn(&R) -> Option<f64>);
 
-const CHARTS: [Chart; 9] = [
+/// Title of a chart of accuracies, and the accuracies of its role.
+type AccuracyChart = (&'static str, fn(&VaeRecord) -> &ByObservability<Accuracy>);
+
+/// Name and figure of a line of accuracies.
+type AccuracyLine = (&'static str, fn(&ByObservability<Accuracy>) -> f64);
+
+const VAE: [Chart<VaeRecord>; 3] = [
     Chart {
         title: "VAE: loss and its parts",
+        x_label: "epoch",
         y_label: "loss",
         log_y: true,
-        lines: &[("all", "/loss"), ("reconstruction", "/reconstruction"), ("state", "/state")],
-        ..PLAIN
+        lines: &[
+            ("all", |r| Some(r.loss)),
+            ("reconstruction", |r| Some(r.reconstruction)),
+            ("state", |r| Some(r.state)),
+        ],
     },
-    Chart { title: "VAE: divergence of the posterior", y_label: "KL, nats", lines: &[("KL", "/kl")], ..PLAIN },
     Chart {
-        title: "VAE: pictures, trained poses",
+        title: "VAE: divergence of the posterior",
+        x_label: "epoch",
+        y_label: "KL, nats",
+        log_y: false,
+        lines: &[("KL", |r| Some(r.kl))],
+    },
+    Chart {
+        title: "VAE: images, trained poses",
+        x_label: "epoch",
         y_label: "PSNR, dB",
+        log_y: false,
         lines: &[
-            ("decoded", "/psnr_db"),
-            ("mean picture of the pose", "/mean_picture_psnr_db"),
-            ("decoded, pixels that change", "/changed_pixels_psnr_db"),
+            ("decoded", |r| r.figures.psnr_db),
+            ("mean image of the pose", |r| r.figures.mean_picture_psnr_db),
+            ("decoded, pixels that change", |r| r.figures.changed_pixels_psnr_db),
         ],
-        ..PLAIN
-    },
-    Chart {
-        title: "State accuracy of latents, trained poses",
-        lines: &[
-            ("place fully visible", "/trained/full/accuracy"),
-            ("partly", "/trained/partial/accuracy"),
-            ("not", "/trained/none/accuracy"),
-        ],
-        ..ACCURACY
-    },
-    Chart {
-        title: "State accuracy of latents, calibration poses",
-        lines: &[
-            ("place fully visible", "/calibration/full/accuracy"),
-            ("partly", "/calibration/partial/accuracy"),
-            ("not", "/calibration/none/accuracy"),
-        ],
-        ..ACCURACY
-    },
-    Chart {
-        title: "State accuracy of latents, unseen poses",
-        lines: &[
-            ("place fully visible", "/unseen/full/accuracy"),
-            ("partly", "/unseen/partial/accuracy"),
-            ("not", "/unseen/none/accuracy"),
-        ],
-        ..ACCURACY
-    },
-    Chart {
-        title: "Mixture density network",
-        stage: "mdn",
-        x: "step",
-        y_label: "negative log-likelihood, nats",
-        lines: &[("mean of 100 steps", "/negative_log_likelihood")],
-        ..PLAIN
-    },
-    Chart {
-        title: "Field: loss",
-        stage: "nerf",
-        x: "step",
-        y_label: "loss",
-        log_y: true,
-        lines: &[("running mean", "/loss")],
-        ..PLAIN
-    },
-    Chart {
-        title: "Field: rays",
-        stage: "nerf",
-        x: "step",
-        y_label: "PSNR, dB",
-        lines: &[("running mean", "/ray_psnr_db")],
-        ..PLAIN
     },
 ];
 
-/// Draws `curves.png` in a run's folder from its `metrics.jsonl`. Without any figure there is no picture.
+/// Charts of the state accuracy of latents.
+const ACCURACY: [AccuracyChart; 3] = [
+    ("State accuracy of latents, trained poses", |r| &r.figures.trained),
+    ("State accuracy of latents, calibration poses", |r| &r.figures.calibration),
+    ("State accuracy of latents, held-out poses", |r| &r.figures.unseen),
+];
+
+const ACCURACY_LINES: [AccuracyLine; 3] =
+    [("place fully visible", |a| a.full.accuracy), ("partly", |a| a.partial.accuracy), ("not", |a| a.none.accuracy)];
+
+const MIXTURE: [Chart<MixtureRecord>; 1] = [Chart {
+    title: "Mixture density network",
+    x_label: "step",
+    y_label: "negative log-likelihood, nats",
+    log_y: false,
+    lines: &[("mean of 100 steps", |r| Some(r.negative_log_likelihood))],
+}];
+
+const FIELD: [Chart<FieldRecord>; 2] = [
+    Chart {
+        title: "Field: loss",
+        x_label: "step",
+        y_label: "loss",
+        log_y: true,
+        lines: &[("running mean", |r| Some(r.loss))],
+    },
+    Chart {
+        title: "Field: rays",
+        x_label: "step",
+        y_label: "PSNR, dB",
+        log_y: false,
+        lines: &[("running mean", |r| Some(r.ray_psnr_db))],
+    },
+];
+
+/// Draws `curves.png` in a run's folder from its metrics file. Without figures there is no image.
 pub fn draw(dir: &Path) -> Result<(), TrainingError> {
-    draw_to(dir, &dir.join("curves.png")).map(|_| ())
+    let panels = training_curves(dir)?;
+    if panels.is_empty() {
+        return Ok(());
+    }
+    Ok(carff_plots::curves(&dir.join("curves.png"), "Training", &panels)?)
 }
 
-/// [`draw`] into another file; says whether there was anything to draw.
-pub fn draw_to(dir: &Path, picture: &Path) -> Result<bool, TrainingError> {
-    let path = dir.join("metrics.jsonl");
+/// Charts of a run's metrics file; empty without figures. A truncated line, left by a killed run, is skipped. A record
+/// with an unknown or missing key is an error.
+pub fn training_curves(dir: &Path) -> Result<Vec<Panel>, TrainingError> {
+    let path = dir.join(METRICS);
     let bytes = match std::fs::read(&path) {
         Ok(bytes) => bytes,
-        Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(false),
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(Vec::new()),
         Err(source) => return Err(TrainingError::File { path, source }),
     };
-    let panels = panels(&String::from_utf8_lossy(&bytes));
-    if panels.is_empty() {
-        return Ok(false);
+    let text = String::from_utf8_lossy(&bytes);
+    let lines = text.lines().enumerate();
+    let lines = lines.filter_map(|(i, line)| Some((i + 1, serde_json::from_str(line).ok()?))).collect();
+    Metrics { path, lines }.panels()
+}
+
+/// The metrics file: line numbers and lines.
+struct Metrics {
+    path: PathBuf,
+    lines: Vec<(usize, Value)>,
+}
+
+impl Metrics {
+    fn panels(&self) -> Result<Vec<Panel>, TrainingError> {
+        let vae = self.records::<VaeRecord>(names::VAE)?;
+        let mut panels = charts(&VAE, &vae);
+        panels.extend(ACCURACY.map(|(title, of)| {
+            let line = |(name, figure): AccuracyLine| series(name, &vae, |r| Some(100.0 * figure(of(r))));
+            panel(title, ["epoch", "correct, %"], false, ACCURACY_LINES.map(line))
+        }));
+        panels.extend(charts(&MIXTURE, &self.records(names::MIXTURE)?));
+        panels.extend(charts(&FIELD, &self.records(names::FIELD)?));
+        panels.retain(|panel| !panel.series.is_empty());
+        Ok(panels)
     }
-    carff_plots::curves(picture, "Training", &panels)?;
-    Ok(true)
+
+    /// Records of a phase by epoch or step. A killed run resumes from its last saved state: later records of the
+    /// earlier run are replaced.
+    fn records<R: Record>(&self, phase: &str) -> Result<BTreeMap<u64, R>, TrainingError> {
+        let mut rows = BTreeMap::new();
+        for (number, line) in &self.lines {
+            let wrong = |what: String| TrainingError::Format {
+                path: self.path.clone(),
+                what: format!("line {number}: {what}; remove the file to draw curves from now on"),
+            };
+            let mut line = line.clone();
+            let stage = line.as_object_mut().and_then(|map| map.remove("stage"));
+            match stage.as_ref().and_then(Value::as_str) {
+                Some(stage) if stage == phase => {}
+                Some(_) => continue,
+                None => return Err(wrong("missing field `stage`".into())),
+            }
+            let record: R = serde_json::from_value(line).map_err(|e| wrong(e.to_string()))?;
+            rows.split_off(&record.x());
+            rows.insert(record.x(), record);
+        }
+        Ok(rows)
+    }
 }
 
-/// The charts for which there are figures. A line that was cut off when a run was killed is passed over.
-fn panels(metrics: &str) -> Vec<Panel> {
-    let records: Vec<Value> = metrics.lines().filter_map(|line| serde_json::from_str(line).ok()).collect();
-    CHARTS.iter().map(|chart| panel(chart, &records)).filter(|p| !p.series.is_empty()).collect()
-}
-
-fn panel(chart: &Chart, records: &[Value]) -> Panel {
-    let rows = current(chart, records);
-    let points = |pointer: &str| -> Vec<(f64, f64)> {
-        let figure = |record: &Value| record.pointer(pointer).and_then(Value::as_f64);
-        rows.iter().filter_map(|(x, record)| Some((*x as f64, figure(record)? * chart.factor))).collect()
+fn charts<R>(charts: &[Chart<R>], records: &BTreeMap<u64, R>) -> Vec<Panel> {
+    let chart = |chart: &Chart<R>| {
+        let lines = chart.lines.iter().map(|(name, figure)| series(name, records, figure));
+        panel(chart.title, [chart.x_label, chart.y_label], chart.log_y, lines)
     };
-    let series = chart.lines.iter().map(|(name, pointer)| Series {
-        name: (*name).into(),
-        points: points(pointer),
-        ..Series::default()
-    });
+    charts.iter().map(chart).collect()
+}
+
+fn series<R>(name: &str, records: &BTreeMap<u64, R>, figure: impl Fn(&R) -> Option<f64>) -> Series {
+    let points = records.iter().filter_map(|(x, record)| Some((*x as f64, figure(record)?)));
+    Series { name: name.into(), points: points.filter(|(_, y)| y.is_finite()).collect(), ..Series::default() }
+}
+
+fn panel(title: &str, [x_label, y_label]: [&str; 2], log_y: bool, lines: impl IntoIterator<Item = Series>) -> Panel {
     Panel {
-        title: chart.title.into(),
-        x_label: chart.x.into(),
-        y_label: chart.y_label.into(),
-        log_y: chart.log_y,
-        series: series.filter(|s| !s.points.is_empty()).collect(),
+        title: title.into(),
+        x_label: x_label.into(),
+        y_label: y_label.into(),
+        log_y,
+        series: lines.into_iter().filter(|s| !s.points.is_empty()).collect(),
         ..Panel::default()
     }
-}
-
-/// A stage's records by epoch or step. A run that was killed goes on from its last saved state: what an earlier run
-/// recorded from there on counts no more.
-fn current<'a>(chart: &Chart, records: &'a [Value]) -> BTreeMap<u64, &'a Value> {
-    let mut rows = BTreeMap::new();
-    for record in records.iter().filter(|r| r["stage"] == chart.stage) {
-        if let Some(x) = record[chart.x].as_u64() {
-            rows.split_off(&x);
-            rows.insert(x, record);
-        }
-    }
-    rows
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use carff_evaluation::VaeFigures;
 
-    const METRICS: &str = concat!(
-        r#"{"stage":"vae","epoch":1,"loss":4.0,"kl":1.0,"trained":{"full":{"accuracy":0.25}}}"#,
-        "\n",
-        r#"{"stage":"vae","epoch":2,"loss":3.0,"kl":2.0,"psnr_db":20.0}"#,
-        "\n",
-        r#"{"stage":"vae","epoch":3,"loss":9.0,"kl":3.0}"#,
-        "\n",
-        r#"{"stage":"vae","epoch":4,"lo"#,
-        "\n",
-        r#"{"stage":"vae","epoch":2,"loss":2.5,"kl":null}"#,
-        "\n",
-        r#"{"stage":"threshold","threshold":0.5}"#,
-        "\n",
-        r#"{"stage":"nerf","step":100,"loss":0.01,"ray_psnr_db":17.0}"#,
-        "\n",
-        r#"{"stage":"nerf","step":200,"loss":0.0"#,
-    );
+    /// A line of the metrics file.
+    fn line(phase: &str, record: &impl serde::Serialize) -> String {
+        let mut line = serde_json::to_value(record).unwrap();
+        line["stage"] = phase.into();
+        line.to_string() + "\n"
+    }
+
+    fn vae(epoch: u64, loss: f64, kl: f64) -> String {
+        let mut figures = VaeFigures::default();
+        figures.trained.full.accuracy = 0.25;
+        line("vae", &VaeRecord { epoch, loss, reconstruction: 1.0, kl, state: 1.0, figures })
+    }
+
+    fn metrics() -> String {
+        let mut text = [vae(1, 4.0, 1.0), vae(2, 3.0, 2.0), vae(3, 9.0, 3.0)].concat();
+        text += "{\"stage\":\"vae\",\"epoch\":4,\"lo\n";
+        text += &vae(2, 2.5, f64::NAN);
+        text += "{\"stage\":\"threshold\",\"threshold\":0.5}\n";
+        text += &line("nerf", &FieldRecord { step: 100, loss: 0.01, ray_psnr_db: 17.0 });
+        text + "{\"stage\":\"nerf\",\"step\":200,\"loss\":0.0"
+    }
+
+    fn written(text: &str) -> tempfile::TempDir {
+        let dir = tempfile::tempdir().unwrap();
+        std::fs::write(dir.path().join(METRICS), text).unwrap();
+        dir
+    }
 
     fn points<'a>(panels: &'a [Panel], title: &str, name: &str) -> &'a [(f64, f64)] {
         let panel = panels.iter().find(|p| p.title == title).unwrap();
         &panel.series.iter().find(|s| s.name == name).unwrap().points
     }
 
-    /// Of a run that was killed in the middle of a line and went on from an earlier epoch, what counts is what came
-    /// later; lines cut off are passed over; figures that a record lacks leave no point, and charts without figures are
-    /// left out.
+    /// Records of a killed run are replaced from the epoch at which it resumed; truncated lines are skipped; figures
+    /// that a record lacks, or that are not finite, have no point; charts without figures are left out.
     #[test]
     fn a_killed_and_resumed_run_is_read() {
-        let panels = panels(METRICS);
+        let panels = training_curves(written(&metrics()).path()).unwrap();
         assert_eq!(points(&panels, "VAE: loss and its parts", "all"), [(1.0, 4.0), (2.0, 2.5)]);
         assert_eq!(points(&panels, "VAE: divergence of the posterior", "KL"), [(1.0, 1.0)]);
-        assert_eq!(points(&panels, "State accuracy of latents, trained poses", "place fully visible"), [(1.0, 25.0)]);
+        let accuracy = points(&panels, "State accuracy of latents, trained poses", "place fully visible");
+        assert_eq!(accuracy, [(1.0, 25.0), (2.0, 25.0)]);
         assert_eq!(points(&panels, "Field: rays", "running mean"), [(100.0, 17.0)]);
-        assert!(
-            panels.iter().all(|p| p.title != "Mixture density network" && p.title != "VAE: pictures, trained poses")
-        );
+        assert!(panels.iter().all(|p| p.title != "Mixture density network" && p.title != "VAE: images, trained poses"));
     }
 
-    /// The picture is a PNG in the run's folder; a run without metrics, or with none that are drawn, has no picture and
-    /// no error.
+    /// A record with a renamed key is an error that names file and line, never a missing point.
     #[test]
-    fn the_picture_is_in_the_run_folder() {
+    fn a_renamed_key_is_an_error() {
+        for key in ["stage", "epoch", "kl", "accuracy", "calibration", "ray_psnr_db"] {
+            let text = metrics().replace(&format!("\"{key}\""), "\"renamed\"");
+            let error = training_curves(written(&text).path()).expect_err(key).to_string();
+            assert!(error.contains(METRICS) && error.contains("line "), "{key}: {error}");
+        }
+    }
+
+    /// The image is a PNG in the run's folder. A run without metrics, or without figures, has no image and no error.
+    #[test]
+    fn the_image_is_in_the_run_folder() {
         let dir = tempfile::tempdir().unwrap();
         draw(dir.path()).unwrap();
-        std::fs::write(dir.path().join("metrics.jsonl"), "{\"stage\":\"thr").unwrap();
+        std::fs::write(dir.path().join(METRICS), "{\"stage\":\"thr").unwrap();
         draw(dir.path()).unwrap();
         assert!(!dir.path().join("curves.png").exists());
-        std::fs::write(dir.path().join("metrics.jsonl"), METRICS).unwrap();
+        std::fs::write(dir.path().join(METRICS), metrics()).unwrap();
         draw(dir.path()).unwrap();
         let image = carff_dataset::Image::load_png(&dir.path().join("curves.png")).unwrap();
         assert!(image.width_px > 1000 && image.height_px > 700);

@@ -1,6 +1,6 @@
-//! Backbone features on disk while a training needs them, so that one that is killed goes on without computing them again.
+//! Backbone features on disk, from which an interrupted training resumes without computing them again.
 
-use crate::{TrainingError, run::Run};
+use crate::TrainingError;
 use std::{
     fs::{File, OpenOptions},
     io::{BufReader, Read, Seek, SeekFrom, Write},
@@ -8,13 +8,13 @@ use std::{
 };
 use tch::{Device, Kind, Tensor};
 
-/// The file's name in the run folder: rows in half precision, one after the other.
+/// Name of the file in the run's folder: consecutive rows in half precision.
 pub const FEATURES: &str = "features.f16";
 
 /// Rows that are read at a time.
 const READ_ROWS: usize = 64;
 
-/// The file of one run.
+/// Features file of one run.
 pub struct FeatureFile {
     path: PathBuf,
     file: File,
@@ -22,16 +22,17 @@ pub struct FeatureFile {
 }
 
 impl FeatureFile {
-    /// Opens the run's file, empty or with what an earlier call wrote; `row` is the shape of one picture's features.
-    pub fn open(run: &Run, row: &[i64]) -> Result<Self, TrainingError> {
-        let path = run.dir.join(FEATURES);
+    /// Opens the file in the run's folder `dir`, empty or with the rows of an earlier call. `row` is the shape of one
+    /// image's features.
+    pub fn open(dir: &Path, row: &[i64]) -> Result<Self, TrainingError> {
+        let path = dir.join(FEATURES);
         let file = OpenOptions::new().create(true).truncate(false).read(true).write(true).open(&path);
         let file = file.map_err(|source| TrainingError::File { path: path.clone(), source })?;
         Ok(Self { path, file, row: row.to_vec() })
     }
 
-    /// Reads what is there into the first rows of `features`, and says how many these are. Batches, of `batches` rows each,
-    /// count when they are whole; what a killed program wrote of the next one is cut off.
+    /// Reads the file into the first rows of `features`, and returns their number. Only whole batches, of `batches`
+    /// rows each, are kept; the rest of the file is truncated.
     pub fn read(&mut self, features: &Tensor, batches: impl Iterator<Item = usize>) -> Result<usize, TrainingError> {
         let there = self.file.metadata().map_err(|e| self.failed(e))?.len() / self.row_bytes() as u64;
         let mut rows = 0;
@@ -75,7 +76,7 @@ impl FeatureFile {
     }
 }
 
-/// Removes the file of a run folder, once nothing needs it any more.
+/// Removes the file from the folder of a run.
 pub fn remove(dir: &Path) -> Result<(), TrainingError> {
     let path = dir.join(FEATURES);
     match std::fs::remove_file(&path) {
@@ -87,20 +88,17 @@ pub fn remove(dir: &Path) -> Result<(), TrainingError> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use std::sync::atomic::AtomicBool;
 
-    /// Whole batches come back to the bit; one that was written in part is cut off, and can be written again.
+    /// Whole batches are read bit for bit; a partial batch is truncated and can be written again.
     #[test]
     fn whole_batches_come_back() {
         tch::manual_seed(1);
         let dir = tempfile::tempdir().unwrap();
-        let stop = AtomicBool::new(false);
-        let run = Run { dir: dir.path().to_owned(), on_progress: &|_| {}, stop: &stop };
         let half = (Kind::Half, Device::Cpu);
         let all = Tensor::randn([80, 3, 2, 2], (Kind::Float, Device::Cpu)).to_kind(Kind::Half);
         // 70 rows, then five; of the last five a part.
         let batches = || [70_usize, 5, 5].into_iter();
-        let mut file = FeatureFile::open(&run, &[3, 2, 2]).unwrap();
+        let mut file = FeatureFile::open(dir.path(), &[3, 2, 2]).unwrap();
         assert_eq!(file.read(&Tensor::zeros([80, 3, 2, 2], half), batches()).unwrap(), 0);
         file.append(&all.narrow(0, 0, 70)).unwrap();
         file.append(&all.narrow(0, 70, 5)).unwrap();
@@ -108,11 +106,11 @@ mod tests {
         file.file.write_all(b"torn").unwrap();
 
         let read = Tensor::zeros([80, 3, 2, 2], half);
-        let mut file = FeatureFile::open(&run, &[3, 2, 2]).unwrap();
+        let mut file = FeatureFile::open(dir.path(), &[3, 2, 2]).unwrap();
         assert_eq!(file.read(&read, batches()).unwrap(), 75);
         assert_eq!(read.narrow(0, 0, 75), all.narrow(0, 0, 75));
         file.append(&all.narrow(0, 75, 5)).unwrap();
-        let mut file = FeatureFile::open(&run, &[3, 2, 2]).unwrap();
+        let mut file = FeatureFile::open(dir.path(), &[3, 2, 2]).unwrap();
         assert_eq!(file.read(&read, batches()).unwrap(), 80);
         assert_eq!(read, all);
         remove(dir.path()).unwrap();

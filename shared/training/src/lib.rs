@@ -1,65 +1,53 @@
-//! How the three models are trained.
+//! Training of the three models, from images to a checkpoint.
 //!
-//! What lives here: the training file, the posed pictures as tensors, the loops of the pose-conditional VAE, the field
-//! and the mixture density network, their progress, and saving and resuming. What never does: the models themselves.
+//! ```no_run
+//! use carff_training::{Phases, Run, Training, TrainingConfig};
+//! use std::{path::Path, sync::atomic::AtomicBool};
+//! # fn main() -> Result<(), carff_training::TrainingError> {
+//! let config = TrainingConfig::load(Path::new("configs/training/toy.toml"))?;
+//! let stop = AtomicBool::new(false);
+//! let run = Run { dir: "runs/toy".into(), on_progress: &|p| println!("{}", p.line), stop: &stop };
+//! let (dataset, out, device) = (config.dataset.as_path(), config.out.as_path(), tch::Device::Cpu);
+//! let training = Training { config: &config, dataset, random_poses: None, out, device };
+//! println!("{}", training.run(Phases::All, &run)?.summary());
+//! # Ok(())
+//! # }
+//! ```
+//!
+//! | module | content |
+//! |---|---|
+//! | `config`, `augmentation` | the training file |
+//! | `pipeline`, `calibrate`, `places` | from images to a checkpoint |
+//! | `run` | the loop of all phases, and the folder of a run |
+//! | `vae`, `field`, `mixture` | the training phases |
+//! | `features`, `records`, `curves` | files of a run: backbone features, metrics, curves |
+//! | `random_poses` | images from random poses for a dataset without a scenario file |
+//! | [`ablation`] | the encoder ablation |
 
-pub mod accuracy;
-pub mod config;
-pub mod curves;
-pub mod features;
-pub mod field;
-pub mod free;
-pub mod mixture;
-pub mod pictures;
-pub mod pipeline;
-pub mod places;
-pub mod run;
-pub mod vae;
+pub mod ablation;
+mod augmentation;
+mod calibrate;
+mod config;
+mod curves;
+mod error;
+mod features;
+mod field;
+mod mixture;
+mod pipeline;
+mod places;
+mod random_poses;
+mod records;
+mod run;
+mod vae;
 
-/// Why a training cannot go on.
-#[derive(Debug, thiserror::Error)]
-pub enum TrainingError {
-    /// The data set cannot be used.
-    #[error(transparent)]
-    Dataset(#[from] carff_dataset::DatasetError),
-    /// A model or a weights file cannot be used.
-    #[error(transparent)]
-    Model(#[from] carff_models::ModelError),
-    /// The field cannot be made or trained so.
-    #[error(transparent)]
-    Field(#[from] carff_field::FieldError),
-    /// A checkpoint cannot be read or written.
-    #[error(transparent)]
-    Checkpoint(#[from] carff_checkpoint::CheckpointError),
-    /// The scenario cannot be probed.
-    #[error(transparent)]
-    Probing(#[from] carff_decision::ProbingError),
-    /// The curves cannot be drawn.
-    #[error(transparent)]
-    Plot(#[from] carff_plots::PlotError),
-    /// libtorch refused an operation.
-    #[error("libtorch: {0}")]
-    Torch(#[from] tch::TchError),
-    /// A file could not be read or written.
-    #[error("{path}: {source}{}", carff_nearest::beside(path))]
-    File {
-        /// Which file.
-        path: std::path::PathBuf,
-        /// What the system said.
-        source: std::io::Error,
-    },
-    /// The training file or a saved state is wrong.
-    #[error("{path}: {what}")]
-    Format {
-        /// Which file.
-        path: std::path::PathBuf,
-        /// What is wrong.
-        what: String,
-    },
-    /// The data set lacks something that this training needs.
-    #[error("the data set cannot train this model: {0}")]
-    Unfit(String),
-    /// The user asked to stop; the state is saved.
-    #[error("stopped; the same command goes on from the saved state")]
-    Stopped,
-}
+pub use augmentation::Augmentation;
+pub use carff_evaluation::Progress;
+pub use config::{CalibrationConfig, FieldTraining, FreePoses, MdnTraining, TrainingConfig, VaeTraining};
+pub use curves::training_curves;
+pub use error::TrainingError;
+pub use features::FEATURES;
+pub use pipeline::{Phases, Training};
+pub use places::places;
+pub use random_poses::render_random_poses;
+pub use run::{Run, forget_run};
+pub use vae::losses;

@@ -1,27 +1,26 @@
-//! The training loop of the mixture density network (paper section 3.4).
+//! Training phase of the mixture density network (paper section 3.4).
 //!
-//! An input is the posterior of a view; its target is a real Gaussian draw from the posterior of a random neighbouring
-//! view of the next time step that tells its state. Where several states look the same in the input's view, the step that follows any of
-//! them is the target equally often. After the last step the scene stays as it is.
+//! An input is the posterior of a view. Its target is a Gaussian draw from the posterior of a random unambiguous view
+//! of the next time step. Where several states look the same from the input's view, their next steps are equally
+//! frequent targets. After the last step the scene does not change.
 
 use crate::{
     TrainingError,
     config::TrainingConfig,
-    pictures::Pictures,
-    run::{Progress, Run, SaveClock, cosine, damaged, part, prefixed},
+    records::MixtureRecord,
+    run::{Context, Phase, Report, cosine, names, part, prefixed},
 };
+use carff_base::random::Key;
 use carff_messages::{Gaussian, LATENT_DIM};
-use carff_models::{
+use carff_networks::{
     ModelError,
     adam::Adam,
     mixture::MixtureNet,
     weights::{self, Tensors},
 };
-use carff_random::Key;
 use rand::Rng;
 use rand_distr::StandardNormal;
-use serde_json::json;
-use tch::{Device, Kind, Tensor, nn::VarStore};
+use tch::{Device, Tensor, nn::VarStore};
 
 /// The network with its variables.
 pub struct Mdn {
@@ -31,126 +30,122 @@ pub struct Mdn {
 }
 
 impl Mdn {
-    /// Fresh weights on `device` from the global generator (seed it first).
+    /// A network on `device` with random weights from libtorch's global generator.
     pub fn new(config: &TrainingConfig, device: Device) -> Result<Self, ModelError> {
         let store = VarStore::new(device);
         Ok(Self { net: MixtureNet::new(&(store.root() / "mixture"), &config.mixture)?, store })
     }
 
-    /// Weights that a checkpoint keeps.
+    /// Weights of a checkpoint.
     pub fn weights(&self) -> Tensors {
         weights::of_store(&self.store)
     }
 
-    /// Puts the weights of a saved training back; `false` when they do not fit.
+    /// Restores the weights of a saved state; `false` when they do not fit.
     #[must_use]
     pub fn restore_weights(&self, state: &Tensors) -> bool {
         weights::fill_store(&self.store, &part(state, "weights.")).is_ok()
     }
 }
 
-/// Trains the network on `posteriors[copy][picture]`, or goes on where an earlier run stopped.
-pub fn train(
-    config: &TrainingConfig,
-    pictures: &Pictures,
-    posteriors: &[Vec<Gaussian>],
-    mdn: &Mdn,
-    run: &Run,
-) -> Result<(), TrainingError> {
-    let settings = &config.mdn;
-    let mut adam = Adam::new(&[&mdn.store], 0.0);
-    let mut first = 0;
-    if let Some((done, state)) = run.load("mdn")? {
-        if !(mdn.restore_weights(&state) && adam.restore(&part(&state, "adam."))) {
-            return Err(damaged(&run.state_path("mdn")));
+/// Steps between two records.
+const RECORD_EVERY: usize = 100;
+
+/// Training phase of the mixture density network.
+pub struct MixturePhase<'a> {
+    context: Context<'a>,
+    /// `[copy][image]`.
+    posteriors: &'a [Vec<Gaussian>],
+    mdn: &'a Mdn,
+    adam: Adam,
+    inputs: Vec<usize>,
+    /// Images of each state whose posteriors are targets.
+    targets: Vec<Vec<usize>>,
+    /// Equivalent states of each image.
+    equivalent: Vec<Vec<usize>>,
+    /// Sum of the losses since the last record.
+    sum: f64,
+}
+
+impl<'a> MixturePhase<'a> {
+    /// The phase before its first step. `posteriors` are `[copy][image]`.
+    pub fn new(context: Context<'a>, posteriors: &'a [Vec<Gaussian>], mdn: &'a Mdn) -> Result<Self, TrainingError> {
+        let posed = context.posed;
+        let targets = posed.unambiguous_by_state();
+        if let Some(state) = targets.iter().position(Vec::is_empty) {
+            return Err(TrainingError::Unfit(format!(
+                "no trained view of state {state} shows enough of the actor's place"
+            )));
         }
-        first = done;
+        Ok(Self {
+            context,
+            posteriors,
+            mdn,
+            adam: Adam::new(&[&mdn.store], 0.0),
+            inputs: posed.trained_and_random(),
+            targets,
+            equivalent: posed.labels.iter().map(|l| posed.equivalent_states(l.view, l.state)).collect(),
+            sum: 0.0,
+        })
     }
-    let trained = pictures.trained_and_free();
-    let targets_of = telling(pictures);
-    if let Some(state) = targets_of.iter().position(Vec::is_empty) {
-        return Err(TrainingError::Unfit(format!(
-            "no trained view of state {state} shows enough of the actor's place"
-        )));
+}
+
+impl Phase for MixturePhase<'_> {
+    type Record = MixtureRecord;
+
+    fn name(&self) -> &'static str {
+        names::MIXTURE
     }
-    let alike: Vec<Vec<usize>> = pictures.labels.iter().map(|l| pictures.alike(l.view, l.state)).collect();
-    let mut clock = SaveClock::default();
-    let mut sum = 0.0;
-    for step in first..settings.steps {
-        let mut rng = carff_random::stream(Key { seed: config.seed, frame: step as u64, step: 0x6d64_6e00, sample: 0 });
+
+    fn total(&self) -> usize {
+        self.context.config.mdn.steps
+    }
+
+    fn restore(&mut self, _done: usize, state: &Tensors) -> bool {
+        self.mdn.restore_weights(state) && self.adam.restore(&part(state, "adam."))
+    }
+
+    fn step(&mut self, step: usize) {
+        let Context { config, posed, .. } = self.context;
+        let settings = &config.mdn;
+        let mut rng = carff_base::random::stream(Key::named(names::MIXTURE, config.seed, step as u64));
         let [mut means, mut log_variances, mut targets] = [(); 3].map(|()| Vec::<f32>::new());
         for _ in 0..settings.batch {
-            let i = trained[rng.random_range(0..trained.len())];
-            let input = &posteriors[rng.random_range(0..posteriors.len())][i];
+            let i = self.inputs[rng.random_range(0..self.inputs.len())];
+            let input = &self.posteriors[rng.random_range(0..self.posteriors.len())][i];
             let noise: [f32; LATENT_DIM] =
                 std::array::from_fn(|_| rng.sample::<f32, _>(StandardNormal) * settings.input_noise as f32);
             means.extend(input.at(&noise));
             log_variances.extend(input.log_variance);
-            // States that look the same in this view are equally likely: the input must not be learnt by heart.
-            let alike = &alike[i];
-            let state = alike[rng.random_range(0..alike.len())];
-            let views = &targets_of[pictures.next_state(state)];
-            let next = &posteriors[rng.random_range(0..posteriors.len())][views[rng.random_range(0..views.len())]];
+            // Equivalent states are equally probable: the network must not memorise the input.
+            let equivalent = &self.equivalent[i];
+            let state = equivalent[rng.random_range(0..equivalent.len())];
+            let views = &self.targets[posed.scenario.next_state(state)];
+            let copy = &self.posteriors[rng.random_range(0..self.posteriors.len())];
+            let next = &copy[views[rng.random_range(0..views.len())]];
             let unit: [f32; LATENT_DIM] = std::array::from_fn(|_| rng.sample(StandardNormal));
             targets.extend(next.at(&unit));
         }
-        let rows =
-            |values: &[f32]| Tensor::from_slice(values).view([-1, LATENT_DIM as i64]).to_device(mdn.net.device());
-        let loss = mdn.net.negative_log_likelihood(&rows(&means), &rows(&log_variances), &rows(&targets));
-        adam.step(&loss, settings.learning_rate * cosine(step, settings.steps), 5.0);
-        sum += loss.double_value(&[]);
-        let done = step + 1;
-        if done % 100 == 0 || done == settings.steps {
-            let mean = sum / if done % 100 == 0 { 100.0 } else { (done % 100) as f64 };
-            sum = 0.0;
-            run.metric(&json!({"stage": "mdn", "step": done, "negative_log_likelihood": mean}))?;
-            (run.on_progress)(&Progress {
-                stage: "mdn",
-                done,
-                total: settings.steps,
-                line: format!("negative log-likelihood {mean:.3}"),
-            });
-        }
-        let stopping = run.stopped();
-        if stopping || clock.is_due() || done == settings.steps {
-            let mut state: Tensors = prefixed("adam.", adam.state()).collect();
-            state.extend(prefixed("weights.", mdn.weights()));
-            run.save("mdn", done, state)?;
-        }
-        if stopping {
-            return Err(TrainingError::Stopped);
-        }
+        let net = &self.mdn.net;
+        let rows = |values: &[f32]| Tensor::from_slice(values).view([-1, LATENT_DIM as i64]).to_device(net.device());
+        let loss = net.negative_log_likelihood(&rows(&means), &rows(&log_variances), &rows(&targets));
+        self.adam.step(&loss, settings.learning_rate * cosine(step, settings.steps), 5.0);
+        self.sum += loss.double_value(&[]);
     }
-    Ok(())
-}
 
-/// Per state the pictures of trained and free poses that tell it: those that look like no other state from their pose.
-/// The posterior of any other picture rightly stands between states. Where no picture tells a state, those count that
-/// show at least half of the actor's place.
-pub fn telling(pictures: &Pictures) -> Vec<Vec<usize>> {
-    let mut by_state = vec![Vec::new(); pictures.scenario.state_count()];
-    let mut fallback = by_state.clone();
-    for i in pictures.trained_and_free() {
-        let label = pictures.labels[i];
-        if pictures.alike(label.view, label.state).len() == 1 {
-            by_state[label.state].push(i);
-        } else if label.visible_fraction >= 0.5 {
-            fallback[label.state].push(i);
+    fn report(&mut self, done: usize) -> Result<Report<MixtureRecord>, TrainingError> {
+        let steps = if done.is_multiple_of(RECORD_EVERY) { RECORD_EVERY } else { done % RECORD_EVERY };
+        if steps < RECORD_EVERY && done < self.total() {
+            return Ok(Report { line: None, record: None });
         }
+        let mean = std::mem::take(&mut self.sum) / steps as f64;
+        let record = MixtureRecord { step: done as u64, negative_log_likelihood: mean };
+        Ok(Report { line: Some(format!("negative log-likelihood {mean:.3}")), record: Some(record) })
     }
-    by_state.into_iter().zip(fallback).map(|(telling, rest)| if telling.is_empty() { rest } else { telling }).collect()
-}
 
-/// Mean negative log-likelihood over given pairs, for tests and reports.
-pub fn likelihood(net: &MixtureNet, inputs: &[Gaussian], targets: &[[f32; LATENT_DIM]]) -> f64 {
-    let rows = |values: Vec<f32>| Tensor::from_slice(&values).view([-1, LATENT_DIM as i64]).to_device(net.device());
-    tch::no_grad(|| {
-        net.negative_log_likelihood(
-            &rows(inputs.iter().flat_map(|g| g.mean).collect()),
-            &rows(inputs.iter().flat_map(|g| g.log_variance).collect()),
-            &rows(targets.iter().flatten().copied().collect()),
-        )
-        .to_kind(Kind::Double)
-        .double_value(&[])
-    })
+    fn state(&self) -> Tensors {
+        let mut state: Tensors = prefixed("adam.", self.adam.state()).collect();
+        state.extend(prefixed("weights.", self.mdn.weights()));
+        state
+    }
 }

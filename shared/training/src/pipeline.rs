@@ -1,226 +1,244 @@
-//! From pictures to a checkpoint: VAE, field, mixture density network, calibration, figures.
+//! From images to a checkpoint: VAE, mixture density network, field, calibration, figures.
 
 use crate::{
-    TrainingError,
-    config::{Augmentation, TrainingConfig},
-    field::{self, Clouds},
-    mixture::{self, Mdn},
-    pictures::Pictures,
+    TrainingConfig, TrainingError,
+    calibrate::{calibrated_probing, choose_and_save_threshold},
+    field::{Clouds, FieldPhase, saved_field},
+    mixture::{Mdn, MixturePhase},
     places::places,
-    run::{Progress, Run, damaged},
-    vae::{self, Inputs, Vae},
+    records::{self, DoneRecord},
+    run::{Context, Run, drive, names},
+    vae::{Inputs, Vae, VaePhase},
 };
 use carff_checkpoint::CheckpointPlanning;
 use carff_checkpoint::{FORMAT_VERSION, Manifest, ScenarioIdentity, SplitRecord, files, save_field};
 use carff_dataset::{Observability, PoseRole, drives::eligible_inputs};
-use carff_decision::{
-    Calibration, CalibrationTrial, Evidence, Policy, ProbeLayout, Sampling, choose_threshold, unchosen_threshold,
+use carff_decision::{Policy, Sampling};
+use carff_evaluation::{
+    BirdsEye, CheckpointFigures, FieldRenderer, Input, Models, NoisyEncoder, Planner, PlanningFigures, PosedImages,
+    ProbingFigures, SampleFigures, SampleTrials, TrainedAndUnseen, ViewFigures, birds_eye, to_bytes, to_unit,
 };
-use carff_evaluation::{Input, Models, Trial, birds_eye, planning_table, sample_accuracy, trials};
-use carff_field::{Field, RenderBuffer, RenderOptions};
+use carff_field::Field;
 use carff_messages::{Gaussian, LATENT_DIM};
-use carff_models::stored::save_weights;
-use carff_random::Key;
-use serde_json::{Value, json};
+use carff_networks::stored::save_weights;
+use serde_json::Value;
 use std::path::Path;
 use tch::Device;
 
-/// Which models to train.
+/// Trials of each image in the planning tables.
+const PLANNING_REPEATS: usize = 5;
+/// Samples of each input in the sample accuracy.
+const ACCURACY_SAMPLES: usize = 50;
+/// Largest number of images in the strip of a dataset with one state.
+const STRIP_IMAGES: usize = 8;
+
+/// Phases to train.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Stage {
+pub enum Phases {
     /// All three, in order.
     All,
-    /// The pose-conditional VAE.
+    /// Only the pose-conditional VAE.
     Vae,
-    /// The field.
-    Nerf,
-    /// The mixture density network.
-    Mdn,
+    /// Only the field.
+    Field,
+    /// Only the mixture density network.
+    Mixture,
 }
 
-/// Trains what `stage` says on a data set, and on the set `free` of freely drawn poses beside it, and writes what is
-/// ready to the checkpoint folder `out`. Finished stages are read from their saved states; a stage that is asked for by
-/// name needs those before it. VAE and mixture density network are trained on `device`, the field by its own kernels on
-/// the processor.
-pub fn train(
-    config: &TrainingConfig,
-    dataset: &Path,
-    free: Option<&Path>,
-    out: &Path,
-    stage: Stage,
-    device: Device,
-    run: &Run,
-) -> Result<Value, TrainingError> {
-    carff_models::allocator::keep_large_blocks();
-    tch::set_num_threads(config.threads);
-    tch::manual_seed(config.seed as i64);
-    let mut pictures = Pictures::open(dataset, config.split_seed)?;
-    if let Some(free) = free {
-        pictures.add_free(free)?;
-    }
-    let states = pictures.scenario.state_count();
-    if states == 1 {
-        return field_alone(config, &pictures, out, stage, run);
-    }
-    let places = places(&pictures.scenario)?;
-    let pretrained = config.pretrained_backbone.as_deref();
-    let mut vae = Vae::new(config, pictures.dataset.view_count(), states, pretrained, device)?;
-    let posteriors = match finished(run, "vae", config.vae.all_epochs(), |state| vae.restore_weights(state)) {
-        Ok(()) => posteriors_of(config, &pictures, &mut vae, run)?,
-        Err(error) if matches!(stage, Stage::Nerf | Stage::Mdn) => return Err(error),
-        Err(_) => {
-            let inputs = Inputs::new(config, &pictures, &mut vae, run)?;
-            vae::train(config, &pictures, &vae, &inputs, run)?;
-            inputs.all_posteriors(&vae, run)?
+/// A training: its input and output.
+#[derive(Clone, Copy)]
+pub struct Training<'a> {
+    /// The training file.
+    pub config: &'a TrainingConfig,
+    /// Folder of the dataset.
+    pub dataset: &'a Path,
+    /// Folder of the dataset of random poses.
+    pub random_poses: Option<&'a Path>,
+    /// Folder of the checkpoint.
+    pub out: &'a Path,
+    /// Device of the VAE and the mixture density network. The field is trained on the CPU.
+    pub device: Device,
+}
+
+impl Training<'_> {
+    /// Trains `phases` and writes the trained models to the checkpoint. Finished phases are read from their saved
+    /// states. A single phase requires that the phases before it are finished.
+    pub fn run(&self, phases: Phases, run: &Run) -> Result<CheckpointFigures, TrainingError> {
+        let config = self.config;
+        carff_networks::allocator::keep_large_blocks();
+        tch::set_num_threads(config.threads);
+        tch::manual_seed(config.seed as i64);
+        let mut posed = PosedImages::open(self.dataset, config.split_seed)?;
+        if let Some(dir) = self.random_poses {
+            posed.add_random_poses(dir)?;
         }
-    };
-    let mut metrics = json!({"vae": vae::evaluate(config, &pictures, &vae, &posteriors[0], true)?});
-    let clouds = Clouds::new(&pictures, &posteriors[0])?;
-    let mut manifest = Manifest { places, ..begun(config, &pictures, clouds.states()) };
-    write_vae(config, &vae, out)?;
-
-    // The mixture density network before the field: it is quick, and needs the posteriors alone.
-    let mdn = Mdn::new(config, device)?;
-    let mdn_ready = if matches!(stage, Stage::All | Stage::Mdn) {
-        mixture::train(config, &pictures, &posteriors, &mdn, run)?;
-        true
-    } else {
-        finished(run, "mdn", config.mdn.steps, |state| mdn.restore_weights(state)).is_ok()
-    };
-    if mdn_ready {
-        save_weights(out, files::MIXTURE, &mdn.weights())?;
+        let context = Context { config, posed: &posed, run };
+        let (manifest, figures) = if posed.scenario.state_count() == 1 {
+            self.train_one_state(context, phases)?
+        } else {
+            self.train_states(context, phases)?
+        };
+        save(manifest, &figures, self.out)?;
+        run.record(records::names::DONE, &DoneRecord { metrics: &figures })?;
+        Ok(figures)
     }
 
-    let field = if matches!(stage, Stage::All | Stage::Nerf) {
-        Some(field::train(config, &pictures, &clouds, run)?)
-    } else {
-        run.load("nerf")?.and_then(|(_, state)| field::saved_field(config, &state))
-    };
-    if let Some(mut field) = field {
-        // What ships is what is judged.
+    fn train_states(&self, context: Context, phases: Phases) -> Result<(Manifest, CheckpointFigures), TrainingError> {
+        let Context { config, posed, run } = context;
+        let places = places(&posed.scenario)?;
+        let (vae, posteriors) = self.trained_vae(context, phases)?;
+        let mut figures = CheckpointFigures {
+            vae: Some(vae.figures(context, &posteriors[0], true)?),
+            ..CheckpointFigures::default()
+        };
+        let clouds = Clouds::new(posed, &posteriors[0])?;
+        let mut manifest = Manifest { places, ..new_manifest(context, clouds.states()) };
+        write_vae(config, &vae, self.out)?;
+
+        // The mixture density network is trained before the field: it is quick, and needs only the posteriors.
+        let mdn = Mdn::new(config, self.device)?;
+        let mixture_ready = if matches!(phases, Phases::All | Phases::Mixture) {
+            drive(&mut MixturePhase::new(context, &posteriors, &mdn)?, run)?;
+            true
+        } else {
+            run.load_finished(names::MIXTURE, config.mdn.steps, |state| mdn.restore_weights(state)).is_ok()
+        };
+        if mixture_ready {
+            save_weights(self.out, files::MIXTURE, &mdn.weights())?;
+        }
+
+        let field = if matches!(phases, Phases::All | Phases::Field) {
+            Some(trained_field(context, &clouds)?)
+        } else {
+            run.load(names::FIELD)?.and_then(|(_, state)| saved_field(config, &state))
+        };
+        if let Some(mut field) = field {
+            // The saved field is the one that is evaluated.
+            field.round_to_f16();
+            save_field(self.out, &field)?;
+            manifest.field = Some(field.config().clone());
+            let (prober, calibration) = calibrated_probing(&manifest, &field, &clouds, config.seed)?;
+            figures.probing =
+                Some(ProbingFigures { separations: calibration.separations(), places: prober.places().len() });
+            let threads = config.threads.max(1) as usize;
+            if let Some(view) = birds_eye(&field, &manifest.states, &posed.dataset, threads)? {
+                write_strip(run, "birds_eye.png", &view)?;
+                figures.birds_eye = Some(view);
+            }
+            manifest.probing = Some(calibration);
+        }
+        if manifest.probing.is_some() && mixture_ready {
+            save(manifest.clone(), &figures, self.out)?;
+            let mut models = Models::load(self.out)?;
+            choose_and_save_threshold(context, &mut models, self.out)?;
+            figures.planning = Some(self.planning_figures(context, &models)?);
+            figures.samples = Some(TrainedAndUnseen {
+                trained: sample_figures(context, &mut models, PoseRole::Rest),
+                unseen: sample_figures(context, &mut models, PoseRole::Unseen),
+            });
+        }
+        Ok((manifest, figures))
+    }
+
+    /// The VAE and the posteriors `[copy][image]`: from the run's folder where they are there, else trained.
+    fn trained_vae(&self, context: Context, phases: Phases) -> Result<(Vae, Vec<Vec<Gaussian>>), TrainingError> {
+        let Context { config, posed, run } = context;
+        let (poses, states) = (posed.dataset.view_count(), posed.scenario.state_count());
+        let mut vae = Vae::new(config, poses, states, config.pretrained_backbone.as_deref(), self.device)?;
+        let finished = run.load_finished(names::VAE, config.vae.all_epochs(), |state| vae.restore_weights(state));
+        if finished.is_ok() {
+            let copies = config.augmentation.copies + 1;
+            if let Some(posteriors) = run.load_posteriors(copies, posed.images.len())? {
+                return Ok((vae, posteriors));
+            }
+        }
+        let inputs = match finished {
+            Err(error) if matches!(phases, Phases::Field | Phases::Mixture) => return Err(error),
+            finished => {
+                let inputs = Inputs::new(context, &mut vae)?;
+                if finished.is_err() {
+                    drive(&mut VaePhase::new(context, &vae, &inputs), run)?;
+                }
+                inputs
+            }
+        };
+        let posteriors = inputs.all_posteriors(&vae)?;
+        Ok((vae, posteriors))
+    }
+
+    /// Trains a dataset with one state, as imported datasets have: only the field, on one latent. Its figures are those
+    /// of trained and held-out poses.
+    fn train_one_state(
+        &self,
+        context: Context,
+        phases: Phases,
+    ) -> Result<(Manifest, CheckpointFigures), TrainingError> {
+        if matches!(phases, Phases::Vae | Phases::Mixture) {
+            return Err(TrainingError::Unfit(
+                "the dataset has one state: there is nothing to encode or to forecast; train the field, with \
+                 `--stage nerf`"
+                    .into(),
+            ));
+        }
+        let only = Gaussian { mean: [0.0; LATENT_DIM], log_variance: [-10.0; LATENT_DIM] };
+        let clouds = Clouds::new(context.posed, &vec![only; context.posed.images.len()])?;
+        let mut field = trained_field(context, &clouds)?;
         field.round_to_f16();
-        save_field(out, &field)?;
-        manifest.field = Some(field.config().clone());
-        let (prober, calibration) = calibrate_probing(&manifest, &field, &clouds, config.seed)?;
-        metrics["probing"] = json!({"separations": calibration.separations(), "places": prober.places().len()});
-        if let Some(view) = birds_eye(&field, &manifest.states, &pictures.dataset, config.threads.max(1) as usize)? {
-            write_strip(run, "birds_eye.png", &view)?;
-            metrics["birds_eye"] = serde_json::to_value(&view).unwrap_or(Value::Null);
-        }
-        manifest.probing = Some(calibration);
+        save_field(self.out, &field)?;
+        let mut strip = BirdsEye::default();
+        let views = TrainedAndUnseen {
+            trained: view_figures(context, &field, PoseRole::Rest, None),
+            unseen: view_figures(context, &field, PoseRole::Unseen, Some(&mut strip)),
+        };
+        write_strip(context.run, "views.png", &strip)?;
+        let manifest = Manifest { field: Some(field.config().clone()), ..new_manifest(context, vec![only]) };
+        Ok((manifest, CheckpointFigures { views: Some(views), ..CheckpointFigures::default() }))
     }
-    manifest.metrics = metrics;
-    manifest.save(out)?;
-    if manifest.probing.is_some() && mdn_ready {
-        let mut models = Models::load(out)?;
-        calibrate_threshold(config, &pictures, &mut models, out, run)?;
-        let figures = figures(config, &pictures, &mut models, out)?;
-        if let (Some(to), Some(from)) = (manifest.metrics.as_object_mut(), figures.as_object()) {
-            to.extend(from.clone());
-        }
-        manifest.save(out)?;
-    }
-    run.metric(&json!({"stage": "done", "metrics": manifest.metrics}))?;
-    Ok(manifest.metrics)
-}
 
-/// Of a set of one state, as imported ones are, there is nothing to encode or to forecast: the field alone is trained, on
-/// one latent, and judged on the poses that were kept away from it.
-fn field_alone(
-    config: &TrainingConfig,
-    pictures: &Pictures,
-    out: &Path,
-    stage: Stage,
-    run: &Run,
-) -> Result<Value, TrainingError> {
-    if matches!(stage, Stage::Vae | Stage::Mdn) {
-        return Err(TrainingError::Unfit(
-            "the data set has one state: there is nothing to encode or to forecast; train the field, with `--stage nerf`"
-                .into(),
-        ));
-    }
-    let only = Gaussian { mean: [0.0; LATENT_DIM], log_variance: [-10.0; LATENT_DIM] };
-    let clouds = Clouds::new(pictures, &vec![only; pictures.images.len()])?;
-    let mut field = field::train(config, pictures, &clouds, run)?;
-    field.round_to_f16();
-    save_field(out, &field)?;
-    let options = RenderOptions { threads: config.threads.max(1) as usize, ..RenderOptions::default() };
-    let mut buffer = RenderBuffer::new();
-    let mut strip = carff_evaluation::BirdsEye::default();
-    let mut metrics = serde_json::Map::new();
-    for (name, role) in [("trained", PoseRole::Rest), ("unseen", PoseRole::Unseen)] {
-        let mut psnr_db = Vec::new();
-        for i in pictures.with_roles(&[role]) {
-            let (camera, truth) = (pictures.dataset.frames()[i].camera, &pictures.images[i]);
-            field.render(&camera, &only.mean, &options, &mut buffer);
-            let true_values: Vec<f32> = truth.rgb.iter().map(|&b| f32::from(b) / 255.0).collect();
-            psnr_db.extend(carff_metrics::psnr_db(&buffer.rgb, &true_values));
-            let alike =
-                strip.truths.first().is_none_or(|t| (t.width_px, t.height_px) == (truth.width_px, truth.height_px));
-            if role == PoseRole::Unseen && alike && strip.truths.len() < 8 {
-                let rgb = buffer.rgb.iter().map(|v| (v.clamp(0.0, 1.0) * 255.0 + 0.5) as u8).collect();
-                strip.pictures.push(carff_dataset::Image { rgb, ..*truth });
-                strip.truths.push(truth.clone());
-            }
-        }
-        let mean = carff_metrics::mean(&psnr_db);
-        metrics.insert(name.into(), json!({"poses": psnr_db.len(), "psnr_db": mean}));
-    }
-    write_strip(run, "views.png", &strip)?;
-    let manifest = Manifest {
-        field: Some(field.config().clone()),
-        metrics: json!({"views": metrics}),
-        ..begun(config, pictures, vec![only])
-    };
-    manifest.save(out)?;
-    run.metric(&json!({"stage": "done", "metrics": manifest.metrics}))?;
-    Ok(manifest.metrics)
-}
-
-/// The posteriors that a finished VAE gave, from the run's folder; computed anew when they are not there.
-fn posteriors_of(
-    config: &TrainingConfig,
-    pictures: &Pictures,
-    vae: &mut Vae,
-    run: &Run,
-) -> Result<Vec<Vec<Gaussian>>, TrainingError> {
-    match run.load_posteriors(config.augmentation.copies + 1, pictures.images.len())? {
-        Some(posteriors) => Ok(posteriors),
-        None => Inputs::new(config, pictures, vae, run)?.all_posteriors(vae, run),
+    /// Planning tables of a checkpoint. Its threshold was chosen before; these tables choose nothing.
+    fn planning_figures(&self, context: Context, models: &Models) -> Result<PlanningFigures, TrainingError> {
+        let Context { config, posed, .. } = context;
+        let unfit = |e: &dyn std::fmt::Display| TrainingError::Unfit(e.to_string());
+        let threshold = CheckpointPlanning::load(self.out).map_err(|e| unfit(&e))?.hazard_threshold;
+        let Models { encoder, mixture, probe, .. } = models;
+        let encoder = NoisyEncoder { encoder, noise: config.calibration.sensor, seed: config.seed + 1 };
+        let horizon = config.calibration.horizon;
+        let planner = Planner { net: mixture, probe, sampling: Sampling::Stratified, horizon };
+        let table = |role| {
+            let inputs = eligible_inputs(&posed.dataset, &posed.split.views(role)).map_err(|e| unfit(&e))?;
+            let trials = encoder.trials(&posed.dataset, &inputs, PLANNING_REPEATS)?;
+            Ok::<_, TrainingError>(planner.table(&trials, &Policy::all(threshold)).0)
+        };
+        Ok(PlanningFigures {
+            all_views: table(PoseRole::Rest)?,
+            calibration_views: table(PoseRole::Calibration)?,
+            unseen_views: table(PoseRole::Unseen)?,
+        })
     }
 }
 
-fn finished(
-    run: &Run,
-    stage: &str,
-    total: usize,
-    restore: impl FnOnce(&carff_models::weights::Tensors) -> bool,
-) -> Result<(), TrainingError> {
-    match run.load(stage)? {
-        Some((done, state)) if done >= total => {
-            if restore(&state) {
-                Ok(())
-            } else {
-                Err(damaged(&run.state_path(stage)))
-            }
-        }
-        Some((done, _)) => {
-            Err(TrainingError::Unfit(format!("stage {stage} stopped at {done} of {total}: finish it first")))
-        }
-        None => Err(TrainingError::Unfit(format!("stage {stage} is not trained yet: run it first"))),
-    }
+fn trained_field(context: Context, clouds: &Clouds) -> Result<Field, TrainingError> {
+    FieldPhase::new(context, clouds, names::FIELD, context.config.nerf.trainer.steps)?.trained()
 }
 
-/// What the manifest says before anything is trained but the states' latents.
-fn begun(config: &TrainingConfig, pictures: &Pictures, states: Vec<Gaussian>) -> Manifest {
+/// Writes the manifest with its figures.
+fn save(mut manifest: Manifest, figures: &CheckpointFigures, out: &Path) -> Result<(), TrainingError> {
+    manifest.metrics = serde_json::to_value(figures)
+        .map_err(|e| TrainingError::Format { path: out.join(files::MANIFEST), what: e.to_string() })?;
+    Ok(manifest.save(out)?)
+}
+
+/// Manifest of a checkpoint without trained models, except the states' latents.
+fn new_manifest(context: Context, states: Vec<Gaussian>) -> Manifest {
+    let Context { config, posed, .. } = context;
     Manifest {
         format_version: FORMAT_VERSION,
-        scenario: ScenarioIdentity::of(&pictures.scenario, pictures.dataset.view_count()),
+        scenario: ScenarioIdentity::of(&posed.scenario, posed.dataset.view_count()),
         seed: config.seed,
         split: SplitRecord {
             seed: config.split_seed,
-            unseen: pictures.split.views(PoseRole::Unseen),
-            calibration: pictures.split.views(PoseRole::Calibration),
+            unseen: posed.split.views(PoseRole::Unseen),
+            calibration: posed.split.views(PoseRole::Calibration),
         },
         encoder: config.encoder.clone(),
         decoder: config.decoder.clone(),
@@ -234,15 +252,49 @@ fn begun(config: &TrainingConfig, pictures: &Pictures, states: Vec<Gaussian>) ->
     }
 }
 
-/// Copies a file, whole or not at all. One that is there already under this name stays: copied onto itself it would be
-/// emptied.
-fn copy(from: &Path, to: &Path) -> std::io::Result<()> {
-    if to.exists() && from.canonicalize()? == to.canonicalize()? {
-        return Ok(());
+/// Accuracy of probed samples on the unoccluded views of one role.
+fn sample_figures(context: Context, models: &mut Models, role: PoseRole) -> SampleFigures {
+    let Context { config, posed, .. } = context;
+    let seed = config.seed + 1;
+    let full = |i: &usize| posed.labels[*i].observability == Observability::Full;
+    let mut inputs = Vec::new();
+    for i in posed.with_roles(&[role]).into_iter().filter(full) {
+        let image = config.augmentation.inputs(posed, &[i], 0, seed);
+        let label = posed.labels[i];
+        inputs.extend(models.encoder.encode(&image).into_iter().map(|posterior| Input {
+            state: label.state,
+            view: label.view,
+            posterior,
+            frame: i as u64,
+        }));
     }
-    let partial = to.with_extension("partial");
-    std::fs::copy(from, &partial)?;
-    std::fs::rename(&partial, to)
+    let trials = SampleTrials {
+        net: &models.mixture,
+        scenario: &posed.scenario,
+        equivalence: &posed.equivalence,
+        samples: ACCURACY_SAMPLES,
+        seed,
+    };
+    trials.accuracy(&mut models.probe, &inputs).into()
+}
+
+/// Quality of the field on the images of one role; some of the images are added to `strip`.
+fn view_figures(context: Context, field: &Field, role: PoseRole, mut strip: Option<&mut BirdsEye>) -> ViewFigures {
+    let posed = context.posed;
+    let mut renderer = FieldRenderer::new(context.config.threads.max(1) as usize);
+    let mut psnr_db = Vec::new();
+    for i in posed.with_roles(&[role]) {
+        let truth = &posed.images[i];
+        let values = renderer.values(field, &posed.dataset.frames()[i].camera, &[0.0; LATENT_DIM]);
+        psnr_db.extend(carff_base::statistics::psnr_db(values, &to_unit(&truth.rgb)));
+        let Some(strip) = &mut strip else { continue };
+        let size = |t: &carff_dataset::Image| (t.width_px, t.height_px);
+        if strip.truths.len() < STRIP_IMAGES && strip.truths.first().is_none_or(|t| size(t) == size(truth)) {
+            strip.pictures.push(carff_dataset::Image { rgb: to_bytes(values), ..*truth });
+            strip.truths.push(truth.clone());
+        }
+    }
+    ViewFigures { poses: psnr_db.len(), psnr_db: carff_base::statistics::mean(&psnr_db) }
 }
 
 fn write_vae(config: &TrainingConfig, vae: &Vae, out: &Path) -> Result<(), TrainingError> {
@@ -260,174 +312,17 @@ fn write_vae(config: &TrainingConfig, vae: &Vae, out: &Path) -> Result<(), Train
     Ok(save_weights(out, files::DECODER, &decoder)?)
 }
 
-/// Latents of each known state that the prober is calibrated on.
-const CALIBRATION_LATENTS: usize = 64;
-
-fn calibrate_probing(
-    manifest: &Manifest,
-    field: &Field,
-    clouds: &Clouds,
-    seed: u64,
-) -> Result<(ProbeLayout, Calibration), TrainingError> {
-    let prober = ProbeLayout::new(manifest.places.clone(), manifest.scenario.hazard_states())?;
-    let places = prober.places().len();
-    let mut densities = vec![0.0; prober.points().len()];
-    let occupancies: Vec<Vec<f32>> = (0..prober.state_count())
-        .map(|state| {
-            let mut rng = carff_random::stream(Key { seed, frame: state as u64, step: 0x7072_6f62, sample: 0 });
-            let mut rows = Vec::with_capacity(CALIBRATION_LATENTS * places);
-            for _ in 0..CALIBRATION_LATENTS {
-                let latent: [f32; LATENT_DIM] = clouds.draw(state, 1.0, &mut rng);
-                field.density(prober.points(), &latent, &mut densities);
-                let mut row = vec![0.0; places];
-                prober.occupancies(&densities, &mut row);
-                rows.extend(row);
-            }
-            rows
-        })
-        .collect();
-    let calibration = Calibration::fit(&prober, &occupancies)?;
-    Ok((prober, calibration))
+/// Copies a file atomically. A file is not copied onto itself, which would empty it.
+fn copy(from: &Path, to: &Path) -> std::io::Result<()> {
+    if to.exists() && from.canonicalize()? == to.canonicalize()? {
+        return Ok(());
+    }
+    let partial = to.with_extension("partial");
+    std::fs::copy(from, &partial)?;
+    std::fs::rename(&partial, to)
 }
 
-/// Names this use of the seed, so that no picture is altered just as it was in training.
-const CALIBRATION_STREAM: u64 = 0x6361_6c69_6272_6174;
-
-/// Chooses the calibrated rule's threshold on the calibration poses, and writes it beside the manifest.
-fn calibrate_threshold(
-    config: &TrainingConfig,
-    pictures: &Pictures,
-    models: &mut Models,
-    out: &Path,
-    run: &Run,
-) -> Result<(), TrainingError> {
-    let settings = &config.calibration;
-    let unfit = |e: &dyn std::fmt::Display| TrainingError::Unfit(e.to_string());
-    if pictures.scenario.hazard_branches.is_empty() {
-        // Nothing is to be told apart, so nothing is chosen; no state is a hazard, and no threshold above 0 is reached.
-        return CheckpointPlanning::new(config.split_seed, 0.5).save(out).map_err(|e| unfit(&e));
-    }
-    let inputs =
-        eligible_inputs(&pictures.dataset, &pictures.split.views(PoseRole::Calibration)).map_err(|e| unfit(&e))?;
-    // Altered as in training: a threshold that was chosen on pictures just as they were learned would be too sharp for
-    // others.
-    let altered = Augmentation { sensor: settings.sensor, ..config.augmentation.clone() };
-    let mut trials = Vec::with_capacity(inputs.len() * settings.repeats);
-    for input in &inputs {
-        let state = input.branch * pictures.scenario.timestamps + input.timestamp;
-        let Some(index) = pictures.dataset.frame_index(state, input.view) else { continue };
-        for repeat in 0..settings.repeats {
-            let picture = pictures.inputs(&[index], repeat, &altered, config.seed ^ CALIBRATION_STREAM);
-            let frame = (index * 1000 + repeat) as u64;
-            let (kind, seed) = (input.kind, config.seed);
-            let posteriors = models.encoder.encode(&picture);
-            trials.extend(posteriors.into_iter().map(|posterior| Trial { posterior, kind, frame, seed }));
-        }
-    }
-    let mut found = Vec::with_capacity(trials.len());
-    for trial in &trials {
-        let plan = carff_decision::Plan {
-            samples: settings.samples,
-            sampling: Sampling::Stratified,
-            horizon: settings.horizon,
-            seed: trial.seed,
-            frame: trial.frame,
-        };
-        let steps = carff_decision::look_ahead(
-            |input, _| models.mixture.forecast(input),
-            &mut models.probe,
-            &trial.posterior,
-            plan,
-        );
-        let hazard = Evidence::of_steps(&steps).hazard_probability();
-        found.push(CalibrationTrial {
-            hazard_probability: hazard,
-            halt_is_right: trial.kind == carff_dataset::drives::DriveKind::Hazard,
-        });
-    }
-    let chosen = choose_threshold(&found);
-    let threshold = chosen.unwrap_or_else(|| {
-        unchosen_threshold(pictures.scenario.hazard_branches.len(), pictures.scenario.branches.len())
-    });
-    if chosen.is_none() {
-        let line = format!(
-            "the calibration poses allow no trial of one kind (hazard or clear), so that nothing chooses the calibrated rule's \
-             threshold: {threshold} is half of an even belief; another `split_seed` may allow them"
-        );
-        (run.on_progress)(&Progress { stage: "threshold", done: 1, total: 1, line });
-    }
-    let probabilities = |halt: bool| -> Vec<f64> {
-        found.iter().filter(|t| t.halt_is_right == halt).map(|t| t.hazard_probability).collect()
-    };
-    run.metric(&json!({
-        "stage": "threshold", "threshold": threshold, "chosen": chosen.is_some(), "trials": found.len(),
-        "hazard": probabilities(true), "clear": probabilities(false),
-    }))?;
-    CheckpointPlanning::new(config.split_seed, threshold).save(out).map_err(|e| unfit(&e))
-}
-
-/// The figures that a checkpoint's manifest carries. The thresholds are chosen by now; nothing is chosen from these.
-fn figures(
-    config: &TrainingConfig,
-    pictures: &Pictures,
-    models: &mut Models,
-    out: &Path,
-) -> Result<Value, TrainingError> {
-    let unfit = |e: &dyn std::fmt::Display| TrainingError::Unfit(e.to_string());
-    let threshold = CheckpointPlanning::load(out).map_err(|e| unfit(&e))?.hazard_threshold;
-    let rules = Policy::all(threshold);
-    let mut planning = serde_json::Map::new();
-    let tables = [
-        ("all_views", PoseRole::Rest),
-        ("calibration_views", PoseRole::Calibration),
-        ("unseen_views", PoseRole::Unseen),
-    ];
-    for (name, role) in tables {
-        let views = pictures.split.views(role);
-        let inputs = eligible_inputs(&pictures.dataset, &views).map_err(|e| unfit(&e))?;
-        let trials =
-            trials(&models.encoder, &pictures.dataset, &inputs, 5, &config.calibration.sensor, config.seed + 1)?;
-        let (table, _) = planning_table(
-            &models.mixture,
-            &models.probe,
-            &trials,
-            &rules,
-            Sampling::Stratified,
-            config.calibration.horizon,
-        );
-        planning.insert(name.into(), serde_json::to_value(table).unwrap_or(Value::Null));
-    }
-    let mut samples = serde_json::Map::new();
-    for (name, role) in [("trained", PoseRole::Rest), ("unseen", PoseRole::Unseen)] {
-        let full = |i: &usize| pictures.labels[*i].observability == Observability::Full;
-        let mut inputs = Vec::new();
-        for i in pictures.with_roles(&[role]).into_iter().filter(full) {
-            let image = pictures.inputs(&[i], 0, &config.augmentation, config.seed + 1);
-            inputs.extend(models.encoder.encode(&image).into_iter().map(|posterior| Input {
-                state: pictures.labels[i].state,
-                view: pictures.labels[i].view,
-                posterior,
-                frame: i as u64,
-            }));
-        }
-        let table = sample_accuracy(
-            &models.mixture,
-            &mut models.probe,
-            &inputs,
-            pictures.scenario.timestamps,
-            &pictures.equivalence,
-            50,
-            config.seed + 1,
-        );
-        samples.insert(
-            name.into(),
-            json!({"full": table, "accuracy": table.accuracy(), "possible": table.possible_share()}),
-        );
-    }
-    Ok(json!({"planning": planning, "samples": samples}))
-}
-
-/// Rendered above true, one column a picture.
+/// Draws rendered images above true ones, one column for each.
 fn write_strip(run: &Run, name: &str, view: &carff_evaluation::BirdsEye) -> Result<(), TrainingError> {
     let (Some(first), columns) = (view.pictures.first(), view.pictures.len()) else { return Ok(()) };
     let (w, h) = (first.width_px as usize, first.height_px as usize);
@@ -447,78 +342,11 @@ fn write_strip(run: &Run, name: &str, view: &carff_evaluation::BirdsEye) -> Resu
     Ok(sheet.save_png(&run.dir.join(name))?)
 }
 
-/// A progress line for those who have no bar.
-pub fn plain_line(progress: &Progress) -> String {
-    format!("{} {}/{}  {}", progress.stage, progress.done, progress.total, progress.line)
-}
-
-/// The figures of a finished training, for a person.
-pub fn summary(metrics: &Value) -> String {
-    let number = |path: &str| metrics.pointer(path).and_then(Value::as_f64);
-    let mut lines = Vec::new();
-    let mut line = |label: &str, values: &[(&str, Option<f64>, f64, &str)]| {
-        let parts: Vec<String> = values
-            .iter()
-            .filter_map(|(name, value, scale, unit)| value.map(|v| format!("{name} {:.1}{unit}", v * scale)))
-            .collect();
-        if !parts.is_empty() {
-            lines.push(format!("{label}: {}", parts.join(", ")));
-        }
-    };
-    line(
-        "state accuracy of latents, fully observable views",
-        &[
-            ("trained poses", number("/vae/trained/full/accuracy"), 100.0, " %"),
-            ("unseen poses", number("/vae/unseen/full/accuracy"), 100.0, " %"),
-        ],
-    );
-    line(
-        "the same by name, where states that look the same count as wrong",
-        &[
-            ("trained poses", number("/vae/trained/full/raw"), 100.0, " %"),
-            ("of at most", number("/vae/trained/full/raw_ceiling"), 100.0, " %"),
-            ("unseen poses", number("/vae/unseen/full/raw"), 100.0, " %"),
-            ("of at most", number("/vae/unseen/full/raw_ceiling"), 100.0, " %"),
-        ],
-    );
-    line(
-        "state accuracy of probed samples, fully observable views",
-        &[
-            ("trained poses", number("/samples/trained/accuracy"), 100.0, " %"),
-            ("unseen poses", number("/samples/unseen/accuracy"), 100.0, " %"),
-        ],
-    );
-    line(
-        "the same, where every state that may come next counts as right",
-        &[
-            ("trained poses", number("/samples/trained/possible"), 100.0, " %"),
-            ("unseen poses", number("/samples/unseen/possible"), 100.0, " %"),
-        ],
-    );
-    line(
-        "PSNR of views",
-        &[
-            ("trained poses", number("/views/trained/psnr_db"), 1.0, " dB"),
-            ("unseen poses", number("/views/unseen/psnr_db"), 1.0, " dB"),
-        ],
-    );
-    line(
-        "bird's-eye PSNR",
-        &[
-            ("matching", number("/birds_eye/matching_db"), 1.0, " dB"),
-            ("un-matching", number("/birds_eye/unmatching_db"), 1.0, " dB"),
-            ("mean picture of all states", number("/birds_eye/mean_picture_db"), 1.0, " dB"),
-            ("inside the vehicles' pixels", number("/birds_eye/changed_db"), 1.0, " dB"),
-        ],
-    );
-    lines.join("\n")
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    /// A copy is whole and takes the place of what was there; onto itself, through a link too, it changes nothing.
+    /// A copy is whole and replaces the target; a copy onto itself, also through a link, changes nothing.
     #[test]
     fn a_file_survives_its_own_copy() {
         let folder = tempfile::tempdir().unwrap();

@@ -1,19 +1,20 @@
-//! The boxes that are probed, out of what a scenario says stands where in each of its states.
+//! Places that are probed, from the boxes of a scenario's states.
 
 use crate::TrainingError;
 use carff_dataset::{NamedBox, ScenarioInfo};
 use carff_decision::Place;
 use carff_messages::{MAX_PLACES, MAX_STATES};
 
-/// Every distinct box of the states, and every candidate, with the states in which it is taken. Boxes that no state
-/// moves tell nothing and are left out; where there are too many, so are those that are not dynamic.
+/// Places of a scenario: every distinct box of the states, and every candidate, with the states in which it is
+/// occupied. Boxes that are the same in all states are left out. Where there are too many places, boxes that are not
+/// dynamic are left out too.
 ///
-/// An error where states are too many, or where no box tells any of them apart: there would be nothing to probe.
+/// Too many states are an error, and so are states without any distinguishing box: there would be nothing to probe.
 pub fn places(scenario: &ScenarioInfo) -> Result<Vec<Place>, TrainingError> {
     let states = scenario.state_count();
     if states > MAX_STATES {
         return Err(TrainingError::Unfit(format!(
-            "the scenario has {states} states (branches x timestamps); at most {MAX_STATES} can be told apart"
+            "the scenario has {states} states (branches x timestamps); at most {MAX_STATES} are supported"
         )));
     }
     let of_states = scenario.states.iter().enumerate();
@@ -25,8 +26,8 @@ pub fn places(scenario: &ScenarioInfo) -> Result<Vec<Place>, TrainingError> {
     }
     match places.len() {
         0 => Err(TrainingError::Unfit(
-            "no box tells the scenario's states apart, so there is nothing to probe: `scenario.states[].boxes` must say \
-             where in each state what moves, comes or goes stands"
+            "no box distinguishes the scenario's states, so there is nothing to probe: `scenario.states[].boxes` must \
+             have the boxes of the dynamic objects of each state"
                 .into(),
         )),
         1..=MAX_PLACES => Ok(places),
@@ -36,7 +37,7 @@ pub fn places(scenario: &ScenarioInfo) -> Result<Vec<Place>, TrainingError> {
     }
 }
 
-/// The distinct places of some boxes, in their order, but for those that are taken in every state or in none.
+/// Distinct places of some boxes in their order, without those that are occupied in all states or in none.
 fn moved<'a>(boxes: impl Iterator<Item = (Option<usize>, &'a NamedBox)>, states: usize) -> Vec<Place> {
     let mut places: Vec<Place> = Vec::new();
     for (state, named) in boxes {
@@ -44,7 +45,7 @@ fn moved<'a>(boxes: impl Iterator<Item = (Option<usize>, &'a NamedBox)>, states:
         let near = |other: &Place| {
             let o = other.oriented_box;
             let distance: f64 = (0..3).map(|i| (o.center[i] - b.center[i]).powi(2)).sum();
-            // What is small moves by little: a hand's places lie closer than a car's.
+            // Small objects move by small distances: the places of a hand are closer than those of a car.
             let close = (0.2 * b.half_size.iter().map(|h| h * h).sum::<f64>().sqrt()).min(0.25);
             other.name == named.name && distance.sqrt() < close && (o.yaw - b.yaw).abs() < 0.1
         };
@@ -63,15 +64,15 @@ fn moved<'a>(boxes: impl Iterator<Item = (Option<usize>, &'a NamedBox)>, states:
 #[cfg(test)]
 mod tests {
     use super::*;
+    use carff_base::geometry::OrientedBox;
     use carff_dataset::StateInfo;
-    use carff_geometry::OrientedBox;
 
     fn named(name: &str, x_m: f64, dynamic: bool) -> NamedBox {
         let oriented_box = OrientedBox { center: [x_m, 0.0, 0.0], half_size: [2.0, 1.0, 1.0], yaw: 0.0 };
         NamedBox { name: name.into(), role: None, oriented_box, dynamic }
     }
 
-    /// `timestamps` states of two branches, in the first of which `boxes` stand.
+    /// A scenario of two branches of `timestamps` states; the boxes of the first branch move.
     fn scenario(timestamps: usize, boxes: impl Fn(usize) -> Vec<NamedBox>) -> ScenarioInfo {
         let state = |s: usize| {
             let (branch, timestamp) = (s / timestamps, s % timestamps);
@@ -92,7 +93,7 @@ mod tests {
         }
     }
 
-    /// A place is a box with the states in which it is taken; one that stands still tells nothing.
+    /// A place is a box with the states in which it is occupied; a static box is not a place.
     #[test]
     fn places_are_where_states_differ() {
         let found = places(&scenario(2, |t| vec![named("house", 5.0, false), named("truck", 3.0 * t as f64, true)]));
@@ -101,10 +102,10 @@ mod tests {
         assert_eq!(found, [truck([true, false, true, true]), truck([false, true, false, false])]);
     }
 
-    /// With more places than there can be, what is not dynamic is left out; what is still too much is refused, as are too
-    /// many states, each with the number.
+    /// With too many places, boxes that are not dynamic are left out. Still too many places, and too many states, are
+    /// errors with the number.
     #[test]
-    fn too_many_are_told() {
+    fn too_many_are_errors() {
         let both = |t: usize| vec![named("ego", 3.0 * t as f64, false), named("truck", 3.0 * t as f64, true)];
         assert_eq!(places(&scenario(24, both)).unwrap().len(), 48);
         let found = places(&scenario(32, |t| [both(t), vec![named("bus", 3.0 * t as f64, false)]].concat())).unwrap();
@@ -115,9 +116,9 @@ mod tests {
         assert!(told(&scenario(33, both)).contains("66 states"));
     }
 
-    /// Boxes that are the same in every state, or none, leave nothing to probe: the error names the key.
+    /// Without boxes, or with boxes that are the same in all states, the error names the key.
     #[test]
-    fn nothing_to_probe_is_told() {
+    fn nothing_to_probe_is_an_error() {
         for boxes in [vec![named("house", 5.0, true)], Vec::new()] {
             let told = places(&scenario(2, |_| boxes.clone())).unwrap_err().to_string();
             assert!(told.contains("`scenario.states[].boxes`"), "{told}");

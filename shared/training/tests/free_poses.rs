@@ -4,12 +4,7 @@
 
 use carff_dataset::{Dataset, Equivalence, Image, PoseRole, PoseSplit};
 use carff_scenes::{Extras, RenderOptions, Scenario};
-use carff_training::{
-    TrainingError,
-    config::TrainingConfig,
-    free, pipeline,
-    run::{Progress, Run},
-};
+use carff_training::{Phases, Progress, Run, Training, TrainingConfig, TrainingError, render_random_poses};
 use std::collections::BTreeMap;
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
@@ -73,17 +68,17 @@ impl Place {
         self.folder.path().join(name)
     }
 
-    /// Makes the set in the run folder `name`, until `stop_at` (stage, steps done), or to the end.
+    /// Makes the set in the run folder `name`, until `stop_at` (phase, steps done), or to the end.
     fn make(&self, name: &str, stop_at: Option<(&str, usize)>) -> Result<Option<PathBuf>, TrainingError> {
         let stop = AtomicBool::new(false);
         let on_progress = |progress: &Progress| {
-            if stop_at.is_some_and(|(stage, done)| progress.stage == stage && progress.done >= done) {
+            if stop_at.is_some_and(|(phase, done)| progress.phase == phase && progress.done >= done) {
                 stop.store(true, Ordering::Relaxed);
             }
         };
         std::fs::create_dir_all(self.at(name)).unwrap();
         let run = Run { dir: self.at(name), on_progress: &on_progress, stop: &stop };
-        free::set(&self.config, &self.at("set"), &run)
+        render_random_poses(&self.config, &self.at("set"), &run)
     }
 }
 
@@ -97,8 +92,8 @@ fn files(dir: &Path) -> BTreeMap<String, Vec<u8>> {
     all
 }
 
-/// Every state is shown from each drawn pose, at the encoder's size, about as it looks from there; from some poses the second
-/// step's branches look the same, behind the wall, from others they do not.
+/// Every state is shown from each drawn pose, at the encoder's size, about as it looks from there; from some poses the
+/// second step's branches look the same, behind the wall, from others they do not.
 #[test]
 fn free_poses_show_what_is_there() {
     let mut place = Place::new();
@@ -126,8 +121,8 @@ fn free_poses_show_what_is_there() {
     assert!((1..24).contains(&hidden), "{hidden} of 24");
 }
 
-/// States whose pictures are the same from all trained poses are shown alike, to the last bit: nothing that the field adds
-/// tells them apart.
+/// States whose pictures are the same from all trained poses are shown alike, to the last bit: nothing that the field
+/// adds tells them apart.
 #[test]
 fn states_that_look_the_same_stay_the_same() {
     let place = Place::new();
@@ -160,13 +155,15 @@ fn a_set_without_boxes_is_refused_at_once() {
     assert_eq!(std::fs::read_dir(place.at("run")).unwrap().count(), 0);
     let stop = AtomicBool::new(false);
     let run = Run { dir: place.at("run"), on_progress: &|_| {}, stop: &stop };
-    let out = place.at("out");
-    let trained = pipeline::train(&place.config, &place.at("set"), None, &out, pipeline::Stage::All, Device::Cpu, &run);
-    assert!(trained.unwrap_err().to_string().contains("`scenario.states[].boxes`"));
+    let (dataset, out) = (place.at("set"), place.at("out"));
+    let training =
+        Training { config: &place.config, dataset: &dataset, random_poses: None, out: &out, device: Device::Cpu };
+    assert!(training.run(Phases::All, &run).unwrap_err().to_string().contains("`scenario.states[].boxes`"));
     assert!(!out.exists());
 }
 
-/// What is made does not depend on the pictures of unseen poses: a result on these is one on what nothing was learnt from.
+/// What is made does not depend on the pictures of unseen poses: a result on these is one on what nothing was learnt
+/// from.
 #[test]
 fn unseen_poses_stay_unseen() {
     let place = Place::new();
@@ -184,13 +181,13 @@ fn unseen_poses_stay_unseen() {
     assert!(files(&place.make("after", None).unwrap().unwrap()) == before);
 }
 
-/// Interrupted while its field trains and while its pictures are made, the set ends with the same bytes; a finished one is
-/// not made again, and a configuration that wants none gets none.
+/// Interrupted while its field trains and while its pictures are made, the set ends with the same bytes; a finished one
+/// is not made again, and a configuration that wants none gets none.
 #[test]
 fn making_free_poses_resumes() {
     let mut place = Place::new();
     let straight = place.make("straight", None).unwrap().unwrap();
-    for stop_at in [(free::STAGE, 80), ("pictures", 5)] {
+    for stop_at in [("free", 80), ("images", 5)] {
         assert!(matches!(place.make("halting", Some(stop_at)), Err(TrainingError::Stopped)), "{stop_at:?}");
     }
     let halting = place.make("halting", None).unwrap().unwrap();

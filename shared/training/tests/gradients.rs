@@ -3,10 +3,10 @@
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
 use carff_checkpoint::shapes::MixtureConfig;
-use carff_models::mixture::MixtureNet;
+use carff_networks::mixture::MixtureNet;
 use carff_training::{
-    config::VaeTraining,
-    vae::{contrastive, cross_entropy, kl_divergence, reconstruction_error, reparameterised},
+    VaeTraining,
+    losses::{contrastive, cross_entropy, kl_divergence, reconstruction_error, reparameterised},
 };
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use tch::{Device, Kind, Tensor, nn::VarStore, no_grad};
@@ -77,8 +77,8 @@ fn reconstruction_through_the_draw() {
     }
 }
 
-/// The mixture's negative log-likelihood: by each number of the targets; and along the gradients of the inputs and of each of
-/// the network's weights, as there are kinks on the way to each number of these.
+/// The mixture's negative log-likelihood: by each number of the targets; and along the gradients of the inputs and of
+/// each of the network's weights, as there are kinks on the way to each number of these.
 #[test]
 fn likelihood() {
     let _alone = seeded(3);

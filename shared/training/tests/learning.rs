@@ -2,16 +2,9 @@
 
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
-use carff_evaluation::Models;
+use carff_evaluation::{CheckpointFigures, Models};
 use carff_scenes::{Extras, Scenario};
-use carff_training::{
-    TrainingError,
-    config::TrainingConfig,
-    features::FEATURES,
-    pipeline::{self, Stage},
-    run::{Progress, Run},
-};
-use serde_json::Value;
+use carff_training::{FEATURES, Phases, Progress, Run, Training, TrainingConfig, TrainingError};
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -100,23 +93,29 @@ impl Place {
         self.folder.path().join(name)
     }
 
-    /// Trains all stages, alone in this process, until `stop_at` (stage, steps done), or to the end.
-    fn train(&self, name: &str, stop_at: Option<(&str, usize)>) -> Result<Value, TrainingError> {
-        self.train_stage(name, Stage::All, stop_at)
+    /// Trains all phases, without another training in this process, until `stop_at` (phase, steps done), or to the end.
+    fn train(&self, name: &str, stop_at: Option<(&str, usize)>) -> Result<CheckpointFigures, TrainingError> {
+        self.train_phases(name, Phases::All, stop_at)
     }
 
-    fn train_stage(&self, name: &str, stage: Stage, stop_at: Option<(&str, usize)>) -> Result<Value, TrainingError> {
+    fn train_phases(
+        &self,
+        name: &str,
+        phases: Phases,
+        stop_at: Option<(&str, usize)>,
+    ) -> Result<CheckpointFigures, TrainingError> {
         let _alone = alone();
         let stop = AtomicBool::new(false);
         let on_progress = |progress: &Progress| {
-            if stop_at.is_some_and(|(stage, done)| progress.stage == stage && progress.done >= done) {
+            if stop_at.is_some_and(|(phase, done)| progress.phase == phase && progress.done >= done) {
                 stop.store(true, Ordering::Relaxed);
             }
         };
         let dir = self.out(&format!("{name}-run"));
         std::fs::create_dir_all(&dir).unwrap();
         let run = Run { dir, on_progress: &on_progress, stop: &stop };
-        pipeline::train(&self.config, &self.out("set"), None, &self.out(name), stage, tch::Device::Cpu, &run)
+        let (dataset, out, device) = (self.out("set"), self.out(name), tch::Device::Cpu);
+        Training { config: &self.config, dataset: &dataset, random_poses: None, out: &out, device }.run(phases, &run)
     }
 }
 
@@ -125,16 +124,16 @@ impl Place {
 #[test]
 fn training_learns() {
     let place = Place::new();
-    let metrics = place.train("learnt", None).unwrap();
-    let figure =
-        |path: &str| metrics.pointer(path).and_then(Value::as_f64).unwrap_or_else(|| panic!("{path}: {metrics:#}"));
+    let figures = place.train("learnt", None).unwrap();
     // Chance is 25 %.
-    assert!(figure("/vae/trained/full/accuracy") > 0.95, "{metrics:#}");
-    assert!(figure("/samples/trained/accuracy") > 0.8, "{metrics:#}");
-    assert!(figure("/birds_eye/matching_db") > figure("/birds_eye/unmatching_db") + 2.0, "{metrics:#}");
-    for kind in ["clear", "hazard"] {
-        let cell = |key: &str| figure(&format!("/planning/all_views/calibrated/10/{kind}/{key}"));
-        assert!(cell("trials") >= 20.0 && cell("success") >= 0.9 * cell("trials"), "{kind}: {metrics:#}");
+    assert!(figures.vae.unwrap().trained.full.accuracy > 0.95, "{figures:#?}");
+    assert!(figures.samples.unwrap().trained.accuracy > 0.8, "{figures:#?}");
+    let birds_eye = figures.birds_eye.as_ref().unwrap();
+    assert!(birds_eye.matching_db > birds_eye.unmatching_db + 2.0, "{birds_eye:#?}");
+    let planning = figures.planning.unwrap();
+    let counts = planning.all_views.calibrated[&10];
+    for count in [counts.clear, counts.hazard].map(Option::unwrap) {
+        assert!(count.trials >= 20 && count.rate().unwrap() >= 0.9, "{planning:#?}");
     }
     let _alone = alone();
     assert_eq!(Models::load(&place.out("learnt")).unwrap().probe.states().len(), 4);
@@ -146,17 +145,17 @@ fn the_decoder_learns_alone() {
     let mut place = Place::new();
     place.config.vae.epochs = 12;
     place.config.vae.learning_rate = 2e-3;
-    let before = place.train_stage("together", Stage::Vae, None).unwrap();
+    let before = place.train_phases("together", Phases::Vae, None).unwrap();
     place.config.vae.decoder_epochs = 100;
-    let after = place.train_stage("alone", Stage::Vae, None).unwrap();
+    let after = place.train_phases("alone", Phases::Vae, None).unwrap();
     let read = |name: &str| std::fs::read(place.out(name).join("encoder.safetensors")).unwrap();
     assert!(read("together") == read("alone"), "the encoder has changed");
-    let psnr_db = |metrics: &Value| metrics.pointer("/vae/changed_pixels_psnr_db").and_then(Value::as_f64).unwrap();
-    assert!(psnr_db(&after) > psnr_db(&before) + 0.5, "{before:#} {after:#}");
+    let psnr_db = |figures: &CheckpointFigures| figures.vae.unwrap().changed_pixels_psnr_db.unwrap();
+    assert!(psnr_db(&after) > psnr_db(&before) + 0.5, "{before:#?} {after:#?}");
 }
 
-/// A training that is stopped in each of its three stages, while features are computed, and while the decoder learns alone,
-/// and each time goes on, ends with the same bytes as one that is not.
+/// A training that is stopped in each of its three stages, while features are computed, and while the decoder learns
+/// alone, and each time goes on, ends with the same bytes as one that is not.
 #[test]
 fn training_resumes() {
     let mut place = Place::new();

@@ -5,12 +5,7 @@
 
 use carff_dataset::{Dataset, ImportOptions, import};
 use carff_scenes::{Extras, Scenario};
-use carff_training::{
-    TrainingError,
-    config::TrainingConfig,
-    pipeline::{self, Stage},
-    run::{Progress, Run},
-};
+use carff_training::{Phases, Progress, Run, Training, TrainingConfig, TrainingError};
 use std::ops::ControlFlow;
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
@@ -96,17 +91,20 @@ fn an_imported_set_trains_the_field() {
     std::fs::write(path("training.toml"), TRAINING).unwrap();
     let config = TrainingConfig::load(&path("training.toml")).unwrap();
     let (stop, on_progress) = (AtomicBool::new(false), |_: &Progress| {});
-    let train = |stage: Stage| {
+    let (dataset, out) = (path("set"), path("out"));
+    let training =
+        Training { config: &config, dataset: &dataset, random_poses: None, out: &out, device: tch::Device::Cpu };
+    let train = |phases: Phases| {
         let run = Run { dir: folder.path().to_owned(), on_progress: &on_progress, stop: &stop };
-        pipeline::train(&config, &path("set"), None, &path("out"), stage, tch::Device::Cpu, &run)
+        training.run(phases, &run)
     };
-    for stage in [Stage::Vae, Stage::Mdn] {
-        let error = train(stage).unwrap_err();
+    for phases in [Phases::Vae, Phases::Mixture] {
+        let error = train(phases).unwrap_err();
         assert!(matches!(error, TrainingError::Unfit(_)) && error.to_string().contains("--stage nerf"), "{error}");
     }
-    let metrics = train(Stage::Nerf).unwrap();
-    let figure = |path: &str| metrics.pointer(path).and_then(serde_json::Value::as_f64).unwrap();
-    assert_eq!((figure("/views/trained/poses"), figure("/views/unseen/poses")), (24.0, 3.0));
+    let figures = train(Phases::Field).unwrap();
+    let views = figures.views.unwrap();
+    assert_eq!((views.trained.poses, views.unseen.poses), (24, 3));
 
     let images = Dataset::open(&path("set")).unwrap().load_all_images().unwrap();
     let mut of_mean = 0.0;
@@ -117,15 +115,15 @@ fn an_imported_set_trains_the_field() {
         let flat = carff_dataset::Image::filled(image.width_px, image.height_px, mean);
         of_mean += flat.psnr_db(image).unwrap() / images.len() as f64;
     }
-    let unseen = figure("/views/unseen/psnr_db");
+    let unseen = views.unseen.psnr_db.unwrap();
     assert!(unseen > of_mean + 4.0, "{unseen} dB, mean colours {of_mean} dB");
     assert!(path("views.png").is_file() && path("out/field.safetensors").is_file());
     // A finished training is not done again.
-    assert_eq!(train(Stage::All).unwrap(), metrics);
+    assert_eq!(train(Phases::All).unwrap(), figures);
 }
 
-/// Every shipped training file is valid, names its scenario (but for the one of sets from elsewhere, which have none), and
-/// writes to the checkpoint of its own name.
+/// Every shipped training file is valid, names its scenario (but for the one of sets from elsewhere, which have none),
+/// and writes to the checkpoint of its own name.
 #[test]
 fn every_shipped_training_file_is_valid() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).ancestors().nth(2).unwrap();

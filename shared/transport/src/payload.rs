@@ -1,6 +1,7 @@
 //! The two forms of a message in shared memory: by itself, or as the user header of an image.
 
 use crate::{Publisher, SendError, Service};
+use carff_messages::check::equals;
 use carff_messages::{ImageMeta, Invalid, Message};
 use iceoryx2::port::ReceiveError;
 use iceoryx2::port::subscriber::Subscriber;
@@ -52,15 +53,15 @@ pub trait Payload: Debug + 'static {
     #[doc(hidden)]
     fn bytes(sample: &Sample<Service, Self::Body, Self::UserHeader>) -> &[u8];
 
-    /// Stamps, validates and sends a message, with a copy of the bytes of the image that it describes.
+    /// Sends a copy of a message and of the image that it describes, without stamp or validation.
     #[doc(hidden)]
-    fn send(publisher: &mut Publisher<Self>, message: Self::Message, bytes: &[u8]) -> Result<(), SendError>
+    fn forward(publisher: &mut Publisher<Self>, message: Self::Message, bytes: &[u8]) -> Result<(), SendError>
     where
         Self: Sized;
 
-    /// Checks that the number of bytes matches the description.
+    /// Checks that a valid message describes an image of so many bytes; 0 for a message by itself.
     #[doc(hidden)]
-    fn check_size(sample: &Sample<Service, Self::Body, Self::UserHeader>) -> Result<(), Invalid>;
+    fn check_size(message: &Self::Message, bytes: usize) -> Result<(), Invalid>;
 }
 
 #[doc(hidden)]
@@ -103,12 +104,12 @@ impl<M: Message> Payload for M {
         &[]
     }
 
-    fn send(publisher: &mut Publisher<Self>, message: M, _bytes: &[u8]) -> Result<(), SendError> {
-        publisher.send(message)
+    fn forward(publisher: &mut Publisher<Self>, message: M, _bytes: &[u8]) -> Result<(), SendError> {
+        publisher.send_unchecked(message)
     }
 
-    fn check_size(_sample: &Sample<Service, M, ()>) -> Result<(), Invalid> {
-        Ok(())
+    fn check_size(_message: &M, bytes: usize) -> Result<(), Invalid> {
+        equals("image bytes", bytes as u64, 0)
     }
 }
 
@@ -143,15 +144,11 @@ impl<M: ImageMeta> Payload for Image<M> {
         sample.payload()
     }
 
-    fn send(publisher: &mut Publisher<Self>, message: M, bytes: &[u8]) -> Result<(), SendError> {
-        publisher.send_bytes(bytes, message)
+    fn forward(publisher: &mut Publisher<Self>, message: M, bytes: &[u8]) -> Result<(), SendError> {
+        publisher.send_image_unchecked(publisher.copy(bytes)?, message)
     }
 
-    fn check_size(sample: &Sample<Service, [u8], M>) -> Result<(), Invalid> {
-        let (found, expected) = (sample.payload().len(), sample.user_header().image_bytes());
-        if found == expected {
-            return Ok(());
-        }
-        Err(Invalid::Mismatch { field: "image bytes", found: found as u64, expected: expected as u64 })
+    fn check_size(message: &M, bytes: usize) -> Result<(), Invalid> {
+        equals("image bytes", bytes as u64, message.image_bytes() as u64)
     }
 }

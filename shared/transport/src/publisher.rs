@@ -2,7 +2,7 @@
 
 use crate::payload::{Image, Payload};
 use crate::{Counters, Run, SendError, Service, Topic, monotonic_now_ns};
-use carff_messages::{Header, ImageMeta, Message, SCHEMA_VERSION};
+use carff_messages::{Header, ImageMeta, Invalid, Message, SCHEMA_VERSION};
 use iceoryx2::port::notifier::Notifier;
 use iceoryx2::sample_mut::SampleMut;
 use ndarray::ArrayViewMut3;
@@ -17,7 +17,7 @@ pub struct Publisher<P: Payload> {
     port: iceoryx2::port::publisher::Publisher<Service, P::Body, P::UserHeader>,
     notifier: Notifier<Service>,
     counters: Arc<Counters>,
-    max_bytes: usize,
+    pub(crate) max_bytes: usize,
 }
 
 impl<P: Payload> Publisher<P> {
@@ -33,13 +33,13 @@ impl<P: Payload> Publisher<P> {
     }
 
     /// Stamps the header and validates the message.
-    fn stamp(&self, message: &mut P::Message) -> Result<(), SendError> {
+    pub(crate) fn stamp(&self, message: &mut P::Message) -> Result<(), SendError> {
         let header: &mut Header = message.header_mut();
         header.schema_version = SCHEMA_VERSION;
         header.run_id = self.run_id;
         header.sequence = self.sequence;
         header.publish_time_ns = monotonic_now_ns();
-        message.validate().map_err(|source| SendError::Invalid { topic: self.topic.to_owned(), source })
+        message.validate().map_err(|source| self.invalid(source))
     }
 
     /// Counts the message and wakes receivers. A listener that cannot be woken (dead, or stopped with a full socket)
@@ -50,6 +50,10 @@ impl<P: Payload> Publisher<P> {
         if let Err(error) = self.notifier.notify() {
             tracing::debug!(topic = self.topic, %error, "a listener was not woken");
         }
+    }
+
+    pub(crate) fn invalid(&self, source: Invalid) -> SendError {
+        SendError::Invalid { topic: self.topic.to_owned(), source }
     }
 
     pub(crate) fn of_another_type(&self) -> SendError {
@@ -115,17 +119,18 @@ impl<M: ImageMeta> Publisher<Image<M>> {
         self.send_image_unchecked(loan, meta)
     }
 
-    /// Sends an image from other memory: its bytes are copied once, into memory that is not zeroed first.
-    pub fn send_bytes(&mut self, bytes: &[u8], mut meta: M) -> Result<(), SendError> {
-        self.stamp(&mut meta)?;
+    /// Returns a copy of an image in such memory, which is not cleared first.
+    pub(crate) fn copy(&self, bytes: &[u8]) -> Result<ImageLoan<M>, SendError> {
         if bytes.len() > self.max_bytes {
             return Err(self.size(bytes.len(), self.max_bytes));
         }
-        if bytes.len() != meta.image_bytes() {
-            return Err(self.size(bytes.len(), meta.image_bytes()));
-        }
         let sample = self.port.loan_slice_uninit(bytes.len()).map_err(|e| self.failed(&e))?;
-        self.send_image_unchecked(ImageLoan { sample: sample.write_from_slice(bytes) }, meta)
+        Ok(ImageLoan { sample: sample.write_from_slice(bytes) })
+    }
+
+    /// Stamps the header, validates, and sends a copy of an image.
+    pub fn send_bytes(&mut self, bytes: &[u8], meta: M) -> Result<(), SendError> {
+        self.send_image(self.copy(bytes)?, meta)
     }
 
     /// Sends without stamping or validation: for replay, and for tests that inject faults.

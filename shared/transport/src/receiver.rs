@@ -3,7 +3,8 @@
 use crate::payload::{Image, Payload};
 use crate::wait::Input;
 use crate::{Counters, ReceiveError, Run, Service, Topic, descriptors};
-use carff_messages::{ImageMeta, Invalid, Message};
+use carff_messages::check::equals;
+use carff_messages::{ImageMeta, Message};
 use iceoryx2::port::listener::Listener;
 use iceoryx2::port::subscriber::Subscriber;
 use ndarray::ArrayView3;
@@ -47,7 +48,8 @@ impl<P: Payload> Sample<P> {
 }
 
 impl<M: ImageMeta> Sample<Image<M>> {
-    /// Returns the image as (height, width, channel), borrowed from shared memory.
+    /// The image as (height, width, channel), borrowed from shared memory.
+    #[allow(clippy::missing_panics_doc, reason = "an empty view needs no bytes")]
     pub fn image(&self) -> ArrayView3<'_, u8> {
         let [width_px, height_px] = self.size_px().map(|side| side as usize);
         // A received image has as many bytes as its description states; the empty view is never returned.
@@ -109,14 +111,9 @@ impl<P: Payload> Receiver<P> {
     /// Counts the message and returns whether it is valid.
     fn accepts(&self, sample: &iceoryx2::sample::Sample<Service, P::Body, P::UserHeader>) -> bool {
         let message = P::message(sample);
-        let found = message.header().run_id;
-        let same_run = if found == self.run_id {
-            Ok(())
-        } else {
-            Err(Invalid::Mismatch { field: "header.run_id", found, expected: self.run_id })
-        };
-        // The size in the description is only meaningful if the message is valid.
-        match message.validate().and(same_run).and_then(|()| P::check_size(sample)) {
+        let same_run = equals("header.run_id", message.header().run_id, self.run_id);
+        // The size that a message describes only means something once the message is valid.
+        match message.validate().and(same_run).and_then(|()| P::check_size(message, P::bytes(sample).len())) {
             Ok(()) => {
                 self.counters.count_received();
                 true

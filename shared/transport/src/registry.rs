@@ -3,7 +3,7 @@
 use crate::payload::Payload;
 use crate::{Input, Node, OpenError, Ports, Publisher, ReceiveError, Receiver, Sample, SendError, Topic, topics};
 use carff_messages::Stage;
-use carff_messages::forms::{AnyMessage, DynMessage, FormError, Readable, read, schema};
+use carff_messages::forms::{AnyMessage, FormError, OwnedMessage, Readable, read, schema};
 use serde_json::Value;
 use std::cmp::Ordering;
 use std::fmt;
@@ -22,8 +22,8 @@ pub trait AnyTopic: fmt::Debug + Sync {
     /// Returns name and JSON Schema of its message's form.
     fn schema(&self) -> (&'static str, Value);
 
-    /// Reads a message from the JSON of its form.
-    fn read(&self, json: &[u8]) -> Result<Box<dyn DynMessage>, FormError>;
+    /// Reads a message from the JSON of its form, and takes the bytes of its image, which must have the described size.
+    fn read(&self, json: &[u8], bytes: Vec<u8>) -> Result<OwnedMessage, FormError>;
 
     /// Returns the current publishers and subscribers.
     fn ports(&self, node: &Node) -> Result<Ports, OpenError>;
@@ -44,8 +44,14 @@ pub trait AnyTopic: fmt::Debug + Sync {
 
 /// A publisher for a topic of any payload.
 pub trait AnyPublisher: fmt::Debug + Send {
-    /// Stamps, validates and sends a copy of a message. A message of another type is an error.
+    /// Size of the largest image that it can send, bytes.
+    fn max_bytes(&self) -> usize;
+
+    /// Stamps, validates and sends a copy of a message. A message of another type than the topic's is an error.
     fn send(&mut self, message: AnyMessage<'_>) -> Result<(), SendError>;
+
+    /// Sends a copy of a message unchanged, sequence number included, without validation.
+    fn forward(&mut self, message: AnyMessage<'_>) -> Result<(), SendError>;
 }
 
 /// A receiver for a topic of any payload.
@@ -79,8 +85,10 @@ where
         (P::Message::SCHEMA, schema::<<P::Message as Readable>::Form>())
     }
 
-    fn read(&self, json: &[u8]) -> Result<Box<dyn DynMessage>, FormError> {
-        read::<P::Message>(json)
+    fn read(&self, json: &[u8], bytes: Vec<u8>) -> Result<OwnedMessage, FormError> {
+        let message: P::Message = read(json)?;
+        P::check_size(&message, bytes.len())?;
+        Ok(OwnedMessage::new(Box::new(message), bytes))
     }
 
     fn ports(&self, node: &Node) -> Result<Ports, OpenError> {
@@ -108,9 +116,20 @@ impl<P: Payload> AnyPublisher for Publisher<P>
 where
     P::Message: Readable,
 {
+    fn max_bytes(&self) -> usize {
+        self.max_bytes
+    }
+
     fn send(&mut self, message: AnyMessage<'_>) -> Result<(), SendError> {
-        let typed = message.get::<P::Message>().ok_or_else(|| self.of_another_type())?;
-        P::send(self, *typed, message.bytes())
+        let mut typed: P::Message = *message.get().ok_or_else(|| self.of_another_type())?;
+        self.stamp(&mut typed)?;
+        P::check_size(&typed, message.bytes().len()).map_err(|source| self.invalid(source))?;
+        P::forward(self, typed, message.bytes())
+    }
+
+    fn forward(&mut self, message: AnyMessage<'_>) -> Result<(), SendError> {
+        let typed = message.get().ok_or_else(|| self.of_another_type())?;
+        P::forward(self, *typed, message.bytes())
     }
 }
 
@@ -146,7 +165,7 @@ pub struct TopicId {
 
 /// Error for an unknown topic name.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("there is no topic `{name}`{}. All: {}", carff_nearest::hint(name, TopicId::all().map(TopicId::name)), all_names())]
+#[error("there is no topic `{name}`{}. All: {}", carff_base::names::hint(name, TopicId::all().map(TopicId::name)), all_names())]
 pub struct UnknownTopic {
     /// The unknown name.
     pub name: String,

@@ -17,7 +17,7 @@ use carff_messages::{
 use carff_observe::RunRecord;
 use carff_recording::{About, Reader as RecordingReader, Writer};
 use carff_scenes::Scenario;
-use carff_training::config::TrainingConfig;
+use carff_training::TrainingConfig;
 use carff_transport::TopicId;
 use raw::patch;
 use std::fs;

@@ -2,7 +2,7 @@
 
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
-use carff_random::{Key, stream};
+use carff_base::random::{Key, stream};
 use carff_readers::{READERS, Reader};
 use rand::Rng;
 

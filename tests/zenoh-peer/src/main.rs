@@ -5,7 +5,7 @@
 //! `end`. As with all that is compared, the time is from before the sender asks for memory to after the receiver has
 //! read the last byte, and the receiver acknowledges by a pipe, which is not part of the time.
 //!
-//! The protocol is that of tests/bench/src/ipc, written again here: a library for both would tie this package's lock file
+//! The protocol is that of launch/bench/src/ipc, written again here: a library for both would tie this package's lock file
 //! to the main one, which it is apart from so that zenoh's crates are nobody's but its own.
 //!
 //! The two processes speak by a Unix socket in the folder and by shared memory; neither looks for others nor listens

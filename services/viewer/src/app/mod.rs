@@ -22,9 +22,9 @@ use crate::input::{Album, Input};
 use crate::live::LiveFeed;
 use crate::render::{Drawn, Job, Pace, RenderWorker, View};
 use crate::session::{Found, Scene, Selection, Session};
+use carff_base::geometry::PinholeCamera;
 use carff_dataset::{Image, Observability};
 use carff_field::LATENT_DIM;
-use carff_geometry::PinholeCamera;
 use eframe::egui::{self, CentralPanel, Context, SidePanel, ThemePreference, TopBottomPanel, ViewportCommand};
 use std::collections::VecDeque;
 use std::path::{Path, PathBuf};
@@ -212,7 +212,8 @@ impl Viewer {
         let wake = waker.clone();
         let places = session.models().probe.layout().places();
         let other_checkpoint = live.as_ref().and_then(|live| other_checkpoint(live, &session));
-        let middle_m = carff_metrics::mean(&places.iter().map(|p| p.oriented_box.center[2]).collect::<Vec<_>>());
+        let middle_m =
+            carff_base::statistics::mean(&places.iter().map(|p| p.oriented_box.center[2]).collect::<Vec<_>>());
         Ok(Self {
             camera: OrbitCamera::over_corner(bounds_m),
             choice: Choice { branch: 0, timestamp: 0, view: 0, shows: None },

@@ -2,7 +2,7 @@
 
 use super::{Command, Viewer, theme};
 use crate::camera::{FOV_DEG, edges, project_segment};
-use carff_geometry::PinholeCamera;
+use carff_base::geometry::PinholeCamera;
 use eframe::egui::{
     Align2, Button, Color32, DragValue, FontId, Painter, PointerButton, Rect, Response, Sense, Slider, Stroke,
     TextStyle, Ui, UiBuilder, pos2, vec2,

@@ -1,6 +1,6 @@
 //! Traversal of the occupancy grid by packets of eight rays: the positions of samples. The inner loop of marching.
 
-use carff_geometry::Ray;
+use carff_base::geometry::Ray;
 
 use super::math::fma;
 use crate::space::contraction::Contraction;

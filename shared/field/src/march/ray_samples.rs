@@ -1,6 +1,6 @@
 //! Samples along rays as lists, for measurements and parity tests.
 
-use carff_geometry::Ray;
+use carff_base::geometry::Ray;
 
 use super::samples::{March, MarchScratch, NO_RAY, RayLimits, Samples};
 use crate::config::LATENT_DIM;

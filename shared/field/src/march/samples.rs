@@ -2,7 +2,7 @@
 
 use std::ops::Range;
 
-use carff_geometry::Ray;
+use carff_base::geometry::Ray;
 
 use crate::kernels::block::{BlockBuffer, BlocksMut, LANES};
 use crate::kernels::dispatch;

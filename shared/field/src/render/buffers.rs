@@ -1,6 +1,6 @@
 //! Rendered images, and what rendering reuses from image to image.
 
-use carff_geometry::Ray;
+use carff_base::geometry::Ray;
 
 use crate::pool::Pool;
 
@@ -8,7 +8,7 @@ use crate::pool::Pool;
 ///
 /// ```
 /// use carff_field::{Field, FieldConfig, RenderBuffer, RenderOptions};
-/// use carff_geometry::PinholeCamera;
+/// use carff_base::geometry::PinholeCamera;
 /// let config = FieldConfig { log2_table_size: 10, occupancy_resolution: 16, ..FieldConfig::default() };
 /// let field = Field::new(config, 7)?;
 /// let camera = PinholeCamera::look_at([0.0, -20.0, 9.0], [0.0, 0.0, 1.0], [0.0, 0.0, 1.0], 16, 12, 60.0);

@@ -1,6 +1,6 @@
 //! From marched samples to pixels.
 
-use carff_geometry::Ray;
+use carff_base::geometry::Ray;
 
 use super::buffers::PixelsMut;
 use crate::config::{LATENT_DIM, RenderOptions};

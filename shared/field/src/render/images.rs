@@ -2,7 +2,7 @@
 
 use std::cell::RefCell;
 
-use carff_geometry::{PinholeCamera, Ray};
+use carff_base::geometry::{PinholeCamera, Ray};
 
 use super::buffers::{HypothesisBuffer, PixelsMut, RayPixels, RenderBuffer};
 use super::compositor::Worker;

@@ -1,6 +1,6 @@
 //! Batches of rays, and the report of a training step.
 
-use carff_geometry::Ray;
+use carff_base::geometry::Ray;
 
 use crate::config::LATENT_DIM;
 

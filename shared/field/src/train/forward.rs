@@ -6,7 +6,7 @@ use crate::kernels::math::spherical_harmonics;
 use crate::march::samples::Samples;
 use crate::model::field::{Field, Folded, RGB_ROWS};
 use crate::model::network::{GROUP, Input};
-use carff_geometry::Ray;
+use carff_base::geometry::Ray;
 
 impl Shard {
     /// Computes the background's colour for each ray.

@@ -1,6 +1,6 @@
 //! Batches of rays drawn from posed images of several states, with more rays through pixels that differ among states.
 
-use carff_geometry::PinholeCamera;
+use carff_base::geometry::PinholeCamera;
 
 use super::batch::RayBatch;
 use crate::config::LATENT_DIM;
@@ -45,7 +45,7 @@ pub fn changed_pixels(images: &[&[u8]], threshold: u8) -> Vec<u32> {
 ///
 /// ```
 /// use carff_field::{RAYS_PER_GROUP, RayBatch, RaySampler, TrainingView};
-/// use carff_geometry::PinholeCamera;
+/// use carff_base::geometry::PinholeCamera;
 /// let camera = PinholeCamera::look_at([0.0, -5.0, 1.0], [0.0; 3], [0.0, 0.0, 1.0], 4, 4, 60.0);
 /// let view = TrainingView { camera, rgb: vec![255; 4 * 4 * 3], changed: Vec::new() };
 /// let mut sampler = RaySampler::new(vec![view], 0.5, 1);

@@ -2,7 +2,7 @@
 
 use std::ops::Range;
 
-use carff_geometry::Ray;
+use carff_base::geometry::Ray;
 
 use super::batch::RayBatch;
 use crate::config::{LATENT_DIM, TrainerConfig};

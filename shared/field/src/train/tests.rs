@@ -1,6 +1,6 @@
 //! Contracts of the trainer.
 
-use carff_geometry::Ray;
+use carff_base::geometry::Ray;
 
 use crate::kernels::math::{hash, sigmoid, unit};
 use crate::model::network::Dense;

@@ -22,7 +22,7 @@ type AdamPiece<'a> = (&'a mut [f32], [&'a mut [f32]; 2], Vec<&'a mut [f32]>);
 ///
 /// ```
 /// use carff_field::{Field, FieldConfig, FieldTrainer, RayBatch, TrainerConfig};
-/// use carff_geometry::Ray;
+/// use carff_base::geometry::Ray;
 /// let config = FieldConfig { log2_table_size: 10, occupancy_resolution: 16, ..FieldConfig::default() };
 /// let trainer_config = TrainerConfig { threads: 1, ..TrainerConfig::default() };
 /// let mut trainer = FieldTrainer::new(Field::new(config, 1)?, trainer_config)?;

@@ -44,8 +44,8 @@ readable! {
 }
 
 /// Reads a message from the JSON of its form.
-pub fn read<M: Readable>(json: &[u8]) -> Result<Box<dyn DynMessage>, FormError> {
-    Ok(Box::new(M::of_form(&serde_json::from_slice(json)?)?))
+pub fn read<M: Readable>(json: &[u8]) -> Result<M, FormError> {
+    M::of_form(&serde_json::from_slice(json)?)
 }
 
 /// A [`Readable`] message of any type.

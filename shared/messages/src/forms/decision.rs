@@ -43,7 +43,7 @@ impl From<&Action> for ActionForm {
             sample_count: action.sample_count,
             confidence: action.confidence,
             hazard_probability: action.hazard_probability,
-            is_decision: action.is_decision == 1,
+            is_decision: action.is_decision(),
             valid_until_ns: action.valid_until_ns,
             based_on_frame: (action.based_on_frame != u64::MAX).then_some(action.based_on_frame),
             latency_ns: action.latency_ns,

@@ -67,14 +67,14 @@ impl From<&FrameMeta> for FrameForm {
             height_px: meta.height_px,
             intrinsics: meta.intrinsics,
             world_from_camera: meta.world_from_camera.to_vec(),
-            dataset_view: (view.known == 1).then(|| DatasetViewForm {
+            dataset_view: view.is_known().then(|| DatasetViewForm {
                 view: index(view.view),
                 branch: index(view.branch),
                 timestamp: index(view.timestamp),
                 drive: index(view.drive),
                 frame_in_drive: index(view.frame_in_drive),
                 observability: observability_name(view.observability),
-                last_of_timestamp: view.last_of_timestamp == 1,
+                last_of_timestamp: view.is_last_of_timestamp(),
             }),
         }
     }

@@ -1,0 +1,180 @@
+//! Encoder and forecaster, one frame at a time, as their stages run them.
+
+use crate::OutputArgs;
+use crate::report::{Report, number, table};
+use crate::stats::{Contender, Ratio, Times, in_turns, timed};
+use anyhow::Context;
+use carff_checkpoint::{
+    Manifest,
+    shapes::{BackboneConfig, BackboneKind, EncoderConfig},
+};
+use carff_decision::Sampling;
+use carff_messages::Gaussian;
+use carff_networks::{
+    borrow,
+    encoder::{Encoder, gaussians, pictures_from_bytes},
+};
+use ndarray::ArrayView3;
+use std::path::PathBuf;
+use tch::{Device, Kind, nn::VarStore};
+
+/// Side of the measured picture, pixels.
+const SIDE_PX: usize = 128;
+/// Latents drawn from a forecast.
+const SAMPLES: usize = 10;
+
+/// Encoder and forecaster, one frame at a time.
+#[derive(Clone, Debug, clap::Args)]
+pub struct EncoderArgs {
+    /// Checkpoint folder.
+    #[arg(long, default_value = "configs/checkpoints/approaching-intersection")]
+    checkpoint: PathBuf,
+    /// Leave out the vision transformer, which takes 1.3 GB and seconds a frame.
+    #[arg(long)]
+    no_vit: bool,
+    /// Fewer rounds.
+    #[arg(long)]
+    quick: bool,
+    #[command(flatten)]
+    pub(crate) output: OutputArgs,
+}
+
+pub(crate) fn run(args: &EncoderArgs) -> anyhow::Result<Report> {
+    carff_networks::allocator::keep_large_blocks();
+    let manifest = Manifest::load(&args.checkpoint)?;
+    let encoder = carff_networks::stored::load_encoder(&args.checkpoint, &manifest)?;
+    let net = carff_networks::stored::load_mixture(&args.checkpoint, &manifest)?;
+    let rgb: Vec<u8> = (0..SIDE_PX * SIDE_PX * 3).map(|i| ((i * 2_654_435_761) >> 13) as u8).collect();
+    let posterior = encode(&encoder, &rgb).context("the encoder gives no posterior")?;
+
+    let mut report = Report::default();
+    let mut rows = vec![["a frame (ms)", "p50", "p99", "max", "frames"].map(str::to_owned)];
+    let mut note = |name: &str, key: &str, seconds: &[f64]| {
+        let times = Times::new(seconds.iter().map(|s| s * 1e3).collect());
+        let [p50, p99, max] = [0.5, 0.99, 1.0].map(|q| times.quantile(q));
+        rows.push([name.to_owned(), number(p50), number(p99), number(max), times.len().to_string()]);
+        report.set(&format!("{key}p50_ms"), p50);
+        report.set(&format!("{key}p99_ms"), p99);
+    };
+
+    let with_threads = |threads: i32| -> Contender<'_> {
+        let (encoder, rgb) = (&encoder, &rgb);
+        let mut clock = timed(move || {
+            std::hint::black_box(encode(encoder, rgb));
+        });
+        // The change of threads is no part of the frame.
+        Box::new(move || {
+            tch::set_num_threads(threads);
+            clock()
+        })
+    };
+    let seconds = in_turns(if args.quick { 20 } else { 300 }, &mut [with_threads(1), with_threads(2)]);
+    let backbone = format!("{:?}", manifest.encoder.backbone.kind);
+    note(&format!("encoder, {backbone}, 1 thread"), "encoder.", &seconds[0]);
+    note(&format!("encoder, {backbone}, 2 threads"), "encoder.two_threads.", &seconds[1]);
+
+    let halved = in_bf16(args, &manifest, &encoder, &rgb)?;
+    if let Some(halved) = &halved {
+        note("encoder, backbone in bf16, 1 thread", "encoder.bf16.", &halved.seconds);
+    }
+
+    tch::set_num_threads(1);
+    let forecast = timed(|| {
+        let mixture = net.forecast(&posterior);
+        std::hint::black_box(mixture.draw(SAMPLES, Sampling::Stratified, 1, 2, 1));
+    });
+    let seconds = in_turns(if args.quick { 200 } else { 3000 }, &mut [forecast]);
+    note(&format!("forecaster, n = {SAMPLES}, 1 thread"), "forecaster.", &seconds[0]);
+
+    if !args.no_vit {
+        let config = EncoderConfig {
+            backbone: BackboneConfig { kind: BackboneKind::Vit, ..BackboneConfig::default() },
+            ..EncoderConfig::default()
+        };
+        let store = VarStore::new(Device::Cpu);
+        let vit = Encoder::new(&config, &(store.root() / "backbone"), &(store.root() / "head"), None)?;
+        let with_threads = |threads: i32| -> Contender<'_> {
+            let (vit, rgb) = (&vit, &rgb);
+            let mut clock = timed(move || {
+                std::hint::black_box(encode(vit, rgb));
+            });
+            Box::new(move || {
+                tch::set_num_threads(threads);
+                clock()
+            })
+        };
+        let seconds = in_turns(if args.quick { 2 } else { 10 }, &mut [with_threads(1), with_threads(2)]);
+        note("encoder, ViT-L/16 of random weights, 1 thread", "encoder.vit_l16.", &seconds[0]);
+        note("encoder, ViT-L/16 of random weights, 2 threads", "encoder.vit_l16.two_threads.", &seconds[1]);
+    }
+    print!("{}", table(&rows));
+    if let Some(halved) = &halved {
+        println!(
+            "with the backbone in bf16 a frame is encoded {} as fast as in f32; this one's mean moves by {} of its \
+             deviations",
+            halved.ratio,
+            number(halved.moved)
+        );
+        report.set("encoder.bf16.vs_f32", halved.ratio.of_medians);
+        report.set("encoder.bf16.moves_mean_by_deviations", halved.moved);
+    }
+    Ok(report)
+}
+
+/// The encoder with its backbone in bf16.
+struct Halved {
+    /// Of each frame.
+    seconds: Vec<f64>,
+    /// Against f32.
+    ratio: Ratio,
+    /// How far the posterior's mean moves, in its deviations: the most of all coordinates.
+    moved: f64,
+}
+
+/// Measures a frozen backbone in bf16, with the head in f32, on one thread; there is none where the backbone learns.
+fn in_bf16(args: &EncoderArgs, manifest: &Manifest, encoder: &Encoder, rgb: &[u8]) -> anyhow::Result<Option<Halved>> {
+    let file = args.checkpoint.join(carff_checkpoint::files::BACKBONE);
+    if !manifest.encoder.backbone.frozen || !file.is_file() {
+        return Ok(None);
+    }
+    let (mut backbone, head) = (VarStore::new(Device::Cpu), VarStore::new(Device::Cpu));
+    let halved = Encoder::new(&manifest.encoder, &(backbone.root() / "backbone"), &head.root(), Some(file.as_path()))?;
+    backbone.set_kind(Kind::BFloat16);
+    let encode_halved = || {
+        borrow::with_image(image(rgb)?, |picture| {
+            let picture = pictures_from_bytes(&picture.unsqueeze(0)).to_kind(Kind::BFloat16);
+            let (mean, log_variance) =
+                tch::no_grad(|| encoder.posterior(&halved.features(&picture).to_kind(Kind::Float), 0.0));
+            gaussians(&mean, &log_variance)
+        })
+        .and_then(|all| all.into_iter().next())
+    };
+    let whole = encode(encoder, rgb).context("the encoder gives no posterior")?;
+    let off = encode_halved().context("the encoder gives no posterior in bf16")?;
+    let moved = (0..off.mean.len())
+        .map(|k| f64::from((off.mean[k] - whole.mean[k]).abs() / (0.5 * whole.log_variance[k]).exp()))
+        .fold(0.0, f64::max);
+    tch::set_num_threads(1);
+    let seconds = in_turns(
+        if args.quick { 20 } else { 100 },
+        &mut [
+            timed(|| {
+                std::hint::black_box(encode(encoder, rgb));
+            }),
+            timed(|| {
+                std::hint::black_box(encode_halved());
+            }),
+        ],
+    );
+    let ratio = Ratio::new(&seconds[0], &seconds[1]);
+    Ok(seconds.into_iter().nth(1).map(|seconds| Halved { seconds, ratio, moved }))
+}
+
+/// From bytes to posterior, as the encoder stage does it.
+fn encode(encoder: &Encoder, rgb: &[u8]) -> Option<Gaussian> {
+    borrow::with_image(image(rgb)?, |picture| encoder.encode_bytes(picture)).flatten()
+}
+
+fn image(rgb: &[u8]) -> Option<ArrayView3<'_, u8>> {
+    ArrayView3::from_shape((SIDE_PX, SIDE_PX, 3), rgb).ok()
+}

@@ -1,0 +1,619 @@
+//! The field's kernels against the same model in tensor operations and against the machine's limits.
+
+use crate::OutputArgs;
+use crate::limits::{matrix_product, triad};
+use crate::reference::{Precision, Rays, ReferenceField, Samples, huber_sum};
+use crate::report::{Report, number, table};
+use crate::stats::{Contender, Ratio, Times, in_turns, timed};
+use anyhow::Context;
+use carff_base::geometry::{PinholeCamera, Ray};
+use carff_base::random::{Key, gaussians, uniform};
+use carff_checkpoint::{FieldProbe, Manifest, load_field_probe};
+use carff_decision::{Draw, Mixture};
+use carff_field::{
+    Field, FieldConfig, FieldTrainer, HypothesisBuffer, InstructionSet, LATENT_DIM, RayBatch, RayLimits, RaySamples,
+    RenderBuffer, RenderOptions, TrainerConfig,
+};
+use std::path::PathBuf;
+use std::time::Instant;
+use tch::{Kind, Tensor, nn::OptimizerConfig};
+
+/// Hypotheses whose probing is measured.
+const HYPOTHESES: usize = 10;
+/// Rays of a training step, and samples of each: 2^17 samples together.
+const TRAINING_RAYS: usize = 4096;
+const SAMPLES_PER_RAY: usize = 32;
+/// A learning rate that leaves the field as it is: each step is the same work.
+const STANDSTILL: f32 = 1e-12;
+/// Points and latents that the networks' rate is measured with: features stay in the second-level cache.
+const POINTS: usize = 2048;
+const LATENTS: usize = 32;
+
+/// The field's kernels against the same model in tensor operations and against the machine's limits.
+#[derive(Clone, Debug, clap::Args)]
+pub struct FieldArgs {
+    /// Checkpoint folder whose field is measured.
+    #[arg(long, default_value = "configs/checkpoints/approaching-intersection")]
+    checkpoint: PathBuf,
+    /// Threads. Default: all cores.
+    #[arg(long)]
+    threads: Option<usize>,
+    /// Side of the bird's-eye view, pixels.
+    #[arg(long, default_value_t = 128)]
+    side_px: u32,
+    /// Fewer rounds.
+    #[arg(long)]
+    quick: bool,
+    #[command(flatten)]
+    pub(crate) output: OutputArgs,
+}
+
+pub(crate) fn run(args: &FieldArgs) -> anyhow::Result<Report> {
+    carff_networks::allocator::keep_large_blocks();
+    let cores = std::thread::available_parallelism().map_or(1, usize::from);
+    let threads = args.threads.unwrap_or(cores).max(1);
+    tch::set_num_threads(threads as i32);
+    let manifest = Manifest::load(&args.checkpoint)?;
+    let field = carff_checkpoint::load_field(&args.checkpoint, &manifest)?;
+    let mut probe = load_field_probe(&args.checkpoint, &manifest)?;
+    let states: Vec<[f32; LATENT_DIM]> = manifest.states.iter().map(|s| s.mean).collect();
+    anyhow::ensure!(!states.is_empty(), "checkpoint {}: it knows no states", args.checkpoint.display());
+    println!(
+        "field of {}: {} numbers, {} instructions ({} for pictures), {} threads\n",
+        args.checkpoint.display(),
+        field.parameter_count(),
+        field.instruction_set().name(),
+        InstructionSet::detect_for_pictures().name(),
+        threads
+    );
+    let bench = Bench {
+        threads,
+        side_px: args.side_px.clamp(16, 2048),
+        rounds: if args.quick { 3 } else { 15 },
+        precisions: precisions(&field),
+    };
+
+    let mut pictures = field.clone();
+    pictures.set_instruction_set(InstructionSet::detect_for_pictures());
+    let mut report = Report::default();
+    report.set_value("field.instruction_set", field.instruction_set().name().into());
+    report.set_value("field.instruction_set_for_pictures", pictures.instruction_set().name().into());
+    report.set("field.threads", threads as f64);
+    bench.networks(&field, &pictures, &mut report);
+    bench.rendering(&field, &pictures, &states, &mut report);
+    bench.probes(&mut probe, &states, &mut report);
+    bench.training(&field, &states, &mut report)?;
+    Ok(report)
+}
+
+/// A camera straight above the bounds, the picture's up = +Y.
+pub(crate) fn birds_eye(config: &FieldConfig, side_px: u32) -> PinholeCamera {
+    let [low, high] = config.bounds_m.map(|corner| corner.map(f64::from));
+    let centre = [0, 1, 2].map(|i| f64::midpoint(low[i], high[i]));
+    let extent = (high[0] - low[0]).max(high[1] - low[1]);
+    let fov_deg = 60.0_f64;
+    let height = low[2] + extent / 2.0 / (fov_deg / 2.0).to_radians().tan();
+    let eye = [centre[0], centre[1], height];
+    PinholeCamera::look_at(eye, [centre[0], centre[1], low[2]], [0.0, 1.0, 0.0], side_px, side_px, fov_deg)
+}
+
+/// Multiplications and additions of the density network for one sample.
+#[derive(Clone, Copy, Debug)]
+struct Operations {
+    /// Of the first layer: once for all latents, where there are several.
+    first: f64,
+    /// Of the others, for the density alone (four outputs, of which one counts).
+    rest: f64,
+    /// Of all layers with all outputs, as rendering needs them.
+    whole: f64,
+}
+
+impl Operations {
+    fn of(c: &FieldConfig) -> Self {
+        let (features, width) = (c.levels * c.features_per_level, c.hidden_width);
+        let twice = |products: usize| 2.0 * products as f64;
+        Self {
+            first: twice(features * width),
+            rest: twice(width * width + width * 4),
+            whole: twice(features * width + width * width + width * (1 + c.geometry_features)),
+        }
+    }
+}
+
+struct Bench {
+    threads: usize,
+    side_px: u32,
+    rounds: usize,
+    precisions: Vec<Precision>,
+}
+
+impl Bench {
+    /// The density network's rate against the rate of matrix products, in f32 and as for pictures.
+    fn networks(&self, field: &Field, pictures: &Field, report: &mut Report) {
+        let points: Vec<[f32; 3]> = (0..POINTS).map(|i| random_point(field.config(), i as u64)).collect();
+        let latents: Vec<[f32; LATENT_DIM]> = (0..LATENTS).map(|i| random_latent(i as u64)).collect();
+        let each = Operations::of(field.config());
+        let operations = (each.first + each.rest * LATENTS as f64) * (POINTS * self.threads) as f64;
+        let native = |field| {
+            let mut outs = vec![vec![0.0_f32; POINTS * LATENTS]; self.threads];
+            let (points, latents) = (&points, &latents);
+            timed(move || {
+                std::thread::scope(|scope| {
+                    for out in &mut outs {
+                        scope.spawn(move || Field::density_by_latent(field, points, latents, out));
+                    }
+                });
+            })
+        };
+        let width = field.config().hidden_width as i64;
+        let square = [1024, 1024, 1024];
+        let layer = [1 << 17, width, width];
+        let named = [
+            ("density network, native f32", (native(field), operations)),
+            ("matrix product 1024^3, f32", matrix_product(Kind::Float, square)),
+            ("matrix product 131072 x width x width, f32", matrix_product(Kind::Float, layer)),
+            ("matrix product 1024^3, bf16", matrix_product(Kind::BFloat16, square)),
+            ("matrix product 131072 x width x width, bf16", matrix_product(Kind::BFloat16, layer)),
+            ("memory bandwidth (GB/s)", triad(self.threads)),
+            ("density network, native, as for pictures", (native(pictures), operations)),
+        ];
+        let (names, measured): (Vec<_>, Vec<_>) = named.into_iter().unzip();
+        let (mut contenders, amounts): (Vec<_>, Vec<_>) = measured.into_iter().unzip();
+        let seconds = in_turns(self.rounds, &mut contenders);
+        let rates: Vec<Times> =
+            seconds.iter().zip(&amounts).map(|(s, a)| Times::new(s.iter().map(|s| a / s / 1e9).collect())).collect();
+        let mut rows = vec![["rate", "median", "lowest", "highest"].map(str::to_owned)];
+        for (name, rate) in names.iter().zip(&rates) {
+            let [median, low, high] = [0.5, 0.0, 1.0].map(|q| number(rate.quantile(q)));
+            let unit = if name.contains("GB/s") { "" } else { " (GFLOP/s)" };
+            rows.push([format!("{name}{unit}"), median, low, high]);
+        }
+        print!("{}", table(&rows));
+        let native = rates[0].median();
+        let limit = rates[1].median().max(rates[2].median());
+        let share = native / limit;
+        println!("networks: {} of the measured limit of f32 matrix products", percent(share));
+        if pictures.instruction_set().is_bf16() {
+            let limit = rates[3].median().max(rates[4].median());
+            let share = rates[6].median() / limit;
+            println!("with bf16 products: {} of that of bf16 matrix products", percent(share));
+            report.set("field.mlp_bf16_gflops", rates[6].median());
+            report.set("field.mlp_bf16_share_of_limit", share);
+        }
+        println!();
+        report.set("field.mlp_gflops", native);
+        report.set("field.mlp_share_of_limit", share);
+        report.set("field.limit.f32_gflops", limit);
+        report.set("field.limit.bf16_gflops", rates[3].median().max(rates[4].median()));
+        report.set("field.limit.bandwidth_gb_s", rates[5].median());
+    }
+
+    /// Bird's-eye views of every state.
+    fn rendering(&self, field: &Field, pictures: &Field, states: &[[f32; LATENT_DIM]], report: &mut Report) {
+        let camera = birds_eye(field.config(), self.side_px);
+        let rays: Vec<Ray> = (0..self.side_px * self.side_px)
+            .map(|i| camera.ray(f64::from(i % self.side_px) + 0.5, f64::from(i / self.side_px) + 0.5))
+            .collect();
+        let options = RenderOptions { threads: self.threads, ..RenderOptions::default() };
+        let limits = RayLimits {
+            max_samples: options.max_samples_per_ray,
+            min_transmittance: options.min_transmittance,
+            step_scale: 1.0,
+            use_occupancy: true,
+        };
+        let samples: Vec<RaySamples> = states
+            .iter()
+            .map(|z| {
+                let mut samples = RaySamples::default();
+                field.samples_along(&rays, z, &limits, &mut samples);
+                samples
+            })
+            .collect();
+        let count = samples.iter().map(|s| s.ray.len()).sum::<usize>() as f64 / states.len() as f64;
+        let kept = |s: &RaySamples| s.weight.iter().filter(|w| **w > options.min_weight).count();
+        let kept = samples.iter().map(kept).sum::<usize>() as f64 / states.len() as f64;
+
+        let tensor_rays = Rays::new(&rays, field.config().direction_degree);
+        let tensor_samples: Vec<Samples> = samples.iter().map(Samples::new).collect();
+        let latents: Vec<Tensor> = states.iter().map(|z| Tensor::from_slice(z)).collect();
+        let references: Vec<ReferenceField> = self.precisions.iter().map(|p| ReferenceField::new(field, *p)).collect();
+        let min_weight = f64::from(options.min_weight);
+        let frame = |reference: &ReferenceField, state: usize, chunk: i64| {
+            drop(std::hint::black_box(reference.render(
+                &tensor_rays,
+                &tensor_samples[state],
+                &latents[state],
+                min_weight,
+                chunk,
+            )));
+        };
+        let hypotheses: Vec<[f32; LATENT_DIM]> = (0..HYPOTHESES).map(|i| states[i % states.len()]).collect();
+        let mut together = HypothesisBuffer::default();
+        let mut buffer = RenderBuffer::new();
+        let mut exact = RenderBuffer::new();
+        let mut contenders = vec![
+            round_and_round(states.len(), |s| pictures.render(&camera, &states[s], &options, &mut buffer)),
+            round_and_round(states.len(), |s| field.render(&camera, &states[s], &options, &mut exact)),
+        ];
+        let mut chunks = Vec::new();
+        for reference in &references {
+            let chunk = best(&[1 << 13, 1 << 12, 1 << 14, 1 << 16, 1 << 22], |chunk| frame(reference, 0, chunk));
+            chunks.push(chunk.min(count as i64));
+            contenders.push(round_and_round(states.len(), move |s| frame(reference, s, chunk)));
+        }
+        contenders.push(timed(|| pictures.render_hypotheses(&camera, &hypotheses, &options, &mut together)));
+        let mut seconds = in_turns(self.rounds, &mut contenders);
+        drop(contenders);
+        println!(
+            "bird's-eye view {0} x {0}: {1:.0} samples, {2:.0} of them with colour, a frame",
+            self.side_px, count, kept
+        );
+        let shared = Times::new(seconds.pop().unwrap_or_default()).median() / HYPOTHESES as f64;
+        let in_f32 = seconds.remove(1);
+        let native = self.versus("render", count, &chunks, &seconds, report);
+        println!("(tensor operations are given where the samples lie: they need not march)");
+        if pictures.instruction_set().is_bf16() {
+            let ratio = Ratio::new(&in_f32, &seconds[0]);
+            let (mut here, mut exact) = (Vec::new(), Vec::new());
+            for z in states {
+                for (field, all) in [(pictures, &mut here), (field, &mut exact)] {
+                    field.render(&camera, z, &options, &mut buffer);
+                    all.extend_from_slice(&buffer.rgb);
+                }
+            }
+            let db = carff_base::statistics::psnr_db(&here, &exact).unwrap_or(f64::INFINITY);
+            println!("native kernels with bf16 products are {ratio} as fast as in f32; {} dB against it", number(db));
+            report.set("field.render_f32_ms", Times::new(in_f32).median() * 1e3);
+            report.set("field.render_bf16_vs_f32", ratio.of_medians);
+            report.set("field.render_bf16_psnr_db", db);
+        }
+        let changing = together.pictures[0].changing.iter().filter(|c| **c).count() as f64
+            / f64::from(self.side_px * self.side_px);
+        println!(
+            "{HYPOTHESES} hypotheses together: {} ms, {} frames a second, each; {} of the rays meet what changes\n",
+            number(shared * 1e3),
+            number(1.0 / shared),
+            percent(changing)
+        );
+        report.set("field.render_fps", 1.0 / shared);
+        report.set("field.render_alone_fps", 1.0 / native);
+        report.set("field.render_changing_rays", changing);
+        report.set("field.render_samples", count);
+        report.set("field.render_colored_samples", kept);
+        self.breakdown(pictures, states, &camera, &samples, report);
+    }
+
+    /// Where rendering's time goes, on one thread: by leaving parts out.
+    fn breakdown(
+        &self,
+        field: &Field,
+        states: &[[f32; LATENT_DIM]],
+        camera: &PinholeCamera,
+        samples: &[RaySamples],
+        report: &mut Report,
+    ) {
+        let (z, samples) = (&states[0], &samples[0]);
+        let rays: Vec<Ray> = (0..self.side_px * self.side_px)
+            .map(|i| camera.ray(f64::from(i % self.side_px) + 0.5, f64::from(i / self.side_px) + 0.5))
+            .collect();
+        let points: Vec<[f32; 3]> = samples
+            .ray
+            .iter()
+            .zip(&samples.distance_m)
+            .map(|(ray, t)| {
+                let ray = &rays[*ray as usize];
+                std::array::from_fn(|i| ray.origin[i] + t * ray.direction[i])
+            })
+            .collect();
+        let latents: Vec<[f32; LATENT_DIM]> = vec![*z; 9];
+        let (mut one, mut nine) = (vec![0.0; points.len()], vec![0.0; points.len() * 9]);
+        let (mut buffer, mut without_color) = (RenderBuffer::new(), RenderBuffer::new());
+        let mut nothing = RenderBuffer::new();
+        let options = RenderOptions::default();
+        // No sample weighs more than 1: then each ray's heaviest alone has a colour.
+        let one_color = RenderOptions { min_weight: 2.0, ..options };
+        let colored = samples.weight.iter().filter(|w| **w > options.min_weight).count() as f64;
+        let up: Vec<Ray> = rays
+            .iter()
+            .map(|r| Ray {
+                origin: [r.origin[0], r.origin[1], 1e6],
+                direction: r.direction.map(|v| v * 1e-9),
+                spread: r.spread,
+            })
+            .collect();
+        let seconds = in_turns(
+            self.rounds,
+            &mut [
+                timed(|| field.render(camera, z, &options, &mut buffer)),
+                timed(|| field.render(camera, z, &one_color, &mut without_color)),
+                // In pieces, as rendering does it: features stay in the cache.
+                timed(|| {
+                    for (points, out) in points.chunks(512).zip(one.chunks_mut(512)) {
+                        field.density(points, z, out);
+                    }
+                }),
+                timed(|| {
+                    for (points, out) in points.chunks(512).zip(nine.chunks_mut(512 * 9)) {
+                        field.density_by_latent(points, &latents, out);
+                    }
+                }),
+                timed(|| {
+                    field.render_rays(&up, z, &RenderOptions { max_samples_per_ray: 1, ..options }, &mut nothing);
+                }),
+            ],
+        );
+        let [all, one_color, density, ninefold, rays_alone] =
+            [0, 1, 2, 3, 4].map(|i| Times::new(seconds[i].clone()).median());
+        // One more latent costs the layers after the first, for the density alone; the rest is in proportion.
+        let (each, more) = (Operations::of(field.config()), (ninefold - density) / 8.0);
+        let network = more * each.whole / each.rest;
+        let features = density - more * (each.first + each.rest) / each.rest;
+        let color = (all - one_color) * colored / (colored - rays.len() as f64).max(1.0);
+        let parts = [
+            ("features", features),
+            ("density_network", network),
+            ("color_network", color),
+            ("rays_and_background", rays_alone),
+            ("marching_and_the_rest", all - color - features - network - rays_alone),
+        ];
+        let mut rows = vec![["where a frame's time goes (one thread)", "ms", "share"].map(str::to_owned)];
+        for (name, part) in parts {
+            rows.push([name.replace('_', " "), number(part * 1e3), percent(part / all)]);
+            report.set(&format!("field.render_parts_ms.{name}"), part * 1e3);
+        }
+        rows.push(["all".to_owned(), number(all * 1e3), percent(1.0)]);
+        report.set("field.render_one_thread_ms", all * 1e3);
+        println!("{}", table(&rows));
+    }
+
+    /// Probing ten hypotheses, as the prober does it (one thread), and their densities alone.
+    fn probes(&self, probe: &mut FieldProbe, states: &[[f32; LATENT_DIM]], report: &mut Report) {
+        let draws: Vec<[f32; LATENT_DIM]> = (0..HYPOTHESES)
+            .map(|i| {
+                let noise = random_latent(i as u64);
+                std::array::from_fn(|k| states[i % states.len()][k] + 0.2 * noise[k])
+            })
+            .collect();
+        let field = Field::clone(probe.field());
+        let points = field.prepare(probe.layout().points());
+        let mut densities = vec![0.0; points.len() * draws.len()];
+        let mixture = Mixture { weights: Vec::new(), components: Vec::new() };
+        let drawn = || draws.iter().map(|z| Draw { latent: *z, component: 0 }).collect::<Vec<_>>();
+        let seconds = in_turns(
+            self.rounds * 20,
+            &mut [
+                timed(|| {
+                    std::hint::black_box(probe.step(mixture.clone(), drawn(), 1.0));
+                }),
+                timed(|| field.density_prepared(&points, &draws, &mut densities)),
+            ],
+        );
+        let [step, alone] = [0, 1].map(|i| Times::new(seconds[i].clone()));
+        let mut rows = vec![["probing, one thread (ms)", "p50", "p99"].map(str::to_owned)];
+        for (name, times) in [
+            (format!("{HYPOTHESES} hypotheses at {} points, with readings", points.len()), &step),
+            ("densities alone, features shared".to_owned(), &alone),
+        ] {
+            rows.push([name, number(times.median() * 1e3), number(times.quantile(0.99) * 1e3)]);
+        }
+        println!("{}", table(&rows));
+        report.set("field.probe_ms", step.median() * 1e3);
+        report.set("field.probe_p99_ms", step.quantile(0.99) * 1e3);
+        report.set("field.probe_densities_ms", alone.median() * 1e3);
+        report.set("field.probe_points", points.len() as f64);
+    }
+
+    /// A training step of 2^17 samples, each with a colour and a gradient.
+    fn training(&self, field: &Field, states: &[[f32; LATENT_DIM]], report: &mut Report) -> anyhow::Result<()> {
+        let batch = training_batch(field.config(), states);
+        let config = TrainerConfig {
+            threads: self.threads,
+            gradient_shards: self.threads,
+            learning_rate_table: STANDSTILL,
+            learning_rate_networks: STANDSTILL,
+            max_samples_per_ray: SAMPLES_PER_RAY,
+            samples_per_step: usize::MAX,
+            min_transmittance: 0.0,
+            roulette_weight: 0.0,
+            jitter: false,
+            occupancy_warmup_steps: u64::MAX,
+            target_samples_per_ray: SAMPLES_PER_RAY as f32,
+            most_step_scale: 4.0,
+            ..TrainerConfig::default()
+        };
+        let mut trainer = FieldTrainer::new(field.clone(), config.clone())?;
+        let mut samples = RaySamples::default();
+        field.samples_along(&batch.rays, &batch.latents[0], &trainer.limits(), &mut samples);
+        let count = trainer.step(&batch).kept_samples;
+        anyhow::ensure!(count == samples.ray.len(), "{count} samples in place of {}", samples.ray.len());
+
+        let references: Vec<ReferenceField> = self.precisions.iter().map(|p| ReferenceField::new(field, *p)).collect();
+        let mut contenders: Vec<Contender<'_>> = vec![timed(|| {
+            std::hint::black_box(trainer.step(&batch));
+        })];
+        let mut chunks = Vec::new();
+        let degree = field.config().direction_degree;
+        for reference in &references {
+            let mut optimizer = tch::nn::Adam::default()
+                .build(reference.store(), f64::from(STANDSTILL))
+                .context("no optimizer from libtorch")?;
+            let mut step = move |pieces: &[Piece]| {
+                optimizer.zero_grad();
+                for piece in pieces {
+                    let pixels = reference.pixels(&piece.rays, &piece.samples, &piece.latents);
+                    let loss = huber_sum(&pixels, &piece.targets, f64::from(config.huber_delta));
+                    (loss / (3.0 * TRAINING_RAYS as f64)).backward();
+                }
+                optimizer.step();
+            };
+            let rays_at_once = best(&[512, TRAINING_RAYS as i64, 1024, 256, 128], |rays| {
+                step(&pieces(&batch, &samples, rays as usize, degree));
+            });
+            let pieces = pieces(&batch, &samples, rays_at_once as usize, degree);
+            chunks.push(rays_at_once * SAMPLES_PER_RAY as i64);
+            contenders.push(timed(move || step(&pieces)));
+        }
+        let seconds = in_turns(self.rounds.min(9), &mut contenders);
+        drop(contenders);
+        println!("training step of {count} samples, all with colour and gradient");
+        self.versus("train", count as f64, &chunks, &seconds, report);
+        Ok(())
+    }
+
+    /// Prints and notes native kernels against tensor operations; returns the native median, seconds.
+    fn versus(&self, what: &str, count: f64, chunks: &[i64], seconds: &[Vec<f64>], report: &mut Report) -> f64 {
+        let medians: Vec<f64> = seconds.iter().map(|s| Times::new(s.clone()).median()).collect();
+        let mut rows = vec![["by", "ms", "a second", "ns/sample"].map(str::to_owned)];
+        let mut row = |name: String, median: f64| {
+            rows.push([name, number(median * 1e3), number(1.0 / median), number(median * 1e9 / count)]);
+        };
+        row("native kernels".to_owned(), medians[0]);
+        report.set(&format!("field.{what}_ms"), medians[0] * 1e3);
+        for ((precision, chunk), median) in self.precisions.iter().zip(chunks).zip(&medians[1..]) {
+            let kind = precision_name(*precision);
+            row(format!("tensor operations, {kind}, {chunk} samples at a time"), *median);
+            report.set(&format!("field.{what}_tch_{kind}_ms"), median * 1e3);
+        }
+        let better = (1..medians.len()).min_by(|a, b| medians[*a].total_cmp(&medians[*b])).unwrap_or(0);
+        let ratio = Ratio::new(&seconds[better], &seconds[0]);
+        println!("{}native kernels are {ratio} as fast as tensor operations at their best", table(&rows));
+        report.set(&format!("field.{what}_vs_tch"), ratio.of_medians);
+        report.set(&format!("field.{what}_vs_tch_low"), ratio.low);
+        report.set(&format!("field.{what}_vs_tch_high"), ratio.high);
+        medians[0]
+    }
+}
+
+fn precision_name(precision: Precision) -> &'static str {
+    match precision {
+        Precision::F32 => "f32",
+        Precision::Bf16 => "bf16",
+    }
+}
+
+/// Precisions that are worth measuring: bf16 where the tensor library is not far slower with it than with f32.
+fn precisions(field: &Field) -> Vec<Precision> {
+    let points: Vec<f32> = (0..1 << 12).flat_map(|i| random_point(field.config(), i)).collect();
+    let (points, latent) = (Tensor::from_slice(&points).view([-1, 3]), Tensor::from_slice(&random_latent(0)));
+    let seconds = [Precision::F32, Precision::Bf16].map(|precision| {
+        let reference = ReferenceField::new(field, precision);
+        let mut least = f64::INFINITY;
+        for _ in 0..3 {
+            let start = Instant::now();
+            drop(std::hint::black_box(tch::no_grad(|| reference.density(&points, &latent))));
+            least = least.min(start.elapsed().as_secs_f64());
+        }
+        least
+    });
+    let slower = seconds[1] / seconds[0];
+    if slower > 1.5 {
+        println!("networks in bf16 are left out: tensor operations are {slower:.1} times slower with them here\n");
+        vec![Precision::F32]
+    } else {
+        vec![Precision::F32, Precision::Bf16]
+    }
+}
+
+/// Part of a training batch, as tensors.
+struct Piece {
+    rays: Rays,
+    samples: Samples,
+    latents: Tensor,
+    targets: Tensor,
+}
+
+/// A batch in pieces of `size` rays.
+fn pieces(batch: &RayBatch, samples: &RaySamples, size: usize, degree: usize) -> Vec<Piece> {
+    let flat = |rows: Vec<f32>, width: i64| Tensor::from_slice(&rows).view([-1, width]);
+    (0..batch.rays.len())
+        .step_by(size.max(1))
+        .map(|first| {
+            let range = first..(first + size).min(batch.rays.len());
+            let from = samples.ray.partition_point(|r| (*r as usize) < range.start);
+            let to = samples.ray.partition_point(|r| (*r as usize) < range.end);
+            let own = RaySamples {
+                ray: samples.ray[from..to].iter().map(|r| r - first as u32).collect(),
+                distance_m: samples.distance_m[from..to].to_vec(),
+                delta_m: samples.delta_m[from..to].to_vec(),
+                ..RaySamples::default()
+            };
+            let latents = batch.latent_index[range.clone()].iter().flat_map(|l| batch.latents[*l as usize]).collect();
+            let targets = batch.target_rgb[range.clone()].iter().flatten().copied().collect();
+            Piece {
+                rays: Rays::new(&batch.rays[range], degree),
+                samples: Samples::new(&own),
+                latents: flat(latents, LATENT_DIM as i64),
+                targets: flat(targets, 3),
+            }
+        })
+        .collect()
+}
+
+/// Rays from around the bounds into them, of any state. What they shall see is of no matter for speed.
+fn training_batch(config: &FieldConfig, states: &[[f32; LATENT_DIM]]) -> RayBatch {
+    let [low, high] = config.bounds_m;
+    let mut batch = RayBatch { latents: states.to_vec(), ..RayBatch::default() };
+    for i in 0..TRAINING_RAYS {
+        let at = |k: u32| uniform(Key { seed: 7, frame: i as u64, step: k, sample: 0 }) as f32;
+        let angle = std::f32::consts::TAU * at(0);
+        let radius = 0.5 * (high[0] - low[0]).max(high[1] - low[1]);
+        let origin = [
+            0.5 * (low[0] + high[0]) + radius * angle.cos(),
+            0.5 * (low[1] + high[1]) + radius * angle.sin(),
+            low[2] + 1.0 + 8.0 * at(1),
+        ];
+        let target = random_point(config, i as u64);
+        let d: [f32; 3] = std::array::from_fn(|k| target[k] - origin[k]);
+        let n = d.iter().map(|v| v * v).sum::<f32>().sqrt().max(1e-6);
+        // As wide as a pixel of a picture of 128 by 128 pixels that sees 60 degrees.
+        batch.rays.push(Ray { origin, direction: d.map(|v| v / n), spread: 0.009 });
+        batch.target_rgb.push([at(2), at(3), at(4)]);
+        batch.latent_index.push((i % states.len()) as u32);
+    }
+    batch
+}
+
+fn random_point(config: &FieldConfig, i: u64) -> [f32; 3] {
+    let [low, high] = config.bounds_m;
+    std::array::from_fn(|k| {
+        let at = uniform(Key { seed: 3, frame: i, step: k as u32, sample: 0 }) as f32;
+        low[k] + (high[k] - low[k]) * at
+    })
+}
+
+fn random_latent(i: u64) -> [f32; LATENT_DIM] {
+    gaussians(Key { seed: 5, frame: i, step: 0, sample: 0 })
+}
+
+/// The setting that takes the least time, each tried twice; where a try takes long, no further one is made.
+fn best(settings: &[i64], mut action: impl FnMut(i64)) -> i64 {
+    const LONG_S: f64 = 4.0;
+    let mut least = (f64::INFINITY, settings[0]);
+    for &setting in settings {
+        for _ in 0..2 {
+            let start = Instant::now();
+            action(setting);
+            let seconds = start.elapsed().as_secs_f64();
+            if seconds < least.0 {
+                least = (seconds, setting);
+            }
+            if seconds > LONG_S {
+                return least.1;
+            }
+        }
+    }
+    least.1
+}
+
+/// Times an action on another one of `count` things at each turn.
+fn round_and_round<'a>(count: usize, mut action: impl FnMut(usize) + 'a) -> Contender<'a> {
+    let mut turn = 0;
+    timed(move || {
+        action(turn % count);
+        turn += 1;
+    })
+}
+
+fn percent(share: f64) -> String {
+    format!("{:.1} %", share * 100.0)
+}

@@ -1,0 +1,138 @@
+#!/usr/bin/env python3
+"""Writes the bill of materials of the shipped programs as CycloneDX 1.5 JSON.
+
+Usage: python3 launch/packaging/build_sbom.py [OUT]     (default: target/carff.cdx.json; needs cargo-cyclonedx)
+
+cargo-cyclonedx writes one file per crate into the source folders, so this program runs it on a copy. It merges the files
+of the programs into one document with each crate once, and adds libtorch, which is in no lock file. Equal sources give
+equal bytes: the time is that of the last commit.
+"""
+
+import importlib.util
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import uuid
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+TARGET = "x86_64-unknown-linux-gnu"
+PROGRAMS = ["launch", "launch/carff", "services/camera", "services/encoder", "services/forecaster", "services/prober",
+            "services/renderer", "services/controller", "services/viewer"]
+TOOL = ["cargo", "cyclonedx"]
+# The crate that links with libtorch.
+LINKED = "torch-sys"
+
+
+def run(*command: str, **kwargs) -> str:
+    done = subprocess.run(command, capture_output=True, text=True, **kwargs)
+    if done.returncode != 0:
+        sys.exit(f"{' '.join(command)} failed:\n{done.stderr.strip()}")
+    return done.stdout.strip()
+
+
+def is_there() -> bool:
+    """Returns true if cargo-cyclonedx is installed."""
+    return shutil.which("cargo-cyclonedx") is not None
+
+
+def describe() -> list[dict]:
+    """Returns the tool's description of each program's crate."""
+    listed = run("git", "ls-files", "-z", "--cached", "--others", "--exclude-standard", "*.toml", "*.rs", "Cargo.lock",
+                 cwd=ROOT)
+    environment = {**os.environ, "SOURCE_DATE_EPOCH": run("git", "log", "-1", "--format=%ct", cwd=ROOT)}
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder).resolve()
+        for name in filter(None, listed.split("\0")):
+            if (ROOT / name).is_file():
+                (copy / name).parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(ROOT / name, copy / name)
+        run(*TOOL, "--format", "json", "--spec-version", "1.5", "--target", TARGET, "--override-filename", "bom", "--quiet",
+            cwd=copy, env=environment)
+        texts = [(copy / program / "bom.json").read_text(encoding="utf-8") for program in PROGRAMS]
+    # Remove the path of the copy.
+    return [json.loads(text.replace(str(copy), "")) for text in texts]
+
+
+def libtorch() -> list[dict]:
+    """Returns the parts of libtorch that launch/packaging/fetch_libtorch.py fetches, or the user's libtorch."""
+    if own := os.environ.get("LIBTORCH"):
+        version = (Path(own) / "build-version").read_text(encoding="utf-8").strip()
+        return [{"type": "library", "bom-ref": "libtorch", "name": "libtorch", "version": version}]
+    spec = importlib.util.spec_from_file_location("fetch_libtorch", ROOT / "launch/packaging/fetch_libtorch.py")
+    module = importlib.util.module_from_spec(spec)
+    sys.dont_write_bytecode = True
+    spec.loader.exec_module(module)
+    return [
+        {
+            "type": "library",
+            "bom-ref": f"pkg:pypi/{name}@{version}",
+            "name": name,
+            "version": version,
+            "purl": f"pkg:pypi/{name}@{version}",
+            "hashes": [{"alg": "SHA-256", "content": sha256}],
+        }
+        for name, version, sha256, _ in module.WHEELS
+    ]
+
+
+def merge(bills: list[dict]) -> dict:
+    """Merges all bills into one, with each component once, sorted by name."""
+    components: dict[str, dict] = {}
+    uses: dict[str, set[str]] = {}
+    programs = []
+    for bill in bills:
+        program = bill["metadata"]["component"]
+        programs.append(program["bom-ref"])
+        for component in [program, *bill.get("components", [])]:
+            # A crate that is both a program and a library counts as the program.
+            if component["type"] == "application" or component["bom-ref"] not in components:
+                components[component["bom-ref"]] = component
+        for entry in bill.get("dependencies", []):
+            uses.setdefault(entry["ref"], set()).update(entry.get("dependsOn", []))
+    torch = libtorch()
+    for part in torch:
+        components[part["bom-ref"]] = part
+    for ref, component in components.items():
+        if component["name"] == LINKED:
+            uses.setdefault(ref, set()).update(part["bom-ref"] for part in torch)
+    version = re.search(r'^version = "(.+)"$', (ROOT / "Cargo.toml").read_text(encoding="utf-8"), re.M).group(1)
+    metadata = {key: value for key, value in bills[0]["metadata"].items() if key in {"timestamp", "tools"}}
+    metadata["component"] = {"type": "application", "bom-ref": "carff", "name": "carff", "version": version}
+    bill = {
+        "bomFormat": "CycloneDX",
+        "specVersion": "1.5",
+        "version": 1,
+        "metadata": metadata,
+        "components": sorted(components.values(), key=lambda c: (c["name"], c.get("version", ""), c["bom-ref"])),
+        "dependencies": [{"ref": "carff", "dependsOn": sorted(programs)}]
+        + [{"ref": ref, "dependsOn": sorted(used)} for ref, used in sorted(uses.items())],
+    }
+    known = {"carff", *components}
+    missing = {used for entry in bill["dependencies"] for used in entry["dependsOn"]} - known
+    if missing:
+        sys.exit(f"used but not described: {', '.join(sorted(missing))}")
+    return {**bill, "serialNumber": f"urn:uuid:{uuid.uuid5(uuid.NAMESPACE_URL, json.dumps(bill, sort_keys=True))}"}
+
+
+def build() -> str:
+    """Returns the bill as text."""
+    return json.dumps(merge(describe()), indent=1) + "\n"
+
+
+def main() -> None:
+    out = Path(sys.argv[1] if len(sys.argv) > 1 else ROOT / "target/carff.cdx.json")
+    if not is_there():
+        sys.exit("cargo-cyclonedx is not installed: run `cargo install --locked cargo-cyclonedx`, then repeat")
+    text = build()
+    out.parent.mkdir(parents=True, exist_ok=True)
+    out.write_text(text, encoding="utf-8")
+    print(f"{out}: {len(json.loads(text)['components'])} components of {len(PROGRAMS)} programs")
+
+
+if __name__ == "__main__":
+    main()

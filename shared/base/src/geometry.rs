@@ -1,0 +1,317 @@
+//! Cameras, rays and boxes, with their spaces and units.
+//!
+//! World: metres, +Z up. Camera: OpenGL axes (+X right, +Y up, -Z forward).
+//! Images: pixel (0, 0) is the top left one, with its centre at (0.5, 0.5).
+//!
+//! ```
+//! use carff_base::geometry::PinholeCamera;
+//! let camera = PinholeCamera::look_at([0.0, 0.0, 10.0], [0.0, 0.0, 0.0], [0.0, 1.0, 0.0], 128, 128, 60.0);
+//! let ray = camera.ray(64.0, 64.0);
+//! assert!((ray.direction[2] + 1.0).abs() < 1e-6);
+//! ```
+
+use serde::{Deserialize, Serialize};
+
+/// A ray in world space; `direction` has unit length.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Ray {
+    /// Start, metres, world space.
+    pub origin: [f32; 3],
+    /// Unit vector, world space.
+    pub direction: [f32; 3],
+    /// Width of its pixel at one metre along the ray, metres; 0 for a ray without a pixel.
+    pub spread: f32,
+}
+
+/// Reason why a camera is not usable.
+#[derive(Debug, thiserror::Error, PartialEq, Eq)]
+pub enum CameraError {
+    /// A number is NaN or infinite.
+    #[error("`{0}` must be finite")]
+    NotFinite(&'static str),
+    /// Sizes and focal lengths must be above zero.
+    #[error("`{0}` must be greater than zero")]
+    NotPositive(&'static str),
+    /// The rotation part must be orthonormal and right-handed.
+    #[error("the rotation part of `transform_matrix` is not a rotation")]
+    NotARotation,
+}
+
+/// An ideal pinhole camera at a known pose.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct PinholeCamera {
+    /// Image width, pixels.
+    pub width_px: u32,
+    /// Image height, pixels.
+    pub height_px: u32,
+    /// Focal length along x, pixels.
+    pub fl_x_px: f64,
+    /// Focal length along y, pixels.
+    pub fl_y_px: f64,
+    /// Principal point, x, pixels.
+    pub cx_px: f64,
+    /// Principal point, y, pixels.
+    pub cy_px: f64,
+    /// Row-major 4x4; maps camera space (OpenGL axes) to world space (metres).
+    pub world_from_camera: [[f64; 4]; 4],
+}
+
+impl PinholeCamera {
+    /// Returns a camera at `eye` that looks at `target`, with a horizontal field of view in degrees and square pixels.
+    /// If the view direction is parallel to `up`, another up vector is used.
+    pub fn look_at(
+        eye: [f64; 3],
+        target: [f64; 3],
+        up: [f64; 3],
+        width_px: u32,
+        height_px: u32,
+        fov_x_deg: f64,
+    ) -> Self {
+        let back = normalize(sub(eye, target));
+        let mut right = cross(up, back);
+        if dot(right, right) < 1e-12 {
+            right = cross(if back[2].abs() > 0.9 { [0.0, 1.0, 0.0] } else { [0.0, 0.0, 1.0] }, back);
+        }
+        let right = normalize(right);
+        let true_up = cross(back, right);
+        let fl = f64::from(width_px) / 2.0 / (fov_x_deg.to_radians() / 2.0).tan();
+        Self {
+            width_px,
+            height_px,
+            fl_x_px: fl,
+            fl_y_px: fl,
+            cx_px: f64::from(width_px) / 2.0,
+            cy_px: f64::from(height_px) / 2.0,
+            world_from_camera: [
+                [right[0], true_up[0], back[0], eye[0]],
+                [right[1], true_up[1], back[1], eye[1]],
+                [right[2], true_up[2], back[2], eye[2]],
+                [0.0, 0.0, 0.0, 1.0],
+            ],
+        }
+    }
+
+    /// Returns the camera's position, metres, world space.
+    pub fn position_m(&self) -> [f64; 3] {
+        let m = &self.world_from_camera;
+        [m[0][3], m[1][3], m[2][3]]
+    }
+
+    /// Returns the ray through image coordinates (`x_px`, `y_px`); a pixel's centre is at +0.5.
+    pub fn ray(&self, x_px: f64, y_px: f64) -> Ray {
+        let in_camera = [(x_px - self.cx_px) / self.fl_x_px, -(y_px - self.cy_px) / self.fl_y_px, -1.0];
+        let m = &self.world_from_camera;
+        let world = [0, 1, 2].map(|i| m[i][0] * in_camera[0] + m[i][1] * in_camera[1] + m[i][2] * in_camera[2]);
+        let direction = normalize(world);
+        let length = in_camera.iter().map(|v| v * v).sum::<f64>().sqrt();
+        let spread = 1.0 / ((self.fl_x_px * self.fl_y_px).sqrt() * length);
+        Ray {
+            origin: self.position_m().map(|v| v as f32),
+            direction: direction.map(|v| v as f32),
+            spread: spread as f32,
+        }
+    }
+
+    /// Projects a world point into the image: (x, y) in pixels, and the depth along the optical axis in metres; `None`
+    /// if it is behind the camera.
+    pub fn project(&self, point_m: [f64; 3]) -> Option<([f64; 2], f64)> {
+        let m = &self.world_from_camera;
+        let d = sub(point_m, self.position_m());
+        let c = [0, 1, 2].map(|j| m[0][j] * d[0] + m[1][j] * d[1] + m[2][j] * d[2]);
+        let depth = -c[2];
+        (depth > 1e-9)
+            .then(|| ([self.cx_px + self.fl_x_px * c[0] / depth, self.cy_px - self.fl_y_px * c[1] / depth], depth))
+    }
+
+    /// Returns the same camera with another image size.
+    #[must_use]
+    pub fn resized(&self, width_px: u32, height_px: u32) -> Self {
+        let sx = f64::from(width_px) / f64::from(self.width_px);
+        let sy = f64::from(height_px) / f64::from(self.height_px);
+        Self {
+            width_px,
+            height_px,
+            fl_x_px: self.fl_x_px * sx,
+            fl_y_px: self.fl_y_px * sy,
+            cx_px: self.cx_px * sx,
+            cy_px: self.cy_px * sy,
+            world_from_camera: self.world_from_camera,
+        }
+    }
+
+    /// Checks that sizes are positive, all numbers are finite, and the pose is a rigid motion.
+    pub fn validate(&self) -> Result<(), CameraError> {
+        for (name, value) in [("fl_x", self.fl_x_px), ("fl_y", self.fl_y_px)] {
+            if !value.is_finite() {
+                return Err(CameraError::NotFinite(name));
+            }
+            if value <= 0.0 {
+                return Err(CameraError::NotPositive(name));
+            }
+        }
+        for (name, value) in [("cx", self.cx_px), ("cy", self.cy_px)] {
+            if !value.is_finite() {
+                return Err(CameraError::NotFinite(name));
+            }
+        }
+        if self.width_px == 0 {
+            return Err(CameraError::NotPositive("w"));
+        }
+        if self.height_px == 0 {
+            return Err(CameraError::NotPositive("h"));
+        }
+        let m = &self.world_from_camera;
+        if m.iter().flatten().any(|v| !v.is_finite()) {
+            return Err(CameraError::NotFinite("transform_matrix"));
+        }
+        let column = |j: usize| [m[0][j], m[1][j], m[2][j]];
+        let (x, y, z) = (column(0), column(1), column(2));
+        let unit = |v: [f64; 3]| (dot(v, v) - 1.0).abs() < 1e-3;
+        let right_handed = dot(cross(x, y), z) > 0.0;
+        let orthogonal = dot(x, y).abs() < 1e-3 && dot(y, z).abs() < 1e-3 && dot(x, z).abs() < 1e-3;
+        let last_row = m[3] == [0.0, 0.0, 0.0, 1.0];
+        if unit(x) && unit(y) && unit(z) && orthogonal && right_handed && last_row {
+            Ok(())
+        } else {
+            Err(CameraError::NotARotation)
+        }
+    }
+}
+
+/// A box that is rotated about the vertical axis.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct OrientedBox {
+    /// Centre, metres, world space.
+    pub center: [f64; 3],
+    /// Half of the extent along the box's own axes, metres.
+    pub half_size: [f64; 3],
+    /// Rotation about +Z, radians; 0 puts the box's length along +X.
+    #[serde(default)]
+    pub yaw: f64,
+}
+
+impl OrientedBox {
+    /// Returns the world point of box coordinates in [-1, 1]^3.
+    pub fn point(&self, unit: [f64; 3]) -> [f64; 3] {
+        let (s, c) = self.yaw.sin_cos();
+        let l = [0, 1, 2].map(|i| unit[i] * self.half_size[i]);
+        [self.center[0] + c * l[0] - s * l[1], self.center[1] + s * l[0] + c * l[1], self.center[2] + l[2]]
+    }
+
+    /// Returns true if a ray hits the box in front of its origin.
+    pub fn is_met_by(&self, ray: &Ray) -> bool {
+        let (s, c) = self.yaw.sin_cos();
+        let turned = |v: [f64; 3]| [c * v[0] + s * v[1], -s * v[0] + c * v[1], v[2]];
+        let origin = turned(sub(ray.origin.map(f64::from), self.center));
+        let direction = turned(ray.direction.map(f64::from));
+        let (mut near, mut far) = (0.0_f64, f64::INFINITY);
+        for axis in 0..3 {
+            let [a, b] = [-1.0, 1.0].map(|side| (side * self.half_size[axis] - origin[axis]) / direction[axis]);
+            // Along a face both values are infinite or NaN, and `min` and `max` ignore NaN.
+            near = near.max(a.min(b));
+            far = far.min(a.max(b));
+        }
+        near <= far
+    }
+
+    /// Returns true if a world point is inside the box (including its faces).
+    pub fn contains(&self, point_m: [f64; 3]) -> bool {
+        let (s, c) = self.yaw.sin_cos();
+        let d = sub(point_m, self.center);
+        let l = [c * d[0] + s * d[1], -s * d[0] + c * d[1], d[2]];
+        (0..3).all(|i| l[i].abs() <= self.half_size[i])
+    }
+
+    /// Returns a regular lattice of `counts` points along the box's axes, scaled to `fill` of its extent (0..=1).
+    pub fn lattice(&self, counts: [usize; 3], fill: f64) -> Vec<[f64; 3]> {
+        let at = |i: usize, n: usize| if n <= 1 { 0.0 } else { fill * (2.0 * i as f64 / (n - 1) as f64 - 1.0) };
+        let mut points = Vec::with_capacity(counts.iter().product());
+        for z in 0..counts[2] {
+            for y in 0..counts[1] {
+                for x in 0..counts[0] {
+                    points.push(self.point([at(x, counts[0]), at(y, counts[1]), at(z, counts[2])]));
+                }
+            }
+        }
+        points
+    }
+}
+
+fn sub(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
+    [a[0] - b[0], a[1] - b[1], a[2] - b[2]]
+}
+
+fn dot(a: [f64; 3], b: [f64; 3]) -> f64 {
+    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+}
+
+fn cross(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
+    [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+}
+
+fn normalize(a: [f64; 3]) -> [f64; 3] {
+    let n = dot(a, a).sqrt();
+    a.map(|v| v / n)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Projecting a point of a pixel's ray returns that pixel.
+    #[test]
+    fn project_inverts_ray() {
+        let camera = PinholeCamera::look_at([3.0, -4.0, 2.0], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0], 128, 96, 60.0);
+        camera.validate().unwrap();
+        let ray = camera.ray(17.5, 80.5);
+        let point = [0, 1, 2].map(|i| f64::from(ray.origin[i]) + 7.0 * f64::from(ray.direction[i]));
+        let (pixel, depth) = camera.project(point).unwrap();
+        assert!((pixel[0] - 17.5).abs() < 1e-4 && (pixel[1] - 80.5).abs() < 1e-4);
+        assert!(depth > 0.0 && depth < 7.0);
+    }
+
+    /// A camera can look straight down, with the given up direction in the image.
+    #[test]
+    fn look_straight_down() {
+        let camera = PinholeCamera::look_at([0.0, 0.0, 20.0], [0.0, 0.0, 0.0], [0.0, 1.0, 0.0], 128, 128, 60.0);
+        camera.validate().unwrap();
+        let (pixel, _) = camera.project([0.0, 5.0, 0.0]).unwrap();
+        assert!(pixel[1] < 64.0);
+    }
+
+    /// A mirrored or sheared pose is refused.
+    #[test]
+    fn validate_refuses_what_is_not_rigid() {
+        let mut camera = PinholeCamera::look_at([0.0, 0.0, 2.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], 8, 8, 60.0);
+        camera.world_from_camera[0][0] = 3.0;
+        assert_eq!(camera.validate(), Err(CameraError::NotARotation));
+        camera.world_from_camera[0][0] = f64::NAN;
+        assert_eq!(camera.validate(), Err(CameraError::NotFinite("transform_matrix")));
+    }
+
+    /// Lattice points are inside the box, also if it is rotated.
+    #[test]
+    fn lattice_lies_inside() {
+        let b = OrientedBox { center: [1.0, 2.0, 3.0], half_size: [2.0, 1.0, 0.5], yaw: 0.7 };
+        let points = b.lattice([4, 3, 2], 0.9);
+        assert_eq!(points.len(), 24);
+        assert!(points.iter().all(|&p| b.contains(p)));
+        assert!(!b.contains([1.0, 2.0, 3.6]));
+    }
+
+    /// Rays through the box from any side hit it, rotated or not; rays next to it, away from it, or parallel to it do
+    /// not.
+    #[test]
+    fn boxes_are_met() {
+        let upright = OrientedBox { center: [3.0, 0.0, 1.0], half_size: [1.0, 0.2, 1.0], yaw: 0.0 };
+        let turned = OrientedBox { yaw: std::f64::consts::FRAC_PI_2, ..upright };
+        let ray = |origin, direction| Ray { origin, direction, spread: 0.0 };
+        let along_x = |y| ray([-5.0, y, 1.0], [1.0, 0.0, 0.0]);
+        assert!(upright.is_met_by(&along_x(0.1)) && !upright.is_met_by(&along_x(0.5)));
+        assert!(turned.is_met_by(&along_x(0.5)) && !turned.is_met_by(&along_x(1.5)));
+        assert!(!upright.is_met_by(&ray([-5.0, 0.0, 1.0], [-1.0, 0.0, 0.0])));
+        assert!(upright.is_met_by(&ray([3.5, 0.1, 9.0], [0.0, 0.0, -1.0])));
+        assert!(!upright.is_met_by(&ray([4.5, 0.1, 9.0], [0.0, 0.0, -1.0])));
+        assert!(upright.is_met_by(&ray([3.0, 0.0, 1.0], [0.0, 1.0, 0.0])), "from within");
+    }
+}

@@ -1,0 +1,199 @@
+//! The results of a checkpoint on a dataset: `results.json`, the images, and one page.
+
+mod gallery;
+mod page;
+
+use crate::stats::draws::Frequencies;
+use crate::tables::{
+    encoder::{EncoderTable, encoder_table},
+    field::{PictureTable, picture_table},
+    forecast::{self, ForecastTable},
+    planning::{self, PlanningResults},
+    targets::{self, Target},
+};
+use crate::{ByRole, EvaluationError, Progress, Reliability, Subject};
+pub use gallery::Gallery;
+pub use page::encoder_rows;
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use std::path::Path;
+
+/// A table, in the order of the page.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Table {
+    /// PSNR matrices and novel views.
+    Psnr,
+    /// Decoder, support vector machine, state accuracy.
+    Encoder,
+    /// Accuracy and recall against the number of samples.
+    Recall,
+    /// Every decision rule, and the reliability of the hazard probability.
+    Planning,
+    /// How often each outcome is drawn where several are open.
+    Frequencies,
+    /// t-SNE, reconstructions, curves, beliefs, density.
+    Pictures,
+}
+
+impl Table {
+    /// All tables.
+    pub const ALL: [Self; 6] =
+        [Self::Psnr, Self::Encoder, Self::Recall, Self::Planning, Self::Frequencies, Self::Pictures];
+
+    /// Name of the table for `--only`.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Psnr => "psnr",
+            Self::Encoder => "encoder",
+            Self::Recall => "recall",
+            Self::Planning => "planning",
+            Self::Frequencies => "frequencies",
+            Self::Pictures => "pictures",
+        }
+    }
+}
+
+/// All results, as in `results.json`. A table that was not requested, or that the scenario cannot have, is absent.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Results {
+    /// Subject of the evaluation.
+    pub subject: About,
+    /// Targets and measured figures.
+    pub targets: Vec<Target>,
+    /// Images of the field.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub pictures: Option<PictureTable>,
+    /// Encoder and decoder.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub encoder: Option<EncoderTable>,
+    /// Accuracy and recall against the number of samples.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub forecast: Option<ForecastTable>,
+    /// Every decision rule.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub planning: Option<PlanningResults>,
+    /// Reliability of the hazard probability.
+    #[serde(skip_serializing_if = "ByRole::is_empty", default)]
+    pub hazard_reliability: ByRole<Reliability>,
+    /// Frequency of each outcome where several are open.
+    #[serde(skip_serializing_if = "ByRole::is_empty", default)]
+    pub frequencies: ByRole<FrequencyTable>,
+    /// Image files, in the order of the page.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub gallery: Option<Gallery>,
+    /// Tables that are left out, each with the reason.
+    pub left_out: BTreeMap<String, String>,
+}
+
+/// Subject and seeds of an evaluation.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct About {
+    /// Version of the program.
+    pub program_version: String,
+    /// Name of the scenario.
+    pub scenario: String,
+    /// Names of the branches.
+    pub branches: Vec<String>,
+    /// Time steps of a branch.
+    pub timestamps: usize,
+    /// Folder of the checkpoint, as given.
+    pub checkpoint: String,
+    /// Folder of the dataset, as given.
+    pub dataset: String,
+    /// Images of the dataset.
+    pub pictures: usize,
+    /// Number of poses of each role.
+    pub poses: ByRole<usize>,
+    /// Seed of the training.
+    pub training_seed: u64,
+    /// Seed of the split of the poses.
+    pub split_seed: u64,
+    /// Seed of the draws of this evaluation.
+    pub seed: u64,
+}
+
+/// Frequencies where images leave several outcomes open. Draws are independent, from the forecast of the next step.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct FrequencyTable {
+    /// Frequencies of branches.
+    pub by_branch: Vec<Frequencies>,
+    /// Frequencies of an actor being present. Empty for two branches, where they equal `by_branch`.
+    pub by_presence: Vec<Frequencies>,
+}
+
+/// Computes the requested tables and writes `results.json`, `README.md` and their images into `out`.
+pub fn evaluate(
+    subject: &Subject,
+    tables: &[Table],
+    out: &Path,
+    on_progress: &dyn Fn(&Progress),
+) -> Result<Results, EvaluationError> {
+    std::fs::create_dir_all(out).map_err(|source| EvaluationError::File { path: out.into(), source })?;
+    let mut results = Results { subject: subject.about(), ..Results::default() };
+    let has = |table| tables.contains(&table);
+    if has(Table::Psnr) {
+        results.pictures = results.kept(Table::Psnr, picture_table(subject, on_progress));
+    }
+    if has(Table::Encoder) {
+        results.encoder = Some(encoder_table(subject));
+    }
+    if has(Table::Recall) || has(Table::Frequencies) {
+        let (recall, frequencies) = match forecast::forecast(subject, on_progress) {
+            Ok((recall, frequencies)) => (Ok(recall), frequencies),
+            Err(why) => (Err(why.clone()), Err(why)),
+        };
+        if has(Table::Recall) {
+            results.forecast = results.kept(Table::Recall, recall);
+            results.forecast.as_ref().map(|table| forecast::draw(table, out)).transpose()?;
+        }
+        if has(Table::Frequencies) {
+            results.frequencies = results.kept(Table::Frequencies, frequencies).unwrap_or_default();
+        }
+    }
+    if has(Table::Planning)
+        && let Some((table, reliability)) = results.kept(Table::Planning, planning::planning(subject, on_progress)?)
+    {
+        planning::draw(&reliability, out)?;
+        results.planning = Some(table);
+        results.hazard_reliability = reliability;
+    }
+    if has(Table::Pictures) {
+        results.gallery = Some(gallery::gallery(subject, out, on_progress)?);
+    }
+    results.targets = targets::targets(&results);
+    let json = serde_json::to_string_pretty(&results)
+        .map_err(|e| EvaluationError::Format { path: out.join("results.json"), what: e.to_string() })?;
+    for (name, text) in [("results.json", json + "\n"), ("README.md", page::page(&results))] {
+        let path = out.join(name);
+        std::fs::write(&path, text).map_err(|source| EvaluationError::File { path, source })?;
+    }
+    Ok(results)
+}
+
+impl Results {
+    /// Returns a table; of a table that is missing, the reason is kept instead.
+    fn kept<T>(&mut self, table: Table, found: Result<T, String>) -> Option<T> {
+        found.map_err(|why| self.left_out.insert(table.name().to_owned(), why)).ok()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Results with a renamed key are a read error, not a missing figure.
+    #[test]
+    fn a_renamed_key_is_an_error() {
+        let results = Results { encoder: Some(EncoderTable::default()), ..Results::default() };
+        let text = serde_json::to_string(&results).unwrap();
+        assert_eq!(serde_json::from_str::<Results>(&text).unwrap(), results);
+        for key in ["encoder", "psnr_db", "up_to_equivalence", "training_seed"] {
+            let other = text.replace(&format!("\"{key}\""), "\"renamed\"");
+            assert!(serde_json::from_str::<Results>(&other).is_err(), "{key}");
+        }
+    }
+}

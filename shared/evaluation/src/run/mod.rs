@@ -1,0 +1,385 @@
+//! Planning tables of a run of the graph: every rule over the run's drives, and over every eligible view.
+
+mod filmstrip;
+
+use crate::trials::planning::{NoisyEncoder, Planner};
+use crate::{CheckpointFigures, Count, EvaluationError, Models, PlanningTable, SAMPLE_COUNTS};
+use carff_checkpoint::FieldProbe;
+use carff_dataset::{
+    Dataset, Observability, PoseRole, PoseSplit, ScenarioInfo,
+    drives::{DriveKind, EligibleInput, eligible_inputs},
+    sensor::SensorNoise,
+};
+use carff_decision::{Evidence, Plan, Policy, Sampling, Step, look_ahead};
+use carff_messages::{Gaussian, Rule};
+use carff_scenes::Scenario;
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use std::fmt::Write;
+use std::path::PathBuf;
+
+/// Smallest number of trials of a table, where it has enough images.
+const TRIALS: usize = 300;
+/// Largest number of trials of one image: images that differ only in sensor noise are not independent.
+const MOST_REPEATS: usize = 5;
+
+/// Settings of the run that is judged.
+#[derive(Debug)]
+pub struct RunSettings {
+    /// Name of the run.
+    pub run: String,
+    /// Folder of the dataset.
+    pub dataset: PathBuf,
+    /// Folder of the checkpoint.
+    pub checkpoint: PathBuf,
+    /// Scenario from which free drives are rendered; `None` for other runs.
+    pub free: Option<Scenario>,
+    /// Frames of a free drive between two states.
+    pub frames_per_timestamp: usize,
+    /// Rule of the controller.
+    pub rule: Rule,
+    /// Threshold of the calibrated rule.
+    pub threshold: f64,
+    /// Samples of each step.
+    pub samples: usize,
+    /// Spread of the samples over the mixture's components.
+    pub sampling: Sampling,
+    /// Steps that are looked ahead.
+    pub horizon: u32,
+    /// Noise of the camera.
+    pub noise: SensorNoise,
+    /// Seed of the split into trained and held-out poses.
+    pub split_seed: u64,
+    /// Seed of the run.
+    pub seed: u64,
+}
+
+/// A camera frame of a drive on which the controller decided.
+#[derive(Clone, Debug, PartialEq)]
+pub struct DecidedFrame {
+    /// Frame number in the run.
+    pub frame: u64,
+    /// Number of the drive.
+    pub drive: u64,
+    /// Number of earlier frames of the drive.
+    pub frame_in_drive: usize,
+    /// Hidden branch.
+    pub branch: usize,
+    /// Time step of the branch.
+    pub timestamp: usize,
+    /// Camera pose; `None` for a random pose.
+    pub view: Option<usize>,
+    /// Visibility of the actor's place, where known.
+    pub observability: Option<Observability>,
+    /// Posterior of the encoder, where it was recorded.
+    pub posterior: Option<Gaussian>,
+    /// Whether the action was anything but an advance.
+    pub halted: bool,
+    /// Hazard probability of the decision.
+    pub hazard_probability: f32,
+    /// Reason of the action, where it is not the belief.
+    pub other_reason: Option<String>,
+}
+
+/// Selects the frame of each drive whose decision counts: the last decided frame of the first timestamp at which the
+/// drive is a trial by [`ScenarioInfo::trial_kind`].
+pub fn decisive_frames(
+    frames: impl IntoIterator<Item = DecidedFrame>,
+    scenario: &ScenarioInfo,
+) -> Vec<(DecidedFrame, DriveKind)> {
+    let mut by_drive: BTreeMap<u64, (DecidedFrame, DriveKind)> = BTreeMap::new();
+    for frame in frames {
+        let Some(kind) = scenario.trial_kind(frame.branch, frame.timestamp, frame.observability) else { continue };
+        match by_drive.get(&frame.drive) {
+            Some((there, _)) if there.timestamp < frame.timestamp => {}
+            _ => {
+                by_drive.insert(frame.drive, (frame, kind));
+            }
+        }
+    }
+    by_drive.into_values().collect()
+}
+
+/// Planning tables of a run: `planning` of its report.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RunPlanning {
+    /// Threshold of the calibrated rule.
+    pub threshold: f64,
+    /// Agreement of the run with the library.
+    pub live: LiveAgreement,
+    /// Drives of the run.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub drives: Option<PlanningTable>,
+    /// Free drives of the run.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub free_drives: Option<PlanningTable>,
+    /// Every eligible image of trained poses that chose no setting.
+    pub all_views: PlanningTable,
+    /// Every eligible image of held-out poses.
+    pub unseen_views: PlanningTable,
+    /// Images behind the tables of views.
+    pub views: RunViews,
+}
+
+/// Decisions of the graph against those of the library.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct LiveAgreement {
+    /// Rule of the controller.
+    pub rule: String,
+    /// Samples of each step.
+    pub samples: usize,
+    /// Compared decisions.
+    pub compared: usize,
+    /// Decisions that are those of the library.
+    pub agrees_with_library: usize,
+}
+
+/// Images behind the tables of views.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RunViews {
+    /// Trained poses that chose no setting.
+    pub all_views: RunViewCounts,
+    /// Held-out poses.
+    pub unseen_views: RunViewCounts,
+}
+
+/// Number of images of each kind, and of the trials of each image.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RunViewCounts {
+    /// Images in which halting is correct.
+    pub hazard: usize,
+    /// Images in which advancing is correct.
+    pub clear: usize,
+    /// Trials of each image.
+    pub repeats: usize,
+}
+
+/// A run with its dataset and models.
+pub struct JudgedRun {
+    settings: RunSettings,
+    dataset: Dataset,
+    scenario: ScenarioInfo,
+    models: Models,
+}
+
+impl JudgedRun {
+    /// Reads dataset and models of a run.
+    pub fn load(settings: RunSettings) -> Result<Self, EvaluationError> {
+        let dataset = Dataset::open(&settings.dataset)?;
+        let scenario =
+            dataset.scenario().cloned().ok_or_else(|| EvaluationError::Unfit("it has no scenario".into()))?;
+        let models = Models::load(&settings.checkpoint)?;
+        Ok(Self { settings, dataset, scenario, models })
+    }
+
+    /// Scenario of the run.
+    pub fn scenario(&self) -> &ScenarioInfo {
+        &self.scenario
+    }
+
+    /// Figures of the checkpoint, as measured in training.
+    pub fn checkpoint_figures(&self) -> Result<CheckpointFigures, EvaluationError> {
+        CheckpointFigures::of(&self.models.manifest, &self.settings.checkpoint)
+    }
+
+    /// Computes the planning tables from the decisive frames of the run.
+    pub fn planning(&self, decisive: &[(DecidedFrame, DriveKind)]) -> Result<RunPlanning, EvaluationError> {
+        let (drives, live) = self.drives_table(decisive);
+        let split = PoseSplit::for_dataset(&self.dataset, self.settings.split_seed);
+        let (all_views, of_all) = self.views_table(&split.views(PoseRole::Rest))?;
+        let (unseen_views, of_unseen) = self.views_table(&split.views(PoseRole::Unseen))?;
+        let (drives, free_drives) =
+            if self.settings.free.is_some() { (None, Some(drives)) } else { (Some(drives), None) };
+        let views = RunViews { all_views: of_all, unseen_views: of_unseen };
+        Ok(RunPlanning {
+            threshold: self.settings.threshold,
+            live,
+            drives,
+            free_drives,
+            all_views,
+            unseen_views,
+            views,
+        })
+    }
+
+    /// Looks ahead from the posterior of a frame, with the random numbers of the run: with the run's number of samples,
+    /// these are the samples of the run. `None` when no posterior was recorded.
+    fn look_ahead(&self, probe: &mut FieldProbe, frame: &DecidedFrame, samples: usize) -> Option<Vec<Step>> {
+        let RunSettings { sampling, horizon, seed, .. } = self.settings;
+        let plan = Plan { samples, sampling, horizon, seed, frame: frame.frame };
+        let forecast = |input: &Gaussian, _| self.models.mixture.forecast(input);
+        Some(look_ahead(forecast, probe, &frame.posterior?, plan))
+    }
+
+    /// Every rule over the drives of the run, and the agreement of the run with the library.
+    fn drives_table(&self, decisive: &[(DecidedFrame, DriveKind)]) -> (PlanningTable, LiveAgreement) {
+        let mut probe = self.models.probe.clone();
+        let mut table = PlanningTable::default();
+        let mut live = LiveAgreement {
+            rule: self.settings.rule.name().to_owned(),
+            samples: self.settings.samples,
+            ..LiveAgreement::default()
+        };
+        for (frame, kind) in decisive {
+            for samples in SAMPLE_COUNTS {
+                let Some(steps) = self.look_ahead(&mut probe, frame, samples) else { continue };
+                let evidence = Evidence::of_steps(&steps);
+                for policy in Policy::all(self.settings.threshold) {
+                    let mut halted = policy.decide(&evidence).halt;
+                    if policy.rule == self.settings.rule && samples == live.samples {
+                        // The table counts the action of the graph, not the action of the library.
+                        live.compared += 1;
+                        live.agrees_with_library += usize::from(frame.halted == halted);
+                        halted = frame.halted;
+                    }
+                    table.add(policy.rule, samples, *kind, halted == (*kind == DriveKind::Hazard));
+                }
+            }
+        }
+        (table, live)
+    }
+
+    /// Every rule over all eligible images of some poses, and the number of images.
+    fn views_table(&self, views: &[usize]) -> Result<(PlanningTable, RunViewCounts), EvaluationError> {
+        let RunSettings { sampling, horizon, noise, seed, .. } = self.settings;
+        let inputs = eligible_inputs(&self.dataset, views)?;
+        let of = |kind| inputs.iter().filter(|i: &&EligibleInput| i.kind == kind).count();
+        let counts = RunViewCounts {
+            hazard: of(DriveKind::Hazard),
+            clear: of(DriveKind::Clear),
+            repeats: TRIALS.div_ceil(inputs.len().max(1)).min(MOST_REPEATS),
+        };
+        let Models { encoder, mixture, probe, .. } = &self.models;
+        let trials = NoisyEncoder { encoder, noise, seed }.trials(&self.dataset, &inputs, counts.repeats)?;
+        let (table, _) =
+            Planner { net: mixture, probe, sampling, horizon }.table(&trials, &Policy::all(self.settings.threshold));
+        Ok((table, counts))
+    }
+}
+
+impl RunPlanning {
+    /// The tables as text.
+    ///
+    /// ```
+    /// use carff_dataset::drives::DriveKind;
+    /// use carff_evaluation::run::RunPlanning;
+    /// use carff_messages::Rule;
+    /// let mut planning = RunPlanning::default();
+    /// planning.all_views.add(Rule::Paper, 2, DriveKind::Clear, true);
+    /// assert!(planning.text().contains("1/1 = 100.0 %"));
+    /// ```
+    pub fn text(&self) -> String {
+        let times = |v: &RunViewCounts| {
+            let (hazard, clear, repeats) = (v.hazard, v.clear, v.repeats);
+            format!(" ({hazard} hazard and {clear} clear images, each {repeats} times with fresh sensor noise)")
+        };
+        let tables = [
+            ("drives of this run", self.drives.as_ref(), String::new()),
+            ("free drives of this run, from random poses", self.free_drives.as_ref(), String::new()),
+            ("every eligible view of trained poses", Some(&self.all_views), times(&self.views.all_views)),
+            ("every eligible view of held-out poses", Some(&self.unseen_views), times(&self.views.unseen_views)),
+        ];
+        let mut out = String::new();
+        let _ = writeln!(out, "\nPlanning: correct actions out of trials, with 95 % interval of the rate");
+        for (title, table, times) in tables {
+            let Some(table) = table else { continue };
+            let _ = writeln!(out, "\n  {title}{times}");
+            let _ = writeln!(out, "  {:<15} {:>3}  {:<32} {:<32}", "rule", "n", "hazard: halts", "clear: advances");
+            for (rule, by_samples) in table.rules() {
+                for samples in SAMPLE_COUNTS {
+                    let counts = by_samples.get(&samples).copied().unwrap_or_default();
+                    let (hazard, clear) = (share(counts.hazard), share(counts.clear));
+                    let _ = writeln!(out, "  {rule:<15} {samples:>3}  {hazard:<32} {clear}");
+                }
+            }
+        }
+        out
+    }
+}
+
+/// One count of a table as text; a dash for no trials.
+fn share(count: Option<Count>) -> String {
+    let text = count.and_then(|c| {
+        let [rate, low, high] = [c.rate()?, c.interval[0], c.interval[1]].map(|v| 100.0 * v);
+        Some(format!("{}/{} = {rate:.1} % [{low:.1}, {high:.1}]", c.success, c.trials))
+    });
+    text.unwrap_or_else(|| "-".to_owned())
+}
+
+#[cfg(test)]
+pub(crate) mod tests {
+    use super::*;
+
+    /// A frame of the first timestamp of a drive that hides the actor's place.
+    pub(crate) fn frame() -> DecidedFrame {
+        DecidedFrame {
+            frame: 0,
+            drive: 0,
+            frame_in_drive: 0,
+            branch: 0,
+            timestamp: 0,
+            view: Some(0),
+            observability: Some(Observability::None),
+            posterior: None,
+            halted: true,
+            hazard_probability: 0.5,
+            other_reason: None,
+        }
+    }
+
+    /// The last frame of the first timestamp with one correct action counts in each drive: hidden in a hazard branch,
+    /// fully visible in another branch, and never the last timestamp.
+    #[test]
+    fn decisive_frames_are_those_with_one_right_answer() {
+        let at = |frame, drive, timestamp, branch, observability| DecidedFrame {
+            frame,
+            branch,
+            timestamp,
+            drive,
+            observability: Some(observability),
+            ..super::tests::frame()
+        };
+        let frames = [
+            at(0, 0, 0, 0, Observability::None),
+            at(1, 0, 0, 0, Observability::None),
+            at(3, 0, 1, 0, Observability::None),
+            at(4, 1, 0, 1, Observability::None),
+            at(5, 1, 1, 1, Observability::Full),
+            at(6, 1, 2, 1, Observability::Full),
+            at(7, 2, 0, 0, Observability::Full),
+            at(8, 3, 2, 0, Observability::None),
+        ];
+        let scenario = ScenarioInfo {
+            name: "test".into(),
+            bounds: [[-1.0; 3], [1.0; 3]],
+            branches: vec!["hazard".into(), "clear".into()],
+            timestamps: 3,
+            bev_view: None,
+            states: Vec::new(),
+            candidates: Vec::new(),
+            static_boxes: Vec::new(),
+            hazard_branches: vec![0],
+            hazard_action: "halt".into(),
+            clear_action: "advance".into(),
+        };
+        let found: Vec<_> = decisive_frames(frames, &scenario).iter().map(|(f, kind)| (f.frame, *kind)).collect();
+        assert_eq!(found, [(1, DriveKind::Hazard), (5, DriveKind::Clear)]);
+    }
+
+    /// The text has each count with its interval, and a dash for no trials.
+    #[test]
+    fn tables_become_text() {
+        let count = Count { success: 29, trials: 30, interval: [0.833, 0.994] };
+        let mut drives = PlanningTable::default();
+        drives.paper.entry(10).or_default().hazard = Some(count);
+        let text = RunPlanning { drives: Some(drives), ..RunPlanning::default() }.text();
+        let line = text.lines().find(|l| l.contains("29/30")).unwrap();
+        assert_eq!(line.split_whitespace().collect::<Vec<_>>()[..2], ["paper", "10"]);
+        assert!(line.contains("29/30 = 96.7 % [83.3, 99.4]") && line.trim_end().ends_with('-'), "{line}");
+        assert!(!text.contains("free drives"), "{text}");
+    }
+}

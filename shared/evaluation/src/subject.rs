@@ -1,0 +1,217 @@
+//! Subject of an evaluation: a checkpoint, a dataset of its scenario, and the posterior of each image.
+
+use crate::trials::planning::{NoisyEncoder, Planner};
+use crate::{About, ByRole, Decoding, EvaluationError, PosedImages, Progress, ROLES};
+use carff_base::random::Key;
+use carff_checkpoint::CheckpointPlanning;
+use carff_checkpoint::{CheckpointError, FieldProbe, Manifest, ScenarioIdentity, files};
+use carff_dataset::{
+    Image,
+    drives::DriveKind,
+    sensor::{SensorNoise, apply_noise_into},
+};
+use carff_decision::Sampling;
+use carff_messages::Gaussian;
+use carff_networks::{
+    decoder::Decoder,
+    encoder::{Encoder, pictures_from_bytes},
+    mixture::MixtureNet,
+    stored::{load_decoder, load_encoder_on, load_mixture},
+};
+use carff_plots::Panel;
+use serde::Deserialize;
+use std::path::{Path, PathBuf};
+use tch::{Device, Tensor};
+
+/// Settings of an evaluation.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct EvalOptions {
+    /// Device of the encoder.
+    pub device: Device,
+    /// Threads that render and probe.
+    pub threads: usize,
+    /// Seed of sensor noise, draws and folds.
+    pub seed: u64,
+}
+
+/// A checkpoint on a dataset.
+pub struct Subject {
+    /// Folder of the checkpoint.
+    pub checkpoint: PathBuf,
+    /// Description of the checkpoint.
+    pub manifest: Manifest,
+    /// Image to posterior.
+    pub encoder: Encoder,
+    /// Posterior and pose to image.
+    pub decoder: Decoder,
+    /// Posterior to mixture, or the reason why it is missing.
+    pub mixture: Result<MixtureNet, String>,
+    /// Hypothesis to state, or the reason why it is missing.
+    pub probe: Result<FieldProbe, String>,
+    /// Images of the dataset.
+    pub posed: PosedImages,
+    /// Posterior of each image without sensor noise.
+    pub posteriors: Vec<Gaussian>,
+    /// Threshold of the calibrated rule, where one was chosen.
+    pub threshold: Option<f64>,
+    /// Training curves, where the folder of the training run is available.
+    pub training_curves: Vec<Panel>,
+    /// Decisive image of each free drive, without sensor noise, and the correct action. Empty until the caller renders
+    /// them.
+    pub free_drives: Vec<(Image, DriveKind)>,
+    /// Settings of this evaluation.
+    pub options: EvalOptions,
+    trained: TrainedWith,
+}
+
+/// The training settings that an evaluation takes over.
+#[derive(Clone, Copy, Debug, Deserialize)]
+struct TrainedWith {
+    calibration: CalibratedWith,
+    vae: VaeTrainedWith,
+}
+
+#[derive(Clone, Copy, Debug, Deserialize)]
+struct CalibratedWith {
+    sensor: SensorNoise,
+    horizon: u32,
+}
+
+#[derive(Clone, Copy, Debug, Deserialize)]
+struct VaeTrainedWith {
+    residual: bool,
+}
+
+/// Images between two progress reports.
+const BATCH: usize = 8;
+
+impl Subject {
+    /// Reads checkpoint and dataset, and encodes every image.
+    pub fn load(
+        checkpoint: &Path,
+        dataset: &Path,
+        options: EvalOptions,
+        on_progress: &dyn Fn(&Progress),
+    ) -> Result<Self, EvaluationError> {
+        let manifest = Manifest::load(checkpoint)?;
+        let posed = PosedImages::open(dataset, manifest.split.seed)?;
+        let given = ScenarioIdentity::of(&posed.scenario, posed.dataset.view_count());
+        manifest.check_scenario(checkpoint, &given)?;
+        let encoder = load_encoder_on(checkpoint, &manifest, options.device)?;
+        let trained = TrainedWith::deserialize(&manifest.training).map_err(|e| EvaluationError::Format {
+            path: checkpoint.join(files::MANIFEST),
+            what: format!("`training`: {e}; make the checkpoint again with `carff train`"),
+        })?;
+        let mut subject = Self {
+            checkpoint: checkpoint.to_owned(),
+            decoder: load_decoder(checkpoint, &manifest)?,
+            mixture: or_why(load_mixture(checkpoint, &manifest))?,
+            probe: or_why(carff_checkpoint::load_field_probe(checkpoint, &manifest))?,
+            posteriors: Vec::with_capacity(posed.images.len()),
+            threshold: CheckpointPlanning::load(checkpoint).ok().map(|p| p.hazard_threshold),
+            manifest,
+            encoder,
+            posed,
+            training_curves: Vec::new(),
+            free_drives: Vec::new(),
+            options,
+            trained,
+        };
+        let total = subject.posed.images.len();
+        let all: Vec<usize> = (0..total).collect();
+        for chunk in all.chunks(BATCH) {
+            for &i in chunk {
+                let image = &subject.posed.images[i];
+                let posterior = subject.encoder.encode(&as_tensor(&image.rgb, image));
+                subject.posteriors.extend(posterior);
+            }
+            let done = subject.posteriors.len();
+            on_progress(&Progress { phase: "encoding", done, total, line: String::new() });
+        }
+        Ok(subject)
+    }
+
+    /// Sensor noise of a camera in use: the noise under which the threshold was chosen.
+    pub fn noise(&self) -> SensorNoise {
+        self.trained.calibration.sensor
+    }
+
+    /// The encoder behind a camera in use.
+    pub fn noisy_encoder(&self) -> NoisyEncoder<'_> {
+        NoisyEncoder { encoder: &self.encoder, noise: self.noise(), seed: self.options.seed }
+    }
+
+    /// Forecast and probe, or the reason why one is missing.
+    pub fn planner(&self, sampling: Sampling) -> Result<Planner<'_>, String> {
+        let probe = self.probe.as_ref().map_err(Clone::clone)?;
+        let net = self.mixture.as_ref().map_err(Clone::clone)?;
+        Ok(Planner { net, probe, sampling, horizon: self.trained.calibration.horizon })
+    }
+
+    /// The decoder.
+    pub fn decoding(&self) -> Decoding<'_> {
+        Decoding { posed: &self.posed, decoder: &self.decoder, residual: self.trained.vae.residual }
+    }
+
+    /// An image with sensor noise, `[1, 3, H, W]` in 0..=1. The noise of an image is always the same.
+    pub fn noisy_input(&self, image: usize) -> Tensor {
+        let key = Key::named("reca", self.options.seed, image as u64);
+        let image = &self.posed.images[image];
+        let mut noisy = image.rgb.clone();
+        if apply_noise_into(&image.rgb, &mut noisy, &self.noise(), key).is_err() {
+            // Only settings out of range are refused; those of a checkpoint were validated.
+            noisy.copy_from_slice(&image.rgb);
+        }
+        as_tensor(&noisy, image)
+    }
+
+    /// Name of a state: its branch and its time step.
+    pub fn state_name(&self, state: usize) -> String {
+        let scenario = &self.posed.scenario;
+        let branch = scenario.branches.get(scenario.branch_of(state)).map_or("?", String::as_str);
+        format!("{branch} t{}", scenario.timestamp_of(state))
+    }
+
+    /// Whether two states look the same from above.
+    pub fn same_from_above(&self, a: usize, b: usize) -> bool {
+        self.posed.scenario.bev_view.is_some_and(|view| self.posed.equivalence.same(view, a, b))
+    }
+
+    /// Description for the results.
+    pub fn about(&self) -> About {
+        let scenario = &self.manifest.scenario;
+        let mut poses = ByRole::default();
+        for role in ROLES {
+            poses.set(role, self.posed.split.views(role).len());
+        }
+        About {
+            program_version: env!("CARGO_PKG_VERSION").to_owned(),
+            scenario: scenario.name.clone(),
+            branches: scenario.branches.clone(),
+            timestamps: scenario.timestamps,
+            checkpoint: self.checkpoint.display().to_string(),
+            dataset: self.posed.dataset.dir().display().to_string(),
+            pictures: self.posed.images.len(),
+            poses,
+            training_seed: self.manifest.seed,
+            split_seed: self.manifest.split.seed,
+            seed: self.options.seed,
+        }
+    }
+}
+
+/// Bytes of an image of the size of `image` as `[1, 3, H, W]` in 0..=1.
+fn as_tensor(rgb: &[u8], image: &Image) -> Tensor {
+    let sides = [1, i64::from(image.height_px), i64::from(image.width_px), 3];
+    pictures_from_bytes(&Tensor::from_slice(rgb).view(sides))
+}
+
+/// Turns a part that is not trained yet into the reason to leave tables out. A damaged part is an error.
+fn or_why<T>(part: Result<T, CheckpointError>) -> Result<Result<T, String>, CheckpointError> {
+    match part {
+        Err(CheckpointError::Missing { part, stage, .. }) => {
+            Ok(Err(format!("the checkpoint has no {part} (`carff train --stage {stage}` makes it)")))
+        }
+        other => other.map(Ok),
+    }
+}

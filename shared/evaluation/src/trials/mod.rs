@@ -1,0 +1,35 @@
+//! Trials: the models on images with known answers.
+
+pub mod birds_eye;
+pub mod hypotheses;
+pub mod planning;
+pub mod samples;
+
+use carff_checkpoint::{CheckpointError, FieldProbe, Manifest};
+use carff_networks::{encoder::Encoder, mixture::MixtureNet};
+use std::path::Path;
+
+/// Models of the decision path.
+pub struct Models {
+    /// Image to posterior.
+    pub encoder: Encoder,
+    /// Posterior to mixture.
+    pub mixture: MixtureNet,
+    /// Hypothesis to state.
+    pub probe: FieldProbe,
+    /// Description of the checkpoint.
+    pub manifest: Manifest,
+}
+
+impl Models {
+    /// Reads a checkpoint.
+    pub fn load(dir: &Path) -> Result<Self, CheckpointError> {
+        let manifest = Manifest::load(dir)?;
+        Ok(Self {
+            encoder: carff_networks::stored::load_encoder(dir, &manifest)?,
+            mixture: carff_networks::stored::load_mixture(dir, &manifest)?,
+            probe: carff_checkpoint::load_field_probe(dir, &manifest)?,
+            manifest,
+        })
+    }
+}

@@ -1,0 +1,287 @@
+//! The planning table (paper section 4.3): success of each decision rule over eligible input views.
+
+use carff_base::random::Key;
+use carff_base::statistics::wilson_interval;
+use carff_checkpoint::FieldProbe;
+use carff_dataset::{
+    Dataset, DatasetError, Image,
+    drives::{DriveKind, EligibleInput},
+    sensor::{SensorNoise, apply_noise_into},
+};
+use carff_decision::{Evidence, Plan, Policy, Sampling, look_ahead};
+use carff_messages::{Gaussian, Rule};
+use carff_networks::{
+    encoder::{Encoder, pictures_from_bytes},
+    mixture::MixtureNet,
+};
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use tch::Tensor;
+
+/// Numbers of samples that the table has columns for.
+pub const SAMPLE_COUNTS: [usize; 3] = [2, 10, 35];
+
+/// Number of samples whose outcomes [`Planner::table`] returns.
+const OUTCOME_SAMPLES: usize = 10;
+
+/// One trial: the posterior of an input view with one correct action.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Trial {
+    /// The posterior.
+    pub posterior: Gaussian,
+    /// The correct action.
+    pub kind: DriveKind,
+    /// Frame number, which names the random draws of this trial.
+    pub frame: u64,
+    /// Seed of the run.
+    pub seed: u64,
+}
+
+/// Frame number of the trial `repeat` of an image: no two trials share their random draws.
+pub fn trial_frame(image: usize, repeat: usize) -> u64 {
+    (image * 1000 + repeat) as u64
+}
+
+/// Correct actions among trials, with a 95 % Wilson interval.
+///
+/// ```
+/// let mut count = carff_evaluation::Count::default();
+/// [true, true, false].into_iter().for_each(|right| count.add(right));
+/// assert_eq!((count.success, count.trials), (2, 3));
+/// ```
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Count {
+    /// Correct actions.
+    pub success: usize,
+    /// Trials.
+    pub trials: usize,
+    /// 95 % interval of the success rate, `[low, high]`.
+    pub interval: [f64; 2],
+}
+
+impl Count {
+    /// Counts one trial.
+    pub fn add(&mut self, right: bool) {
+        self.trials += 1;
+        self.success += usize::from(right);
+        self.interval = wilson_interval(self.success, self.trials);
+    }
+
+    /// Success rate, 0..=1; `None` for no trials.
+    pub fn rate(&self) -> Option<f64> {
+        (self.trials > 0).then(|| self.success as f64 / self.trials as f64)
+    }
+}
+
+/// One value for each kind of trial. A kind without a value is absent in files.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ByKind<T> {
+    /// Trials in which advancing is correct.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub clear: Option<T>,
+    /// Trials in which halting is correct.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub hazard: Option<T>,
+}
+
+impl<T> Default for ByKind<T> {
+    fn default() -> Self {
+        Self { clear: None, hazard: None }
+    }
+}
+
+impl<T> ByKind<T> {
+    /// Value of one kind.
+    pub fn get(&self, kind: DriveKind) -> Option<&T> {
+        match kind {
+            DriveKind::Hazard => self.hazard.as_ref(),
+            DriveKind::Clear => self.clear.as_ref(),
+        }
+    }
+
+    /// Place of the value of one kind.
+    pub fn entry(&mut self, kind: DriveKind) -> &mut Option<T> {
+        match kind {
+            DriveKind::Hazard => &mut self.hazard,
+            DriveKind::Clear => &mut self.clear,
+        }
+    }
+}
+
+/// Counts of one rule by number of samples.
+pub type BySamples = BTreeMap<usize, ByKind<Count>>;
+
+/// Counts by rule, number of samples, and kind of trial. A rule without trials is absent in files.
+///
+/// ```
+/// use carff_dataset::drives::DriveKind;
+/// use carff_evaluation::PlanningTable;
+/// use carff_messages::Rule;
+/// let mut table = PlanningTable::default();
+/// table.add(Rule::Paper, 10, DriveKind::Hazard, true);
+/// assert_eq!(table.paper[&10].hazard.unwrap().success, 1);
+/// let text = serde_json::to_string(&table)?;
+/// assert_eq!(serde_json::from_str::<PlanningTable>(&text)?, table);
+/// assert!(serde_json::from_str::<PlanningTable>(&text.replace("paper", "papers")).is_err());
+/// # Ok::<(), serde_json::Error>(())
+/// ```
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct PlanningTable {
+    /// Halts when the hazard probability reaches the threshold.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    pub calibrated: BySamples,
+    /// Always advances.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    pub overconfident: BySamples,
+    /// The paper's rule.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    pub paper: BySamples,
+    /// Always halts.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    pub underconfident: BySamples,
+}
+
+impl PlanningTable {
+    /// Counts one trial of a rule.
+    pub fn add(&mut self, rule: Rule, samples: usize, kind: DriveKind, right: bool) {
+        let by_samples = match rule {
+            Rule::Underconfident => &mut self.underconfident,
+            Rule::Overconfident => &mut self.overconfident,
+            Rule::Paper => &mut self.paper,
+            Rule::Calibrated => &mut self.calibrated,
+        };
+        by_samples.entry(samples).or_default().entry(kind).get_or_insert_default().add(right);
+    }
+
+    /// Names and counts of all rules, in the order of reports.
+    pub fn rules(&self) -> [(&'static str, &BySamples); 4] {
+        [
+            ("underconfident", &self.underconfident),
+            ("overconfident", &self.overconfident),
+            ("paper", &self.paper),
+            ("calibrated", &self.calibrated),
+        ]
+    }
+
+    /// Whether nothing was counted.
+    pub fn is_empty(&self) -> bool {
+        self.rules().iter().all(|(_, by_samples)| by_samples.is_empty())
+    }
+}
+
+/// Encoder behind a noisy sensor.
+#[derive(Clone, Copy)]
+pub struct NoisyEncoder<'a> {
+    /// The encoder.
+    pub encoder: &'a Encoder,
+    /// Noise of the sensor.
+    pub noise: SensorNoise,
+    /// Seed of the noise.
+    pub seed: u64,
+}
+
+impl NoisyEncoder<'_> {
+    /// Trials of each input's image, `repeats` times with fresh sensor noise.
+    pub fn trials(
+        &self,
+        dataset: &Dataset,
+        inputs: &[EligibleInput],
+        repeats: usize,
+    ) -> Result<Vec<Trial>, DatasetError> {
+        let mut trials = Vec::with_capacity(inputs.len() * repeats);
+        for input in inputs {
+            let state = dataset.scenario().and_then(|s| s.state(input.branch, input.timestamp));
+            let Some(index) = state.and_then(|state| dataset.frame_index(state, input.view)) else { continue };
+            let image = dataset.load_image(index)?;
+            for repeat in 0..repeats {
+                trials.extend(self.trial(&image, input.kind, trial_frame(index, repeat)));
+            }
+        }
+        Ok(trials)
+    }
+
+    /// A trial of one image. `frame` names its random draws.
+    pub fn trial(&self, image: &Image, kind: DriveKind, frame: u64) -> Option<Trial> {
+        let mut noisy = vec![0_u8; image.rgb.len()];
+        let key = Key { seed: self.seed, frame, step: 0, sample: 0 };
+        if apply_noise_into(&image.rgb, &mut noisy, &self.noise, key).is_err() {
+            noisy.copy_from_slice(&image.rgb);
+        }
+        let sides = [1, i64::from(image.height_px), i64::from(image.width_px), 3];
+        let input = pictures_from_bytes(&Tensor::from_slice(&noisy).view(sides));
+        let posterior = self.encoder.encode(&input).into_iter().next()?;
+        Some(Trial { posterior, kind, frame, seed: self.seed })
+    }
+}
+
+/// Result of one trial.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct TrialOutcome {
+    /// Hazard probability over the horizon, 0..=1.
+    pub hazard_probability: f32,
+    /// The correct action.
+    pub kind: DriveKind,
+}
+
+/// Forecast, probe and horizon behind a planning table.
+#[derive(Clone, Copy)]
+pub struct Planner<'a> {
+    /// Posterior to mixture.
+    pub net: &'a MixtureNet,
+    /// Hypothesis to state.
+    pub probe: &'a FieldProbe,
+    /// Spread of the samples over the mixture's components.
+    pub sampling: Sampling,
+    /// Steps that are looked ahead.
+    pub horizon: u32,
+}
+
+/// Index of a rule, number of samples, and whether the rule halted.
+type Halt = (usize, usize, bool);
+
+impl Planner<'_> {
+    /// Runs every trial with every rule and number of samples, on all threads of rayon's pool. Outcomes, in the order
+    /// of the trials, are those of 10 samples.
+    pub fn table(&self, trials: &[Trial], policies: &[Policy]) -> (PlanningTable, Vec<TrialOutcome>) {
+        let posteriors: Vec<Gaussian> = trials.iter().map(|t| t.posterior).collect();
+        let first = if posteriors.is_empty() { Vec::new() } else { self.net.forecast_all(&posteriors) };
+        let later = self.net.forecast_all(self.probe.states());
+        let Self { sampling, horizon, .. } = *self;
+        let results: Vec<(Vec<Halt>, TrialOutcome)> = trials
+            .par_iter()
+            .zip(&first)
+            .map_init(
+                || self.probe.clone(),
+                |probe, (trial, mixture)| {
+                    let mut actions = Vec::with_capacity(SAMPLE_COUNTS.len() * policies.len());
+                    let mut outcome = TrialOutcome { hazard_probability: 0.0, kind: trial.kind };
+                    for samples in SAMPLE_COUNTS {
+                        let plan = Plan { samples, sampling, horizon, seed: trial.seed, frame: trial.frame };
+                        let forecast =
+                            |_: &Gaussian, state: Option<usize>| state.map_or(mixture, |s| &later[s]).clone();
+                        let steps = look_ahead(forecast, probe, &trial.posterior, plan);
+                        let evidence = Evidence::of_steps(&steps);
+                        let halts = policies.iter().map(|policy| policy.decide(&evidence).halt);
+                        actions.extend(halts.enumerate().map(|(policy, halt)| (policy, samples, halt)));
+                        if samples == OUTCOME_SAMPLES {
+                            outcome.hazard_probability = evidence.hazard_probability() as f32;
+                        }
+                    }
+                    (actions, outcome)
+                },
+            )
+            .collect();
+        let mut table = PlanningTable::default();
+        for (actions, outcome) in &results {
+            for &(policy, samples, halted) in actions {
+                let right = halted == (outcome.kind == DriveKind::Hazard);
+                table.add(policies[policy].rule, samples, outcome.kind, right);
+            }
+        }
+        (table, results.into_iter().map(|(_, outcome)| outcome).collect())
+    }
+}

@@ -1,0 +1,123 @@
+//! Calibration of a trained checkpoint: the probing, and the threshold of the calibrated rule.
+
+use crate::{
+    TrainingError,
+    augmentation::Augmentation,
+    field::Clouds,
+    records::{ThresholdRecord, names},
+    run::Context,
+};
+use carff_base::random::{Key, tag};
+use carff_checkpoint::CheckpointPlanning;
+use carff_checkpoint::Manifest;
+use carff_dataset::{
+    PoseRole,
+    drives::{DriveKind, eligible_inputs},
+};
+use carff_decision::{
+    Calibration, CalibrationTrial, Evidence, Plan, ProbeLayout, Sampling, choose_threshold, look_ahead,
+    unchosen_threshold,
+};
+use carff_evaluation::{Models, Progress, Trial, trial_frame};
+use carff_field::Field;
+use carff_messages::LATENT_DIM;
+use std::path::Path;
+
+/// Latents of each known state on which the probing is calibrated.
+const CALIBRATION_LATENTS: usize = 64;
+
+/// Calibrates the probing of a field on latents of the known states.
+pub fn calibrated_probing(
+    manifest: &Manifest,
+    field: &Field,
+    clouds: &Clouds,
+    seed: u64,
+) -> Result<(ProbeLayout, Calibration), TrainingError> {
+    let layout = ProbeLayout::new(manifest.places.clone(), manifest.scenario.hazard_states())?;
+    let places = layout.places().len();
+    let mut densities = vec![0.0; layout.points().len()];
+    let occupancies: Vec<Vec<f32>> = (0..layout.state_count())
+        .map(|state| {
+            let mut rng = carff_base::random::stream(Key::named("prob", seed, state as u64));
+            let mut rows = Vec::with_capacity(CALIBRATION_LATENTS * places);
+            for _ in 0..CALIBRATION_LATENTS {
+                let latent: [f32; LATENT_DIM] = clouds.draw(state, 1.0, &mut rng);
+                field.density(layout.points(), &latent, &mut densities);
+                let mut row = vec![0.0; places];
+                layout.occupancies(&densities, &mut row);
+                rows.extend(row);
+            }
+            rows
+        })
+        .collect();
+    let calibration = Calibration::fit(&layout, &occupancies)?;
+    Ok((layout, calibration))
+}
+
+/// Chooses the threshold of the calibrated rule on the calibration poses, and saves it in the checkpoint.
+pub fn choose_and_save_threshold(context: Context, models: &mut Models, out: &Path) -> Result<(), TrainingError> {
+    let Context { config, posed, run } = context;
+    let (hazards, branches) = (posed.scenario.hazard_branches.len(), posed.scenario.branches.len());
+    let save = |threshold| {
+        let planning = CheckpointPlanning::new(config.split_seed, threshold);
+        planning.save(out).map_err(|e| TrainingError::Unfit(e.to_string()))
+    };
+    if hazards == 0 {
+        // Without hazard states the hazard probability is always 0: any positive threshold is never reached.
+        return save(0.5);
+    }
+    let trials = calibration_trials(context, models)?;
+    let chosen = choose_threshold(&trials);
+    let threshold = chosen.unwrap_or_else(|| unchosen_threshold(hazards, branches));
+    if chosen.is_none() {
+        let line = format!(
+            "the calibration poses have no trial of one kind (hazard or clear), so the threshold of the calibrated \
+             rule is {threshold}, half of an even belief; another `split_seed` may give trials of both kinds"
+        );
+        (run.on_progress)(&Progress { phase: names::THRESHOLD, done: 1, total: 1, line });
+    }
+    let probabilities = |halt: bool| -> Vec<f64> {
+        trials.iter().filter(|t| t.halt_is_right == halt).map(|t| t.hazard_probability).collect()
+    };
+    let record = ThresholdRecord {
+        threshold,
+        chosen: chosen.is_some(),
+        trials: trials.len(),
+        hazard: probabilities(true),
+        clear: probabilities(false),
+    };
+    run.record(names::THRESHOLD, &record)?;
+    save(threshold)
+}
+
+/// Hazard probabilities of the calibration poses. Images are augmented as in training: a threshold from unaugmented
+/// training images would be too narrow for other images.
+fn calibration_trials(context: Context, models: &mut Models) -> Result<Vec<CalibrationTrial>, TrainingError> {
+    let Context { config, posed, .. } = context;
+    let settings = &config.calibration;
+    let inputs = eligible_inputs(&posed.dataset, &posed.split.views(PoseRole::Calibration))
+        .map_err(|e| TrainingError::Unfit(e.to_string()))?;
+    let augmentation = Augmentation { sensor: settings.sensor, ..config.augmentation.clone() };
+    // Another seed than in training, so that no image is augmented as in training.
+    let augmentation_seed = config.seed ^ tag("calibrat");
+    let mut trials = Vec::with_capacity(inputs.len() * settings.repeats);
+    for input in &inputs {
+        let state = posed.scenario.state(input.branch, input.timestamp);
+        let Some(index) = state.and_then(|state| posed.dataset.frame_index(state, input.view)) else { continue };
+        for repeat in 0..settings.repeats {
+            let image = augmentation.inputs(posed, &[index], repeat, augmentation_seed);
+            let (kind, frame, seed) = (input.kind, trial_frame(index, repeat), config.seed);
+            let posteriors = models.encoder.encode(&image).into_iter();
+            trials.extend(posteriors.map(|posterior| Trial { posterior, kind, frame, seed }));
+        }
+    }
+    let Models { mixture, probe, .. } = models;
+    let (samples, horizon, sampling) = (settings.samples, settings.horizon, Sampling::Stratified);
+    let judged = trials.iter().map(|trial| {
+        let plan = Plan { samples, sampling, horizon, seed: trial.seed, frame: trial.frame };
+        let steps = look_ahead(|input, _| mixture.forecast(input), probe, &trial.posterior, plan);
+        let hazard_probability = Evidence::of_steps(&steps).hazard_probability();
+        CalibrationTrial { hazard_probability, halt_is_right: trial.kind == DriveKind::Hazard }
+    });
+    Ok(judged.collect())
+}

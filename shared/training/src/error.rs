@@ -1,0 +1,52 @@
+//! Errors of training.
+
+/// Reason why a training failed.
+#[derive(Debug, thiserror::Error)]
+pub enum TrainingError {
+    /// The dataset cannot be used.
+    #[error(transparent)]
+    Dataset(#[from] carff_dataset::DatasetError),
+    /// A model or a weights file cannot be used.
+    #[error(transparent)]
+    Model(#[from] carff_networks::ModelError),
+    /// The field cannot be made or trained with these settings.
+    #[error(transparent)]
+    Field(#[from] carff_field::FieldError),
+    /// A checkpoint cannot be read or written.
+    #[error(transparent)]
+    Checkpoint(#[from] carff_checkpoint::CheckpointError),
+    /// The scenario cannot be probed.
+    #[error(transparent)]
+    Probing(#[from] carff_decision::ProbingError),
+    /// The models cannot be evaluated.
+    #[error(transparent)]
+    Evaluation(#[from] carff_evaluation::EvaluationError),
+    /// The curves cannot be drawn.
+    #[error(transparent)]
+    Plot(#[from] carff_plots::PlotError),
+    /// libtorch refused an operation.
+    #[error("libtorch: {0}")]
+    Torch(#[from] tch::TchError),
+    /// A file could not be read or written.
+    #[error("{path}: {source}{}", carff_base::names::beside(path))]
+    File {
+        /// The file.
+        path: std::path::PathBuf,
+        /// Cause given by the system.
+        source: std::io::Error,
+    },
+    /// The training file or a saved state is wrong.
+    #[error("{path}: {what}")]
+    Format {
+        /// The file.
+        path: std::path::PathBuf,
+        /// The problem.
+        what: String,
+    },
+    /// The dataset lacks something that this training needs.
+    #[error("the dataset cannot train this model: {0}")]
+    Unfit(String),
+    /// The user asked to stop; the state is saved.
+    #[error("stopped; the same command resumes from the saved state")]
+    Stopped,
+}

@@ -1,0 +1,216 @@
+//! From a tiny trained scenario to a page: every table that it can have, and a reason for every one that it cannot.
+
+#![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
+
+use carff_dataset::Image;
+use carff_evaluation::{EvalOptions, Results, Subject, Table, evaluate};
+use carff_scenes::{Extras, Scenario};
+use carff_training::{
+    Phases, Run, Training, TrainingConfig,
+    ablation::{self, Variant},
+    training_curves,
+};
+use std::ops::ControlFlow;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::AtomicBool;
+use std::sync::{Mutex, MutexGuard, PoisonError};
+
+/// A block drives along a road, or does not; fourteen cameras look at it, eight stand behind a wall.
+const SCENARIO: &str = include_str!("../../../tests/data/small-scenario.toml");
+
+/// Nets so small that they are trained in seconds, and a little.
+const TRAINING: &str = r#"
+dataset = "set"
+out = "out"
+seed = 3
+split_seed = 5
+threads = 1
+
+[encoder]
+backbone = { kind = "efficientnet-lite0", input_px = 64 }
+reduce_channels = 16
+pool_channels = 8
+hidden = 16
+
+[decoder]
+hidden = 16
+channels = 16
+
+[augmentation]
+copies = 0
+
+[vae]
+epochs = 4
+batch = 16
+learning_rate = 4e-3
+dropout = 0.0
+
+[mixture]
+components = 2
+hidden = 32
+
+[mdn]
+steps = 60
+batch = 32
+
+[field]
+levels = 4
+log2_table_size = 11
+max_resolution = 64
+hidden_width = 32
+samples_across = 32.0
+
+[nerf]
+rays = 256
+
+[nerf.trainer]
+steps = 120
+occupancy_warmup_steps = 40
+threads = 1
+"#;
+
+/// libtorch has one random generator a process: two trainings at once would draw from each other's.
+fn alone() -> MutexGuard<'static, ()> {
+    static ALONE: Mutex<()> = Mutex::new(());
+    ALONE.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+struct Place {
+    folder: tempfile::TempDir,
+    config: TrainingConfig,
+}
+
+const OPTIONS: EvalOptions = EvalOptions { device: tch::Device::Cpu, threads: 1, seed: 2 };
+
+impl Place {
+    fn new(scenario: &str) -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("training.toml");
+        std::fs::write(&file, TRAINING).unwrap();
+        let mut config = TrainingConfig::load(&file).unwrap();
+        let root = Path::new(env!("CARGO_MANIFEST_DIR")).ancestors().nth(2).unwrap();
+        config.pretrained_backbone = Some(root.join("configs/checkpoints/backbones/efficientnet-lite0.safetensors"));
+        let scenario = Scenario::parse(Path::new("small.toml"), scenario).unwrap();
+        scenario.render_dataset(&folder.path().join("set"), Extras::None, |_, _| ControlFlow::Continue(())).unwrap();
+        Self { folder, config }
+    }
+
+    fn at(&self, name: &str) -> PathBuf {
+        self.folder.path().join(name)
+    }
+
+    fn run<R>(&self, name: &str, work: impl FnOnce(&Run) -> R) -> R {
+        let _alone = alone();
+        let dir = self.at(name);
+        std::fs::create_dir_all(&dir).unwrap();
+        work(&Run { dir, on_progress: &|_| {}, stop: &AtomicBool::new(false) })
+    }
+
+    fn training<'a>(&'a self, dataset: &'a Path, out: &'a Path) -> Training<'a> {
+        Training { config: &self.config, dataset, random_poses: None, out, device: tch::Device::Cpu }
+    }
+
+    fn train(&self, phases: Phases) {
+        self.run("run", |run| {
+            self.training(&self.at("set"), &self.at("checkpoint")).run(phases, run).unwrap();
+        });
+    }
+
+    fn results(&self, tables: &[Table]) -> Results {
+        let mut subject = Subject::load(&self.at("checkpoint"), &self.at("set"), OPTIONS, &|_| {}).unwrap();
+        subject.training_curves = training_curves(&self.at("run")).unwrap();
+        evaluate(&subject, tables, &self.at("results"), &|_| {}).unwrap()
+    }
+}
+
+/// All tables are there, count what they say they count, are on disk as they are in memory, and the page shows every
+/// picture that was drawn; the same seed gives the same figures; one table alone is one table alone.
+#[test]
+fn every_table_is_made() {
+    let place = Place::new(SCENARIO);
+    place.train(Phases::All);
+    let results = place.results(&Table::ALL);
+    let read: Results =
+        serde_json::from_str(&std::fs::read_to_string(place.at("results/results.json")).unwrap()).unwrap();
+    assert_eq!((&read.targets, &read.subject, &read.gallery), (&results.targets, &results.subject, &results.gallery));
+
+    let pictures = results.pictures.as_ref().unwrap();
+    let toggled = pictures.toggled.as_ref().unwrap();
+    assert_eq!((toggled.psnr_db.len(), toggled.renderings), (4, 4));
+    assert!(toggled.actor_db.is_some() && pictures.novel_views.unseen.as_ref().unwrap().pictures > 0);
+    let predicted = pictures.predicted.as_ref().unwrap();
+    assert!(predicted.psnr_db[0].is_none() && predicted.psnr_db[1].is_some(), "first steps are not forecast");
+
+    let encoder = results.encoder.as_ref().unwrap();
+    let trained = results.subject.poses.trained.unwrap() + results.subject.poses.calibration.unwrap();
+    assert_eq!(encoder.svm.trained.pictures, 4 * trained);
+    assert!(encoder.svm.trained.ceiling > 0.25 && encoder.svm.trained.ceiling <= 1.0);
+    assert!(encoder.state_accuracy.unseen.unwrap().full.trials > 0);
+
+    let recall = results.forecast.as_ref().unwrap().parts.trained.as_ref().unwrap();
+    assert!(recall.accuracy.trials >= 300 && recall.recall.trials >= 200 && recall.recall.mean.len() == 50);
+    assert!(recall.recall.mean.windows(2).all(|w| w[0] <= w[1]), "more samples of one trial show no less");
+    assert!((recall.expected_recall[1] - 0.75).abs() < 0.2);
+
+    let planning = results.planning.as_ref().unwrap();
+    assert_eq!(planning.one_image.paper[&10].hazard.unwrap().trials, 30);
+    assert!(planning.all_views.calibrated[&10].clear.unwrap().trials >= 300);
+    assert!(planning.free_drives.is_none());
+    assert!(results.hazard_reliability.trained.as_ref().unwrap().trials > 0);
+    assert!(results.frequencies.trained.as_ref().unwrap().by_branch[0].outcomes.len() == 2);
+    assert!(results.left_out.is_empty(), "{:?}", results.left_out);
+
+    let page = std::fs::read_to_string(place.at("results/README.md")).unwrap();
+    let files: Vec<&str> = page.split("](").skip(1).filter_map(|rest| rest.split(')').next()).collect();
+    assert!(files.len() >= 8, "{files:?}");
+    for file in files {
+        assert!(Image::load_png(&place.at("results").join(file)).unwrap().width_px > 100, "{file}");
+    }
+
+    let again = place.results(&[Table::Recall]);
+    assert_eq!(again.forecast, results.forecast);
+    assert!(again.planning.is_none() && again.encoder.is_none() && again.gallery.is_none());
+}
+
+/// Of a scenario with one branch there is nothing to plan, and no branch to recall; of a checkpoint whose VAE alone is
+/// trained there are no pictures of a field: each is a line with the reason, and no error.
+#[test]
+fn what_cannot_be_is_said() {
+    let single = SCENARIO
+        .replace(r#"branches = ["with", "without"]"#, r#"branches = ["with"]"#)
+        .replace(r#"hazard_branches = ["with"]"#, "");
+    let place = Place::new(&single);
+    place.train(Phases::Vae);
+    let results = place.results(&[Table::Psnr, Table::Encoder, Table::Recall, Table::Planning, Table::Frequencies]);
+    let left_out: Vec<&str> = results.left_out.keys().map(String::as_str).collect();
+    assert_eq!(left_out, ["frequencies", "planning", "psnr", "recall"]);
+    assert!(results.left_out["psnr"].contains("--stage nerf"), "{:?}", results.left_out);
+    assert!(results.encoder.is_some());
+    let page = std::fs::read_to_string(place.at("results/README.md")).unwrap();
+    assert!(page.contains("no branch in which the hazard action is right"), "{page}");
+}
+
+/// Every variant trains and is scored, a row that is there is read again, and the table names them all.
+#[test]
+fn every_variant_has_a_row() {
+    let mut place = Place::new(SCENARIO);
+    place.config.vae.epochs = 1;
+    let out = place.at("ablation");
+    let row = |variant: Variant| {
+        place.run(&format!("ablation/{}/run", variant.name()), |run| {
+            ablation::row(&place.training(&place.at("set"), &out), variant, run, OPTIONS).unwrap()
+        })
+    };
+    let rows: Vec<_> = Variant::ALL.into_iter().map(row).collect();
+    assert!(rows.iter().all(|r| r.scores.train.psnr_db > 5.0 && r.scores.svm.trained.pictures > 0));
+    let checkpoint = ablation::folders(&out, Variant::Full).1;
+    std::fs::remove_dir_all(&checkpoint).unwrap();
+    assert_eq!(row(Variant::Full).scores.train.pictures, rows[0].scores.train.pictures);
+    assert!(!checkpoint.exists(), "read, not trained again");
+    let table = ablation::AblationTable { dataset: "set".into(), epochs: 1, free_poses: 0, seed: 3, rows };
+    ablation::write_table(&table, &out).unwrap();
+    let page = std::fs::read_to_string(out.join("README.md")).unwrap();
+    for variant in Variant::ALL {
+        assert!(page.contains(variant.description(&place.config)), "{variant:?}");
+    }
+}
