@@ -11,7 +11,7 @@ use std::sync::atomic::{AtomicU32, Ordering};
 /// Run id of stages that a test starts by itself.
 const RUN_ID: u64 = 7;
 
-/// Settings under which the speed of the machine changes no decision: nothing is stale on a busy machine.
+/// Settings under which the speed of the machine changes no decision: nothing becomes stale on a busy machine.
 pub const PATIENT: &str = "[controller]\nrate_hz = 4.0\ndeadline_ms = 60000\n[launcher]\nstart_timeout_ms = 600000\n\
                            stop_timeout_ms = 30000\n";
 
@@ -19,12 +19,12 @@ pub const PATIENT: &str = "[controller]\nrate_hz = 4.0\ndeadline_ms = 60000\n[la
 pub const PATIENT_AND_ENDLESS: &str = "[camera]\nrepeat = true\n[controller]\nrate_hz = 4.0\ndeadline_ms = 60000\n\
                                        [launcher]\nstart_timeout_ms = 600000\nstop_timeout_ms = 30000\n";
 
-/// Counts the decisions that a launcher has shown: each is one line.
+/// Counts the decisions that a launcher has printed: each is one line.
 pub fn decisions(text: &str) -> usize {
     text.lines().filter(|line| line.contains("hazard ") && line.trim_end().ends_with(" ms")).count()
 }
 
-/// A graph of a test's own. Dropped, it removes what its run may have left.
+/// A graph for one test. Dropping it removes leftovers of its run.
 #[derive(Debug)]
 pub struct TestGraph {
     folder: tempfile::TempDir,

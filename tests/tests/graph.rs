@@ -12,8 +12,8 @@ use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
 use std::os::unix::net::UnixDatagram;
 
-/// The shipped graph file drives the shipped checkpoint: it ends with exit code 0, its report has every promised key,
-/// and neither a process nor a file in shared memory is left.
+/// The shipped graph file drives the shipped checkpoint: the exit code is 0, the report has every promised key, and
+/// neither a process nor a file in shared memory is left.
 #[test]
 fn the_shipped_graph_drives() {
     let (set, checkpoint) = (scenario_set(), shipped_checkpoint());

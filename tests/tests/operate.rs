@@ -166,8 +166,8 @@ fn rows(path: &Path) -> usize {
     std::fs::read_to_string(path).map_or(0, |text| text.lines().count().saturating_sub(1))
 }
 
-/// A recording goes through the same graph again with the same beliefs and decisions, bit for bit; through a graph that
-/// draws fewer samples it does not, and the first difference is told. What other tools are given can be exported.
+/// A recording replayed through the same graph gives the same beliefs and decisions, bit for bit. A graph that draws
+/// fewer samples gives others, and the first difference is reported. The data for other tools can be exported.
 #[test]
 fn a_recording_is_decided_again_as_it_was() {
     let (graph, launcher) = running();

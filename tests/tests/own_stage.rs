@@ -10,9 +10,9 @@ use rustix::process::Signal;
 use speed_gate::{FREE_M_S, SPEED_LIMIT, SpeedLimit};
 use std::process::Command;
 
-/// It joins the shipped graph by its name alone and publishes its own messages: valid ones, each on the frame of an
-/// action. It leaves when it is asked to and the graph goes on; another one ends by itself when the graph does. Nothing
-/// is left.
+/// The stage joins the shipped graph only by its name and publishes its own valid messages, each about the frame of an
+/// action. It leaves on request and the graph continues; another one ends by itself when the graph ends. Nothing is
+/// left.
 #[test]
 fn a_stage_of_its_own_joins_and_leaves() {
     let graph = TestGraph::new(&scenario_set(), &shipped_checkpoint(), PATIENT_AND_ENDLESS);

@@ -1,4 +1,4 @@
-//! Counter-based random streams, one for each draw that a run makes.
+//! Counter-based random streams, one per draw of a run.
 //!
 //! A stream is named by (run seed, frame, step, sample). So a draw does not depend on earlier draws, on its thread or
 //! process, or on skipped frames.

@@ -1,9 +1,9 @@
 //! A trained scenario on disk: manifest and weights.
 //!
-//! A checkpoint is a folder: `manifest.json` says what was trained, on what, how and how well; the weights lie beside
-//! it as safetensors. Nothing in it is code. What does not fit is an error that names the key. The field's weights are
-//! read here; those of the networks in tch are read in `carff_networks`, so that whoever needs none of them is not linked
-//! with libtorch.
+//! A checkpoint is a folder with `manifest.json` and weights as safetensors. The manifest records the scenario, the
+//! training and its results. A checkpoint contains no code. Contents that do not match are an error that names the key.
+//! This crate reads the field's weights. `carff_networks` reads the weights of the tch networks, so that programs
+//! without them do not link libtorch.
 
 mod field;
 mod planning;

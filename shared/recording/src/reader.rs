@@ -14,7 +14,7 @@ use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
-/// Longest record that is read, bytes: a chunk with an image of the largest size fits in.
+/// Maximum length of a record, bytes: enough for a chunk with an image of the largest size.
 const MAX_RECORD_BYTES: usize = 4 * MAX_IMAGE_BYTES;
 /// Maximum number of channels.
 const MAX_CHANNELS: usize = 4096;

@@ -6,9 +6,9 @@
 //! later state. The camera is on the ego's roof. If no roof view is a trial of the wanted kind, because a building
 //! hides the place, the camera is drawn from all of the scenario's ranges and drifts.
 //!
-//! All that is drawn for drive `n` comes from the streams (seed, frame `n`, step `drvf`, sample `try`): drives can
-//! be made one by one, in any order. A drive is a trial of its kind as [`carff_dataset::ScenarioInfo::trial_kind`] says, which is judged
-//! on pictures of a third of the width and height.
+//! All random values of drive `n` come from the streams (seed, frame `n`, step `drvf`, sample `try`), so drives can be
+//! made one by one, in any order. [`carff_dataset::ScenarioInfo::trial_kind`] defines the kind of a trial; it is
+//! evaluated on images of a third of the width and height.
 //!
 //! ```no_run
 //! use carff_scenes::Scenario;

@@ -59,7 +59,7 @@ pub trait Payload: Debug + 'static {
     where
         Self: Sized;
 
-    /// Checks that a valid message describes an image of so many bytes; 0 for a message by itself.
+    /// Checks that the number of bytes matches the description; 0 for a message by itself.
     #[doc(hidden)]
     fn check_size(message: &Self::Message, bytes: usize) -> Result<(), Invalid>;
 }

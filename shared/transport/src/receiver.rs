@@ -48,7 +48,7 @@ impl<P: Payload> Sample<P> {
 }
 
 impl<M: ImageMeta> Sample<Image<M>> {
-    /// The image as (height, width, channel), borrowed from shared memory.
+    /// Returns the image as (height, width, channel), borrowed from shared memory.
     #[allow(clippy::missing_panics_doc, reason = "an empty view needs no bytes")]
     pub fn image(&self) -> ArrayView3<'_, u8> {
         let [width_px, height_px] = self.size_px().map(|side| side as usize);
@@ -112,7 +112,7 @@ impl<P: Payload> Receiver<P> {
     fn accepts(&self, sample: &iceoryx2::sample::Sample<Service, P::Body, P::UserHeader>) -> bool {
         let message = P::message(sample);
         let same_run = equals("header.run_id", message.header().run_id, self.run_id);
-        // The size that a message describes only means something once the message is valid.
+        // The size in the description is only meaningful if the message is valid.
         match message.validate().and(same_run).and_then(|()| P::check_size(message, P::bytes(sample).len())) {
             Ok(()) => {
                 self.counters.count_received();

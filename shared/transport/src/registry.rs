@@ -44,7 +44,7 @@ pub trait AnyTopic: fmt::Debug + Sync {
 
 /// A publisher for a topic of any payload.
 pub trait AnyPublisher: fmt::Debug + Send {
-    /// Size of the largest image that it can send, bytes.
+    /// Returns the size of the largest image that it can send, bytes.
     fn max_bytes(&self) -> usize;
 
     /// Stamps, validates and sends a copy of a message. A message of another type than the topic's is an error.
