@@ -19,7 +19,15 @@ from collections import Counter
 from pathlib import Path
 
 # Folders whose Rust files must follow the rules. The others are only counted.
-HELD_RUST: list[str] = ["examples", "launch/carff"]
+HELD_RUST: list[str] = [
+    "examples", "launch/carff", "launch/src", "launch/tests",
+    "services/camera", "services/controller", "services/encoder", "services/forecaster", "services/prober",
+    "services/renderer", "services/viewer",
+    "shared/base", "shared/checkpoint", "shared/config", "shared/dataset", "shared/decision", "shared/messages",
+    "shared/networks", "shared/observe", "shared/plots", "shared/recording", "shared/runtime", "shared/scenes",
+    "shared/transport",
+    "tests/readers", "tests/src", "tests/tests",
+]
 
 # Documents that are not held yet, with the reason.
 NOT_HELD = {
@@ -57,6 +65,9 @@ FIRST_LINE = re.compile(r"(?:What|Which|Who|How|Whether|Where|When|Of)\b")
 # (file, matched text): reason. An entry that matches nothing is a finding.
 ALLOWED: dict[tuple[str, str], str] = {
     ("docs/VIEWER.md", "picture"): "name of a pane",
+    ("launch/src/dataset.rs", "picture"): "key of the scenario file",
+    ("services/viewer/src/main.rs", "picture"): "option `--picture`",
+    ("shared/scenes/tests/rendering.rs", "picture"): "key of the scenario file",
 }
 
 FENCE = re.compile(r"^```.*?^```|<!--.*?-->", re.MULTILINE | re.DOTALL)

@@ -1,4 +1,4 @@
-//! `carff dataset`: renders scenarios into data sets, checks data sets, and imports plain ones.
+//! `carff dataset`: renders scenarios into datasets, checks datasets, and imports posed images.
 
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
@@ -9,51 +9,53 @@ use carff_scenes::{Extras, Scenario};
 use carff_training::places;
 use indicatif::{ProgressBar, ProgressStyle};
 
-/// What to do with data sets.
+/// Commands for datasets.
 #[derive(Debug, clap::Subcommand)]
 pub enum DatasetCommand {
-    /// Render a scenario into a posed data set.
-    #[command(after_help = "Example: freely drawn cameras
+    /// Render a scenario into a posed dataset.
+    #[command(after_help = "Example: random cameras
   carff dataset render approaching-intersection --free-poses 50 --seed 3 --out data/free")]
     Render {
         /// A scenario file, or the name of one in configs/scenarios.
         scenario: PathBuf,
-        /// Folder to write; it must be new, empty, or a set that this command wrote.
+        /// Folder to write; it must be new, empty, or a dataset that this command wrote.
         #[arg(long)]
         out: PathBuf,
         /// Also write depth (16-bit PNG, millimetres) and actor masks.
         #[arg(long)]
         depth: bool,
-        /// In place of the fixed cameras, so many drawn at random from the same ranges.
+        /// Draw this many cameras at random from the ranges of the fixed cameras, and render them instead.
         #[arg(long, value_parser = clap::value_parser!(u32).range(1..=10_000))]
         free_poses: Option<u32>,
-        /// Seed of the free poses.
+        /// Seed of the random cameras.
         #[arg(long, default_value_t = 1)]
         seed: u64,
     },
-    /// Turn a plain set, as nerfstudio and instant-ngp write them, into a set of one state.
-    #[command(after_help = "Example: a set whose middle metres matter
+    /// Convert a dataset in the format of nerfstudio or instant-ngp into a dataset of one state.
+    #[command(after_help = "Example: a dataset with its region of interest
   carff dataset import path/to/set --out data/mine --bounds -2,-2,0,2,2,2")]
     Import {
-        /// Folder of the set: one `transforms.json` or three (`transforms_train.json` and so on), and PNG or JPEG pictures.
+        /// Folder of the dataset: one `transforms.json` or three (`transforms_train.json` and so on), and PNG or JPEG
+        /// images.
         dir: PathBuf,
-        /// Folder to write; it must be new, empty, or a set that this program wrote.
+        /// Folder to write; it must be new, empty, or a dataset that this program wrote.
         #[arg(long)]
         out: PathBuf,
-        /// Longest side of a picture, pixels; larger ones are scaled down.
+        /// Longest side of an image, pixels; larger ones are scaled down.
         #[arg(long, default_value_t = 256, value_parser = clap::value_parser!(u32).range(16..=8192))]
         max_side: u32,
-        /// The box that matters, in the set's units: x0,y0,z0,x1,y1,z1. Default: about what the cameras look at.
+        /// Region of interest in the dataset's units: x0,y0,z0,x1,y1,z1. Default: about the region that the cameras
+        /// look at.
         #[arg(long, value_parser = corners, allow_hyphen_values = true)]
         bounds: Option<[[f64; 3]; 2]>,
     },
-    /// Check a data set and print its statistics.
-    #[command(after_help = "Example: with a picture of all its pictures
+    /// Check a dataset and print its statistics.
+    #[command(after_help = "Example: with a contact sheet of all images
   carff dataset check data/approaching-intersection --contact-sheet reports/contact.png")]
     Check {
-        /// Folder of the set.
+        /// Folder of the dataset.
         dir: PathBuf,
-        /// Where to write a picture of the whole set: a row per state, a column per view.
+        /// Write a contact sheet of all images here: a row per state, a column per view.
         #[arg(long)]
         contact_sheet: Option<PathBuf>,
         /// Columns of the contact sheet.
@@ -72,22 +74,22 @@ pub fn run(command: DatasetCommand) -> anyhow::Result<()> {
                 scenario = scenario.with_free_cameras(count as usize, seed)?;
             }
             let extras = if depth { Extras::DepthAndMasks } else { Extras::None };
-            let pictures = render(&scenario, &out, extras)?;
-            println!("{pictures} pictures in {}", out.display());
+            let images = render(&scenario, &out, extras)?;
+            println!("{images} images in {}", out.display());
             Ok(())
         }
         DatasetCommand::Import { dir, out, max_side, bounds } => {
             let options = ImportOptions { max_side_px: max_side, bounds, ..ImportOptions::default() };
             let imported = import(&dir, &out, &options)?;
             println!(
-                "{} pictures in {} ({} undistorted, {} scaled down)",
+                "{} images in {} ({} undistorted, {} scaled down)",
                 imported.frames,
                 out.display(),
                 imported.undistorted,
                 imported.scaled
             );
             let [low, high] = imported.bounds.map(|corner| corner.map(|v| (v * 1000.0).round() / 1000.0));
-            println!("Bounds {low:?} to {high:?}; what lies beyond is background: give --bounds if that is wrong");
+            println!("Bounds {low:?} to {high:?}; outside is background. Pass --bounds to change it");
             Ok(())
         }
         DatasetCommand::Check { dir, contact_sheet, columns } => {
@@ -96,7 +98,7 @@ pub fn run(command: DatasetCommand) -> anyhow::Result<()> {
     }
 }
 
-/// Two corners out of six numbers with commas between them.
+/// Parses two corners from six numbers with commas between them.
 fn corners(text: &str) -> Result<[[f64; 3]; 2], String> {
     let values: Result<Vec<f64>, _> = text.split(',').map(|part| part.trim().parse()).collect();
     match values.as_deref() {
@@ -109,7 +111,7 @@ fn corners(text: &str) -> Result<[[f64; 3]; 2], String> {
     }
 }
 
-/// A path as it is, or else the scenario of that name in configs/scenarios.
+/// Returns the path of a scenario file, or of the scenario of that name in configs/scenarios.
 fn find_scenario(scenario: &Path) -> anyhow::Result<PathBuf> {
     if scenario.is_file() {
         return Ok(scenario.to_owned());
@@ -119,14 +121,14 @@ fn find_scenario(scenario: &Path) -> anyhow::Result<PathBuf> {
         return Ok(named);
     }
     let hint = carff_base::names::beside(&named);
-    bail!("no scenario {}: there is no such file, nor {}{hint}", scenario.display(), named.display());
+    bail!("no scenario {}: neither this file nor {} exists{hint}", scenario.display(), named.display());
 }
 
-/// Renders a set, with a progress bar. Returns the number of pictures.
+/// Renders a dataset, with a progress bar. Returns the number of images.
 pub fn render(scenario: &Scenario, out: &Path, extras: Extras) -> anyhow::Result<u64> {
     let pictures = (scenario.cameras().len() * scenario.info().state_count()) as u64;
     let bar = ProgressBar::new(pictures);
-    bar.set_style(ProgressStyle::with_template("{msg} [{bar:40}] {pos}/{len} pictures, {eta} left")?);
+    bar.set_style(ProgressStyle::with_template("{msg} [{bar:40}] {pos}/{len} images, {eta} left")?);
     bar.set_message(scenario.info().name.clone());
     let rendered = scenario.render_dataset(out, extras, |done, _| {
         bar.set_position(done as u64);
@@ -143,7 +145,7 @@ fn check(dir: &Path, sheet: Option<&Path>, columns: usize) -> anyhow::Result<()>
     print!("{}", DatasetReport::of(&dataset, &images));
     if let Some(scenario) = dataset.scenario().filter(|s| s.state_count() > 1) {
         match places(scenario) {
-            Ok(places) => println!("Places that are probed: {}", places.len()),
+            Ok(places) => println!("Probed places: {}", places.len()),
             Err(problem) => println!("warning: {problem}"),
         }
     }
@@ -178,7 +180,7 @@ spread_m = 1.0
         DatasetCommand::Render { scenario, out, depth: true, free_poses: None, seed: 1 }
     }
 
-    /// A rendered set passes its own check and may be rendered again; a folder of somebody else's is left alone.
+    /// A rendered dataset passes its own check and can be rendered again; a folder with other files is not changed.
     #[test]
     fn render_then_check() {
         let dir = tempfile::tempdir().unwrap();
@@ -196,7 +198,7 @@ spread_m = 1.0
         std::fs::create_dir(&foreign).unwrap();
         std::fs::write(foreign.join("thesis.txt"), "irreplaceable").unwrap();
         let error = run(render_command(&scenario, &foreign)).unwrap_err();
-        assert!(format!("{error:#}").contains("not a set that this program wrote"), "{error:#}");
+        assert!(format!("{error:#}").contains("not a dataset that this program wrote"), "{error:#}");
         assert_eq!(std::fs::read_to_string(foreign.join("thesis.txt")).unwrap(), "irreplaceable");
     }
 
@@ -209,7 +211,7 @@ spread_m = 1.0
         }
     }
 
-    /// A scenario that is neither a file nor a name is an error that names both places.
+    /// A scenario that is neither a file nor a name is an error that names both paths.
     #[test]
     fn unknown_scenario() {
         let error = find_scenario(Path::new("nowhere-at-all")).unwrap_err().to_string();

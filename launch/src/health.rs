@@ -1,5 +1,5 @@
-//! How each stage is, from its heartbeats and from how long its topic has been quiet: pure logic, without processes and
-//! without a clock. Logs are for people; nothing here reads one.
+//! The health of each stage, from its heartbeats and the silence of its topic: pure logic, without processes and
+//! without a clock. It never reads logs; they are for people.
 //!
 //! ```text
 //! starting --ready--> ok <--> slow, stale          its own words, and its topics' deadlines
@@ -12,23 +12,23 @@
 use carff_messages::{Health, HealthState};
 use std::fmt;
 
-/// How long a stage may take for what, nanoseconds.
+/// Time limits of a stage, nanoseconds.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[allow(clippy::struct_field_names, reason = "the postfix is the unit")]
 pub struct Limits {
-    /// From its start until it is ready.
+    /// Limit from the start until the stage is ready.
     pub start_ns: u64,
-    /// Without a heartbeat before it is stale.
+    /// Time without a heartbeat after which the stage is stale.
     pub silence_ns: u64,
-    /// Without a heartbeat before it hangs.
+    /// Time without a heartbeat after which the stage hangs.
     pub hang_ns: u64,
-    /// Without a round of its loop before it hangs.
+    /// Time without a round of its loop after which the stage hangs.
     pub standstill_ns: u64,
-    /// Without a message on its topic, once it has begun, before it is stale.
+    /// Time without a message on its topic, once the topic has begun, after which the stage is stale.
     pub quiet_ns: u64,
 }
 
-/// Why a stage has to be killed.
+/// Reason why a stage must be killed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Ailment {
     /// It was not ready in time.
@@ -36,14 +36,14 @@ pub enum Ailment {
         /// The limit, nanoseconds.
         limit_ns: u64,
     },
-    /// No heartbeat comes: the process is stopped, or gets no time.
+    /// No heartbeat arrives: the process is stopped, or gets no processor time.
     Silent {
-        /// For how long, nanoseconds.
+        /// Time without a heartbeat, nanoseconds.
         for_ns: u64,
     },
-    /// Heartbeats come, but its loop does not go round.
+    /// Heartbeats arrive, but the loop makes no rounds.
     Standstill {
-        /// For how long, nanoseconds.
+        /// Time without a round, nanoseconds.
         for_ns: u64,
     },
 }
@@ -54,7 +54,7 @@ impl fmt::Display for Ailment {
         match self {
             Self::NotReady { limit_ns } => write!(f, "was not ready within {} ms", limit_ns / NS_PER_MS),
             Self::Silent { for_ns } => write!(f, "hangs: no heartbeat for {} ms", for_ns / NS_PER_MS),
-            Self::Standstill { for_ns } => write!(f, "hangs: its loop stands still for {} ms", for_ns / NS_PER_MS),
+            Self::Standstill { for_ns } => write!(f, "hangs: no round of its loop for {} ms", for_ns / NS_PER_MS),
         }
     }
 }
@@ -67,14 +67,14 @@ struct Life {
     ready: bool,
     /// Arrival and sequence number of its latest heartbeat.
     beat: Option<(u64, u64)>,
-    /// What that said.
+    /// State in the latest heartbeat.
     said: HealthState,
     standstill_ns: u64,
-    /// When its latest message came.
+    /// Arrival of the latest message on the topic.
     spoke_ns: Option<u64>,
 }
 
-/// What the stage goes through.
+/// Phase of the stage's life.
 #[derive(Clone, Copy, Debug)]
 enum Phase {
     Runs(Life),
@@ -92,14 +92,14 @@ pub struct StageHealth {
 }
 
 impl StageHealth {
-    /// A stage whose first process has just been started.
+    /// Creates the health of a stage whose first process has just started.
     pub fn started(limits: Limits, pid: u32, now_ns: u64) -> Self {
         let mut health = Self { limits, phase: Phase::Restarting, was_ready: false };
         health.restarted(pid, now_ns);
         health
     }
 
-    /// Another process of it has been started.
+    /// Records the start of another process.
     pub fn restarted(&mut self, pid: u32, now_ns: u64) {
         self.phase = Phase::Runs(Life {
             pid,
@@ -112,7 +112,7 @@ impl StageHealth {
         });
     }
 
-    /// A heartbeat. One of an earlier process, and one that was heard before, says nothing.
+    /// Records a heartbeat. Repeated heartbeats, and heartbeats of earlier processes, are ignored.
     pub fn heard(&mut self, health: &Health, now_ns: u64) {
         let Phase::Runs(life) = &mut self.phase else { return };
         let sequence = health.header.sequence;
@@ -120,7 +120,7 @@ impl StageHealth {
             return;
         }
         life.beat = Some((now_ns, sequence));
-        // A code that stands for nothing has been refused on arrival.
+        // An unknown code has been refused on arrival.
         life.said = health.state().unwrap_or(HealthState::Faulty);
         life.standstill_ns = health.header.publish_time_ns.saturating_sub(health.last_progress_ns);
         if !matches!(life.said, HealthState::Starting | HealthState::Faulty) {
@@ -128,7 +128,7 @@ impl StageHealth {
         }
     }
 
-    /// A message on the stage's topic came, and when.
+    /// Records the time of a message on the stage's topic.
     pub fn spoke(&mut self, at_ns: u64) {
         if let Phase::Runs(life) = &mut self.phase
             && at_ns >= life.started_ns
@@ -137,22 +137,22 @@ impl StageHealth {
         }
     }
 
-    /// Its process ended, and another one is to come.
+    /// Records the end of its process; a restart follows.
     pub fn died(&mut self) {
         self.phase = Phase::Restarting;
     }
 
-    /// Its process ended, and none is to come.
+    /// Records the end of its process; no restart follows.
     pub fn lost(&mut self) {
         self.phase = Phase::Lost;
     }
 
-    /// It has done its work.
+    /// Records that the stage has completed its work.
     pub fn done(&mut self) {
         self.phase = Phase::Done;
     }
 
-    /// Leaves out of account a time in which the judge itself stood still.
+    /// Excludes a gap in which the judge itself was not running.
     pub fn forgive(&mut self, gap_ns: u64) {
         if let Phase::Runs(life) = &mut self.phase {
             life.started_ns += gap_ns;
@@ -162,17 +162,17 @@ impl StageHealth {
         }
     }
 
-    /// Whether its present process is ready.
+    /// Returns true if the current process is ready.
     pub fn is_ready(&self) -> bool {
         matches!(&self.phase, Phase::Runs(life) if life.ready)
     }
 
-    /// Whether any of its processes has ever been ready.
+    /// Returns true if any of its processes has ever been ready.
     pub fn was_ready(&self) -> bool {
         self.was_ready
     }
 
-    /// Why it has to be killed, if it has to be.
+    /// Returns the reason to kill the stage, if there is one.
     pub fn ailment(&self, now_ns: u64) -> Option<Ailment> {
         let Phase::Runs(life) = &self.phase else { return None };
         if !life.ready {
@@ -183,12 +183,12 @@ impl StageHealth {
         if silent_ns > self.limits.hang_ns {
             return Some(Ailment::Silent { for_ns: silent_ns });
         }
-        // One that ends by itself goes no further round.
+        // A stage that is ending makes no more rounds.
         let standstill_ns = if life.said == HealthState::Done { 0 } else { life.standstill_ns };
         (standstill_ns > self.limits.standstill_ns).then_some(Ailment::Standstill { for_ns: standstill_ns })
     }
 
-    /// Its state.
+    /// Returns its state.
     pub fn state(&self, now_ns: u64) -> HealthState {
         let life = match &self.phase {
             Phase::Runs(life) => life,
@@ -204,7 +204,7 @@ impl StageHealth {
             HealthState::Starting | HealthState::Faulty | HealthState::Done => life.said,
             _ if life.silent_ns(now_ns) > self.limits.silence_ns || quiet => HealthState::Stale,
             HealthState::Ok | HealthState::Slow | HealthState::Stale => life.said,
-            // A living process cannot say these of itself.
+            // A living process cannot report these states of itself.
             HealthState::Restarting | HealthState::Lost => HealthState::Faulty,
         }
     }
@@ -252,7 +252,7 @@ mod tests {
         }
     }
 
-    /// A stage of process 7 that became ready at 100 ms.
+    /// Returns a stage of process 7 that became ready at 100 ms.
     fn ready() -> StageHealth {
         let mut health = StageHealth::started(LIMITS, 7, 0);
         health.heard(&beat(7, 0, HealthState::Starting, 0), 50 * MS);
@@ -261,7 +261,7 @@ mod tests {
         health
     }
 
-    /// From starting to ok; slow and stale are the stage's own words, and it recovers by itself.
+    /// A stage goes from starting to ok; it reports slow and stale itself, and recovers by itself.
     #[test]
     fn a_stage_says_how_it_is() {
         let mut health = ready();
@@ -276,7 +276,7 @@ mod tests {
         }
     }
 
-    /// Without heartbeats it is first stale, then hangs; heartbeats of another process, and one heard twice, help it not.
+    /// Without heartbeats it is first stale, then hangs; repeated heartbeats and those of other processes do not count.
     #[test]
     fn silence_is_stale_then_a_hang() {
         let mut health = ready();
@@ -290,7 +290,8 @@ mod tests {
         assert_eq!(ailment.to_string(), "hangs: no heartbeat for 2001 ms");
     }
 
-    /// Heartbeats alone are no proof of life: a loop that stands still hangs too. One that has done its work does not.
+    /// Heartbeats do not suffice: a stage whose loop makes no rounds hangs too. A stage that has completed its work
+    /// does not.
     #[test]
     fn a_loop_that_stands_still_hangs() {
         let mut health = ready();
@@ -303,7 +304,7 @@ mod tests {
         assert_eq!((health.ailment(400 * MS), health.state(400 * MS)), (None, HealthState::Done));
     }
 
-    /// A process that is not ready in time hangs, also when it says that it is starting, and also after a restart.
+    /// A process that is not ready in time hangs, even if it reports that it is starting, and also after a restart.
     #[test]
     fn start_up_has_a_limit() {
         let mut health = StageHealth::started(LIMITS, 7, 0);
@@ -317,13 +318,13 @@ mod tests {
         health.heard(&beat(7, 50, HealthState::Ok, 0), 6100 * MS);
         assert_eq!(health.state(6100 * MS), HealthState::Starting);
         assert_eq!(health.ailment(11_001 * MS), Some(Ailment::NotReady { limit_ns: 5000 * MS }));
-        // Its counts begin anew.
+        // The counts of the new process start again.
         health.heard(&beat(8, 0, HealthState::Ok, 0), 6200 * MS);
         assert_eq!((health.state(6200 * MS), health.ailment(6200 * MS)), (HealthState::Ok, None));
     }
 
-    /// A topic that has begun and goes quiet makes its stage stale, whatever that says of itself; one that has not begun
-    /// does not. It is no reason to kill.
+    /// A topic that has begun and falls silent makes its stage stale, even if the stage reports ok. A topic that has
+    /// not begun does not. Silence is never a reason to kill.
     #[test]
     fn a_quiet_topic_is_stale() {
         let mut health = ready();
@@ -336,7 +337,7 @@ mod tests {
         assert_eq!(health.state(820 * MS), HealthState::Ok);
     }
 
-    /// When the judge itself stood still, nobody is blamed for that time.
+    /// A time in which the judge itself was not running counts for no stage.
     #[test]
     fn the_judges_own_pause_is_forgiven() {
         let mut health = ready();
@@ -347,7 +348,7 @@ mod tests {
         assert_eq!(starting.ailment(64_000 * MS), None);
     }
 
-    /// The ends: lost and done stay what they are.
+    /// The final states lost and done do not change.
     #[test]
     fn the_ends_are_final() {
         let mut health = ready();

@@ -1,4 +1,4 @@
-//! `carff launch`: starts a graph, watches it, shows its decisions, ends it, and reports.
+//! `carff launch`: starts a graph, watches it, prints its decisions, ends it, and writes a report.
 
 use crate::health::{Ailment, Limits, StageHealth};
 use crate::monitor::{FrameRecord, Monitor};
@@ -27,24 +27,25 @@ use std::sync::Arc;
 use std::thread::JoinHandle;
 use std::time::{Duration, SystemTime};
 
-/// Stages in the order of their start: those that listen before those that speak, the camera last.
+/// Start order of the stages: subscribers before publishers, the camera last.
 const START_ORDER: [Stage; 6] =
     [Stage::Controller, Stage::Renderer, Stage::Prober, Stage::Forecaster, Stage::Encoder, Stage::Camera];
-/// How often messages and children are looked at: before the smallest buffer (8 pictures) fills up at 400 a second.
+/// Polling interval of messages and children: short enough that the smallest buffer (8 images) holds 400 images a
+/// second.
 const WATCH_NS: u64 = 20_000_000;
-/// How often what dead processes left is looked for: probes come and go, and the launcher starts none of them.
+/// Interval of the search for leftovers of dead processes: the launcher does not start the probes.
 const CLEANUP_NS: u64 = 1_000_000_000;
-/// A pause of the launcher's own that is longer than this is held against nobody.
+/// A longer pause of the launcher itself counts for no stage.
 const OWN_PAUSE_NS: u64 = 300_000_000;
-/// A stage's loop may stand still for so many times its own deadline.
+/// Multiple of its deadline after which a stage's loop counts as hanging.
 const STANDSTILL_DEADLINES: u64 = 10;
-/// A stage's topic may be quiet for so many frames.
+/// Number of frame periods that a stage's topic may be quiet.
 const QUIET_FRAMES: f64 = 3.0;
-/// Exit code after Ctrl-C, as shells have it: 128 and the signal's number.
+/// Exit code after Ctrl-C, as in shells: 128 plus the signal's number.
 pub(crate) const INTERRUPTED: u8 = 130;
-/// Source of the launcher's own lines in the log.
+/// Source of the launcher's own log lines.
 pub(crate) const LAUNCHER: &str = "launcher";
-/// Bytes of a frame that are reckoned with when shared memory is checked, before the pictures are known.
+/// Assumed bytes of a frame in the check of shared memory, before the image size is known.
 pub(crate) const FRAME_BYTES: usize = 1 << 17;
 
 /// Start a graph.
@@ -52,42 +53,42 @@ pub(crate) const FRAME_BYTES: usize = 1 << 17;
 pub struct LaunchArgs {
     /// The graph file, as in configs/graphs.
     pub graph: PathBuf,
-    /// Data set folder, in place of the graph file's.
+    /// Dataset folder; replaces the graph file's.
     #[arg(long)]
     pub dataset: Option<PathBuf>,
-    /// Checkpoint folder, in place of the graph file's.
+    /// Checkpoint folder; replaces the graph file's.
     #[arg(long)]
     pub checkpoint: Option<PathBuf>,
-    /// Stop after so many frames.
+    /// Stop after this many frames.
     #[arg(long)]
     pub frames: Option<u64>,
-    /// How many drives, in place of the graph file's.
+    /// Number of drives; replaces the graph file's.
     #[arg(long)]
     pub drives: Option<u32>,
     /// Write the report here, as JSON.
     #[arg(long)]
     pub report: Option<PathBuf>,
-    /// Run name, in place of the graph file's: two runs side by side need two names.
+    /// Run name; replaces the graph file's. Two concurrent runs need two names.
     #[arg(long)]
     pub run: Option<String>,
-    /// Folder of the stages' programs, in place of this program's own.
+    /// Folder of the stages' programs; default: this program's folder.
     #[arg(long, hide = true)]
     pub stages: Option<PathBuf>,
 }
 
-/// Something that takes the camera's place.
+/// A replacement of the camera.
 pub(crate) struct Feed {
-    /// Stages that are not started, the camera among them: what they would send comes from the feed.
+    /// Stages that are not started, including the camera: the feed sends their messages.
     pub(crate) without: BTreeSet<Stage>,
-    /// Called on a thread of its own once all others are ready; the run ends when it returns.
+    /// Function that runs on its own thread once all stages are ready; the run ends when it returns.
     pub(crate) run: FeedRun,
 }
 
-/// What a feed does in a run, until it is done or told to stop.
+/// Function of a feed: runs until it is done or stopped.
 pub(crate) type FeedRun = Box<dyn FnOnce(&Run, &Stop) -> anyhow::Result<()> + Send>;
 
-/// Launches, and ends when the camera has done its work (exit code 0), on Ctrl-C (130), or with an error when a stage
-/// is lost.
+/// Launches a graph. Ends when the camera is done (exit code 0), on Ctrl-C (130), or with an error when a stage is
+/// lost.
 pub fn run(args: &LaunchArgs) -> anyhow::Result<ExitCode> {
     let terminal = Arc::new(Terminal::new());
     let (ended, outcome) = run_graph(args, None, &terminal)?;
@@ -98,7 +99,7 @@ pub fn run(args: &LaunchArgs) -> anyhow::Result<ExitCode> {
     report(args, &Arc::new(outcome), &terminal)
 }
 
-/// The report of a run that came to its end.
+/// Prints and writes the report of a finished run.
 fn report(args: &LaunchArgs, outcome: &Arc<RunOutcome>, terminal: &Terminal) -> anyhow::Result<ExitCode> {
     let stop = Stop::on_signals().context("cannot handle signals")?;
     let planning = evaluate(outcome, &stop, terminal)?;
@@ -150,12 +151,12 @@ pub(crate) fn run_graph(
     let lock = RunLock::take(&runtime_dir(), &name, &record, "--run")?;
     lock.sweep(&run, "--run")?;
 
-    // A feed brings its own pictures.
+    // A feed brings its own images.
     if feed.is_none() {
         provide_dataset(&graph, args, &dataset, terminal)?;
         refuse_another_scenario(&graph, &dataset, &checkpoint)?;
     }
-    // From here on Ctrl-C is an orderly end; until here it may simply end the process, as no stage runs yet.
+    // From here on Ctrl-C ends the run in order. Before, no stage runs, and the process may simply end.
     let stop = Stop::on_signals().context("cannot handle signals")?;
     let view_bytes = carff_messages::rgb_bytes(graph.renderer.width_px, graph.renderer.height_px);
     check_space(Path::new("/dev/shm"), "the graph", topics::graph_bytes(FRAME_BYTES, view_bytes))?;
@@ -205,13 +206,13 @@ pub(crate) fn run_graph(
             (ended, outcome)
         })
     };
-    // All stages are dead and reaped, and the lock is held: whatever is left is nobody's.
+    // All stages are dead and reaped, and the lock is held: remaining files belong to no process.
     remove_run_leftovers(&run)?;
     result
 }
 
-/// The planning tables (none for a run without drives), computed on a thread of their own, so that Ctrl-C still ends the
-/// program: then there are none either.
+/// Computes the planning tables on a separate thread, so that Ctrl-C still ends the program. Returns none after Ctrl-C,
+/// and for a run without drives.
 fn evaluate(outcome: &Arc<RunOutcome>, stop: &Stop, terminal: &Terminal) -> anyhow::Result<Option<Planning>> {
     let theirs = Arc::clone(outcome);
     let work = std::thread::spawn(move || planning::evaluate(&theirs));
@@ -228,16 +229,16 @@ fn evaluate(outcome: &Arc<RunOutcome>, stop: &Stop, terminal: &Terminal) -> anyh
     work.join().map_err(|_| anyhow!("the computation of the planning table failed"))?
 }
 
-/// How a run ended that did not fail.
+/// End of a run that did not fail.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Ended {
-    /// The camera, or what takes its place, has shown everything.
+    /// The camera or its feed has sent everything.
     Done,
-    /// Somebody asked for it.
+    /// A user interrupted the run.
     Interrupted,
 }
 
-/// A stage under watch.
+/// A stage with its process and health.
 #[derive(Debug)]
 struct Watched {
     stage: Stage,
@@ -258,13 +259,13 @@ struct Launcher<'a> {
     drives: u32,
     terminal: Arc<Terminal>,
     watchdog: Watchdog,
-    /// What takes the camera's place, once it has begun.
+    /// Thread of the feed, once it has started.
     feed: Option<JoinHandle<anyhow::Result<()>>>,
-    /// When the stages were last looked at.
+    /// Time of the last check of the stages.
     watched_ns: u64,
-    /// When what the dead left is looked for next.
+    /// Time of the next search for leftovers.
     cleanup_ns: u64,
-    /// The stage without which the run goes on at a halt, and why.
+    /// The lost stage without which the run continues at a halt, and the cause.
     lost: Option<String>,
 }
 
@@ -308,19 +309,19 @@ impl Launcher<'_> {
         }
     }
 
-    /// Whether what takes the camera's place has come to its end.
+    /// Returns true if the feed has ended.
     fn is_fed(&mut self) -> anyhow::Result<bool> {
         match self.feed.take_if(|feed| feed.is_finished()) {
             None => Ok(false),
             Some(feed) => {
-                feed.join().map_err(|_| anyhow!("the feed broke off"))??;
+                feed.join().map_err(|_| anyhow!("the feed failed"))??;
                 Ok(true)
             }
         }
     }
 
     fn start(&mut self, stage: Stage) -> anyhow::Result<()> {
-        // A camera that is started again goes on after its last frame.
+        // A restarted camera continues after its last frame.
         let first_frame = if stage == Stage::Camera { self.monitor.records.frame_count() } else { 0 };
         let args = StageArgs { first_frame, ..self.stage_args.clone() };
         let process = StageProcess::start(stage, &self.folder, &args, &self.terminal)?;
@@ -355,7 +356,7 @@ impl Launcher<'_> {
             Stage::Renderer => topics::VIEW.deadline,
             Stage::Controller => topics::ACTION.deadline,
         };
-        // The controller has a rate of its own.
+        // The controller has its own rate.
         let frames_ns = if stage == Stage::Controller { 0.0 } else { QUIET_FRAMES * frame_ns };
         Limits {
             start_ns: launcher.start_timeout_ms * NS_PER_MS,
@@ -385,7 +386,7 @@ impl Launcher<'_> {
         }
     }
 
-    /// Sleeps until it is time to look again, and takes in what has arrived.
+    /// Sleeps until the next check, and reads all messages.
     fn step(&mut self) -> anyhow::Result<Woken> {
         let woken = self.waiter.wait_until(&[], monotonic_now_ns() + WATCH_NS)?;
         self.collect()?;
@@ -398,7 +399,8 @@ impl Launcher<'_> {
         Ok(self.monitor.drain(|frame| terminal.line(&decision_line(frame, graph, drives, terminal)))?)
     }
 
-    /// Looks at the stages: kills who hangs, restarts who died, by policy. True when the camera is done.
+    /// Checks the stages: kills those that hang, restarts those that died, by policy. Returns true when the camera is
+    /// done.
     fn watch(&mut self) -> anyhow::Result<bool> {
         let now_ns = monotonic_now_ns();
         let pause_ns = now_ns.saturating_sub(std::mem::replace(&mut self.watched_ns, now_ns));
@@ -411,7 +413,7 @@ impl Launcher<'_> {
                 ended.insert(watched.stage, status);
             }
         }
-        // What the dead said last is heard before they are judged.
+        // The last messages of a dead process are read before it is judged.
         if !ended.is_empty() {
             self.collect()?;
         }
@@ -456,9 +458,9 @@ impl Launcher<'_> {
         Ok(false)
     }
 
-    /// Decides what comes after a stage's end: a restart by its policy, or a run without it, or none at all.
+    /// Handles the end of a stage: a restart by its policy, a run without it, or an error.
     fn judge(&mut self, index: usize, cause: &str, now_ns: u64) -> anyhow::Result<()> {
-        // The dead one has been waited for: its ports can be freed for its successor.
+        // The dead process has been reaped: its ports can be freed for its successor.
         self.node.cleanup_dead();
         let watched = &mut self.stages[index];
         let stage = watched.stage;
@@ -483,11 +485,11 @@ impl Launcher<'_> {
             n => format!("stage `{stage}` is lost after {n} restarts: {cause}"),
         };
         match (stage, self.graph.launcher.when_lost) {
-            // Nothing that is decided rests on it.
-            (Stage::Renderer, _) => self.terminal.log(LAUNCHER, &format!("ERROR {lost}: going on without views")),
+            // No decision depends on the renderer.
+            (Stage::Renderer, _) => self.terminal.log(LAUNCHER, &format!("ERROR {lost}: continuing without views")),
             (Stage::Controller, _) | (_, WhenLost::End) => bail!(lost),
             (_, WhenLost::Halt) => {
-                self.terminal.log(LAUNCHER, &format!("ERROR {lost}: the safe action stands until the run is stopped"));
+                self.terminal.log(LAUNCHER, &format!("ERROR {lost}: the safe action applies until the run is stopped"));
                 self.lost = Some(lost);
             }
         }
@@ -507,10 +509,10 @@ impl Launcher<'_> {
         ));
     }
 
-    /// Ends the stages, the camera first, each within the time limit; kills what does not end.
+    /// Ends the stages, the camera first, each within the time limit; kills those that do not end.
     fn shut_down(&mut self) {
         service_manager::stopping();
-        // Whatever ended the run, the feed is told by the same stop; it leaves the run before the stages do.
+        // The same stop ends the feed; the feed leaves the run before the stages do.
         if let Some(feed) = self.feed.take() {
             self.waiter.stop().stop();
             if let Ok(Err(error)) = feed.join() {
@@ -519,7 +521,7 @@ impl Launcher<'_> {
         }
         let limit = Duration::from_millis(self.graph.launcher.stop_timeout_ms);
         let deadline_ns = monotonic_now_ns() + limit.as_nanos() as u64;
-        // In the order of the data's way: who speaks before who listens.
+        // In the order of the data flow: publishers before subscribers.
         self.stages.reverse();
         for process in self.stages.iter().filter_map(|w| w.process.as_ref()) {
             process.terminate();
@@ -535,14 +537,14 @@ impl Launcher<'_> {
                 std::thread::sleep(Duration::from_millis(5));
             }
         }
-        // Their last heartbeats hold the final counts. A failure here has nothing left to stop.
+        // Their last heartbeats contain the final counts. A failure here has no consequences.
         if let Err(error) = self.collect() {
             self.terminal.log(LAUNCHER, &format!("ERROR {}", carff_base::errors::sentence(&*error)));
         }
     }
 }
 
-/// Renders the data set when it is missing and the graph says from which scenario.
+/// Renders the dataset if it is missing and the graph names its scenario.
 fn provide_dataset(graph: &GraphConfig, args: &LaunchArgs, dataset: &Path, terminal: &Terminal) -> anyhow::Result<()> {
     let complete = std::fs::read_dir(dataset)
         .is_ok_and(|entries| entries.flatten().any(|e| e.file_name().to_string_lossy().starts_with("transforms")));
@@ -551,7 +553,7 @@ fn provide_dataset(graph: &GraphConfig, args: &LaunchArgs, dataset: &Path, termi
     }
     ensure!(
         args.dataset.is_none() || !dataset.exists(),
-        "{} holds no data set (no transforms.json)",
+        "{} contains no dataset (no transforms.json)",
         dataset.display()
     );
     match graph.scenario_path() {
@@ -561,15 +563,15 @@ fn provide_dataset(graph: &GraphConfig, args: &LaunchArgs, dataset: &Path, termi
             crate::dataset::render(&Scenario::load(&scenario)?, dataset, Extras::None).map(drop)
         }
         _ => bail!(
-            "data set {} is missing: give --dataset, or name its scenario in the graph file (`run.scenario`){}",
+            "dataset {} is missing: pass --dataset, or name its scenario in the graph file (`run.scenario`){}",
             dataset.display(),
             carff_base::names::beside(dataset)
         ),
     }
 }
 
-/// A checkpoint knows one scenario: driven through another one it would be sure and wrong. A checkpoint that is not there
-/// is told of by the stage that misses it.
+/// Refuses a checkpoint of another scenario, whose decisions would be confident and wrong. The stage that needs a
+/// missing checkpoint reports it.
 fn refuse_another_scenario(graph: &GraphConfig, dataset: &Path, checkpoint: &Path) -> anyhow::Result<()> {
     if graph.camera.source == CameraSource::Folder || !checkpoint.join(carff_checkpoint::files::MANIFEST).exists() {
         return Ok(());

@@ -1,5 +1,5 @@
-//! The `carff` command's parts that start graphs or compute with models: launching and watching a graph, replays, soaks,
-//! training and judging, data sets. What the stages compute lives in the stages; what looks at a run, in `carff`.
+//! The parts of the `carff` command that start graphs or compute with models: launch, replay, soak, training,
+//! evaluation and datasets. The crate `carff` contains the commands that observe a run.
 
 pub mod ablate;
 #[cfg(feature = "import")]

@@ -1,4 +1,4 @@
-//! Every command of `carff`, its help, completions and manual pages: what `carff` becomes for all that computes.
+//! Every command of `carff` with its help, completions and manual pages.
 
 use carff::{Attach, exit_code, until_read};
 #[cfg(feature = "bench")]
@@ -18,21 +18,21 @@ use carff_launch::train::TrainArgs;
 use clap::{CommandFactory, Parser, Subcommand};
 use std::process::ExitCode;
 
-/// What every command has in common.
+/// Common end of every command's help.
 const ENDS: &str = "\
-Example: what is in the way of a graph, then start it
+Example: check a graph, then start it
   carff doctor configs/graphs/approaching-intersection.toml
   carff launch configs/graphs/approaching-intersection.toml
 
 Exit codes:
     0  done
-    1  an error, told in one sentence
-       (doctor: something keeps a graph from running; soak: the contract was broken)
+    1  an error, reported in one sentence
+       (doctor: a graph cannot run; soak: the contract was violated)
     2  wrong arguments
   130  interrupted (Ctrl-C)
 
 Environment:
-  NO_COLOR  no colours, wherever the output goes";
+  NO_COLOR  no colours in any output";
 
 /// CARFF: from a camera image to a driving decision, in separate processes.
 #[derive(Debug, Parser)]
@@ -44,40 +44,40 @@ struct Cli {
 
 #[derive(Debug, Subcommand)]
 enum Command {
-    /// Start a graph, show its decisions, and end with a report.
+    /// Start a graph, print its decisions, and end with a report.
     #[command(after_help = "Example: two drives, with a report
   carff launch configs/graphs/approaching-intersection.toml --drives 2 --report reports/run.json")]
     Launch(LaunchArgs),
     #[command(flatten)]
     Attach(Attach),
     /// Send a recording through a graph again, and compare.
-    #[command(after_help = "Example: is everything still decided as it was? And at half the speed, to look at
+    #[command(after_help = "Example: compare all decisions; then replay at half the speed
   carff replay run.mcap --verify
   carff replay run.mcap --rate 0.5
 
 Exit code: 1 when --verify finds a difference.")]
     Replay(ReplayArgs),
-    /// Render and check data sets.
+    /// Render and check datasets.
     #[command(
         subcommand,
-        after_help = "Example: pictures of a scenario, and a look at them
+        after_help = "Example: render a scenario, and check the images
   carff dataset render approaching-intersection --out data/approaching-intersection
   carff dataset check data/approaching-intersection --contact-sheet reports/contact.png"
     )]
     Dataset(DatasetCommand),
-    /// Train a scenario's models; goes on where an earlier run stopped.
-    #[command(after_help = "Example: the models that ship, into a folder of your own
+    /// Train a scenario's models; continues an earlier run that stopped.
+    #[command(after_help = "Example: train the shipped models into your own folder
   carff train configs/training/approaching-intersection.toml --out runs/mine/checkpoint --run-dir runs/mine")]
     Train(TrainArgs),
-    /// Judge a checkpoint: every table and picture, as JSON and one page.
-    #[command(after_help = "Example: the planning table alone
+    /// Evaluate a checkpoint: every table and image, as JSON and one page.
+    #[command(after_help = "Example: only the planning table
   carff eval configs/checkpoints/approaching-intersection --only planning --out reports/results")]
     Eval(EvalArgs),
-    /// Train the encoder with one thing changed at a time, and tabulate; goes on where an earlier run stopped.
+    /// Train the encoder with one change at a time, and tabulate; continues an earlier run that stopped.
     #[command(after_help = "Example: two of the variants
   carff ablate configs/training/approaching-intersection-ablation.toml --only full --only stem --out reports/ablation")]
     Ablate(AblateArgs),
-    /// Make published weights of an image backbone ready for training.
+    /// Convert published weights of an image backbone for training.
     #[command(
         subcommand,
         after_help = "Example: a vision transformer, as timm and Hugging Face publish them
@@ -89,7 +89,7 @@ Exit code: 1 when --verify finds a difference.")]
     #[cfg(not(feature = "import"))]
     #[command(hide = true)]
     Backbone(carff::NotBuilt),
-    /// Measure the program's parts, and the whole loop, on this machine.
+    /// Measure the program's parts and the whole loop on this machine.
     #[command(
         subcommand,
         after_help = "Example: from camera to action, in a minute
@@ -101,32 +101,32 @@ Exit code: 1 when --verify finds a difference.")]
     #[cfg(not(feature = "bench"))]
     #[command(hide = true)]
     Bench(carff::NotBuilt),
-    /// Run a graph under a seeded schedule of faults, and hold it to its contract.
+    /// Run a graph under a seeded schedule of faults, and check its contract.
     #[command(after_help = "Example: ten minutes of every kind of fault
   carff soak configs/soak/all.toml --minutes 10 --seed 7 --json reports/soak.json")]
     Soak(SoakArgs),
-    /// One fault from outside, for a soak.
+    /// Inject one fault, for a soak.
     #[command(hide = true)]
     SoakInject(InjectArgs),
-    /// Look at the machine, and at a graph: what will go wrong, what it means, and what to do.
-    #[command(after_help = "Example: the machine, and all that a graph needs
+    /// Check the machine and a graph: problems, their consequences, and remedies.
+    #[command(after_help = "Example: check the machine, and all requirements of a graph
   carff doctor configs/graphs/approaching-intersection.toml
   carff doctor --json
 
-Exit code: 1 when there is an error among the findings, else 0.")]
+Exit code: 1 if a finding is an error, else 0.")]
     Doctor(DoctorArgs),
     /// Print the JSON Schema of a kind of file, for editors.
-    #[command(after_help = "Example: as it lies in configs/schemas
+    #[command(after_help = "Example: write a file of configs/schemas
   carff schema graph > graph.schema.json
 
 A TOML file names its schema in its first line, for editors that know taplo: #:schema ../schemas/graph.schema.json")]
     Schema(SchemaArgs),
-    /// Print a shell's completions of this command.
-    #[command(after_help = "Example: for bash, from the next login on
+    /// Print shell completions of this command.
+    #[command(after_help = "Example: for bash, from the next login
   carff completions bash > ~/.local/share/bash-completion/completions/carff")]
     Completions(CompletionsArgs),
     /// Write this command's man pages.
-    #[command(after_help = "Example: where man finds them
+    #[command(after_help = "Example: into a folder of man's search path
   carff man ~/.local/share/man/man1")]
     Man(ManArgs),
 }
@@ -168,13 +168,13 @@ fn run() -> anyhow::Result<ExitCode> {
 mod tests {
     use super::*;
 
-    /// All commands that a user sees, with those below them.
+    /// Collects all visible commands with their subcommands.
     fn all(command: &clap::Command, found: &mut Vec<clap::Command>) {
         found.push(command.clone());
         command.get_subcommands().filter(|c| !c.is_hide_set() && c.get_name() != "help").for_each(|c| all(c, found));
     }
 
-    /// Each command's help ends with an example, each line of which is a command line that is understood.
+    /// Each command's help ends with an example, and each line of it parses as a command line.
     #[test]
     fn every_help_has_examples_that_parse() {
         let mut commands = Vec::new();
@@ -190,11 +190,11 @@ mod tests {
                 assert!(parsed.is_ok(), "{line}: {}", parsed.err().map(|e| e.to_string()).unwrap_or_default());
                 lines += 1;
             }
-            assert!(lines > 0, "no example of `{}` is a command line", command.get_name());
+            assert!(lines > 0, "the help of `{}` has no example command", command.get_name());
         }
     }
 
-    /// Every command line in a block of the book and the other pages is understood.
+    /// Every command line in a block of the book and the other pages parses.
     #[test]
     fn commands_in_the_book_parse() {
         let root = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
@@ -211,7 +211,7 @@ mod tests {
                     if !line.starts_with("carff ") {
                         continue;
                     }
-                    // A second terminal's column stands far to the right.
+                    // The column of a second terminal is far to the right.
                     let line = line.split("     ").next().unwrap_or(line);
                     let words = line.split_whitespace().take_while(|word| !["|", ">", "&", "#"].contains(word));
                     let shown = |e: &clap::Error| e.kind() == clap::error::ErrorKind::DisplayHelp;
@@ -227,7 +227,7 @@ mod tests {
         assert!(lines > 30, "{lines}");
     }
 
-    /// The graph file that the book deploys is valid, without a warning.
+    /// The graph file of the book's deployment page is valid, without a warning.
     #[test]
     fn the_graph_in_the_book_is_valid() {
         let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("debian/vehicle.toml");
@@ -235,7 +235,8 @@ mod tests {
         assert_eq!(graph.warnings(), Vec::<String>::new());
     }
 
-    /// The description is sound (names and shortcuts do not clash), and its completions and pages can be made.
+    /// The description is consistent (names and shortcuts do not clash), and its completions and pages can be
+    /// generated.
     #[test]
     fn completions_and_pages() {
         Cli::command().debug_assert();

@@ -1,4 +1,4 @@
-//! Listens to all topics of a run and writes down what happened, frame by frame.
+//! Subscribes to all topics of a run and records every frame.
 
 use carff_config::GraphConfig;
 use carff_messages::{
@@ -8,55 +8,55 @@ use carff_messages::{
 use carff_transport::{Image, Node, OpenError, ReceiveError, Receiver, topics};
 use std::collections::{BTreeMap, VecDeque};
 
-/// Everything known about one camera frame. What is from the data set is -1 or `Unknown` where there is none.
+/// Record of a camera frame. Values from the dataset are -1 or `Unknown` without a dataset.
 #[derive(Clone, Debug)]
 pub struct FrameRecord {
     /// Frame number in the run.
     pub frame_id: u64,
     /// Camera pose.
     pub view: i32,
-    /// Hidden course of events.
+    /// Time step of the branch.
     pub branch: i32,
     /// Step of it.
     pub timestamp: i32,
-    /// Drive number.
+    /// Number of the drive.
     pub drive: i32,
-    /// Frames of the drive before this one.
+    /// Number of earlier frames of the drive.
     pub frame_in_drive: i32,
-    /// Whether it is the last frame of its timestamp, whose decision counts.
+    /// True for the last frame of its time step, whose decision counts.
     pub last_of_timestamp: bool,
-    /// How much of the actor or its place it shows.
+    /// Visibility of the actor or its place.
     pub observability: Option<Observability>,
-    /// When it was taken: monotonic clock, nanoseconds.
+    /// Capture time: monotonic clock, nanoseconds.
     pub capture_time_ns: u64,
-    /// What the encoder saw.
+    /// Posterior from the encoder.
     pub posterior: Option<Gaussian>,
-    /// The decision that rests on it.
+    /// Decision based on the frame.
     pub action: Option<ActionCode>,
-    /// Why (the decision's reason); also set when a belief on it was refused.
+    /// Reason of the decision; also set if a belief about the frame was refused.
     pub reason: Option<Reason>,
-    /// Hazard probability that the decision rests on.
+    /// Hazard probability of the decision.
     pub hazard_probability: f32,
-    /// How sure the rule was.
+    /// Confidence of the decision.
     pub confidence: f32,
     /// Time from capture to the publication of the decision, nanoseconds; 0 without a decision.
     pub latency_ns: u64,
 }
 
-/// What a stage has said of itself, summed over its restarts.
+/// Health reports of a stage, summed over its restarts.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct StageSummary {
     /// Latest heartbeat.
     pub last: Option<Health>,
-    /// Messages skipped because a newer one was there.
+    /// Messages skipped in favour of newer ones.
     pub skipped: u64,
     /// Invalid messages dropped.
     pub invalid: u64,
     /// Errors.
     pub errors: u64,
-    /// Largest resident memory, bytes.
+    /// Maximum resident memory, bytes.
     pub max_rss_bytes: u64,
-    /// Counts of processes before the latest.
+    /// Counts of earlier processes.
     earlier: [u64; 3],
 }
 
@@ -72,41 +72,41 @@ impl StageSummary {
         self.last = Some(*health);
     }
 
-    /// Its state, as last heard.
+    /// Returns the state in the last heartbeat.
     pub fn state(&self) -> HealthState {
         self.last.and_then(|h| h.state().ok()).unwrap_or(HealthState::Starting)
     }
 }
 
-/// All that was recorded of a run: of frames and times the newest, as many as were asked for.
+/// Records of a run: the newest frames and times, up to a limit.
 #[derive(Clone, Debug, Default)]
 pub struct Records {
-    /// What the graph file asks for, and how much is kept.
+    /// Values that the graph file requests, and the limit of records.
     wanted: Wanted,
-    /// By frame number.
+    /// Frames by number.
     pub frames: BTreeMap<u64, FrameRecord>,
-    /// Actions published, decisions and ticks alike.
+    /// Number of published actions, both decisions and repeats.
     pub actions: u64,
     /// Safe actions by reason.
     pub safe_actions: BTreeMap<&'static str, u64>,
-    /// What was given up under overload: beliefs with fewer samples, frames with fewer steps, views with fewer pixels
-    /// than the graph file asks for.
+    /// Reductions under overload: beliefs with fewer samples, frames with fewer steps, and views with fewer pixels than
+    /// the graph file requests.
     pub given_up: BTreeMap<&'static str, u64>,
-    /// Time that each forecast step took, nanoseconds.
+    /// Duration of each forecast step, nanoseconds.
     pub forecaster_ns: VecDeque<u64>,
-    /// Time that each probing step took, nanoseconds.
+    /// Duration of each probing step, nanoseconds.
     pub prober_ns: VecDeque<u64>,
-    /// Time that each frame's encoding took, nanoseconds.
+    /// Duration of each frame's encoding, nanoseconds.
     pub encoder_ns: VecDeque<u64>,
-    /// Time that each view took, nanoseconds.
+    /// Duration of each view's rendering, nanoseconds.
     pub renderer_ns: VecDeque<u64>,
-    /// What the stages said of themselves.
+    /// Health reports of the stages.
     pub stages: BTreeMap<Stage, StageSummary>,
-    /// When each stage's latest message was published: monotonic clock, nanoseconds.
+    /// Publication time of each stage's latest message: monotonic clock, nanoseconds.
     pub spoke_ns: BTreeMap<Stage, u64>,
 }
 
-/// What the graph file asks for.
+/// Values that the graph file requests.
 #[derive(Clone, Copy, Debug, Default)]
 struct Wanted {
     keep: usize,
@@ -116,17 +116,17 @@ struct Wanted {
 }
 
 impl Records {
-    /// The frames in order.
+    /// Returns the frames in order.
     pub fn frames(&self) -> Vec<FrameRecord> {
         self.frames.values().cloned().collect()
     }
 
-    /// Frames that the camera took, whether or not the launcher was quick enough to write each down.
+    /// Returns the number of captured frames, including frames that the launcher could not record.
     pub fn frame_count(&self) -> u64 {
         self.frames.last_key_value().map_or(0, |(last, _)| last + 1)
     }
 
-    /// Frames that a stage of the decision path passed over.
+    /// Returns the number of frames that a stage of the decision path skipped.
     pub fn skipped(&self) -> u64 {
         [Stage::Encoder, Stage::Forecaster, Stage::Prober, Stage::Controller]
             .iter()
@@ -181,7 +181,7 @@ impl Records {
     }
 
     fn take_belief(&mut self, belief: &Belief) {
-        // A belief rests on a forecast: both have spoken.
+        // A belief depends on a forecast: both stages have published.
         for stage in [Stage::Forecaster, Stage::Prober] {
             self.spoke_ns.insert(stage, belief.header.publish_time_ns);
         }
@@ -218,7 +218,7 @@ impl Records {
     }
 }
 
-/// Subscribed to all topics of a run.
+/// Subscriptions to all topics of a run.
 #[derive(Debug)]
 pub struct Monitor {
     frames: Receiver<Image<FrameMeta>>,
@@ -227,12 +227,12 @@ pub struct Monitor {
     actions: Receiver<Action>,
     views: Receiver<Image<ViewMeta>>,
     healths: Vec<Receiver<Health>>,
-    /// What was recorded.
+    /// Records of the run.
     pub records: Records,
 }
 
 impl Monitor {
-    /// Subscribes, without being woken by messages: that would take a core from the stages at each hand-over.
+    /// Subscribes without being notified of messages: notifications would take a core from the stages.
     pub fn open(node: &Node, graph: &GraphConfig) -> Result<Self, OpenError> {
         let wanted = Wanted {
             keep: graph.launcher.keep_frames as usize,
@@ -252,9 +252,9 @@ impl Monitor {
         })
     }
 
-    /// Takes in all that waits. Calls `decided` for each frame that was decided on.
+    /// Reads all waiting messages. Calls `decided` for each frame with a decision.
     pub fn drain(&mut self, mut decided: impl FnMut(&FrameRecord)) -> Result<(), ReceiveError> {
-        // In the order of the data's way, so that what refers to a frame finds it.
+        // Topics are read in the order of the data flow, so that each message finds its frame.
         while let Some(frame) = self.frames.next()? {
             self.records.take_frame(&frame);
         }

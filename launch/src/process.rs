@@ -1,4 +1,4 @@
-//! One child process of the launcher.
+//! A child process of the launcher.
 
 use anyhow::Context;
 use carff::log_line;
@@ -13,7 +13,7 @@ use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 
-/// Longest line that is relayed; a longer one is cut.
+/// Maximum length of a relayed line; longer lines are cut.
 const MAX_LINE_BYTES: u64 = 4096;
 
 /// A stage's process, with its log relayed.
@@ -21,12 +21,12 @@ const MAX_LINE_BYTES: u64 = 4096;
 pub(crate) struct StageProcess {
     child: Child,
     relay: Option<JoinHandle<()>>,
-    /// The last line that said what went wrong.
+    /// The last log line that reported an error.
     last_error: Arc<Mutex<Option<String>>>,
 }
 
 impl StageProcess {
-    /// Starts it. Call this from the main thread: the child ends with the thread that started it.
+    /// Starts the process. Call this from the main thread: the child ends with the thread that started it.
     pub(crate) fn start(
         stage: Stage,
         folder: &Path,
@@ -39,7 +39,7 @@ impl StageProcess {
             .stdin(Stdio::null())
             .stdout(Stdio::null())
             .stderr(Stdio::piped())
-            // Ctrl-C goes to the launcher alone, which then ends the stages in order.
+            // Only the launcher receives Ctrl-C; it ends the stages in order.
             .process_group(0)
             .spawn()
             .with_context(|| format!("cannot start {}; build it with `cargo build --release`", program.display()))?;
@@ -62,34 +62,34 @@ impl StageProcess {
         self.child.id()
     }
 
-    /// Whether it has ended, and how. Reaps it, so that it is no zombie whose locks still count.
+    /// Returns the exit status if the process has ended. Reaps it, because locks of a zombie would still count.
     pub(crate) fn ended(&mut self) -> anyhow::Result<Option<ExitStatus>> {
         let status = self.child.try_wait().context("cannot watch a stage")?;
         if status.is_some()
             && let Some(relay) = self.relay.take()
         {
-            // Its last words come before what is said about its end.
+            // Its last log lines are printed before its end is reported.
             let _ = relay.join();
         }
         Ok(status)
     }
 
-    /// The last error that it logged.
+    /// Returns the last error that it logged.
     pub(crate) fn last_error(&self) -> Option<String> {
         self.last_error.lock().ok()?.clone()
     }
 
-    /// Asks it to end.
+    /// Asks the process to end.
     pub(crate) fn terminate(&self) {
         if let Some(pid) = Pid::from_raw(self.child.id() as i32) {
-            // It fails when the process has ended already, which is what is wanted.
+            // A failure means that the process has already ended.
             let _ = kill_process(pid, Signal::TERM);
-            // One that is stopped cannot hear it otherwise.
+            // A stopped process must continue to receive the signal.
             let _ = kill_process(pid, Signal::CONT);
         }
     }
 
-    /// Ends it at once.
+    /// Kills the process.
     pub(crate) fn kill(&mut self) {
         let _ = self.child.kill();
         let _ = self.child.wait();
@@ -107,7 +107,7 @@ impl Drop for StageProcess {
     }
 }
 
-/// Calls `each` for each line, of any encoding, cut at a limit, until the end.
+/// Calls `each` for each line, in any encoding, cut at a limit, until the end.
 fn relay_lines(mut input: impl BufRead, mut each: impl FnMut(&str)) {
     let mut line = Vec::new();
     loop {
@@ -123,7 +123,7 @@ fn relay_lines(mut input: impl BufRead, mut each: impl FnMut(&str)) {
 mod tests {
     use super::*;
 
-    /// Lines arrive one by one; long ones in pieces, broken encodings as replacement characters.
+    /// Lines arrive one by one; long lines in pieces, broken encodings as replacement characters.
     #[test]
     fn lines_are_relayed_whatever_they_are() {
         let mut text = b"one\ntwo \xff\n".to_vec();

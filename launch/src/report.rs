@@ -5,7 +5,7 @@ use carff_messages::Stage;
 use serde_json::{Map, Value, json};
 use std::collections::BTreeMap;
 
-/// A finished run, for the report and for whoever adds tables to it.
+/// A finished run, for the report and for callers that add tables.
 #[derive(Clone, Debug, Default)]
 pub struct RunOutcome {
     /// Run name.
@@ -14,23 +14,23 @@ pub struct RunOutcome {
     pub graph: String,
     /// The run's seed.
     pub seed: u64,
-    /// Folder of the data set.
+    /// Folder of the dataset.
     pub dataset: std::path::PathBuf,
     /// Folder of the trained models.
     pub checkpoint: std::path::PathBuf,
-    /// All that was recorded.
+    /// Records of the run.
     pub records: Records,
     /// Restarts by stage.
     pub restarts: BTreeMap<Stage, u32>,
-    /// Invalid messages that the launcher itself met.
+    /// Number of invalid messages that the launcher received.
     pub invalid: u64,
 }
 
-/// p50, p99 and max of times in nanoseconds, in milliseconds; null where there are none.
+/// Converts times in nanoseconds to p50, p99 and max in milliseconds; null if there are no times.
 pub fn quantiles_ms<'a>(times_ns: impl IntoIterator<Item = &'a u64>) -> Value {
     let mut sorted: Vec<u64> = times_ns.into_iter().copied().collect();
     sorted.sort_unstable();
-    // The smallest time that at least this share of all times does not exceed.
+    // The smallest time that is at least as large as this share of all times.
     let at = |share: f64| {
         let rank = (share * sorted.len() as f64).ceil() as usize;
         sorted.get(rank.max(1) - 1).map(|&ns| ns as f64 / 1e6)
@@ -38,7 +38,7 @@ pub fn quantiles_ms<'a>(times_ns: impl IntoIterator<Item = &'a u64>) -> Value {
     json!({ "p50": at(0.5), "p99": at(0.99), "max": at(1.0), "count": sorted.len() })
 }
 
-/// The report, with what `tables` adds.
+/// Returns the report with `tables` added.
 pub fn json(outcome: &RunOutcome, tables: Map<String, Value>) -> Value {
     let records = &outcome.records;
     let decided: Vec<u64> = records.frames.values().filter(|f| f.action.is_some()).map(|f| f.latency_ns).collect();
@@ -81,7 +81,7 @@ pub fn json(outcome: &RunOutcome, tables: Map<String, Value>) -> Value {
 mod tests {
     use super::*;
 
-    /// Quantiles are times that occurred; of a hundred, p99 is the 99th and max the last; none are null.
+    /// Quantiles are measured times; of a hundred, p99 is the 99th and max the last; of none, they are null.
     #[test]
     fn quantiles_are_exact() {
         let times: Vec<u64> = (1..=100).rev().map(|ms| ms * 1_000_000).collect();
@@ -90,7 +90,7 @@ mod tests {
         assert_eq!(quantiles_ms(&[])["p50"], Value::Null);
     }
 
-    /// All promised keys are there, also of a run in which nothing happened, and tables are added at the top.
+    /// The report has all promised keys, also for a run without events, and tables are added at the top level.
     #[test]
     fn promised_keys_are_there() {
         let mut tables = Map::new();

@@ -1,5 +1,5 @@
-//! `carff schema`: the JSON Schema of each kind of file, made from the structures that read it, so that editors
-//! complete and check. What lies in `configs/schemas` is this.
+//! `carff schema`: the JSON Schema of each kind of file, generated from the structures that read the file. Editors use
+//! it for completion and checks. `configs/schemas` contains the generated files.
 
 use carff_config::{GraphConfig, SoakConfig};
 use carff_scenes::config::ScenarioConfig;
@@ -10,28 +10,28 @@ use serde_json::Value;
 /// Print the schema of a kind of file.
 #[derive(Clone, Debug, clap::Args)]
 pub struct SchemaArgs {
-    /// Which kind of file.
+    /// Kind of file.
     pub kind: FileKind,
 }
 
 /// A kind of file that a user writes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub enum FileKind {
-    /// What a graph runs, as in configs/graphs.
+    /// A graph, as in configs/graphs.
     Graph,
     /// A world to render, as in configs/scenarios.
     Scenario,
-    /// How models are trained, as in configs/training.
+    /// The training of models, as in configs/training.
     Training,
-    /// Faults and what is asked of a graph under them, as in configs/soak.
+    /// Faults and the contract of a graph under them, as in configs/soak.
     Soak,
 }
 
 impl FileKind {
-    /// All kinds.
+    /// Lists all kinds of files.
     pub const ALL: [Self; 4] = [Self::Graph, Self::Scenario, Self::Training, Self::Soak];
 
-    /// The folder of the shipped files, below `configs`.
+    /// Returns the folder of the shipped files, below `configs`.
     pub fn folder(self) -> &'static str {
         match self {
             Self::Graph => "graphs",
@@ -41,7 +41,7 @@ impl FileKind {
         }
     }
 
-    /// The schema's file, below `configs/schemas`.
+    /// Returns the schema's file name, below `configs/schemas`.
     pub fn file(self) -> &'static str {
         match self {
             Self::Graph => "graph.schema.json",
@@ -61,7 +61,7 @@ impl FileKind {
     }
 }
 
-/// The schema of a kind of file: draft 7, which editors know best.
+/// Returns the schema of a kind of file: draft 7, which editors support best.
 pub fn schema(kind: FileKind) -> Value {
     let generator = SchemaSettings::draft07().into_generator();
     let mut schema = match kind {
@@ -76,14 +76,14 @@ pub fn schema(kind: FileKind) -> Value {
     schema
 }
 
-/// Prints it.
+/// Prints the schema.
 pub fn run(args: &SchemaArgs) -> anyhow::Result<()> {
     let text = serde_json::to_string_pretty(&schema(args.kind))? + "\n";
     print!("{text}");
     Ok(())
 }
 
-/// Descriptions on one line, and defaults in single precision as they are written (0.02, not 0.019999999552965164).
+/// Puts descriptions on one line, and shortens single-precision defaults (0.02, not 0.019999999552965164).
 fn tidy(value: &mut Value) {
     match value {
         Value::Object(map) => {
@@ -110,7 +110,7 @@ fn tidy(value: &mut Value) {
 mod tests {
     use super::*;
 
-    /// A file's keys are in its schema with their meaning, nothing else is allowed, and defaults read as they are written.
+    /// A file's keys are in its schema with their descriptions, no other keys are allowed, and defaults are readable.
     #[test]
     fn schemas_say_what_keys_mean() {
         let graph = schema(FileKind::Graph);

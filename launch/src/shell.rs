@@ -1,4 +1,4 @@
-//! `carff completions` and `carff man`: what shells and `man` show of this command, made from its own description.
+//! `carff completions` and `carff man`: shell completions and man pages, generated from the command's description.
 
 use anyhow::Context;
 use std::path::PathBuf;
@@ -13,7 +13,7 @@ pub struct CompletionsArgs {
 /// Write man pages.
 #[derive(Clone, Debug, clap::Args)]
 pub struct ManArgs {
-    /// Folder for the pages, one for each command; it is made if it is missing.
+    /// Folder for the pages, one per command; it is created if it is missing.
     pub dir: PathBuf,
 }
 
@@ -25,10 +25,10 @@ pub fn completions(args: &CompletionsArgs, mut command: clap::Command) {
     print!("{}", String::from_utf8_lossy(&script));
 }
 
-/// Writes the man pages of a command and of those below it.
+/// Writes the man pages of a command and its subcommands.
 pub fn man(args: &ManArgs, command: clap::Command) -> anyhow::Result<()> {
     let dir = args.dir.display();
-    std::fs::create_dir_all(&args.dir).with_context(|| format!("cannot make {dir}"))?;
+    std::fs::create_dir_all(&args.dir).with_context(|| format!("cannot create {dir}"))?;
     clap_mangen::generate_to(command, &args.dir).with_context(|| format!("cannot write into {dir}"))?;
     println!("man pages in {dir}: man {dir}/carff.1");
     Ok(())

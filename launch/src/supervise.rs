@@ -1,36 +1,36 @@
-//! When a dead stage is started again: pure logic, without processes.
+//! The restart policy of dead stages: pure logic, without processes.
 
 use carff_config::RestartPolicy;
 use std::collections::VecDeque;
 
-/// Longest pause, as a multiple of the first one.
+/// Longest pause, as a multiple of the first pause.
 const MAX_BACKOFF_FACTOR: u64 = 16;
 
-/// What to do about a stage that died.
+/// Verdict on a stage that died.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Verdict {
-    /// Start it again at this time, nanoseconds on the monotonic clock.
+    /// Restart it at this time, nanoseconds on the monotonic clock.
     RestartAt(u64),
-    /// Give it up.
+    /// Do not restart it.
     Lost,
 }
 
-/// Counts the restarts of one stage.
+/// Counter of one stage's restarts.
 #[derive(Clone, Debug)]
 pub struct RestartBudget {
     policy: RestartPolicy,
     restarts: u32,
-    /// When it died, as far as that still counts, nanoseconds.
+    /// Times of deaths within the policy's window, nanoseconds.
     recent_ns: VecDeque<u64>,
 }
 
 impl RestartBudget {
-    /// Nothing has died yet.
+    /// Creates a supervisor without deaths.
     pub fn new(policy: RestartPolicy) -> Self {
         Self { policy, restarts: 0, recent_ns: VecDeque::new() }
     }
 
-    /// Restarts so far.
+    /// Returns the number of restarts.
     pub fn restarts(&self) -> u32 {
         self.restarts
     }
@@ -68,7 +68,7 @@ mod tests {
         assert_eq!(budget.restarts(), 7);
     }
 
-    /// Deaths that lie further back than the policy looks count no more: a stage may die now and then for ever.
+    /// Deaths before the policy's window do not count: a stage may die now and then indefinitely.
     #[test]
     fn old_deaths_are_forgotten() {
         let mut budget = RestartBudget::new(RestartPolicy::OnFailure { backoff_ms: 10, max_restarts: 2, within_s: 60 });

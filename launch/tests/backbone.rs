@@ -1,4 +1,5 @@
-//! Contracts of `carff backbone import`: what it writes is what went in, and nothing that is there is replaced unasked.
+//! Tests of `carff backbone import`: the written tensors equal the input, and existing files are replaced only on
+//! request.
 
 use carff_networks::weights;
 use std::{
@@ -6,8 +7,8 @@ use std::{
     process::{Command, Output},
 };
 
-/// The weights that ship, in their published names: imported, they are the same tensors again. A second time they are
-/// refused, but for `--force`.
+/// The shipped weights under their published names are imported as equal tensors. A second import is refused without
+/// `--force`.
 #[test]
 fn the_shipped_weights_are_imported() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");

@@ -1,4 +1,4 @@
-//! `carff doctor` and exit codes, as scripts see them.
+//! Tests of `carff doctor` and of exit codes, as scripts use them.
 
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
@@ -10,7 +10,7 @@ fn carff(args: &[&str]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_carff-launch")).args(args).output().unwrap()
 }
 
-/// The JSON is whole, its counts are those of its findings, and the exit code is 1 exactly when an error is among them.
+/// The JSON is complete, its counts match its findings, and the exit code is 1 exactly if a finding is an error.
 #[test]
 fn findings_as_json() {
     let folder = tempfile::tempdir().unwrap();
@@ -30,7 +30,7 @@ fn findings_as_json() {
     }
 }
 
-/// Without a terminal there are no colours; wrong arguments end with 2, errors with 1, help with 0.
+/// Without a terminal there are no colours; wrong arguments exit with 2, errors with 1, help with 0.
 #[test]
 fn exit_codes() {
     let plain = carff(&["doctor"]);

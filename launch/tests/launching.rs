@@ -1,5 +1,5 @@
-//! Whole graphs of real processes, with stages that compute next to nothing: what the launcher does when all goes well,
-//! when a stage dies, and when it is interrupted or killed.
+//! Tests of whole graphs of real processes with trivial stages: a normal run, a stage that dies, and a launcher that is
+//! interrupted or killed.
 
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
@@ -22,7 +22,7 @@ use std::time::Duration;
 const HORIZON: u32 = 2;
 const SIDE: u32 = 16;
 
-/// Plays a stage when the launcher of a test starts this program as one; does nothing otherwise.
+/// Acts as a stage if the launcher of a test starts this program as one; otherwise does nothing.
 #[test]
 fn fake_stage() {
     let (Ok(role), Ok(args)) = (std::env::var("CARFF_FAKE"), std::env::var("CARFF_ARGS")) else { return };
@@ -64,7 +64,8 @@ fn camera(stage: &mut StageContext) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Faults: `none`; `start` fails before it is ready; `once` dies in mid-run, its first life only; `always`.
+/// Faults: `none`; `start` fails before it is ready; `once` dies during its first life only; `always` dies in each
+/// life.
 fn encoder(stage: &mut StageContext, fault: &str) -> anyhow::Result<()> {
     anyhow::ensure!(fault != "start", "the weights are not where they should be");
     let mut frames = stage.input(&topics::FRAME)?;
@@ -155,7 +156,7 @@ fn idle(stage: &mut StageContext) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// A graph of its own, in a folder of its own.
+/// A graph with its own name and folder.
 struct Graph {
     folder: tempfile::TempDir,
     name: String,
@@ -229,13 +230,13 @@ fn text(output: &Output) -> String {
     format!("{}\n{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr))
 }
 
-/// A launcher that has shown its first decision.
+/// Returns a launcher that has printed its first decision.
 fn deciding(graph: &Graph) -> Child {
     let mut child = graph.command(100_000).spawn().unwrap();
     let stdout = child.stdout.take().unwrap();
     let mut lines = BufReader::new(stdout).lines().map_while(Result::ok);
-    assert!(lines.any(|line| line.contains("hazard 0.25")), "no decision was shown");
-    // Keep reading, so that the launcher never writes into a closed pipe.
+    assert!(lines.any(|line| line.contains("hazard 0.25")), "no decision was printed");
+    // Keep reading, so that the launcher never writes to a closed pipe.
     std::thread::spawn(move || lines.for_each(drop));
     child
 }
@@ -244,7 +245,7 @@ fn signal(child: &Child, signal: Signal) {
     kill_process(Pid::from_raw(child.id() as i32).unwrap(), signal).unwrap();
 }
 
-/// Whether it comes true before a watchdog barks.
+/// Returns true if the condition becomes true before the watchdog's limit.
 fn eventually(mut condition: impl FnMut() -> bool) -> bool {
     let deadline_ns = monotonic_now_ns() + 30_000_000_000;
     while monotonic_now_ns() < deadline_ns {
@@ -256,7 +257,8 @@ fn eventually(mut condition: impl FnMut() -> bool) -> bool {
     false
 }
 
-/// A run to its end: each frame is recorded, decisions are shown and reported, nothing is left, exit code 0.
+/// A run completes: each frame is recorded, decisions are printed and reported, nothing is left, and the exit code is
+/// 0.
 #[test]
 fn a_run_ends_with_a_report_and_leaves_nothing() {
     let graph = Graph::new("none");
@@ -273,7 +275,7 @@ fn a_run_ends_with_a_report_and_leaves_nothing() {
     graph.assert_nothing_left();
 }
 
-/// A stage that dies in mid-run is started again, the run goes on to its end, and the report counts it.
+/// A stage that dies during a run is restarted, the run completes, and the report counts the restart.
 #[test]
 fn a_dead_stage_is_started_again() {
     let graph = Graph::new("once");
@@ -282,7 +284,7 @@ fn a_dead_stage_is_started_again() {
     let report = graph.report();
     assert_eq!(report["restarts_by_stage"]["encoder"], 1, "{}", text(&output));
     assert_eq!(report["frames"], 100, "{report}\n{}", text(&output));
-    assert!(report["decisions"].as_u64().unwrap() > 5, "decisions went on after the restart: {report}");
+    assert!(report["decisions"].as_u64().unwrap() > 5, "decisions continued after the restart: {report}");
     assert!(text(&output).contains("stage encoder died (killed by signal 6)"), "{}", text(&output));
     graph.assert_nothing_left();
 }
@@ -297,7 +299,7 @@ fn a_lost_stage_ends_the_run() {
     graph.assert_nothing_left();
 }
 
-/// A stage that cannot start ends the launch with the stage's own sentence, without restarts.
+/// A stage that cannot start ends the launch with the stage's own error, without restarts.
 #[test]
 fn a_stage_that_cannot_start_says_why() {
     let graph = Graph::new("start");
@@ -319,7 +321,7 @@ fn an_interrupt_ends_everything() {
     graph.assert_nothing_left();
 }
 
-/// A second launch of the same run is refused with a sentence that names the first; under another name it runs.
+/// A second launch of the same run is refused with the name of the first run; under another name it runs.
 #[test]
 fn a_second_launch_of_a_run_is_refused() {
     let graph = Graph::new("none");
@@ -338,7 +340,7 @@ fn a_second_launch_of_a_run_is_refused() {
     graph.assert_nothing_left();
 }
 
-/// When the launcher itself is killed, its stages end by themselves, and the next launch of that run works.
+/// If the launcher is killed, its stages end by themselves, and the next launch of that run works.
 #[test]
 fn a_killed_launcher_leaves_no_stage_and_no_obstacle() {
     let graph = Graph::new("none");
@@ -351,7 +353,7 @@ fn a_killed_launcher_leaves_no_stage_and_no_obstacle() {
     graph.assert_nothing_left();
 }
 
-/// Missing and wrong graph files are one clear sentence each.
+/// Missing and wrong graph files cause one clear sentence each.
 #[test]
 fn wrong_graph_files_are_named() {
     let graph = Graph::new("none");
@@ -371,5 +373,5 @@ fn wrong_graph_files_are_named() {
     )
     .unwrap();
     let bare = launch(&graph.path("bare.toml"));
-    assert!(bare.contains("is missing: give --dataset"), "{bare}");
+    assert!(bare.contains("is missing: pass --dataset"), "{bare}");
 }

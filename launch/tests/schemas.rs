@@ -1,4 +1,4 @@
-//! The schemas that ship: up to date, named by the files that they are for, and with all keys of these.
+//! Tests of the shipped schemas: they are up to date, and the shipped files name them and have only their keys.
 
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
@@ -10,7 +10,7 @@ fn configs() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs")
 }
 
-/// What lies in configs/schemas is what `carff schema` prints.
+/// The files in configs/schemas equal the output of `carff schema`.
 #[test]
 fn the_shipped_schemas_are_up_to_date() {
     for kind in FileKind::ALL {
@@ -26,7 +26,7 @@ fn the_shipped_schemas_are_up_to_date() {
     }
 }
 
-/// Every shipped file names its schema for editors, which knows each of its keys and no other.
+/// Every shipped file names its schema for editors, and has only keys of the schema.
 #[test]
 fn schemas_know_the_keys_of_shipped_files() {
     for kind in FileKind::ALL {
@@ -47,7 +47,7 @@ fn schemas_know_the_keys_of_shipped_files() {
     }
 }
 
-/// The keys of a value, at any depth, that its schema does not know.
+/// Returns the keys of a value, at any depth, that its schema does not contain.
 fn unknown(value: &Value, schema: &Value, root: &Value) -> Vec<String> {
     let branches = branches(schema, root);
     match value {
@@ -66,7 +66,7 @@ fn unknown(value: &Value, schema: &Value, root: &Value) -> Vec<String> {
     }
 }
 
-/// A schema and all that it refers to or combines.
+/// Returns a schema with all schemas that it refers to or combines.
 fn branches<'a>(schema: &'a Value, root: &'a Value) -> Vec<&'a Value> {
     let referred = schema["$ref"].as_str().and_then(|path| root.pointer(path.trim_start_matches('#')));
     let combined = ["allOf", "anyOf", "oneOf"].into_iter().filter_map(|key| schema[key].as_array()).flatten();

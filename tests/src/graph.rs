@@ -1,4 +1,4 @@
-//! A graph of a test's own: a run name that nobody else has, a folder, a graph file.
+//! A graph for one test: a unique run name, a folder, a graph file.
 
 use crate::{Finished, Process, program};
 use carff_messages::Stage;
@@ -8,10 +8,10 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::atomic::{AtomicU32, Ordering};
 
-/// The run id of stages that a test starts by itself.
+/// Run id of stages that a test starts by itself.
 const RUN_ID: u64 = 7;
 
-/// Settings under which the speed of the machine changes no decision: nothing is stale on a busy machine.
+/// Settings under which the speed of the machine changes no decision: nothing becomes stale on a busy machine.
 pub const PATIENT: &str = "[controller]\nrate_hz = 4.0\ndeadline_ms = 60000\n[launcher]\nstart_timeout_ms = 600000\n\
                            stop_timeout_ms = 30000\n";
 
@@ -19,12 +19,12 @@ pub const PATIENT: &str = "[controller]\nrate_hz = 4.0\ndeadline_ms = 60000\n[la
 pub const PATIENT_AND_ENDLESS: &str = "[camera]\nrepeat = true\n[controller]\nrate_hz = 4.0\ndeadline_ms = 60000\n\
                                        [launcher]\nstart_timeout_ms = 600000\nstop_timeout_ms = 30000\n";
 
-/// Counts the decisions that a launcher has shown: each is one line.
+/// Counts the decisions that a launcher has printed: each is one line.
 pub fn decisions(text: &str) -> usize {
     text.lines().filter(|line| line.contains("hazard ") && line.trim_end().ends_with(" ms")).count()
 }
 
-/// A graph of a test's own. Dropped, it removes what its run may have left.
+/// A graph for one test. Dropping it removes leftovers of its run.
 #[derive(Debug)]
 pub struct TestGraph {
     folder: tempfile::TempDir,
@@ -32,7 +32,7 @@ pub struct TestGraph {
 }
 
 impl TestGraph {
-    /// Writes the graph file: `[run]` with a name of its own and these paths, then `rest`, which begins inside `[run]`.
+    /// Writes the graph file: `[run]` with a unique name and these paths, then `rest`, which starts inside `[run]`.
     pub fn new(dataset: &Path, checkpoint: &Path, rest: &str) -> Self {
         static NEXT: AtomicU32 = AtomicU32::new(0);
         let name = format!("x{}-{}", std::process::id(), NEXT.fetch_add(1, Ordering::Relaxed));
@@ -46,41 +46,41 @@ impl TestGraph {
         Self { folder, run: Run::new(&name, RUN_ID).unwrap() }
     }
 
-    /// Its run, for whoever joins the stages that [`Self::stage`] starts.
+    /// Returns its run, for tests that join the stages of [`Self::stage`].
     pub fn run(&self) -> &Run {
         &self.run
     }
 
-    /// A path in its folder.
+    /// Returns a path in its folder.
     pub fn path(&self, name: &str) -> PathBuf {
         self.folder.path().join(name)
     }
 
-    /// The graph file.
+    /// Returns the path of the graph file.
     pub fn file(&self) -> PathBuf {
         self.path("graph.toml")
     }
 
-    /// `carff launch` on its graph file, or on another one under its run name.
+    /// Returns the command `carff launch` on its graph file, or on another one under its run name.
     pub fn launch(&self, file: &Path, args: &[&str]) -> Command {
         let mut command = Command::new(program("carff"));
         command.current_dir(self.folder.path()).arg("launch").arg(file).args(["--run", self.run.name()]).args(args);
         command
     }
 
-    /// `carff launch` on its graph file, to its end.
+    /// Runs `carff launch` on its graph file to the end.
     pub fn launch_to_end(&self, args: &[&str]) -> Finished {
         Process::start(&mut self.launch(&self.file(), args)).end()
     }
 
-    /// One stage, started by itself.
+    /// Starts one stage by itself.
     pub fn stage(&self, stage: Stage) -> Process {
         let mut command = Command::new(program(&format!("carff-{stage}")));
         command.current_dir(self.folder.path()).arg("--graph").arg(self.file());
         Process::start(command.args(["--run", self.run.name(), "--run-id", &RUN_ID.to_string()]))
     }
 
-    /// The process of a stage of the launched run, found by what the launcher wrote on its command line.
+    /// Returns the process of a stage of the launched run, found by its command line.
     pub fn stage_pid(&self, stage: Stage) -> Option<u32> {
         let wanted = format!("carff-{stage}");
         std::fs::read_dir("/proc").unwrap().flatten().find_map(|entry| {
@@ -92,12 +92,12 @@ impl TestGraph {
         })
     }
 
-    /// The report that a launch with `--report report.json` wrote.
+    /// Returns the report of a launch with `--report report.json`.
     pub fn report(&self) -> Value {
         serde_json::from_str(&std::fs::read_to_string(self.path("report.json")).unwrap()).unwrap()
     }
 
-    /// Fails if a process, a file in shared memory, the run's folder or its lock is still there.
+    /// Fails if a process, a file in shared memory, the run's folder or its lock still exists.
     #[track_caller]
     pub fn assert_nothing_left(&self) {
         assert_eq!(living_processes(&self.run).unwrap(), Vec::<u32>::new());
@@ -113,7 +113,7 @@ impl TestGraph {
 
 impl Drop for TestGraph {
     fn drop(&mut self) {
-        // A failed test must not leave anything behind; one that passed has nothing.
+        // A failed test must not leave anything behind; a passed test has left nothing.
         let _ = remove_run_leftovers(&self.run);
     }
 }

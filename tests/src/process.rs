@@ -1,4 +1,4 @@
-//! A program under watch: what it prints, how it ends, and its end if it does not.
+//! A watched program: its output, its exit status, and its end if it hangs.
 
 use crate::{WATCHDOG, eventually};
 use rustix::process::{Pid, Signal, kill_process};
@@ -7,7 +7,7 @@ use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 
-/// A running program. Dropped, it is killed.
+/// A running program. Dropping it kills it.
 #[derive(Debug)]
 pub struct Process {
     child: Child,
@@ -18,14 +18,14 @@ pub struct Process {
 /// A program that has ended.
 #[derive(Clone, Debug)]
 pub struct Finished {
-    /// How.
+    /// Exit status of the program.
     pub status: ExitStatus,
-    /// All that it printed, standard output and error as they came.
+    /// Complete output: standard output and error in their order of arrival.
     pub text: String,
 }
 
 impl Process {
-    /// Starts it, and reads what it prints so that it never waits for a reader.
+    /// Starts a program, and reads its output so that it never blocks.
     pub fn start(command: &mut Command) -> Self {
         let mut child = command
             .stdin(Stdio::null())
@@ -39,21 +39,21 @@ impl Process {
         Self { child, text, readers: vec![stdout, stderr] }
     }
 
-    /// Its process id.
+    /// Returns its process id.
     pub fn id(&self) -> u32 {
         self.child.id()
     }
 
-    /// All that it has printed so far.
+    /// Returns its output so far.
     pub fn text(&self) -> String {
         self.text.lock().unwrap().clone()
     }
 
-    /// Waits until it has printed something that holds; fails when it ends before, or at the watchdog.
+    /// Waits until its output satisfies a condition; fails if it ends before, or at the watchdog's limit.
     pub fn wait_for(&mut self, what: &str, mut holds: impl FnMut(&str) -> bool) {
         let mut ended = false;
         let seen = eventually(|| {
-            // Looked at in this order, the last words of a program that has ended are read too.
+            // Read in this order, so that the last output of an ended program is included.
             ended = self.child.try_wait().unwrap().is_some();
             if ended {
                 self.readers.drain(..).for_each(|reader| reader.join().unwrap());
@@ -65,12 +65,12 @@ impl Process {
         assert!(holds(&text), "it ended without {what}:\n{text}");
     }
 
-    /// Sends it a signal.
+    /// Sends a signal to it.
     pub fn signal(&self, signal: Signal) {
         kill_process(Pid::from_raw(self.child.id() as i32).unwrap(), signal).unwrap();
     }
 
-    /// Waits for its end; fails at the watchdog.
+    /// Waits for its end; fails at the watchdog's limit.
     pub fn end(mut self) -> Finished {
         let ended = eventually(|| self.child.try_wait().unwrap().is_some());
         if !ended {
@@ -86,26 +86,26 @@ impl Process {
 
 impl Drop for Process {
     fn drop(&mut self) {
-        // Both fail when it has ended already, which is what is wanted.
+        // Both fail if it has already ended, which is fine.
         let _ = self.child.kill();
         let _ = self.child.wait();
     }
 }
 
 impl Finished {
-    /// Fails unless it ended well.
+    /// Fails unless it ended with success.
     #[track_caller]
     pub fn assert_success(&self) {
         assert!(self.status.success(), "{}:\n{}", self.status, self.text);
     }
 
-    /// Fails unless it ended with exit code 1 and one line that begins with `error:` and holds all these words; a
-    /// panic is none.
+    /// Fails unless it ended with exit code 1 and one line that starts with `error:` and contains all these words; a
+    /// panic does not count.
     #[track_caller]
     pub fn assert_one_error(&self, words: &[&str]) {
         assert_eq!(self.status.code(), Some(1), "{}:\n{}", self.status, self.text);
         let errors: Vec<&str> = self.text.lines().filter(|line| line.starts_with("error:")).collect();
-        assert_eq!(errors.len(), 1, "one error is wanted:\n{}", self.text);
+        assert_eq!(errors.len(), 1, "one error is expected:\n{}", self.text);
         for word in words {
             assert!(errors[0].contains(word), "`{word}` is missing in: {}\nin all:\n{}", errors[0], self.text);
         }

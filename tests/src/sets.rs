@@ -1,4 +1,4 @@
-//! Data sets and checkpoints for tests.
+//! Datasets and checkpoints for tests.
 
 use crate::{Process, program, programs, project_root, shipped_checkpoint};
 use carff_dataset::Image;
@@ -8,7 +8,7 @@ use std::hash::Hasher;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-/// The shipped scenario's data set, rendered once for this build of `carff` and kept in the target folder.
+/// Renders the shipped scenario's dataset once per build of `carff`, and keeps it in the target folder.
 pub fn scenario_set() -> PathBuf {
     let scenario = project_root().join("configs/scenarios/approaching-intersection.toml");
     let mut hasher = std::collections::hash_map::DefaultHasher::new();
@@ -17,7 +17,7 @@ pub fn scenario_set() -> PathBuf {
     }
     let folder = programs().join("carff-tests");
     std::fs::create_dir_all(&folder).unwrap();
-    // Test programs run side by side too: one renders, the others wait for it.
+    // Test programs run in parallel too: one renders, the others wait for it.
     let lock = std::fs::File::create(folder.join("lock")).unwrap();
     flock(&lock, FlockOperation::LockExclusive).unwrap();
     let set = folder.join(format!("set-{:016x}", hasher.finish()));
@@ -34,8 +34,8 @@ pub fn scenario_set() -> PathBuf {
     set
 }
 
-/// A small set of plain pictures: two branches x two timestamps x 20 poses of 8 x 8 pixels, half of the poses blind and
-/// half of them clear.
+/// Writes a small dataset of plain images: two branches x two time steps x 20 poses of 8 x 8 pixels, half of the poses
+/// blind and half of them clear.
 pub fn picture_set(folder: &Path) {
     let images = folder.join("images");
     std::fs::create_dir_all(&images).unwrap();
@@ -64,7 +64,7 @@ pub fn picture_set(folder: &Path) {
     std::fs::write(folder.join("transforms.json"), set.to_string()).unwrap();
 }
 
-/// A copy of the shipped checkpoint, with its manifest changed.
+/// Copies the shipped checkpoint, with a changed manifest.
 pub fn copy_checkpoint(folder: &Path, change: impl FnOnce(&mut serde_json::Value)) {
     std::fs::create_dir_all(folder).unwrap();
     for entry in std::fs::read_dir(shipped_checkpoint()).unwrap().flatten().filter(|e| e.path().is_file()) {

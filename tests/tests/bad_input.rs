@@ -1,4 +1,4 @@
-//! What the `carff` command answers to what it cannot use: one error that says what to do, exit code 1, nothing left.
+//! Tests of the `carff` command with unusable input: one error with a remedy, exit code 1, nothing left.
 
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
@@ -6,7 +6,7 @@ use carff_tests::{Process, TestGraph, picture_set, program};
 use std::path::Path;
 use std::process::Command;
 
-/// A wrong graph file is answered with file, line, key and what is allowed.
+/// A wrong graph file causes an error with file, line, key and the allowed values.
 #[test]
 fn wrong_graph_files() {
     let graph = TestGraph::new(Path::new("none"), Path::new("none"), "");
@@ -29,18 +29,18 @@ fn wrong_graph_files() {
     graph.assert_nothing_left();
 }
 
-/// A data set that is missing, or a folder that holds none, is named, with what to give instead.
+/// A missing dataset, or a folder without one, is an error with its name and an alternative.
 #[test]
 fn missing_data_sets() {
     let graph = TestGraph::new(Path::new("nowhere"), Path::new("none"), "");
     graph.launch_to_end(&[]).assert_one_error(&["nowhere", "is missing", "--dataset"]);
     let empty = graph.path("empty");
     std::fs::create_dir(&empty).unwrap();
-    graph.launch_to_end(&["--dataset", empty.to_str().unwrap()]).assert_one_error(&["empty", "holds no data set"]);
+    graph.launch_to_end(&["--dataset", empty.to_str().unwrap()]).assert_one_error(&["empty", "contains no dataset"]);
     graph.assert_nothing_left();
 }
 
-/// A checkpoint that is missing ends the launch with the stage's own sentence, which says how to make one.
+/// A missing checkpoint ends the launch with the stage's own error, which names the training command.
 #[test]
 fn missing_checkpoint() {
     let set = tempfile::tempdir().unwrap();
@@ -50,7 +50,7 @@ fn missing_checkpoint() {
     graph.assert_nothing_left();
 }
 
-/// A checkpoint of another format version is refused, with both versions.
+/// A checkpoint of another format version is refused with both versions.
 #[test]
 fn checkpoint_of_another_format() {
     let set = tempfile::tempdir().unwrap();
@@ -66,7 +66,7 @@ fn checkpoint_of_another_format() {
     graph.assert_nothing_left();
 }
 
-/// A program of the graph that is missing is named, with how to build it.
+/// A missing program of the graph is an error with its name and the build command.
 #[test]
 fn missing_program() {
     let set = tempfile::tempdir().unwrap();
@@ -77,7 +77,7 @@ fn missing_program() {
     graph.assert_nothing_left();
 }
 
-/// Wrong data sets are told which file, which frame and which key.
+/// Errors of wrong datasets name the file, the frame and the key.
 #[test]
 fn dataset_check_names_the_place() {
     let set = tempfile::tempdir().unwrap();
@@ -98,22 +98,21 @@ fn dataset_check_names_the_place() {
     check().assert_one_error(&["b1_t0_v7.png"]);
 }
 
-/// Shared memory that is too small, or that cannot be written, is found before any stage starts, and named.
+/// Shared memory that is too small, or not writable, is reported before any stage starts.
 ///
-/// Both need a mount of the test's own; where the system gives none to its users, the check itself is still tested in
-/// `carff-transport`.
+/// Both cases need a private mount; if the system does not let users mount, `carff-transport` still tests the check.
 #[test]
 fn shared_memory_full_or_not_writable() {
     let private = |mount: &str, rest: &str| {
         let mut command = Command::new("unshare");
         let uid = rustix::process::getuid().as_raw();
         command.args(["--user", "--map-root-user", "--mount", "sh", "-c"]);
-        // Back to this user inside: the run's folder is named after them.
+        // Inside, switch back to this user: the run's folder is named after the user.
         command.arg(format!("mount -t tmpfs {mount} tmpfs /dev/shm && exec unshare --user --map-user={uid} {rest}"));
         command
     };
     if !Process::start(&mut private("", "true")).end().status.success() {
-        eprintln!("this system lets its users mount nothing: not tried here");
+        eprintln!("this system does not let users mount: not tested here");
         return;
     }
     let set = tempfile::tempdir().unwrap();
@@ -130,8 +129,8 @@ fn shared_memory_full_or_not_writable() {
     graph.assert_nothing_left();
 }
 
-/// Standard output that nobody reads any more (`| head`) ends a command without a word, as the shell's convention for it
-/// says.
+/// If no process reads standard output any more (`| head`), a command ends without a message, as is the convention in
+/// shells.
 #[test]
 fn a_reader_that_has_seen_enough() {
     let set = tempfile::tempdir().unwrap();

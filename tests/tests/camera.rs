@@ -1,4 +1,4 @@
-//! The camera as its own process, with pictures that cannot be used.
+//! Tests of the camera process with unusable images.
 
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
@@ -8,7 +8,7 @@ use carff_tests::{TestGraph, eventually, picture_set};
 use carff_transport::{Node, topics};
 use std::path::Path;
 
-/// Unreadable and wrong-sized pictures of a folder are named, counted as errors and never shown; the others are shown.
+/// Unreadable and wrong-sized images of a folder are named, counted as errors and never shown; the others are shown.
 #[test]
 fn a_folder_with_bad_pictures() {
     let pictures = tempfile::tempdir().unwrap();
@@ -47,8 +47,8 @@ fn a_folder_with_bad_pictures() {
     assert_eq!(shown, [10, 10, 10, 90, 90, 90]);
 }
 
-/// A data set whose pictures cannot be read, or have another size than it says, ends the camera with an error that names
-/// the picture: no drive is shown with a picture left out.
+/// A dataset with unreadable images, or with images of another size than its description, ends the camera with an error
+/// that names the image: no drive is shown without it.
 #[test]
 fn drives_with_bad_pictures() {
     let set = tempfile::tempdir().unwrap();
@@ -75,8 +75,7 @@ fn drives_with_bad_pictures() {
     assert!(wrong_sized.text.contains("4x4") && wrong_sized.text.contains("8x8"), "{}", wrong_sized.text);
 }
 
-/// Free drives are rendered and published as they go: every frame of each drive, with its truth, at poses of which no two
-/// are the same.
+/// Free drives are rendered during the run: every frame of each drive is published with its truth, at distinct poses.
 #[test]
 fn free_drives_are_published() {
     let scenario = carff_tests::project_root().join("configs/scenarios/approaching-intersection");

@@ -1,4 +1,4 @@
-//! The controller as its own process, with a test in the prober's place that lies.
+//! Tests of the controller process, with a test in place of the prober that publishes invalid beliefs.
 
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
@@ -11,7 +11,7 @@ use std::sync::OnceLock;
 
 const HORIZON: u32 = 2;
 
-/// A belief of two states that holds. All steps of a frame have one time of capture, and a later frame has a later one.
+/// Returns a valid belief of two states. All steps of a frame have one capture time, and a later frame has a later one.
 fn belief(run_id: u64, frame_id: u64, step: u32, hazard: f32) -> Belief {
     static START_NS: OnceLock<u64> = OnceLock::new();
     let captured_ns = START_NS.get_or_init(|| monotonic_now_ns() - 1_000_000) + frame_id;
@@ -28,7 +28,7 @@ fn belief(run_id: u64, frame_id: u64, step: u32, hazard: f32) -> Belief {
     belief
 }
 
-/// A controller under test, and what it says.
+/// A controller under test, with its messages.
 struct Controlled {
     graph: TestGraph,
     process: Process,
@@ -38,7 +38,7 @@ struct Controlled {
     /// All actions so far.
     seen: Vec<Action>,
     health: Option<Health>,
-    // Dropped last: it closes the run.
+    // This field is dropped last: it closes the run.
     _node: Node,
 }
 
@@ -89,8 +89,8 @@ impl Controlled {
     }
 }
 
-/// Beliefs with a NaN, an infinity, a wrong count, another schema or another run are dropped and counted one by one, and
-/// no action ever rests on them; valid ones before and after are decided on.
+/// Beliefs with a NaN, an infinity, a wrong count, another schema or another run are dropped and counted one by one. No
+/// action is based on them; valid beliefs before and after them are decided on.
 #[test]
 fn rogue_beliefs_never_reach_an_action() {
     let mut controller = Controlled::start(60_000);
@@ -128,24 +128,24 @@ fn rogue_beliefs_never_reach_an_action() {
     for action in &controller.seen {
         assert!(action.validate().is_ok(), "{action:?}");
         let rests_on = action.based_on_frame;
-        assert!([0, 100, u64::MAX].contains(&rests_on), "an action rests on the rogue frame {rests_on}");
+        assert!([0, 100, u64::MAX].contains(&rests_on), "an action is based on the rogue frame {rests_on}");
     }
     controller.stop();
 }
 
-/// With no valid belief the car halts: first because there is none, then because what came was not valid.
+/// Without a valid belief the car halts: first because none has arrived, then because the last one was not valid.
 #[test]
 fn what_is_not_valid_halts() {
     let mut controller = Controlled::start(150);
     let halts = |reason: Reason| {
         move |c: &Controlled| c.seen.iter().any(|a| a.reason == reason.code() && a.action == ActionCode::Halt.code())
     };
-    controller.until("it halts as nothing came", halts(Reason::NoBeliefYet));
+    controller.until("it halts without a belief", halts(Reason::NoBeliefYet));
     let run_id = controller.graph.run().id();
     let mut rogue = belief(run_id, 0, HORIZON, 0.0);
     rogue.hazard_probability = f32::NAN;
     controller.beliefs.send_unchecked(rogue).unwrap();
-    controller.until("it halts as what came is not valid", halts(Reason::InvalidBelief));
+    controller.until("it halts on an invalid belief", halts(Reason::InvalidBelief));
     assert!(controller.seen.iter().all(|a| a.code().unwrap() == ActionCode::Halt && !a.is_decision()));
     controller.stop();
 }

@@ -1,4 +1,4 @@
-//! Whole graphs: the shipped programs on the shipped checkpoint, launched as a user launches them.
+//! Tests of whole graphs: the shipped programs on the shipped checkpoint, launched as a user launches them.
 
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
@@ -12,8 +12,8 @@ use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
 use std::os::unix::net::UnixDatagram;
 
-/// The shipped graph file drives the shipped checkpoint: it ends with exit code 0, its report has every promised key,
-/// and neither a process nor a file in shared memory is left.
+/// The shipped graph file drives the shipped checkpoint: the exit code is 0, the report has every promised key, and
+/// neither a process nor a file in shared memory is left.
 #[test]
 fn the_shipped_graph_drives() {
     let (set, checkpoint) = (scenario_set(), shipped_checkpoint());
@@ -29,7 +29,7 @@ fn the_shipped_graph_drives() {
     let number = |value: &Value, what: &str| {
         value.as_f64().unwrap_or_else(|| panic!("{what} is {value}, not a number:\n{report:#}"))
     };
-    // Two drives of three timestamps with six frames each.
+    // Two drives of three time steps with six frames each.
     assert!((1.0..=36.0).contains(&number(&report["frames"], "frames")), "{report:#}");
     assert!(number(&report["actions"], "actions") > 0.0);
     assert!(number(&report["skipped"], "skipped") >= 0.0);
@@ -50,7 +50,7 @@ fn the_shipped_graph_drives() {
                     let what = format!("planning.{table}.{rule}.{samples}.{kind}");
                     let (success, trials) = (number(&cell["success"], &what), number(&cell["trials"], &what));
                     assert!(success <= trials, "{what}: {cell}");
-                    // Whatever the models: these two rules look at nothing.
+                    // These two rules do not depend on the models.
                     match (rule, kind) {
                         ("underconfident", "hazard") | ("overconfident", "clear") => {
                             assert!(success == trials, "{what}");
@@ -66,14 +66,14 @@ fn the_shipped_graph_drives() {
     assert!(trials("hazard") + trials("clear") >= 300.0, "{report:#}");
 }
 
-/// Ctrl-C ends all processes of a graph in full work, with the shell's exit code for it, and leaves nothing behind.
+/// Ctrl-C ends all processes of a working graph, with the shell's exit code for it, and leaves nothing behind.
 #[test]
 fn an_interrupt_leaves_nothing() {
     let graph = TestGraph::new(&scenario_set(), &shipped_checkpoint(), &format!("{PATIENT}[camera]\nrepeat = true\n"));
     let mut launcher = Process::start(&mut graph.launch(&graph.file(), &[]));
     launcher.wait_for("decision", |text| decisions(text) >= 3);
     for stage in Stage::ALL {
-        assert!(graph.stage_pid(stage).is_some(), "stage {stage} does not run");
+        assert!(graph.stage_pid(stage).is_some(), "stage {stage} is not running");
     }
     assert!(!graph.run().shared_memory_files().unwrap().is_empty());
     launcher.signal(Signal::INT);
@@ -82,8 +82,8 @@ fn an_interrupt_leaves_nothing() {
     graph.assert_nothing_left();
 }
 
-/// With `log.format = "json"` every line of the log is an object that says when, who, how grave and what, the launcher's
-/// own lines among them.
+/// With `launcher.log_format = "json"` every line of the log is an object with time, source, level and message,
+/// including the launcher's own lines.
 #[test]
 fn logs_are_json_where_asked_for() {
     let more = format!("{PATIENT}log_format = \"json\"\n[camera]\nrepeat = true\n");
@@ -106,8 +106,8 @@ fn logs_are_json_where_asked_for() {
     assert!(said("launcher", "interrupted"), "{text}");
 }
 
-/// A service manager hears that the graph is ready (after all stages are), that it lives for as long as it does, and
-/// that it stops.
+/// A service manager is notified that the graph is ready (after all stages), that it is alive while it runs, and that
+/// it stops.
 #[test]
 fn a_service_manager_is_told() {
     let graph = TestGraph::new(&scenario_set(), &shipped_checkpoint(), &format!("{PATIENT}[camera]\nrepeat = true\n"));
@@ -130,7 +130,7 @@ fn a_service_manager_is_told() {
     }
     assert!(before_ready.iter().all(|word| word == "WATCHDOG=1"), "{before_ready:?}");
     for stage in Stage::ALL {
-        assert!(graph.stage_pid(stage).is_some(), "stage {stage} does not run");
+        assert!(graph.stage_pid(stage).is_some(), "stage {stage} is not running");
     }
     for _ in 0..3 {
         assert_eq!(hear(), "WATCHDOG=1");
@@ -140,7 +140,7 @@ fn a_service_manager_is_told() {
     assert_eq!(launcher.end().status.code(), Some(130));
 }
 
-/// Each stage but the camera may be killed outright: the launcher starts it again, and decisions go on.
+/// Each stage except the camera may be killed: the launcher restarts it, and decisions continue.
 #[test]
 fn killed_stages_are_started_again() {
     let graph = TestGraph::new(&scenario_set(), &shipped_checkpoint(), &format!("{PATIENT}[camera]\nrepeat = true\n"));
@@ -150,10 +150,10 @@ fn killed_stages_are_started_again() {
         let killed = graph.stage_pid(stage).unwrap();
         kill_process(Pid::from_raw(killed as i32).unwrap(), Signal::KILL).unwrap();
         let died = format!("stage {stage} died");
-        launcher.wait_for("word of its death", |text| text.contains(&died));
+        launcher.wait_for("a report of its death", |text| text.contains(&died));
         let lives = || graph.stage_pid(stage).is_some_and(|pid| pid != killed);
-        assert!(eventually(lives), "stage {stage} was not started again:\n{}", launcher.text());
-        // What was under way may still be decided on without the dead one; so many more cannot.
+        assert!(eventually(lives), "stage {stage} was not restarted:\n{}", launcher.text());
+        // Frames in progress may still be decided on without the dead stage; this many more cannot.
         let before = decisions(&launcher.text());
         launcher.wait_for("further decisions", |text| decisions(text) >= before + 10);
     }
@@ -163,7 +163,7 @@ fn killed_stages_are_started_again() {
     graph.assert_nothing_left();
 }
 
-/// A camera that shall not be started again ends the run with one sentence when it dies.
+/// A camera without restarts ends the run with one sentence when it dies.
 #[test]
 fn a_lost_camera_ends_the_run() {
     let graph = TestGraph::new(
@@ -179,8 +179,8 @@ fn a_lost_camera_ends_the_run() {
     graph.assert_nothing_left();
 }
 
-/// A folder in which one picture is broken and one has another size: both are reported as errors of the camera, and the
-/// graph decides on the others.
+/// In a folder with a broken image and an image of another size, both are reported as errors of the camera, and the
+/// graph decides on the other images.
 #[test]
 fn bad_pictures_are_left_out() {
     let pictures = tempfile::tempdir().unwrap();
@@ -206,8 +206,8 @@ fn bad_pictures_are_left_out() {
     graph.assert_nothing_left();
 }
 
-/// A checkpoint that was trained on another scenario than the data set shows is refused before anything is decided; the
-/// error names the key that differs and both values.
+/// A checkpoint of another scenario than the dataset's is refused before any decision; the error names the key that
+/// differs and both values.
 #[test]
 fn a_checkpoint_of_another_scenario() {
     let folder = tempfile::tempdir().unwrap();
@@ -220,7 +220,7 @@ fn a_checkpoint_of_another_scenario() {
     graph.assert_nothing_left();
 }
 
-/// Weights that are cut off, or of another shape than the manifest says, are refused with the file's name.
+/// Weights that are cut off, or of another shape than the manifest's, are refused with the file's name.
 #[test]
 fn a_checkpoint_with_damaged_weights() {
     let folder = tempfile::tempdir().unwrap();

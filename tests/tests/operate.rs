@@ -1,4 +1,4 @@
-//! Probes, recordings and replays on whole graphs, as a user attaches them from another terminal.
+//! Tests of probes, recordings and replays on whole graphs, attached as a user does from another terminal.
 
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
@@ -48,8 +48,8 @@ fn stop(graph: &TestGraph, launcher: Process) {
     graph.assert_nothing_left();
 }
 
-/// Loading libtorch takes thirty times what a probe takes to start: what computes with no tensor is not linked with it.
-/// (Asked to, the dynamic loader lists what it would load, and ends.)
+/// Loading libtorch takes thirty times the start of a probe: programs that compute no tensors are not linked with it.
+/// (On request, the dynamic loader lists the libraries that it would load, and ends.)
 #[test]
 fn what_needs_no_tensors_is_not_linked_with_libtorch() {
     let loads = |name: &str| {
@@ -64,7 +64,8 @@ fn what_needs_no_tensors_is_not_linked_with_libtorch() {
     }
 }
 
-/// Every probe shows what runs, without a config; the graph's decisions go on, and nothing is left at the end.
+/// Every probe shows the running graph without configuration; the graph's decisions continue, and nothing is left at
+/// the end.
 #[test]
 fn probes_show_what_runs() {
     let (graph, launcher) = running();
@@ -117,8 +118,8 @@ fn probes_show_what_runs() {
     stop(&graph, launcher);
 }
 
-/// Probes that come, go and are killed leave the graph running and nothing behind; when all slots of a topic are taken,
-/// the next probe is told so, and one that goes makes room.
+/// Probes that come, go and are killed leave the graph running and nothing behind. If all slots of a topic are in use,
+/// the next probe gets an error, and a probe that leaves frees its slot.
 #[test]
 fn probes_come_and_go() {
     let (graph, mut launcher) = running();
@@ -160,13 +161,13 @@ fn export(graph: &TestGraph, words: &[&str]) -> Finished {
     Process::start(&mut command).end()
 }
 
-/// Rows of a table; 0 when there is none.
+/// Returns the number of rows of a table; 0 if it does not exist.
 fn rows(path: &Path) -> usize {
     std::fs::read_to_string(path).map_or(0, |text| text.lines().count().saturating_sub(1))
 }
 
-/// A recording goes through the same graph again with the same beliefs and decisions, bit for bit; through a graph that
-/// draws fewer samples it does not, and the first difference is told. What other tools are given can be exported.
+/// A recording replayed through the same graph gives the same beliefs and decisions, bit for bit. A graph that draws
+/// fewer samples gives others, and the first difference is reported. The data for other tools can be exported.
 #[test]
 fn a_recording_is_decided_again_as_it_was() {
     let (graph, launcher) = running();
@@ -176,7 +177,7 @@ fn a_recording_is_decided_again_as_it_was() {
 
     let same = replay(&graph, &["--verify"]);
     same.assert_success();
-    assert!(same.text.contains("all the same, bit for bit"), "{}", same.text);
+    assert!(same.text.contains("all equal, bit for bit"), "{}", same.text);
     graph.assert_nothing_left();
 
     std::fs::write(graph.path("other.toml"), text.replacen("[run]\n", "[run]\nsamples = 4\n", 1)).unwrap();
@@ -186,7 +187,7 @@ fn a_recording_is_decided_again_as_it_was() {
     assert!(told, "{}", other.text);
     graph.assert_nothing_left();
 
-    // From the middle of the way: beliefs as recorded, decided upon again.
+    // Replay from the middle of the path: beliefs as recorded, decided upon again.
     let only = replay(&graph, &["--only", "belief", "--to", "1.5"]);
     only.assert_success();
     assert!(only.text.contains("hazard ") || only.text.contains("replaying"), "{}", only.text);
@@ -201,7 +202,7 @@ fn a_recording_is_decided_again_as_it_was() {
     assert_eq!(pictures.filter(|e| e.file_name().to_string_lossy().starts_with("frame-")).count(), frames);
 }
 
-/// A recorder that is killed leaves what it had written; a second recording of the same name is refused.
+/// A recorder that is killed leaves its written messages; a second recording of the same name is refused.
 #[test]
 fn a_killed_recorder_leaves_its_recording() {
     let (graph, launcher) = running();
@@ -210,7 +211,7 @@ fn a_killed_recorder_leaves_its_recording() {
         let finished = export(&graph, &["run.mcap", "--csv", "csv"]);
         finished.status.success() && rows(&graph.path("csv/controller-action.csv")) > 0
     };
-    // Readable while it is written.
+    // The recording is readable while it is written.
     assert!(eventually(readable), "{}", recorder.text());
     recorder.signal(Signal::KILL);
     recorder.end();
@@ -219,7 +220,7 @@ fn a_killed_recorder_leaves_its_recording() {
     stop(&graph, launcher);
 }
 
-/// Fails if a stage was started again, met an error, or dropped an input as invalid.
+/// Fails if a stage was restarted, had an error, or dropped an input as invalid.
 #[track_caller]
 fn assert_unharmed(graph: &TestGraph) {
     let status = carff(graph, &["metrics", "--once"], &[]).end();
@@ -232,13 +233,13 @@ fn assert_unharmed(graph: &TestGraph) {
     }
 }
 
-/// On a disk that is full the recorder says so in one sentence and ends; what it had written can be read, and the graph
-/// goes on unharmed.
+/// On a full disk the recorder reports it in one sentence and ends. Its written messages are readable, and the graph
+/// continues unaffected.
 #[test]
 fn a_full_disk_ends_the_recording_alone() {
     let (graph, mut launcher) = running();
-    // The disk is in memory, of a megabyte, and seen by the recorder alone. Back to this user within: the run's folder is
-    // named after them.
+    // The disk is in memory, has a megabyte, and is only visible to the recorder. Inside, switch back to this user: the
+    // run's folder is named after the user.
     let user = rustix::process::getuid();
     let (enter, back) = if user.is_root() {
         (vec!["--mount"], String::new())
@@ -254,7 +255,7 @@ fn a_full_disk_ends_the_recording_alone() {
     };
     std::fs::create_dir(graph.path("disk")).unwrap();
     if !on_small_disk(&format!("{back}true")).status.success() {
-        println!("skipped: this system lets its users mount nothing");
+        println!("skipped: this system does not let users mount");
         stop(&graph, launcher);
         return;
     }
@@ -272,14 +273,14 @@ fn a_full_disk_ends_the_recording_alone() {
     stop(&graph, launcher);
 }
 
-/// On a disk that takes eight seconds for each of its first writes the recorder drops whole messages, says so, counts
-/// them, and goes on; what it has written is whole, and the graph decides meanwhile, unharmed.
+/// On a disk that takes eight seconds for each of its first writes the recorder drops whole messages, reports and
+/// counts them, and continues. Its file is valid, and the graph's decisions are unaffected.
 #[test]
 fn a_slow_disk_costs_messages_alone() {
     let (graph, mut launcher) = running();
     let folder = graph.file().parent().unwrap().canonicalize().unwrap();
     let path = folder.join("run.mcap");
-    // strace holds up the system call itself, and the recorder is this test's own child under it.
+    // strace delays the system call itself, and the recorder is this test's own child under it.
     let slow = |program: &Path| {
         let mut command = Command::new("strace");
         command.current_dir(&folder).args(["-D", "-f", "-qq", "--seccomp-bpf", "-o", "/dev/null", "-P"]).arg(&path);
@@ -287,14 +288,14 @@ fn a_slow_disk_costs_messages_alone() {
         command
     };
     if !slow(Path::new("true")).status().is_ok_and(|status| status.success()) {
-        println!("skipped: there is no strace that may slow a program down");
+        println!("skipped: strace is missing, or may not trace");
         stop(&graph, launcher);
         return;
     }
     let mut record = slow(&program("carff"));
     record.args(["record", "--run", graph.run().name(), "--queue-mb", "1", "-o"]).arg(&path);
     let mut recorder = Process::start(&mut record);
-    recorder.wait_for("word of the slow disk", |text| text.contains("the disk is too slow"));
+    recorder.wait_for("a report of the slow disk", |text| text.contains("the disk is too slow"));
     let before = decisions(&launcher.text());
     launcher.wait_for("further decisions", |text| decisions(text) > before);
     assert_unharmed(&graph);
@@ -329,7 +330,7 @@ impl Client {
         self.0.send(Message::text(what.to_string())).unwrap();
     }
 
-    /// The next message in words that is of this kind.
+    /// Returns the next text message of a kind.
     fn hear(&mut self, op: &str) -> Value {
         loop {
             if let Message::Text(text) = self.0.read().unwrap() {
@@ -341,7 +342,7 @@ impl Client {
         }
     }
 
-    /// The next data of a subscription, and its time, nanoseconds since 1970.
+    /// Returns the next data of a subscription, and its time, nanoseconds since 1970.
     fn receive(&mut self, subscription: u32) -> (u64, Vec<u8>) {
         loop {
             if let Message::Binary(bytes) = self.0.read().unwrap() {
@@ -357,7 +358,7 @@ impl Client {
 }
 
 /// A client of the Foxglove protocol finds the topics, subscribes and gets messages that it can read, in JSON and in
-/// protobuf; it can publish nothing. The bridge listens to this machine alone, unless it is told otherwise.
+/// protobuf; it cannot publish. By default the bridge only listens on this machine.
 #[test]
 fn a_bridge_serves_clients_that_only_look() {
     let (graph, launcher) = running();
@@ -366,7 +367,7 @@ fn a_bridge_serves_clients_that_only_look() {
     let mut bridge = carff(&graph, &["bridge", "--listen", "127.0.0.1:0"], &[]);
     bridge.wait_for("address", |text| text.contains("ws://127.0.0.1:") && text.ends_with('\n'));
     let port: u16 = bridge.text().trim().rsplit_once(':').unwrap().1.parse().unwrap();
-    // Whoever listens at all addresses listens at this one too.
+    // A bridge that listens on all addresses listens on this one too.
     assert!(TcpStream::connect((Ipv4Addr::new(127, 0, 0, 2), port)).is_err());
 
     assert!(Client::connect(port, None).is_err() && Client::connect(port, Some("chat")).is_err());
@@ -399,7 +400,7 @@ fn a_bridge_serves_clients_that_only_look() {
     assert_eq!((picture.encoding.as_str(), picture.step), ("rgb8", picture.width * 3));
     assert!(picture.height > 0 && picture.data.len() as u32 == picture.step * picture.height);
 
-    // An action of one's own: neither is it taken for a channel, nor does its data go anywhere.
+    // The client's own action is not accepted as a channel, and its data is not forwarded.
     client.say(&json!({ "op": "advertise", "channels": [
         { "id": 1, "topic": "controller/action", "encoding": "json", "schemaName": "carff.Action" },
     ] }));
@@ -408,13 +409,13 @@ fn a_bridge_serves_clients_that_only_look() {
     client.0.send(Message::binary([&[1], &1_u32.to_le_bytes()[..], b"{}"].concat())).unwrap();
     let refused = client.hear("status");
     assert!(refused["level"] == 2 && refused["message"].as_str().unwrap().contains("nknown channel"), "{refused}");
-    assert!(client.receive(7).0 > first_ns, "it still looks");
+    assert!(client.receive(7).0 > first_ns, "it still runs");
     let topics: Value = serde_json::from_str(&probe(&graph, &["list"], &["--json", "--seconds", "1"])).unwrap();
     let actions = topics.as_array().unwrap().iter().find(|t| t["topic"] == "controller/action").unwrap();
     assert_eq!(actions["publishers"], json!(["controller"]));
     assert_unharmed(&graph);
 
-    // The client is still there, and reads no more: that is not waited for.
+    // The client is still connected, and does not read any more: the bridge does not wait for it.
     bridge.signal(Signal::INT);
     bridge.end().assert_success();
     stop(&graph, launcher);

@@ -1,4 +1,4 @@
-//! A stage of a user's own, `examples/speed-gate`, beside the shipped programs.
+//! Test of a user's own stage, `examples/speed-gate`, next to the shipped programs.
 
 use carff_messages::Message;
 use carff_observe::attach;
@@ -10,9 +10,9 @@ use rustix::process::Signal;
 use speed_gate::{FREE_M_S, SPEED_LIMIT, SpeedLimit};
 use std::process::Command;
 
-/// It joins the shipped graph by its name alone and publishes its own messages: valid ones, each on the frame of an
-/// action. It leaves when it is asked to and the graph goes on; another one ends by itself when the graph does. Nothing
-/// is left.
+/// The stage joins the shipped graph only by its name and publishes its own valid messages, each about the frame of an
+/// action. It leaves on request and the graph continues; another one ends by itself when the graph ends. Nothing is
+/// left.
 #[test]
 fn a_stage_of_its_own_joins_and_leaves() {
     let graph = TestGraph::new(&scenario_set(), &shipped_checkpoint(), PATIENT_AND_ENDLESS);
@@ -20,7 +20,7 @@ fn a_stage_of_its_own_joins_and_leaves() {
     launcher.wait_for("decision", |text| decisions(text) >= 1);
     let gate = || {
         let mut gate = Process::start(Command::new(program("speed-gate")).arg(graph.run().name()));
-        gate.wait_for("word that it has joined", |text| text.contains("joined run"));
+        gate.wait_for("a report that it has joined", |text| text.contains("joined run"));
         gate
     };
 
@@ -47,7 +47,7 @@ fn a_stage_of_its_own_joins_and_leaves() {
         }
         assert!(found.windows(2).all(|pair| pair[0].header.sequence + 1 == pair[1].header.sequence), "{found:?}");
         let both = found.iter().filter(|l| frames.contains(&l.header.frame_id)).count();
-        assert!(both > 0, "no limit rests on the frame of an action that was seen: {found:?}");
+        assert!(both > 0, "no limit is based on the frame of a received action: {found:?}");
     }
     first.signal(Signal::TERM);
     let finished = first.end();

@@ -1,4 +1,4 @@
-//! Another user of the same machine can neither read what a run exchanges nor put anything in.
+//! Tests that another user of the machine can neither read the data of a run nor add any.
 
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
@@ -10,13 +10,13 @@ use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-/// A user who owns nothing; its number is the same on every Linux system.
+/// A user without files; its number is the same on every Linux system.
 const NOBODY: u32 = 65534;
 
 fn all_below(folder: &Path, found: &mut Vec<PathBuf>) {
     found.push(folder.to_owned());
     for entry in std::fs::read_dir(folder).unwrap().flatten() {
-        // What comes and goes may be gone by now.
+        // Temporary files may have been removed by now.
         match entry.file_type() {
             Ok(kind) if kind.is_dir() => all_below(&entry.path(), found),
             _ => found.push(entry.path()),
@@ -24,7 +24,7 @@ fn all_below(folder: &Path, found: &mut Vec<PathBuf>) {
     }
 }
 
-/// Files that another user can read, or write to, in his own words.
+/// Returns the files that another user can read or write, as a shell of that user reports them.
 fn what_nobody_can(files: &[PathBuf]) -> String {
     let script = "for f in \"$@\"; do head -c 1 \"$f\" > /dev/null 2>&1 && echo \"reads $f\"; \
                   [ -e \"$f\" ] && (: >> \"$f\") 2> /dev/null && echo \"writes $f\"; done; true";
@@ -35,8 +35,8 @@ fn what_nobody_can(files: &[PathBuf]) -> String {
     String::from_utf8_lossy(&output.stdout).into_owned()
 }
 
-/// All that a run in full work keeps, in shared memory and in small files and sockets, is this user's alone, by owner and
-/// mode; and where these tests may become another user, that one really can open nothing, while he can what is for all.
+/// All files of a running graph, in shared memory and elsewhere, are private to this user by owner and mode. If this
+/// test may become another user, that user can open none of them, but can open public files.
 #[test]
 fn a_run_is_its_users_alone() {
     let graph = TestGraph::new(&scenario_set(), &shipped_checkpoint(), "[camera]\nrepeat = true\n");
@@ -51,7 +51,7 @@ fn a_run_is_its_users_alone() {
     for file in &files {
         let Ok(found) = std::fs::symlink_metadata(file) else { continue };
         assert_eq!(found.uid(), me, "{}", file.display());
-        // What lies in a folder that nobody else enters is safe whatever its mode; shared memory lies in the open.
+        // Files in a folder that no other user can enter are safe with any mode; shared memory is accessible to all.
         let in_the_open = !file.starts_with(runtime_dir()) || *file == runtime_dir();
         assert!(!in_the_open || matches!(found.mode() & 0o077, 0), "{}: mode {:o}", file.display(), found.mode());
     }

@@ -1,4 +1,4 @@
-//! Two minutes of `carff soak` on the shipped graph and checkpoint.
+//! Test of two minutes of `carff soak` on the shipped graph and checkpoint.
 
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
@@ -6,8 +6,8 @@ use carff_tests::{Process, program, project_root, scenario_set, shipped_checkpoi
 use serde_json::Value;
 use std::process::Command;
 
-/// Under every kind of fault that the time allows the contract holds: no wrong action, every recovery, counters right,
-/// nothing left over. The result has every promised key.
+/// The contract holds under every kind of fault that the time allows: no wrong action, every recovery, correct
+/// counters, nothing left over. The result has every promised key.
 #[test]
 fn the_graph_survives() {
     let folder = tempfile::tempdir().unwrap();
@@ -28,7 +28,7 @@ fn the_graph_survives() {
     assert!(result["faults"].is_object() && result.get("rss_growth_percent_per_hour").is_some(), "{result:#}");
 }
 
-/// A wrong soak file is one error that names the file and the key.
+/// A wrong soak file causes one error that names the file and the key.
 #[test]
 fn a_wrong_soak_file_is_named() {
     let folder = tempfile::tempdir().unwrap();

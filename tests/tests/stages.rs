@@ -1,4 +1,5 @@
-//! The decision path's four stages on the shipped checkpoint, with a test in the camera's place and a liar among them.
+//! Tests of the decision path's four stages on the shipped checkpoint, with a test in place of the camera that also
+//! publishes invalid messages.
 
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
@@ -31,8 +32,8 @@ fn frame(run_id: u64, frame_id: u64) -> FrameMeta {
     }
 }
 
-/// A NaN in a message of any topic, and a picture of another size than it says, is dropped and counted by each stage
-/// that reads the topic, and goes no further: no action ever rests on it, and what is valid is still decided on.
+/// A NaN in a message of any topic, and an image of another size than its description, is dropped and counted by each
+/// stage that reads the topic. No action is based on it, and valid messages are still decided on.
 #[test]
 fn rogue_messages_stop_at_the_next_stage() {
     let rest = "[controller]\nrate_hz = 4.0\ndeadline_ms = 60000\n";
@@ -81,7 +82,7 @@ fn rogue_messages_stop_at_the_next_stage() {
     belief.hazard_probability = f32::NAN;
     beliefs.send_unchecked(belief).unwrap();
     // The forecaster reads beliefs too.
-    until("each has dropped what is not valid", &|stage, health| {
+    until("each has dropped the invalid messages", &|stage, health| {
         health.invalid
             == match stage {
                 Stage::Encoder | Stage::Forecaster => 2,
@@ -101,7 +102,10 @@ fn rogue_messages_stop_at_the_next_stage() {
         based_on.contains(&1)
     });
     assert!(decided, "{}", said());
-    assert!(based_on.iter().all(|frame| [1, u64::MAX].contains(frame)), "an action rests on a rogue one: {based_on:?}");
+    assert!(
+        based_on.iter().all(|frame| [1, u64::MAX].contains(frame)),
+        "an action is based on a rogue message: {based_on:?}"
+    );
     for process in processes {
         process.signal(Signal::TERM);
         process.end().assert_success();

@@ -1,28 +1,28 @@
-//! From what was found on the machine to findings. Nothing here looks at the machine.
+//! Turns facts about the machine into findings. This module does not access the machine.
 
 use super::finding::{Area, Finding};
 use carff_config::{StageConfig, StagesConfig};
 use carff_messages::Stage;
 use std::path::{Path, PathBuf};
 
-/// The version that the programs are built for.
+/// The libtorch version that the programs are built for.
 pub const LIBTORCH: &str = "2.11.0";
-/// What the six processes of a graph take together, and some room.
+/// Memory that the six processes of a graph need, with a margin.
 const GRAPH_BYTES: u64 = 1 << 30;
-/// Clock sources that cost a microsecond and more a reading.
+/// Clock sources whose reading takes a microsecond or more.
 const SLOW_CLOCKS: [&str; 4] = ["hpet", "acpi_pm", "jiffies", "refined-jiffies"];
-/// Governors that keep the processor slow until load has been there for a while.
+/// Governors that raise the clock rate only after a longer load.
 const SLOW_GOVERNORS: [&str; 2] = ["powersave", "conservative"];
-/// Free disk below which recordings and data sets soon have no room, and below which nothing has.
+/// Free disk space below which recordings soon fill the disk, and below which nothing can be written.
 const DISK_BYTES: (u64, u64) = (2 << 30, 64 << 20);
-/// Below it, memory cannot be locked for a stage.
+/// Locked memory below which a stage cannot be locked.
 const LOCKED_BYTES: u64 = 1 << 30;
-/// Open files that a process of a graph with all its probes may need.
+/// Maximum number of open files of a process in a graph with all probes.
 const OPEN_FILES: u64 = 1024;
-/// Users below this are the system's own: logind leaves their files alone.
+/// First user number of a person: logind keeps the files of system users.
 const FIRST_PERSON: u32 = 1000;
 
-/// A size for people.
+/// Formats a number of bytes.
 pub fn size(bytes: u64) -> String {
     const UNITS: [(&str, u64); 3] = [("GiB", 1 << 30), ("MiB", 1 << 20), ("KiB", 1 << 10)];
     match UNITS.iter().find(|(_, unit)| bytes >= *unit) {
@@ -31,7 +31,7 @@ pub fn size(bytes: u64) -> String {
     }
 }
 
-/// The processor's name and its features, in the system's spelling.
+/// Checks the processor's features, named as the system names them.
 pub fn processor(name: &str, features: &[&str]) -> Finding {
     let has = |all: &[&str]| all.iter().all(|f| features.contains(f));
     if !has(&["avx2", "fma"]) {
@@ -39,8 +39,8 @@ pub fn processor(name: &str, features: &[&str]) -> Finding {
             Area::Machine,
             "processor",
             format!("{name}, without AVX2 and FMA"),
-            "the field is computed by portable kernels, several times slower",
-            "take an x86-64 processor of 2013 or later; in a virtual machine, hand the host's processor through \
+            "the field uses portable kernels, which are several times slower",
+            "use an x86-64 processor of 2013 or later; in a virtual machine, pass the host's processor through \
              (QEMU: -cpu host)",
         );
     }
@@ -48,19 +48,19 @@ pub fn processor(name: &str, features: &[&str]) -> Finding {
     Finding::ok(Area::Machine, "processor", format!("{name}, with AVX2 and FMA{wide}"))
 }
 
-/// Cores against the threads of a graph: encoder, forecaster and prober take turns on a frame, the renderer works beside
-/// them.
+/// Compares cores with the threads of a graph. Encoder, forecaster and prober run one after another; the renderer runs
+/// in parallel.
 pub fn cores(cores: usize, stages: &StagesConfig) -> Finding {
     let path = stages.encoder.threads.max(stages.forecaster.threads).max(stages.prober.threads);
     let wanted = (path + stages.renderer.threads) as usize;
     if cores >= wanted {
-        return Finding::ok(Area::Machine, "cores", format!("{cores}, for {wanted} threads that work at a time"));
+        return Finding::ok(Area::Machine, "cores", format!("{cores}, for {wanted} concurrent threads"));
     }
     Finding::warning(
         Area::Machine,
         "cores",
         format!(
-            "{cores}, for {wanted} threads that work at a time ({path} on the frame, {} rendering)",
+            "{cores}, for {wanted} concurrent threads ({path} on the frame, {} rendering)",
             stages.renderer.threads
         ),
         "stages wait for each other: frames are skipped, and actions come late",
@@ -68,7 +68,7 @@ pub fn cores(cores: usize, stages: &StagesConfig) -> Finding {
     )
 }
 
-/// Memory that programs can have now.
+/// Checks the memory available to programs, bytes.
 pub fn memory(available_bytes: u64) -> Finding {
     if available_bytes >= GRAPH_BYTES {
         return Finding::ok(Area::Machine, "memory", format!("{} available", size(available_bytes)));
@@ -76,33 +76,33 @@ pub fn memory(available_bytes: u64) -> Finding {
     Finding::warning(
         Area::Machine,
         "memory",
-        format!("{} available, and a graph takes about {}", size(available_bytes), size(GRAPH_BYTES)),
+        format!("{} available, and a graph needs about {}", size(available_bytes), size(GRAPH_BYTES)),
         "the system may swap, or kill a stage",
         "end other programs, or give the machine (or container) more memory",
     )
 }
 
-/// How the monotonic clock behaved when it was read many times.
+/// Measurements of the monotonic clock over many readings.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Clock {
-    /// What it reads, as the system names it.
+    /// Name of the clock source.
     pub source: Option<String>,
-    /// Readings that were below the one before.
+    /// Number of readings below the previous one.
     pub steps_back: u32,
-    /// Time of a reading, nanoseconds.
+    /// Duration of a reading, nanoseconds.
     pub reading_ns: f64,
 }
 
-/// The clock that orders all messages.
+/// Checks the clock that orders all messages.
 pub fn clock(clock: &Clock) -> Finding {
-    let name = clock.source.as_deref().unwrap_or("of an unknown source");
+    let name = clock.source.as_deref().unwrap_or("unknown source");
     let found = format!("{name}, {:.0} ns a reading", clock.reading_ns);
     if clock.steps_back > 0 {
         return Finding::error(
             Area::Machine,
             "clock",
             format!("{found}; it went back {} times", clock.steps_back),
-            "messages are ordered by this clock: frames would be taken for old ones",
+            "messages are ordered by this clock: new frames would look old",
             "choose another clock source (/sys/devices/system/clocksource/clocksource0), and report it to the maker of \
              the machine",
         );
@@ -112,15 +112,15 @@ pub fn clock(clock: &Clock) -> Finding {
             Area::Machine,
             "clock",
             found,
-            "every message reads it several times, and each reading is a system call and more",
-            "boot with tsc=reliable where the processor's counter is sound; in a virtual machine, choose the host's \
+            "every message reads it several times, and each reading needs at least a system call",
+            "boot with tsc=reliable if the processor's counter is reliable; in a virtual machine, choose the host's \
              clock (kvm-clock)",
         );
     }
     Finding::ok(Area::Machine, "clock", found)
 }
 
-/// The governors of the cores' clock rates; none where somebody else governs them.
+/// Checks the governors of the cores' clock rates; the list is empty if the host controls the rates.
 pub fn governor(governors: &[String]) -> Finding {
     let slow = governors.iter().filter(|g| SLOW_GOVERNORS.contains(&g.as_str())).count();
     if let Some(name) = governors.iter().find(|g| SLOW_GOVERNORS.contains(&g.as_str())) {
@@ -128,7 +128,7 @@ pub fn governor(governors: &[String]) -> Finding {
             Area::Machine,
             "governor",
             format!("{name} on {slow} of {} cores", governors.len()),
-            "between two frames cores fall back to a low clock rate: each frame takes longer",
+            "cores return to a low clock rate between frames: each frame takes longer",
             "sudo cpupower frequency-set -g performance",
         );
     }
@@ -140,35 +140,35 @@ pub fn governor(governors: &[String]) -> Finding {
     Finding::ok(Area::Machine, "governor", found)
 }
 
-/// Free space where this is started: data sets, reports and recordings go below it.
+/// Checks the free space of the current folder, which receives datasets, reports and recordings.
 pub fn disk(folder: &Path, free_bytes: u64) -> Finding {
     let found = format!("{} free in {}", size(free_bytes), folder.display());
-    let advice = "free some, or start in another folder";
+    let advice = "free some space, or start in another folder";
     if free_bytes < DISK_BYTES.1 {
-        return Finding::error(Area::Machine, "disk", found, "no data set, report or recording can be written", advice);
+        return Finding::error(Area::Machine, "disk", found, "no dataset, report or recording can be written", advice);
     }
     if free_bytes < DISK_BYTES.0 {
-        return Finding::warning(Area::Machine, "disk", found, "a recording of some minutes fills it", advice);
+        return Finding::warning(Area::Machine, "disk", found, "a recording of a few minutes fills the disk", advice);
     }
     Finding::ok(Area::Machine, "disk", found)
 }
 
-/// Where shared memory lies.
+/// The file system of shared memory.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct SharedMemory {
     /// The folder.
     pub folder: PathBuf,
-    /// Kind of its file system; none when it is not mounted.
+    /// Type of its file system; `None` if it is not mounted.
     pub file_system: Option<String>,
-    /// Whether files can be made in it.
+    /// True if this user can create files in it.
     pub writable: bool,
-    /// Its size, bytes.
+    /// Size, bytes.
     pub size_bytes: u64,
-    /// Free in it, bytes.
+    /// Free space, bytes.
     pub free_bytes: u64,
 }
 
-/// Shared memory against what a graph needs.
+/// Compares shared memory with the needs of a graph.
 pub fn shared_memory(memory: &SharedMemory, needed_bytes: u64) -> Vec<Finding> {
     let folder = memory.folder.display();
     let area = Area::SharedMemory;
@@ -176,8 +176,8 @@ pub fn shared_memory(memory: &SharedMemory, needed_bytes: u64) -> Vec<Finding> {
         return vec![Finding::error(
             area,
             "folder",
-            format!("{folder} is not there"),
-            "no process can hand a picture to another",
+            format!("{folder} does not exist"),
+            "processes cannot exchange images",
             format!("sudo mount -t tmpfs -o size=512m,mode=1777 tmpfs {folder}"),
         )];
     };
@@ -186,23 +186,23 @@ pub fn shared_memory(memory: &SharedMemory, needed_bytes: u64) -> Vec<Finding> {
         Finding::error(
             area,
             "rights",
-            format!("{folder} cannot be written by this user"),
-            "no process can hand a picture to another",
+            format!("this user cannot write to {folder}"),
+            "processes cannot exchange images",
             format!("sudo chmod 1777 {folder}"),
         )
     } else if file_system == "tmpfs" {
-        Finding::ok(area, "rights", format!("{folder} can be written, and is tmpfs"))
+        Finding::ok(area, "rights", format!("{folder} is writable, and is tmpfs"))
     } else {
         Finding::warning(
             area,
             "rights",
             format!("{folder} is {file_system}, not tmpfs"),
-            "pictures go to a disk: the loop stands still whenever it is busy",
+            "images go to a disk: the loop stalls while the disk is busy",
             format!("sudo mount -t tmpfs -o size=512m,mode=1777 tmpfs {folder}"),
         )
     });
     let found = format!(
-        "{} free of {}; a graph takes up to {}",
+        "{} free of {}; a graph needs up to {}",
         size(memory.free_bytes),
         size(memory.size_bytes),
         size(needed_bytes)
@@ -212,33 +212,33 @@ pub fn shared_memory(memory: &SharedMemory, needed_bytes: u64) -> Vec<Finding> {
         (2 * needed_bytes).next_power_of_two().max(512 << 20) >> 20
     );
     findings.push(if memory.free_bytes < needed_bytes {
-        Finding::error(area, "size", found, "`carff launch` refuses to start, since full shared memory kills", advice)
+        Finding::error(area, "size", found, "`carff launch` refuses to start: full shared memory kills stages", advice)
     } else if memory.free_bytes < 2 * needed_bytes {
-        Finding::warning(area, "size", found, "a second graph, or a viewer, may find no room", advice)
+        Finding::warning(area, "size", found, "a second graph or a viewer may not find enough space", advice)
     } else {
         Finding::ok(area, "size", found)
     });
     findings
 }
 
-/// What there is of a run.
+/// Processes and files of a run.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct RunFiles {
-    /// Its name.
+    /// Name of the run.
     pub name: String,
-    /// Its launcher, if it lives.
+    /// Process number of its launcher, if alive.
     pub launcher: Option<u32>,
-    /// Its processes that live.
+    /// Numbers of its living processes.
     pub living: Vec<u32>,
-    /// Its small files: a folder, a record.
+    /// Its small files: a folder and a record.
     pub small: Vec<PathBuf>,
     /// Its files in shared memory.
     pub segments: Vec<PathBuf>,
-    /// Size of those, bytes.
+    /// Total size of the files in shared memory, bytes.
     pub segment_bytes: u64,
 }
 
-/// Runs that live, and what dead ones left. `strays` are files in shared memory that belong to no run of this user.
+/// Reports living runs and the files of dead runs. `strays` are files in shared memory of no run of this user.
 pub fn leftovers(runs: &[RunFiles], strays: &[PathBuf]) -> Vec<Finding> {
     let area = Area::SharedMemory;
     let list = |pids: &[u32]| pids.iter().map(u32::to_string).collect::<Vec<_>>().join(" ");
@@ -251,7 +251,7 @@ pub fn leftovers(runs: &[RunFiles], strays: &[PathBuf]) -> Vec<Finding> {
             (None, []) if run.segments.is_empty() => Finding::ok(
                 area,
                 "leftovers",
-                format!("run `{}` was killed; its next start removes the small files that it left", run.name),
+                format!("run `{}` was killed; its next start removes its remaining small files", run.name),
             ),
             (None, []) => Finding::warning(
                 area,
@@ -262,14 +262,14 @@ pub fn leftovers(runs: &[RunFiles], strays: &[PathBuf]) -> Vec<Finding> {
                     run.segments.len(),
                     size(run.segment_bytes)
                 ),
-                "they take room until the run is started again, which removes them",
+                "they use memory until the next start of the run, which removes them",
                 format!("rm -r {}", removal(run)),
             ),
             (None, living) => Finding::warning(
                 area,
                 "orphans",
-                format!("run `{}` has no launcher, but processes {}", run.name, list(living)),
-                "it cannot be started again while they live; stages end by themselves within seconds",
+                format!("run `{}` has no launcher, but these processes: {}", run.name, list(living)),
+                "the run cannot start while they live; stages end by themselves within seconds",
                 format!("kill {}", list(living)),
             ),
         })
@@ -278,13 +278,13 @@ pub fn leftovers(runs: &[RunFiles], strays: &[PathBuf]) -> Vec<Finding> {
         findings.push(Finding::warning(
             area,
             "strays",
-            format!("{} files in shared memory belong to no run that is known here", strays.len()),
-            "they take room until somebody removes them",
+            format!("{} files in shared memory belong to no known run", strays.len()),
+            "they use memory until they are removed",
             format!("if no graph runs: rm {}", words(strays.iter().map(PathBuf::as_path))),
         ));
     }
     if findings.is_empty() {
-        findings.push(Finding::ok(area, "leftovers", "none, and nothing runs"));
+        findings.push(Finding::ok(area, "leftovers", "none, and no run is alive"));
     }
     findings
 }
@@ -293,12 +293,12 @@ fn removal(run: &RunFiles) -> String {
     words(run.small.iter().chain(&run.segments).map(PathBuf::as_path))
 }
 
-/// Paths on a command line; many are named by what they begin with.
+/// Formats paths for a command line; many paths become a prefix with `*`.
 fn words<'a>(paths: impl Iterator<Item = &'a Path>) -> String {
     let mut words: Vec<String> = paths
         .map(|path| {
             let text = path.display().to_string();
-            // A segment's name is its run's prefix, an underscore, and more.
+            // A segment's name starts with its run's prefix and an underscore.
             match path.file_name().and_then(|n| n.to_str()).and_then(|n| n.split_once('_')) {
                 Some((prefix, _)) if prefix.starts_with("carff") => {
                     path.with_file_name(format!("{prefix}_*")).display().to_string()
@@ -312,29 +312,29 @@ fn words<'a>(paths: impl Iterator<Item = &'a Path>) -> String {
     words.join(" ")
 }
 
-/// What the system allows a process of this user. None is no limit.
+/// Resource limits of a process of this user. `None`: unlimited.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Allowed {
-    /// Memory that can be locked, bytes.
+    /// Lockable memory, bytes.
     pub locked_bytes: Option<u64>,
     /// Highest real-time priority.
     pub realtime_priority: Option<u64>,
     /// `RLIMIT_NICE`: 20 less the lowest niceness.
     pub nice: Option<u64>,
-    /// Open files.
+    /// Number of open files.
     pub open_files: Option<u64>,
-    /// Whether it may lock memory without a limit (`CAP_IPC_LOCK`).
+    /// True if the user may lock unlimited memory (`CAP_IPC_LOCK`).
     pub may_lock: bool,
-    /// Whether it may take any priority (`CAP_SYS_NICE`).
+    /// True if the user may take any priority (`CAP_SYS_NICE`).
     pub may_schedule: bool,
 }
 
-/// Limits against what a graph asks for.
+/// Compares limits with the requests of a graph.
 pub fn limits(allowed: &Allowed, stages: &StagesConfig) -> Vec<Finding> {
     let area = Area::Limits;
-    let without = "the stage says so in its log, and goes on without";
+    let without = "the stage logs a warning, and continues without it";
     let raise = |line: &str, unit: &str| {
-        format!("write `USER - {line}` to /etc/security/limits.d/carff.conf and log in anew; in a systemd unit: {unit}")
+        format!("write `USER - {line}` to /etc/security/limits.d/carff.conf, log in again; in a systemd unit: {unit}")
     };
     let show = |limit: Option<u64>, show: &dyn Fn(u64) -> String| limit.map_or_else(|| "no limit".to_owned(), show);
     let each = || Stage::ALL.into_iter().map(|stage| (stage.name(), stages.of(stage)));
@@ -393,7 +393,7 @@ pub fn limits(allowed: &Allowed, stages: &StagesConfig) -> Vec<Finding> {
         Finding::warning(
             area,
             "open files",
-            format!("{files}, where {OPEN_FILES} are usual"),
+            format!("{files}; {OPEN_FILES} are usual"),
             "probes and viewers may fail to attach",
             raise("nofile 4096", "LimitNOFILE=4096"),
         )
@@ -401,7 +401,7 @@ pub fn limits(allowed: &Allowed, stages: &StagesConfig) -> Vec<Finding> {
     findings
 }
 
-/// Processors that a graph binds stages to, and that are not there.
+/// Checks that the processors of the stages' affinities exist.
 pub fn bound_cores(online: &[u32], stages: &StagesConfig) -> Option<Finding> {
     let missing: Vec<String> = Stage::ALL
         .into_iter()
@@ -414,27 +414,27 @@ pub fn bound_cores(online: &[u32], stages: &StagesConfig) -> Option<Finding> {
         Finding::warning(
             Area::Limits,
             "cores",
-            format!("the graph binds stages to processors that are not there ({})", missing.join(", ")),
-            "the stage says so in its log, and runs anywhere",
+            format!("the graph binds stages to processors that do not exist ({})", missing.join(", ")),
+            "the stage logs a warning, and runs on any processor",
             "change `stages.*.cpus` in the graph file",
         )
     })
 }
 
-/// What decides whether logind removes shared memory when the user logs out.
+/// Settings that decide whether logind removes shared memory at log-out.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Logind {
-    /// Whether it runs.
+    /// True if logind runs.
     pub runs: bool,
-    /// `RemoveIPC` where it is set, and in which file.
+    /// Value of `RemoveIPC`, and the file that sets it.
     pub setting: Option<(bool, PathBuf)>,
-    /// This user.
+    /// Number of this user.
     pub uid: u32,
-    /// Whether the user's services go on after the log-out.
+    /// True if the user's services continue after log-out.
     pub lingers: bool,
 }
 
-/// The last `RemoveIPC` of logind's configuration files, in the order in which it reads them.
+/// Returns the last `RemoveIPC` of logind's configuration files, in the order in which logind reads them.
 pub fn remove_ipc_setting(files: &[(PathBuf, String)]) -> Option<(bool, PathBuf)> {
     let mut setting = None;
     for (path, text) in files {
@@ -450,19 +450,19 @@ pub fn remove_ipc_setting(files: &[(PathBuf, String)]) -> Option<(bool, PathBuf)
     setting
 }
 
-/// Whether a log-out takes shared memory away from a graph that runs.
+/// Checks that a log-out does not remove shared memory of a running graph.
 pub fn remove_ipc(logind: &Logind) -> Finding {
     let ok = |found: String| Finding::ok(Area::Limits, "RemoveIPC", found);
     if !logind.runs {
         return ok("logind does not run here".to_owned());
     }
     if logind.uid < FIRST_PERSON {
-        return ok(format!("not for user {}, which is one of the system's", logind.uid));
+        return ok(format!("not for user {}, a system user", logind.uid));
     }
     let found = match &logind.setting {
         Some((false, path)) => return ok(format!("no ({})", path.display())),
         Some((true, path)) => format!("yes ({})", path.display()),
-        None => "not set, which is yes".to_owned(),
+        None => "not set, which means yes".to_owned(),
     };
     if logind.lingers {
         return ok(format!("{found}, but this user lingers"));
@@ -471,19 +471,19 @@ pub fn remove_ipc(logind: &Logind) -> Finding {
         Area::Limits,
         "RemoveIPC",
         found,
-        "when you log out, logind removes the shared memory of graphs that still run: they break",
+        "when you log out, logind removes the shared memory of running graphs: they fail",
         "write `[Login]` and `RemoveIPC=no` to /etc/systemd/logind.conf.d/carff.conf and restart systemd-logind; or \
          loginctl enable-linger; or run the graph as a service of a system user",
     )
 }
 
-/// The libtorch that this process has loaded, and what it says its version is.
+/// Checks the version of the libtorch that this process has loaded.
 pub fn libtorch(library: Option<&Path>, version: Option<&str>) -> Finding {
     let area = Area::Programs;
-    let advice = "make libtorch, or give one of your own: make build LIBTORCH=/path/to/libtorch, and \
-                  LD_LIBRARY_PATH=/path/to/libtorch/lib where it runs";
+    let advice = "make libtorch, or use your own libtorch: make build LIBTORCH=/path/to/libtorch, and \
+                  LD_LIBRARY_PATH=/path/to/libtorch/lib at run time";
     let Some(library) = library else {
-        return Finding::error(area, "libtorch", "it is not loaded", "no model runs", advice);
+        return Finding::error(area, "libtorch", "it is not loaded", "models cannot run", advice);
     };
     match version {
         Some(version) if version == LIBTORCH || version.starts_with(&format!("{LIBTORCH}+")) => {
@@ -493,20 +493,20 @@ pub fn libtorch(library: Option<&Path>, version: Option<&str>) -> Finding {
             area,
             "libtorch",
             format!("{version} ({}); the programs are built for {LIBTORCH}", library.display()),
-            "programs may crash, or compute something else",
+            "programs may crash, or compute wrong results",
             advice,
         ),
         None => Finding::warning(
             area,
             "libtorch",
-            format!("{}, which has no file `build-version` beside it", library.display()),
-            format!("it cannot be told whether it is {LIBTORCH}"),
+            format!("{}, without a file `build-version` next to it", library.display()),
+            format!("the version may differ from {LIBTORCH}"),
             advice,
         ),
     }
 }
 
-/// The stages' programs that are not in a folder.
+/// Checks that a folder contains the stages' programs.
 pub fn programs(folder: &Path, missing: &[String]) -> Finding {
     if missing.is_empty() {
         return Finding::ok(Area::Programs, "stages", format!("all in {}", folder.display()));
@@ -516,7 +516,7 @@ pub fn programs(folder: &Path, missing: &[String]) -> Finding {
         "stages",
         format!("{} not in {}", missing.join(", "), folder.display()),
         "`carff launch` cannot start them",
-        "make build; programs that are installed elsewhere must lie together",
+        "make build; programs that are installed elsewhere must be in one folder",
     )
 }
 
@@ -535,7 +535,7 @@ mod tests {
         findings.iter().map(|f| (f.subject, f.level)).collect()
     }
 
-    /// What is not well says what it means and what to do; what is well says neither.
+    /// A finding that is not ok has a meaning and advice; an ok finding has neither.
     #[track_caller]
     fn assert_level(finding: &Finding, level: Level) {
         assert_eq!(finding.level, level, "{finding:?}");
@@ -543,7 +543,7 @@ mod tests {
         assert_eq!(finding.advice.is_empty(), level == Level::Ok, "{finding:?}");
     }
 
-    /// Kernels want AVX2 and FMA; AVX-512 is mentioned where it is.
+    /// Kernels need AVX2 and FMA; AVX-512 is mentioned if present.
     #[test]
     fn processors() {
         assert_level(&processor("old", &["sse4_2"]), Level::Warning);
@@ -552,7 +552,7 @@ mod tests {
         assert!(processor("newer", &["avx2", "fma", "avx512f", "avx512vl"]).found.ends_with("AVX-512"));
     }
 
-    /// A frame's stages take turns, the renderer works beside them: their most and its own are what cores are for.
+    /// The largest path stage and the renderer together decide how many cores are needed.
     #[test]
     fn cores_against_threads() {
         let mut stages = StagesConfig::default();
@@ -563,7 +563,7 @@ mod tests {
         assert_level(&cores(3, &stages), Level::Warning);
     }
 
-    /// A clock that goes back is an error, a slow one a warning, any other is well.
+    /// A clock that goes back is an error, a slow clock is a warning, any other clock is ok.
     #[test]
     fn clocks() {
         let with = |source: Option<&str>, steps_back| {
@@ -575,7 +575,7 @@ mod tests {
         assert_level(&with(Some("tsc"), 1), Level::Error);
     }
 
-    /// One slow governor is enough; no governor at all is none to worry about.
+    /// One slow governor causes a warning; no governor is ok.
     #[test]
     fn governors() {
         let with = |names: &[&str]| governor(&names.iter().map(|&n| n.to_owned()).collect::<Vec<_>>());
@@ -586,7 +586,7 @@ mod tests {
         assert!(slow.found.contains("powersave on 1 of 2"), "{slow:?}");
     }
 
-    /// Memory and disk have their limits, disk two of them.
+    /// Memory and disk have their limits; the disk has two.
     #[test]
     fn room() {
         assert_level(&memory(4 << 30), Level::Ok);
@@ -596,7 +596,7 @@ mod tests {
         assert_level(&disk(Path::new("here"), MIB), Level::Error);
     }
 
-    /// Shared memory must be there, writable, in memory, and have room for the graph; what mends it is a command.
+    /// Shared memory must exist, be writable, be in memory, and have space for the graph; the advice is a command.
     #[test]
     fn shared_memory_in_every_state() {
         let good = SharedMemory {
@@ -622,8 +622,8 @@ mod tests {
         assert!(small[1].advice.contains("size=2048m") && small[1].advice.contains("--shm-size"), "{small:?}");
     }
 
-    /// A run that runs is well; a dead one's files, processes without a launcher and strays are warnings with the command
-    /// that removes them.
+    /// A running graph is ok. Files of a dead run, processes without a launcher, and stray files are warnings with the
+    /// command that removes them.
     #[test]
     fn what_runs_left() {
         let segments: Vec<PathBuf> =
@@ -656,7 +656,7 @@ mod tests {
         assert_eq!(levels(&leftovers(&[], &[])), [("leftovers", Level::Ok)]);
     }
 
-    /// Limits only matter where the graph asks for more, and privileges lift them.
+    /// Limits only matter if the graph needs more, and privileges lift them.
     #[test]
     fn limits_against_what_is_asked() {
         let low = Allowed {
@@ -687,7 +687,7 @@ mod tests {
         assert_eq!(limits(&few, &StagesConfig::default()).last().map(|f| f.level), Some(Level::Warning));
     }
 
-    /// Stages bound to processors that are not there are named with them.
+    /// Stages bound to missing processors are reported with their processors.
     #[test]
     fn processors_that_are_not_there() {
         let bound = with_prober(StageConfig { cpus: vec![1, 9], ..StageConfig::default() });
@@ -697,7 +697,7 @@ mod tests {
         assert!(finding.found.contains("(prober: 9)"), "{finding:?}");
     }
 
-    /// The last file that sets it wins; comments set nothing.
+    /// The last file that sets the value wins; comments are ignored.
     #[test]
     fn settings_of_logind() {
         let file = |name: &str, text: &str| (PathBuf::from(name), text.to_owned());
@@ -708,7 +708,7 @@ mod tests {
         assert_eq!(remove_ipc_setting(&files), Some((false, "c".into())));
     }
 
-    /// Only a person's files go, at a log-out that logind sees, unless it is told not to or the person lingers.
+    /// Only a person's files are removed, at a log-out that logind sees, unless a setting or lingering prevents it.
     #[test]
     fn log_outs() {
         let person = Logind { runs: true, setting: None, uid: 1000, lingers: false };
@@ -724,7 +724,7 @@ mod tests {
         }
     }
 
-    /// The version must be the one that the programs are built for, with any build's suffix.
+    /// The version must be the version of the build, with any suffix.
     #[test]
     fn versions_of_libtorch() {
         let library = Some(Path::new("lib/libtorch_cpu.so"));
@@ -736,7 +736,7 @@ mod tests {
         assert_level(&libtorch(None, None), Level::Error);
     }
 
-    /// Missing programs are named.
+    /// Missing programs are reported by name.
     #[test]
     fn missing_programs() {
         assert_level(&programs(Path::new("bin"), &[]), Level::Ok);

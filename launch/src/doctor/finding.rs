@@ -1,33 +1,33 @@
-//! What a check found, and how it is shown.
+//! Findings of `carff doctor`, and their display.
 
 use serde::Serialize;
 use std::fmt::Write as _;
 
-/// How bad it is.
+/// Severity of a finding.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Level {
-    /// As it should be.
+    /// No problem.
     Ok,
     /// A graph runs, but slower, or not after the next log-out.
     Warning,
-    /// A graph does not start, or decides wrongly.
+    /// A graph does not start, or makes wrong decisions.
     Error,
 }
 
-/// What it is about.
+/// Area of a finding.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Area {
     /// Processor, memory, clock, disk.
     Machine,
-    /// Shared memory, and what runs have left in it.
+    /// Shared memory, and leftovers of runs.
     SharedMemory,
-    /// What the system allows this user.
+    /// Resource limits of this user.
     Limits,
     /// Programs and libraries.
     Programs,
-    /// A graph file, and what it names.
+    /// A graph file, and the files that it names.
     Graph,
 }
 
@@ -45,30 +45,30 @@ impl Area {
     }
 }
 
-/// One finding.
+/// A finding of one check.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct Finding {
-    /// What it is about.
+    /// Area of the finding.
     pub area: Area,
-    /// The same more closely, in one or two words.
+    /// Subject within the area, in one or two words.
     pub subject: &'static str,
-    /// How bad it is.
+    /// Severity of the finding.
     pub level: Level,
-    /// What was found.
+    /// Observed fact.
     pub found: String,
-    /// What follows from it; empty when all is well.
+    /// Consequence; empty if there is no problem.
     pub means: String,
-    /// What to do about it; empty when all is well.
+    /// Remedy; empty if there is no problem.
     pub advice: String,
 }
 
 impl Finding {
-    /// As it should be.
+    /// Creates a finding without a problem.
     pub fn ok(area: Area, subject: &'static str, found: impl Into<String>) -> Self {
         Self { area, subject, level: Level::Ok, found: found.into(), means: String::new(), advice: String::new() }
     }
 
-    /// A graph runs, but.
+    /// Creates a finding with which a graph still runs.
     pub fn warning(
         area: Area,
         subject: &'static str,
@@ -80,7 +80,7 @@ impl Finding {
         Self { area, subject, level: Level::Warning, found, means, advice }
     }
 
-    /// No graph runs.
+    /// Creates a finding with which no graph runs.
     pub fn error(
         area: Area,
         subject: &'static str,
@@ -92,12 +92,12 @@ impl Finding {
     }
 }
 
-/// How many are of a level.
+/// Returns the number of findings of a level.
 pub fn count(findings: &[Finding], level: Level) -> usize {
     findings.iter().filter(|f| f.level == level).count()
 }
 
-/// For people: by area, what is not well with its meaning and advice.
+/// Formats the findings for people: by area, problems with their consequence and remedy.
 pub fn text(findings: &[Finding], coloured: bool) -> String {
     let mut text = String::new();
     for area in Area::ALL {
@@ -126,12 +126,12 @@ pub fn text(findings: &[Finding], coloured: bool) -> String {
         n => format!("{n} {what}s"),
     };
     let (errors, warnings) = (count(findings, Level::Error), count(findings, Level::Warning));
-    let verdict = if errors == 0 { "a graph can run here" } else { "a graph cannot run so" };
+    let verdict = if errors == 0 { "a graph can run here" } else { "a graph cannot run" };
     let _ = writeln!(text, "\n{}, {}: {verdict}", counted(errors, "error"), counted(warnings, "warning"));
     text
 }
 
-/// For programs.
+/// Formats the findings for programs.
 pub fn json(findings: &[Finding]) -> serde_json::Value {
     serde_json::json!({
         "errors": count(findings, Level::Error),
@@ -146,14 +146,13 @@ mod tests {
 
     fn findings() -> Vec<Finding> {
         vec![
-            Finding::error(Area::Graph, "data set", "it is missing", "nothing to drive through", "render it"),
+            Finding::error(Area::Graph, "dataset", "it is missing", "nothing to drive through", "render it"),
             Finding::ok(Area::Machine, "cores", "2"),
             Finding::warning(Area::Machine, "governor", "powersave", "slow", "change it"),
         ]
     }
 
-    /// Areas come in their order, each finding that is not well says what it means and what to do, and colours are only
-    /// there when they are wanted.
+    /// Areas have a fixed order, each problem shows its consequence and remedy, and colours appear only on request.
     #[test]
     fn text_for_people() {
         let plain = text(&findings(), false);
@@ -161,12 +160,12 @@ mod tests {
         assert!(place("Machine") < place("cores") && place("cores") < place("governor"), "{plain}");
         assert!(place("governor") < place("so: slow") && place("so: slow") < place("do: change it"), "{plain}");
         assert!(place("do: change it") < place("Graph") && place("Graph") < place("render it"), "{plain}");
-        assert!(plain.ends_with("1 error, 1 warning: a graph cannot run so\n"), "{plain}");
+        assert!(plain.ends_with("1 error, 1 warning: a graph cannot run\n"), "{plain}");
         assert!(!plain.contains('\x1b') && text(&findings(), true).contains("\x1b[31mERROR"));
         assert!(text(&findings()[1..2], false).ends_with("no errors, no warnings: a graph can run here\n"));
     }
 
-    /// The JSON holds all of it, with levels and areas as words.
+    /// The JSON contains all fields, with levels and areas as words.
     #[test]
     fn json_for_programs() {
         let json = json(&findings());

@@ -1,4 +1,4 @@
-//! Looks at the machine. What is found means nothing yet.
+//! Collects facts about the machine, without judging them.
 
 use super::checks::{Allowed, Clock, Logind, RunFiles, SharedMemory};
 use carff_messages::Stage;
@@ -8,12 +8,12 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::os::unix::fs::{MetadataExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 
-/// Readings of the clock.
+/// Number of readings of the clock.
 const READINGS: u32 = 10_000;
-/// Bits of the effective capabilities: locking memory, choosing priorities.
+/// Bits of the effective capabilities: locking memory, setting priorities.
 const CAP_IPC_LOCK: u32 = 14;
 const CAP_SYS_NICE: u32 = 23;
-/// Where logind's settings lie, in the order in which a later one wins.
+/// Folders of logind's settings; later ones take precedence.
 const LOGIND_FOLDERS: [&str; 3] =
     ["/usr/lib/systemd/logind.conf.d", "/run/systemd/logind.conf.d", "/etc/systemd/logind.conf.d"];
 
@@ -21,7 +21,7 @@ fn read(path: impl AsRef<Path>) -> Option<String> {
     std::fs::read_to_string(path).ok().map(|text| text.trim().to_owned())
 }
 
-/// The processor's name and features.
+/// Returns the processor's name and features.
 pub fn processor() -> (String, Vec<String>) {
     let text = read("/proc/cpuinfo").unwrap_or_default();
     let field = |wanted: &str| {
@@ -33,14 +33,14 @@ pub fn processor() -> (String, Vec<String>) {
     (name, features.split_whitespace().map(str::to_owned).collect())
 }
 
-/// Memory that programs can have now, bytes.
+/// Returns the memory available to programs, bytes.
 pub fn available_memory() -> Option<u64> {
     let text = read("/proc/meminfo")?;
     let line = text.lines().find_map(|line| line.strip_prefix("MemAvailable:"))?;
     Some(line.split_whitespace().next()?.parse::<u64>().ok()? * 1024)
 }
 
-/// How the monotonic clock behaves.
+/// Measures the monotonic clock.
 pub fn clock() -> Clock {
     let (first_ns, mut last_ns, mut steps_back) = (monotonic_now_ns(), 0, 0);
     for _ in 0..READINGS {
@@ -55,18 +55,18 @@ pub fn clock() -> Clock {
     }
 }
 
-/// The governor of each core's clock rate.
+/// Returns the governor of each core's clock rate.
 pub fn governors() -> Vec<String> {
     let Ok(cores) = std::fs::read_dir("/sys/devices/system/cpu") else { return Vec::new() };
     cores.flatten().filter_map(|core| read(core.path().join("cpufreq/scaling_governor"))).collect()
 }
 
-/// The processors that are there, by number.
+/// Returns the numbers of the online processors.
 pub fn online() -> Vec<u32> {
     numbers(&read("/sys/devices/system/cpu/online").unwrap_or_default())
 }
 
-/// "0-2,5" as numbers.
+/// Parses a list of ranges, such as "0-2,5".
 fn numbers(ranges: &str) -> Vec<u32> {
     ranges
         .split(',')
@@ -78,13 +78,13 @@ fn numbers(ranges: &str) -> Vec<u32> {
         .collect()
 }
 
-/// Free bytes where a folder lies.
+/// Returns the free bytes of a folder's file system.
 pub fn free_bytes(folder: &Path) -> Option<u64> {
     let stat = rustix::fs::statvfs(folder).ok()?;
     Some(stat.f_bavail.saturating_mul(stat.f_frsize))
 }
 
-/// The folder of shared memory.
+/// Returns the state of the shared memory's folder.
 pub fn shared_memory() -> SharedMemory {
     let folder = Path::new(SHARED_MEMORY_DIR);
     let stat = rustix::fs::statvfs(folder).ok();
@@ -98,7 +98,7 @@ pub fn shared_memory() -> SharedMemory {
     }
 }
 
-/// The kind of the file system that is mounted at a folder, or of the nearest one above it.
+/// Returns the type of the file system of a folder.
 fn file_system(mounts: &str, folder: &Path) -> String {
     mounts
         .lines()
@@ -107,12 +107,12 @@ fn file_system(mounts: &str, folder: &Path) -> String {
             let (place, kind) = (Path::new(words.next()?), words.next()?);
             folder.starts_with(place).then(|| (place.components().count(), kind.to_owned()))
         })
-        // Of several mounts at one place, the last is on top.
+        // Of several mounts at one folder, the last is on top.
         .max_by_key(|(depth, _)| *depth)
-        .map_or_else(|| "of an unknown kind".to_owned(), |(_, kind)| kind)
+        .map_or_else(|| "of unknown type".to_owned(), |(_, kind)| kind)
 }
 
-/// This user's runs, and the files in shared memory that look like a run's but are none's.
+/// Returns this user's runs, and files in shared memory that look like a run's but belong to none.
 pub fn runs() -> anyhow::Result<(Vec<RunFiles>, Vec<PathBuf>)> {
     let folder = runtime_dir();
     let launchers: BTreeMap<String, u32> = carff_observe::runs()?.into_iter().map(|run| (run.name, run.pid)).collect();
@@ -125,7 +125,7 @@ pub fn runs() -> anyhow::Result<(Vec<RunFiles>, Vec<PathBuf>)> {
     let mut runs = Vec::new();
     let mut known = BTreeSet::new();
     for (name, small) in small {
-        // What no run can be called is somebody else's.
+        // Names that no run can have belong to other programs.
         let Ok(run) = Run::new(&name, 0) else { continue };
         let segments = run.shared_memory_files().unwrap_or_default();
         known.insert(run.shared_memory_prefix());
@@ -156,14 +156,14 @@ pub fn runs() -> anyhow::Result<(Vec<RunFiles>, Vec<PathBuf>)> {
     Ok((runs, strays))
 }
 
-/// Whether a file's name is that of a run's shared memory: `carff`, eight digits, an underscore.
+/// Returns true for the name of a run's shared memory: `carff`, eight digits, an underscore.
 fn is_segment(name: &str) -> bool {
     name.strip_prefix("carff")
         .and_then(|rest| rest.split_once('_'))
         .is_some_and(|(hash, _)| hash.len() == 8 && hash.bytes().all(|b| b.is_ascii_hexdigit()))
 }
 
-/// What the system allows.
+/// Returns the resource limits of this process.
 pub fn allowed() -> Allowed {
     let status = read("/proc/self/status").unwrap_or_default();
     let effective = status.lines().find_map(|line| line.strip_prefix("CapEff:"));
@@ -178,7 +178,7 @@ pub fn allowed() -> Allowed {
     }
 }
 
-/// What logind does at this user's log-out.
+/// Returns logind's settings for this user's log-out.
 pub fn logind() -> Logind {
     let mut paths = vec![PathBuf::from("/usr/lib/systemd/logind.conf"), PathBuf::from("/etc/systemd/logind.conf")];
     let mut additions: Vec<PathBuf> = LOGIND_FOLDERS
@@ -186,7 +186,7 @@ pub fn logind() -> Logind {
         .flat_map(|folder| std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path()))
         .filter(|path| path.extension().is_some_and(|e| e == "conf"))
         .collect();
-    // By name, whichever folder they lie in.
+    // By file name, in whichever folder.
     additions.sort_by(|a, b| a.file_name().cmp(&b.file_name()));
     paths.extend(additions);
     let files: Vec<(PathBuf, String)> =
@@ -200,7 +200,7 @@ pub fn logind() -> Logind {
     }
 }
 
-/// The libtorch that this process has loaded, and the version that a file beside it says.
+/// Returns the libtorch that this process has loaded, and the version in the file next to it.
 pub fn libtorch() -> (Option<PathBuf>, Option<String>) {
     let maps = read("/proc/self/maps").unwrap_or_default();
     let library = maps
@@ -212,7 +212,7 @@ pub fn libtorch() -> (Option<PathBuf>, Option<String>) {
     (library, version)
 }
 
-/// The stages' programs that are not in a folder, or cannot be started.
+/// Returns the stages' programs that are missing in a folder or cannot be started.
 pub fn missing_programs(folder: &Path) -> Vec<String> {
     let is_program = |path: &Path| path.metadata().is_ok_and(|m| m.is_file() && m.permissions().mode() & 0o111 != 0);
     Stage::ALL.iter().map(|stage| format!("carff-{stage}")).filter(|name| !is_program(&folder.join(name))).collect()
@@ -222,7 +222,7 @@ pub fn missing_programs(folder: &Path) -> Vec<String> {
 mod tests {
     use super::*;
 
-    /// Ranges of processors, as the system writes them.
+    /// Ranges of processors are parsed as the system writes them.
     #[test]
     fn ranges_of_processors() {
         assert_eq!(numbers("0-2,5"), [0, 1, 2, 5]);
@@ -231,17 +231,17 @@ mod tests {
         assert_eq!(numbers("x-2,3"), [3]);
     }
 
-    /// The deepest mount counts, and of two at one place the later.
+    /// The deepest mount counts; of two at one folder, the later one.
     #[test]
     fn the_mount_on_top_counts() {
         let mounts =
             "overlay / overlay rw 0 0\ntmpfs /dev tmpfs rw 0 0\nshm /dev/shm ext4 rw 0 0\nshm /dev/shm tmpfs rw 0 0";
         assert_eq!(file_system(mounts, Path::new("/dev/shm")), "tmpfs");
         assert_eq!(file_system(mounts, Path::new("/data")), "overlay");
-        assert_eq!(file_system("", Path::new("/data")), "of an unknown kind");
+        assert_eq!(file_system("", Path::new("/data")), "of unknown type");
     }
 
-    /// Only names that the transport gives are taken for a run's.
+    /// Only names that the transport gives count as a run's.
     #[test]
     fn names_of_segments() {
         assert!(is_segment("carff0123abcd_service_x"));
@@ -250,7 +250,7 @@ mod tests {
         }
     }
 
-    /// What this machine really has can be read: it has a processor, a clock that does not go back, and limits.
+    /// The facts of this machine can be read: it has a processor, a clock that does not go back, and limits.
     #[test]
     fn this_machine_can_be_read() {
         assert!(!processor().1.is_empty());

@@ -1,4 +1,4 @@
-//! A graph file, and whether what it names is there and fits together.
+//! Checks a graph file, and the existence and consistency of the files that it names.
 
 use super::finding::{Area, Finding};
 use carff_checkpoint::CheckpointPlanning;
@@ -9,10 +9,10 @@ use carff_scenes::Scenario;
 use std::fmt::Display;
 use std::path::Path;
 
-/// Nothing but this refuses a launch.
+/// Consequence of findings that make `carff launch` refuse the graph.
 const NO_LAUNCH: &str = "`carff launch` refuses it";
 
-/// Everything about a graph, its data set and checkpoint possibly replaced.
+/// Checks a graph with its dataset and checkpoint; both can be replaced.
 pub fn check(path: &Path, graph: &GraphConfig, dataset: Option<&Path>, checkpoint: Option<&Path>) -> Vec<Finding> {
     let mut findings = vec![Finding::ok(Area::Graph, "file", path.display().to_string())];
     for warning in graph.warnings() {
@@ -20,7 +20,7 @@ pub fn check(path: &Path, graph: &GraphConfig, dataset: Option<&Path>, checkpoin
             Area::Graph,
             "settings",
             warning,
-            "it runs, but not as you may expect",
+            "the graph runs, but possibly not as intended",
             format!("change {}", path.display()),
         ));
     }
@@ -33,16 +33,16 @@ pub fn check(path: &Path, graph: &GraphConfig, dataset: Option<&Path>, checkpoin
     findings
 }
 
-/// A graph file that cannot be read.
+/// Returns the finding for a graph file that cannot be read.
 pub fn wrong(error: &ConfigError) -> Finding {
     let advice = match error {
-        ConfigError::Read { .. } => "give the path of a graph file, as in configs/graphs",
-        _ => "change the file as the error says",
+        ConfigError::Read { .. } => "pass the path of a graph file, as in configs/graphs",
+        _ => "correct the file at the reported line",
     };
     Finding::error(Area::Graph, "file", error.to_string(), NO_LAUNCH, advice)
 }
 
-/// The scenario, if one is named; a wrong one only matters where the graph renders it.
+/// Checks the scenario, if the graph names one; a wrong one is an error only if the graph renders it.
 fn scenario(graph: &GraphConfig, renders: bool, findings: &mut Vec<Finding>) -> Option<Scenario> {
     let path = graph.scenario_path()?;
     match Scenario::load(&path) {
@@ -56,7 +56,7 @@ fn scenario(graph: &GraphConfig, renders: bool, findings: &mut Vec<Finding>) -> 
                 Area::Graph,
                 "scenario",
                 error.to_string().as_str(),
-                "free drives and a missing data set cannot be rendered",
+                "free drives and a missing dataset cannot be rendered",
                 "correct `run.scenario` in the graph file, or the scenario file",
             ));
             None
@@ -64,24 +64,24 @@ fn scenario(graph: &GraphConfig, renders: bool, findings: &mut Vec<Finding>) -> 
     }
 }
 
-/// The pictures' source. Returns what scenario it shows.
+/// Checks the source of images. Returns the scenario of the images.
 fn pictures(
     graph: &GraphConfig,
     dataset: &Path,
     scenario: Option<&Scenario>,
     findings: &mut Vec<Finding>,
 ) -> Option<ScenarioIdentity> {
-    let subject = "data set";
+    let subject = "dataset";
     if graph.camera.source == CameraSource::Folder {
         let folder = graph.camera.folder.as_ref().map_or_else(|| dataset.join("images"), |f| graph.resolve(f));
         findings.push(if folder.is_dir() {
-            Finding::ok(Area::Graph, "pictures", folder.display().to_string())
+            Finding::ok(Area::Graph, "images", folder.display().to_string())
         } else {
             Finding::error(
                 Area::Graph,
-                "pictures",
-                format!("{} is no folder{}", folder.display(), carff_base::names::beside(&folder)),
-                "the camera has nothing to show",
+                "images",
+                format!("{} is not a folder{}", folder.display(), carff_base::names::beside(&folder)),
+                "the camera has no images",
                 "correct `camera.folder` in the graph file",
             )
         });
@@ -93,14 +93,14 @@ fn pictures(
             Some(_) => Finding::ok(
                 Area::Graph,
                 subject,
-                format!("{} is not there yet: `carff launch` renders it", dataset.display()),
+                format!("{} does not exist yet: `carff launch` renders it", dataset.display()),
             ),
             None => Finding::error(
                 Area::Graph,
                 subject,
-                format!("{} is not there{}", dataset.display(), carff_base::names::beside(dataset)),
+                format!("{} does not exist{}", dataset.display(), carff_base::names::beside(dataset)),
                 NO_LAUNCH,
-                "give --dataset, or name the scenario that it is rendered from in the graph file (`run.scenario`)",
+                "pass --dataset, or name its scenario in the graph file (`run.scenario`)",
             ),
         });
         return rendered;
@@ -112,11 +112,11 @@ fn pictures(
                     Area::Graph,
                     subject,
                     warning.clone(),
-                    "the set can be used, but not all of it",
+                    "parts of the dataset cannot be used",
                     format!("carff dataset check {}", dataset.display()),
                 ));
             }
-            let found = format!("{}: {} pictures", dataset.display(), set.frames().len());
+            let found = format!("{}: {} images", dataset.display(), set.frames().len());
             findings.push(Finding::ok(Area::Graph, subject, found));
             set.scenario().map(|s| ScenarioIdentity::of(s, set.view_count()))
         }
@@ -126,14 +126,14 @@ fn pictures(
                 subject,
                 error.to_string(),
                 NO_LAUNCH,
-                format!("carff dataset check {} says all that is wrong; or render it again", dataset.display()),
+                format!("run `carff dataset check {}` for all errors, or render the dataset again", dataset.display()),
             ));
             None
         }
     }
 }
 
-/// The checkpoint's parts, each read as the stages read it.
+/// Checks the parts of the checkpoint; each is read as the stages read it.
 fn models(checkpoint: &Path, shown: Option<&ScenarioIdentity>, findings: &mut Vec<Finding>) {
     let bad = |error: &dyn Display, advice: &str| {
         Finding::error(Area::Graph, "checkpoint", error.to_string(), NO_LAUNCH, advice)
@@ -141,7 +141,7 @@ fn models(checkpoint: &Path, shown: Option<&ScenarioIdentity>, findings: &mut Ve
     let manifest = match Manifest::load(checkpoint) {
         Ok(manifest) => manifest,
         Err(error) => {
-            let advice = "train the scenario (carff train configs/training/NAME.toml), or give --checkpoint";
+            let advice = "train the scenario (carff train configs/training/NAME.toml), or pass --checkpoint";
             return findings.push(bad(&error, advice));
         }
     };
@@ -153,12 +153,12 @@ fn models(checkpoint: &Path, shown: Option<&ScenarioIdentity>, findings: &mut Ve
         CheckpointPlanning::load(checkpoint).map(drop).map_err(|e| e.to_string()),
     ];
     let whole = parts.iter().all(Result::is_ok);
-    let again = "train it again, or copy the folder again from where it is whole";
+    let again = "train it again, or copy the folder again from a complete copy";
     findings.extend(parts.iter().filter_map(|part| part.as_ref().err()).map(|error| bad(error, again)));
     match shown.map(|shown| manifest.check_scenario(checkpoint, shown)) {
         Some(Err(error)) => findings.push(bad(
             &error,
-            "take the data set and the scenario that the checkpoint was trained on, or another checkpoint",
+            "use the dataset and scenario that the checkpoint was trained on, or another checkpoint",
         )),
         _ if whole => {
             let found = format!("{}, of {}", checkpoint.display(), manifest.scenario.name);
@@ -188,20 +188,20 @@ mod tests {
         findings.iter().filter(|f| f.level == Level::Error).map(|f| (f.subject, f.found.as_str())).collect()
     }
 
-    /// The shipped graph with its checkpoint is well, whether its data set has been rendered or not.
+    /// The shipped graph with its checkpoint is ok, with or without a rendered dataset.
     #[test]
     fn the_shipped_graph_is_well() {
         let (path, graph) = shipped();
         let missing = root().join("nowhere/at-all");
         let findings = check(&path, &graph, Some(&missing), None);
         assert_eq!(errors(&findings), []);
-        let set = findings.iter().find(|f| f.subject == "data set").unwrap();
+        let set = findings.iter().find(|f| f.subject == "dataset").unwrap();
         assert!(set.found.contains("renders it"), "{set:?}");
         assert!(findings.iter().any(|f| f.subject == "checkpoint" && f.level == Level::Ok));
     }
 
-    /// A data set that cannot be made, a checkpoint that is not there or damaged, and one of another scenario are errors,
-    /// each with what to do.
+    /// A dataset that cannot be rendered, a missing or damaged checkpoint, and a checkpoint of another scenario are
+    /// errors, each with a remedy.
     #[test]
     fn what_is_wrong_is_said() {
         let (path, graph) = shipped();
@@ -211,7 +211,7 @@ mod tests {
         let findings =
             check(&path, &without, Some(&nowhere), Some(&root().join("configs/checkpoints/aproaching-intersection")));
         let found = errors(&findings);
-        assert_eq!(found.iter().map(|(subject, _)| *subject).collect::<Vec<_>>(), ["data set", "checkpoint"]);
+        assert_eq!(found.iter().map(|(subject, _)| *subject).collect::<Vec<_>>(), ["dataset", "checkpoint"]);
         assert!(found[1].1.contains("did you mean") && found[1].1.contains("approaching-intersection"), "{found:?}");
         assert!(
             findings.iter().filter(|f| f.level == Level::Error).all(|f| !f.means.is_empty() && !f.advice.is_empty())
@@ -233,7 +233,7 @@ mod tests {
         assert!(found[1].1.contains("planning.json") && found[2].1.contains("scenario.name"), "{found:?}");
     }
 
-    /// A scenario that cannot be read is an error where it would be rendered, else a warning; both name the nearest.
+    /// An unreadable scenario is an error if the graph renders it, else a warning; both suggest the nearest name.
     #[test]
     fn a_wrong_scenario_matters_where_it_is_rendered() {
         let (path, mut graph) = shipped();

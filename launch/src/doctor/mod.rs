@@ -1,5 +1,5 @@
-//! `carff doctor`: looks at the machine and at a graph, and says what will go wrong, what it means and what to do.
-//! `gather` looks, `checks` judges, `finding` shows.
+//! `carff doctor`: checks the machine and a graph, and reports problems with consequence and remedy. `gather` collects
+//! facts, `checks` judges them, `finding` prints the findings.
 
 mod checks;
 mod finding;
@@ -15,12 +15,12 @@ use std::io::IsTerminal;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-/// Look at the machine.
+/// Check the machine.
 #[derive(Clone, Debug, clap::Args)]
 pub struct DoctorArgs {
-    /// A graph file, as in configs/graphs: what it asks of the machine, and whether what it names is there and fits.
+    /// A graph file, as in configs/graphs: also check its requirements, and that the files that it names exist and fit.
     pub graph: Option<PathBuf>,
-    /// Data set folder, in place of the graph file's.
+    /// Dataset folder, in place of the graph file's.
     #[arg(long, requires = "graph")]
     pub dataset: Option<PathBuf>,
     /// Checkpoint folder, in place of the graph file's.
@@ -31,7 +31,7 @@ pub struct DoctorArgs {
     pub json: bool,
 }
 
-/// Prints what it finds; exit code 1 when something keeps a graph from running.
+/// Prints the findings; the exit code is 1 if a finding prevents a graph from running.
 pub fn run(args: &DoctorArgs) -> anyhow::Result<ExitCode> {
     let findings = examine(args)?;
     let text = if args.json {
@@ -45,7 +45,7 @@ pub fn run(args: &DoctorArgs) -> anyhow::Result<ExitCode> {
     Ok(if failed { ExitCode::FAILURE } else { ExitCode::SUCCESS })
 }
 
-/// All findings.
+/// Returns all findings.
 pub fn examine(args: &DoctorArgs) -> anyhow::Result<Vec<Finding>> {
     let graph = args.graph.as_deref().map(GraphConfig::load);
     let config = graph.as_ref().and_then(|g| g.as_ref().ok());
@@ -58,7 +58,7 @@ pub fn examine(args: &DoctorArgs) -> anyhow::Result<Vec<Finding>> {
     let mut findings = vec![checks::processor(&name, &features), checks::cores(cores, &stages)];
     findings.extend(gather::available_memory().map(checks::memory));
     findings.extend([checks::clock(&gather::clock()), checks::governor(&gather::governors())]);
-    let here = std::env::current_dir().context("the current folder is gone")?;
+    let here = std::env::current_dir().context("the current folder does not exist")?;
     findings.extend(gather::free_bytes(&here).map(|bytes| checks::disk(&here, bytes)));
 
     let view_bytes = carff_messages::rgb_bytes(renderer.width_px, renderer.height_px);

@@ -1,4 +1,4 @@
-//! What a replayed graph made of its frames, against what was recorded: posteriors, forecasts, beliefs and decisions.
+//! Compares a replayed graph's posteriors, forecasts, beliefs and decisions with the recorded ones.
 
 use carff_messages::forms::{ActionForm, AnyMessage, BeliefForm, ForecastForm, HeaderForm, PosteriorForm};
 use carff_messages::{Action, Belief, Forecast, Posterior};
@@ -9,19 +9,19 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 use std::path::Path;
 
-/// What is compared, in the order in which a graph makes it.
+/// The compared topics, in the order in which a graph publishes them.
 pub(super) const COMPARED: [TopicId; 4] = [TopicId::POSTERIOR, TopicId::FORECAST, TopicId::BELIEF, TopicId::ACTION];
 
-/// A message that is compared: its topic, its frame and its step.
+/// Key of a compared message: its topic, frame and step.
 type Place = (TopicId, u64, u32);
 
-/// What a graph made of replayed frames, without times.
+/// Messages of a graph about replayed frames, without times.
 #[derive(Debug, Default)]
 pub(super) struct Replayed {
     made: BTreeMap<Place, Value>,
 }
 
-/// What came of a comparison.
+/// Result of a comparison.
 #[derive(Debug, Default, PartialEq, Eq)]
 pub(super) struct Comparison {
     compared: BTreeMap<TopicId, u64>,
@@ -36,7 +36,7 @@ fn without_times(header: &mut HeaderForm) {
     (header.sequence, header.capture_time_ns, header.publish_time_ns) = (0, 0, 0);
 }
 
-/// What a message says but for when it was made; none for messages that are not compared.
+/// Returns a message without its times; `None` for topics that are not compared.
 fn timeless(message: AnyMessage<'_>) -> Option<(Place, Value)> {
     let header = message.header();
     let (mut frame, mut step) = (header.frame_id, header.step);
@@ -67,12 +67,12 @@ fn timeless(message: AnyMessage<'_>) -> Option<(Place, Value)> {
 }
 
 impl Replayed {
-    /// Takes what the replayed graph sent.
+    /// Adds a message of the replayed graph.
     pub(super) fn take(&mut self, message: AnyMessage<'_>) {
         self.made.extend(timeless(message));
     }
 
-    /// Compares all that was recorded of recorded frames.
+    /// Compares all recorded messages about recorded frames.
     pub(super) fn compare(&self, recording: &Path) -> anyhow::Result<Comparison> {
         let mut reader = Reader::open(recording)?;
         let mut comparison = Comparison::default();
@@ -92,7 +92,7 @@ impl Replayed {
 }
 
 impl Comparison {
-    /// Whether all was there, and the same.
+    /// Returns true if all messages arrived and are equal.
     pub(super) fn is_same(&self) -> bool {
         self.different == 0 && self.missing == 0 && !self.compared.is_empty()
     }
@@ -115,12 +115,12 @@ impl Comparison {
     }
 }
 
-/// The word for a topic's message.
+/// Returns the noun for a topic's message.
 fn noun(topic: TopicId) -> &'static str {
     if topic == TopicId::ACTION { "decision" } else { topic.name().rsplit('/').next().unwrap_or_default() }
 }
 
-/// The first place where two JSON values differ.
+/// Returns the first difference between two JSON values.
 fn first_difference(path: &str, recorded: &Value, replayed: &Value) -> Option<String> {
     match (recorded, replayed) {
         (Value::Object(a), Value::Object(b)) => a.iter().find_map(|(key, value)| {
@@ -144,11 +144,11 @@ impl fmt::Display for Comparison {
             COMPARED.iter().filter_map(|t| Some(format!("{} {}s", self.compared.get(t)?, noun(*t)))).collect();
         let counts = counts.join(", ");
         if self.is_same() {
-            write!(f, "{counts}: all the same, bit for bit")?;
+            write!(f, "{counts}: all equal, bit for bit")?;
         } else if self.compared.is_empty() {
             write!(
                 f,
-                "the recording holds nothing that a graph makes of a recorded frame: there is nothing to compare"
+                "the recording has no posterior, forecast, belief or decision of a recorded frame: nothing to compare"
             )?;
         } else {
             write!(f, "{counts}: {} differ, {} are missing", self.different, self.missing)?;
@@ -157,7 +157,7 @@ impl fmt::Display for Comparison {
             write!(f, "\nfirst difference: {first}")?;
         }
         if self.cut_off {
-            write!(f, "\nthe recording ends in the middle")?;
+            write!(f, "\nthe recording is incomplete")?;
         }
         Ok(())
     }
@@ -193,8 +193,8 @@ mod tests {
         writer.finish().unwrap();
     }
 
-    /// The same beliefs at other times are the same; one that differs is told with its frame and its field, and one that
-    /// did not come is missing.
+    /// Beliefs that differ only in time are equal. A different belief is reported with its frame and field, and an
+    /// absent one is missing.
     #[test]
     fn differences_are_told() {
         let folder = tempfile::tempdir().unwrap();

@@ -1,4 +1,4 @@
-//! Sending recorded messages in place of the stages that sent them.
+//! Sends recorded messages in place of their stages.
 
 use super::compare::{COMPARED, Replayed};
 use anyhow::{Context, ensure};
@@ -13,23 +13,23 @@ use std::path::PathBuf;
 use std::sync::mpsc::{Receiver, TryRecvError, channel};
 use std::sync::{Arc, Mutex};
 
-/// Frames whose new time of capture is remembered.
+/// Number of frames whose new capture time is remembered.
 const FRAMES: usize = 256;
-/// How long a frame's decision is waited for, nanoseconds.
+/// Longest wait for a frame's decision, nanoseconds.
 const PATIENCE_NS: u64 = 3_000_000_000;
-/// How long the last frame is given, nanoseconds.
+/// Wait after the last frame, nanoseconds.
 const LINGER_NS: u64 = 500_000_000;
-/// Time between two looks at what comes back, nanoseconds.
+/// Interval between two checks for answers, nanoseconds.
 const LOOK_NS: u64 = 2_000_000;
 
-/// When the next message goes out.
+/// Timing of the next message.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum Pace {
-    /// At its recorded time, so many times as fast.
+    /// At its recorded time, sped up by this factor.
     Rate(f64),
-    /// Frames: when Enter is pressed.
+    /// Frames: at each press of Enter.
     OnEnter,
-    /// Frames: when the one before has been decided on.
+    /// Frames: after the decision on the previous frame.
     AfterEachDecision,
 }
 
@@ -38,20 +38,20 @@ pub(super) struct Player {
     pub(super) recording: PathBuf,
     pub(super) topics: BTreeSet<TopicId>,
     pub(super) pace: Pace,
-    /// The part that is played, nanoseconds after the recording's first message.
+    /// Start of the played part, nanoseconds after the recording's first message.
     pub(super) from_ns: u64,
     pub(super) to_ns: u64,
     pub(super) terminal: Arc<Terminal>,
-    /// Takes what the graph makes of it.
+    /// Collects the graph's answers.
     pub(super) replayed: Option<Arc<Mutex<Replayed>>>,
 }
 
-/// A publisher for each topic that is played.
+/// A publisher for each played topic.
 #[derive(Default)]
 struct Publishers(BTreeMap<TopicId, Box<dyn AnyPublisher>>);
 
 impl Publishers {
-    /// Opens the topics; `largest_bytes` holds the size of each one's largest image.
+    /// Opens the topics; `largest_bytes` contains the size of each topic's largest image.
     fn open(node: &Node, wanted: &BTreeSet<TopicId>, largest_bytes: &BTreeMap<TopicId, usize>) -> anyhow::Result<Self> {
         let open = |topic: &TopicId| {
             let bytes = largest_bytes.get(topic).copied().unwrap_or(0);
@@ -72,7 +72,7 @@ impl Publishers {
     }
 }
 
-/// The new times of capture: the same for all messages of a frame, as old now as it was then.
+/// New capture times: equal for all messages of a frame, which keeps the frame's recorded age.
 #[derive(Default)]
 struct Times(BTreeMap<u64, u64>);
 
@@ -88,7 +88,7 @@ impl Times {
 }
 
 impl Player {
-    /// Plays to the end, or to a stop.
+    /// Plays to the end, or until it is stopped.
     pub(super) fn play(self, run: &Run, stop: &Stop) -> anyhow::Result<()> {
         let node = Node::open(run, "replay")?;
         let waiter = Waiter::new(stop.clone());
@@ -116,12 +116,12 @@ impl Player {
                     if begun_ns == 0 {
                         begun_ns = monotonic_now_ns();
                         self.terminal.note(&format!(
-                            "replaying {} from {:.1} s on",
+                            "replaying {} from {:.1} s",
                             self.recording.display(),
                             at_ns as f64 / 1e9
                         ));
                     }
-                    // At rate 0 everything goes out at once.
+                    // At rate 0 everything is sent at once.
                     let due_ns = begun_ns + ((at_ns - self.from_ns.min(at_ns)) as f64 / rate.max(1e-9)) as u64;
                     let due_ns = if rate > 0.0 { due_ns } else { 0 };
                     self.look_until(&waiter, &mut back, due_ns, |_| false)?
@@ -150,16 +150,16 @@ impl Player {
             }
         }
         self.terminal.status(String::new());
-        ensure!(first_ns.is_some(), "{} holds no message", self.recording.display());
+        ensure!(first_ns.is_some(), "{} contains no message", self.recording.display());
         if reader.is_cut_off() {
-            self.terminal.note("the recording ends in the middle: it was replayed up to there");
+            self.terminal.note("the recording is incomplete: it was replayed up to its last message");
         }
-        // What the last frame leads to is still on its way.
+        // The last frame's results are still in progress.
         self.look_until(&waiter, &mut back, monotonic_now_ns() + LINGER_NS, |_| false)?;
         Ok(())
     }
 
-    /// Looks at what comes back until a time, or until `enough`; false on a stop.
+    /// Receives answers until a time, or until `enough`; returns false on a stop.
     fn look_until(
         &self,
         waiter: &Waiter,
@@ -198,7 +198,7 @@ impl Player {
         loop {
             match keys.try_recv() {
                 Ok(()) => return Ok(true),
-                // The end of the input is the end of the replay.
+                // The end of the input ends the replay.
                 Err(TryRecvError::Disconnected) => return Ok(false),
                 Err(TryRecvError::Empty) => {}
             }
@@ -208,7 +208,7 @@ impl Player {
         }
     }
 
-    /// Bytes of the largest image of each topic.
+    /// Returns the size of the largest image of each topic, bytes.
     fn largest_images(&self) -> anyhow::Result<BTreeMap<TopicId, usize>> {
         let mut largest = BTreeMap::from([(TopicId::FRAME, 1), (TopicId::VIEW, 1)]);
         let mut reader = Reader::open(&self.recording)?;
@@ -221,7 +221,8 @@ impl Player {
     }
 }
 
-/// A message for each line of standard input, from a thread: reading it cannot be broken off.
+/// Returns a channel with a message for each line of standard input; a thread reads it, because a read cannot be
+/// interrupted.
 fn keys() -> Receiver<()> {
     let (sender, receiver) = channel();
     std::thread::spawn(move || {
@@ -238,7 +239,7 @@ fn keys() -> Receiver<()> {
 mod tests {
     use super::*;
 
-    /// All messages of a frame get one time of capture, as old as it was.
+    /// All messages of a frame get one capture time, with the frame's recorded age.
     #[test]
     fn a_frame_is_captured_once() {
         let mut times = Times::default();

@@ -1,4 +1,4 @@
-//! `carff replay`: a recording through a graph again.
+//! `carff replay`: sends a recording through a graph again.
 
 mod compare;
 mod feed;
@@ -22,44 +22,44 @@ use std::sync::{Arc, Mutex};
 pub struct ReplayArgs {
     /// The recording.
     pub recording: PathBuf,
-    /// How many times as fast as it was.
+    /// Speed factor.
     #[arg(long, value_parser = positive, conflicts_with = "step")]
     pub rate: Option<f64>,
-    /// One frame for each press of Enter.
+    /// Send one frame for each press of Enter.
     #[arg(long)]
     pub step: bool,
-    /// Begin so many seconds after its begin.
+    /// Start this many seconds after the beginning.
     #[arg(long, value_parser = positive)]
     pub from: Option<f64>,
-    /// End so many seconds after its begin.
+    /// Stop this many seconds after the beginning.
     #[arg(long, value_parser = positive)]
     pub to: Option<f64>,
-    /// Topics that come from the recording, separated by commas, in place of `camera/frame` alone: the stages that send
-    /// them, and those before, are not started. `all`: no stage is.
+    /// Topics to send from the recording, separated by commas. Default: only `camera/frame`. The stages that publish
+    /// them, and all stages before those, are not started. `all`: no stage is started.
     #[arg(long, value_parser = only)]
     pub only: Option<Only>,
-    /// One frame after another, each waited for; then compare every posterior, forecast, belief and decision with the
-    /// recorded ones.
+    /// Send one frame at a time and wait for its decision; then compare every posterior, forecast, belief and decision
+    /// with the recorded ones.
     #[arg(long, conflicts_with_all = ["rate", "step", "only"])]
     pub verify: bool,
-    /// Run name, in place of the recorded one's.
+    /// Run name; replaces the recorded one.
     #[arg(long)]
     pub run: Option<String>,
-    /// Graph file, in place of the recorded one.
+    /// Graph file; replaces the recorded one.
     #[arg(long)]
     pub graph: Option<PathBuf>,
-    /// Data set folder, in place of the recorded one's.
+    /// Dataset folder; replaces the recorded one.
     #[arg(long)]
     pub dataset: Option<PathBuf>,
-    /// Checkpoint folder, in place of the recorded one's.
+    /// Checkpoint folder; replaces the recorded one.
     #[arg(long)]
     pub checkpoint: Option<PathBuf>,
-    /// Folder of the stages' programs, in place of this program's own.
+    /// Folder of the stages' programs; default: this program's folder.
     #[arg(long, hide = true)]
     pub stages: Option<PathBuf>,
 }
 
-/// The topics that come from the recording.
+/// Topics that the recording supplies.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Only(pub BTreeSet<TopicId>);
 
@@ -82,10 +82,10 @@ fn positive(text: &str) -> Result<f64, String> {
     }
 }
 
-/// The stages in the order of the data's way; the renderer hangs beside it.
+/// The stages in the order of the data flow, without the renderer, which is a branch of it.
 const WAY: [Stage; 5] = [Stage::Camera, Stage::Encoder, Stage::Forecaster, Stage::Prober, Stage::Controller];
 
-/// The stages that are not started when these topics come from the recording: those that send them, and those before.
+/// Returns the stages that are not started for these topics: their publishers, and all stages before them.
 fn replaced(topics: &BTreeSet<TopicId>) -> BTreeSet<Stage> {
     let last = WAY.iter().rposition(|&stage| topics.contains(&TopicId::of_stage(stage))).unwrap_or(0);
     let mut stages: BTreeSet<Stage> = WAY[..=last].iter().copied().collect();
@@ -95,11 +95,11 @@ fn replaced(topics: &BTreeSet<TopicId>) -> BTreeSet<Stage> {
     stages
 }
 
-/// Replays. Exit code 1 when a comparison found a difference.
+/// Replays a recording. The exit code is 1 if a comparison found a difference.
 pub fn run(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
     let about = Reader::open(&args.recording)?.about().clone();
-    let folder = tempfile::tempdir().context("cannot make a temporary folder")?;
-    // The recorded file, unless the one it came from is still the same: then messages name that one.
+    let folder = tempfile::tempdir().context("cannot create a temporary folder")?;
+    // The recorded configuration, or the original file if it is unchanged: error messages then name that file.
     let graph = match &args.graph {
         Some(graph) => graph.clone(),
         None if std::fs::read_to_string(&about.graph).is_ok_and(|text| text == about.graph_text) => about.graph.into(),
@@ -158,7 +158,7 @@ fn write_graph(folder: &Path, text: &str) -> anyhow::Result<PathBuf> {
 mod tests {
     use super::*;
 
-    /// Whoever sends what comes from the recording is not started, nor is anybody before.
+    /// Publishers of replayed topics are not started, and no stage before them.
     #[test]
     fn senders_are_replaced() {
         let of = |text: &str| replaced(&only(text).unwrap().0);

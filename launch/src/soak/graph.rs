@@ -1,4 +1,4 @@
-//! The graph under fire: its launcher's process, its folder, and what it holds of the system.
+//! The graph under test: its launcher's process, its folder, and its system resources.
 
 use super::patience::Patience;
 use anyhow::{Context, bail, ensure};
@@ -13,10 +13,10 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::time::Duration;
 
-/// Frames that the launcher remembers: nobody reads its report, and memory is watched.
+/// Number of frames in the launcher's report: the report is not read, and memory is measured.
 const KEEP_FRAMES: u64 = 300;
 
-/// A graph that is started and stopped.
+/// A graph that the soak starts and stops.
 pub(super) struct Graph {
     folder: tempfile::TempDir,
     pub(super) config: GraphConfig,
@@ -25,17 +25,17 @@ pub(super) struct Graph {
     launcher: Option<Child>,
 }
 
-/// What a process tree holds of the system.
+/// System resources of a process tree.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub(super) struct Holdings {
-    /// Files of the run in shared memory.
+    /// Number of the run's files in shared memory.
     pub(super) files: usize,
-    /// Open descriptors by process.
+    /// Number of open descriptors by process.
     pub(super) descriptors: BTreeMap<&'static str, usize>,
 }
 
 impl Holdings {
-    /// How much more this is than a baseline.
+    /// Returns the number of resources above a baseline.
     pub(super) fn excess(&self, baseline: &Self) -> usize {
         let of = |name: &str| baseline.descriptors.get(name).copied().unwrap_or(0);
         let descriptors: usize = self.descriptors.iter().map(|(name, n)| n.saturating_sub(of(name))).sum();
@@ -44,7 +44,7 @@ impl Holdings {
 }
 
 impl Graph {
-    /// Writes the graph file, and copies the checkpoint, which faults may damage.
+    /// Writes the graph file, and copies the checkpoint, because faults may damage it.
     pub(super) fn new(
         soak: &SoakConfig,
         dataset: Option<&Path>,
@@ -55,7 +55,7 @@ impl Graph {
         let dataset = config.resolve(dataset.unwrap_or(&config.run.dataset));
         ensure!(
             dataset.is_dir(),
-            "data set {} is missing: `carff launch` renders it, or give --dataset",
+            "dataset {} is missing: `carff launch` renders it, or pass --dataset",
             dataset.display()
         );
         let trained = config.resolve(checkpoint.unwrap_or(&config.run.checkpoint));
@@ -72,7 +72,7 @@ impl Graph {
         (config.run.dataset, config.run.checkpoint) = (std::path::absolute(dataset)?, checkpoint.clone());
         config.camera.repeat = true;
         config.launcher.keep_frames = KEEP_FRAMES;
-        // A soak kills more often than any policy for the road puts up with.
+        // A soak kills more often than any policy for the road allows.
         let often = RestartPolicy::OnFailure { backoff_ms: 50, max_restarts: 1000, within_s: 60 };
         for stage in Stage::ALL {
             let process = config.stages.of_mut(stage);
@@ -87,7 +87,7 @@ impl Graph {
         self.folder.path().join("graph.toml")
     }
 
-    /// What the launcher and the stages have printed.
+    /// Returns the log of the launcher and the stages.
     pub(super) fn log(&self) -> PathBuf {
         self.folder.path().join("launcher.log")
     }
@@ -96,7 +96,7 @@ impl Graph {
         self.launcher.as_ref().map(Child::id)
     }
 
-    /// Starts it, and returns once others may join its run.
+    /// Starts the graph, and returns once its run can be joined.
     pub(super) fn start(&mut self) -> anyhow::Result<Run> {
         let log = std::fs::File::options().create(true).append(true).open(self.log())?;
         let mut child = Command::new(std::env::current_exe()?)
@@ -115,7 +115,7 @@ impl Graph {
             }
             let record = std::fs::read(runtime_dir().join(format!("{}.run", self.name)));
             let record = record.ok().and_then(|bytes| RunRecord::from_bytes(&bytes)).filter(|r| r.pid == child.id());
-            // The launcher has cleared up what was there before once its own node lives.
+            // The launcher has removed old leftovers by the time its own node is alive.
             if let Some(record) = record
                 && living_processes(&named).is_ok_and(|living| living.contains(&child.id()))
             {
@@ -131,7 +131,7 @@ impl Graph {
         }
     }
 
-    /// Whether the launcher has ended by itself, and how.
+    /// Returns the exit status if the launcher has ended by itself.
     pub(super) fn ended(&mut self) -> anyhow::Result<Option<ExitStatus>> {
         match &mut self.launcher {
             Some(launcher) => Ok(launcher.try_wait()?),
@@ -139,7 +139,7 @@ impl Graph {
         }
     }
 
-    /// Ends the launcher by a signal and waits for it, `limit_ms` at most; then for its stages too.
+    /// Ends the launcher by a signal and waits `limit_ms` at most; then waits for its stages.
     pub(super) fn end(&mut self, signal: Signal, limit_ms: u64) -> anyhow::Result<Option<ExitStatus>> {
         let Some(mut launcher) = self.launcher.take() else { return Ok(None) };
         if let Some(pid) = Pid::from_raw(launcher.id() as i32) {
@@ -163,7 +163,7 @@ impl Graph {
         }
     }
 
-    /// Files that a stopped graph has left: shared memory, the run's folder, its lock.
+    /// Returns the files that a stopped graph has left: shared memory, the run's folder, its lock.
     pub(super) fn leftovers(&self) -> anyhow::Result<Vec<PathBuf>> {
         let run = Run::new(&self.name, 0)?;
         let mut left = run.shared_memory_files()?;
@@ -173,7 +173,7 @@ impl Graph {
         Ok(left)
     }
 
-    /// What it holds now; the processes are those of the latest heartbeats.
+    /// Returns its current resources; the processes are those of the latest heartbeats.
     pub(super) fn holdings(&self, run: &Run, pids: &BTreeMap<Stage, u32>) -> anyhow::Result<Holdings> {
         let mut descriptors: BTreeMap<&'static str, usize> = BTreeMap::new();
         let count = |pid: u32| std::fs::read_dir(format!("/proc/{pid}/fd")).map(Iterator::count);
@@ -196,25 +196,25 @@ impl Drop for Graph {
     }
 }
 
-/// A process that is sure to be the same one later: its number may be another one's by then.
+/// A handle of a process that stays valid if the system reuses the process number.
 pub(super) struct Victim {
     handle: OwnedFd,
 }
 
 impl Victim {
-    /// The process of a number, if it lives.
+    /// Returns the process of a number, if it is alive.
     pub(super) fn new(pid: u32) -> anyhow::Result<Self> {
         let pid = Pid::from_raw(pid as i32).context("no process has the number 0")?;
         Ok(Self { handle: pidfd_open(pid, PidfdFlags::empty())? })
     }
 
-    /// Sends a signal; false when the process has ended.
+    /// Sends a signal; returns false if the process has ended.
     pub(super) fn signal(&self, signal: Signal) -> bool {
         pidfd_send_signal(&self.handle, signal).is_ok()
     }
 }
 
-/// Resident memory of a process, bytes.
+/// Returns the resident memory of a process, bytes.
 pub(super) fn resident_bytes(pid: u32) -> Option<u64> {
     let text = std::fs::read_to_string(format!("/proc/{pid}/statm")).ok()?;
     let pages: u64 = text.split_whitespace().nth(1)?.parse().ok()?;

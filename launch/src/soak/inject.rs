@@ -1,4 +1,5 @@
-//! The liars of a soak, in processes of their own: a rogue publisher, and probes that come and go. No stage knows them.
+//! Injectors of a soak, in their own processes: a rogue publisher, and probes that come and go. The stages do not know
+//! them.
 
 use anyhow::{Context, ensure};
 use carff_base::random::{Key, stream};
@@ -8,33 +9,33 @@ use rand::Rng;
 use rustix::process::{Signal, set_parent_process_death_signal};
 use std::time::Duration;
 
-/// Longest sleep between two looks, nanoseconds.
+/// Longest sleep between two checks, nanoseconds.
 const LOOK_NS: u64 = 100_000_000;
-/// How often it looks for frames before it gives up: looks, as time may pass without it.
+/// Number of checks for frames before it gives up. It counts checks, because the process may get no processor time.
 const LOOKS: usize = 300;
-/// Frames in a burst, for each one that is asked for.
+/// Number of frames in a burst, for each requested frame.
 const BURST: u32 = 12;
-/// How late a late frame comes.
+/// Delay of a late frame.
 const LATE: Duration = Duration::from_millis(400);
-/// Time between two rogue messages: slow enough that each is seen by whoever counts.
+/// Interval between two rogue messages: long enough that each receiver counts each message.
 const BETWEEN: Duration = Duration::from_millis(5);
 
-/// One fault from outside. Prints how many rogue beliefs it sent.
+/// Injects one fault. Prints the number of rogue beliefs that it sent.
 #[derive(Clone, Debug, clap::Args)]
 pub struct InjectArgs {
     /// The run's name.
     run: String,
     /// The run's id.
     run_id: u64,
-    /// What: `probe`, or a kind of the soak file.
+    /// Kind of fault: `probe`, or a kind of the soak file.
     what: String,
-    /// How many.
+    /// Number of messages or probes.
     count: u32,
     /// Seed.
     seed: u64,
 }
 
-/// Does it.
+/// Injects the fault.
 pub fn run(args: &InjectArgs) -> anyhow::Result<()> {
     set_parent_process_death_signal(Some(Signal::KILL)).context("cannot watch the parent process")?;
     let node = Node::open(&Run::new(&args.run, args.run_id)?, "injector")?;
@@ -50,7 +51,7 @@ pub fn run(args: &InjectArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Subscribes to everything, says so, reads a little, and then waits to be stopped or killed.
+/// Subscribes to all topics, reports it, reads a little, and then waits to be stopped or killed.
 fn probe(node: &Node, count: u32) -> anyhow::Result<()> {
     let waiter = Waiter::new(Stop::on_signals()?);
     let mut frames = node.receiver(&topics::FRAME)?;
@@ -71,7 +72,7 @@ fn probe(node: &Node, count: u32) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Messages that no receiver may accept, on every topic of the decision path. Returns how many beliefs were among them.
+/// Publishes messages that no receiver may accept, on every topic of the decision path. Returns the number of beliefs.
 fn rogue(node: &Node, args: &InjectArgs) -> anyhow::Result<u32> {
     let mut posteriors = node.publisher(&topics::POSTERIOR)?;
     let mut forecasts = node.publisher(&topics::FORECAST)?;
@@ -120,12 +121,12 @@ fn rogue(node: &Node, args: &InjectArgs) -> anyhow::Result<u32> {
         beliefs.send_unchecked(belief)?;
         std::thread::sleep(BETWEEN);
     }
-    // Whoever reads maps this process's memory when it first reads; it must still be there then.
+    // Readers map this process's memory at their first read; it must still exist then.
     std::thread::sleep(Duration::from_millis(300));
     Ok(args.count)
 }
 
-/// Frames that were seen before, sent again as they should not be.
+/// Sends recorded frames again: late, repeated, or out of order.
 fn frames(node: &Node, args: &InjectArgs) -> anyhow::Result<()> {
     let mut input = node.receiver(&topics::FRAME)?;
     let waiter = Waiter::new(Stop::on_signals()?);
@@ -156,7 +157,7 @@ fn frames(node: &Node, args: &InjectArgs) -> anyhow::Result<()> {
             let jump_ns = if args.seed & (1 << 60) == 0 { jump_ns } else { -jump_ns };
             (0..args.count).try_for_each(|_| send(&mut output, &seen[newest], jump_ns))?;
         }
-        other => anyhow::bail!("`{other}` is no fault from outside"),
+        other => anyhow::bail!("`{other}` is not a fault that can be injected"),
     }
     std::thread::sleep(Duration::from_millis(300));
     Ok(())

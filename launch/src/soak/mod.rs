@@ -1,4 +1,5 @@
-//! `carff soak`: the real graph in real processes under a seeded schedule of faults; after each, its contract is checked.
+//! `carff soak`: runs the real graph in real processes under a seeded schedule of faults, and checks its contract after
+//! each.
 //!
 //! ```text
 //! soak --starts--> carff launch --starts--> stages         signals: SIGKILL, SIGSTOP, SIGCONT, SIGINT
@@ -35,19 +36,19 @@ use watch::{Notes, Terms, Watcher};
 
 const NS_PER_MS: u64 = 1_000_000;
 const NS_PER_S: u64 = 1_000_000_000;
-/// Shared memory of a soak's own, so that filling it harms nobody else: its size.
+/// Size of the soak's private shared memory, so that filling it harms no other process.
 const MEMORY_SIZE: &str = "size=256m";
 /// Size of the disk that fills under a recorder.
 const DISK_SIZE: &str = "size=4m";
-/// How a slowed process is stopped and continued in turn, milliseconds.
+/// Times for which a slowed process alternately stops and runs, milliseconds.
 const SLOW_MS: (u64, u64) = (40, 20);
-/// How long the camera stands still so that frames are dropped, in frames.
+/// Time for which the camera is stopped so that frames are dropped, in frames.
 const DROPPED_FRAMES: f64 = 4.0;
-/// Time between two looks at the processes' memory.
+/// Interval between two measurements of the processes' memory.
 const MEMORY_PERIOD_NS: u64 = 5 * NS_PER_S;
-/// After a recovery the times of actions count again from so much later on.
+/// Time after a recovery from which the times of actions count again.
 const SETTLE_NS: u64 = 200_000_000;
-/// Longest time that an injector may take.
+/// Longest run time of an injector.
 const INJECTOR_MS: u64 = 60_000;
 
 /// Soak a graph.
@@ -55,33 +56,33 @@ const INJECTOR_MS: u64 = 60_000;
 pub struct SoakArgs {
     /// The soak file, as in configs/soak.
     pub config: PathBuf,
-    /// How long, minutes.
+    /// Duration, minutes.
     #[arg(long, default_value_t = 2.0)]
     pub minutes: f64,
-    /// The schedule's seed.
+    /// Seed of the schedule.
     #[arg(long, default_value_t = 1)]
     pub seed: u64,
-    /// Write the result here, as JSON; evidence of a violation goes into a folder beside it.
+    /// Write the result here, as JSON; evidence of a violation goes into a folder next to it.
     #[arg(long)]
     pub json: Option<PathBuf>,
-    /// Data set folder, in place of the graph file's.
+    /// Dataset folder; replaces the graph file's.
     #[arg(long)]
     pub dataset: Option<PathBuf>,
-    /// Checkpoint folder, in place of the graph file's.
+    /// Checkpoint folder; replaces the graph file's.
     #[arg(long)]
     pub checkpoint: Option<PathBuf>,
-    /// Set by the program itself once shared memory is its own.
+    /// Set by the program itself once it has private shared memory.
     #[arg(long, hide = true)]
     pub own_memory: bool,
 }
 
-/// Soaks; exit code 0 when the contract held all the time, 1 at the first violation, 130 on Ctrl-C.
+/// Soaks a graph; exit code 0 if the contract always held, 1 at the first violation, 130 on Ctrl-C.
 pub fn run(args: &SoakArgs) -> anyhow::Result<ExitCode> {
     let config = SoakConfig::load(&args.config)?;
     ensure!(args.minutes > 0.0 && args.minutes.is_finite(), "--minutes is {}; it must be above 0", args.minutes);
     if !args.own_memory && (config.faults.full_memory > 0 || config.faults.full_disk > 0) {
         with_own_memory();
-        eprintln!("this system lets its users mount nothing: full shared memory and full disks are not tried");
+        eprintln!("this system does not let users mount: full shared memory and full disks are not tested");
     }
     let stop = Stop::on_signals().context("cannot handle signals")?;
     let graph = Graph::new(&config, args.dataset.as_deref(), args.checkpoint.as_deref(), args.seed)?;
@@ -106,7 +107,7 @@ pub fn run(args: &SoakArgs) -> anyhow::Result<ExitCode> {
     let stalled = soak.graph.end(Signal::TERM, config.contract.stop_ms)?.is_none();
     let interrupted = soak.waiter.stop().is_stopped();
     if stalled && !interrupted && soak.notes.violation.is_none() && result.is_ok() {
-        soak.notes.violation = Some("the graph did not end when it was asked to".to_owned());
+        soak.notes.violation = Some("the graph did not end on request".to_owned());
     }
     result?;
     soak.outcome.finish(&soak.notes, &soak.lives, &config.contract);
@@ -133,7 +134,7 @@ pub fn run(args: &SoakArgs) -> anyhow::Result<ExitCode> {
     })
 }
 
-/// Goes on as a process whose shared memory nobody else sees. Returns where the system allows none.
+/// Continues as a process with private shared memory. Returns if the system does not allow it.
 fn with_own_memory() {
     let user = rustix::process::getuid();
     let enter = |command: &mut Command, what: &str| {
@@ -154,7 +155,7 @@ fn with_own_memory() {
     let possible = new("true").stdout(Stdio::null()).stderr(Stdio::null()).status().is_ok_and(|s| s.success());
     let Ok(program) = std::env::current_exe() else { return };
     if possible {
-        // Back to this user inside: the run's folder is named after them.
+        // Inside, switch back to this user: the run's folder is named after the user.
         let back = if user.is_root() { String::new() } else { format!("unshare --user --map-user={} ", user.as_raw()) };
         let error = new(&format!("exec {back}\"$@\""))
             .arg("sh")
@@ -162,11 +163,11 @@ fn with_own_memory() {
             .args(std::env::args_os().skip(1))
             .arg("--own-memory")
             .exec();
-        eprintln!("cannot enter a mount of one's own: {error}");
+        eprintln!("cannot enter a private mount: {error}");
     }
 }
 
-/// A soak in progress.
+/// A running soak.
 struct Soak<'a> {
     args: &'a SoakArgs,
     config: &'a SoakConfig,
@@ -176,7 +177,7 @@ struct Soak<'a> {
     watcher: Option<Watcher>,
     recorder: FlightRecorder,
     notes: Notes,
-    /// What the undisturbed graph holds of the system.
+    /// System resources of the undisturbed graph.
     baseline: Option<Holdings>,
     outcome: Outcome,
     lives: Lives,
@@ -184,7 +185,7 @@ struct Soak<'a> {
 }
 
 impl Soak<'_> {
-    /// Starts the graph and does faults to it until the time is over, the first violation, or an interrupt.
+    /// Starts the graph and injects faults until the time is over, a violation occurs, or the user interrupts.
     fn drive(&mut self) -> anyhow::Result<()> {
         self.start_graph()?;
         let begun_ns = monotonic_now_ns();
@@ -215,7 +216,7 @@ impl Soak<'_> {
         Ok(())
     }
 
-    /// Whether nothing has been violated, nobody interrupts, and the launcher lives.
+    /// Returns true if there is no violation and no interrupt, and the launcher is alive.
     fn goes_on(&mut self) -> anyhow::Result<bool> {
         if let Some(status) = self.graph.ended()? {
             self.violated(format!("the launcher ended by itself: {status}"));
@@ -255,7 +256,7 @@ impl Soak<'_> {
         Ok(())
     }
 
-    /// Looks until something holds; false when it does not within `limit_ms`, times without a processor left out.
+    /// Polls until a condition holds; returns false after `limit_ms`, excluding times without a processor.
     fn look_until(
         &mut self,
         limit_ms: u64,
@@ -290,7 +291,7 @@ impl Soak<'_> {
             self.recorder.keep_on(&self.run)?;
         }
         if self.baseline.is_none() && self.goes_on()? {
-            // The renderer's first views, and whatever else comes late.
+            // The renderer's first views, and other late messages.
             self.look_for(3000)?;
             self.baseline = Some(self.holdings()?);
         }
@@ -305,7 +306,7 @@ impl Soak<'_> {
         self.graph.holdings(&self.run, &self.pids())
     }
 
-    /// Does one fault and checks what has to hold after it. False when it cannot be done here.
+    /// Injects one fault and checks the contract after it. Returns false if the fault is not possible here.
     fn inflict(&mut self, fault: &Fault) -> anyhow::Result<bool> {
         let pids = self.pids();
         match fault.kind {
@@ -371,8 +372,8 @@ impl Soak<'_> {
 
     fn pid_of(&self, fault: &Fault, pids: &BTreeMap<Stage, u32>) -> anyhow::Result<u32> {
         match fault.target {
-            Some(stage) => pids.get(&stage).copied().with_context(|| format!("stage {stage} was never heard")),
-            None => self.graph.pid().context("the launcher does not run"),
+            Some(stage) => pids.get(&stage).copied().with_context(|| format!("stage {stage} never sent a heartbeat")),
+            None => self.graph.pid().context("the launcher is not running"),
         }
     }
 
@@ -383,15 +384,15 @@ impl Soak<'_> {
         }
     }
 
-    /// What is done to the controller itself is not held against its actions' times.
+    /// Excludes faults on the controller itself from the checks of its actions' times.
     fn excuse(&mut self, target: Option<Stage>, ms: u64) {
         if target == Some(Stage::Controller) {
             self.notes.judge.excuse(monotonic_now_ns() + (ms + 1000) * NS_PER_MS);
         }
     }
 
-    /// Waits until all stages are well, a decision has been made since, and nothing more is held of the system than
-    /// before the fault.
+    /// Waits until all stages are ok, a new decision has been made, and the graph uses no more resources than before
+    /// the fault.
     fn recover(&mut self, killed: Option<u32>) -> anyhow::Result<()> {
         let limit_ms = self.config.contract.recovery_ms;
         let begun_ns = monotonic_now_ns();
@@ -408,34 +409,34 @@ impl Soak<'_> {
         let took_ns = took_ns.saturating_sub(self.watcher()?.stalled_ns - stalled_ns);
         if !recovered && !self.waiter.stop().is_stopped() {
             let states: Vec<String> = self.watcher()?.health.values().map(|h| format!("{h:?}")).collect();
-            self.violated(format!("not recovered within {limit_ms} ms: {}", states.join("\n")));
+            self.violated(format!("no recovery within {limit_ms} ms: {}", states.join("\n")));
         }
         self.outcome.recoveries_ms.push(took_ns as f64 / 1e6);
         self.notes.judge.excuse_no_more(monotonic_now_ns() + SETTLE_NS);
-        // What is left of the dead is gone soon after.
+        // Leftovers of dead processes are removed soon after.
         let Some(baseline) = self.baseline.clone() else { return Ok(()) };
         let mut found = Holdings::default();
         let back = self.look_until(limit_ms, |soak| {
-            // A process may end between two looks; the next one tells.
+            // A process may end between two checks; the next check decides.
             found = soak.holdings().unwrap_or_default();
             Ok(!found.descriptors.is_empty() && found.excess(&baseline) == 0 || soak.notes.violation.is_some())
         })?;
         if !back && !self.waiter.stop().is_stopped() {
             self.outcome.leaked_files = found.excess(&baseline);
-            self.violated(format!("more is held of the system than before: {found:?}, at first {baseline:?}"));
+            self.violated(format!("the graph uses more resources than before: {found:?}, at first {baseline:?}"));
         }
         Ok(())
     }
 
-    /// Rogue messages: none may reach an action, and the controller has to count each belief among them.
+    /// Injects rogue messages: none may reach an action, and the controller must count each rogue belief.
     fn lie(&mut self, fault: &Fault) -> anyhow::Result<()> {
         let controller = |soak: &mut Self| -> anyhow::Result<(u32, u64)> {
-            let health = soak.watcher()?.health.get(&Stage::Controller).context("the controller was never heard")?;
+            let health = soak.watcher()?.health.get(&Stage::Controller).context("the controller sent no heartbeat")?;
             Ok((health.pid, health.invalid))
         };
         let (pid, before) = controller(self)?;
         let sent: u64 =
-            self.injector(fault.kind.name(), fault)?.trim().parse().context("the injector said no count")?;
+            self.injector(fault.kind.name(), fault)?.trim().parse().context("the injector printed no count")?;
         let mut counted = (pid, before);
         let all = self.look_until(self.config.contract.recovery_ms, |soak| {
             counted = controller(soak)?;
@@ -443,7 +444,7 @@ impl Soak<'_> {
         })?;
         if counted.0 == pid && (!all || counted.1 != before + sent) && self.notes.violation.is_none() {
             let found = counted.1 - before;
-            self.violated(format!("the controller counted {found} invalid beliefs of {sent} that were sent"));
+            self.violated(format!("the controller counted {found} of {sent} invalid beliefs"));
         }
         self.recover(None)
     }
@@ -464,7 +465,7 @@ impl Soak<'_> {
             .context("cannot start an injector")
     }
 
-    /// Lets an injector do its work; returns what it printed.
+    /// Runs an injector; returns its output.
     fn injector(&mut self, what: &str, fault: &Fault) -> anyhow::Result<String> {
         let mut child = self.helper(what, fault.count, fault.seed)?;
         let mut patience = Patience::of_ms(INJECTOR_MS);
@@ -483,10 +484,10 @@ impl Soak<'_> {
         Ok(said)
     }
 
-    /// Probes attach; half of them detach, the others are killed, holding a frame.
+    /// Attaches probes; half of them detach, the others are killed while they hold a frame.
     fn storm(&mut self, fault: &Fault) -> anyhow::Result<()> {
         let mut probes = Vec::new();
-        // As many as there is room for beside the graph's own subscribers, the soak and its recorder.
+        // As many as fit in addition to the graph's own subscribers, the soak and its recorder.
         for i in 0..fault.count.min(3) {
             let mut probe = self.helper("probe", i, 0)?;
             let mut ready = String::new();
@@ -508,7 +509,7 @@ impl Soak<'_> {
         self.recover(None)
     }
 
-    /// A second recorder's disk fills: it says so and keeps what it has, and nobody else notices.
+    /// Fills a second recorder's disk: the recorder reports it and keeps its data, and no other process is affected.
     fn fill_disk(&mut self) -> anyhow::Result<()> {
         let mut cramped = Cramped::start(&self.run)?;
         let mut status = None;
@@ -531,7 +532,7 @@ impl Soak<'_> {
         self.recover(None)
     }
 
-    /// Cuts a stage's weights in half and kills it: it cannot come back until they are put right.
+    /// Cuts a stage's weights in half and kills the stage: it cannot return until they are restored.
     fn damage_checkpoint(&mut self, fault: &Fault, pids: &BTreeMap<Stage, u32>) -> anyhow::Result<()> {
         let (stage, file) = match fault.seed % 3 {
             0 => (Stage::Encoder, carff_checkpoint::files::ENCODER),
@@ -541,17 +542,17 @@ impl Soak<'_> {
         let path = self.graph.checkpoint.join(file);
         let good = std::fs::read(&path)?;
         write_whole(&path, &good[..good.len() / 2])?;
-        let pid = pids.get(&stage).copied().context("the stage was never heard")?;
+        let pid = pids.get(&stage).copied().context("the stage never sent a heartbeat")?;
         self.kill(Some(stage), pid);
         self.look_for(fault.hold_ms)?;
         write_whole(&path, &good)?;
         self.recover(Some(pid))
     }
 
-    /// Ends the graph and starts it again: nothing may be left of it in between.
+    /// Ends the graph and starts it again: it may leave nothing behind.
     fn cycle(&mut self, signal: Signal) -> anyhow::Result<()> {
         let limit_ms = self.config.contract.stop_ms;
-        // What the watcher and the recorder have open is none of the graph's.
+        // The watcher's and the recorder's files do not belong to the graph.
         self.watcher = None;
         self.recorder.end()?;
         let status = self.graph.end(signal, limit_ms)?;
@@ -561,11 +562,11 @@ impl Soak<'_> {
                 let left = self.graph.leftovers()?;
                 if !left.is_empty() {
                     self.outcome.leaked_files += left.len();
-                    self.violated(format!("a stopped graph has left {left:?}"));
+                    self.violated(format!("a stopped graph left {left:?}"));
                 }
             }
             (Signal::INT, code) => self.violated(format!("an interrupted graph ended with exit code {code:?}")),
-            // What a killed launcher leaves, the next one removes.
+            // The next launcher removes the leftovers of a killed one.
             _ => {}
         }
         if self.notes.violation.is_some() || self.waiter.stop().is_stopped() {
@@ -578,7 +579,7 @@ impl Soak<'_> {
         self.recover(None)
     }
 
-    /// Log, latest messages, recording and schedule, in a folder beside the JSON file.
+    /// Stores log, latest messages, recording and schedule in a folder next to the JSON file.
     fn keep_evidence(&mut self) -> anyhow::Result<()> {
         let folder = self.args.json.as_deref().unwrap_or(Path::new("soak.json")).with_extension("evidence");
         std::fs::create_dir_all(&folder)?;
@@ -595,14 +596,14 @@ impl Soak<'_> {
     }
 }
 
-/// Replaces a file at once: nobody ever reads a part of it.
+/// Replaces a file atomically: no reader sees a part of it.
 fn write_whole(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
     let partial = path.with_extension("partial");
     std::fs::write(&partial, bytes)?;
     Ok(std::fs::rename(&partial, path)?)
 }
 
-/// Takes all free shared memory, until it is dropped.
+/// Occupies all free shared memory until it is dropped.
 struct Filler {
     path: PathBuf,
 }
@@ -616,7 +617,7 @@ impl Filler {
         while chunk >= stat.f_frsize {
             match rustix::fs::fallocate(&file, rustix::fs::FallocateFlags::empty(), bytes, chunk) {
                 Ok(()) => bytes += chunk,
-                // Somebody else took some meanwhile.
+                // Another process took some memory meanwhile.
                 Err(_) => chunk /= 2,
             }
         }

@@ -1,11 +1,11 @@
-//! A time limit that leaves out the times in which the waiting process itself got no processor.
+//! A time limit that excludes times in which the waiting process itself got no processor.
 
 use carff_transport::monotonic_now_ns;
 
-/// The most that counts between two looks, nanoseconds.
+/// Maximum time that counts between two checks, nanoseconds.
 const MOST_NS: u64 = 100_000_000;
 
-/// How long something is still waited for.
+/// Remaining waiting time.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Patience {
     left_ns: u64,
@@ -13,12 +13,12 @@ pub(super) struct Patience {
 }
 
 impl Patience {
-    /// For so many milliseconds from now on.
+    /// Returns a limit of `limit_ms` milliseconds from now.
     pub(super) fn of_ms(limit_ms: u64) -> Self {
         Self { left_ns: limit_ms.saturating_mul(1_000_000), looked_ns: monotonic_now_ns() }
     }
 
-    /// Whether it has run out. Asked often, or most of the time counts as none of the waiter's.
+    /// Returns true when the time is over. Call it often: a long time between two calls counts only up to the maximum.
     pub(super) fn ran_out(&mut self) -> bool {
         self.ran_out_at(monotonic_now_ns())
     }
@@ -34,7 +34,7 @@ impl Patience {
 mod tests {
     use super::*;
 
-    /// It runs out after its time in small steps, and a long gap counts as a short one.
+    /// The limit expires after its time in small steps, and a long gap counts as a short one.
     #[test]
     fn gaps_do_not_count() {
         let mut patience = Patience::of_ms(1000);

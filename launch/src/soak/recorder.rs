@@ -1,5 +1,5 @@
-//! The recorders of a soak: one that runs beside the graph all the time, whose last files are evidence, and one on a
-//! disk that is too small.
+//! The recorders of a soak: one runs next to the graph all the time, and its last files are evidence; another one
+//! writes to a disk that is too small.
 
 use super::patience::Patience;
 use anyhow::{Context, bail, ensure};
@@ -11,12 +11,12 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::time::Duration;
 
-/// Longest time that a recorder may take to begin or to end, milliseconds.
+/// Longest time in which a recorder must start or end, milliseconds.
 const LIMIT_MS: u64 = 30_000;
-/// Seconds in one file of the recording that is kept.
+/// Seconds per file of the evidence recording.
 const FILE_SECONDS: &str = "20";
 
-/// Folder of the small disk, within the soak's own shared memory.
+/// Returns the folder of the small disk, within the soak's private shared memory.
 pub(super) fn small_disk() -> PathBuf {
     Path::new(SHARED_MEMORY_DIR).join("soak-disk")
 }
@@ -32,7 +32,7 @@ fn recordings(folder: &Path) -> anyhow::Result<Vec<PathBuf>> {
     Ok(entries.filter(|p| p.extension().is_some_and(|e| e == "mcap")).collect())
 }
 
-/// Records the graph as long as it runs.
+/// Records the graph while it runs.
 #[derive(Debug)]
 pub(super) struct FlightRecorder {
     folder: tempfile::TempDir,
@@ -44,12 +44,12 @@ impl FlightRecorder {
         Ok(Self { folder: tempfile::tempdir()?, child: None })
     }
 
-    /// The files, those of the latest graph alone.
+    /// Returns the files of the latest graph.
     pub(super) fn files(&self) -> anyhow::Result<Vec<PathBuf>> {
         recordings(self.folder.path())
     }
 
-    /// Begins, if it does not record already; what was recorded before goes.
+    /// Starts recording if it is not active; an earlier recording is removed.
     pub(super) fn keep_on(&mut self, run: &Run) -> anyhow::Result<()> {
         if let Some(child) = &mut self.child
             && child.try_wait()?.is_none()
@@ -63,20 +63,20 @@ impl FlightRecorder {
         let mut command = recorder(run, &self.folder.path().join("run.mcap"))?;
         let child = command.args(["--file-seconds", FILE_SECONDS, "--keep", "2"]).stderr(log).spawn();
         let child = self.child.insert(child.context("cannot start a recorder")?);
-        // It makes its file when it has joined.
+        // The recorder creates its file when it has joined.
         let mut patience = Patience::of_ms(LIMIT_MS);
         while recordings(self.folder.path())?.is_empty() {
             if let Some(status) = child.try_wait()? {
-                let said = std::fs::read_to_string(self.folder.path().join("recorder.log")).unwrap_or_default();
-                bail!("the recorder ended at its start ({status}): {said}");
+                let output = std::fs::read_to_string(self.folder.path().join("recorder.log")).unwrap_or_default();
+                bail!("the recorder ended at its start ({status}): {output}");
             }
-            ensure!(!patience.ran_out(), "the recorder did not begin within {LIMIT_MS} ms");
+            ensure!(!patience.ran_out(), "the recorder did not start within {LIMIT_MS} ms");
             std::thread::sleep(Duration::from_millis(5));
         }
         Ok(())
     }
 
-    /// Ends it: its files are whole.
+    /// Ends the recorder, which completes its files.
     pub(super) fn end(&mut self) -> anyhow::Result<()> {
         let Some(mut child) = self.child.take() else { return Ok(()) };
         if let Some(pid) = Pid::from_raw(child.id() as i32) {
@@ -99,7 +99,7 @@ impl Drop for FlightRecorder {
     }
 }
 
-/// A recorder whose disk will be full in seconds.
+/// A recorder whose disk is full within seconds.
 #[derive(Debug)]
 pub(super) struct Cramped {
     folder: PathBuf,
@@ -117,16 +117,16 @@ impl Cramped {
         Ok(Self { folder, child })
     }
 
-    /// How it ended, once it has.
+    /// Returns the exit status once it has ended.
     pub(super) fn ended(&mut self) -> anyhow::Result<Option<ExitStatus>> {
         Ok(self.child.try_wait()?)
     }
 
-    /// What is wrong with how it ended: it has to say that its disk is full, and what it wrote before has to be readable.
+    /// Returns an error if the recorder did not report its full disk, or if its earlier data is not readable.
     pub(super) fn complaint(&self, status: ExitStatus) -> anyhow::Result<Option<String>> {
-        let said = std::fs::read_to_string(small_disk().with_extension("log"))?;
-        if status.code() != Some(1) || !said.contains("run.mcap") {
-            return Ok(Some(format!("a recorder on a full disk ended with {status} and said: {said}")));
+        let output = std::fs::read_to_string(small_disk().with_extension("log"))?;
+        if status.code() != Some(1) || !output.contains("run.mcap") {
+            return Ok(Some(format!("a recorder on a full disk ended with {status} and printed: {output}")));
         }
         let mut reader = Reader::open(&self.folder.join("run.mcap"))?;
         let mut messages = 0_u64;
@@ -134,7 +134,7 @@ impl Cramped {
         while let Ok(Some(_)) = reader.next() {
             messages += 1;
         }
-        Ok((messages == 0).then(|| "nothing of a recording on a full disk is readable".to_owned()))
+        Ok((messages == 0).then(|| "a recording on a full disk has no readable message".to_owned()))
     }
 }
 

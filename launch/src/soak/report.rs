@@ -1,4 +1,4 @@
-//! What a soak found, as figures.
+//! The result of a soak, as figures.
 
 use super::SoakArgs;
 use super::watch::Notes;
@@ -8,19 +8,19 @@ use std::collections::BTreeMap;
 
 const NS_PER_S: f64 = 1e9;
 
-/// Everything that was counted.
+/// All counts of a soak.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Outcome {
     pub(super) seconds: f64,
     pub(super) faults: BTreeMap<&'static str, u64>,
-    /// Faults that this system does not let anybody try.
+    /// Faults that this system does not permit.
     pub(super) not_tried: BTreeMap<&'static str, u64>,
-    /// Stages killed.
+    /// Number of killed stages.
     pub(super) kills: u64,
-    /// Graphs stopped and started.
+    /// Number of graphs stopped and started.
     pub(super) cycles: u64,
     pub(super) recoveries_ms: Vec<f64>,
-    /// The worst of them by kind of fault.
+    /// Longest recovery by kind of fault.
     pub(super) worst_recoveries_ms: BTreeMap<&'static str, f64>,
     pub(super) worst_start_ms: f64,
     pub(super) leaked_files: usize,
@@ -34,7 +34,7 @@ pub(super) struct Outcome {
 /// Resident memory over the life of each process.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Lives {
-    /// (time, bytes) by process.
+    /// Samples (time, bytes) by process.
     lives: BTreeMap<(&'static str, u32), Vec<(u64, u64)>>,
 }
 
@@ -43,8 +43,8 @@ impl Lives {
         self.lives.entry((name, pid)).or_default().push((at_ns, bytes));
     }
 
-    /// Fastest growth of any process, percent an hour, with its name: from a line through its memory after the
-    /// warm-up. `None` when no life was long enough.
+    /// Returns the fastest growth of any process, percent an hour, with its name: from a linear fit after the warm-up.
+    /// `None` if no life was long enough.
     pub(super) fn growth_percent_per_hour(&self, warm_up_s: u64, span_s: u64) -> Option<(f64, &'static str)> {
         let growths = self.lives.iter().filter_map(|((name, _), points)| {
             let first_ns = points.first()?.0;
@@ -71,7 +71,7 @@ impl Lives {
     }
 }
 
-/// The value that a share of all does not exceed.
+/// Returns the value that a share of all does not exceed.
 fn quantile(values: &[f64], share: f64) -> Option<f64> {
     let mut sorted = values.to_vec();
     sorted.sort_by(f64::total_cmp);
@@ -79,7 +79,7 @@ fn quantile(values: &[f64], share: f64) -> Option<f64> {
 }
 
 impl Outcome {
-    /// Puts the recoveries from number `first` on down to a kind of fault.
+    /// Assigns the recoveries from number `first` to a kind of fault.
     pub(super) fn note_recoveries(&mut self, kind: &'static str, first: usize) {
         for &ms in self.recoveries_ms.iter().skip(first) {
             let worst = self.worst_recoveries_ms.entry(kind).or_default();
@@ -87,7 +87,7 @@ impl Outcome {
         }
     }
 
-    /// Judges what only the whole tells.
+    /// Checks the limits that apply to the whole soak.
     pub(super) fn finish(&mut self, notes: &Notes, lives: &Lives, contract: &Contract) {
         let growth = lives.growth_percent_per_hour(contract.warm_up_s, contract.memory_span_s);
         self.growth_percent_per_hour = growth.map(|(percent, _)| percent);
@@ -160,7 +160,7 @@ impl Outcome {
 mod tests {
     use super::*;
 
-    /// Growth is that of a line through the memory after the warm-up; lives that were too short say nothing.
+    /// Growth is the slope of a linear fit after the warm-up; lives that were too short do not count.
     #[test]
     fn growth_is_fitted_after_the_warm_up() {
         let mut lives = Lives::default();
@@ -177,7 +177,7 @@ mod tests {
         assert!(lives.growth_percent_per_hour(120, 4000).is_none());
     }
 
-    /// Each kind of fault has the worst of its own recoveries; one without recoveries has none.
+    /// Each kind of fault has the longest of its own recoveries; a kind without recoveries has none.
     #[test]
     fn recoveries_belong_to_their_kind() {
         let mut outcome = Outcome::default();
@@ -191,7 +191,7 @@ mod tests {
         assert_eq!(outcome.worst_recoveries_ms, BTreeMap::from([("kill", 500.0), ("stop", 900.0)]));
     }
 
-    /// Quantiles are values that occurred; of none there is none.
+    /// Quantiles are measured values; without values there is no quantile.
     #[test]
     fn quantiles_occurred() {
         let values: Vec<f64> = (1..=200).rev().map(f64::from).collect();

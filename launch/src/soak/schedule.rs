@@ -1,4 +1,4 @@
-//! Which fault comes when: a pure function of the soak file and the seed.
+//! The schedule of faults: a pure function of the soak file and the seed.
 
 use carff_base::random::{Key, stream};
 use carff_config::{Kind, SoakConfig};
@@ -6,27 +6,27 @@ use carff_messages::Stage;
 use rand::Rng;
 use std::fmt;
 
-/// Names the schedule's random streams among all others of the program.
+/// Name of the schedule's random streams.
 const STREAM: u32 = 0x50a4;
-/// Shortest time that a process is stopped or slowed, milliseconds.
+/// Shortest time for which a process is stopped or slowed, milliseconds.
 const MIN_HOLD_MS: u64 = 50;
 
-/// One fault.
+/// A fault of the schedule.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Fault {
-    /// Its number in the schedule, from 0.
+    /// Number in the schedule, from 0.
     pub number: u64,
-    /// Time to wait before it, milliseconds.
+    /// Pause before the fault, milliseconds.
     pub pause_ms: u64,
-    /// What.
+    /// Kind of fault.
     pub kind: Kind,
-    /// To whom, where it is done to a stage; `None` is the launcher.
+    /// The affected stage, for faults on a stage; `None` is the launcher.
     pub target: Option<Stage>,
-    /// For how long, where it lasts, milliseconds.
+    /// Duration, for faults that last, milliseconds.
     pub hold_ms: u64,
-    /// How many, where there are several: messages, probes.
+    /// Number of messages or probes.
     pub count: u32,
-    /// Seed of whatever else it draws.
+    /// Seed of its further random draws.
     pub seed: u64,
 }
 
@@ -45,7 +45,7 @@ impl fmt::Display for Fault {
     }
 }
 
-/// The fault of a number.
+/// Returns the fault of a number.
 pub fn fault(config: &SoakConfig, seed: u64, number: u64) -> Fault {
     let mut random = stream(Key { seed, frame: number, step: STREAM, sample: 0 });
     let sum: u32 = Kind::ALL.iter().map(|&kind| config.faults.of(kind)).sum();
@@ -56,7 +56,7 @@ pub fn fault(config: &SoakConfig, seed: u64, number: u64) -> Fault {
         at = at.saturating_sub(weight);
         here
     });
-    // The weights' sum is above 0, so one of them was met.
+    // The sum of the weights is above 0, so one of them was chosen.
     let kind = drawn.unwrap_or(Kind::Kill);
     let pause_ms = random.random_range(config.pace.min_pause_ms..=config.pace.max_pause_ms);
     // The launcher can be stopped as well.
@@ -78,7 +78,7 @@ mod tests {
         (0..count).map(|number| fault(config, seed, number)).collect()
     }
 
-    /// The same file and seed give the same schedule, whatever was asked before; another seed gives another one.
+    /// The same file and seed give the same schedule in any order of calls; another seed gives another schedule.
     #[test]
     fn a_seed_is_a_schedule() {
         let config = config("kill = 3\nstop = 1\nnan = 2\n");
@@ -87,8 +87,8 @@ mod tests {
         assert_ne!(first(&config, 7, 200), first(&config, 8, 200));
     }
 
-    /// Kinds come as often as their weights say, those without one never; times stay within their limits; every stage
-    /// is met, and the launcher by stops alone.
+    /// Kinds occur as often as their weights require, kinds without weight never. Times stay within their limits. Every
+    /// stage is affected; the launcher is only stopped.
     #[test]
     fn weights_and_limits_hold() {
         let config = config("kill = 30\nstop = 10\n");

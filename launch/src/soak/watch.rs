@@ -1,6 +1,6 @@
-//! Listens to a graph under fire and holds its actions against what the controller was given.
+//! Subscribes to a graph under test and checks its actions against the controller's inputs.
 //!
-//! All that is judged of actions is judged by the times that the controller itself wrote into them.
+//! All checks of actions use the times that the controller wrote into them.
 
 use anyhow::Context;
 use carff_checkpoint::load_policy;
@@ -12,17 +12,17 @@ use carff_transport::{Input, Node, Receiver, Waiter, monotonic_now_ns, topics};
 use std::collections::{BTreeMap, VecDeque};
 use std::path::Path;
 
-/// Frames whose beliefs are remembered.
+/// Number of frames whose beliefs are remembered.
 const FRAMES: usize = 64;
-/// Messages that are kept as evidence.
+/// Number of messages that are kept as evidence.
 const EVIDENCE: usize = 400;
-/// Longest sleep between two looks at the inputs, nanoseconds.
+/// Longest sleep between two reads of the inputs, nanoseconds.
 const LOOK_NS: u64 = 20_000_000;
-/// When the soak itself got no time for so long, nobody else is blamed for that time.
+/// A longer pause of the soak itself counts for no stage.
 const STALL_NS: u64 = 100_000_000;
 const NS_PER_MS: f64 = 1e6;
 
-/// What holds of the graph's actions.
+/// Limits on the graph's actions.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Terms {
     pub(super) policy: Policy,
@@ -43,18 +43,18 @@ impl Terms {
     }
 }
 
-/// What the controller was given, and what it made of it: pure logic.
+/// Inputs and actions of the controller: pure logic.
 #[derive(Clone, Debug)]
 pub(super) struct Judge {
     terms: Terms,
-    /// Beliefs by time of capture.
+    /// Beliefs by capture time.
     frames: BTreeMap<u64, Vec<Belief>>,
-    /// The last decision by a belief.
+    /// The last decision based on a belief.
     decision: Option<Action>,
     last: Option<Action>,
-    /// Times before this are not held against the controller: it was killed or stopped, or the machine stood still.
+    /// Times before this do not count: the controller was killed or stopped, or the machine was paused.
     excused_until_ns: u64,
-    /// Decisions of which some belief was not seen.
+    /// Number of decisions of which a belief was not received.
     pub(super) unjudged: u64,
     pub(super) judged: u64,
     pub(super) worst_safe_action_ns: u64,
@@ -76,17 +76,17 @@ impl Judge {
         }
     }
 
-    /// Leaves the time up to now out of account.
+    /// Excludes the time until `until_ns`.
     pub(super) fn excuse(&mut self, until_ns: u64) {
         self.excused_until_ns = self.excused_until_ns.max(until_ns);
     }
 
-    /// Leaves no time after this out of account.
+    /// Ends the excluded time at `from_ns`.
     pub(super) fn excuse_no_more(&mut self, from_ns: u64) {
         self.excused_until_ns = self.excused_until_ns.min(from_ns);
     }
 
-    /// The controller is another process: it remembers nothing, and nor does its judge.
+    /// Records a new controller process: it remembers nothing, and neither does its judge.
     pub(super) fn restarted(&mut self, now_ns: u64) {
         (self.decision, self.last) = (None, None);
         self.excuse(now_ns);
@@ -99,14 +99,14 @@ impl Judge {
         }
     }
 
-    /// Judges an action; the error says what is wrong with it.
+    /// Checks an action; the error describes the violation.
     pub(super) fn acted(&mut self, action: &Action) -> Result<(), String> {
         let wrong = |what: String| Err(format!("{what}: {action:?}"));
         if let Err(error) = action.validate() {
             return wrong(format!("an action that is not valid ({error})"));
         }
         let (published_ns, excused_ns) = (action.header.publish_time_ns, self.excused_until_ns);
-        // What was not seen proves nothing.
+        // A belief that was not received proves nothing.
         if self.last.is_some_and(|last| action.header.sequence != last.header.sequence.wrapping_add(1)) {
             (self.last, self.decision) = (None, None);
         }
@@ -124,7 +124,7 @@ impl Judge {
             if advances {
                 return wrong("it advances without a belief".to_owned());
             }
-            // In time: soon after what stood before has expired.
+            // The safe action must follow soon after the last decision expired.
             if let Some(decision) = self.decision.take()
                 && decision.valid_until_ns >= excused_ns
                 && decision.code() == Ok(ActionCode::Advance)
@@ -162,7 +162,7 @@ impl Judge {
             return wrong("it rests on a stale belief".to_owned());
         }
         if action.valid_until_ns > captured_ns + action.latency_ns + self.terms.deadline_ns {
-            return wrong("it stands for longer than the deadline".to_owned());
+            return wrong("it is valid for longer than the deadline".to_owned());
         }
         let beliefs = self.frames.get(&captured_ns).map(Vec::as_slice).unwrap_or_default();
         let step = |step: u32| beliefs.iter().find(|b| b.header.step == step);
@@ -181,16 +181,13 @@ impl Judge {
         }
         let halts = self.terms.policy.decide(&evidence).halt;
         if halts == (action.code() == Ok(ActionCode::Advance)) {
-            return wrong(format!(
-                "a wrong action: the beliefs it was given ask for {}",
-                if halts { "halt" } else { "advance" }
-            ));
+            return wrong(format!("a wrong action: its beliefs require {}", if halts { "halt" } else { "advance" }));
         }
         Ok(())
     }
 }
 
-/// Listens to a running graph.
+/// Subscriptions to a running graph.
 pub(super) struct Watcher {
     beliefs: Receiver<Belief>,
     actions: Receiver<Action>,
@@ -199,20 +196,20 @@ pub(super) struct Watcher {
     looked_ns: u64,
     /// The latest heartbeat of each stage.
     pub(super) health: BTreeMap<Stage, Health>,
-    /// The latest decision that rests on a belief.
+    /// Time of the latest decision based on a belief.
     pub(super) decided_ns: u64,
     /// Time in which the soak itself got no processor, nanoseconds.
     pub(super) stalled_ns: u64,
-    // Dropped last: it closes the run.
+    // This field is dropped last: it closes the run.
     _node: Node,
 }
 
-/// What a look brought that outlives the watcher: the graph starts and stops under it.
+/// Observations that outlive the watcher, while the graph starts and stops.
 pub(super) struct Notes {
     pub(super) judge: Judge,
     /// Times from camera to decision of undisturbed frames, milliseconds.
     pub(super) latency_ms: Vec<f64>,
-    /// Whether frames are undisturbed now.
+    /// True while frames are undisturbed.
     pub(super) calm: bool,
     /// The latest messages, as text.
     pub(super) evidence: VecDeque<String>,
@@ -225,7 +222,7 @@ impl Watcher {
         Ok(Self {
             beliefs: node.receiver(&topics::BELIEF)?,
             actions: node.receiver(&topics::ACTION)?,
-            healths: healths.collect::<Result<_, _>>().context("cannot listen to the stages")?,
+            healths: healths.collect::<Result<_, _>>().context("cannot subscribe to the stages")?,
             waiter,
             looked_ns: monotonic_now_ns(),
             health: BTreeMap::new(),
@@ -235,7 +232,7 @@ impl Watcher {
         })
     }
 
-    /// Sleeps for a moment at most, and takes in what came.
+    /// Sleeps briefly, and reads all messages.
     pub(super) fn look(&mut self, notes: &mut Notes) -> anyhow::Result<()> {
         let mut inputs: Vec<&dyn Input> = vec![&self.beliefs, &self.actions];
         inputs.extend(self.healths.iter().map(|h| h as &dyn Input));
@@ -290,7 +287,8 @@ impl Watcher {
         Ok(())
     }
 
-    /// Whether all stages are well by heartbeats that are younger than this; those of a killed process do not count.
+    /// Returns true if all stages are ok by heartbeats newer than `since_ns`; heartbeats of a killed process do not
+    /// count.
     pub(super) fn all_well(&self, since_ns: u64, killed: Option<u32>) -> bool {
         Stage::ALL.iter().all(|stage| {
             self.health.get(stage).is_some_and(|h| {
@@ -365,19 +363,19 @@ mod tests {
     }
 
     impl Judge {
-        /// The next action in the controller's sequence.
+        /// Passes the next action in the controller's sequence.
         fn next(&mut self, mut action: Action) -> Result<(), String> {
             action.header.sequence = self.last.map_or(0, |last| last.header.sequence + 1);
             self.acted(&action)
         }
     }
 
-    /// A safe action.
+    /// Returns a safe action.
     fn halt(at_ms: u64) -> Action {
         Action { reason: Reason::StaleBelief.code(), is_decision: 0, ..action(0, ActionCode::Halt, at_ms) }
     }
 
-    /// Decisions that follow the rule pass, repeated or not, and are counted; those that do not are violations, both ways.
+    /// Decisions that follow the rule pass and are counted, repeated or not; others are violations, for both actions.
     #[test]
     fn decisions_are_held_against_the_beliefs() {
         for (hazard, code, right) in [
@@ -401,8 +399,8 @@ mod tests {
         assert_eq!((judge.judged, judge.unjudged), (0, 1));
     }
 
-    /// A decision that comes twice, out of order, on a stale belief, or for too long is a violation; and so is to advance
-    /// without a belief, or to repeat what was not decided.
+    /// A decision that is repeated, out of order, based on a stale belief, or valid for too long is a violation. So is
+    /// an advance without a belief, or a repetition of another decision.
     #[test]
     fn what_no_controller_may_do() {
         let decided = || {
@@ -422,8 +420,8 @@ mod tests {
         assert!(decided().next(other).unwrap_err().contains("repeats"));
     }
 
-    /// The safe action has to follow a decision's expiry within the slack, and actions each other within period and
-    /// slack; a time that is excused counts for neither.
+    /// The safe action must follow a decision's expiry within the slack, and actions must follow each other within
+    /// period and slack; an excused time counts for neither.
     #[test]
     fn safe_actions_and_the_rate_are_timed() {
         let stands = |until: &[u64]| {
@@ -442,7 +440,7 @@ mod tests {
         let mut excused = stands(&[260, 310]);
         excused.excuse(5000 * MS);
         assert!(excused.next(halt(4990)).is_ok());
-        // Nor are actions that were missed held against anybody.
+        // Missed actions are not violations either.
         let mut missed = stands(&[260]);
         let mut late = halt(999);
         late.header.sequence = 77;

@@ -1,4 +1,4 @@
-//! Replays the views of a data set as drives.
+//! Replays the views of a dataset as drives.
 
 use crate::source::Source;
 use anyhow::Context;
@@ -12,7 +12,7 @@ use carff_messages::{DatasetView, FrameMeta, Observability};
 use std::collections::HashMap;
 use std::path::Path;
 
-/// Drives, with all their pictures in memory.
+/// Drives with all their images in memory.
 #[derive(Debug)]
 pub struct DriveSource {
     dataset: Dataset,
@@ -22,20 +22,20 @@ pub struct DriveSource {
     seed: u64,
     frames_per_timestamp: usize,
     repeat: bool,
-    /// Frames shown so far, in all repetitions.
+    /// Number of shown frames, over all repetitions.
     shown: usize,
     current: usize,
 }
 
 impl DriveSource {
-    /// Plans the drives and loads their pictures.
+    /// Plans the drives and loads their images.
     pub fn open(dataset: &Path, checkpoint: &Path, graph: &GraphConfig, count: u32) -> anyhow::Result<Self> {
         let dataset = Dataset::open(dataset)?;
         let split_seed = match graph.camera.split_seed {
             Some(seed) => seed,
             None => {
                 CheckpointPlanning::load(checkpoint)
-                    .context("which poses were trained on? Set `camera.split_seed`, or give a checkpoint that says it")?
+                    .context("unknown training poses: set `camera.split_seed`, or use a checkpoint that records it")?
                     .split_seed
             }
         };
@@ -48,7 +48,7 @@ impl DriveSource {
         if drives.iter().any(|d| d.kind.is_none()) {
             tracing::warn!(
                 poses = views.len(),
-                "no pose has a right answer (a hidden hazard, or a place in full view without one): no drive will be counted"
+                "no pose has a right answer (a hidden hazard, or a fully visible place without one): no drive counts"
             );
         }
         let mut images = HashMap::new();
@@ -71,7 +71,7 @@ impl DriveSource {
         })
     }
 
-    /// The drives, in order.
+    /// Returns the drives in order.
     pub fn drives(&self) -> &[Drive] {
         &self.drives
     }

@@ -1,4 +1,4 @@
-//! Shows the pictures of a folder, in the order of their names.
+//! Shows the images of a folder, in the order of their names.
 
 use crate::source::Source;
 use anyhow::{Context, anyhow, ensure};
@@ -10,10 +10,10 @@ use carff_dataset::sensor::{SensorNoise, apply_noise_into};
 use carff_messages::{DatasetView, FrameMeta};
 use std::path::{Path, PathBuf};
 
-/// Horizontal field of view that is assumed, as plain pictures do not say it, degrees.
+/// Assumed horizontal field of view, because plain images do not contain it, degrees.
 const FIELD_OF_VIEW_DEG: f64 = 60.0;
 
-/// The pictures of a folder, in memory.
+/// The images of a folder, in memory.
 #[derive(Debug)]
 pub struct FolderSource {
     images: Vec<Image>,
@@ -26,8 +26,8 @@ pub struct FolderSource {
 }
 
 impl FolderSource {
-    /// Loads all PNG pictures of a folder. One that cannot be read, or has another size than the first, is left out,
-    /// with an error that names it; a folder with none that can be used is an error.
+    /// Loads all PNG images of a folder. An image that cannot be read, or has another size than the first, is omitted
+    /// with an error that names it. A folder without a usable image is an error.
     pub fn open(folder: &Path, graph: &GraphConfig) -> anyhow::Result<(Self, Vec<anyhow::Error>)> {
         let entries = std::fs::read_dir(folder).with_context(|| format!("cannot read folder {}", folder.display()))?;
         let mut paths: Vec<PathBuf> = entries.filter_map(|e| Some(e.ok()?.path())).collect();
@@ -40,7 +40,7 @@ impl FolderSource {
                 Ok(image) => match images.first() {
                     Some(first) if (first.width_px, first.height_px) != (image.width_px, image.height_px) => {
                         errors.push(anyhow!(
-                            "{}: {}x{} pixels, but the first picture has {}x{}: left out; scale it",
+                            "{}: {}x{} pixels, but the first image has {}x{}: omitted; scale it",
                             path.display(),
                             image.width_px,
                             image.height_px,
@@ -55,7 +55,7 @@ impl FolderSource {
         }
         ensure!(
             !images.is_empty(),
-            "{} holds no PNG picture that can be read ({} tried{})",
+            "{} contains no readable PNG image ({} tried{})",
             folder.display(),
             paths.len(),
             errors.first().map(|e| format!("; the first: {e:#}")).unwrap_or_default()
@@ -112,14 +112,14 @@ mod tests {
         GraphConfig::parse(text, "test.toml".as_ref()).unwrap()
     }
 
-    /// Broken and wrong-sized pictures are left out, each with an error that names the file; the rest are shown in
-    /// order, each as often as asked.
+    /// Broken and wrong-sized images are omitted, each with an error that names the file; the others are shown in
+    /// order, each as often as configured.
     #[test]
     fn bad_pictures_are_named_and_left_out() {
         let folder = tempfile::tempdir().unwrap();
         let path = |name: &str| folder.path().join(name);
         Image::filled(4, 2, [10, 10, 10]).save_png(&path("a.png")).unwrap();
-        std::fs::write(path("b.png"), b"not a picture").unwrap();
+        std::fs::write(path("b.png"), b"not an image").unwrap();
         Image::filled(3, 2, [0, 0, 0]).save_png(&path("c.png")).unwrap();
         Image::filled(4, 2, [90, 90, 90]).save_png(&path("d.png")).unwrap();
         std::fs::write(path("notes.txt"), b"no picture").unwrap();
@@ -145,12 +145,12 @@ mod tests {
         assert_eq!(greys, [10, 10, 90, 90]);
     }
 
-    /// A folder without a usable picture, and a missing one, are errors that name it.
+    /// A folder without a usable image, and a missing folder, are errors that name it.
     #[test]
     fn nothing_to_show_is_an_error() {
         let folder = tempfile::tempdir().unwrap();
         let error = FolderSource::open(folder.path(), &graph()).unwrap_err();
-        assert!(error.to_string().contains("no PNG picture"), "{error:#}");
+        assert!(error.to_string().contains("no PNG image"), "{error:#}");
         let missing = folder.path().join("missing");
         assert!(FolderSource::open(&missing, &graph()).unwrap_err().to_string().contains("missing"));
     }

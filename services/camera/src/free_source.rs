@@ -1,4 +1,4 @@
-//! Renders what a moving ego sees, as it goes.
+//! Renders the images of a moving ego during the run.
 
 use crate::source::Source;
 use anyhow::Context;
@@ -8,28 +8,28 @@ use carff_dataset::sensor::{SensorNoise, apply_noise_into};
 use carff_messages::{DatasetView, FrameMeta, Observability, Stage};
 use carff_scenes::{FreeDrive, FreeFrame, Scenario};
 
-/// Free drives through a scenario; each is planned when the one before it has ended.
+/// Free drives through a scenario; each is planned when the previous one has ended.
 #[derive(Debug)]
 pub struct FreeDriveSource {
     scenario: Scenario,
     noise: SensorNoise,
     seed: u64,
     frames_per_timestamp: usize,
-    /// How many drives; `None`: no end.
+    /// Number of drives; `None`: unlimited.
     drives: Option<u64>,
-    /// Number of the next drive, and the one that is shown.
+    /// Number of the next drive, and the current drive.
     next: u64,
     drive: Option<FreeDrive>,
     frame_in_drive: usize,
     current: Option<FreeFrame>,
-    /// One thread: the other cores are for the stages that wait for the picture.
+    /// One thread: the other cores are for the stages that wait for the image.
     pool: rayon::ThreadPool,
 }
 
 impl FreeDriveSource {
-    /// Loads the scenario and tries one drive of each kind, so that a scenario that has none ends here.
+    /// Loads the scenario and plans one drive of each kind, so that a scenario without drives is an error here.
     pub fn open(graph: &GraphConfig, drives: u32) -> anyhow::Result<Self> {
-        let path = graph.scenario_path().context("`run.scenario` does not say which scenario to render")?;
+        let path = graph.scenario_path().context("`run.scenario` must name the scenario to render")?;
         let scenario = Scenario::load(&path)?;
         let frames_per_timestamp = graph.camera.frames_per_timestamp as usize;
         for number in 0..2 {
@@ -49,7 +49,7 @@ impl FreeDriveSource {
         })
     }
 
-    /// Renders the next frame, of the next drive where one has ended.
+    /// Renders the next frame, of the next drive if the current one has ended.
     fn render(&mut self) -> anyhow::Result<Option<FreeFrame>> {
         self.frame_in_drive += 1;
         if self.drive.as_ref().is_none_or(|drive| self.frame_in_drive >= drive.frame_count()) {

@@ -1,4 +1,4 @@
-//! Where the camera's pictures come from. No topic is opened here.
+//! Sources of the camera's images, without topics.
 
 mod drive_source;
 mod folder_source;

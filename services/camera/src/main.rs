@@ -1,5 +1,5 @@
-//! The camera stage: takes pictures from a [`source::Source`] at a fixed rate and publishes them.
-//! What a picture means lives in the encoder.
+//! The camera stage: takes images from a [`source::Source`] at a fixed rate and publishes them.
+//! The encoder interprets the images.
 
 use anyhow::Context;
 use carff_camera::{DriveSource, FolderSource, FreeDriveSource, Source};
@@ -17,7 +17,7 @@ fn run(stage: &mut StageContext) -> anyhow::Result<()> {
     let mut frames = stage.image_output(&topics::FRAME, source.max_image_bytes())?;
     let period_ns = (1e9 / stage.graph.run.frame_rate_hz) as u64;
     let limit = stage.args.frames.unwrap_or(u64::MAX);
-    // A camera restarted in mid-run continues after the last frame of its predecessor.
+    // A camera that is restarted during a run continues after the last frame of its predecessor.
     let mut frame_id = 0;
     while frame_id < stage.args.first_frame && source.advance()?.is_some() {
         frame_id += 1;
@@ -35,10 +35,10 @@ fn run(stage: &mut StageContext) -> anyhow::Result<()> {
         frames.send_image(loan, meta)?;
         stage.worked(&meta.header, capture_time_ns);
         frame_id += 1;
-        // A late frame delays those after it; it is never made up for by a burst.
+        // A late frame delays later ones; the camera does not catch up with a burst.
         next_ns = (next_ns + period_ns).max(monotonic_now_ns());
     }
-    // The last frames are still being worked on, and a view of them may still be wanted.
+    // The last frames are still in progress, and their views may still be rendered.
     stage.wait_until(&[], monotonic_now_ns() + stage.graph.camera.linger_ms * 1_000_000)?;
     tracing::info!(frames = frame_id, "done");
     Ok(())
@@ -60,7 +60,7 @@ fn open_source(stage: &mut StageContext) -> anyhow::Result<Box<dyn Source>> {
                 None => stage.dataset.join("images"),
             };
             let (source, unreadable) = FolderSource::open(&folder, &stage.graph)
-                .with_context(|| format!("no pictures from {}", folder.display()))?;
+                .with_context(|| format!("no images from {}", folder.display()))?;
             for error in &unreadable {
                 stage.error(error);
             }

@@ -1,4 +1,4 @@
-//! The camera's drives through a small data set.
+//! Tests of the camera's drives through a small dataset.
 
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
@@ -13,8 +13,8 @@ use std::path::Path;
 const VIEWS: usize = 20;
 const GREY: u8 = 40;
 
-/// Two branches x three timestamps x twenty poses, of which half see nothing and half everything; the grey value of a
-/// picture tells its branch and timestamp.
+/// Writes two branches x three time steps x twenty poses; half of the poses see nothing and half everything. The grey
+/// value of an image encodes its branch and time step.
 fn write_dataset(folder: &Path) {
     let writer = DatasetWriter::create(folder).unwrap();
     let camera = PinholeCamera::look_at([0.0, 0.0, 5.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], 8, 8, 60.0);
@@ -51,8 +51,8 @@ fn graph() -> GraphConfig {
     GraphConfig::parse(text, "test.toml".as_ref()).unwrap()
 }
 
-/// Each drive shows its branch's timestamps in order, each as often as asked, with fresh noise and a valid description;
-/// after the last drive comes nothing; the same seed shows the same bytes.
+/// Each drive shows its branch's time steps in order, each as often as configured, with new noise and a valid
+/// description. After the last drive there is no frame. The same seed gives the same bytes.
 #[test]
 fn drives_show_timestamps_in_order_with_fresh_noise() {
     let folder = tempfile::tempdir().unwrap();
@@ -87,12 +87,12 @@ fn drives_show_timestamps_in_order_with_fresh_noise() {
         assert!((mean - wanted).abs() < 20.0, "frame {i}: mean {mean}, wanted about {wanted}");
     }
     for pair in shots.chunks(2) {
-        assert_ne!(pair[0].1, pair[1].1, "noise is drawn anew for each frame");
+        assert_ne!(pair[0].1, pair[1].1, "noise is drawn again for each frame");
     }
     assert_eq!(shots, shoot());
 }
 
-/// A broken picture of a data set stops the camera before it starts, with an error that names the file.
+/// A broken image of a dataset stops the camera at its start, with an error that names the file.
 #[test]
 fn a_broken_picture_is_named() {
     let folder = tempfile::tempdir().unwrap();
@@ -105,7 +105,7 @@ fn a_broken_picture_is_named() {
     assert!(format!("{error:#}").contains("b0_t1_v"), "{error:#}");
 }
 
-/// Without a checkpoint, and without a seed in the graph file, the error says what to set.
+/// Without a checkpoint, and without a seed in the graph file, the error names the setting.
 #[test]
 fn an_unknown_split_says_what_to_set() {
     let folder = tempfile::tempdir().unwrap();

@@ -1,4 +1,4 @@
-//! The camera's free drives through a shipped scenario.
+//! Tests of the camera's free drives through a shipped scenario.
 
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
@@ -7,8 +7,8 @@ use carff_config::GraphConfig;
 use carff_messages::{Header, ImageMeta, Message};
 use std::path::Path;
 
-/// Free drives show each timestamp in order, with its truth and a valid description, hazard and clear in turn; noise is
-/// drawn anew for each frame; the same seed shows the same bytes; after the last drive comes nothing.
+/// Free drives show each time step in order, with its truth and a valid description; hazard and clear drives alternate.
+/// Noise is drawn again for each frame. The same seed gives the same bytes. After the last drive there is no frame.
 #[test]
 fn free_drives_show_timestamps_in_order() {
     let scenario = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs/scenarios/approaching-intersection");

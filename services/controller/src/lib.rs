@@ -1,24 +1,25 @@
-//! The controller's logic: from beliefs to actions, without topics and without a clock of its own.
+//! The controller's logic: from beliefs to actions, without topics and without its own clock.
 //!
-//! `carff-decision` holds the decision rules; this crate decides when one is applied, and what is valid in between.
+//! `carff-decision` contains the decision rules; this crate decides when a rule is applied, and which action is valid
+//! in between.
 
 use carff_decision::{Decision, Evidence, Policy};
 use carff_messages::{Action, ActionCode, Belief, Header, MAX_HORIZON, Message, Reason};
 
-/// The settings of a controller.
+/// Settings of a controller.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Settings {
     /// The decision rule and its threshold.
     pub policy: Policy,
-    /// A belief older than this since capture is not acted on, and after this long without a new one the car halts.
+    /// Largest age of a belief since capture, and longest validity of a decision; the car then halts.
     pub deadline_ns: u64,
-    /// Time between two ticks.
+    /// Interval between two ticks.
     pub period_ns: u64,
-    /// The run's seed, for headers.
+    /// Seed of the run, for headers.
     pub seed: u64,
 }
 
-/// What one step of a frame's belief says. A step that comes twice must say the same twice.
+/// Content of one step of a frame's belief. A repeated step must be equal.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Step {
     hazard_probability: f32,
@@ -49,37 +50,37 @@ struct Pending {
     evidence: Evidence,
 }
 
-/// The action that stands.
+/// The current action.
 #[derive(Clone, Copy, Debug)]
 struct Standing {
     action: Action,
     decided_ns: u64,
 }
 
-/// Decides on beliefs as they come, and says at each tick what stands.
+/// Decides on beliefs as they arrive, and returns the current action at each tick.
 ///
-/// Frames are ordered by their time of capture: the clock is one for all, and no message can be ahead of it, so whatever
-/// once arrived, a later frame is newer.
+/// Frames are ordered by capture time: all processes share the clock, and no message can be ahead of it. So for any
+/// message that has arrived, a later frame is newer.
 #[derive(Clone, Debug)]
 pub struct Controller {
     settings: Settings,
     pending: Option<Pending>,
     standing: Option<Standing>,
-    /// Capture time and number of the newest frame that was decided on or refused.
+    /// Capture time and number of the newest settled frame, which was decided on or refused.
     settled: Option<(u64, u64)>,
-    /// Why the last belief was not acted on, until one is.
+    /// Reason why the last belief was refused, until a belief is accepted.
     refused: Option<Reason>,
 }
 
 impl Controller {
-    /// One that has seen nothing yet: its ticks say halt.
+    /// Creates a controller without beliefs: its ticks return halt.
     pub fn new(settings: Settings) -> Self {
         Self { settings, pending: None, standing: None, settled: None, refused: None }
     }
 
-    /// Takes in a belief. Acts at once when it is the frame's last one: by the rule when all steps are there and fresh,
-    /// else by halting. A belief of a frame that is settled or passed over is ignored, so none is acted on twice. One
-    /// that contradicts its frame's other steps settles the frame by halting; one from the future is dropped.
+    /// Processes a belief. The frame's last belief causes an action at once: by the rule if all steps are present and
+    /// fresh, else halt. A belief of a settled or older frame is ignored, so no frame is decided twice. A belief that
+    /// contradicts its frame's other steps settles the frame with halt; a belief from the future is dropped.
     pub fn on_belief(&mut self, belief: &Belief, now_ns: u64) -> Option<Action> {
         if belief.validate().is_err() {
             self.on_invalid();
@@ -122,12 +123,12 @@ impl Controller {
         Some(action)
     }
 
-    /// Notes that a belief arrived which was not valid and was dropped.
+    /// Records that an invalid belief arrived and was dropped.
     pub fn on_invalid(&mut self) {
         self.refused = Some(Reason::InvalidBelief);
     }
 
-    /// What stands now: the last decision while it is fresh, else the safe action with its reason.
+    /// Returns the current action: the last decision while it is fresh, else the safe action with its reason.
     pub fn on_tick(&mut self, now_ns: u64) -> Action {
         if now_ns >= self.expires_ns() {
             self.standing = None;
@@ -139,18 +140,18 @@ impl Controller {
         self.safe_action(self.refused.unwrap_or(quiet), now_ns)
     }
 
-    /// The last word: the safe action.
+    /// Returns the last action: the safe action.
     pub fn on_stop(&self, now_ns: u64) -> Action {
         self.safe_action(Reason::Stopping, now_ns)
     }
 
-    /// When what stands stops to stand, nanoseconds: from then on a tick says the safe action. `u64::MAX` when nothing
-    /// stands.
+    /// Returns the time at which the current action expires, nanoseconds: from then on a tick returns the safe action.
+    /// `u64::MAX` without a current action.
     pub fn expires_ns(&self) -> u64 {
         self.standing.map_or(u64::MAX, |s| s.decided_ns.saturating_add(self.settings.deadline_ns + 1))
     }
 
-    /// Settles a frame by halting.
+    /// Settles a frame with halt.
     fn refuse(&mut self, header: &Header, reason: Reason, now_ns: u64) -> Action {
         self.settled = Some((header.capture_time_ns, header.frame_id));
         (self.pending, self.standing, self.refused) = (None, None, Some(reason));
@@ -203,7 +204,7 @@ impl Pending {
         }
     }
 
-    /// Takes in a step. False when it contradicts what the frame's other messages said.
+    /// Records a step. Returns false if it contradicts the frame's other messages.
     fn take(&mut self, belief: &Belief) -> bool {
         let index = belief.header.step as usize - 1;
         let (own, step) = (&self.header, Step::of(belief));

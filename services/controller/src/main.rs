@@ -1,4 +1,4 @@
-//! The controller stage: an action for each belief, and one at each tick. It never goes quiet.
+//! The controller stage: an action for each belief, and one at each tick. It always publishes.
 
 use anyhow::Context;
 use carff_checkpoint::load_policy;
@@ -7,7 +7,7 @@ use carff_messages::Stage;
 use carff_runtime::{StageContext, frame_span};
 use carff_transport::{Woken, monotonic_now_ns, topics};
 
-/// Beliefs taken in before the clock is looked at again: a flood of them holds up no tick.
+/// Maximum number of beliefs between two reads of the clock, so that a flood of them delays no tick.
 const MOST_AT_ONCE: usize = 16;
 
 fn main() -> std::process::ExitCode {
@@ -24,7 +24,7 @@ fn run(stage: &mut StageContext) -> anyhow::Result<()> {
     let mut invalid = 0;
     let mut tick_ns = monotonic_now_ns();
     loop {
-        // A decision that expires is answered at once, not at the next tick.
+        // The expiry of a decision is handled at once, not at the next tick.
         let wake_ns = tick_ns.min(controller.expires_ns());
         if stage.wait_until(&[&beliefs], wake_ns)? == Woken::Stopped {
             return Ok(actions.send(controller.on_stop(monotonic_now_ns()))?);
@@ -43,7 +43,7 @@ fn run(stage: &mut StageContext) -> anyhow::Result<()> {
             invalid = stage.invalid_count();
             controller.on_invalid();
         }
-        // Ticks keep their rate whatever arrives.
+        // Ticks keep their rate during any load.
         let now_ns = monotonic_now_ns();
         if now_ns >= tick_ns.min(controller.expires_ns()) {
             actions.send(controller.on_tick(now_ns))?;
@@ -57,7 +57,7 @@ fn run(stage: &mut StageContext) -> anyhow::Result<()> {
 fn settings(stage: &StageContext) -> anyhow::Result<Settings> {
     let config = &stage.graph.controller;
     let policy = load_policy(config.rule, config.threshold, &stage.checkpoint)
-        .context("no threshold for the calibrated rule: set `controller.threshold`, or give a checkpoint")?;
+        .context("no threshold for the calibrated rule: set `controller.threshold`, or use a checkpoint")?;
     Ok(Settings {
         policy,
         deadline_ns: config.deadline_ms * 1_000_000,

@@ -13,7 +13,7 @@ fn calibrated() -> Controller {
     controller(Rule::Calibrated)
 }
 
-/// A belief of ten samples, of which `hazardous` show the hazard, for a frame captured at `frame_id` x 100 ms.
+/// Returns a belief of ten samples, of which `hazardous` show the hazard, for a frame captured at `frame_id` x 100 ms.
 fn belief(frame_id: u64, step: u32, hazard_probability: f32, hazardous: usize) -> Belief {
     let header = Header::of_frame(frame_id, frame_id * 100 * MS, 1).at_step(step);
     let mut belief = Belief::empty(header, HORIZON);
@@ -34,7 +34,7 @@ fn told(action: &Action) -> (ActionCode, Reason) {
     (action.code().unwrap(), action.reason().unwrap())
 }
 
-/// Before anything arrives, each tick says halt, and says why.
+/// Before any message, each tick returns halt with its reason.
 #[test]
 fn quiet_from_the_start_is_halt() {
     let mut controller = calibrated();
@@ -46,7 +46,7 @@ fn quiet_from_the_start_is_halt() {
     }
 }
 
-/// Nothing is decided before the last step; then at once, on the largest hazard of all steps, by the path's share.
+/// Nothing is decided before the last step; then at once, by the largest hazard of all steps, weighted by the path.
 #[test]
 fn decides_on_all_steps_of_a_frame() {
     let mut controller = calibrated();
@@ -61,22 +61,22 @@ fn decides_on_all_steps_of_a_frame() {
 
     assert!(controller.on_belief(&belief(4, 1, 0.4, 4), 410 * MS).is_none());
     let action = controller.on_belief(&belief(4, 2, 0.0, 0), 420 * MS).unwrap();
-    assert_eq!(told(&action), (ActionCode::Halt, Reason::Belief), "the first step alone is enough");
+    assert_eq!(told(&action), (ActionCode::Halt, Reason::Belief), "the first step is enough");
 }
 
-/// A final belief is acted on once; older frames and repeated ones are ignored.
+/// A final belief causes one action; older and repeated frames are ignored.
 #[test]
 fn each_frame_is_decided_once_and_in_order() {
     let mut controller = calibrated();
     assert!(controller.on_belief(&belief(5, 1, 0.0, 0), 510 * MS).is_none());
     assert!(controller.on_belief(&belief(5, 2, 0.0, 0), 520 * MS).is_some());
-    assert!(controller.on_belief(&belief(5, 2, 0.9, 9), 530 * MS).is_none(), "the same again");
+    assert!(controller.on_belief(&belief(5, 2, 0.9, 9), 530 * MS).is_none(), "a repetition");
     assert!(controller.on_belief(&belief(4, 1, 0.9, 9), 530 * MS).is_none());
     assert!(controller.on_belief(&belief(4, 2, 0.9, 9), 530 * MS).is_none(), "an older frame");
     assert_eq!(told(&controller.on_tick(540 * MS)), (ActionCode::Advance, Reason::Belief));
 }
 
-/// A newer frame's first step abandons the older frame, whose last step then decides nothing.
+/// A newer frame's first step abandons the older frame, whose last step then causes no decision.
 #[test]
 fn newest_frame_wins() {
     let mut controller = calibrated();
@@ -87,7 +87,7 @@ fn newest_frame_wins() {
     assert_eq!((told(&action), action.based_on_frame), ((ActionCode::Halt, Reason::Belief), 2));
 }
 
-/// A decision stands until the deadline, then the car halts, and the next fresh belief lets it go on.
+/// A decision is valid until the deadline, then the car halts, and the next fresh belief lets it continue.
 #[test]
 fn halts_when_beliefs_stop_and_recovers() {
     let mut controller = calibrated();
@@ -101,7 +101,7 @@ fn halts_when_beliefs_stop_and_recovers() {
     assert_eq!(told(&controller.on_tick(921 * MS)), (ActionCode::Advance, Reason::Belief));
 }
 
-/// A belief that comes too late, or without its first step, is answered with halt and its reason, also at ticks.
+/// A belief that is late, or without its first step, causes halt with its reason, also at ticks.
 #[test]
 fn late_and_incomplete_beliefs_halt() {
     let mut controller = calibrated();
@@ -114,7 +114,8 @@ fn late_and_incomplete_beliefs_halt() {
     assert_eq!(told(&controller.on_tick(311 * MS)), (ActionCode::Halt, Reason::IncompleteBelief));
 }
 
-/// An invalid belief is never acted on: a standing decision stays until its deadline, then the car halts and says why.
+/// An invalid belief causes no action: the current decision is valid until its deadline, then the car halts with the
+/// reason.
 #[test]
 fn invalid_beliefs_are_never_acted_on() {
     let mut controller = calibrated();
@@ -129,7 +130,7 @@ fn invalid_beliefs_are_never_acted_on() {
     assert_eq!(told(&controller.on_tick(300 * MS)), (ActionCode::Halt, Reason::InvalidBelief));
 }
 
-/// An early end of the look-ahead (nothing resolved at step 1) is decided on as it is.
+/// A look-ahead that ends early (nothing resolved at step 1) causes a decision.
 #[test]
 fn an_early_end_is_decided_on() {
     let mut controller = calibrated();
@@ -139,7 +140,8 @@ fn an_early_end_is_decided_on() {
     assert_eq!(told(&action), (ActionCode::Halt, Reason::Belief));
 }
 
-/// The other rules reach the action too: the paper's halts on one sample in ten, the two extremes never change.
+/// The other rules also determine the action: the paper's rule halts on one sample in ten, the two extremes never
+/// change.
 #[test]
 fn every_rule_is_wired() {
     let run = |rule: Rule, hazardous: usize| {
@@ -155,8 +157,8 @@ fn every_rule_is_wired() {
     assert_eq!(run(Rule::Overconfident, 10), ActionCode::Advance);
 }
 
-/// Two messages for one step of one frame that differ, steps that disagree on the horizon, and two frames captured at one
-/// instant, each settle the frame by halting at once; the next frame is decided on.
+/// Different messages for one step of a frame, steps that disagree on the horizon, and two frames with one capture time
+/// settle the frame with halt at once; the next frame is decided on.
 #[test]
 fn contradictory_beliefs_halt() {
     let contradict: [fn(&mut Belief); 3] =
@@ -164,7 +166,7 @@ fn contradictory_beliefs_halt() {
     for change in contradict {
         let mut controller = calibrated();
         controller.on_belief(&belief(1, 1, 0.0, 0), 110 * MS);
-        assert!(controller.on_belief(&belief(1, 1, 0.0, 0), 112 * MS).is_none(), "the same twice is no contradiction");
+        assert!(controller.on_belief(&belief(1, 1, 0.0, 0), 112 * MS).is_none(), "a repetition is not a contradiction");
         let mut other = belief(1, 1, 0.0, 0);
         change(&mut other);
         let action = controller.on_belief(&other, 115 * MS).unwrap();
@@ -177,8 +179,8 @@ fn contradictory_beliefs_halt() {
     }
 }
 
-/// A belief on a frame that the clock has not reached is never acted on and shuts nothing out: what stands goes on to
-/// stand, and later frames are decided on. The same holds for frame numbers beyond all others.
+/// A belief about a frame in the future causes no action and blocks nothing: the current action stays valid, and later
+/// frames are decided on. The same is true for frame numbers beyond all others.
 #[test]
 fn no_belief_poisons_the_future() {
     let mut controller = calibrated();
@@ -200,8 +202,8 @@ fn no_belief_poisons_the_future() {
     assert_eq!((told(&action), action.based_on_frame), ((ActionCode::Halt, Reason::Belief), 4));
 }
 
-/// What stands says until when, and a tick at that time halts; when nothing stands there is nothing to wake for. The
-/// last word is the safe action.
+/// The current action has an expiry, and a tick at that time halts; without a current action there is no wake-up. The
+/// last action is the safe action.
 #[test]
 fn a_decision_expires_on_time() {
     let mut controller = calibrated();

@@ -1,4 +1,4 @@
-//! The controller, fed with messages, decides what the decision library decides on the same steps.
+//! The controller, fed with messages, makes the decisions of the decision library on the same steps.
 
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
@@ -16,7 +16,7 @@ use carff_messages::{
 const STATES: usize = 6;
 const MS: u64 = 1_000_000;
 
-/// Uniform draws in [0, 1), named by the trial.
+/// Returns uniform random numbers in [0, 1), named by the trial.
 fn draws(trial: u64) -> impl FnMut() -> f32 {
     let mut sample = 0;
     move || {
@@ -32,7 +32,7 @@ fn layout() -> ProbeLayout {
         .unwrap()
 }
 
-/// A random probed latent; `clear_share` of the latents show no hazard.
+/// Returns a random probed latent; `clear_share` of the latents show no hazard.
 fn probed(next: &mut impl FnMut() -> f32, clear_share: f32) -> Probed {
     let hazard_likelihood = match next() {
         _ if next() < clear_share => 0.01 * next(),
@@ -45,7 +45,7 @@ fn probed(next: &mut impl FnMut() -> f32, clear_share: f32) -> Probed {
     Probed { occupancies: vec![next()], reading }
 }
 
-/// The random steps of one frame.
+/// Returns random steps of one frame.
 fn steps(next: &mut impl FnMut() -> f32) -> Vec<Step> {
     let horizon = 1 + (next() * MAX_HORIZON as f32) as u32;
     let samples = 1 + (next() * 64.0) as usize;
@@ -91,7 +91,7 @@ fn act(policy: Policy, layout: &ProbeLayout, steps: &[Step]) -> Action {
     action.unwrap()
 }
 
-/// For 2000 random frames and every rule: the same action, confidence, hazard probability and number of samples.
+/// For 2000 random frames and every rule, action, confidence, hazard probability and number of samples are equal.
 #[test]
 fn controller_and_library_agree() {
     let layout = layout();
@@ -110,13 +110,13 @@ fn controller_and_library_agree() {
             *halts += usize::from(decision.halt);
         }
     }
-    // Both actions occur, so that the comparison means something.
+    // Both actions occur, so that the comparison is meaningful.
     let [under, over, paper, calibrated] = halts;
     assert_eq!((under, over), (2000, 0));
     assert!((200..1990).contains(&paper) && (200..1800).contains(&calibrated), "{halts:?}");
 }
 
-/// A step survives the way into messages and back; only the probabilities of single samples stay behind.
+/// A step is converted to messages and back; only the probabilities of single samples are lost.
 #[test]
 fn steps_round_trip_through_messages() {
     let layout = layout();

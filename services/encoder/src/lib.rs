@@ -7,12 +7,12 @@ use carff_networks::{borrow, encoder::Encoder};
 use ndarray::{Array3, ArrayView3};
 use std::path::Path;
 
-/// Side of the image that warms the encoder up, pixels.
+/// Side of the image for the warm-up, pixels.
 const WARM_UP_PX: usize = 128;
-/// Runs that warm the encoder up.
+/// Number of runs of the warm-up.
 const WARM_UPS: usize = 3;
 
-/// Loads the encoder and runs it on a grey image, so that the first frame takes no longer than the others.
+/// Loads the encoder and runs it on a grey image, so that the first frame is as fast as later ones.
 pub fn load(checkpoint: &Path, threads: usize) -> anyhow::Result<Encoder> {
     carff_networks::allocator::keep_large_blocks();
     carff_networks::device::set_threads(threads);
@@ -25,7 +25,7 @@ pub fn load(checkpoint: &Path, threads: usize) -> anyhow::Result<Encoder> {
     Ok(encoder)
 }
 
-/// Returns the posterior of one image, (height, width, channel), which is read in place.
+/// Returns the posterior of an image (height, width, channel), which is read in place.
 pub fn encode(encoder: &Encoder, image: ArrayView3<'_, u8>) -> anyhow::Result<Gaussian> {
     borrow::with_image(image, |image| encoder.encode_bytes(image))
         .flatten()

@@ -1,4 +1,4 @@
-//! The forecaster stage's arithmetic: from a posterior, observed or fed back, to a mixture and its draws.
+//! The forecaster stage's arithmetic: from a posterior, observed or fed back, to a mixture and its samples.
 
 use carff_checkpoint::Manifest;
 use carff_decision::{Sampling, path_probability, set_mixture_and_draws};
@@ -16,7 +16,7 @@ pub struct Forecaster {
 }
 
 impl Forecaster {
-    /// Loads the mixture density network and runs it a few times, so that the first frame takes no longer than the others.
+    /// Loads the mixture density network and runs it a few times, so that the first frame is as fast as later ones.
     pub fn load(
         checkpoint: &Path,
         threads: usize,
@@ -34,12 +34,12 @@ impl Forecaster {
         Ok(Self { net, samples, sampling, horizon })
     }
 
-    /// How many latents to draw from now on, and how many steps to look ahead for frames that begin from now on.
+    /// Sets the number of samples from now on, and the horizon of frames that start from now on.
     pub fn set_quality(&mut self, samples: usize, horizon: u32) {
         (self.samples, self.horizon) = (samples, horizon);
     }
 
-    /// The forecast of an observed posterior: step 1.
+    /// Returns the forecast from an observed posterior: step 1.
     pub fn from_observation(&self, posterior: &Posterior) -> Forecast {
         let mut forecast = Forecast::empty(posterior.header.at_step(1), ForecastSource::Observed, self.horizon);
         forecast.encoder_ns = posterior.stage_latency_ns;
@@ -47,7 +47,7 @@ impl Forecaster {
         forecast
     }
 
-    /// The forecast of a probed belief's resolved state: the next step. `None` when the belief was the frame's last.
+    /// Returns the forecast from a belief's resolved state: the next step. `None` if the belief was the frame's last.
     pub fn from_feedback(&self, belief: &Belief) -> Option<Forecast> {
         if belief.is_final() || belief.header.step >= belief.horizon {
             return None;

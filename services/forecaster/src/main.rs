@@ -34,7 +34,7 @@ fn run(stage: &mut StageContext) -> anyhow::Result<()> {
             forecasts.send(forecast)?;
         }
         while let Some(belief) = beliefs.next()? {
-            // A belief on a frame that a newer one has overtaken is not looked ahead from.
+            // A belief about a frame older than the newest one is not forecast from.
             let started_ns = monotonic_now_ns();
             let _span = frame_span(&belief.header);
             if overload.observe(&belief) {

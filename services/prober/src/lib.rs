@@ -5,8 +5,8 @@ use carff_decision::mixture_and_draws;
 use carff_messages::{Belief, Forecast};
 use std::path::Path;
 
-/// Loads the field and its calibration, and probes each known state once, so that the first forecast takes no longer
-/// than the others.
+/// Loads the field and its calibration, and probes each known state once, so that the first forecast is as fast as
+/// later ones.
 pub fn load(checkpoint: &Path) -> anyhow::Result<FieldProbe> {
     let manifest = Manifest::load(checkpoint)?;
     let mut probe = load_field_probe(checkpoint, &manifest)?;

@@ -1,4 +1,4 @@
-//! The renderer stage's arithmetic: which hypotheses to show, from where, and their pictures.
+//! The renderer stage's arithmetic: the choice of hypotheses and cameras, and their images.
 
 use anyhow::Context;
 use carff_base::geometry::PinholeCamera;
@@ -8,27 +8,27 @@ use carff_field::{Field, HypothesisBuffer, InstructionSet, RenderBuffer, RenderO
 use carff_messages::{Belief, Forecast, Header, LATENT_DIM, ViewKind, ViewMeta, row_major};
 use std::path::Path;
 
-/// Loads the field, for pictures alone.
+/// Loads the field for rendering.
 pub fn load(checkpoint: &Path) -> anyhow::Result<Field> {
     let mut field = carff_checkpoint::load_field(checkpoint, &Manifest::load(checkpoint)?)?;
     field.set_instruction_set(InstructionSet::detect_for_pictures());
     Ok(field)
 }
 
-/// One hypothesis to render.
+/// A hypothesis to render.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Hypothesis {
-    /// Its index: a mixture component's, or the number of components plus a sample's.
+    /// Index: a mixture component's, or the number of components plus a sample's.
     pub index: u32,
-    /// The latent.
+    /// Latent of the hypothesis.
     pub latent: [f32; LATENT_DIM],
-    /// The state that probing found in it; -1 for none of the known ones.
+    /// The state that probing found; -1 for none of the known ones.
     pub state: i32,
-    /// Its probability, 0..=1.
+    /// Probability of the hypothesis, 0..=1.
     pub probability: f32,
 }
 
-/// The hypotheses of a forecast and its belief, the most probable first, at most `count`: the component means, then
+/// Returns at most `count` hypotheses of a forecast and its belief, the most probable first: the component means, then
 /// the samples.
 pub fn hypotheses(forecast: &Forecast, belief: &Belief, count: usize) -> Vec<Hypothesis> {
     let components = forecast.component_count as usize;
@@ -89,7 +89,7 @@ impl Pairing {
     }
 }
 
-/// Renders what one camera sees under each hypothesis, one picture each.
+/// Renders one image per hypothesis from one camera.
 pub fn render(
     field: &Field,
     camera: &PinholeCamera,
@@ -102,7 +102,7 @@ pub fn render(
     field.render_hypotheses(camera, &latents, &options, buffer);
 }
 
-/// Writes a picture as 8-bit RGB, rows from the top.
+/// Writes an image as 8-bit RGB, rows from the top.
 pub fn write(picture: &RenderBuffer, rgb: &mut [u8]) -> anyhow::Result<()> {
     let wanted = picture.rgb.len();
     (rgb.len() == wanted).then_some(()).with_context(|| format!("{} bytes for a view of {wanted}", rgb.len()))?;

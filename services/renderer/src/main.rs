@@ -1,4 +1,4 @@
-//! The renderer stage: forecasts and beliefs in, pictures of the hypotheses out. It gives way to the decision path.
+//! The renderer stage: forecasts and beliefs in, images of the hypotheses out. The decision path has priority.
 
 use carff_field::HypothesisBuffer;
 use carff_messages::{Stage, rgb_bytes};
@@ -6,7 +6,7 @@ use carff_renderer::{Pairing, camera, hypotheses, load, meta, render, write};
 use carff_runtime::{Overload, StageContext, frame_span};
 use carff_transport::{monotonic_now_ns, topics};
 
-/// Smallest side of a view, however little room there is, pixels.
+/// Minimum side of a view under overload, pixels.
 const MIN_SIDE_PX: u32 = 16;
 
 fn main() -> std::process::ExitCode {

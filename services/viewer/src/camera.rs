@@ -1,39 +1,39 @@
-//! The camera that a hand moves: orbit, pan and zoom about a point, and where points of the world fall in its picture.
+//! The user's camera: orbit, pan and zoom about a target point, and projection of world points into its image.
 
 use carff_base::geometry::{OrientedBox, PinholeCamera};
 
-/// Degrees that dragging across the picture's shorter side turns by.
+/// Rotation for a drag across the image's shorter side, degrees.
 const ORBIT_DEG_PER_SIDE: f64 = 180.0;
-/// How near straight up or down the camera comes, degrees.
+/// Highest elevation of the camera, degrees.
 const MOST_ELEVATION_DEG: f64 = 90.0;
-/// Below the horizon the ground hides everything.
+/// Lowest elevation, degrees: below the horizon the ground hides everything.
 const LEAST_ELEVATION_DEG: f64 = -5.0;
-/// Nearest and farthest distance to the point that is looked at, metres.
+/// Nearest and farthest distance to the target point, metres.
 const DISTANCE_M: [f64; 2] = [1.0, 200.0];
 /// Narrowest and widest field of view, degrees.
 pub const FOV_DEG: [f64; 2] = [15.0, 110.0];
-/// What is nearer than this to the camera's plane is cut off, metres.
+/// Distance of the near plane, metres.
 const NEAR_M: f64 = 0.05;
-/// Widest field of view across a picture's longer side, degrees: wider ones show a smear.
+/// Widest field of view across an image's longer side, degrees: wider images are distorted.
 const MOST_WIDE_DEG: f64 = 150.0;
 
-/// A camera that looks at a point, upright.
+/// An upright camera that looks at a target point.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct OrbitCamera {
-    /// What it looks at, metres, world space.
+    /// The point that the camera looks at, metres, world space.
     pub target_m: [f64; 3],
-    /// How far away it stands, metres.
+    /// Distance to the target, metres.
     pub distance_m: f64,
     /// Direction from the target to the camera about +Z, degrees; 0 is +X.
     pub azimuth_deg: f64,
     /// Angle of that direction above the ground, degrees.
     pub elevation_deg: f64,
-    /// Field of view across the picture's shorter side, degrees.
+    /// Field of view across the image's shorter side, degrees.
     pub fov_deg: f64,
 }
 
 impl OrbitCamera {
-    /// Over a corner of the region that matters, as the renderer stage's free view.
+    /// Returns a camera above a corner of the region of interest, as the renderer stage's free view.
     pub fn over_corner(bounds_m: [[f64; 3]; 2]) -> Self {
         let [low, high] = bounds_m;
         let target_m = [f64::midpoint(low[0], high[0]), f64::midpoint(low[1], high[1]), low[2] + 0.5];
@@ -41,7 +41,7 @@ impl OrbitCamera {
         Self { target_m, distance_m: 1.25 * extent_m, azimuth_deg: -50.0, elevation_deg: 38.0, fov_deg: 45.0 }
     }
 
-    /// Straight down on the region that matters, the picture's up = +Y.
+    /// Returns a camera that looks straight down on the region of interest; +Y is up in the image.
     pub fn above(bounds_m: [[f64; 3]; 2]) -> Self {
         let [low, high] = bounds_m;
         let fov_deg = 45.0_f64;
@@ -55,13 +55,13 @@ impl OrbitCamera {
         }
     }
 
-    /// Where another camera stands and looks. `ground_m` is the height at which its line of sight is taken to end.
+    /// Returns the pose of another camera. `ground_m` is the height at which its line of sight ends.
     pub fn from_pinhole(camera: &PinholeCamera, ground_m: f64) -> Self {
         let m = &camera.world_from_camera;
         let eye_m = camera.position_m();
         let back = [m[0][2], m[1][2], m[2][2]];
         let horizontal = back[0].hypot(back[1]);
-        // Straight up or down the direction tells no azimuth: the picture's up does.
+        // A vertical view direction has no azimuth: take the image's up direction.
         let azimuth = if horizontal > 1e-6 { back[1].atan2(back[0]) } else { (-m[1][1]).atan2(-m[0][1]) };
         let to_ground_m = if back[2] > 1e-3 { (eye_m[2] - ground_m) / back[2] } else { DISTANCE_M[1] };
         let distance_m = to_ground_m.clamp(DISTANCE_M[0], 30.0);
@@ -76,7 +76,7 @@ impl OrbitCamera {
         }
     }
 
-    /// Turns about the target as a hand drags over a picture of this size; down and right are positive.
+    /// Turns about the target for a drag over an image of this size; down and right are positive.
     pub fn orbit(&mut self, drag_px: [f64; 2], picture_px: [f64; 2]) {
         let deg_per_px = ORBIT_DEG_PER_SIDE / picture_px[0].min(picture_px[1]).max(1.0);
         self.azimuth_deg = (self.azimuth_deg - drag_px[0] * deg_per_px).rem_euclid(360.0);
@@ -84,7 +84,7 @@ impl OrbitCamera {
             (self.elevation_deg + drag_px[1] * deg_per_px).clamp(LEAST_ELEVATION_DEG, MOST_ELEVATION_DEG);
     }
 
-    /// Moves along the picture's plane, so that what lies at the target's distance stays under the hand.
+    /// Moves parallel to the image plane, so that points at the target's distance follow the mouse.
     pub fn pan(&mut self, drag_px: [f64; 2], picture_px: [f64; 2]) {
         let shorter_px = picture_px[0].min(picture_px[1]).max(1.0);
         let metres_per_px = 2.0 * self.distance_m * (self.fov_deg / 2.0).to_radians().tan() / shorter_px;
@@ -94,7 +94,7 @@ impl OrbitCamera {
         }
     }
 
-    /// Goes nearer (`factor` above 1) or farther.
+    /// Moves nearer (`factor` above 1) or farther.
     pub fn zoom(&mut self, factor: f64) {
         if factor.is_finite() && factor > 0.0 {
             self.distance_m = (self.distance_m / factor).clamp(DISTANCE_M[0], DISTANCE_M[1]);
@@ -106,20 +106,20 @@ impl OrbitCamera {
         self.fov_deg = fov_deg.clamp(FOV_DEG[0], FOV_DEG[1]);
     }
 
-    /// Right, up and back, world space.
+    /// Returns the right, up and back axes, world space.
     fn axes(&self) -> [[f64; 3]; 3] {
         let (sin_a, cos_a) = self.azimuth_deg.to_radians().sin_cos();
         let (sin_e, cos_e) = self.elevation_deg.to_radians().sin_cos();
         [[-sin_a, cos_a, 0.0], [-sin_e * cos_a, -sin_e * sin_a, cos_e], [cos_e * cos_a, cos_e * sin_a, sin_e]]
     }
 
-    /// Where it stands, metres, world space.
+    /// Returns the camera's position, metres, world space.
     pub fn eye_m(&self) -> [f64; 3] {
         let [_, _, back] = self.axes();
         [0, 1, 2].map(|i| self.target_m[i] + self.distance_m * back[i])
     }
 
-    /// The pinhole camera for a picture of this size.
+    /// Returns the pinhole camera for an image of this size.
     pub fn pinhole(&self, width_px: u32, height_px: u32) -> PinholeCamera {
         let [_, up, _] = self.axes();
         let half = (self.fov_deg.clamp(FOV_DEG[0], FOV_DEG[1]) / 2.0).to_radians().tan();
@@ -129,8 +129,7 @@ impl OrbitCamera {
     }
 }
 
-/// Where a segment of the world falls in a picture, pixels. What lies behind the camera is cut off; `None` when all
-/// does.
+/// Projects a segment into an image, pixels. The part behind the camera is cut off; `None` if nothing remains.
 pub fn project_segment(camera: &PinholeCamera, a_m: [f64; 3], b_m: [f64; 3]) -> Option<[[f64; 2]; 2]> {
     let m = &camera.world_from_camera;
     let eye_m = camera.position_m();
@@ -150,7 +149,7 @@ pub fn project_segment(camera: &PinholeCamera, a_m: [f64; 3], b_m: [f64; 3]) -> 
     Some([camera.project(a_m)?.0, camera.project(b_m)?.0])
 }
 
-/// The twelve edges of a box, metres, world space.
+/// Returns the twelve edges of a box, metres, world space.
 pub fn edges(of: &OrientedBox) -> [[[f64; 3]; 2]; 12] {
     let corner = |i: usize| of.point([0, 1, 2].map(|axis| if i >> axis & 1 == 1 { 1.0 } else { -1.0 }));
     let pairs = [0, 1, 2].map(|axis| {
@@ -173,7 +172,7 @@ mod tests {
         (a - b).abs() < 1e-6
     }
 
-    /// However it is turned, the target stays in the picture's middle and at its distance, and the pose is a rotation.
+    /// At any rotation, the target stays in the middle of the image and at its distance, and the pose is a rotation.
     #[test]
     fn orbiting_keeps_target_and_distance() {
         let mut camera = OrbitCamera::over_corner(BOUNDS_M);
@@ -189,7 +188,7 @@ mod tests {
         assert!((LEAST_ELEVATION_DEG..=MOST_ELEVATION_DEG).contains(&camera.elevation_deg));
     }
 
-    /// Dragging right turns the scene with the hand: what was in front of the target goes right.
+    /// Dragging right turns the scene with the mouse: points in front of the target move right.
     #[test]
     fn orbit_follows_the_hand() {
         let mut camera = OrbitCamera::over_corner(BOUNDS_M);
@@ -200,7 +199,7 @@ mod tests {
         assert!(x > 325.0, "{x}");
     }
 
-    /// Panning moves what is at the target's distance by just as many pixels as the hand.
+    /// Panning moves points at the target's distance by the same number of pixels as the mouse.
     #[test]
     fn pan_follows_the_hand() {
         for size in [[640, 480], [480, 640]] {
@@ -213,7 +212,7 @@ mod tests {
         }
     }
 
-    /// Zooming in by two halves the distance; limits hold, and a factor that is none changes nothing.
+    /// Zooming in by two halves the distance; limits hold, and an invalid factor changes nothing.
     #[test]
     fn zoom_is_limited() {
         let mut camera = OrbitCamera::over_corner(BOUNDS_M);
@@ -232,7 +231,7 @@ mod tests {
         assert!(near(camera.fov_deg, FOV_DEG[1]));
     }
 
-    /// From above, +Y is up in the picture and the whole region is in it, whatever the window's shape.
+    /// From above, +Y is up in the image, and the image contains the whole region at any aspect ratio of the window.
     #[test]
     fn above_shows_the_region() {
         let camera = OrbitCamera::above(BOUNDS_M);
@@ -247,7 +246,7 @@ mod tests {
         }
     }
 
-    /// Standing where another camera stands gives its picture: position, direction and field of view.
+    /// A camera made from another camera gives the same image: position, direction and field of view.
     #[test]
     fn takes_another_cameras_place() {
         let eyes = [([3.0, -12.0, 5.0], [-2.0, 0.0, 0.5]), ([-6.0, -7.0, 22.0], [-6.0, -7.0, 0.0])];
@@ -262,7 +261,7 @@ mod tests {
         }
     }
 
-    /// A segment that crosses the camera's plane is cut off there; one that lies behind it is not drawn.
+    /// A segment that crosses the camera's plane is cut off there; a segment behind the camera is not drawn.
     #[test]
     fn segments_are_cut_at_the_camera() {
         let camera = PinholeCamera::look_at([0.0; 3], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0], 100, 100, 90.0);
@@ -272,7 +271,7 @@ mod tests {
         assert!(b[0] < 0.0 && b[0].is_finite());
     }
 
-    /// The edges of a box join each corner with the three next to it.
+    /// The edges of a box join each corner with its three neighbours.
     #[test]
     fn a_box_has_twelve_edges() {
         let of = OrientedBox { center: [1.0, 2.0, 3.0], half_size: [1.0, 2.0, 3.0], yaw: 0.4 };

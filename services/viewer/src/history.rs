@@ -1,9 +1,9 @@
-//! What was looked at, in order, with a way back and forward.
+//! The history of shown entries, with back and forward.
 
-/// Entries that are kept; the oldest go first.
+/// Maximum number of entries; the oldest are dropped first.
 const MOST: usize = 200;
 
-/// A line of entries, one of which is the current one.
+/// A list of entries with a current one.
 #[derive(Clone, Debug)]
 pub struct History<T> {
     entries: Vec<T>,
@@ -17,17 +17,17 @@ impl<T> Default for History<T> {
 }
 
 impl<T> History<T> {
-    /// The entry that is shown.
+    /// Returns the current entry.
     pub fn current(&self) -> Option<&T> {
         self.entries.get(self.current)
     }
 
-    /// The entry that is shown, to be changed.
+    /// Returns the current entry for changes.
     pub fn current_mut(&mut self) -> Option<&mut T> {
         self.entries.get_mut(self.current)
     }
 
-    /// Goes on from the current entry: what came after it is forgotten.
+    /// Appends an entry after the current one and drops the entries that followed it.
     pub fn push(&mut self, entry: T) {
         self.entries.truncate(self.current + 1);
         self.entries.push(entry);
@@ -36,37 +36,37 @@ impl<T> History<T> {
         self.current = self.entries.len() - 1;
     }
 
-    /// Puts other entries in place of all; the one at the same place is shown, or else the last.
+    /// Replaces all entries; the position stays, or becomes the last one if the list is shorter.
     pub fn replace(&mut self, entries: Vec<T>) {
         self.entries = entries;
         self.current = self.current.min(self.entries.len().saturating_sub(1));
     }
 
-    /// Whether there is an entry before the current one.
+    /// Returns true if there is an entry before the current one.
     pub fn has_back(&self) -> bool {
         self.current > 0
     }
 
-    /// Whether there is an entry after the current one.
+    /// Returns true if there is an entry after the current one.
     pub fn has_forward(&self) -> bool {
         self.current + 1 < self.entries.len()
     }
 
-    /// Goes to the entry before; false when there is none.
+    /// Goes to the previous entry; returns false if there is none.
     pub fn back(&mut self) -> bool {
         let moved = self.has_back();
         self.current -= usize::from(moved);
         moved
     }
 
-    /// Goes to the entry after; false when there is none.
+    /// Goes to the next entry; returns false if there is none.
     pub fn forward(&mut self) -> bool {
         let moved = self.has_forward();
         self.current += usize::from(moved);
         moved
     }
 
-    /// Shows the entry at a place; false when there is none.
+    /// Goes to the entry at an index; returns false if there is none.
     pub fn go_to(&mut self, place: usize) -> bool {
         let there = place < self.entries.len();
         if there {
@@ -75,12 +75,12 @@ impl<T> History<T> {
         there
     }
 
-    /// All entries, oldest first.
+    /// Returns all entries, oldest first.
     pub fn entries(&self) -> &[T] {
         &self.entries
     }
 
-    /// The current entry's place among them.
+    /// Returns the index of the current entry.
     pub fn place(&self) -> usize {
         self.current
     }
@@ -90,7 +90,7 @@ impl<T> History<T> {
 mod tests {
     use super::*;
 
-    /// Back and forward walk the line and stop at its ends; going on from the middle forgets what came after.
+    /// Back and forward walk the list and stop at its ends; a push from the middle drops the entries after it.
     #[test]
     fn walks_and_branches() {
         let mut history = History::default();
@@ -109,7 +109,7 @@ mod tests {
         assert_eq!(history.current(), Some(&9));
     }
 
-    /// A full line forgets its oldest entries, and the newest stays current.
+    /// A full list drops its oldest entries, and the newest stays current.
     #[test]
     fn is_bounded() {
         let mut history = History::default();
@@ -119,7 +119,7 @@ mod tests {
         assert_eq!((history.entries().len(), history.current()), (MOST, Some(&(2 * MOST - 1))));
     }
 
-    /// Replaced entries keep the place; a shorter line shows its last.
+    /// Replacing entries keeps the position; a shorter list shows its last entry.
     #[test]
     fn replacing_keeps_the_place() {
         let mut history = History::default();

@@ -1,4 +1,4 @@
-//! What is looked at: a picture of a data set, of a file, or of a running camera; and the data set to choose from.
+//! Input images: from a dataset, from a file, or from a running camera.
 
 use crate::models::Models;
 use carff_base::geometry::PinholeCamera;
@@ -7,77 +7,77 @@ use carff_dataset::{Dataset, DatasetError, Image, Observability};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-/// A picture, and what is known of it.
+/// An image with its metadata.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Input {
-    /// What it is called in the window.
+    /// Name of the image in the window.
     pub title: String,
-    /// Its pixels.
+    /// Pixels of the image.
     pub image: Image,
-    /// The camera that took it, if that is known.
+    /// The camera of the image, if known.
     pub camera: Option<PinholeCamera>,
-    /// What it really shows, if that is known.
+    /// True state of the image, if known.
     pub truth: Option<Truth>,
-    /// Names the draws of forecasts that rest on it: the frame's number, or its place in the data set.
+    /// Number that names the random draws of its forecasts: the frame's number, or the index in the dataset.
     pub frame: u64,
-    /// The seed of the run that it comes from; `None`: the window's own.
+    /// The seed of the run that sent the image; `None`: the window's own seed.
     pub seed: Option<u64>,
 }
 
-/// What a picture really shows. Nothing is computed from it.
+/// The true state of an image. It is only displayed; nothing is computed from it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Truth {
-    /// The hidden course of events.
+    /// The hidden branch.
     pub branch: usize,
-    /// Step of it.
+    /// Time step of the branch.
     pub timestamp: usize,
     /// The camera pose.
     pub view: usize,
-    /// How much of the actor or its place is seen, if that is known.
+    /// Visibility of the actor or its place, if known.
     pub observability: Option<Observability>,
 }
 
 impl Input {
-    /// A picture alone: of a file, say.
+    /// Creates an input without metadata, for example from a file.
     pub fn of_picture(title: impl Into<String>, image: Image) -> Arc<Self> {
         Arc::new(Self { title: title.into(), image, camera: None, truth: None, frame: 0, seed: None })
     }
 
-    /// Reads a PNG picture.
+    /// Reads an input from a PNG file.
     pub fn load_png(path: &Path) -> Result<Arc<Self>, DatasetError> {
         let title = path.file_name().map_or_else(|| path.display().to_string(), |n| n.to_string_lossy().into_owned());
         Ok(Self::of_picture(title, Image::load_png(path)?))
     }
 }
 
-/// Why a data set cannot be chosen from.
+/// Reason why a dataset cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum AlbumError {
-    /// It cannot be read.
+    /// The dataset cannot be read.
     #[error(transparent)]
     Dataset(#[from] DatasetError),
-    /// It shows another scenario than the checkpoint knows.
+    /// The dataset's scenario differs from the checkpoint's.
     #[error(transparent)]
     Scenario(#[from] CheckpointError),
-    /// It does not say which states its pictures show.
-    #[error("{path}: transforms.json has no `scenario`, or pictures without `view_id`: nothing to choose states from")]
+    /// The dataset does not name the states of its images.
+    #[error("{path}: transforms.json has no `scenario`, or images without `view_id`: nothing to choose states from")]
     NoScenario {
-        /// The data set's folder.
+        /// Path of the dataset's folder.
         path: PathBuf,
     },
 }
 
-/// A data set, by state and view.
+/// A dataset, indexed by state and view.
 #[derive(Debug)]
 pub struct Album {
     dataset: Dataset,
     steps: usize,
-    /// `state * views + view` to the frame.
+    /// Maps `state * views + view` to the frame.
     index: Vec<Option<usize>>,
 }
 
 impl Album {
-    /// Opens a data set that shows the checkpoint's scenario.
+    /// Opens a dataset of the checkpoint's scenario.
     pub fn open(dir: &Path, models: &Models) -> Result<Self, AlbumError> {
         let dataset = Dataset::open(dir)?;
         let nothing = || AlbumError::NoScenario { path: dir.to_owned() };
@@ -99,17 +99,17 @@ impl Album {
         Ok(Self { dataset, steps, index })
     }
 
-    /// The data set.
+    /// Returns the dataset.
     pub fn dataset(&self) -> &Dataset {
         &self.dataset
     }
 
-    /// Steps of each branch.
+    /// Returns the number of time steps of each branch.
     pub fn steps(&self) -> usize {
         self.steps
     }
 
-    /// Number of camera poses.
+    /// Returns the number of camera poses.
     pub fn view_count(&self) -> usize {
         self.dataset.view_count()
     }
@@ -119,12 +119,12 @@ impl Album {
         (view < views).then(|| self.index.get(state * views + view).copied().flatten()).flatten()
     }
 
-    /// How much of the actor or its place a picture shows, if that is known.
+    /// Returns how much of the actor or its place an image shows, if that is known.
     pub fn observability(&self, state: usize, view: usize) -> Option<Observability> {
         self.dataset.frames()[self.frame(state, view)?].observability
     }
 
-    /// The next view of a state, forwards or backwards and around the end, that shows so much (`None`: any).
+    /// Returns the next view of a state with a visibility (`None`: any), forwards or backwards, with wrap-around.
     pub fn next_view(&self, state: usize, from: usize, forwards: bool, shows: Option<Observability>) -> Option<usize> {
         let views = self.view_count();
         (1..=views).map(|i| if forwards { (from + i) % views } else { (from % views + 2 * views - i) % views }).find(
@@ -132,7 +132,7 @@ impl Album {
         )
     }
 
-    /// The picture of a state from a view; `None` when the set has none.
+    /// Returns the image of a state from a view, or `None` if the dataset has none.
     pub fn input(&self, state: usize, view: usize, models: &Models) -> Result<Option<Arc<Input>>, AlbumError> {
         let Some(index) = self.frame(state, view) else { return Ok(None) };
         let frame = &self.dataset.frames()[index];

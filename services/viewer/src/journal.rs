@@ -1,47 +1,47 @@
-//! What happened, for the window's lists and plots: decisions, and how long things took.
+//! The journal for the window's lists and plots: decisions and durations.
 
 use carff_base::statistics::Spread;
 use std::collections::VecDeque;
 
-/// Decisions that are kept.
+/// Maximum number of stored decisions.
 const MOST_DECISIONS: usize = 500;
-/// Times that are kept of each kind.
+/// Maximum number of stored durations of each kind.
 const MOST_TIMES: usize = 600;
 
-/// One decision.
+/// A decision with its reason.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Decision {
-    /// What it rests on: a picture or a frame, and how many steps.
+    /// Basis of the decision: an image or a frame, and the number of steps.
     pub rests_on: String,
-    /// Halt, or advance.
+    /// True for halt, false for advance.
     pub halt: bool,
-    /// How sure the rule is, 0..=1.
+    /// Confidence of the rule, 0..=1.
     pub confidence: f32,
-    /// Probability that the hazard is met at any step looked at, 0..=1.
+    /// Probability of the hazard at any step looked at, 0..=1.
     pub hazard_probability: f32,
-    /// The rule, or why the safe action was taken.
+    /// The rule, or the reason for the safe action.
     pub reason: String,
-    /// From the camera to the action, where a graph took it.
+    /// Latency from camera to action, if a graph decided.
     pub latency_ms: Option<f64>,
 }
 
-/// Times of one kind, by the number of what they were taken at.
+/// Durations of one kind, by frame number or count.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Times {
-    /// What took so long.
+    /// Name of the measured operation.
     pub name: &'static str,
     /// `[number, milliseconds]`, oldest first.
     pub values: VecDeque<[f64; 2]>,
 }
 
 impl Times {
-    /// p50, p99 and the longest, milliseconds.
+    /// Returns p50, p99 and maximum, milliseconds.
     pub fn spread(&self) -> Option<Spread> {
         Spread::of(&self.values.iter().map(|v| v[1]).collect::<Vec<_>>())
     }
 }
 
-/// Decisions and times, the newest of each.
+/// The newest decisions and durations.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Journal {
     decisions: VecDeque<Decision>,
@@ -49,7 +49,7 @@ pub struct Journal {
 }
 
 impl Journal {
-    /// Writes a decision down.
+    /// Adds a decision.
     pub fn decided(&mut self, decision: Decision) {
         if self.decisions.len() >= MOST_DECISIONS {
             self.decisions.pop_front();
@@ -57,7 +57,7 @@ impl Journal {
         self.decisions.push_back(decision);
     }
 
-    /// Writes a time down. `at` is the frame's number, or how many came before.
+    /// Adds a duration. `at` is the frame's number, or the count of earlier durations.
     pub fn took(&mut self, name: &'static str, at: f64, milliseconds: f64) {
         let index = self.times.iter().position(|t| t.name == name).unwrap_or_else(|| {
             self.times.push(Times { name, values: VecDeque::new() });
@@ -70,18 +70,18 @@ impl Journal {
         values.push_back([at, milliseconds]);
     }
 
-    /// As [`Journal::took`], numbered by what was written down before.
+    /// Adds a duration as [`Journal::took`] does, numbered by the count of earlier ones.
     pub fn took_next(&mut self, name: &'static str, milliseconds: f64) {
         let last = self.times.iter().find(|t| t.name == name).and_then(|t| t.values.back());
         self.took(name, last.map_or(0.0, |v| v[0] + 1.0), milliseconds);
     }
 
-    /// The decisions, oldest first.
+    /// Returns the decisions, oldest first.
     pub fn decisions(&self) -> impl DoubleEndedIterator<Item = &Decision> + ExactSizeIterator {
         self.decisions.iter()
     }
 
-    /// The times, by kind.
+    /// Returns the durations by kind.
     pub fn times(&self) -> &[Times] {
         &self.times
     }
@@ -91,7 +91,7 @@ impl Journal {
 mod tests {
     use super::*;
 
-    /// The newest are kept, in order, and numbers go on.
+    /// The journal keeps the newest entries in order, and their numbers continue.
     #[test]
     fn is_bounded() {
         let mut journal = Journal::default();

@@ -1,8 +1,8 @@
-//! The live window: what a picture may mean, forecast, probed and seen from anywhere.
+//! The live window: scenes that explain an image, forecast, probed and seen from any pose.
 //!
-//! What lives where: [`session`] is the window without a window, computed by the functions that the stages use;
-//! [`models`] and [`input`] are what it works on, [`history`] and [`journal`] what it remembers; [`live`] watches a
-//! running graph; [`camera`], [`render`] and [`slice`] make pictures; [`app`] is what is seen and pressed.
+//! [`session`] is the logic without a window; it calls the same functions as the stages. It works on [`models`] and
+//! [`input`], and fills [`history`] and [`journal`]. [`live`] watches a running graph. [`camera`], [`render`] and
+//! [`slice`] make images. [`app`] is the window.
 
 pub mod app;
 pub mod camera;

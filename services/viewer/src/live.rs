@@ -1,4 +1,4 @@
-//! What a running graph does, frame by frame: attached as a probe is, so that nobody waits for this window.
+//! Watches a running graph frame by frame. It attaches as a probe, so it never delays a stage.
 
 use crate::input::{Input, Truth};
 use crate::journal::{Decision, Journal};
@@ -16,48 +16,48 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError, mpsc};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-/// How often the topics are looked at.
+/// Polling interval of the topics.
 const LOOK: Duration = Duration::from_millis(20);
-/// How often the run is looked for, whether it still lives or has come back.
+/// Interval at which the feed checks whether the run is still alive or has come back.
 const LOOK_FOR_RUN: Duration = Duration::from_secs(1);
-/// Frames whose messages are put together at a time; the oldest are given up.
+/// Maximum number of unfinished frames; the oldest are dropped.
 const MOST_FRAMES: usize = 32;
 
-/// Why a run cannot be watched.
+/// Reason why a run cannot be watched.
 #[derive(Debug, thiserror::Error)]
 pub enum LiveError {
-    /// It cannot be joined.
+    /// The run cannot be joined.
     #[error(transparent)]
     Attach(#[from] AttachError),
-    /// One of its topics cannot be opened.
+    /// A topic cannot be opened.
     #[error(transparent)]
     Open(#[from] OpenError),
-    /// One of its topics can no longer be read.
+    /// A topic can no longer be read.
     #[error(transparent)]
     Receive(#[from] ReceiveError),
-    /// No thread can be had.
-    #[error("no thread to watch the run with: {0}")]
+    /// No thread could be started.
+    #[error("cannot start a thread to watch the run: {0}")]
     Thread(std::io::Error),
 }
 
-/// What is known of a run.
+/// State of a watched run.
 #[derive(Clone, Debug)]
 pub struct Watched {
-    /// The run, as it was last joined.
+    /// The run at the last join.
     pub run: LiveRun,
-    /// Whether it is joined now, or why not; it is tried again every second.
+    /// Ok while joined, else the reason why not. The feed retries every second.
     pub joined: Result<(), String>,
-    /// Frames seen.
+    /// Number of frames received.
     pub frames: u64,
-    /// Decisions, and times by frame.
+    /// Decisions, and durations by frame.
     pub journal: Journal,
-    /// What the stages last said of themselves.
+    /// Last health report of each stage.
     pub health: BTreeMap<Stage, Health>,
-    /// What the graph made of the newest frame whose belief is complete, until it is taken.
+    /// Moments of the newest frame with a complete belief, until they are taken.
     newest: Option<Vec<Moment>>,
 }
 
-/// Watches a run on a thread of its own, until it is dropped.
+/// Watches a run on its own thread until the feed is dropped.
 pub struct LiveFeed {
     watched: Arc<Mutex<Watched>>,
     stopped: Arc<AtomicBool>,
@@ -65,11 +65,11 @@ pub struct LiveFeed {
 }
 
 impl LiveFeed {
-    /// Joins a run: the one that is named, or the only one that lives. `wake` is called when something is new.
+    /// Joins the named run, or the only live run. The feed calls `wake` when it has news.
     pub fn attach(run: Option<String>, wake: impl Fn() + Send + 'static) -> Result<Self, LiveError> {
         let stopped = Arc::new(AtomicBool::new(false));
         let theirs = stopped.clone();
-        // The thread joins, so that all that belongs to the run stays in it; its first answer is waited for.
+        // The thread joins, so that everything of the run stays in it. This function waits for its first answer.
         let (answer, answered) = mpsc::sync_channel(1);
         let thread = std::thread::Builder::new()
             .name("live".into())
@@ -88,12 +88,12 @@ impl LiveFeed {
         Ok(Self { watched, stopped, thread: Some(thread) })
     }
 
-    /// What is known now.
+    /// Returns the current state of the run.
     pub fn watched(&self) -> MutexGuard<'_, Watched> {
         locked(&self.watched)
     }
 
-    /// What the graph made of its newest frame, if that is news.
+    /// Returns the moments of the newest frame if they are new.
     pub fn take_newest(&self) -> Option<Vec<Moment>> {
         self.watched().newest.take()
     }
@@ -103,13 +103,13 @@ impl Drop for LiveFeed {
     fn drop(&mut self) {
         self.stopped.store(true, Ordering::Relaxed);
         if let Some(thread) = self.thread.take() {
-            // It ends by a panic only, which has been reported by then.
+            // The thread ends early only by a panic, which has been reported by then.
             let _ = thread.join();
         }
     }
 }
 
-/// What is known, also when a thread died with the lock: it is whole at any time.
+/// Locks the state. It is consistent at any time, so a poisoned lock is harmless.
 fn locked(watched: &Mutex<Watched>) -> MutexGuard<'_, Watched> {
     watched.lock().unwrap_or_else(PoisonError::into_inner)
 }
@@ -120,7 +120,7 @@ impl Watched {
     }
 }
 
-/// Watches until it is stopped, and joins again when the run ends and comes back.
+/// Watches until it is stopped, and rejoins when the run ends and comes back.
 fn watch(first: Watcher, watched: &Mutex<Watched>, stopped: &AtomicBool, wake: &dyn Fn()) {
     let name = first.attached.live.name.clone();
     let mut watcher = Some(first);
@@ -159,7 +159,7 @@ fn watch(first: Watcher, watched: &Mutex<Watched>, stopped: &AtomicBool, wake: &
     }
 }
 
-/// Subscribed to a run's topics.
+/// Subscriptions to a run's topics.
 struct Watcher {
     attached: Attached,
     frames: Receiver<carff_transport::Image<FrameMeta>>,
@@ -169,7 +169,7 @@ struct Watcher {
     actions: Receiver<Action>,
     healths: Vec<Receiver<Health>>,
     assembly: Assembly,
-    /// The last action that was no decision, so that only what changes is written down.
+    /// The last action that was not a decision; only changes are recorded.
     last_safe: Option<(ActionCode, Reason)>,
 }
 
@@ -191,10 +191,10 @@ impl Watcher {
         })
     }
 
-    /// Takes in all that waits; whether the window has something new to show.
+    /// Reads all waiting messages; returns whether the window has news.
     fn drain(&mut self, watched: &Mutex<Watched>) -> Result<bool, ReceiveError> {
         let mut is_new = false;
-        // In the order of the data's way, so that what belongs to a frame finds it.
+        // Topics are read in the order of the data flow, so that each message finds its frame.
         while let Some(frame) = self.frames.next()? {
             let meta = &*frame;
             locked(watched).frames = meta.header.frame_id + 1;
@@ -239,7 +239,7 @@ impl Watcher {
     }
 }
 
-/// A decision to write down: the first action on a frame, or a safe action that is not the one before.
+/// Returns an entry for the first action on a frame, and for a safe action that differs from the last one.
 fn decision(action: &Action, last_safe: &mut Option<(ActionCode, Reason)>) -> Option<Decision> {
     let (code, reason) = (action.code().ok()?, action.reason().ok()?);
     let decided = action.is_decision();
@@ -266,7 +266,7 @@ fn decision(action: &Action, last_safe: &mut Option<(ActionCode, Reason)>) -> Op
     })
 }
 
-/// Puts the messages of each frame together.
+/// Assembles the messages of each frame.
 #[derive(Default)]
 struct Assembly {
     frames: BTreeMap<u64, Parts>,
@@ -276,7 +276,7 @@ struct Parts {
     input: Arc<Input>,
     forecasts: BTreeMap<u32, carff_messages::Forecast>,
     moments: Vec<Moment>,
-    /// What the last of them resolved to, and its posterior: what the next step is forecast from.
+    /// The state that the last belief resolved to, and its posterior: the source of the next forecast.
     fed_back: Option<(Gaussian, usize)>,
 }
 
@@ -301,12 +301,12 @@ impl Assembly {
         }
     }
 
-    /// All moments of a frame, once its last belief is there.
+    /// Returns all moments of a frame when its last belief arrives.
     fn belief(&mut self, belief: &Belief) -> Option<Vec<Moment>> {
         let frame_id = belief.header.frame_id;
         let parts = self.frames.get_mut(&frame_id)?;
         let forecast = parts.forecasts.get(&belief.header.step)?;
-        // A step without the one before it (this window came in between) cannot be followed.
+        // A step without the step before it cannot be followed: the window joined in between.
         let before = parts.moments.last().filter(|m| m.step + 1 == belief.header.step)?;
         let moment = moment(before, parts.fed_back, forecast, belief);
         parts.moments.push(moment);
@@ -316,13 +316,13 @@ impl Assembly {
             return None;
         }
         let whole = self.frames.remove(&frame_id)?.moments;
-        // What is older will not be looked at any more.
+        // Older frames are no longer needed.
         self.frames.retain(|id, _| *id > frame_id);
         Some(whole)
     }
 }
 
-/// The picture of a frame.
+/// Returns the input image of a frame.
 fn input(meta: &FrameMeta, bytes: &[u8]) -> Input {
     let view = &meta.dataset_view;
     let observability = Observability::of_code(view.observability).ok().flatten();
@@ -341,7 +341,7 @@ fn input(meta: &FrameMeta, bytes: &[u8]) -> Input {
     }
 }
 
-/// A step of a frame, as the graph's messages say it. `fed_back` is the state that the step before resolved to.
+/// Returns the moment of a step from the graph's messages. `fed_back` is the state that the step before resolved to.
 fn moment(
     before: &Moment,
     fed_back: Option<(Gaussian, usize)>,
@@ -412,8 +412,8 @@ mod tests {
         belief
     }
 
-    /// A frame's messages become its moments: posterior, and each step with its belief, the second one from the state
-    /// that the first resolved to. Nothing is shown before the last belief.
+    /// A frame's messages become its moments: the posterior, and each step with its belief. The second step starts from
+    /// the state that the first resolved to. Nothing is shown before the last belief.
     #[test]
     fn messages_become_moments() {
         let mut assembly = Assembly::default();
@@ -444,8 +444,8 @@ mod tests {
         assert_eq!(last.selection, crate::session::Selection::Component(1));
     }
 
-    /// Messages of frames that were not seen from their beginning, or whose step before is missing, make no moment; and
-    /// however many frames stay unfinished, a bounded number is kept.
+    /// Frames without their first message or without an earlier step make no moment. The number of unfinished frames is
+    /// bounded.
     #[test]
     fn what_is_incomplete_is_left_out() {
         let mut assembly = Assembly::default();
@@ -462,7 +462,7 @@ mod tests {
         assert_eq!(assembly.frames.len(), MOST_FRAMES);
     }
 
-    /// Each frame's decision is written down once; a safe action when it begins, and again when its reason changes.
+    /// A decision is recorded once per frame; a safe action is recorded when it begins and when its reason changes.
     #[test]
     fn decisions_are_written_down_once() {
         let action = |reason: Reason, is_decision| Action {

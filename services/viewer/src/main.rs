@@ -12,16 +12,16 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::Duration;
 
-/// The checkpoint that ships.
+/// The shipped checkpoint.
 const SHIPPED: &str = "configs/checkpoints/approaching-intersection";
 
-/// Threads for encoding and forecasting: as many as graphs give their stages.
+/// Threads for encoding and forecasting, as in the shipped graphs.
 const MODEL_THREADS: usize = 1;
-/// How much a window that watches a graph gives way to others.
+/// Niceness of the window while it watches a graph.
 const NICE: i32 = 5;
 
-/// A window on what a picture may mean: the scenes that it may stand for, forecast, probed, and seen from anywhere.
-/// From files, or from a running graph, which it does not disturb.
+/// Shows the scenes that explain an image: forecast, probed, and seen from any pose. Images come from files or from a
+/// running graph, which the window does not disturb.
 #[derive(Debug, Parser)]
 #[command(
     version,
@@ -29,35 +29,34 @@ const NICE: i32 = 5;
                   carff-viewer --picture frame.png --do predict --do probe --screenshot scene.png"
 )]
 struct Args {
-    /// Folder of the trained models. Default: those of the run, or the shipped ones.
+    /// Folder of the trained models. Default: the models of the run, or the shipped ones.
     #[arg(long)]
     checkpoint: Option<PathBuf>,
-    /// Folder of the data set to choose pictures from. Default: the one that the models were trained on, if it is
-    /// there.
+    /// Folder of the dataset to choose images from. Default: the dataset that the models were trained on, if it exists.
     #[arg(long)]
     dataset: Option<PathBuf>,
-    /// Watches a running graph: the one of this name, or, without a name, the only one.
+    /// Watch a running graph: the one of this name, or, without a name, the only one.
     #[arg(long, num_args = 0..=1, default_missing_value = "", value_name = "NAME")]
     run: Option<String>,
-    /// A PNG picture to begin with.
+    /// A PNG image to start with.
     #[arg(long, value_name = "FILE", conflicts_with = "run")]
     picture: Option<PathBuf>,
-    /// What to do first; can be given several times.
+    /// Command to run first; can be given several times.
     #[arg(long = "do", value_name = "WHAT")]
     first: Vec<First>,
-    /// Threads for drawing. Default: as many as the machine has; one while a run is watched.
+    /// Threads for drawing. Default: the number of cores; one while a run is watched.
     #[arg(long)]
     threads: Option<usize>,
-    /// How the window looks. Default: as the system says.
+    /// Colours of the window. Default: the system's preference.
     #[arg(long)]
     theme: Option<Look>,
     /// Folder for screenshots.
     #[arg(long, default_value = ".")]
     folder: PathBuf,
-    /// Saves the window as this PNG file once all is drawn, and ends.
+    /// Save the window as this PNG file when everything is drawn, and exit.
     #[arg(long, value_name = "FILE")]
     screenshot: Option<PathBuf>,
-    /// With --screenshot: not before so many seconds.
+    /// With --screenshot: wait at least this many seconds.
     #[arg(long, default_value_t = 0.0, requires = "screenshot")]
     after: f32,
     /// Size of the window, points.
@@ -65,7 +64,7 @@ struct Args {
     size: Vec<f32>,
 }
 
-/// What to do first.
+/// A command to run first.
 #[derive(Clone, Copy, Debug, ValueEnum)]
 enum First {
     Toggle,
@@ -81,7 +80,7 @@ enum Look {
 }
 
 fn main() -> ExitCode {
-    // What the transport says of messages that it drops. It fails only when a log is set up already, which then stays.
+    // Log of messages that the transport drops. It fails only if a log is already set up; that log then stays.
     let _ = tracing_subscriber::fmt()
         .with_env_filter("off,carff_transport=warn")
         .with_writer(std::io::stderr)
@@ -102,7 +101,7 @@ fn run(args: Args) -> anyhow::Result<()> {
     let waker = Waker::default();
     let live = match args.run {
         Some(name) => {
-            // Whatever this window draws, it gives way to the graph. Without it, it works all the same.
+            // The window gives way to the graph. If the system refuses, the window still works.
             let _ = rustix::process::nice(NICE);
             let waker = waker.clone();
             Some(LiveFeed::attach(Some(name).filter(|n| !n.is_empty()), move || waker.wake_soon())?)
@@ -116,7 +115,7 @@ fn run(args: Args) -> anyhow::Result<()> {
     let models = Models::load(&checkpoint.unwrap_or_else(|| SHIPPED.into()), MODEL_THREADS)?;
     let album = album(args.dataset.as_deref(), watched.map(|run| run.dataset), &models)?;
     let picture = args.picture.as_deref().map(Input::load_png).transpose()?;
-    let after = Duration::try_from_secs_f32(args.after).context("--after: give seconds, 0 or more")?;
+    let after = Duration::try_from_secs_f32(args.after).context("--after: must be a number of seconds, 0 or more")?;
     let options = Options {
         threads,
         folder: args.folder,
@@ -129,7 +128,7 @@ fn run(args: Args) -> anyhow::Result<()> {
     };
     let is_live = live.is_some();
     let mut viewer =
-        Viewer::new(Session::new(models), album, live, options, waker).context("no thread to draw with")?;
+        Viewer::new(Session::new(models), album, live, options, waker).context("cannot start a thread to draw with")?;
     if let Some(input) = picture {
         viewer.toggle_input(input).map_err(anyhow::Error::msg)?;
     } else if !is_live {
@@ -163,26 +162,25 @@ fn run(args: Args) -> anyhow::Result<()> {
     eframe::run_native(&title, native, create)
         .map_err(|e| anyhow::anyhow!("cannot open a window: {e}; is there a display (DISPLAY or WAYLAND_DISPLAY)?"))?;
     match args.screenshot {
-        Some(path) if !path.is_file() => bail!("the window ended before {} was saved", path.display()),
+        Some(path) if !path.is_file() => bail!("the window closed before {} was saved", path.display()),
         _ => Ok(()),
     }
 }
 
-/// The data set to choose pictures from; within, why there is none: the window opens all the same, unless one was asked
-/// for.
+/// Returns the dataset to choose images from, or the reason why there is none. A dataset that the user named must open.
 fn album(asked: Option<&Path>, of_run: Option<PathBuf>, models: &Models) -> anyhow::Result<Result<Album, String>> {
     if let Some(dir) = asked {
         return Ok(Ok(Album::open(dir, models)?));
     }
     let Some(dir) = of_run.or_else(|| models.trained_on()) else {
-        return Ok(Err("No data set: give one with --dataset, or drop a PNG picture here.".into()));
+        return Ok(Err("No dataset: pass one with --dataset, or drop a PNG image here.".into()));
     };
     if !dir.is_dir() {
         let name = &models.manifest.scenario.name;
         let dir = dir.display();
         return Ok(Err(format!(
-            "Data set {dir} is not here yet. Render it with\n\ncarff dataset render {name} --out {dir}\n\nand start \
-             again, or drop a PNG picture here."
+            "Dataset {dir} does not exist yet. Render it with\n\ncarff dataset render {name} --out {dir}\n\nand start \
+             again, or drop a PNG image here."
         )));
     }
     Ok(Album::open(&dir, models).map_err(|e| e.to_string()))

@@ -1,4 +1,4 @@
-//! A checkpoint's models, loaded once, as the stages load them.
+//! A checkpoint's models, loaded once, in the same way as the stages load them.
 
 use carff_checkpoint::{CheckpointError, FieldProbe, Manifest, load_field_probe, load_policy};
 use carff_dataset::Image;
@@ -13,31 +13,31 @@ use carff_networks::{
 };
 use std::path::{Path, PathBuf};
 
-/// What a checkpoint holds.
+/// The models of a checkpoint.
 pub struct Models {
-    /// Its folder.
+    /// The checkpoint's folder.
     pub dir: PathBuf,
-    /// What was trained, and how.
+    /// Contents and training of the checkpoint.
     pub manifest: Manifest,
-    /// Hypothesis to state.
+    /// Probe that finds the state of a latent.
     pub probe: FieldProbe,
-    /// Posterior to mixture, or why there is none.
+    /// Network from posterior to mixture, or the reason why there is none.
     pub mixture: Result<MixtureNet, String>,
-    /// The rule that decides: calibrated where a threshold was chosen, else the paper's.
+    /// The rule that decides: calibrated if the checkpoint has a threshold, else the paper's.
     pub policy: Policy,
-    /// What each known state is called: its branch and its step.
+    /// Name of each known state: its branch and its time step.
     pub state_names: Vec<String>,
     encoder: Encoder,
 }
 
 impl Models {
-    /// Reads a checkpoint; the encoder and the forecaster will use so many threads.
+    /// Reads a checkpoint; `threads` is the number of threads of encoder and forecaster.
     pub fn load(dir: &Path, threads: usize) -> Result<Self, CheckpointError> {
         carff_networks::allocator::keep_large_blocks();
         carff_networks::device::set_threads(threads);
         let manifest = Manifest::load(dir)?;
         let mixture = match load_mixture(dir, &manifest) {
-            // A part that training has not made yet leaves its function out; one that is damaged is an error.
+            // A missing part disables its function; a damaged part is an error.
             Err(error @ CheckpointError::Missing { .. }) => Err(error.to_string()),
             other => Ok(other?),
         };
@@ -54,50 +54,50 @@ impl Models {
             encoder: load_encoder(dir, &manifest)?,
             manifest,
         };
-        // Once on a grey picture, so that the first one is as fast as the others.
+        // One grey image warms the encoder up, so that the first real image is as fast as later ones.
         models.encode(&Image::filled(128, 128, [128; 3]));
         Ok(models)
     }
 
-    /// The posterior of a picture, as the encoder stage computes it; `None` for a picture of no or wrong size.
+    /// Returns the posterior of an image as the encoder stage computes it; `None` for an image of the wrong size.
     pub fn encode(&self, image: &Image) -> Option<Gaussian> {
         borrow::with_image(image.view()?, |image| self.encoder.encode_bytes(image)).flatten()
     }
 
-    /// The field.
+    /// Returns the field.
     pub fn field(&self) -> &Field {
         self.probe.field()
     }
 
-    /// Corners of the region that matters, metres, world space.
+    /// Returns the corners of the region of interest, metres, world space.
     pub fn bounds_m(&self) -> [[f64; 3]; 2] {
         self.field().config().bounds_m.map(|corner| corner.map(f64::from))
     }
 
-    /// What a state is called; `unknown` for none of the known ones.
+    /// Returns the name of a state; `unknown` for `None`.
     pub fn state_name(&self, state: Option<usize>) -> &str {
         state.and_then(|s| self.state_names.get(s)).map_or("unknown", String::as_str)
     }
 
-    /// The state of a branch at a step; `None` when there is none.
+    /// Returns the state of a branch at a time step; `None` if there is none.
     pub fn state(&self, branch: usize, timestamp: usize) -> Option<usize> {
         let scenario = &self.manifest.scenario;
         let there = branch < scenario.branches.len() && timestamp < scenario.timestamps;
         there.then(|| branch * scenario.timestamps + timestamp)
     }
 
-    /// Whether the hazard action is right in a state.
+    /// Returns true if the hazard action is right in a state.
     pub fn is_hazard(&self, state: usize) -> bool {
         self.probe.layout().hazard_states().get(state).copied().unwrap_or(false)
     }
 
-    /// Steps that the checkpoint was calibrated to look ahead.
+    /// Returns the number of steps of the calibrated look-ahead.
     pub fn horizon(&self) -> u32 {
         let recorded = self.manifest.training.pointer("/calibration/horizon").and_then(serde_json::Value::as_u64);
         recorded.map_or(2, |h| h.clamp(1, u64::from(carff_messages::MAX_HORIZON)) as u32)
     }
 
-    /// The data set that it was trained on, as the training file names it.
+    /// Returns the training dataset as the training file names it.
     pub fn trained_on(&self) -> Option<PathBuf> {
         self.manifest.training.pointer("/dataset").and_then(serde_json::Value::as_str).map(PathBuf::from)
     }

@@ -1,5 +1,5 @@
-//! Pictures of scenes, drawn on a thread of their own: of each kind the newest request counts, and a view comes coarse
-//! first, then finer, so that the window stays smooth however slow the machine is.
+//! Renders images of scenes on a separate thread. Only the newest request of each kind counts. A view is rendered
+//! coarse first, then finer, so that the window stays responsive on a slow machine.
 
 use crate::slice::density_slice;
 use carff_base::geometry::PinholeCamera;
@@ -10,42 +10,41 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 use std::time::Instant;
 
-/// What a coarse picture of a view may take, milliseconds.
+/// Time budget of a coarse image of a view, milliseconds.
 const COARSE_MS: f64 = 40.0;
-/// What a picture of a scene that changes by itself may take, milliseconds.
+/// Time budget of an image of a scene that changes by itself, milliseconds.
 const STEADY_MS: f64 = 160.0;
-/// What a pixel takes, before any has been measured, nanoseconds.
+/// Assumed render time of a pixel before the first measurement, nanoseconds.
 const FIRST_PIXEL_NS: f64 = 6_000.0;
-/// Weight of the newest measurement of it.
+/// Weight of the newest measurement of the pixel time.
 const NEWEST_WEIGHT: f64 = 0.3;
-/// However slow the machine is, a picture's longer side has so many pixels: of a view, and of a scene that changes by
-/// itself.
+/// Minimum length of an image's longer side, pixels: of a view, and of a scene that changes by itself.
 const COARSEST_PX: u32 = 56;
 const COARSEST_STEADY_PX: u32 = 112;
-/// A view's sides are divided by one of these at first.
+/// Divisors of a view's sides.
 const DIVISORS: [u32; 8] = [1, 2, 3, 4, 6, 8, 12, 16];
-/// Thumbnails that are drawn in one go.
+/// Number of thumbnails rendered at a time.
 const BATCH: usize = 4;
-/// Number of that kind of job.
+/// Index of the thumbnail job.
 const THUMBNAILS: usize = 3;
-/// Gives way to whatever decides on this machine, a running graph above all.
+/// Niceness of the thread: the processes of a running graph come first.
 const NICE: i32 = 10;
 
-/// What to draw.
+/// A render request.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Job {
-    /// The scene from the camera that a hand moves.
+    /// The scene from the user's camera.
     View(View),
     /// The scene from above.
     BirdsEye {
-        /// The scene.
+        /// Latent of the scene.
         latent: [f32; LATENT_DIM],
-        /// From where, and how large.
+        /// Pose and size of the image.
         camera: PinholeCamera,
     },
-    /// How dense the scene is at a height.
+    /// The density of the scene at a height.
     Slice {
-        /// The scene.
+        /// Latent of the scene.
         latent: [f32; LATENT_DIM],
         /// The height, metres.
         height_m: f32,
@@ -54,42 +53,42 @@ pub enum Job {
     },
     /// Several scenes from one camera, small.
     Thumbnails {
-        /// The scenes.
+        /// Latents of the scenes.
         latents: Vec<[f32; LATENT_DIM]>,
-        /// From where, and how large.
+        /// Pose and size of each image.
         camera: PinholeCamera,
-        /// How many are done.
+        /// Number of finished thumbnails.
         done: usize,
     },
 }
 
-/// How fine a view is to be, and how soon.
+/// Resolution and urgency of a view.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Pace {
-    /// The camera is being moved: one coarse picture, at once.
+    /// The camera is moving: one coarse image at once.
     Moving,
-    /// The scene changes by itself: one picture, of the same fineness each time.
+    /// The scene changes by itself: one image, always of the same resolution.
     Steady,
-    /// Nothing moves: a coarse picture, then finer ones up to the whole.
+    /// Nothing moves: a coarse image, then finer ones up to full resolution.
     Resting,
 }
 
-/// A view to draw.
+/// A view to render.
 #[derive(Clone, Debug, PartialEq)]
 pub struct View {
-    /// The scene.
+    /// Latent of the scene.
     pub latent: [f32; LATENT_DIM],
-    /// From where, and how large at last.
+    /// Pose and final size of the image.
     pub camera: PinholeCamera,
-    /// How fine, how soon.
+    /// Resolution and urgency of the view.
     pub pace: Pace,
-    /// What the sides are still to be divided by, one picture each; empty: not begun.
+    /// Remaining divisors of the sides, one image each; empty: not started.
     pub divisors: Vec<u32>,
     number: u64,
 }
 
 impl View {
-    /// A view that has not been begun.
+    /// Returns a view that has not been started.
     pub fn new(latent: [f32; LATENT_DIM], camera: PinholeCamera, pace: Pace) -> Self {
         Self { latent, camera, pace, divisors: Vec::new(), number: 0 }
     }
@@ -106,49 +105,49 @@ impl Job {
     }
 }
 
-/// What was drawn.
+/// A rendered image.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Drawn {
     /// A view.
     View {
-        /// The scene.
+        /// Latent of the scene.
         latent: [f32; LATENT_DIM],
-        /// The picture, coarse or fine.
+        /// The image, coarse or fine.
         image: Image,
-        /// Its camera, at the size that was asked for.
+        /// Camera of the requested size.
         camera: PinholeCamera,
-        /// Whether it has the size that was asked for.
+        /// True if the image has the requested size.
         is_final: bool,
-        /// How long it took, milliseconds.
+        /// Render time, milliseconds.
         took_ms: f64,
     },
     /// A scene from above.
     BirdsEye {
-        /// The scene.
+        /// Latent of the scene.
         latent: [f32; LATENT_DIM],
-        /// The picture.
+        /// The image.
         image: Image,
     },
     /// Density at a height.
     Slice {
-        /// The scene.
+        /// Latent of the scene.
         latent: [f32; LATENT_DIM],
-        /// The picture: brightness is the share of light that is stopped.
+        /// The image: brightness is the share of absorbed light.
         image: Image,
     },
-    /// One of the small pictures.
+    /// A thumbnail of one of several scenes.
     Thumbnail {
-        /// Which of the scenes.
+        /// Index of the scene.
         index: usize,
-        /// Its latent.
+        /// Latent of the scene.
         latent: [f32; LATENT_DIM],
-        /// The picture.
+        /// The image.
         image: Image,
     },
 }
 
 impl Drawn {
-    /// Whether the other one takes its place.
+    /// Returns true if another job replaces this one.
     fn is_replaced_by(&self, other: &Self) -> bool {
         match (self, other) {
             (Self::Thumbnail { index: a, .. }, Self::Thumbnail { index: b, .. }) => a == b,
@@ -157,13 +156,13 @@ impl Drawn {
     }
 }
 
-/// What waits, and what is done.
+/// Waiting jobs and finished images.
 #[derive(Default)]
 struct Desk {
-    /// At most one of each kind, with its turn: the lowest is next. A job that takes another's place takes its turn.
+    /// At most one job per kind, with its turn: the lowest is next. A job that replaces another one takes its turn.
     waiting: Vec<(u64, Job)>,
     turns: u64,
-    /// The kind of job that is being worked on.
+    /// Kind of the job in work.
     working: Option<usize>,
     is_stopped: bool,
     done: Vec<Drawn>,
@@ -180,7 +179,7 @@ impl Desk {
         }
     }
 
-    /// What is left of a job that was begun, unless a newer one of its kind waits.
+    /// Puts back the rest of a started job, unless a newer one of its kind waits.
     fn put_back(&mut self, job: Job) {
         if !self.waiting.iter().any(|(_, other)| other.kind() == job.kind()) {
             self.put(job);
@@ -201,40 +200,40 @@ impl Desk {
 struct Shared {
     desk: Mutex<Desk>,
     called: Condvar,
-    /// Number of the newest view that was asked for.
+    /// Number of the newest requested view.
     newest_view: AtomicU64,
 }
 
 impl Shared {
-    /// The desk, also when a thread died at it: what lies there is whole at any time.
+    /// Locks the desk. Its contents are consistent at any time, so a poisoned lock is harmless.
     fn desk(&self) -> MutexGuard<'_, Desk> {
         self.desk.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-/// Draws on a thread of its own, until it is dropped.
+/// Renders on its own thread until the worker is dropped.
 pub struct RenderWorker {
     shared: Arc<Shared>,
     thread: Option<JoinHandle<()>>,
 }
 
 impl RenderWorker {
-    /// Starts the thread. It draws with so many threads, and calls `wake` when something is done.
+    /// Starts the thread. It renders with `threads` threads and calls `wake` when it has a result.
     pub fn start(mut field: Field, threads: usize, wake: impl Fn() + Send + 'static) -> std::io::Result<Self> {
         field.set_instruction_set(InstructionSet::detect_for_pictures());
         let shared =
             Arc::new(Shared { desk: Mutex::default(), called: Condvar::new(), newest_view: AtomicU64::new(0) });
         let theirs = shared.clone();
         let thread = std::thread::Builder::new().name("render".into()).spawn(move || {
-            // On Linux this is the thread's own priority, and that of the threads that it starts. Without it pictures
-            // come all the same.
+            // On Linux this sets the priority of this thread and of the threads that it starts. Rendering also works
+            // without it.
             let _ = rustix::process::nice(NICE);
             Painter::new(field, threads).work(&theirs, &wake);
         })?;
         Ok(Self { shared, thread: Some(thread) })
     }
 
-    /// Asks for a picture. One of the same kind that waits is forgotten.
+    /// Requests an image. It replaces a waiting request of the same kind.
     pub fn ask(&self, job: Job) {
         let job = match job {
             Job::View(view) => {
@@ -247,18 +246,18 @@ impl RenderWorker {
         self.shared.called.notify_one();
     }
 
-    /// What was drawn since the last call, the newest of each kind.
+    /// Returns the images rendered since the last call, the newest of each kind.
     pub fn take(&self) -> Vec<Drawn> {
         std::mem::take(&mut self.shared.desk().done)
     }
 
-    /// Whether small pictures that were asked for are not all drawn yet.
+    /// Returns true while requested thumbnails are missing.
     pub fn owes_thumbnails(&self) -> bool {
         let desk = self.shared.desk();
         desk.working == Some(THUMBNAILS) || desk.waiting.iter().any(|(_, job)| job.kind() == THUMBNAILS)
     }
 
-    /// Whether all that was asked for has been drawn and taken.
+    /// Returns true when all requested images have been rendered and taken.
     pub fn is_idle(&self) -> bool {
         let desk = self.shared.desk();
         desk.waiting.is_empty() && desk.done.is_empty() && desk.working.is_none()
@@ -272,18 +271,19 @@ impl Drop for RenderWorker {
             desk.is_stopped = true;
             desk.waiting.clear();
         }
-        // What is being drawn is given up, too.
+        // The image in work is abandoned, too.
         self.shared.newest_view.fetch_add(1, Ordering::Relaxed);
         self.shared.called.notify_one();
         if let Some(thread) = self.thread.take() {
-            // It ends by a panic only, which has been reported by then.
+            // The thread ends early only by a panic, which has been reported by then.
             let _ = thread.join();
         }
     }
 }
 
-/// By what a view's sides are divided, picture by picture: the first has at most `budget_px` pixels (or is as coarse as
-/// it gets: `coarsest_px` along the longer side), each further one is at least twice as fine, the last one is whole.
+/// Returns the divisors of a view's sides, image by image. The first image has at most `budget_px` pixels, or is as
+/// coarse as possible (`coarsest_px` along the longer side). Each further image is at least twice as fine; the last one
+/// has full size.
 pub fn divisors(width_px: u32, height_px: u32, coarsest_px: u32, budget_px: f64) -> Vec<u32> {
     let pixels = |divisor: u32| f64::from(width_px / divisor) * f64::from(height_px / divisor);
     let longest_px = width_px.max(height_px);
@@ -308,7 +308,7 @@ struct Painter {
     options: RenderOptions,
     buffer: RenderBuffer,
     hypotheses: HypothesisBuffer,
-    /// What a pixel takes, nanoseconds.
+    /// Measured render time of a pixel, nanoseconds.
     pixel_ns: f64,
 }
 
@@ -354,7 +354,7 @@ impl Painter {
         }
     }
 
-    /// Draws a job, or as much of it as goes at a time; and what is left of it.
+    /// Renders a job, or a part of it; returns the images and the rest of the job.
     fn draw(&mut self, job: Job, shared: &Shared) -> (Vec<Drawn>, Option<Job>) {
         match job {
             Job::View(view) => self.draw_view(view, shared),
@@ -394,7 +394,7 @@ impl Painter {
         let divisor = left.remove(0);
         let camera = view.camera.resized((width_px / divisor).max(1), (height_px / divisor).max(1));
         let started = Instant::now();
-        // A coarse picture is finished in any case: who moves the camera without rest sees it move.
+        // A coarse image is always finished, so that a continuous camera movement stays visible.
         let is_wanted = || !begun || shared.newest_view.load(Ordering::Relaxed) == view.number;
         let Some(image) = self.in_bands(&view.latent, &camera, is_wanted) else { return (Vec::new(), None) };
         let took_ms = started.elapsed().as_secs_f64() * 1e3;
@@ -406,8 +406,7 @@ impl Painter {
         (vec![drawn], rest)
     }
 
-    /// Renders a picture in bands, each of which takes as long as a coarse picture may; `None` when it is no longer
-    /// wanted.
+    /// Renders an image in bands, each within the budget of a coarse image. Returns `None` if it is no longer wanted.
     fn in_bands(
         &mut self,
         latent: &[f32; LATENT_DIM],
@@ -447,7 +446,7 @@ mod tests {
     use std::sync::mpsc;
     use std::time::Duration;
 
-    /// Longest wait for a picture: no limit on how long drawing may take, but on a test that hangs.
+    /// Longest wait for an image. It only bounds a test that hangs.
     const PATIENCE: Duration = Duration::from_secs(120);
 
     fn field() -> Field {
@@ -459,7 +458,7 @@ mod tests {
         PinholeCamera::look_at([3.0, -20.0, 9.0], [0.0; 3], [0.0, 0.0, 1.0], width_px, height_px, 50.0)
     }
 
-    /// A worker, and a call that waits until all is drawn and returns it.
+    /// Returns a worker, and a function that waits until everything is rendered and returns it.
     fn worker() -> (RenderWorker, impl Fn(&RenderWorker) -> Vec<Drawn>) {
         let (told, woken) = mpsc::sync_channel(64);
         let worker = RenderWorker::start(field(), 2, move || told.try_send(()).unwrap_or_default()).unwrap();
@@ -471,15 +470,15 @@ mod tests {
                 if worker.is_idle() {
                     return all;
                 }
-                assert!(since.elapsed() < PATIENCE, "nothing more is drawn");
+                assert!(since.elapsed() < PATIENCE, "rendering has stopped");
                 let _ = woken.recv_timeout(Duration::from_millis(20));
             }
         };
         (worker, until_idle)
     }
 
-    /// The first picture fits the budget or is the coarsest, each further one is at least twice as fine, the last is
-    /// whole.
+    /// The first image fits the budget or is the coarsest, each further one is at least twice as fine, and the last has
+    /// full size.
     #[test]
     fn views_get_finer() {
         for budget_px in [1.0, 500.0, 3_000.0, 40_000.0, 1e9] {
@@ -492,7 +491,7 @@ mod tests {
         assert_eq!((divisors(320, 240, 40, 1e9), divisors(30, 20, 40, 1.0)), (vec![1], vec![1]));
     }
 
-    /// A view ends as what the field renders from that camera in one go, whatever bands and sizes it came in.
+    /// A final view equals the field's own image from that camera, for any bands and intermediate sizes.
     #[test]
     fn a_view_ends_as_the_whole_picture() {
         let (worker, until_idle) = worker();
@@ -508,7 +507,7 @@ mod tests {
         assert!(apart <= Some(1), "{apart:?}");
     }
 
-    /// Of many views that are asked for at once, the newest is finished last, and after it nothing else comes.
+    /// If many views are requested at once, the newest is finished last, and no other follows it.
     #[test]
     fn the_newest_view_wins() {
         let (worker, until_idle) = worker();
@@ -525,7 +524,7 @@ mod tests {
         assert_eq!(finals.last(), Some(&119), "{finals:?}");
     }
 
-    /// All kinds are served, though views are asked for all the time; each thumbnail comes once, for its own latent.
+    /// All kinds are served while views are requested continuously; each thumbnail comes once, for its own latent.
     #[test]
     fn every_kind_is_served() {
         let (worker, until_idle) = worker();
@@ -553,7 +552,7 @@ mod tests {
         assert_eq!(indices, [0, 1, 2, 3, 4, 5]);
     }
 
-    /// What waits for its turn keeps it when a newer request takes its place; a view in motion goes first.
+    /// A waiting job keeps its turn when a newer request replaces it; a view in motion goes first.
     #[test]
     fn turns_are_kept() {
         let mut desk = Desk::default();

@@ -1,8 +1,11 @@
-//! What the window is about, without a window: a picture, the scenes that it may stand for, and what follows.
+//! The logic of the window, without a window: an image, the scenes that explain it, and their forecasts.
 //!
-//! *Toggle* takes a picture to its posterior. *Predict* forecasts one step: a mixture, and latents drawn from it.
-//! *Probe and predict* asks the shown scene what stands where, takes the posterior of the state that it shows for the
-//! next input, and forecasts from that, up to the horizon. All of it is computed by the functions that the stages use.
+//! - *Toggle* computes an image's posterior.
+//! - *Predict* forecasts one step: a mixture, and latents drawn from it.
+//! - *Probe and predict* probes the shown scene, resolves it to a known state, and forecasts from that state's
+//!   posterior, up to the horizon.
+//!
+//! The session calls the same functions as the stages.
 
 use crate::history::History;
 use crate::input::Input;
@@ -13,79 +16,79 @@ use carff_messages::{Gaussian, LATENT_DIM, MAX_HORIZON, MAX_SAMPLES};
 use std::sync::Arc;
 use std::time::Instant;
 
-/// How far and how finely to look ahead, and with which random numbers.
+/// Settings of the look-ahead.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Settings {
-    /// Latents drawn a step, 1..=64.
+    /// Number of latents drawn per step, 1..=64.
     pub samples: usize,
-    /// How they are spread over the components.
+    /// Distribution of the draws over the components.
     pub sampling: Sampling,
-    /// Steps that may be looked ahead, 1..=8.
+    /// Maximum number of look-ahead steps, 1..=8.
     pub horizon: u32,
     /// Seed of the draws.
     pub seed: u64,
 }
 
-/// Which scene is shown.
+/// The shown scene.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Selection {
-    /// That of the forecast's input: the picture's posterior, or the state that was fed back.
+    /// The scene of the forecast's input: the image's posterior, or the state that was fed back.
     Source,
-    /// That of a mixture component's mean.
+    /// The scene of a mixture component's mean.
     Component(usize),
-    /// That of a drawn latent.
+    /// The scene of a drawn latent.
     Sample(usize),
-    /// That of a known state.
+    /// The scene of a known state.
     State(usize),
 }
 
-/// What probing the shown scene found.
+/// The result of probing the shown scene.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Found {
-    /// Occupancy of each place, and what they stand for.
+    /// Occupancy of each place, and the state that they match.
     pub probed: Probed,
     /// Density at each of the prober's points, 1/m.
     pub densities: Vec<f32>,
 }
 
-/// A forecast: the mixture over the next latent, and what was drawn from it.
+/// A forecast: the mixture over the next latent, and its samples.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Forecast {
     /// The mixture.
     pub mixture: Mixture,
-    /// The draws.
+    /// The drawn latents.
     pub draws: Vec<Draw>,
 }
 
-/// One entry of the history: an input, and what has been made of it so far.
+/// An entry of the history: an input with its forecast and belief so far.
 #[derive(Clone, Debug)]
 pub struct Moment {
-    /// The picture that all rests on.
+    /// The input image.
     pub input: Arc<Input>,
-    /// Steps ahead of the picture.
+    /// Number of steps after the image.
     pub step: u32,
-    /// What is forecast from: the picture's posterior, or that of a known state.
+    /// Input of the forecast: the image's posterior, or that of a known state.
     pub source: Gaussian,
-    /// That state; `None` for a picture's posterior.
+    /// The known state; `None` for an image's posterior.
     pub source_state: Option<usize>,
-    /// The forecast; none at step 0.
+    /// The forecast; `None` at step 0.
     pub forecast: Option<Forecast>,
-    /// What probing all of the forecast's scenes found; none before it is probed.
+    /// The belief from all scenes of the forecast; `None` before it is probed.
     pub belief: Option<Step>,
-    /// Which scene is shown.
+    /// The shown scene.
     pub selection: Selection,
-    /// Whether a hand chose it.
+    /// True if the user chose the scene.
     pub is_chosen: bool,
-    /// What probing the shown scene found; none before it is probed.
+    /// Result of probing the shown scene; `None` before it is probed.
     pub found: Option<Found>,
-    /// Probability of the path followed up to here.
+    /// Probability of the path up to this step.
     pub path_probability: f32,
-    /// The probed steps of this path before this one.
+    /// The earlier probed steps of this path.
     pub path: Vec<Step>,
 }
 
 impl Moment {
-    /// A picture's posterior, nothing more.
+    /// Returns a moment with only an image's posterior.
     pub fn of_posterior(input: Arc<Input>, posterior: Gaussian) -> Self {
         Self {
             input,
@@ -102,7 +105,7 @@ impl Moment {
         }
     }
 
-    /// A forecast's scenes; the most probable component is shown.
+    /// Returns a moment with a forecast's scenes; it shows the most probable component.
     pub fn of_forecast(before: &Self, step: u32, forecast: Forecast) -> Self {
         let weights = &forecast.mixture.weights;
         let heaviest = (0..weights.len()).max_by(|&a, &b| weights[a].total_cmp(&weights[b]));
@@ -117,88 +120,88 @@ impl Moment {
         }
     }
 
-    /// The probed steps up to this one.
+    /// Returns the probed steps up to this one.
     pub fn steps(&self) -> impl Iterator<Item = &Step> {
         self.path.iter().chain(&self.belief)
     }
 }
 
-/// A scene to choose, or to show.
+/// A scene that can be shown.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Scene {
-    /// Which.
+    /// Key of the scene.
     pub selection: Selection,
-    /// Its latent.
+    /// Latent of the scene.
     pub latent: [f32; LATENT_DIM],
-    /// What it is called.
+    /// Name of the scene.
     pub name: String,
-    /// What probing found, once it has been probed.
+    /// Result of probing, if the scene has been probed.
     pub probed: Option<Probed>,
-    /// The share of the forecast that it stands for, 0..=1.
+    /// The scene's share of the forecast, 0..=1.
     pub share: Option<f32>,
 }
 
-/// Why something cannot be done.
+/// Reason why a command is not possible.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum SessionError {
-    /// Nothing was toggled yet.
-    #[error("no picture yet: choose one, and press Toggle")]
+    /// No image has been toggled yet.
+    #[error("no image yet: choose one, and press Toggle")]
     NoInput,
-    /// The encoder refused the picture.
-    #[error("`{title}` is no picture that the encoder can read: {width_px} x {height_px} pixels")]
+    /// The encoder refused the image.
+    #[error("the encoder cannot read `{title}`: {width_px} x {height_px} pixels")]
     Picture {
-        /// What it is called.
+        /// Name of the image.
         title: String,
-        /// Its width, pixels.
+        /// Width of the image, pixels.
         width_px: u32,
-        /// Its height, pixels.
+        /// Height of the image, pixels.
         height_px: u32,
     },
     /// The checkpoint cannot forecast.
     #[error("{0}")]
     NoMixture(String),
-    /// The shown scene is none of the known states.
-    #[error("the shown scene is none of the known states, so there is nothing to go on from: choose another one")]
+    /// The shown scene matches no known state.
+    #[error("the shown scene matches no known state, so it cannot be forecast: choose another one")]
     Unknown,
-    /// No further step.
+    /// The horizon is reached.
     #[error("step {step} is the last of the horizon: go back, or set a longer horizon")]
     Horizon {
-        /// The step that is shown.
+        /// The shown step.
         step: u32,
     },
-    /// There is no such scene.
+    /// The scene does not exist.
     #[error("there is no such scene to show: forecast first")]
     NoScene,
 }
 
-/// The models, what was looked at with them, and what came of it.
+/// The models, the history, and the journal.
 pub struct Session {
     models: Models,
     history: History<Moment>,
     settings: Settings,
-    /// Decisions and times.
+    /// Decisions and durations.
     pub journal: Journal,
 }
 
 impl Session {
-    /// With nothing looked at yet.
+    /// Creates a session without an image.
     pub fn new(models: Models) -> Self {
         let settings =
             Settings { samples: 10, sampling: Sampling::Stratified, horizon: models.horizon().max(2), seed: 1 };
         Self { models, history: History::default(), settings, journal: Journal::default() }
     }
 
-    /// The models.
+    /// Returns the models.
     pub fn models(&self) -> &Models {
         &self.models
     }
 
-    /// The settings.
+    /// Returns the settings.
     pub fn settings(&self) -> Settings {
         self.settings
     }
 
-    /// Sets them, within their limits; they count for what is forecast from now on.
+    /// Sets the settings within their limits; they apply to later forecasts.
     pub fn set_settings(&mut self, settings: Settings) {
         self.settings = Settings {
             samples: settings.samples.clamp(1, MAX_SAMPLES),
@@ -207,12 +210,12 @@ impl Session {
         };
     }
 
-    /// What was looked at.
+    /// Returns the history of moments.
     pub fn history(&self) -> &History<Moment> {
         &self.history
     }
 
-    /// What is looked at.
+    /// Returns the current moment.
     pub fn moment(&self) -> Option<&Moment> {
         self.history.current()
     }
@@ -221,7 +224,7 @@ impl Session {
         self.moment().ok_or(SessionError::NoInput)
     }
 
-    /// **Toggle**: the scene that a picture's posterior stands for.
+    /// **Toggle**: shows the scene of an image's posterior.
     pub fn toggle(&mut self, input: Arc<Input>) -> Result<(), SessionError> {
         let started = Instant::now();
         let Some(posterior) = self.models.encode(&input.image) else {
@@ -232,14 +235,14 @@ impl Session {
         let moment = Moment::of_posterior(input, posterior);
         let is_last = !self.history.has_forward();
         match self.history.current_mut() {
-            // Leafing through pictures leaves no trail.
+            // Browsing through images adds no entries.
             Some(shown) if is_last && shown.step == 0 && shown.found.is_none() => *shown = moment,
             _ => self.history.push(moment),
         }
         Ok(())
     }
 
-    /// Whether [`Session::predict`] would do something, or why not.
+    /// Returns an error if [`Session::predict`] is not possible, with the reason.
     pub fn can_predict(&self) -> Result<(), SessionError> {
         let moment = self.current()?;
         self.can_forecast(moment.step.max(1))
@@ -252,8 +255,8 @@ impl Session {
         if step > self.settings.horizon { Err(SessionError::Horizon { step: step - 1 }) } else { Ok(()) }
     }
 
-    /// **Predict**: the mixture over what comes one step after the picture, and latents drawn from it. Where a step is
-    /// shown already, it is drawn again, with the settings as they are now.
+    /// **Predict**: forecasts the mixture one step after the image and draws latents from it. If the step is already
+    /// shown, its latents are drawn again with the current settings.
     pub fn predict(&mut self) -> Result<(), SessionError> {
         self.can_predict()?;
         let moment = self.current()?.clone();
@@ -267,7 +270,7 @@ impl Session {
         Ok(())
     }
 
-    /// One step's forecast, as the forecaster stage draws it for a frame of this number.
+    /// Returns one step's forecast, as the forecaster stage computes it for the same frame number.
     fn forecast(&mut self, source: &Gaussian, input: &Input, step: u32) -> Result<Forecast, SessionError> {
         let started = Instant::now();
         let net = self.models.mixture.as_ref().map_err(|why| SessionError::NoMixture(why.clone()))?;
@@ -278,7 +281,7 @@ impl Session {
         Ok(Forecast { mixture, draws })
     }
 
-    /// **Probe**: what stands where in the shown scene, and, of a forecast, in all others: the belief.
+    /// **Probe**: probes the shown scene and, in a forecast, all others; the result is the belief.
     pub fn probe(&mut self) -> Result<(), SessionError> {
         let started = Instant::now();
         let moment = self.history.current_mut().ok_or(SessionError::NoInput)?;
@@ -305,7 +308,7 @@ impl Session {
         Ok(())
     }
 
-    /// Whether [`Session::probe_and_predict`] would come to a step, or why not. What the scene shows is not known yet.
+    /// Returns an error if [`Session::probe_and_predict`] is not possible. The state of the scene is not known yet.
     pub fn can_advance(&self) -> Result<(), SessionError> {
         self.can_forecast(self.current()?.step + 1)
     }
@@ -319,7 +322,7 @@ impl Session {
         let reading = &moment.found.as_ref().ok_or(SessionError::NoScene)?.probed.reading;
         let state = reading.state.ok_or(SessionError::Unknown)?;
         let source = *self.models.probe.state_posterior(state).ok_or(SessionError::Unknown)?;
-        // The path goes on by the state that was chosen, which need not be the most probable one.
+        // The path continues from the chosen state, which may differ from the most probable one.
         let resolved = match &moment.belief {
             Some(belief) => Resolved { state, ..belief.resolved.clone() },
             None => Resolved {
@@ -337,7 +340,7 @@ impl Session {
         Ok(())
     }
 
-    /// Shows another scene of the same step; where the step has been probed, the scene is, too.
+    /// Shows another scene of the same step; if the step has been probed, the scene is probed, too.
     pub fn select(&mut self, selection: Selection) -> Result<(), SessionError> {
         let moment = self.history.current_mut().ok_or(SessionError::NoInput)?;
         latent(&self.models, moment, selection).ok_or(SessionError::NoScene)?;
@@ -348,24 +351,24 @@ impl Session {
         Ok(())
     }
 
-    /// Goes back in the history; false at its beginning.
+    /// Goes back in the history; returns false at its beginning.
     pub fn back(&mut self) -> bool {
         self.history.back()
     }
 
-    /// Goes forward in the history; false at its end.
+    /// Goes forward in the history; returns false at its end.
     pub fn forward(&mut self) -> bool {
         self.history.forward()
     }
 
-    /// Goes to an entry of the history; false when there is none.
+    /// Goes to an entry of the history; returns false if there is none.
     pub fn go_to(&mut self, place: usize) -> bool {
         self.history.go_to(place)
     }
 
-    /// Shows what a running graph made of a frame, in place of all else: the same step as before, and the scene that
-    /// was chosen, as far as it is there. Where none was chosen the component is kept as long as it weighs at least
-    /// half as much as the heaviest: two that weigh about the same would take turns.
+    /// Shows a running graph's moments of a frame in place of all entries. The step and the chosen scene stay if they
+    /// exist. Without a choice, a component stays while its weight is at least half of the largest weight; otherwise
+    /// two components of similar weight would alternate.
     pub fn follow(&mut self, mut moments: Vec<Moment>) {
         let first = self.history.entries().is_empty();
         for (moment, before) in moments.iter_mut().zip(self.history.entries()) {
@@ -390,7 +393,7 @@ impl Session {
         }
     }
 
-    /// The scene that is shown.
+    /// Returns the shown scene.
     pub fn shown(&self) -> Option<Scene> {
         let moment = self.moment()?;
         let mut scene = self.scene(moment, moment.selection)?;
@@ -398,7 +401,7 @@ impl Session {
         Some(scene)
     }
 
-    /// The scenes to choose from: what was forecast from, the components, the samples.
+    /// Returns the scenes that can be shown: the forecast's input, the components, and the samples.
     pub fn scenes(&self) -> Vec<Scene> {
         let Some(moment) = self.moment() else { return Vec::new() };
         let (components, samples) =
@@ -432,7 +435,7 @@ impl Session {
     }
 }
 
-/// The latent of a scene; `None` when there is no such scene.
+/// Returns the latent of a scene; `None` if the scene does not exist.
 fn latent(models: &Models, moment: &Moment, selection: Selection) -> Option<[f32; LATENT_DIM]> {
     let forecast = moment.forecast.as_ref();
     match selection {
@@ -443,7 +446,7 @@ fn latent(models: &Models, moment: &Moment, selection: Selection) -> Option<[f32
     }
 }
 
-/// Fills in what probing the shown scene finds. What was probed with the others is not probed again.
+/// Probes the shown scene, unless it has been probed with the others.
 fn find(models: &mut Models, moment: &mut Moment) {
     let Some(latent) = latent(models, moment, moment.selection) else {
         moment.found = None;
@@ -461,7 +464,7 @@ fn find(models: &mut Models, moment: &mut Moment) {
     moment.found = Some(Found { probed, densities });
 }
 
-/// "now", "1 step ahead", "2 steps ahead".
+/// Formats a step: "now", "1 step ahead", "2 steps ahead".
 pub fn steps_ahead(step: u32) -> String {
     match step {
         0 => "now".to_owned(),

@@ -1,13 +1,13 @@
-//! How dense a scene is at a height, as a picture from above.
+//! Slices of density: a scene at a height, as an image from above.
 
 use carff_dataset::Image;
 use carff_field::{Field, LATENT_DIM};
 
-/// A surface is as opaque as this length of it is, metres: the field's surfaces are thin.
+/// Length over which opacity is computed, metres: the field's surfaces are thin.
 const DEPTH_M: f32 = 0.25;
 
-/// The share of light that 0.25 m of what lies at a height stops: black none, white all. +X to the right, +Y up, over
-/// the region that matters; `longest_px` points along its longer side.
+/// Returns the share of light that 0.25 m of the scene absorbs at a height: black none, white all. The image covers the
+/// region of interest, +X to the right, +Y up, with `longest_px` points along its longer side.
 pub fn density_slice(field: &Field, latent: &[f32; LATENT_DIM], height_m: f32, longest_px: u32) -> Image {
     let [low, high] = field.config().bounds_m;
     let extent_m = [high[0] - low[0], high[1] - low[1]];
@@ -28,7 +28,7 @@ mod tests {
     use super::*;
     use carff_field::FieldConfig;
 
-    /// The picture has the region's shape, and each pixel is what the field says at its middle.
+    /// The image has the region's aspect ratio, and each pixel is the field's value at the pixel's centre.
     #[test]
     fn pixels_are_the_fields_densities() {
         let bounds_m = [[-4.0, -2.0, 0.0], [4.0, 2.0, 3.0]];

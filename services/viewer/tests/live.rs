@@ -1,4 +1,4 @@
-//! Watching a running graph: messages on its topics become what the window shows, and its end is noticed.
+//! Tests of watching a running graph: its messages become moments, and its end is noticed.
 
 use carff_messages::{
     Action, ActionCode, Belief, DatasetView, Forecast, ForecastSource, FrameMeta, Gaussian, Header, Intrinsics,
@@ -9,7 +9,7 @@ use carff_transport::{Node, Run, monotonic_now_ns, remove_run_leftovers, runtime
 use carff_viewer::live::LiveFeed;
 use std::time::{Duration, Instant};
 
-/// Longest wait: no limit on how long anything may take, but on a test that hangs.
+/// Longest wait. It only bounds a test that hangs.
 const PATIENCE: Duration = Duration::from_secs(60);
 
 fn wait_for<T>(mut look: impl FnMut() -> Option<T>) -> T {
@@ -18,13 +18,13 @@ fn wait_for<T>(mut look: impl FnMut() -> Option<T>) -> T {
         if let Some(found) = look() {
             return found;
         }
-        assert!(since.elapsed() < PATIENCE, "it does not come");
+        assert!(since.elapsed() < PATIENCE, "no news arrives");
         std::thread::sleep(Duration::from_millis(5));
     }
 }
 
-/// A frame with its posterior, forecast, belief and action comes out as two moments and a decision; a run that is not
-/// there is refused by name; when the run's record goes, the window says that it has ended.
+/// A frame with its posterior, forecast, belief and action becomes two moments and a decision. A missing run is refused
+/// by name. When the run's record disappears, the window reports the end of the run.
 #[test]
 fn watches_a_run_from_frame_to_decision() {
     let name = format!("viewer-{}", std::process::id());
@@ -67,7 +67,7 @@ fn watches_a_run_from_frame_to_decision() {
     let mut loan = frames.loan(12).unwrap();
     loan.bytes_mut().copy_from_slice(&[7; 12]);
     frames.send_image(loan, meta).unwrap();
-    // As in a graph: each message rests on one that was there before.
+    // As in a graph: each message follows the one that it depends on.
     wait_for(|| (feed.watched().frames == 5).then_some(()));
     posteriors.send(Posterior { header, gaussian: Gaussian::standard(), stage_latency_ns: 3_000_000 }).unwrap();
     let mut forecast = Forecast::empty(header.at_step(1), ForecastSource::Observed, 1);
@@ -89,7 +89,7 @@ fn watches_a_run_from_frame_to_decision() {
     );
     assert_eq!(moments[1].forecast.as_ref().unwrap().draws[1].latent, [0.5; 8]);
     assert_eq!(moments[1].belief.as_ref().unwrap().resolved.state_probabilities, [0.25, 0.75]);
-    assert!(feed.take_newest().is_none(), "each frame is told once");
+    assert!(feed.take_newest().is_none(), "each frame is reported once");
 
     let action = Action {
         header,

@@ -1,4 +1,4 @@
-//! The session against the shipped checkpoint: what the window does, without a window.
+//! Tests of the session on the shipped checkpoint, without a window.
 
 mod common;
 
@@ -15,7 +15,7 @@ fn session() -> Session {
     Session::new(models())
 }
 
-/// Toggling a picture that shows all gives a scene in which probing finds what really stands there.
+/// Toggling an unambiguous image shows a scene in which probing finds the true actor.
 #[test]
 fn toggle_shows_what_the_picture_shows() {
     let mut session = session();
@@ -34,8 +34,8 @@ fn toggle_shows_what_the_picture_shows() {
     }
 }
 
-/// Predict, probe, and go on by the belief's most probable state: step by step this is what the stages compute, bit for
-/// bit, and the decisions that are written down rest on these steps.
+/// Predicting, probing and continuing by the belief's most probable state computes the same as the stages, bit for bit.
+/// The recorded decisions use these steps.
 #[test]
 fn follows_the_stages_path() {
     let mut session = session();
@@ -68,7 +68,7 @@ fn follows_the_stages_path() {
     assert_eq!(session.journal.decisions().len(), 3);
 }
 
-/// Going on follows the shown scene's state, not the most probable one; the path's probability is that state's.
+/// Continuing follows the shown scene's state, not the most probable one; the path's probability is that state's.
 #[test]
 fn goes_on_from_the_shown_scene() {
     let mut session = session();
@@ -78,7 +78,7 @@ fn goes_on_from_the_shown_scene() {
     let belief = session.moment().unwrap().belief.clone().unwrap();
     let other = (0..belief.samples.len())
         .find(|&i| belief.samples[i].reading.state.is_some_and(|s| s != belief.resolved.state))
-        .expect("a view that hides the place leaves several states open");
+        .expect("a view that hides the place is ambiguous");
     session.select(Selection::Sample(other)).unwrap();
     assert_eq!(session.shown().unwrap().latent, belief.draws[other].latent);
     assert_eq!(session.moment().unwrap().found.as_ref().unwrap().probed, belief.samples[other]);
@@ -90,7 +90,7 @@ fn goes_on_from_the_shown_scene() {
     assert!(moment.belief.is_none() && moment.found.is_none());
 }
 
-/// Back and forward show what was there, with the scene that was chosen; the horizon ends the way, a longer one opens
+/// Back and forward restore the entry with its chosen scene. The horizon limits the path, and a longer horizon extends
 /// it.
 #[test]
 fn history_and_horizon() {
@@ -105,7 +105,7 @@ fn history_and_horizon() {
     assert_eq!(session.probe_and_predict(), Err(SessionError::Horizon { step: 2 }));
     assert!(session.back());
     assert_eq!((session.shown().unwrap().latent, session.shown().unwrap().selection), (first.latent, first.selection));
-    assert!(session.moment().unwrap().belief.is_some(), "what was probed stays probed");
+    assert!(session.moment().unwrap().belief.is_some(), "a probed step stays probed");
     assert!(session.back() && !session.back());
     assert_eq!(session.moment().unwrap().step, 0);
     assert!(session.forward() && session.forward() && !session.forward());
@@ -115,7 +115,8 @@ fn history_and_horizon() {
     assert_eq!(session.history().entries().len(), 4);
 }
 
-/// Predicting again draws again in place: the same for the same seed, others for another, as many as are asked for.
+/// Predicting again draws again in place: equal latents for the same seed, others for another seed, in the requested
+/// number.
 #[test]
 fn predicting_again_draws_again() {
     let mut session = session();
@@ -134,7 +135,7 @@ fn predicting_again_draws_again() {
     assert_eq!((session.history().entries().len(), session.scenes().len()), (2, 1 + first.mixture.weights.len() + 64));
 }
 
-/// What cannot be done is an error that says what to do, and changes nothing.
+/// An impossible command returns an error with a remedy, and changes nothing.
 #[test]
 fn errors_say_what_to_do() {
     let mut session = session();
@@ -150,7 +151,7 @@ fn errors_say_what_to_do() {
     assert_eq!(session.moment().unwrap().selection, Selection::Source);
 }
 
-/// Without a forecaster a checkpoint still toggles and probes; forecasting says how to train the part that is missing.
+/// A checkpoint without a forecaster still toggles and probes; forecasting reports how to train the missing part.
 #[test]
 fn a_checkpoint_without_forecaster_toggles() {
     let folder = copy_without(&["mixture.safetensors"]);
@@ -161,8 +162,8 @@ fn a_checkpoint_without_forecaster_toggles() {
     assert!(error.to_string().contains("carff train --stage mdn"), "{error}");
 }
 
-/// A graph's newer frame takes the place of the one before: the same step stays in view, and a sample that was chosen;
-/// scenes are marked as far as the graph's belief has come.
+/// A newer frame of the graph replaces the shown one: the step and a chosen sample stay in view. Scenes are marked as
+/// far as the graph's belief is known.
 #[test]
 fn follows_a_running_graph() {
     let mut other = session();
@@ -176,7 +177,7 @@ fn follows_a_running_graph() {
     let (older, newer) = (moments(HIDING_VIEW), moments(ABOVE_VIEW));
     let mut session = session();
     session.follow(older);
-    assert_eq!(session.moment().unwrap().step, 1, "the first forecast is what is shown at first");
+    assert_eq!(session.moment().unwrap().step, 1, "the first forecast is shown first");
     session.select(Selection::Sample(3)).unwrap();
     session.follow(newer.clone());
     let moment = session.moment().unwrap();
@@ -184,7 +185,7 @@ fn follows_a_running_graph() {
     assert_eq!(moment.found.as_ref().unwrap().probed, newer[1].belief.as_ref().unwrap().samples[3]);
     assert_eq!(session.history().entries().len(), 2);
 
-    // Where nothing was chosen, a component stays as long as it weighs half as much as the heaviest.
+    // Without a choice, a component stays while its weight is at least half of the largest weight.
     let weighed = |weights: [f32; 4]| {
         let mut moments = newer.clone();
         moments[1].forecast.as_mut().unwrap().mixture.weights = weights.to_vec();
@@ -202,8 +203,8 @@ fn follows_a_running_graph() {
     }
 }
 
-/// Pictures are found by state and view, leafing passes over views that show too much, and a data set of another
-/// scenario is refused with the key that differs.
+/// Images are found by state and view, and browsing skips views with another visibility. A dataset of another scenario
+/// is refused with the key that differs.
 #[test]
 fn albums_are_leafed_through() {
     let folder = copy_without(&["manifest.json"]);

@@ -1,6 +1,6 @@
-//! The window, without a screen: what is pressed is found by its label, and what it does is seen in the session.
+//! Tests of the window without a screen: they press elements by label and check the session.
 
-#![allow(clippy::unwrap_used, reason = "also in what the tests share")]
+#![allow(clippy::unwrap_used, reason = "also in shared fixtures")]
 
 mod common;
 
@@ -13,13 +13,13 @@ use egui_kittest::kittest::{NodeT, Queryable};
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-/// Longest wait for a picture: no limit on how long drawing may take, but on a test that hangs.
+/// Longest wait for an image. It only bounds a test that hangs.
 const PATIENCE: Duration = Duration::from_secs(300);
 
-/// A window with small pictures; `None`: no picture yet.
+/// Creates a window with small images; `None`: no image yet.
 fn window(view: Option<usize>, folder: &Path) -> Harness<'static, Viewer> {
     let options = Options { threads: 1, folder: folder.to_owned(), theme: ThemePreference::Dark, one_shot: None };
-    let none = Err("No data set: drop a PNG picture here.".to_owned());
+    let none = Err("No dataset: drop a PNG image here.".to_owned());
     let mut viewer = Viewer::new(Session::new(models()), none, None, options, Waker::default()).unwrap();
     viewer.finest_px = 96;
     if let Some(view) = view {
@@ -49,13 +49,13 @@ fn step(harness: &Harness<'static, Viewer>) -> u32 {
 fn wait_until_drawn(harness: &mut Harness<'static, Viewer>) {
     let since = Instant::now();
     while !harness.state().is_drawn() {
-        assert!(since.elapsed() < PATIENCE, "the scene is not drawn");
+        assert!(since.elapsed() < PATIENCE, "the scene is not rendered");
         std::thread::sleep(Duration::from_millis(10));
         harness.run_steps(1);
     }
 }
 
-/// The three functions and the way back and forward, by their buttons; one that would do nothing cannot be pressed.
+/// The three main commands, back and forward work by their buttons; a button without effect is disabled.
 #[test]
 fn buttons_look_ahead() {
     let folder = tempfile::tempdir().unwrap();
@@ -67,7 +67,7 @@ fn buttons_look_ahead() {
     click(&mut harness, "Probe");
     let belief = harness.state().session.moment().unwrap().belief.clone().unwrap();
     assert_eq!(belief.samples.len(), 10);
-    assert!(harness.query_by_label("halt").is_some(), "what a rule decides is in the log");
+    assert!(harness.query_by_label("halt").is_some(), "the rule's decision is in the log");
     click(&mut harness, "Probe and predict");
     assert_eq!(step(&harness), 2);
     assert!(harness.get_by_label("Probe and predict").accesskit_node().is_disabled());
@@ -81,7 +81,7 @@ fn buttons_look_ahead() {
     assert!(harness.state().session.moment().unwrap().forecast.is_none());
 }
 
-/// A small picture that is pressed shows its scene; so does a state of the belief; marks follow what is shown.
+/// A pressed thumbnail shows its scene; so does a state of the belief. Marks follow the shown scene.
 #[test]
 fn scenes_are_chosen() {
     let folder = tempfile::tempdir().unwrap();
@@ -98,7 +98,7 @@ fn scenes_are_chosen() {
     assert_eq!(harness.state().session.moment().unwrap().selection, Selection::State(4));
 }
 
-/// Every function has its key; the help lists them, and Escape is not needed to go on.
+/// Every command has its key; the help lists the keys and does not block the window.
 #[test]
 fn keys_do_the_same() {
     let folder = tempfile::tempdir().unwrap();
@@ -123,9 +123,9 @@ fn keys_do_the_same() {
     press(&mut harness, Modifiers::NONE, Key::O);
     assert!(harness.state().session.moment().unwrap().found.is_some());
     press(&mut harness, Modifiers::NONE, Key::F1);
-    assert!(harness.query_by_label("Probe: what stands where, and the belief").is_some());
+    assert!(harness.query_by_label("Probe: occupancy of each place, and the belief").is_some());
     press(&mut harness, Modifiers::NONE, Key::F1);
-    assert!(harness.query_by_label("Probe: what stands where, and the belief").is_none());
+    assert!(harness.query_by_label("Probe: occupancy of each place, and the belief").is_none());
     press(&mut harness, Modifiers::NONE, Key::L);
     assert_eq!(harness.ctx.theme(), Theme::Light);
     press(&mut harness, Modifiers::NONE, Key::B);
@@ -133,7 +133,7 @@ fn keys_do_the_same() {
     assert!(!harness.state().overlays.boxes && !harness.state().overlays.densities);
 }
 
-/// Dragging turns the camera, with the other button it moves, the wheel goes nearer; keys set it.
+/// Dragging turns the camera, dragging with the other button moves it, the wheel zooms, and keys set it.
 #[test]
 fn the_mouse_moves_the_camera() {
     let folder = tempfile::tempdir().unwrap();
@@ -167,7 +167,7 @@ fn the_mouse_moves_the_camera() {
     assert_eq!(harness.state().camera, before);
 }
 
-/// The scene is drawn in the end, and can be saved; a window with no picture says what to do, and its functions wait.
+/// The scene is rendered and can be saved. A window without an image shows what to do, and its commands are disabled.
 #[test]
 fn scenes_are_drawn_and_saved() {
     let folder = tempfile::tempdir().unwrap();
@@ -184,5 +184,5 @@ fn scenes_are_drawn_and_saved() {
     for label in ["Toggle", "Predict", "Probe", "Probe and predict"] {
         assert!(harness.get_by_label(label).accesskit_node().is_disabled(), "{label}");
     }
-    assert!(harness.query_by_label("No data set: drop a PNG picture here.").is_some());
+    assert!(harness.query_by_label("No dataset: drop a PNG image here.").is_some());
 }

@@ -1,7 +1,7 @@
 //! Cameras, rays and boxes, with their spaces and units.
 //!
 //! World: metres, +Z up. Camera: OpenGL axes (+X right, +Y up, -Z forward).
-//! Pictures: pixel (0, 0) is the top left one, its centre at (0.5, 0.5).
+//! Images: pixel (0, 0) is the top left one, with its centre at (0.5, 0.5).
 //!
 //! ```
 //! use carff_base::geometry::PinholeCamera;
@@ -19,11 +19,11 @@ pub struct Ray {
     pub origin: [f32; 3],
     /// Unit vector, world space.
     pub direction: [f32; 3],
-    /// Width of its pixel at one metre along the ray, metres; 0 for a ray that is no pixel's.
+    /// Width of its pixel at one metre along the ray, metres; 0 for a ray without a pixel.
     pub spread: f32,
 }
 
-/// Why a camera is not usable.
+/// Reason why a camera is not usable.
 #[derive(Debug, thiserror::Error, PartialEq, Eq)]
 pub enum CameraError {
     /// A number is NaN or infinite.
@@ -40,9 +40,9 @@ pub enum CameraError {
 /// An ideal pinhole camera at a known pose.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct PinholeCamera {
-    /// Picture width, pixels.
+    /// Image width, pixels.
     pub width_px: u32,
-    /// Picture height, pixels.
+    /// Image height, pixels.
     pub height_px: u32,
     /// Focal length along x, pixels.
     pub fl_x_px: f64,
@@ -76,8 +76,8 @@ impl PinholeCamera {
         extent_m / 2.0 / (Self::ABOVE_FOV_DEG / 2.0).to_radians().tan()
     }
 
-    /// A camera at `eye` that looks at `target`, with a horizontal field of view in degrees and square pixels.
-    /// When the view direction is parallel to `up`, another up vector is taken.
+    /// Returns a camera at `eye` that looks at `target`, with a horizontal field of view in degrees and square pixels.
+    /// If the view direction is parallel to `up`, another up vector is used.
     pub fn look_at(
         eye: [f64; 3],
         target: [f64; 3],
@@ -110,13 +110,13 @@ impl PinholeCamera {
         }
     }
 
-    /// Where the camera stands, metres, world space.
+    /// Returns the camera's position, metres, world space.
     pub fn position_m(&self) -> [f64; 3] {
         let m = &self.world_from_camera;
         [m[0][3], m[1][3], m[2][3]]
     }
 
-    /// The ray through picture coordinates (`x_px`, `y_px`); a pixel's centre is at +0.5.
+    /// Returns the ray through image coordinates (`x_px`, `y_px`); a pixel's centre is at +0.5.
     pub fn ray(&self, x_px: f64, y_px: f64) -> Ray {
         let in_camera = [(x_px - self.cx_px) / self.fl_x_px, -(y_px - self.cy_px) / self.fl_y_px, -1.0];
         let m = &self.world_from_camera;
@@ -131,8 +131,8 @@ impl PinholeCamera {
         }
     }
 
-    /// Where a world point falls in the picture: (x, y) in pixels and the depth along the optical axis in metres;
-    /// `None` when it is behind the camera.
+    /// Projects a world point into the image: (x, y) in pixels, and the depth along the optical axis in metres; `None`
+    /// if it is behind the camera.
     pub fn project(&self, point_m: [f64; 3]) -> Option<([f64; 2], f64)> {
         let m = &self.world_from_camera;
         let d = sub(point_m, self.position_m());
@@ -142,7 +142,7 @@ impl PinholeCamera {
             .then(|| ([self.cx_px + self.fl_x_px * c[0] / depth, self.cy_px - self.fl_y_px * c[1] / depth], depth))
     }
 
-    /// The same camera with a picture of another size.
+    /// Returns the same camera with another image size.
     #[must_use]
     pub fn resized(&self, width_px: u32, height_px: u32) -> Self {
         let sx = f64::from(width_px) / f64::from(self.width_px);
@@ -158,7 +158,7 @@ impl PinholeCamera {
         }
     }
 
-    /// Checks that sizes are positive, all is finite, and the pose is a rigid motion.
+    /// Checks that sizes are positive, all numbers are finite, and the pose is a rigid motion.
     pub fn validate(&self) -> Result<(), CameraError> {
         for (name, value) in [("fl_x", self.fl_x_px), ("fl_y", self.fl_y_px)] {
             if !value.is_finite() {
@@ -197,12 +197,12 @@ impl PinholeCamera {
     }
 }
 
-/// A box turned about the vertical axis.
+/// A box that is rotated about the vertical axis.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct OrientedBox {
     /// Centre, metres, world space.
     pub center: [f64; 3],
-    /// Half the extent along the box's own axes, metres.
+    /// Half of the extent along the box's own axes, metres.
     pub half_size: [f64; 3],
     /// Rotation about +Z, radians; 0 puts the box's length along +X.
     #[serde(default)]
@@ -210,14 +210,14 @@ pub struct OrientedBox {
 }
 
 impl OrientedBox {
-    /// World point of box coordinates in [-1, 1]^3.
+    /// Returns the world point of box coordinates in [-1, 1]^3.
     pub fn point(&self, unit: [f64; 3]) -> [f64; 3] {
         let (s, c) = self.yaw.sin_cos();
         let l = [0, 1, 2].map(|i| unit[i] * self.half_size[i]);
         [self.center[0] + c * l[0] - s * l[1], self.center[1] + s * l[0] + c * l[1], self.center[2] + l[2]]
     }
 
-    /// Whether a ray meets the box in front of its start.
+    /// Returns true if a ray hits the box in front of its origin.
     pub fn is_met_by(&self, ray: &Ray) -> bool {
         let (s, c) = self.yaw.sin_cos();
         let turned = |v: [f64; 3]| [c * v[0] + s * v[1], -s * v[0] + c * v[1], v[2]];
@@ -226,14 +226,14 @@ impl OrientedBox {
         let (mut near, mut far) = (0.0_f64, f64::INFINITY);
         for axis in 0..3 {
             let [a, b] = [-1.0, 1.0].map(|side| (side * self.half_size[axis] - origin[axis]) / direction[axis]);
-            // Along a face both are infinite or no number, and `min` and `max` pass over the latter.
+            // Along a face both values are infinite or NaN, and `min` and `max` ignore NaN.
             near = near.max(a.min(b));
             far = far.min(a.max(b));
         }
         near <= far
     }
 
-    /// Whether a world point lies inside (faces included).
+    /// Returns true if a world point is inside the box (including its faces).
     pub fn contains(&self, point_m: [f64; 3]) -> bool {
         let (s, c) = self.yaw.sin_cos();
         let d = sub(point_m, self.center);
@@ -263,7 +263,7 @@ fn normalize(a: [f64; 3]) -> [f64; 3] {
 mod tests {
     use super::*;
 
-    /// Projecting a point of a pixel's ray gives that pixel back.
+    /// Projecting a point of a pixel's ray returns that pixel.
     #[test]
     fn project_inverts_ray() {
         let camera = PinholeCamera::look_at([3.0, -4.0, 2.0], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0], 128, 96, 60.0);
@@ -275,7 +275,7 @@ mod tests {
         assert!(depth > 0.0 && depth < 7.0);
     }
 
-    /// Straight down works too, and the picture's up is the given one.
+    /// A camera can look straight down, with the given up direction in the image.
     #[test]
     fn look_straight_down() {
         let camera = PinholeCamera::look_at([0.0, 0.0, 20.0], [0.0, 0.0, 0.0], [0.0, 1.0, 0.0], 128, 128, 60.0);
@@ -294,7 +294,7 @@ mod tests {
         assert_eq!(camera.validate(), Err(CameraError::NotFinite("transform_matrix")));
     }
 
-    /// A turned box contains its own points, and none above it.
+    /// A rotated box contains its own points, and not a point above it.
     #[test]
     fn a_box_contains_its_points() {
         let b = OrientedBox { center: [1.0, 2.0, 3.0], half_size: [2.0, 1.0, 0.5], yaw: 0.7 };
@@ -314,7 +314,8 @@ mod tests {
         assert!((x - 64.0).abs() < 1e-9, "{x}");
     }
 
-    /// A box is met by rays through it from any side, turned or not, and not by rays beside it, away from it, or along it.
+    /// Rays through the box from any side hit it, rotated or not; rays next to it, away from it, or parallel to it do
+    /// not.
     #[test]
     fn boxes_are_met() {
         let upright = OrientedBox { center: [3.0, 0.0, 1.0], half_size: [1.0, 0.2, 1.0], yaw: 0.0 };

@@ -1,11 +1,11 @@
-//! The ground of all crates: plain mathematics and words, without a message, a file format or a process.
+//! The base of all crates: mathematics and texts, without messages, file formats or processes.
 //!
 //! | module | content |
 //! |---|---|
 //! | [`geometry`] | cameras, rays and boxes, with their spaces and units |
-//! | [`random`] | random streams that are named by what they are drawn for |
+//! | [`random`] | random streams, named by their purpose |
 //! | [`statistics`] | percentiles, intervals and PSNR |
-//! | [`names`] | suggestions for names that do not exist |
+//! | [`names`] | suggestions for unknown names |
 //! | [`errors`] | an error and its causes as one sentence |
 
 pub mod errors;

@@ -1,5 +1,4 @@
-//! The nearest of the names that exist, for errors: what was probably meant by a name that does not. Nothing is decided
-//! by it.
+//! Suggestions of existing names for errors about unknown names. No decision depends on them.
 //!
 //! ```
 //! use carff_base::names::{hint, nearest};
@@ -13,13 +12,13 @@
 
 use std::path::{Path, PathBuf};
 
-/// Shortest name that is looked for inside longer ones.
+/// Minimum length of a name that is searched inside longer ones.
 const MIN_PART: usize = 3;
-/// Most entries of a folder that are looked at.
+/// Maximum number of folder entries that are compared.
 const MAX_ENTRIES: usize = 1000;
 
-/// The known name that is nearest to `name`: a third of its letters may differ, or it is a part of the known one. The
-/// last part of a known name with slashes counts too. None when nothing is near.
+/// Returns the known name that is nearest to `name`: at most a third of its letters differ, or it is a part of the
+/// known name. The last part of a known name with slashes counts too. `None` if nothing is near.
 pub fn nearest<'a>(name: &str, known: impl IntoIterator<Item = &'a str>) -> Option<&'a str> {
     let wanted = name.to_lowercase();
     let letters = wanted.chars().count();
@@ -32,7 +31,7 @@ pub fn nearest<'a>(name: &str, known: impl IntoIterator<Item = &'a str>) -> Opti
         let rank = if distance <= allowed && distance < letters {
             distance
         } else if letters >= MIN_PART && lower.contains(&wanted) {
-            // Behind all misspellings; the shorter of two that hold it is nearer.
+            // Parts rank behind all misspellings; of two names that contain it, the shorter is nearer.
             letters + lower.len()
         } else {
             continue;
@@ -44,12 +43,12 @@ pub fn nearest<'a>(name: &str, known: impl IntoIterator<Item = &'a str>) -> Opti
     best.map(|(_, candidate)| candidate)
 }
 
-/// What an error about an unknown name ends with: "; did you mean `x`?", or nothing.
+/// Returns the end of an error about an unknown name: "; did you mean `x`?", or nothing.
 pub fn hint<'a>(name: &str, known: impl IntoIterator<Item = &'a str>) -> String {
     nearest(name, known).map(|found| format!("; did you mean `{found}`?")).unwrap_or_default()
 }
 
-/// A message of serde about an unknown field or variant, with the hint behind it; any other one as it is.
+/// Adds the hint to a message of serde about an unknown field or variant; other messages are unchanged.
 ///
 /// ```
 /// let message = "unknown field `horizn`, expected one of `name`, `horizon`";
@@ -64,12 +63,12 @@ fn serde_hint(message: &str) -> Option<String> {
     let (_, rest) = message.split_once("unknown field `").or_else(|| message.split_once("unknown variant `"))?;
     let (name, rest) = rest.split_once('`')?;
     let (_, known) = rest.split_once("expected ")?;
-    // What stands between backquotes: every second piece.
+    // Text between backquotes: every second piece.
     Some(hint(name, known.split('`').skip(1).step_by(2)))
 }
 
-/// The same for a path that does not exist: the nearest name in the folder where the path breaks off. Nothing for one
-/// that exists.
+/// Returns the hint for a path that does not exist: the nearest name in the last existing folder of the path. Empty for
+/// an existing path.
 pub fn beside(path: &Path) -> String {
     sibling(path).map(|found| format!("; did you mean {}?", found.display())).unwrap_or_default()
 }
@@ -100,7 +99,7 @@ fn sibling(path: &Path) -> Option<PathBuf> {
 mod tests {
     use super::*;
 
-    /// Misspellings, swapped letters, case and parts are found; the nearest wins; what is far off is not guessed.
+    /// Misspellings, swapped letters, case and parts are found; the nearest name wins; distant names are not suggested.
     #[test]
     fn the_nearest_or_none() {
         let known = ["horizon", "samples", "sampling", "seed", "frame_rate_hz"];
@@ -118,7 +117,7 @@ mod tests {
         }
     }
 
-    /// Messages of serde of every form get their hint; others are left alone.
+    /// Messages of serde of every form get their hint; other messages are unchanged.
     #[test]
     fn messages_of_serde() {
         for (message, end) in [
@@ -133,8 +132,8 @@ mod tests {
         }
     }
 
-    /// A missing file is compared with its neighbours, with or without its extension, and so is a missing folder; one
-    /// that exists, or has no neighbours, gets nothing.
+    /// A missing file is compared with its neighbours, with or without its extension, and so is a missing folder. An
+    /// existing path, or one without neighbours, gets no hint.
     #[test]
     fn missing_paths() {
         let root = tempfile::tempdir().unwrap();

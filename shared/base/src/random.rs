@@ -1,7 +1,7 @@
-//! Counter-based random streams, one for each draw that a run makes.
+//! Counter-based random streams, one per draw of a run.
 //!
-//! A stream is named by (run seed, frame, step, sample), so a draw never depends on how many draws went before it,
-//! in which thread or process it is made, or whether a frame was skipped.
+//! A stream is named by (run seed, frame, step, sample). So a draw does not depend on earlier draws, on its thread or
+//! process, or on skipped frames.
 //!
 //! ```
 //! let a = carff_base::random::gaussians::<8>(carff_base::random::Key { seed: 7, frame: 3, step: 1, sample: 0 });
@@ -13,7 +13,7 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::StandardNormal;
 
-/// Names one stream.
+/// Name of a stream.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub struct Key {
     /// The run's seed.
@@ -27,7 +27,7 @@ pub struct Key {
 }
 
 impl Key {
-    /// Key of one purpose's stream: its step is the purpose's name, at most four ASCII characters.
+    /// Returns the key of one purpose's stream: its step is the purpose's name, at most four ASCII characters.
     ///
     /// ```
     /// let key = carff_base::random::Key::named("mdn", 7, 3);
@@ -43,7 +43,7 @@ impl Key {
     }
 }
 
-/// Number of a purpose's name: at most eight ASCII characters, the first in the highest byte.
+/// Returns the number of a purpose's name: at most eight ASCII characters, the first in the highest byte.
 ///
 /// ```
 /// assert_eq!(carff_base::random::tag("svm fold"), 0x7376_6d20_666f_6c64);
@@ -63,7 +63,7 @@ pub const fn tag(purpose: &str) -> u64 {
     number
 }
 
-/// The stream of a key.
+/// Returns the stream of a key.
 pub fn stream(key: Key) -> ChaCha8Rng {
     let mut seed = [0_u8; 32];
     seed[0..8].copy_from_slice(&key.seed.to_le_bytes());
@@ -73,13 +73,13 @@ pub fn stream(key: Key) -> ChaCha8Rng {
     ChaCha8Rng::from_seed(seed)
 }
 
-/// `N` independent draws from the standard normal distribution.
+/// Returns `N` independent draws from the standard normal distribution.
 pub fn gaussians<const N: usize>(key: Key) -> [f32; N] {
     let mut rng = stream(key);
     std::array::from_fn(|_| rng.sample(StandardNormal))
 }
 
-/// One uniform draw in [0, 1).
+/// Returns a uniform draw in [0, 1).
 pub fn uniform(key: Key) -> f64 {
     stream(key).random()
 }

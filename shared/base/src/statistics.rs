@@ -5,12 +5,13 @@
 //! assert!(low > 0.91 && high < 0.99);
 //! ```
 
-/// Peak signal-to-noise ratio in dB of values in 0..=1, capped at 100; `None` for no values, or for different lengths.
+/// Returns the peak signal-to-noise ratio in dB of values in 0..=1, capped at 100; `None` without values, or for
+/// different lengths.
 pub fn psnr_db(image: &[f32], truth: &[f32]) -> Option<f64> {
     psnr_where(image, truth, |_| true)
 }
 
-/// [`psnr_db`] over the values whose index `counts`; `None` when no value counts.
+/// Returns [`psnr_db`] over the values whose index `counts`; `None` if no value counts.
 pub fn psnr_where(image: &[f32], truth: &[f32], counts: impl Fn(usize) -> bool) -> Option<f64> {
     if image.len() != truth.len() {
         return None;
@@ -25,12 +26,12 @@ pub fn psnr_where(image: &[f32], truth: &[f32], counts: impl Fn(usize) -> bool) 
     (n > 0).then(|| psnr_of_mse(sum / n as f64))
 }
 
-/// PSNR in dB for a mean squared error of values in 0..=1, capped at 100.
+/// Returns the PSNR in dB for a mean squared error of values in 0..=1, capped at 100.
 pub fn psnr_of_mse(mean_squared_error: f64) -> f64 {
     (-10.0 * mean_squared_error.max(1e-10).log10()).min(100.0)
 }
 
-/// The 95 % Wilson score interval of a proportion, `[low, high]` in 0..=1; `[0, 1]` for no trials.
+/// Returns the 95 % Wilson score interval of a proportion, `[low, high]` in 0..=1; `[0, 1]` without trials.
 pub fn wilson_interval(successes: usize, trials: usize) -> [f64; 2] {
     if trials == 0 {
         return [0.0, 1.0];
@@ -44,7 +45,7 @@ pub fn wilson_interval(successes: usize, trials: usize) -> [f64; 2] {
     [(centre - half).max(0.0), (centre + half).min(1.0)]
 }
 
-/// Percentile of `values` by nearest rank, for a share `q` in 0..=1; `None` for no values.
+/// Returns the percentile of `values` by nearest rank, for a share `q` in 0..=1; `None` without values.
 ///
 /// ```
 /// assert_eq!(carff_base::statistics::percentile(&[3.0, 1.0, 2.0], 0.5), Some(2.0));
@@ -55,7 +56,7 @@ pub fn percentile(values: &[f64], q: f64) -> Option<f64> {
     percentile_of_sorted(&sorted, q)
 }
 
-/// [`percentile`] of sorted values.
+/// Returns the [`percentile`] of sorted values.
 pub fn percentile_of_sorted(sorted: &[f64], q: f64) -> Option<f64> {
     let rank = (q.clamp(0.0, 1.0) * sorted.len() as f64).ceil() as usize;
     sorted.get(rank.saturating_sub(1)).copied()
@@ -73,7 +74,7 @@ pub struct Spread {
 }
 
 impl Spread {
-    /// Spread of `values`; `None` for no values.
+    /// Returns the spread of `values`; `None` without values.
     pub fn of(values: &[f64]) -> Option<Self> {
         let mut sorted = values.to_vec();
         sorted.sort_by(f64::total_cmp);
@@ -85,7 +86,7 @@ impl Spread {
     }
 }
 
-/// Mean of `values`; `None` for no values.
+/// Returns the mean of `values`; `None` without values.
 pub fn mean(values: &[f64]) -> Option<f64> {
     (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
 }

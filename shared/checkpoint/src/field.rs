@@ -1,4 +1,4 @@
-//! The field's weights: safetensors, in half precision, with no tensor library.
+//! The field's weights: safetensors in half precision, read without a tensor library.
 
 use crate::{CheckpointError, Manifest, files};
 use carff_field::{Field, FieldConfig};
@@ -9,7 +9,7 @@ use safetensors::{
 };
 use std::path::Path;
 
-/// Reads the field.
+/// Reads the field of a checkpoint.
 pub fn load_field(dir: &Path, manifest: &Manifest) -> Result<Field, CheckpointError> {
     let path = dir.join(files::FIELD);
     let missing = || CheckpointError::Missing { path: dir.into(), part: "field", stage: "nerf" };
@@ -37,7 +37,7 @@ fn read(dir: &Path, path: &Path, config: FieldConfig) -> Result<Field, Checkpoin
     Field::from_tensors(config, rows).map_err(|source| CheckpointError::Field { path: dir.into(), source })
 }
 
-/// A tensor's numbers, of whichever type they are.
+/// Returns a tensor's values as `f32`; `None` for an unknown type.
 fn values(tensor: &TensorView<'_>) -> Option<Vec<f32>> {
     let data = tensor.data();
     let pairs = || data.as_chunks::<2>().0.iter();
@@ -50,7 +50,7 @@ fn values(tensor: &TensorView<'_>) -> Option<Vec<f32>> {
     })
 }
 
-/// Writes the field: weights in half precision, bit fields as bytes; the file appears whole or not at all.
+/// Writes the field atomically: weights in half precision, bit fields as bytes.
 pub fn save_field(dir: &Path, field: &Field) -> Result<(), CheckpointError> {
     let path = dir.join(files::FIELD);
     let wrong =
@@ -97,7 +97,7 @@ mod tests {
         }
     }
 
-    /// What was written comes back, rounded to half precision as training rounds what it judges.
+    /// A written field is read back, rounded to half precision as training rounds the evaluated weights.
     #[test]
     fn weights_come_back_in_half_precision() {
         let folder = tempfile::tempdir().unwrap();
@@ -108,13 +108,13 @@ mod tests {
         assert_ne!(loaded.tensors(), field.tensors());
         field.round_to_f16();
         assert_eq!(loaded.tensors(), field.tensors());
-        // A second time nothing is lost.
+        // A second round trip changes nothing.
         let bytes = std::fs::read(&path).unwrap();
         save_field(folder.path(), &loaded).unwrap();
         assert_eq!(std::fs::read(&path).unwrap(), bytes);
     }
 
-    /// Each type that weights come in is read as the numbers it stands for; another is refused by its name.
+    /// Each known type of weights is read with its values; another type is refused by its name.
     #[test]
     fn types_of_numbers() {
         let numbers = [0.5_f32, -2.0, 96.0];

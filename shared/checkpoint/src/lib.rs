@@ -1,9 +1,9 @@
 //! A trained scenario on disk: manifest and weights.
 //!
-//! A checkpoint is a folder: `manifest.json` says what was trained, on what, how and how well; the weights lie beside
-//! it as safetensors. Nothing in it is code. What does not fit is an error that names the key. The field's weights are
-//! read here; those of the networks in tch are read in `carff_networks`, so that whoever needs none of them is not linked
-//! with libtorch.
+//! A checkpoint is a folder with `manifest.json` and weights as safetensors. The manifest records the scenario, the
+//! training and its results. A checkpoint contains no code. Contents that do not match are an error that names the key.
+//! This crate reads the field's weights. `carff_networks` reads the weights of the tch networks, so that programs
+//! without them do not link libtorch.
 
 mod field;
 mod planning;
@@ -22,12 +22,12 @@ use serde::{Deserialize, Serialize};
 use shapes::{DecoderConfig, EncoderConfig, MixtureConfig};
 use std::path::{Path, PathBuf};
 
-/// The format that this program writes and reads.
+/// Version of the format that this program writes and reads.
 pub const FORMAT_VERSION: u32 = 1;
-/// A manifest is larger than this only by mistake.
+/// Maximum size of a manifest.
 const MAX_MANIFEST_BYTES: u64 = 16 << 20;
 
-/// Why a checkpoint cannot be used.
+/// Reason why a checkpoint cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum CheckpointError {
     /// A file could not be read or written.
@@ -36,76 +36,76 @@ pub enum CheckpointError {
         carff_base::names::beside(path)
     )]
     File {
-        /// Which file.
+        /// Path of the file.
         path: PathBuf,
-        /// What the system said.
+        /// Error of the system.
         source: std::io::Error,
     },
-    /// The manifest is not one.
+    /// The manifest is not valid.
     #[error("checkpoint {path}: {what}")]
     Manifest {
-        /// Which file.
+        /// Path of the file.
         path: PathBuf,
-        /// What is wrong.
+        /// Description of the error.
         what: String,
     },
-    /// The checkpoint was trained on another scenario than the data set shows.
-    #[error("checkpoint {path} is of another scenario: `{key}` is {trained} there, and {given} in the data set")]
+    /// The checkpoint's scenario differs from the dataset's.
+    #[error("checkpoint {path} is of another scenario: `{key}` is {trained} there, and {given} in the dataset")]
     Scenario {
-        /// Which manifest.
+        /// Path of the manifest.
         path: PathBuf,
-        /// The key that differs.
+        /// Name of the key that differs.
         key: &'static str,
-        /// What the checkpoint says.
+        /// Value in the checkpoint.
         trained: String,
-        /// What the data set says.
+        /// Value in the dataset.
         given: String,
     },
-    /// A part is not there yet: training has not come so far.
+    /// A part is missing: its training phase has not run.
     #[error("checkpoint {path} has no {part}: run `carff train --stage {stage}`")]
     Missing {
-        /// Which checkpoint.
+        /// Path of the checkpoint.
         path: PathBuf,
-        /// What is missing.
+        /// Name of the missing part.
         part: &'static str,
-        /// The training stage that makes it.
+        /// Training phase of the part.
         stage: &'static str,
     },
     /// A weights file cannot be read or written, or does not fit.
     #[error("checkpoint {path}: {what}")]
     Weights {
-        /// Which checkpoint.
+        /// Path of the checkpoint.
         path: PathBuf,
-        /// What is wrong, and in which file.
+        /// Description of the error, with the file.
         what: String,
     },
-    /// The field's weights do not fit.
+    /// The field's weights do not match.
     #[error("checkpoint {path}: {source}")]
     Field {
-        /// Which checkpoint.
+        /// Path of the checkpoint.
         path: PathBuf,
-        /// What is wrong.
+        /// Error of the field.
         source: carff_field::FieldError,
     },
-    /// The probing section is wrong.
+    /// The probing section is not valid.
     #[error("checkpoint {path}: {source}")]
     Probing {
-        /// Which checkpoint.
+        /// Path of the checkpoint.
         path: PathBuf,
-        /// What is wrong.
+        /// Error of the section.
         source: ProbingError,
     },
 }
 
-/// What a scenario is known by.
+/// Identity of a scenario.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ScenarioIdentity {
-    /// Its name.
+    /// Name of the scenario.
     pub name: String,
     /// Names of the branches.
     pub branches: Vec<String>,
-    /// Steps per branch.
+    /// Number of time steps per branch.
     pub timestamps: usize,
     /// Branches in which the hazard action is right.
     pub hazard_branches: Vec<usize>,
@@ -114,7 +114,7 @@ pub struct ScenarioIdentity {
 }
 
 impl ScenarioIdentity {
-    /// The identity of a data set's scenario.
+    /// Returns the identity of a dataset's scenario.
     pub fn of(scenario: &ScenarioInfo, poses: usize) -> Self {
         Self {
             name: scenario.name.clone(),
@@ -125,30 +125,30 @@ impl ScenarioIdentity {
         }
     }
 
-    /// Number of states.
+    /// Returns the number of states.
     pub fn state_count(&self) -> usize {
         self.branches.len() * self.timestamps
     }
 
-    /// Per state whether the right action there is the hazard one.
+    /// Returns for each state whether its right action is the hazard action.
     pub fn hazard_states(&self) -> Vec<bool> {
         (0..self.state_count()).map(|s| self.hazard_branches.contains(&(s / self.timestamps.max(1)))).collect()
     }
 }
 
-/// Which poses training saw.
+/// Split of the poses for training.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SplitRecord {
     /// Seed of the split.
     pub seed: u64,
-    /// Poses never trained on.
+    /// Held-out poses.
     pub unseen: Vec<usize>,
-    /// Poses trained on, and used for thresholds and choices.
+    /// Training poses that are used for thresholds and choices.
     pub calibration: Vec<usize>,
 }
 
-/// What was trained, on what, how and how well.
+/// The manifest: scenario, split, network shapes, states, training and results.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Manifest {
@@ -158,7 +158,7 @@ pub struct Manifest {
     pub scenario: ScenarioIdentity,
     /// Seed of the training.
     pub seed: u64,
-    /// Which poses training saw.
+    /// Split of the poses for training.
     pub split: SplitRecord,
     /// Shape of the encoder.
     pub encoder: EncoderConfig,
@@ -168,31 +168,31 @@ pub struct Manifest {
     pub mixture: MixtureConfig,
     /// Structure of the field, once it is trained.
     pub field: Option<FieldConfig>,
-    /// Per known state the posterior that stands for it: what a resolved state feeds back.
+    /// Posterior of each known state, which a resolved state feeds back.
     pub states: Vec<Gaussian>,
     /// Places to probe.
     pub places: Vec<Place>,
-    /// How the places look when taken and when free, once the field is trained.
+    /// Calibration of the places' occupancy, once the field is trained.
     pub probing: Option<Calibration>,
     /// The training file, as used.
     pub training: serde_json::Value,
-    /// Figures by training stage.
+    /// Results by training phase.
     pub metrics: serde_json::Value,
 }
 
-/// Names of the files in a checkpoint.
+/// File names in a checkpoint.
 pub mod files {
-    /// The manifest.
+    /// Name of the manifest.
     pub const MANIFEST: &str = "manifest.json";
-    /// The frozen backbone.
+    /// Name of the frozen backbone's weights.
     pub const BACKBONE: &str = "backbone.safetensors";
-    /// The encoder's head.
+    /// Name of the encoder head's weights.
     pub const ENCODER: &str = "encoder.safetensors";
-    /// The decoder.
+    /// Name of the decoder's weights.
     pub const DECODER: &str = "decoder.safetensors";
-    /// The mixture density network.
+    /// Name of the mixture density network's weights.
     pub const MIXTURE: &str = "mixture.safetensors";
-    /// The field.
+    /// Name of the field's weights.
     pub const FIELD: &str = "field.safetensors";
 }
 
@@ -207,7 +207,7 @@ impl Manifest {
             return Err(wrong(format!("{size} bytes; at most {MAX_MANIFEST_BYTES} are allowed")));
         }
         let text = std::fs::read_to_string(&path).map_err(file)?;
-        // The version first: a manifest of another format may differ in every other key.
+        // The version is checked first: in another format, any other key may differ.
         let value: serde_json::Value = serde_json::from_str(&text).map_err(|e| wrong(e.to_string()))?;
         match value.get("format_version").and_then(serde_json::Value::as_u64) {
             Some(v) if v == u64::from(FORMAT_VERSION) => {}
@@ -247,7 +247,7 @@ impl Manifest {
         Ok(())
     }
 
-    /// Writes the manifest, whole or not at all.
+    /// Writes the manifest atomically.
     pub fn save(&self, dir: &Path) -> Result<(), CheckpointError> {
         let path = dir.join(files::MANIFEST);
         let file = |source| CheckpointError::File { path: path.clone(), source };
@@ -259,7 +259,7 @@ impl Manifest {
         std::fs::rename(&partial, &path).map_err(file)
     }
 
-    /// Checks that a data set shows the scenario that was trained; the error names the key that differs.
+    /// Checks that a dataset's scenario matches the trained one; the error names the key that differs.
     pub fn check_scenario(&self, dir: &Path, given: &ScenarioIdentity) -> Result<(), CheckpointError> {
         let trained = &self.scenario;
         let show = |key, a: &dyn std::fmt::Debug, b: &dyn std::fmt::Debug| CheckpointError::Scenario {

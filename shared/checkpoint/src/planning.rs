@@ -1,29 +1,29 @@
-//! The part of a checkpoint that stages without models read: the split of the poses and the calibrated threshold.
+//! The part of a checkpoint for stages without models: the split of the poses and the calibrated threshold.
 
 use carff_decision::Policy;
 use carff_messages::Rule;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 
-/// The file's name in a checkpoint folder.
+/// File name in a checkpoint folder.
 const FILE: &str = "planning.json";
-/// The file's format.
+/// Version of the file's format.
 const FORMAT_VERSION: u32 = 1;
 
-/// `planning.json` of a checkpoint.
+/// Contents of a checkpoint's `planning.json`.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CheckpointPlanning {
     /// Format of this file; 1.
     pub format_version: u32,
-    /// Seed by which the poses were split into unseen, calibration and rest.
+    /// Seed of the split into held-out, calibration and other poses.
     pub split_seed: u64,
     /// Hazard probability from which on the calibrated rule halts, 0 to 1; chosen on the calibration poses.
     pub hazard_threshold: f64,
 }
 
-/// Returns the policy of a rule: with `threshold` where one is given, else with that of the checkpoint, which only the
-/// calibrated rule reads.
+/// Returns the policy of a rule: with `threshold` if given, else with the checkpoint's threshold. Only the calibrated
+/// rule reads the threshold.
 pub fn load_policy(rule: Rule, threshold: Option<f64>, checkpoint: &Path) -> Result<Policy, CheckpointPlanningError> {
     let threshold = match (rule, threshold) {
         (_, Some(threshold)) => threshold,
@@ -33,29 +33,29 @@ pub fn load_policy(rule: Rule, threshold: Option<f64>, checkpoint: &Path) -> Res
     Ok(Policy { rule, threshold })
 }
 
-/// Why it cannot be had.
+/// Reason why the file cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum CheckpointPlanningError {
     /// The file cannot be read or written.
     #[error("{path}: {source}; is this the folder of a checkpoint that `carff train` made?")]
     Io {
-        /// Which file.
+        /// Path of the file.
         path: PathBuf,
-        /// What the system said.
+        /// Error of the system.
         source: std::io::Error,
     },
-    /// The file is not what it should be.
+    /// The file's contents are not valid.
     #[error("{path}: {problem}; make the checkpoint again with `carff train`")]
     Format {
-        /// Which file.
+        /// Path of the file.
         path: PathBuf,
-        /// What is wrong.
+        /// Description of the error.
         problem: String,
     },
 }
 
 impl CheckpointPlanning {
-    /// With this format's version.
+    /// Creates the contents with the current format version.
     pub fn new(split_seed: u64, hazard_threshold: f64) -> Self {
         Self { format_version: FORMAT_VERSION, split_seed, hazard_threshold }
     }
@@ -90,7 +90,7 @@ impl CheckpointPlanning {
 mod tests {
     use super::*;
 
-    /// What is saved is what is loaded; a missing file, another version and a bad threshold name the file and the key.
+    /// A saved file is loaded unchanged; a missing file, another version and a bad threshold name the file and the key.
     #[test]
     fn round_trip_and_errors() {
         let folder = tempfile::tempdir().unwrap();

@@ -10,7 +10,7 @@ use std::path::Path;
 /// The density probe of a trained field.
 pub type FieldProbe = DensityProbe<PreparedField>;
 
-/// A trained field with the points of one probe layout prepared.
+/// A trained field with the prepared points of one probe layout.
 #[derive(Clone, Debug)]
 pub struct PreparedField {
     field: Field,

@@ -1,4 +1,4 @@
-//! Shapes of the networks in a checkpoint: what its manifest and a training file say of them.
+//! Shapes of the networks, as in the manifest and in training files.
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -9,8 +9,8 @@ use serde::{Deserialize, Serialize};
 pub struct EncoderConfig {
     /// The image backbone.
     pub backbone: BackboneConfig,
-    /// Channels of the optional convolutional stem before the backbone; 0 leaves it out. A stem makes training run
-    /// the backbone in every step, since its features cannot be kept.
+    /// Channels of the optional convolutional stem before the backbone; 0 omits it. With a stem, training runs the
+    /// backbone in every step, because its features cannot be cached.
     pub stem_channels: i64,
     /// Channels after the head's 1x1 convolution.
     pub reduce_channels: i64,
@@ -32,19 +32,19 @@ impl Default for EncoderConfig {
     }
 }
 
-/// Which backbone, and whether it learns.
+/// Kind and options of the backbone.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct BackboneConfig {
-    /// Which network.
+    /// Kind of network.
     pub kind: BackboneKind,
-    /// Whether the weights stay as they were loaded. A small convolutional network from scratch must learn.
+    /// True if the weights are frozen. A small convolutional network from scratch must be trained.
     #[serde(default = "yes")]
     pub frozen: bool,
-    /// Side in pixels that pictures are resized to before they enter.
+    /// Side in pixels to which images are resized before they enter.
     #[serde(default = "default_input_px")]
     pub input_px: i64,
-    /// Size of a vision transformer; ignored by the others.
+    /// Size of a vision transformer; ignored for other kinds.
     #[serde(default)]
     pub vit: VitConfig,
 }
@@ -63,7 +63,7 @@ impl Default for BackboneConfig {
     }
 }
 
-/// The backbones there are.
+/// Kind of backbone.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum BackboneKind {
@@ -80,9 +80,9 @@ pub enum BackboneKind {
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct VitConfig {
-    /// Patch side, pixels.
+    /// Side of a patch, pixels.
     pub patch_px: i64,
-    /// Token width.
+    /// Width of a token.
     pub width: i64,
     /// Number of blocks.
     pub depth: i64,
@@ -104,8 +104,8 @@ pub struct DecoderConfig {
     pub hidden: i64,
     /// Channels at 8x8; halved at most once on the way up.
     pub channels: i64,
-    /// Whether it is told the pose. Without, one latent has one picture, and the encoder must put the pose into it; the
-    /// residual over the pose's mean picture would tell the pose too (`vae.residual = false`).
+    /// True if the decoder gets the pose. Otherwise a latent has a single image, and the encoder must encode the pose.
+    /// A residual over the pose's mean image would also reveal the pose (`vae.residual = false`).
     pub pose_condition: bool,
 }
 

@@ -12,43 +12,43 @@ pub enum ConfigError {
     /// The file cannot be read.
     #[error("cannot read the {what} file {path}: {source}{}", carff_base::names::beside(path))]
     Read {
-        /// The kind of file.
+        /// Kind of file.
         what: &'static str,
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// The system's error.
+        /// Error of the system.
         source: std::io::Error,
     },
-    /// It is not valid TOML, or has an unknown, missing or wrongly typed key.
+    /// The file is not valid TOML, or has an unknown, missing or wrongly typed key.
     #[error("{path}:{line}: {}{message}", key.as_ref().map(|k| format!("`{k}`: ")).unwrap_or_default())]
     Syntax {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// Line, from 1.
+        /// Line number, from 1.
         line: usize,
-        /// The dotted key, where one is at fault.
+        /// The dotted key, if the error has one.
         key: Option<String>,
         /// The problem, and the allowed values.
         message: String,
     },
-    /// A key of an earlier version.
+    /// A key of an earlier version is in the file.
     #[error("{path}:{line}: `{key}` is now called `{now}`")]
     Moved {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// Line, from 1.
+        /// Line number, from 1.
         line: usize,
         /// The dotted key.
         key: String,
-        /// Its present name.
+        /// Current name of the key.
         now: String,
     },
     /// A value is out of range.
     #[error("{path}:{line}: `{key}` is {value}; allowed: {allowed}")]
     Range {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// Line, from 1.
+        /// Line number, from 1.
         line: usize,
         /// The dotted key.
         key: String,

@@ -1,4 +1,4 @@
-//! What a wrong graph file is answered with, word by word: file, line, key, and what is allowed.
+//! Exact messages for wrong graph files: file, line, key, and the allowed values.
 
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
@@ -72,7 +72,7 @@ fn wrong_files_have_golden_messages() {
     }
 }
 
-/// A key of an earlier version is refused with its present name, wherever it stood.
+/// A key of an earlier version is refused with its current name, wherever it was.
 #[test]
 fn keys_of_earlier_versions_name_the_present_ones() {
     for (table, was, now) in [
@@ -89,7 +89,7 @@ fn keys_of_earlier_versions_name_the_present_ones() {
     }
 }
 
-/// The schema that editors read holds every range that reading checks.
+/// The schema for editors has every range that reading checks.
 #[test]
 fn the_schema_holds_the_ranges() {
     let schema = schemars::schema_for!(GraphConfig).to_value();
@@ -100,14 +100,14 @@ fn the_schema_holds_the_ranges() {
     assert_eq!(stage["cpus"]["items"]["maximum"].as_f64(), Some(1023.0));
 }
 
-/// What is no TOML at all names the line too.
+/// A file that is not TOML is an error with its line.
 #[test]
 fn broken_toml_names_the_line() {
     let message = error("[run]\nname = \"x\ndataset = 3\n");
     assert!(message.starts_with("graph.toml:2: "), "{message}");
 }
 
-/// A missing file is named, with the system's reason.
+/// A missing file is an error with its name and the system's reason.
 #[test]
 fn a_missing_file_is_named() {
     let folder = tempfile::tempdir().unwrap();
@@ -117,7 +117,7 @@ fn a_missing_file_is_named() {
     assert!(error.to_string().contains("none.toml"), "{error}");
 }
 
-/// The shipped graph loads without a warning, and says what its comments say.
+/// The shipped graph loads without a warning, and its values match its comments.
 #[test]
 fn the_shipped_graph_is_valid() {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs/graphs/approaching-intersection.toml");
@@ -130,11 +130,11 @@ fn the_shipped_graph_is_valid() {
         RestartPolicy::OnFailure { backoff_ms: 100, max_restarts: 5, within_s: 60 }
     );
     assert!(graph.scenario_path().unwrap().is_file());
-    // Paths fall back to the project's root, wherever the program runs.
+    // Paths fall back to the project's root from any working directory.
     assert!(graph.resolve(Path::new("configs/graphs")).is_dir());
 }
 
-/// Every shipped graph loads without a warning, and its scenario is there.
+/// Every shipped graph loads without a warning, and its scenario exists.
 #[test]
 fn every_shipped_graph_is_valid() {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs/graphs");
@@ -144,12 +144,12 @@ fn every_shipped_graph_is_valid() {
         let graph = GraphConfig::load(&path).unwrap();
         assert_eq!(graph.warnings(), Vec::<String>::new(), "{}", path.display());
         assert!(graph.scenario_path().unwrap().is_file(), "{}", path.display());
-        assert!(names.insert(graph.run.name.clone()), "{}: two graphs under one name", path.display());
+        assert!(names.insert(graph.run.name.clone()), "{}: two graphs have this name", path.display());
     }
     assert!(names.len() >= 6, "{names:?}");
 }
 
-/// Odd but allowed settings are warned of.
+/// Unusual but allowed settings cause warnings.
 #[test]
 fn odd_settings_are_warned_of() {
     let text =

@@ -1,4 +1,4 @@
-//! The set in memory: frames with cameras and states, and the scenario they belong to.
+//! A dataset in memory: frames with cameras and states, and their scenario.
 
 use std::path::{Path, PathBuf};
 
@@ -11,51 +11,50 @@ use crate::error::DatasetError;
 use crate::image::Image;
 use crate::{seen, transforms};
 
-/// Largest transforms file that is read, bytes.
+/// Maximum size of a transforms file, bytes.
 pub const MAX_TRANSFORMS_BYTES: u64 = 1 << 29;
-/// Most frames in one set.
+/// Maximum number of frames in a dataset.
 pub const MAX_FRAMES: usize = 1_000_000;
-/// Largest width or height of a picture, pixels.
+/// Maximum width or height of an image, pixels.
 pub const MAX_IMAGE_SIDE_PX: u32 = 8192;
 
-/// One picture of the set.
+/// An image of a dataset with its camera and state.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Frame {
-    /// The picture, an absolute path or one relative to the working directory (the set's folder is part of it).
+    /// Path of the image, absolute or relative to the working directory. It includes the dataset's folder.
     pub image_path: PathBuf,
     /// Intrinsics and pose.
     pub camera: PinholeCamera,
     /// State index: branch * timestamps + timestamp.
     pub state: Option<usize>,
-    /// Which course of events.
+    /// Index of the branch.
     pub branch: Option<usize>,
-    /// Which step of it.
+    /// Time step of the branch.
     pub timestamp: Option<usize>,
     /// Index of the fixed camera pose.
     pub view: Option<usize>,
-    /// How much of the actor the picture shows; where the set does not say, what [`Dataset::open`] could tell. `None`
-    /// means unknown.
+    /// Visibility of the actor. If the dataset does not contain it, [`Dataset::open`] derives it. `None` means unknown.
     pub observability: Option<Observability>,
-    /// Visible pixels over pixels that would be covered with nothing in between, 0..=1.
+    /// Ratio of visible pixels to the pixels of the unoccluded actor, 0..=1.
     pub visible_fraction: Option<f32>,
-    /// Pixels that show the actor (or its place).
+    /// Number of pixels that show the actor (or its place).
     pub actor_px: Option<u32>,
     /// Kind of camera, for example `orbit`, `bev` or `dash`.
     pub view_kind: Option<String>,
 }
 
-/// A box with a name and a part to play.
+/// A box with a name and a role.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct NamedBox {
-    /// Its name, for example `actor`.
+    /// Name of the box, for example `actor`.
     pub name: String,
-    /// Its part, for example `ego`, `actor` or `static`.
+    /// Role of the box, for example `ego`, `actor` or `static`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub role: Option<String>,
-    /// Where it is, world space, metres.
+    /// Position and size, world space, metres.
     #[serde(flatten)]
     pub oriented_box: OrientedBox,
-    /// Whether its presence or motion is what the forecast is about.
+    /// True if its presence or motion is the subject of the forecast.
     #[serde(default)]
     pub dynamic: bool,
 }
@@ -63,93 +62,93 @@ pub struct NamedBox {
 /// A place where the actor can be.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Candidate {
-    /// The branch it belongs to; `None`: any.
+    /// Branch of the place; `None`: any.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub branch: Option<usize>,
-    /// The timestamp it belongs to; `None`: any.
+    /// Time step of the place; `None`: any.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub timestamp: Option<usize>,
-    /// The place.
+    /// Box of the place, world space, metres.
     #[serde(flatten)]
     pub named_box: NamedBox,
 }
 
-/// One state: a branch at a timestamp, and what stands where.
+/// A state: a branch at a time step, with its known boxes.
 #[derive(Clone, Debug, PartialEq)]
 pub struct StateInfo {
-    /// Which course of events.
+    /// Index of the branch.
     pub branch: usize,
-    /// Which step of it.
+    /// Time step of the branch.
     pub timestamp: usize,
     /// Known boxes of this state.
     pub boxes: Vec<NamedBox>,
 }
 
-/// The scenario that a set was taken from.
+/// The scenario of a dataset.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ScenarioInfo {
-    /// Its name; the folder's name where the file gives none.
+    /// Name of the scenario; the folder's name if the file has none.
     pub name: String,
-    /// Lower and upper corner of the region that matters, world space, metres.
+    /// Lower and upper corner of the region of interest, world space, metres.
     pub bounds: [[f64; 3]; 2],
     /// Names of the branches.
     pub branches: Vec<String>,
-    /// Steps per branch.
+    /// Number of time steps per branch.
     pub timestamps: usize,
-    /// The view that looks straight down.
+    /// Index of the view that looks straight down.
     pub bev_view: Option<usize>,
-    /// All states, `branches * timestamps` of them; state s is branch s / timestamps at s % timestamps.
+    /// All states, `branches * timestamps` of them; state s is branch s / timestamps at time step s % timestamps.
     pub states: Vec<StateInfo>,
-    /// Where the actor can be.
+    /// Places where the actor can be.
     pub candidates: Vec<Candidate>,
     /// Known boxes that never move.
     pub static_boxes: Vec<NamedBox>,
     /// Branches in which the hazard action is right.
     pub hazard_branches: Vec<usize>,
-    /// What to do in a hazard branch.
+    /// Action in a hazard branch.
     pub hazard_action: String,
-    /// What to do in the others.
+    /// Action in all other branches.
     pub clear_action: String,
 }
 
 impl ScenarioInfo {
-    /// Number of states: branches x timestamps.
+    /// Returns the number of states: branches x time steps.
     pub fn state_count(&self) -> usize {
         self.branches.len() * self.timestamps
     }
 
-    /// State index of a branch at a timestamp.
+    /// Returns the state index of a branch at a time step.
     pub fn state(&self, branch: usize, timestamp: usize) -> Option<usize> {
         (branch < self.branches.len() && timestamp < self.timestamps).then(|| branch * self.timestamps + timestamp)
     }
 
-    /// Branch of a state.
+    /// Returns the branch of a state.
     pub fn branch_of(&self, state: usize) -> usize {
         state / self.timestamps.max(1)
     }
 
-    /// Timestamp of a state.
+    /// Returns the time step of a state.
     pub fn timestamp_of(&self, state: usize) -> usize {
         state % self.timestamps.max(1)
     }
 
-    /// State at the next timestamp of the same branch. The last state of a branch follows itself.
+    /// Returns the state at the next time step of the same branch. The last state of a branch follows itself.
     pub fn next_state(&self, state: usize) -> usize {
         if (state + 1).is_multiple_of(self.timestamps.max(1)) { state } else { state + 1 }
     }
 
-    /// States of a branch, in the order of their timestamps.
+    /// Returns the states of a branch, in the order of their time steps.
     pub fn states_of_branch(&self, branch: usize) -> std::ops::Range<usize> {
         branch * self.timestamps..(branch + 1) * self.timestamps
     }
 
-    /// Whether the hazard action is the right one in this branch.
+    /// Returns true if the hazard action is right in this branch.
     pub fn is_hazard(&self, branch: usize) -> bool {
         self.hazard_branches.contains(&branch)
     }
 }
 
-/// A posed image set, described; pictures are loaded on demand.
+/// A posed image dataset; images are loaded on demand.
 #[derive(Clone, Debug)]
 pub struct Dataset {
     dir: PathBuf,
@@ -161,8 +160,8 @@ pub struct Dataset {
 
 impl Dataset {
     /// Reads and checks `transforms.json`, or else `transforms_train.json`, `transforms_val.json` and
-    /// `transforms_test.json` together. Pictures are looked for but not decoded, unless the set has several branches and
-    /// no frame says its observability: then the pictures tell it, and a warning says so.
+    /// `transforms_test.json` together. It checks that the images exist but does not decode them. Exception: if a
+    /// dataset with several branches has no observability, it is derived from the images, with a warning.
     pub fn open(dir: &Path) -> Result<Self, DatasetError> {
         let read = transforms::read(dir, transforms::Pictures::Png)?;
         let view_count = read.frames.iter().filter_map(|f| f.view).max().map_or(0, |v| v + 1);
@@ -180,35 +179,35 @@ impl Dataset {
                 frame.observability = observability;
             }
             set.warnings.push(
-                "no frame says its `observability`, so the pictures tell it: `none` where each other branch looks the same \
-                 at that timestamp, `full` where none does, else `partial`"
+                "no frame has an `observability`, so it is derived from the images: `none` if each other branch looks \
+                 the same at that timestamp, `full` if none does, else `partial`"
                     .into(),
             );
         }
         Ok(set)
     }
 
-    /// The set's folder.
+    /// Returns the dataset's folder.
     pub fn dir(&self) -> &Path {
         &self.dir
     }
 
-    /// All frames, in the order of the file.
+    /// Returns all frames, in the order of the file.
     pub fn frames(&self) -> &[Frame] {
         &self.frames
     }
 
-    /// The scenario, if the set has one.
+    /// Returns the scenario, if the dataset has one.
     pub fn scenario(&self) -> Option<&ScenarioInfo> {
         self.scenario.as_ref()
     }
 
-    /// Number of fixed camera poses; 0 when frames carry no view index.
+    /// Returns the number of fixed camera poses; 0 if frames have no view index.
     pub fn view_count(&self) -> usize {
         self.view_count
     }
 
-    /// Number of states; a set without scenario has as many as its frames name, and at least one.
+    /// Returns the number of states; without a scenario, it follows from the frames and is at least one.
     pub fn state_count(&self) -> usize {
         match &self.scenario {
             Some(scenario) => scenario.state_count(),
@@ -216,17 +215,17 @@ impl Dataset {
         }
     }
 
-    /// Index of the frame that shows a state from a view.
+    /// Returns the index of the frame of a state from a view.
     pub fn frame_index(&self, state: usize, view: usize) -> Option<usize> {
         self.frames.iter().position(|f| f.state == Some(state) && f.view == Some(view))
     }
 
-    /// What is accepted but looks odd, for `check` to print.
+    /// Returns warnings about accepted but unusual values, for `check` to print.
     pub fn warnings(&self) -> &[String] {
         &self.warnings
     }
 
-    /// Decodes one picture and checks that its size is the one its intrinsics say.
+    /// Decodes an image and checks that its size matches its intrinsics.
     pub fn load_image(&self, frame_index: usize) -> Result<Image, DatasetError> {
         let frame = self
             .frames
@@ -238,7 +237,7 @@ impl Dataset {
             return Err(DatasetError::Image {
                 path: frame.image_path.clone(),
                 problem: format!(
-                    "frame {frame_index} is {}x{} pixels, but its intrinsics (keys `w` and `h`) say {w}x{h}",
+                    "frame {frame_index} is {}x{} pixels, but its intrinsics (keys `w` and `h`) are {w}x{h}",
                     image.width_px, image.height_px
                 ),
             });
@@ -246,7 +245,7 @@ impl Dataset {
         Ok(image)
     }
 
-    /// Decodes all pictures, in parallel, in the order of the frames. The first bad one is the error.
+    /// Decodes all images in parallel, in the order of the frames. Returns the first error.
     pub fn load_all_images(&self) -> Result<Vec<Image>, DatasetError> {
         let images: Vec<_> = (0..self.frames.len()).into_par_iter().map(|i| self.load_image(i)).collect();
         images.into_iter().collect()

@@ -1,30 +1,30 @@
-//! Drives through a set: a hidden course of events, seen from one pose, timestamp by timestamp.
+//! Drives through a dataset: a hidden branch, seen from one pose, time step by time step.
 //!
-//! A trial of the planner is an input view with one right answer (section 4.3 of the paper). Hazard: a hazard branch,
-//! and nothing seen tells so: the actor is not visible, or the state is one that a clear branch has as well. Clear:
-//! another branch, its place is fully visible, and the state is none of a hazard branch. The last timestamp is no input,
-//! as nothing comes after it. Where no branch is a hazard, every input is a clear one. A set that allows one kind alone,
-//! or none, is driven through all the same: what has no right answer is not counted.
+//! A trial of the planner is an input view with one right answer (section 4.3 of the paper). Hazard: a hazard branch
+//! whose view does not reveal it, because the actor is not visible or a clear branch has the same state. Clear: a clear
+//! branch with its place fully visible, in a state that is not a state of a hazard branch. The last time step is not an
+//! input, because nothing follows it. Without hazard branches, every input is clear. A dataset that allows only one
+//! kind, or none, can still be driven: inputs without a right answer do not count.
 
 use crate::{Dataset, Observability, ScenarioInfo};
 use carff_base::random::{Key, tag};
 use rand::Rng;
 use rand::seq::SliceRandom;
 
-/// Names this use of the run's seed, so that no other draw of the same run shares the stream.
+/// Name of the random stream, so that no other draw of the same run shares it.
 const STREAM: u64 = tag("drives 1");
 
-/// What the right action is.
+/// Kind of a drive: its right action.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum DriveKind {
-    /// To halt: the actor comes, and cannot be seen.
+    /// Halt: the actor comes, but is not visible.
     Hazard,
-    /// To advance: nobody comes, and that can be seen.
+    /// Advance: no actor comes, and the view shows it.
     Clear,
 }
 
 impl DriveKind {
-    /// The name that reports use.
+    /// Returns the name for reports.
     pub fn name(self) -> &'static str {
         match self {
             Self::Hazard => "hazard",
@@ -38,47 +38,47 @@ impl DriveKind {
 pub struct EligibleInput {
     /// Camera pose.
     pub view: usize,
-    /// Course of events.
+    /// Branch.
     pub branch: usize,
-    /// Step of it, at most the last but one.
+    /// Time step of the branch, at most the last but one.
     pub timestamp: usize,
     /// The right answer.
     pub kind: DriveKind,
 }
 
-/// One drive: all timestamps of a branch, seen from one pose.
+/// A drive: all time steps of a branch, seen from one pose.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Drive {
     /// Camera pose.
     pub view: usize,
-    /// Hidden course of events.
+    /// Hidden branch.
     pub branch: usize,
-    /// The right answer; none where no pose of the set has one.
+    /// The right answer; `None` if no pose of the dataset has one.
     pub kind: Option<DriveKind>,
-    /// Index in [`Dataset::frames`] of each timestamp's frame.
+    /// Index in [`Dataset::frames`] of each time step's frame.
     pub frames: Vec<usize>,
 }
 
-/// Why no drives can be planned.
+/// Reason why no drives can be planned.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum DrivesError {
-    /// The set has no scenario.
+    /// The dataset has no scenario.
     #[error(
-        "this data set has no `scenario`: there is nothing to drive through; give one that has, or a folder source"
+        "this dataset has no `scenario`, so it cannot be driven; use a dataset with a scenario, or a folder source"
     )]
     NoScenario,
     /// No pose can be driven.
     #[error(
-        "none of the {views} poses has a picture of every timestamp of a branch: give the missing frames, or a folder source"
+        "none of the {views} poses has images of all timestamps of a branch: add missing frames, or use a folder source"
     )]
     NoneWhole {
-        /// How many poses were looked at.
+        /// Number of poses in the dataset.
         views: usize,
     },
 }
 
 impl ScenarioInfo {
-    /// The right answer to a view of a state, if there is one: see the module's text.
+    /// Returns the right answer to a view of a state, if there is one: see the module's text.
     pub fn trial_kind(
         &self,
         branch: usize,
@@ -98,7 +98,7 @@ impl ScenarioInfo {
         }
     }
 
-    /// Whether a branch with the other right action has the very same state at this timestamp: the same known boxes.
+    /// Returns true if a branch with the other right action has the same known boxes at this time step.
     fn is_undecided(&self, branch: usize, timestamp: usize) -> bool {
         let boxes = |b: usize| self.state(b, timestamp).and_then(|s| self.states.get(s)).map(|s| &s.boxes);
         let own = boxes(branch).filter(|boxes| !boxes.is_empty());
@@ -107,7 +107,7 @@ impl ScenarioInfo {
     }
 }
 
-/// All input views with one right answer among some poses, in the order of poses, branches and timestamps.
+/// Returns all input views with one right answer from some poses, in the order of poses, branches and time steps.
 pub fn eligible_inputs(dataset: &Dataset, views: &[usize]) -> Result<Vec<EligibleInput>, DrivesError> {
     let scenario = dataset.scenario().ok_or(DrivesError::NoScenario)?;
     let mut inputs = Vec::new();
@@ -126,16 +126,16 @@ pub fn eligible_inputs(dataset: &Dataset, views: &[usize]) -> Result<Vec<Eligibl
 /// Poses that can be driven, each with the branch of each of its inputs.
 type Poses = Vec<(usize, Vec<usize>)>;
 
-/// Plans drives: hazard and clear ones in turn, their poses drawn by seed out of `views` without replacement while
-/// they last. One kind alone where no pose allows the other; where none allows either, drives without a right answer,
-/// through any branch. The same arguments give the same drives.
+/// Plans drives: hazard and clear ones alternate. A seed draws their poses from `views` without replacement until all
+/// are used. If no pose allows one kind, only the other is planned; if none allows either, drives have no right answer.
+/// The same arguments give the same drives.
 pub fn plan_drives(dataset: &Dataset, views: &[usize], count: usize, seed: u64) -> Result<Vec<Drive>, DrivesError> {
     let scenario = dataset.scenario().ok_or(DrivesError::NoScenario)?;
     let mut rng = carff_base::random::stream(Key { seed, frame: STREAM, step: 0, sample: 0 });
     let frames = |branch: usize, view: usize| -> Option<Vec<usize>> {
         (0..scenario.timestamps).map(|t| dataset.frame_index(scenario.state(branch, t)?, view)).collect()
     };
-    // A pose that lacks a timestamp cannot be driven.
+    // A pose without an image of each time step cannot be driven.
     let (mut hazard, mut clear): (Poses, Poses) = Default::default();
     for input in eligible_inputs(dataset, views)?.iter().filter(|i| frames(i.branch, i.view).is_some()) {
         let poses = if input.kind == DriveKind::Hazard { &mut hazard } else { &mut clear };
@@ -180,8 +180,8 @@ mod tests {
     use crate::{DatasetWriter, FrameRecord, Image};
     use carff_base::geometry::PinholeCamera;
 
-    /// Two branches (0 holds the hazard) x three timestamps x six poses: pose 0 to 2 see nothing of the actor,
-    /// pose 3 and 4 see its place fully, pose 5 in part.
+    /// Writes two branches (0 holds the hazard) x three time steps x six poses: poses 0 to 2 do not see the actor's
+    /// place, poses 3 and 4 see it fully, pose 5 sees a part.
     fn dataset(folder: &std::path::Path) -> Dataset {
         let writer = DatasetWriter::create(folder).unwrap();
         let camera = PinholeCamera::look_at([0.0, 0.0, 5.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], 4, 4, 60.0);
@@ -204,13 +204,13 @@ mod tests {
         Dataset::open(folder).unwrap()
     }
 
-    /// Every eligible input is one that the definition names, and all of them are there.
+    /// Every eligible input matches the definition, and none is missing.
     #[test]
     fn inputs_have_one_right_answer() {
         let folder = tempfile::tempdir().unwrap();
         let dataset = dataset(folder.path());
         let inputs = eligible_inputs(&dataset, &[0, 1, 2, 3, 4, 5]).unwrap();
-        // Three blind poses x two timestamps, and two seeing ones x two timestamps.
+        // Three blind poses x two time steps, and two seeing poses x two time steps.
         assert_eq!(inputs.iter().filter(|i| i.kind == DriveKind::Hazard).count(), 6);
         assert_eq!(inputs.iter().filter(|i| i.kind == DriveKind::Clear).count(), 4);
         assert!(inputs.iter().all(|i| i.timestamp < 2 && (i.branch == 0) == (i.view < 3) && i.view < 5));
@@ -232,8 +232,8 @@ mod tests {
         }
     }
 
-    /// Where both branches are one state, however well it is seen, care is right in the hazard branch, and the clear one
-    /// is no trial. Where they differ, what is seen decides. Without hazards every view but the last step's is clear.
+    /// If both branches are one state, halting is right in the hazard branch from any pose, and the clear branch has no
+    /// trial. If they differ, visibility decides. Without hazards every view before the last step is clear.
     #[test]
     fn undecided_states_and_no_hazard() {
         use crate::{NamedBox, StateInfo};
@@ -269,7 +269,8 @@ mod tests {
         assert_eq!(merge.trial_kind(0, 2, full), None);
     }
 
-    /// Half the drives are hazard ones, poses repeat only when all were used, and the same seed plans the same.
+    /// Half of the drives are hazard drives, poses repeat only after all were used, and the same seed gives the same
+    /// plan.
     #[test]
     fn drives_alternate_and_do_not_repeat_early() {
         let folder = tempfile::tempdir().unwrap();
@@ -295,7 +296,7 @@ mod tests {
         assert!((2..9).any(|seed| plan_drives(&dataset, &views, 10, seed).unwrap() != drives));
     }
 
-    /// Poses that allow one kind alone, or neither, are driven through all the same; the last have no right answer.
+    /// Poses that allow only one kind, or neither, are driven; drives of the latter have no right answer.
     #[test]
     fn poses_without_trials_are_driven_too() {
         let folder = tempfile::tempdir().unwrap();
@@ -315,7 +316,7 @@ mod tests {
         }
     }
 
-    /// A pose that is not in the set cannot be driven, and the error says so.
+    /// A pose that is not in the dataset cannot be driven, and the error reports it.
     #[test]
     fn missing_pictures_are_an_error() {
         let folder = tempfile::tempdir().unwrap();

@@ -1,25 +1,25 @@
-//! Which states look the same from a view, and how accurate a guess from a picture can be at best.
+//! Visual equivalence of states per view, and the accuracy limit that follows from it.
 
 use rayon::prelude::*;
 
 use crate::dataset::Dataset;
 use crate::image::Image;
 
-/// Two states look the same from a view when at most this many pixels differ by more than [`PIXEL_TOLERANCE`].
+/// Two images look the same if at most this many pixels differ by more than [`PIXEL_TOLERANCE`].
 pub const MAX_DIFFERENT_PIXELS: usize = 8;
-/// Largest difference in any channel, of 255, that does not count.
+/// Largest difference in any channel, of 255, that is ignored.
 pub const PIXEL_TOLERANCE: u8 = 12;
 
 /// Visual equivalence of states, per view.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Equivalence {
     states: usize,
-    /// views x states x states.
+    /// Flags of views x states x states.
     same: Vec<bool>,
 }
 
-/// Whether two pictures are the same to the eye: same size, and at most [`MAX_DIFFERENT_PIXELS`] pixels differ by
-/// more than [`PIXEL_TOLERANCE`] in any channel.
+/// Returns true if two images look the same: equal size, and at most [`MAX_DIFFERENT_PIXELS`] pixels differ by more
+/// than [`PIXEL_TOLERANCE`] in any channel.
 pub fn looks_same(a: &Image, b: &Image) -> bool {
     (a.width_px, a.height_px) == (b.width_px, b.height_px)
         && different_pixels(a, b).take(MAX_DIFFERENT_PIXELS + 1).count() <= MAX_DIFFERENT_PIXELS
@@ -33,8 +33,8 @@ fn different_pixels<'a>(a: &'a Image, b: &'a Image) -> impl Iterator<Item = usiz
 }
 
 impl Equivalence {
-    /// Compares all pairs of states in each view. `images` are those of [`Dataset::load_all_images`]. A state with no
-    /// picture in a view is the same only as itself.
+    /// Compares all pairs of states in each view. `images` are those of [`Dataset::load_all_images`]. A state without
+    /// an image in a view is only equivalent to itself.
     pub fn from_dataset(dataset: &Dataset, images: &[Image]) -> Self {
         let (views, states) = (dataset.view_count(), dataset.state_count());
         let mut pictures = vec![vec![None; states]; views];
@@ -46,7 +46,7 @@ impl Equivalence {
         Self::of_pictures(states, &pictures)
     }
 
-    /// Compares all pairs of states in each view; `pictures` has a row of `states` for each.
+    /// Compares all pairs of states in each view; `pictures` has a row of `states` images per view.
     pub fn of_pictures(states: usize, pictures: &[Vec<Option<&Image>>]) -> Self {
         let same = pictures
             .par_iter()
@@ -70,7 +70,7 @@ impl Equivalence {
         Self { states, same }
     }
 
-    /// Whether states `a` and `b` look the same from `view`. Out of range, only equal indices do.
+    /// Returns true if states `a` and `b` look the same from `view`. Out of range, only equal indices do.
     pub fn same(&self, view: usize, a: usize, b: usize) -> bool {
         if a >= self.states || b >= self.states {
             return a == b;
@@ -78,18 +78,18 @@ impl Equivalence {
         self.same.get((view * self.states + a) * self.states + b).copied().unwrap_or(a == b)
     }
 
-    /// The states that look like `state` from `view`, itself among them.
+    /// Returns the states that look like `state` from `view`, including itself.
     pub fn alike(&self, view: usize, state: usize) -> impl Iterator<Item = usize> + '_ {
         (0..self.states).filter(move |&other| self.same(view, other, state))
     }
 
-    /// How many states look like `state` from `view`, itself counted: at least 1.
+    /// Returns the number of states that look like `state` from `view`, including itself: at least 1.
     pub fn class_size(&self, view: usize, state: usize) -> usize {
         self.alike(view, state).count().max(1)
     }
 
-    /// The best mean accuracy of naming the state from a picture, over the given (view, state) pairs: the mean of
-    /// 1 / class size. `None` when there are no pairs.
+    /// Returns the best mean accuracy of naming the state from an image, over the given (view, state) pairs: the mean
+    /// of 1 / class size. `None` if there are no pairs.
     pub fn ceiling(&self, pairs: impl IntoIterator<Item = (usize, usize)>) -> Option<f64> {
         let (mut sum, mut count) = (0.0, 0_usize);
         for (view, state) in pairs {
@@ -104,7 +104,7 @@ impl Equivalence {
 mod tests {
     use super::*;
 
-    /// Eight pixels may differ, nine may not; a difference of 12 does not count, one of 13 does.
+    /// Eight pixels may differ, nine may not; a difference of 12 is ignored, one of 13 is not.
     #[test]
     fn the_limits_are_exact() {
         let a = Image::filled(8, 8, [100; 3]);
@@ -121,7 +121,7 @@ mod tests {
         assert!(!looks_same(&a, &Image::filled(8, 9, [100; 3])));
     }
 
-    /// One view, three states of which two look the same: class sizes 2, 2, 1, ceiling (1/2 + 1/2 + 1) / 3.
+    /// One view of three states, of which two look the same: class sizes 2, 2, 1, ceiling (1/2 + 1/2 + 1) / 3.
     #[test]
     fn ceiling_of_a_known_case() {
         let e = Equivalence { states: 3, same: vec![true, true, false, true, true, false, false, false, true] };

@@ -1,86 +1,86 @@
-//! What can be wrong with a set, and where.
+//! Errors of reading and writing datasets.
 
 use std::path::PathBuf;
 
-/// Why a set cannot be read or written. Each message names the file, and inside it the frame and the key.
+/// Reason why a dataset cannot be read or written. Each message names the file, and inside it the frame and the key.
 #[derive(Debug, thiserror::Error)]
 pub enum DatasetError {
     /// The folder does not exist or is a file.
-    #[error("{}: not a folder; a data set is a folder with transforms.json and its pictures", path.display())]
+    #[error("{}: not a folder; a dataset is a folder with transforms.json and its images", path.display())]
     NotAFolder {
-        /// The folder asked for.
+        /// The requested folder.
         path: PathBuf,
     },
-    /// The folder holds no transforms file.
+    /// The folder has no transforms file.
     #[error(
-        "{}: holds none of transforms.json, transforms_train.json, transforms_val.json, transforms_test.json",
+        "{}: contains none of transforms.json, transforms_train.json, transforms_val.json, transforms_test.json",
         path.display()
     )]
     NoTransforms {
-        /// The folder asked for.
+        /// The requested folder.
         path: PathBuf,
     },
-    /// The operating system refused.
+    /// The operating system reported an error.
     #[error("{}: {source}", path.display())]
     Io {
-        /// File or folder.
+        /// Path of the file or folder.
         path: PathBuf,
-        /// The system's reason.
+        /// Error of the system.
         source: std::io::Error,
     },
-    /// A file beyond the limits.
+    /// A file exceeds the limit.
     #[error("{}: {bytes} bytes, at most {limit} are allowed", path.display())]
     TooLarge {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// Its size.
+        /// Size of the file.
         bytes: u64,
-        /// The limit.
+        /// Maximum size.
         limit: u64,
     },
-    /// Not JSON. The source names line and column.
+    /// The file is not JSON. The source names line and column.
     #[error("{}: not valid JSON: {source}", path.display())]
     Json {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// The parser's reason.
+        /// Error of the parser.
         source: serde_json::Error,
     },
-    /// A key is missing, of the wrong type, out of range, or in conflict with another.
+    /// A key is missing, of the wrong type, out of range, or in conflict with another one.
     #[error("{}: {place}: key `{key}`: {problem}", path.display())]
     Key {
-        /// The transforms file.
+        /// Path of the transforms file.
         path: PathBuf,
-        /// Where in the file, as in `frame 3 (images/b0_t0_v003.png)` or `scenario.states[2]`.
+        /// Place in the file, as in `frame 3 (images/b0_t0_v003.png)` or `scenario.states[2]`.
         place: String,
-        /// The key.
+        /// Name of the key.
         key: String,
-        /// What is wrong and what is allowed.
+        /// The error and the allowed values.
         problem: String,
     },
-    /// A picture that is missing, broken, of another type or of another size than its intrinsics say.
+    /// An image is missing, broken, of another type, or of another size than its intrinsics.
     #[error("{}: {problem}", path.display())]
     Image {
-        /// The picture.
+        /// Path of the image.
         path: PathBuf,
-        /// What is wrong and what is allowed.
+        /// The error and the allowed values.
         problem: String,
     },
-    /// A frame index that the set does not have.
-    #[error("frame {index} does not exist; the set has {count} frames")]
+    /// The dataset has no frame of this index.
+    #[error("frame {index} does not exist; the dataset has {count} frames")]
     NoSuchFrame {
-        /// Index asked for.
+        /// Requested index.
         index: usize,
-        /// Frames in the set.
+        /// Number of frames in the dataset.
         count: usize,
     },
-    /// A folder that must not be overwritten.
+    /// The folder must not be overwritten.
     #[error(
-        "{}: not empty and not a set that this program wrote; give an empty folder or another name",
+        "{}: not empty and not a dataset that this program wrote; use an empty folder or another name",
         path.display()
     )]
     NotOurs {
-        /// The folder.
+        /// Path of the folder.
         path: PathBuf,
     },
 }

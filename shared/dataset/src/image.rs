@@ -1,4 +1,4 @@
-//! Pictures in memory and as PNG files.
+//! Images in memory and as PNG files.
 
 use std::fs::File;
 use std::io::{BufReader, BufWriter};
@@ -13,7 +13,7 @@ use ndarray::{ArrayView3, ArrayViewMut3, s};
 use crate::dataset::MAX_IMAGE_SIDE_PX;
 use crate::error::DatasetError;
 
-/// An 8-bit RGB picture, row-major from the top left.
+/// An 8-bit RGB image, row-major from the top left.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Image {
     /// Width, pixels.
@@ -25,12 +25,12 @@ pub struct Image {
 }
 
 impl Image {
-    /// A picture of one colour.
+    /// Returns an image of one colour.
     pub fn filled(width_px: u32, height_px: u32, colour: [u8; 3]) -> Self {
         Self { width_px, height_px, rgb: colour.repeat(width_px as usize * height_px as usize) }
     }
 
-    /// The image as (height, width, channel); `None` where it has another number of bytes than its size states.
+    /// Returns the image as (height, width, channel); `None` if the number of bytes does not match its size.
     pub fn view(&self) -> Option<ArrayView3<'_, u8>> {
         ArrayView3::from_shape(self.shape(), &self.rgb).ok()
     }
@@ -43,7 +43,7 @@ impl Image {
         (self.height_px as usize, self.width_px as usize, 3)
     }
 
-    /// The colour at column `x_px` and row `y_px`; `None` outside the image.
+    /// Returns the colour at column `x_px` and row `y_px`; `None` outside the image.
     pub fn pixel(&self, x_px: u32, y_px: u32) -> Option<[u8; 3]> {
         let image = self.view()?;
         let channel = |c| image.get((y_px as usize, x_px as usize, c)).copied();
@@ -60,8 +60,8 @@ impl Image {
         }
     }
 
-    /// Peak signal-to-noise ratio against a picture of the same size, decibels (peak 255); infinite when equal,
-    /// `None` when the sizes differ.
+    /// Returns the peak signal-to-noise ratio against an image of the same size, decibels (peak 255); infinite if
+    /// equal, `None` if the sizes differ.
     pub fn psnr_db(&self, other: &Image) -> Option<f64> {
         if (self.width_px, self.height_px) != (other.width_px, other.height_px) {
             return None;
@@ -71,8 +71,8 @@ impl Image {
         Some(10.0 * (255.0_f64 * 255.0 * self.rgb.len() as f64 / sum).log10())
     }
 
-    /// Reads a PNG picture. Eight bits per channel are required. Grey becomes RGB with equal channels; an alpha
-    /// channel is dropped when every pixel is opaque and refused otherwise, since nothing says what lies behind it.
+    /// Reads a PNG image with eight bits per channel. Grey becomes RGB with equal channels. An opaque alpha channel is
+    /// dropped; a transparent pixel is an error, because its background is unknown.
     pub fn load_png(path: &Path) -> Result<Self, DatasetError> {
         let problem = |problem: String| DatasetError::Image { path: path.to_owned(), problem };
         let file = File::open(path).map_err(|source| DatasetError::Io { path: path.to_owned(), source })?;
@@ -80,7 +80,7 @@ impl Image {
         limits.max_image_width = Some(MAX_IMAGE_SIDE_PX);
         limits.max_image_height = Some(MAX_IMAGE_SIDE_PX);
         let decoder = PngDecoder::with_limits(BufReader::new(file), limits)
-            .map_err(|error| problem(format!("not a readable PNG picture: {error}")))?;
+            .map_err(|error| problem(format!("not a readable PNG image: {error}")))?;
         let (width_px, height_px) = decoder.dimensions();
         if width_px > MAX_IMAGE_SIDE_PX || height_px > MAX_IMAGE_SIDE_PX {
             return Err(problem(format!("{width_px}x{height_px} pixels; at most {MAX_IMAGE_SIDE_PX} a side")));
@@ -94,12 +94,12 @@ impl Image {
             other => return Err(problem(format!("pixel type {other:?}; RGB with 8 bits per channel is needed"))),
         };
         let mut bytes = vec![0; decoder.total_bytes() as usize];
-        decoder.read_image(&mut bytes).map_err(|error| problem(format!("not a readable PNG picture: {error}")))?;
+        decoder.read_image(&mut bytes).map_err(|error| problem(format!("not a readable PNG image: {error}")))?;
         let opaque_part = if channels % 2 == 0 {
             if let Some(at) = bytes.chunks_exact(channels).position(|pixel| pixel[channels - 1] != 255) {
                 let (x, y) = (at % width_px as usize, at / width_px as usize);
                 return Err(problem(format!(
-                    "pixel ({x}, {y}) is transparent; only opaque pictures are accepted, so compose it over its \
+                    "pixel ({x}, {y}) is transparent; only opaque images are accepted, so compose it over its \
                      background first"
                 )));
             }
@@ -118,13 +118,13 @@ impl Image {
         Ok(Self { width_px, height_px, rgb })
     }
 
-    /// Writes the picture as an 8-bit RGB PNG file.
+    /// Writes the image as an 8-bit RGB PNG file.
     pub fn save_png(&self, path: &Path) -> Result<(), DatasetError> {
         write_png(path, &self.rgb, self.width_px, self.height_px, ExtendedColorType::Rgb8)
     }
 }
 
-/// Whether a file is a JPEG, by its name.
+/// Returns true if a file's name is that of a JPEG image.
 fn is_jpeg(path: &Path) -> bool {
     path.extension().is_some_and(|e| e.eq_ignore_ascii_case("jpg") || e.eq_ignore_ascii_case("jpeg"))
 }
@@ -140,7 +140,7 @@ pub(crate) fn dimensions(path: &Path) -> Result<(u32, u32), DatasetError> {
     };
     found.map_err(|error| DatasetError::Image {
         path: path.to_owned(),
-        problem: format!("not a readable picture: {error}"),
+        problem: format!("not a readable image: {error}"),
     })
 }
 
@@ -154,7 +154,7 @@ pub(crate) fn load_any(path: &Path, background: [u8; 3]) -> Result<Image, Datase
     let format = if is_jpeg(path) { ImageFormat::Jpeg } else { ImageFormat::Png };
     let mut reader = ImageReader::with_format(BufReader::new(file), format);
     reader.limits(limits);
-    let rgba = reader.decode().map_err(|error| problem(format!("not a readable picture: {error}")))?.into_rgba8();
+    let rgba = reader.decode().map_err(|error| problem(format!("not a readable image: {error}")))?.into_rgba8();
     let over = |value: u8, below: u8, alpha: u8| {
         ((u32::from(value) * u32::from(alpha) + u32::from(below) * u32::from(255 - alpha) + 127) / 255) as u8
     };
@@ -174,7 +174,7 @@ pub(crate) fn write_png(
     if bytes.len() as u64 != expected || width_px == 0 || height_px == 0 {
         return Err(DatasetError::Image {
             path: path.to_owned(),
-            problem: format!("{} bytes do not make a picture of {width_px}x{height_px} pixels", bytes.len()),
+            problem: format!("{} bytes do not make an image of {width_px}x{height_px} pixels", bytes.len()),
         });
     }
     let file = File::create(path).map_err(|source| DatasetError::Io { path: path.to_owned(), source })?;
@@ -192,7 +192,7 @@ mod tests {
         Image { width_px: 5, height_px: 4, rgb }
     }
 
-    /// What is written is read back, byte for byte.
+    /// An image is read back as it was written, byte for byte.
     #[test]
     fn png_round_trip() {
         let dir = tempfile::tempdir().unwrap();
@@ -201,7 +201,7 @@ mod tests {
         assert_eq!(Image::load_png(&path).unwrap(), gradient());
     }
 
-    /// Opaque alpha is dropped, any transparency is refused and located, grey is spread, 16 bits are refused.
+    /// Opaque alpha is dropped, transparency is refused with its position, grey becomes RGB, and 16 bits are refused.
     #[test]
     fn other_pixel_types() {
         let dir = tempfile::tempdir().unwrap();
@@ -220,12 +220,12 @@ mod tests {
         assert!(message.contains("L16") && message.contains("8 bits per channel"), "{message}");
     }
 
-    /// A file that is no PNG, a cut-off file and a missing file are errors that name the file.
+    /// A file that is not PNG, a cut-off file and a missing file are errors that name the file.
     #[test]
     fn broken_files_are_named() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("broken.png");
-        std::fs::write(&path, b"not a picture").unwrap();
+        std::fs::write(&path, b"not an image").unwrap();
         assert!(Image::load_png(&path).unwrap_err().to_string().contains("broken.png: not a readable PNG"));
         gradient().save_png(&path).unwrap();
         let bytes = std::fs::read(&path).unwrap();
@@ -235,7 +235,7 @@ mod tests {
         assert!(Image::load_png(&missing).unwrap_err().to_string().contains("missing.png"));
     }
 
-    /// One channel off by 1 in every pixel of a black picture is 10 log10(255^2 * 3) decibels.
+    /// One channel that is off by 1 in every pixel of a black image gives 10 log10(255^2 * 3) decibels.
     #[test]
     fn psnr_of_a_known_error() {
         let black = Image::filled(4, 4, [0; 3]);

@@ -1,7 +1,7 @@
-//! Import of plain sets, as nerfstudio and instant-ngp write them, into sets of one state.
+//! Import of datasets in the formats of nerfstudio and instant-ngp into datasets of one state.
 //!
-//! Pictures become opaque, undistorted PNG files no larger than asked for; cameras go with them. What such a set does
-//! not say is where its scene lies: a box is put around the point that the cameras look at, unless one is given.
+//! Images become opaque, undistorted PNG files with a maximum size, and their cameras are converted. The source does
+//! not contain the scene's bounds: by default they are a box around the point that the cameras look at.
 
 use std::path::Path;
 
@@ -15,14 +15,14 @@ use crate::image::{Image, load_any};
 use crate::transforms::{Distortion, Pictures, read};
 use crate::writer::{DatasetWriter, FrameRecord};
 
-/// How to import.
+/// Options of an import.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ImportOptions {
-    /// Longest side of a picture that is written, pixels; larger ones are scaled down.
+    /// Longest side of a written image, pixels; larger images are scaled down.
     pub max_side_px: u32,
-    /// What lies behind transparent pixels, sRGB.
+    /// Background of transparent pixels, sRGB.
     pub background: [u8; 3],
-    /// Lower and upper corner of the box that matters, in the set's own units. Default: see [`Imported::bounds`].
+    /// Lower and upper corner of the region of interest, in the dataset's own units. Default: see [`Imported::bounds`].
     pub bounds: Option<[[f64; 3]; 2]>,
 }
 
@@ -32,26 +32,26 @@ impl Default for ImportOptions {
     }
 }
 
-/// What was imported.
+/// Result of an import.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Imported {
-    /// Pictures written.
+    /// Number of written images.
     pub frames: usize,
-    /// The box that matters: given, or else a cube about the point that the cameras' lines of sight pass nearest to, with
-    /// half the cameras' median distance from it on each side.
+    /// Region of interest: the given one, or else a cube around the point nearest to the cameras' lines of sight. Each
+    /// side of the cube extends half of the cameras' median distance from it.
     pub bounds: [[f64; 3]; 2],
-    /// How many pictures were undistorted.
+    /// Number of undistorted images.
     pub undistorted: usize,
-    /// How many pictures were scaled down.
+    /// Number of images that were scaled down.
     pub scaled: usize,
 }
 
-/// Reads a plain set from `from` and writes a set of one state to `out`, which must be new, empty, or a set that this
-/// program wrote. A set that says its scenario is no plain set, and an error.
+/// Reads a dataset from `from` and writes a dataset of one state to `out`, which must be new, empty, or a dataset that
+/// this program wrote. A dataset that names its scenario is an error.
 pub fn import(from: &Path, out: &Path, options: &ImportOptions) -> Result<Imported, DatasetError> {
     let set = read(from, Pictures::PngOrJpeg)?;
     if set.scenario.is_some() {
-        let problem = "the set says its scenario: it can be used as it is, and need not be imported".to_owned();
+        let problem = "the dataset names its scenario: it can be used directly, and need not be imported".to_owned();
         return Err(DatasetError::Image { path: from.to_owned(), problem });
     }
     let cameras: Vec<PinholeCamera> = set.frames.iter().map(|f| f.camera).collect();
@@ -89,7 +89,7 @@ pub fn import(from: &Path, out: &Path, options: &ImportOptions) -> Result<Import
     Ok(Imported { frames: records.len(), bounds, undistorted, scaled })
 }
 
-/// The record, whether the picture was distorted, and whether it was too large.
+/// Returns the record, whether the image was distorted, and whether it was too large.
 fn write_frame(
     writer: &DatasetWriter,
     view: usize,
@@ -100,7 +100,7 @@ fn write_frame(
     let mut image = load_any(&frame.image_path, options.background)?;
     let mut camera = frame.camera;
     if (image.width_px, image.height_px) != (camera.width_px, camera.height_px) {
-        // Pictures that were scaled after their intrinsics were written down: the same form in another size.
+        // Images may have been scaled after their intrinsics were written: equal aspect ratio, other size.
         let across = u64::from(image.width_px) * u64::from(camera.height_px);
         let down = u64::from(image.height_px) * u64::from(camera.width_px);
         if across.abs_diff(down) > u64::from(camera.width_px.max(camera.height_px)) {
@@ -136,12 +136,12 @@ fn scaled_down(image: &Image, width_px: u32, height_px: u32) -> Image {
             let rgb = resize(&buffer, width_px, height_px, FilterType::Triangle).into_raw();
             Image { width_px, height_px, rgb }
         }
-        // A picture's bytes always fit its size.
+        // The number of bytes always matches the size.
         None => image.clone(),
     }
 }
 
-/// The picture that a pinhole camera of the same intrinsics would have taken.
+/// Returns the image that a pinhole camera of the same intrinsics would have taken.
 fn undistort(image: &Image, camera: &PinholeCamera, [k1, k2, k3, k4, p1, p2]: &Distortion, beyond: [u8; 3]) -> Image {
     let mut result = Image::filled(image.width_px, image.height_px, beyond);
     let (w, h) = (image.width_px as usize, image.height_px as usize);
@@ -170,8 +170,8 @@ fn undistort(image: &Image, camera: &PinholeCamera, [k1, k2, k3, k4, p1, p2]: &D
     result
 }
 
-/// See [`Imported::bounds`]. Where all cameras look the same way there is no such point: then it is ahead of them, as far
-/// as they stand apart.
+/// See [`Imported::bounds`]. Parallel cameras have no such point: then it is ahead of them, at the distance of their
+/// spread.
 fn bounds_of(cameras: &[PinholeCamera]) -> [[f64; 3]; 2] {
     let ahead = |c: &PinholeCamera| [0, 1, 2].map(|i| -c.world_from_camera[i][2]);
     // Sum over lines of (I - d d^T) (x - p) = 0.
@@ -203,7 +203,7 @@ fn bounds_of(cameras: &[PinholeCamera]) -> [[f64; 3]; 2] {
     [center.map(|v| v - half), center.map(|v| v + half)]
 }
 
-/// Solves a symmetric 3x3 system; `None` when its determinant is so small that the lines are all but parallel.
+/// Solves a symmetric 3x3 system; `None` if its determinant is so small that the lines are nearly parallel.
 fn solve(m: [[f64; 3]; 3], right: [f64; 3], least: f64) -> Option<[f64; 3]> {
     let determinant = |m: &[[f64; 3]; 3]| {
         m[0][0] * (m[1][1] * m[2][2] - m[1][2] * m[2][1]) - m[0][1] * (m[1][0] * m[2][2] - m[1][2] * m[2][0])
@@ -230,7 +230,7 @@ mod tests {
         PinholeCamera::look_at(eye, target, [0.0, 0.0, 1.0], 64, 48, 60.0)
     }
 
-    /// The box stands about the point that all cameras look at, half as wide as they are far; cameras side by side have it
+    /// The box surrounds the point that all cameras look at, half as wide as their distance; for parallel cameras it is
     /// ahead of them.
     #[test]
     fn the_box_is_where_cameras_look() {
@@ -250,7 +250,7 @@ mod tests {
         assert!(low[1] > 0.5 && high[1] > 2.0 && (low[0] + high[0] - 2.0).abs() < 1e-6, "{low:?} {high:?}");
     }
 
-    /// What a lens bent is straightened: a dot drawn where the distorted camera sees a point is where the pinhole sees it.
+    /// Undistortion inverts the lens: a dot at the distorted position moves to the pinhole camera's position.
     #[test]
     fn lenses_are_straightened() {
         let camera = look([0.0; 3], [0.0, 1.0, 0.0]);

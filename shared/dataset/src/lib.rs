@@ -1,7 +1,8 @@
-//! Posed image sets: reading, writing, checking, splitting.
+//! Posed image datasets: reading, writing, checking, splitting.
 //!
-//! A set is a folder with `transforms.json` (the form of instant-ngp and nerfstudio, plus a few keys that say which
-//! course of events and which time step a picture shows) and its PNG pictures. No model and no rendering lives here.
+//! A dataset is a folder with `transforms.json` and its PNG images. The file has the format of instant-ngp and
+//! nerfstudio, with additional keys for the branch and time step of each image. This crate contains no models and no
+//! rendering.
 //!
 //! ```no_run
 //! use carff_dataset::{Dataset, Equivalence, PoseSplit};

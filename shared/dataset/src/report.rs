@@ -1,4 +1,4 @@
-//! Statistics of a set, for people: what it holds, how hard it is, and whether hidden states leak.
+//! Statistics of a dataset, for people: contents, difficulty, and leaks of hidden states.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -8,16 +8,16 @@ use crate::equivalence::Equivalence;
 use crate::image::Image;
 use carff_messages::Observability;
 
-/// A mean difference above this, of 255, between pictures that should look the same is a leak: nobody can see it,
-/// but a network can.
+/// Images that should look the same leak their state if their mean difference exceeds this limit, of 255. People cannot
+/// see it, but a network can.
 const LEAK_LIMIT: f64 = 0.1;
 
-/// Pictures of one view at one timestamp in two branches, in neither of which the actor's place can be seen.
+/// Two branches' images of one view at one time step that both hide the actor's place.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct HiddenPair {
     /// Camera pose.
     pub view: usize,
-    /// Step.
+    /// Time step of the branches.
     pub timestamp: usize,
     /// The two branches.
     pub branches: [usize; 2],
@@ -27,40 +27,40 @@ pub struct HiddenPair {
     pub max_difference: u8,
 }
 
-/// What `carff dataset check` prints.
+/// The output of `carff dataset check`.
 #[derive(Clone, Debug)]
 pub struct DatasetReport {
-    /// Where the set lies.
+    /// Folder of the dataset.
     pub dir: String,
-    /// Number of pictures.
+    /// Number of images.
     pub frames: usize,
     /// Number of camera poses.
     pub views: usize,
-    /// Pictures of each size (width, height), pixels.
+    /// Number of images of each size (width, height), pixels.
     pub image_sizes: BTreeMap<(u32, u32), usize>,
-    /// Poses of each kind.
+    /// Number of poses of each kind.
     pub view_kinds: BTreeMap<String, usize>,
     /// The scenario.
     pub scenario: Option<ScenarioInfo>,
-    /// Pictures per (branch, timestamp), by observability: full, partial, none, unknown.
+    /// Number of images per (branch, time step), by observability: full, partial, none, unknown.
     pub counts: BTreeMap<(usize, usize), [usize; 4]>,
-    /// PSNR of the mean picture of each pose against the pictures, errors pooled over all of them, decibels. It is
-    /// what a model scores that knows the pose and nothing else. `None` when no pose has two different pictures.
+    /// PSNR of each pose's mean image against the images, with errors pooled over all poses, decibels. A model that
+    /// only knows the pose reaches it. `None` if no pose has two different images.
     pub pose_mean_psnr_db: Option<f64>,
-    /// The same for the bird's-eye view alone.
+    /// PSNR of the mean image for the bird's-eye view only.
     pub bev_pose_mean_psnr_db: Option<f64>,
-    /// Best possible accuracy of naming the state: over all pictures, and by observability.
+    /// Best possible accuracy of naming the state: over all images, and by observability.
     pub ceiling: Option<f64>,
-    /// See `ceiling`; full, partial, none.
+    /// Best possible accuracy for full, partial and none.
     pub ceiling_by_observability: [Option<f64>; 3],
-    /// Every pair of pictures that should look the same because the actor's place is hidden.
+    /// Pairs of images that should look the same because the actor's place is hidden.
     pub hidden_pairs: Vec<HiddenPair>,
-    /// What looks odd.
+    /// Warnings about unusual values.
     pub warnings: Vec<String>,
 }
 
 impl DatasetReport {
-    /// Measures a set. `images` are those of [`Dataset::load_all_images`].
+    /// Measures a dataset. `images` are those of [`Dataset::load_all_images`].
     pub fn of(dataset: &Dataset, images: &[Image]) -> Self {
         let mut image_sizes = BTreeMap::new();
         for image in images {
@@ -94,7 +94,7 @@ impl DatasetReport {
         for pair in hidden_pairs.iter().filter(|p| p.mean_difference > LEAK_LIMIT) {
             warnings.push(format!(
                 "view {} at timestamp {}: the actor is hidden, yet branches {} and {} differ by a mean of {:.3} of 255; \
-                 a network can learn to see that",
+                 a network can learn this difference",
                 pair.view, pair.timestamp, pair.branches[0], pair.branches[1], pair.mean_difference
             ));
         }
@@ -159,7 +159,7 @@ fn hidden_pairs(dataset: &Dataset, images: &[Image]) -> Vec<HiddenPair> {
             hidden.entry((view, timestamp)).or_default().push((branch, i));
         }
     }
-    // Where no branch is a hazard, all of them are compared.
+    // Without hazard branches, all branches are compared.
     let hazards = dataset.scenario().map_or(&[][..], |s| &s.hazard_branches);
     let alike = |a: usize, b: usize| !hazards.is_empty() && hazards.contains(&a) == hazards.contains(&b);
     let mut pairs = Vec::new();
@@ -188,14 +188,14 @@ impl fmt::Display for DatasetReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let decibels = |v: Option<f64>| v.map_or_else(|| "-".to_owned(), |v| format!("{v:.2} dB"));
         let percent = |v: Option<f64>| v.map_or_else(|| "-".to_owned(), |v| format!("{:.1} %", v * 100.0));
-        writeln!(f, "Data set    {}", self.dir)?;
+        writeln!(f, "Dataset    {}", self.dir)?;
         let sizes: Vec<String> = self.image_sizes.iter().map(|((w, h), n)| format!("{n} of {w}x{h} px")).collect();
         writeln!(f, "Pictures    {} ({})", self.frames, sizes.join(", "))?;
         let kinds: Vec<String> = self.view_kinds.iter().map(|(kind, n)| format!("{n} {kind}")).collect();
         let kinds = if kinds.is_empty() { String::new() } else { format!(" ({})", kinds.join(", ")) };
         writeln!(f, "Poses       {}{kinds}", self.views)?;
         let Some(scenario) = &self.scenario else {
-            writeln!(f, "Scenario    none: a plain set, one state")?;
+            writeln!(f, "Scenario    none: one state")?;
             return self.fmt_warnings(f);
         };
         writeln!(
@@ -223,7 +223,7 @@ impl fmt::Display for DatasetReport {
             let name = scenario.branches.get(branch).map_or("?", String::as_str);
             writeln!(f, "{name:width$}  {timestamp:>4} {:>6} {:>8} {:>6} {:>8}", row[0], row[1], row[2], row[3])?;
         }
-        writeln!(f, "\nMean picture of each pose: {}", decibels(self.pose_mean_psnr_db))?;
+        writeln!(f, "\nMean image of each pose: {}", decibels(self.pose_mean_psnr_db))?;
         writeln!(f, "  in the bird's-eye view:  {}", decibels(self.bev_pose_mean_psnr_db))?;
         writeln!(f, "Best possible state accuracy: {}", percent(self.ceiling))?;
         for (o, ceiling) in Observability::ALL.into_iter().zip(self.ceiling_by_observability) {
@@ -255,14 +255,14 @@ impl DatasetReport {
     }
 }
 
-/// How a contact sheet is laid out.
+/// Layout of a contact sheet.
 #[derive(Clone, Copy, Debug)]
 pub struct SheetOptions {
-    /// Views, one a column.
+    /// Maximum number of columns; each is a view.
     pub columns: usize,
-    /// States, one a row.
+    /// Maximum number of rows; each is a state.
     pub max_rows: usize,
-    /// Space between pictures, pixels.
+    /// Space between images, pixels.
     pub gap_px: u32,
 }
 
@@ -276,9 +276,9 @@ impl Default for SheetOptions {
 const LEGEND: [[u8; 3]; 4] = [[40, 160, 60], [230, 190, 30], [205, 50, 45], [128, 128, 128]];
 const BORDER_PX: u32 = 2;
 
-/// One picture of the whole set: a row per state, a column per view, the views spread over kinds of cameras (the
-/// bird's-eye view first). Each picture's border tells its observability: green full, yellow partial, red none, grey
-/// unknown. A set without views is shown in the order of its frames.
+/// Draws a contact sheet: a row per state and a column per view. The views are spread over the kinds of cameras, the
+/// bird's-eye view first. Each image's border shows its observability: green full, yellow partial, red none, grey
+/// unknown. A dataset without views is shown in the order of its frames.
 pub fn contact_sheet(dataset: &Dataset, images: &[Image], options: SheetOptions) -> Image {
     let columns = options.columns.max(1);
     let rows: Vec<Vec<usize>> = if dataset.view_count() == 0 {
@@ -312,7 +312,8 @@ pub fn contact_sheet(dataset: &Dataset, images: &[Image], options: SheetOptions)
     sheet
 }
 
-/// Views that show what the set holds: the bird's-eye one, then each kind's in turn, evenly spaced within the kind.
+/// Returns representative views: the bird's-eye view, then alternately views of each kind, evenly spaced within the
+/// kind.
 fn spread_views(dataset: &Dataset, count: usize) -> Vec<usize> {
     let bev = dataset.scenario().and_then(|s| s.bev_view);
     let mut kinds: Vec<(Option<&str>, Vec<usize>)> = Vec::new();

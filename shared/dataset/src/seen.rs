@@ -1,4 +1,4 @@
-//! How much each picture shows of what tells branches apart, for a set that does not say: told by its pictures.
+//! Derives the observability of frames from their images, for datasets that do not contain it.
 
 use crate::dataset::Frame;
 use crate::equivalence::looks_same;
@@ -7,9 +7,9 @@ use crate::image::Image;
 use carff_messages::Observability;
 use rayon::prelude::*;
 
-/// Observability of each frame, from the other branches' pictures at its timestamp from its view: `none` where all of
-/// them look the same as it, `full` where none does, else `partial`; `None` where there is nothing to compare it with.
-/// `load` decodes the picture of a frame; its first error is the error.
+/// Returns the observability of each frame by comparison with the other branches' images at its time step from its
+/// view: `none` if all of them look the same, `full` if none does, else `partial`; `None` without another image. `load`
+/// decodes the image of a frame; its first error is returned.
 pub(crate) fn told_by_pictures(
     frames: &[Frame],
     views: usize,

@@ -1,7 +1,7 @@
-//! The noise of a small camera: read noise, exposure and white balance that vary from frame to frame.
+//! The noise of a small camera: read noise, and exposure and white balance that vary per frame.
 //!
-//! One function serves the camera stage and training alike, so that a model meets in use what it was trained on.
-//! All draws come from the counter-based stream of a key: the same key gives the same bytes.
+//! The camera stage and the training use this function, so that models are trained on the same noise. All draws come
+//! from the counter-based stream of a key: the same key gives the same bytes.
 
 use carff_base::random::{Key, tag};
 use rand::Rng;
@@ -9,7 +9,7 @@ use rand_distr::StandardNormal;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// How noisy the sensor is. All zero: the picture passes unchanged.
+/// Parameters of the sensor noise. If all are zero, the image is unchanged.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct SensorNoise {
@@ -33,37 +33,37 @@ impl Default for SensorNoise {
     }
 }
 
-/// Why noise cannot be applied.
+/// Reason why noise cannot be applied.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum SensorError {
-    /// A setting out of range.
+    /// A parameter is out of range.
     #[error("sensor noise: `{key}` is {value}; allowed are 0 to {limit}")]
     OutOfRange {
-        /// Which setting.
+        /// Name of the parameter.
         key: &'static str,
-        /// Its value.
+        /// Value of the parameter.
         value: f32,
         /// The largest allowed value.
         limit: f32,
     },
-    /// Source and destination have different lengths, or a length that is not made of RGB pixels.
+    /// Source and destination have different lengths, or a length that is not a multiple of 3.
     #[error("sensor noise: {source_len} bytes into {destination_len}; both must be the same multiple of 3")]
     Lengths {
-        /// Bytes in the source.
+        /// Number of bytes in the source.
         source_len: usize,
-        /// Bytes in the destination.
+        /// Number of bytes in the destination.
         destination_len: usize,
     },
 }
 
-/// Names this use of the run's seed, so that no other draw of the same run shares the stream.
+/// Name of the random stream, so that no other draw of the same run shares it.
 const STREAM: u64 = tag("sensornz");
 
 impl SensorNoise {
-    /// No noise at all.
+    /// Parameters without any noise.
     pub const OFF: Self = Self { sigma: 0.0, gain_sigma: 0.0, channel_gain_sigma: 0.0, channel_offset_sigma: 0.0 };
 
-    /// Checks that each setting is finite and in range.
+    /// Checks that each parameter is finite and in range.
     pub fn validate(&self) -> Result<(), SensorError> {
         for (key, value, limit) in [
             ("sigma", self.sigma, 64.0),
@@ -79,8 +79,8 @@ impl SensorNoise {
     }
 }
 
-/// Writes `source` (RGB, 8 bit) with noise into `destination`, each byte once and in order, so that the destination
-/// can be a loaned sample in shared memory. Nothing is allocated. The same key gives the same noise.
+/// Writes `source` (RGB, 8 bit) with noise into `destination`. It writes each byte once and in order, so that the
+/// destination can be a loaned sample in shared memory. It allocates nothing. The same key gives the same noise.
 pub fn apply_noise_into(
     source: &[u8],
     destination: &mut [u8],
@@ -106,7 +106,7 @@ fn transform(source: impl Iterator<Item = u8>, destination: &mut [u8], noise: &S
     }
 }
 
-/// The draws of one frame.
+/// Random values of one frame.
 struct Noise<R> {
     rng: R,
     sigma: f32,
@@ -146,7 +146,7 @@ mod tests {
 
     const KEY: Key = Key { seed: 5, frame: 17, step: 0, sample: 0 };
 
-    /// The same key gives the same bytes, in place or not; another key gives others.
+    /// The same key gives the same bytes, in place or not; another key gives other bytes.
     #[test]
     fn noise_is_named_by_its_key() {
         let source = vec![128_u8; 64 * 64 * 3];
@@ -173,7 +173,7 @@ mod tests {
         assert!((variance - expected).abs() < 5.0 * expected * (2.0 / n).sqrt(), "{variance}");
     }
 
-    /// Gain and offset are one draw a frame: with no read noise, equal pixels stay equal within a channel.
+    /// Gain and offset are drawn once per frame: without read noise, equal pixels stay equal within a channel.
     #[test]
     fn colour_changes_are_global() {
         let mut rgb = vec![100_u8; 30];
@@ -183,7 +183,7 @@ mod tests {
         assert_ne!(rgb[..3], [100; 3]);
     }
 
-    /// No noise is a copy, black and white do not wrap around, and bad settings or lengths are refused.
+    /// Zero noise copies the image, black and white do not wrap around, and bad parameters or lengths are refused.
     #[test]
     fn limits() {
         let source = [0_u8, 255, 7];

@@ -1,37 +1,37 @@
-//! Which poses are kept away from training, and which choose thresholds.
+//! Split of poses into held-out, calibration and other training poses.
 
 use carff_base::random::{Key, tag};
 use rand::seq::SliceRandom;
 
 use crate::dataset::Dataset;
 
-/// What a camera pose is used for.
+/// Role of a camera pose.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum PoseRole {
-    /// Never trained on.
+    /// Held out: never used in training.
     Unseen,
-    /// Trained on, and used for every threshold and choice of model.
+    /// Used in training, and for every threshold and choice of model.
     Calibration,
-    /// Trained on, and what tables are about.
+    /// Used in training; tables report these poses.
     Rest,
 }
 
-/// The poses of a set, split once by a seed: a tenth unseen, a tenth calibration, the rest.
+/// The poses of a dataset, split by a seed: a tenth held out, a tenth calibration, and the rest.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct PoseSplit {
     roles: Vec<PoseRole>,
 }
 
-/// Names this use of the run's seed, so that no other draw of the same run shares the stream.
+/// Name of the random stream, so that no other draw of the same run shares it.
 const STREAM: u64 = tag("posesplt");
 
 impl PoseSplit {
-    /// Splits `view_count` poses. Those in `always_train` are always in [`PoseRole::Rest`].
+    /// Splits `view_count` poses. Poses in `always_train` are always in [`PoseRole::Rest`].
     pub fn new(view_count: usize, seed: u64, always_train: &[usize]) -> Self {
         Self::stratified(&vec![0; view_count], seed, always_train)
     }
 
-    /// Splits the poses of a set, so that each kind of camera has its tenths; the bird's-eye view is always in
+    /// Splits the poses of a dataset separately for each kind of camera; the bird's-eye view is always in
     /// [`PoseRole::Rest`].
     pub fn for_dataset(dataset: &Dataset, seed: u64) -> Self {
         let mut kinds: Vec<Option<&str>> = Vec::new();
@@ -74,23 +74,23 @@ impl PoseSplit {
         Self { roles }
     }
 
-    /// What a pose is used for. A pose that the split does not know is unseen.
+    /// Returns the role of a pose. A pose outside the split counts as held out.
     pub fn role(&self, view: usize) -> PoseRole {
         self.roles.get(view).copied().unwrap_or(PoseRole::Unseen)
     }
 
-    /// All poses of one role, in ascending order.
+    /// Returns all poses of a role, in ascending order.
     pub fn views(&self, role: PoseRole) -> Vec<usize> {
         (0..self.roles.len()).filter(|&view| self.roles[view] == role).collect()
     }
 
-    /// Number of poses.
+    /// Returns the number of poses.
     pub fn view_count(&self) -> usize {
         self.roles.len()
     }
 }
 
-/// A tenth of the whole, handed out among groups by largest remainder, so that small groups do not vanish all at once.
+/// Distributes a tenth of the total among groups by largest remainder, so that small groups keep their share.
 fn tenths(sizes: &[usize]) -> Vec<usize> {
     let total = sizes.iter().sum::<usize>();
     let wanted = (total + 5) / 10;
@@ -108,7 +108,8 @@ fn tenths(sizes: &[usize]) -> Vec<usize> {
 mod tests {
     use super::*;
 
-    /// 100 poses make 10 unseen, 10 calibration, 80 rest; the same seed makes the same split, another seed another.
+    /// 100 poses give 10 held-out, 10 calibration and 80 other poses; equal seeds give equal splits, other seeds
+    /// others.
     #[test]
     fn tenths_are_drawn_by_seed() {
         let split = PoseSplit::new(100, 7, &[]);
@@ -119,7 +120,7 @@ mod tests {
         assert_ne!(split, PoseSplit::new(100, 8, &[]));
     }
 
-    /// A pose that must be trained on is in the rest whatever the seed.
+    /// A pose that must be trained on is in the rest for every seed.
     #[test]
     fn always_train_is_kept() {
         for seed in 0..50 {
@@ -130,7 +131,7 @@ mod tests {
         }
     }
 
-    /// Each stratum gives its tenth: 50, 10, 18, 12 and 10 poses give 5, 1, 2, 1 and 1 to each small role.
+    /// Each stratum contributes a tenth: 50, 10, 18, 12 and 10 poses give 5, 1, 2, 1 and 1 to each small role.
     #[test]
     fn strata_give_their_share() {
         let sizes = [50, 10, 18, 12, 10];
@@ -145,7 +146,7 @@ mod tests {
         }
     }
 
-    /// Very small sets keep poses to train on, and an unknown pose counts as unseen.
+    /// Very small datasets keep poses to train on, and an unknown pose counts as held out.
     #[test]
     fn small_and_unknown() {
         let split = PoseSplit::new(1, 0, &[]);

@@ -1,4 +1,4 @@
-//! Reading of transforms files: every value is checked, every error says file, place and key.
+//! Reading of transforms files: every value is checked, and every error names file, place and key.
 
 use std::collections::HashMap;
 use std::path::{Component, Path, PathBuf};
@@ -15,15 +15,15 @@ use crate::image::dimensions;
 
 const MAX_BRANCHES: usize = 1024;
 const MAX_TIMESTAMPS: usize = 4096;
-/// Poses of one view may differ by this much among states (metres, or entries of the rotation).
+/// Tolerance between poses of one view in different states (metres, or entries of the rotation).
 const POSE_TOLERANCE: f64 = 1e-4;
 
-/// Which pictures frames may name.
+/// Image formats that frames may name.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Pictures {
-    /// PNG files inside the set's folder: what this program works on.
+    /// PNG files inside the dataset's folder: the program's own format.
     Png,
-    /// Also JPEG files: what it imports.
+    /// PNG and JPEG files, for imports.
     PngOrJpeg,
 }
 
@@ -32,7 +32,7 @@ pub(crate) type Distortion = [f64; 6];
 
 pub(crate) struct Transforms {
     pub frames: Vec<Frame>,
-    /// One for each frame.
+    /// Distortion of each frame.
     pub distortions: Vec<Distortion>,
     pub scenario: Option<ScenarioInfo>,
     pub warnings: Vec<String>,
@@ -60,7 +60,8 @@ pub(crate) fn read(dir: &Path, pictures: Pictures) -> Result<Transforms, Dataset
     for path in files {
         documents.push(Document { root: parse(&path)?, path });
     }
-    // The scenario comes first, whichever file has it: it says how a scene_id splits into branch and timestamp.
+    // The scenario is read first, from whichever file has it: it defines how a scene_id splits into branch and time
+    // step.
     let mut scenario: Option<ScenarioInfo> = None;
     for document in &documents {
         let file = Place { path: &document.path, place: "top level".to_owned() };
@@ -131,7 +132,7 @@ fn parse(path: &Path) -> Result<Value, DatasetError> {
     serde_json::from_slice(&text).map_err(|source| DatasetError::Json { path: path.to_owned(), source })
 }
 
-/// Where in which file we are: makes errors and typed look-ups.
+/// Place in a file, for errors and typed look-ups.
 struct Place<'a> {
     path: &'a Path,
     place: String,
@@ -168,7 +169,7 @@ impl<'a> Place<'a> {
         }
     }
 
-    /// A whole number below `limit`. `3.0` is accepted: other tools write sizes so.
+    /// Returns a whole number below `limit`. `3.0` is accepted, because other tools write sizes that way.
     fn index(&self, map: &Map<String, Value>, key: &str, limit: usize) -> Result<Option<usize>, DatasetError> {
         let Some(value) = present(map, key) else { return Ok(None) };
         let number = value.as_f64().filter(|n| n.fract() == 0.0 && *n >= 0.0 && *n < limit as f64);
@@ -189,7 +190,7 @@ impl<'a> Place<'a> {
     }
 }
 
-/// A key that is there and not null.
+/// Returns the value of a key that exists and is not null.
 fn present<'v>(map: &'v Map<String, Value>, key: &str) -> Option<&'v Value> {
     map.get(key).filter(|value| !value.is_null())
 }
@@ -211,7 +212,7 @@ fn kind(value: &Value) -> &'static str {
     }
 }
 
-/// The frame's own coefficients, or else those at top level.
+/// Returns the frame's own coefficients, or else those at top level.
 fn read_distortion(
     place: &Place,
     frame: &Map<String, Value>,
@@ -231,7 +232,7 @@ fn warn_about_distortion(path: &Path, top: &Map<String, Value>, warnings: &mut V
     for key in ["k1", "k2", "k3", "k4", "p1", "p2"] {
         if top.get(key).and_then(Value::as_f64).is_some_and(|v| v.abs() > 1e-9) {
             warnings.push(format!(
-                "{}: lens distortion (key `{key}`) is ignored; undistort the pictures first",
+                "{}: lens distortion (key `{key}`) is ignored; undistort the images first",
                 path.display()
             ));
         }
@@ -291,14 +292,14 @@ fn read_image_path(
     let name = place
         .text(frame, "file_path")?
         .filter(|name| !name.is_empty())
-        .ok_or_else(|| place.error("file_path", "is missing; it is the picture's path relative to the set's folder"))?;
+        .ok_or_else(|| place.error("file_path", "is missing; it is the image's path relative to the dataset folder"))?;
     let mut relative = PathBuf::new();
     for component in Path::new(name).components() {
         match component {
             Component::Normal(part) => relative.push(part),
             Component::CurDir => {}
             Component::ParentDir | Component::RootDir | Component::Prefix(_) => {
-                return Err(place.error("file_path", "must stay inside the set's folder: no leading `/` and no `..`"));
+                return Err(place.error("file_path", "must stay inside the dataset folder: no leading `/` and no `..`"));
             }
         }
     }
@@ -311,7 +312,7 @@ fn read_image_path(
         Some(extension) => {
             return Err(place.error(
                 "file_path",
-                format!("is a .{extension} file; only .png pictures are read (`carff dataset import` also takes .jpg)"),
+                format!("is a .{extension} file; only .png images are read (`carff dataset import` also takes .jpg)"),
             ));
         }
     }
@@ -356,7 +357,7 @@ fn read_camera(
         (None, Some(_)) => return Err(place.error("w", "is missing while `h` is given")),
         (Some(_), None) => return Err(place.error("h", "is missing while `w` is given")),
     };
-    // A frame's own angle wins over a focal length at top level.
+    // A frame's own angle takes precedence over a focal length at top level.
     let focal_length_px = |place: &Place, map: &Map<String, Value>| -> Result<Option<f64>, DatasetError> {
         if let Some(fl) = place.number(map, "fl_x")? {
             return Ok(Some(fl));
@@ -408,7 +409,7 @@ fn read_camera(
 
 type StateIndices = (Option<usize>, Option<usize>, Option<usize>);
 
-/// State, branch and timestamp of a frame, each derived from the others where the scenario allows it.
+/// Returns state, branch and timestamp of a frame, each derived from the others if the scenario allows it.
 fn read_state(
     place: &Place,
     frame: &Map<String, Value>,
@@ -439,7 +440,7 @@ fn read_state(
         (None, Some(named)) => named,
         (None, None) => {
             let key = if branch.is_some() { "timestamp" } else { "scene_id" };
-            return Err(place.error(key, "is missing; give `scene_id`, or `branch` and `timestamp`"));
+            return Err(place.error(key, "is missing; add `scene_id`, or `branch` and `timestamp`"));
         }
     };
     let (b, t) = (state / scenario.timestamps, state % scenario.timestamps);
@@ -451,7 +452,7 @@ fn read_state(
     Ok((Some(state), Some(b), Some(t)))
 }
 
-/// With no scenario, the largest timestamp says how many there are.
+/// Derives states without a scenario: the largest timestamp gives the number of time steps.
 fn derive_states_without_scenario(frames: &mut [Frame]) {
     if frames.iter().any(|f| f.state.is_some() || f.branch.is_none() || f.timestamp.is_none()) {
         return;
@@ -467,9 +468,9 @@ fn same_pose(a: &PinholeCamera, b: &PinholeCamera) -> bool {
     a.zip(b).all(|(a, b)| (a - b).abs() <= POSE_TOLERANCE)
 }
 
-/// Frames that name no view: each distinct pose is one, in the order in which they come.
+/// Numbers the views of frames without a view: each distinct pose is a view, in order of appearance.
 fn number_views_by_pose(frames: &mut [Frame]) {
-    // Poses in cells of the tolerance's size; the same pose may fall into a neighbour's cell along the position.
+    // Poses are sorted into cells of the tolerance's size; equal poses may be in neighbouring cells along the position.
     let mut known: HashMap<[i64; 3], Vec<(PinholeCamera, usize)>> = HashMap::new();
     let mut next = 0;
     for frame in frames {
@@ -491,8 +492,8 @@ fn number_views_by_pose(frames: &mut [Frame]) {
     }
 }
 
-/// Parts of a set that number their views each from 0: where a number means different poses in two files, those of later
-/// files are counted on.
+/// Renumbers views of files that each start at 0: if a number means different poses in two files, the later file's
+/// views continue the numbering.
 fn number_views_of_parts(frames: &mut [Frame], places: &[(PathBuf, String)]) {
     let mut first: HashMap<usize, usize> = HashMap::new();
     let collide = frames.iter().enumerate().any(|(i, frame)| {
@@ -515,7 +516,7 @@ fn number_views_of_parts(frames: &mut [Frame], places: &[(PathBuf, String)]) {
     }
 }
 
-/// A view is one pose, once in every state of the scenario; view indices have no gaps.
+/// Checks that a view is one pose that occurs once in every state of the scenario, and that indices have no gaps.
 fn check_views(
     frames: &[Frame],
     places: &[(PathBuf, String)],
@@ -532,7 +533,7 @@ fn check_views(
         };
         if let Some(&other) = by_state_and_view.get(&(state, view)) {
             return Err(place(i)
-                .error("view_id", format!("view {view} of state {state} is given before, in {}", places[other].1)));
+                .error("view_id", format!("view {view} of state {state} occurs before, in {}", places[other].1)));
         }
         by_state_and_view.insert((state, view), i);
         let first = *first_of_view.entry(view).or_insert(i);
@@ -681,7 +682,7 @@ fn read_states(
             }
             (Some(s), _) | (None, Some(s)) => s,
             (None, None) => {
-                return Err(at.error("scene_id", "is missing; give `scene_id`, or `branch` and `timestamp`"));
+                return Err(at.error("scene_id", "is missing; add `scene_id`, or `branch` and `timestamp`"));
             }
         };
         if std::mem::replace(&mut seen[state], true) {

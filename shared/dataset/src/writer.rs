@@ -1,5 +1,5 @@
-//! Writing of sets: pictures first, `transforms.json` last, so that an interrupted run never looks like a whole set.
-//! Until then, notes may say what is finished, so that the next run goes on from there.
+//! Writing of datasets: images first, `transforms.json` last, so that an interrupted run never looks complete. Until
+//! then, notes record the finished parts, so that the next run can continue.
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{ErrorKind, Write};
@@ -15,39 +15,39 @@ use crate::error::DatasetError;
 use crate::image::{Image, write_png};
 use carff_messages::Observability;
 
-/// Marks a folder as written by this program, hence free to be written again.
+/// Marks a folder as written by this program, so that it may be written again.
 const MARKER: &str = ".carff-dataset";
 
-/// What is finished of a set that is not: first a line that says which set it is, then a line a note.
+/// Notes on an unfinished dataset: a line with its identity, then a line per finished part.
 const NOTES: &str = "unfinished.jsonl";
 
-/// What the transforms file says about one picture.
+/// Entry of an image in the transforms file.
 #[derive(Clone, Debug, PartialEq)]
 pub struct FrameRecord {
-    /// Path relative to the set's folder, as in `images/b0_t0_v000.png`.
+    /// Path relative to the dataset's folder, as in `images/b0_t0_v000.png`.
     pub file_path: String,
     /// Intrinsics and pose.
     pub camera: PinholeCamera,
-    /// Which course of events, and which step of it.
+    /// Branch and time step of the image.
     pub branch_and_timestamp: Option<(usize, usize)>,
     /// Index of the fixed camera pose.
     pub view: Option<usize>,
-    /// How much of the actor it shows.
+    /// Visibility of the actor.
     pub observability: Option<Observability>,
-    /// Visible pixels over pixels that would be covered with nothing in between, 0..=1.
+    /// Ratio of visible pixels to the pixels of the unoccluded actor, 0..=1.
     pub visible_fraction: Option<f32>,
-    /// Pixels that show the actor or its place.
+    /// Number of pixels that show the actor or its place.
     pub actor_px: Option<u32>,
     /// Kind of camera.
     pub view_kind: Option<String>,
-    /// Depth picture beside it (16-bit grey PNG: millimetres along the ray, 0 where nothing is hit or beyond 65.535 m).
+    /// Path of its depth image (16-bit grey PNG: millimetres along the ray, 0 without a hit or beyond 65.535 m).
     pub depth_file_path: Option<String>,
-    /// Actor mask beside it (8-bit grey PNG: 255 where the pixel shows the actor).
+    /// Path of its actor mask (8-bit grey PNG: 255 where the pixel shows the actor).
     pub mask_file_path: Option<String>,
 }
 
 impl FrameRecord {
-    /// A record with nothing but the picture's path and camera.
+    /// Returns a record with only the image's path and camera.
     pub fn new(file_path: impl Into<String>, camera: PinholeCamera) -> Self {
         Self {
             file_path: file_path.into(),
@@ -64,7 +64,7 @@ impl FrameRecord {
     }
 }
 
-/// Writes one set into a folder. Its methods may be called from several threads.
+/// Writes a dataset into a folder. Its methods may be called from several threads.
 #[derive(Debug)]
 pub struct DatasetWriter {
     dir: PathBuf,
@@ -72,7 +72,7 @@ pub struct DatasetWriter {
 }
 
 impl DatasetWriter {
-    /// Prepares a folder: it must not exist, be empty, or be a set that this program wrote (which is then replaced).
+    /// Prepares a folder: it must not exist, be empty, or be a dataset of this program, which is then replaced.
     pub fn create(dir: &Path) -> Result<Self, DatasetError> {
         claim(dir)?;
         for file in ["transforms.json", NOTES] {
@@ -84,8 +84,8 @@ impl DatasetWriter {
         Ok(Self { dir: dir.to_owned(), notes: None })
     }
 
-    /// As [`Self::create`], but goes on with a set of the same `identity` (one line) that was interrupted: what was written
-    /// stays, and what was noted of it is handed back. Notes end where a line is not whole.
+    /// Prepares a folder as [`Self::create`] does, but continues an interrupted dataset of the same `identity` (one
+    /// line): written files stay, and their notes are returned. An incomplete line ends the notes.
     pub fn go_on<T: DeserializeOwned>(dir: &Path, identity: &str) -> Result<(Self, Vec<T>), DatasetError> {
         claim(dir)?;
         let path = dir.join(NOTES);
@@ -116,7 +116,7 @@ impl DatasetWriter {
         Ok((Self { dir: dir.to_owned(), notes: Some(Mutex::new(file)) }, notes))
     }
 
-    /// Notes that a part is finished, for [`Self::go_on`].
+    /// Records that a part is finished, for [`Self::go_on`].
     pub fn note<T: Serialize>(&self, note: &T) -> Result<(), DatasetError> {
         let Some(notes) = &self.notes else { return Ok(()) };
         let path = self.dir.join(NOTES);
@@ -131,7 +131,7 @@ impl DatasetWriter {
         if !inside || file_path.is_empty() {
             return Err(DatasetError::Image {
                 path: PathBuf::from(file_path),
-                problem: "must stay inside the set's folder: no leading `/` and no `..`".to_owned(),
+                problem: "must stay inside the dataset folder: no leading `/` and no `..`".to_owned(),
             });
         }
         let path = self.dir.join(file_path);
@@ -141,12 +141,13 @@ impl DatasetWriter {
         Ok(path)
     }
 
-    /// Writes a picture; `file_path` is relative to the set's folder.
+    /// Writes an image; `file_path` is relative to the dataset's folder.
     pub fn write_image(&self, file_path: &str, image: &Image) -> Result<(), DatasetError> {
         image.save_png(&self.place(file_path)?)
     }
 
-    /// Writes depth in metres as a 16-bit grey PNG in millimetres; what is not finite or beyond 65.535 m becomes 0.
+    /// Writes depth in metres as a 16-bit grey PNG in millimetres; values that are not finite or beyond 65.535 m become
+    /// 0.
     pub fn write_depth(
         &self,
         file_path: &str,
@@ -159,14 +160,14 @@ impl DatasetWriter {
             .flat_map(|d| {
                 let mm = (d * 1000.0).round();
                 let value = if (0.0..=65535.0).contains(&mm) { mm as u16 } else { 0 };
-                // The encoder takes samples in the machine's byte order.
+                // The encoder takes samples in native byte order.
                 value.to_ne_bytes()
             })
             .collect();
         write_png(&self.place(file_path)?, &bytes, width_px, height_px, ExtendedColorType::L16)
     }
 
-    /// Writes a mask as an 8-bit grey PNG with 255 where it holds.
+    /// Writes a mask as an 8-bit grey PNG, 255 for true.
     pub fn write_mask(
         &self,
         file_path: &str,
@@ -178,7 +179,7 @@ impl DatasetWriter {
         write_png(&self.place(file_path)?, &bytes, width_px, height_px, ExtendedColorType::L8)
     }
 
-    /// Writes `transforms.json`, whole or not at all. Intrinsics stand at top level when all frames share them.
+    /// Writes `transforms.json` atomically. Intrinsics are at top level if all frames share them.
     pub fn finish(self, frames: &[FrameRecord], scenario: Option<&ScenarioInfo>) -> Result<(), DatasetError> {
         let shared = frames
             .first()
@@ -215,7 +216,7 @@ impl DatasetWriter {
     }
 }
 
-/// Makes a folder ours: it must not exist, be empty, or be ours already.
+/// Claims a folder: it must not exist, be empty, or be claimed already.
 fn claim(dir: &Path) -> Result<(), DatasetError> {
     let io = |source| DatasetError::Io { path: dir.to_owned(), source };
     if dir.exists() {

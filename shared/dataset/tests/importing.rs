@@ -1,4 +1,4 @@
-//! Contracts of importing plain sets: both common layouts become sets of one state that are read as any other.
+//! Tests of imports: both common formats become datasets of one state that can be read like others.
 
 #![allow(clippy::unwrap_used)] // The helpers below are parts of tests.
 
@@ -8,7 +8,7 @@ use carff_base::geometry::PinholeCamera;
 use carff_dataset::{Dataset, Image, ImportOptions, import};
 use serde_json::{Value, json};
 
-/// Cameras around the point (0, 0, 1), 4 away from it.
+/// Returns cameras around the point (0, 0, 1), at a distance of 4.
 fn cameras(count: usize) -> Vec<PinholeCamera> {
     (0..count)
         .map(|i| {
@@ -22,8 +22,8 @@ fn put(dir: &Path, name: &str, set: &Value) {
     std::fs::write(dir.join(name), set.to_string()).unwrap();
 }
 
-/// The layout of instant-ngp and of the `NeRF` authors' synthetic scenes: an angle for a focal length, names without
-/// extension, files for each split, transparent pictures.
+/// The format of instant-ngp and of the `NeRF` authors' synthetic scenes is imported: an angle as focal length, names
+/// without extension, a file per split, transparent images.
 #[test]
 fn instant_ngp_layout() {
     let (from, to) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
@@ -32,7 +32,7 @@ fn instant_ngp_layout() {
         std::fs::create_dir(from.path().join(split)).unwrap();
         let frames: Vec<Value> = range
             .map(|i| {
-                // The left half is seen through, the right half is green.
+                // The left half is transparent, the right half is green.
                 let mut picture = image::RgbaImage::from_pixel(40, 30, image::Rgba([0, 200, 0, 255]));
                 for (x, _, pixel) in picture.enumerate_pixels_mut() {
                     pixel.0[3] = if x < 20 { 0 } else { 255 };
@@ -66,14 +66,14 @@ fn instant_ngp_layout() {
         let image = set.load_image(i).unwrap();
         assert_eq!((image.pixel(5, 9).unwrap(), image.pixel(35, 9).unwrap()), ([0, 0, 255], [0, 200, 0]));
     }
-    // Imported again into the same folder; a set that says its scenario is none to import.
+    // A second import into the same folder works; a dataset that names its scenario is not imported.
     import(from.path(), &out, &options).unwrap();
     let error = import(&out, &to.path().join("again"), &options).unwrap_err().to_string();
     assert!(error.contains("need not be imported"), "{error}");
 }
 
-/// The layout of nerfstudio: intrinsics with lens distortion, JPEG pictures, larger than what is worked on, and smaller
-/// than their intrinsics say where they were scaled down since.
+/// The format of nerfstudio is imported: intrinsics with lens distortion, and JPEG images that are larger than the
+/// limit, or smaller than their intrinsics because they were scaled down.
 #[test]
 fn nerfstudio_layout() {
     let (from, to) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
@@ -97,7 +97,7 @@ fn nerfstudio_layout() {
         &json!({"w": 200, "h": 150, "fl_x": 173.2, "fl_y": 173.0, "cx": 101.0, "cy": 74.0, "k1": -0.1, "k2": 0.01,
             "p1": 0.0, "p2": 0.0, "camera_model": "OPENCV", "frames": frames, "applied_transform": [[1, 0, 0, 0]]}),
     );
-    assert!(Dataset::open(from.path()).is_err(), "JPEG pictures are for imports alone");
+    assert!(Dataset::open(from.path()).is_err(), "JPEG images are only for imports");
     let bounds = [[-1.0, -1.0, 0.0], [1.0, 1.0, 2.0]];
     let options = ImportOptions { max_side_px: 80, bounds: Some(bounds), ..ImportOptions::default() };
     let out = to.path().join("set");
@@ -114,7 +114,7 @@ fn nerfstudio_layout() {
     }
 }
 
-/// A picture of another form than its intrinsics say is an error that names it; so is a missing one.
+/// An image with another aspect ratio than its intrinsics is an error that names it; so is a missing image.
 #[test]
 fn wrong_pictures_are_named() {
     let (from, to) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
@@ -133,5 +133,5 @@ fn wrong_pictures_are_named() {
     assert!(error.contains("missing.jpg") && error.contains("there is no file"), "{error}");
     std::fs::write(from.path().join("broken.jpg"), "no picture").unwrap();
     let error = attempt("broken.jpg");
-    assert!(error.contains("broken.jpg") && error.contains("not a readable picture"), "{error}");
+    assert!(error.contains("broken.jpg") && error.contains("not a readable image"), "{error}");
 }

@@ -1,4 +1,4 @@
-//! Contracts of reading and writing sets: what is accepted, what is derived, and what each mistake is told.
+//! Tests of reading and writing datasets: accepted values, derived values, and the message of each error.
 
 #![allow(clippy::unwrap_used)] // The helpers below are parts of tests.
 
@@ -14,7 +14,7 @@ use serde_json::{Value, json};
 const IDENTITY: [[f64; 4]; 4] =
     [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 5.0], [0.0, 0.0, 0.0, 1.0]];
 
-/// Two branches x two timestamps x two views of 8x8 pixels, in the fullest form.
+/// Returns two branches x two time steps x two views of 8x8 pixels, with all keys.
 fn whole() -> Value {
     let mut frames = Vec::new();
     for branch in 0..2 {
@@ -50,7 +50,7 @@ fn whole() -> Value {
     })
 }
 
-/// Writes the description, and a picture wherever a frame names one inside the folder.
+/// Writes the transforms file, and an image for each frame inside the folder.
 fn put(dir: &Path, name: &str, set: &Value) {
     std::fs::write(dir.join(name), set.to_string()).unwrap();
     for (i, frame) in set["frames"].as_array().into_iter().flatten().enumerate() {
@@ -69,7 +69,7 @@ fn open(set: &Value) -> Result<Dataset, String> {
     Dataset::open(dir.path()).map_err(|e| e.to_string().replace(&dir.path().display().to_string(), "SET"))
 }
 
-/// Every key of the format ends up where it belongs.
+/// Every key of the format is read into its field.
 #[test]
 fn whole_set() {
     let dir = tempfile::tempdir().unwrap();
@@ -94,7 +94,7 @@ fn whole_set() {
     assert_eq!(dataset.load_all_images().unwrap().len(), 8);
 }
 
-/// The book's example is a set as it stands: read with no warning, each state with what stands in it.
+/// The book's example is a complete dataset: it is read without warnings, and each state has its boxes.
 #[test]
 fn the_books_example_is_a_set() {
     let page = include_str!("../../../docs/book/src/sets-of-pictures.md");
@@ -112,7 +112,7 @@ fn the_books_example_is_a_set() {
     assert!((set.state_count(), set.view_count()) == (4, 1) && set.warnings().is_empty());
 }
 
-/// The form of the CARFF authors: `scene_id` alone, `view_index` or `time_index` in place of `view_id`.
+/// The format of the CARFF authors is read: only `scene_id`, and `view_index` or `time_index` in place of `view_id`.
 #[test]
 fn authors_form() {
     for key in ["view_index", "time_index"] {
@@ -130,8 +130,8 @@ fn authors_form() {
     }
 }
 
-/// A set that does not say its frames' observability: what looks the same in all branches shows nothing, what looks the same
-/// in some shows a part, what looks the same in none shows all; a warning says so. What a set says stays.
+/// Observability is derived for a dataset without it, with a warning: `none` if all branches look the same, `partial`
+/// if some do, `full` if none does. Values in the dataset are kept.
 #[test]
 fn pictures_tell_observability() {
     let dir = tempfile::tempdir().unwrap();
@@ -139,7 +139,7 @@ fn pictures_tell_observability() {
     set["scenario"]["branches"] = json!(["with", "without", "late"]);
     set["scenario"]["states"] = json!([]);
     let mut frames = Vec::new();
-    // Three views of each branch: one tells all branches apart, one the last from the others, one none.
+    // Three views of each branch: one distinguishes all branches, one only the last from the others, one none.
     for branch in 0..3_u8 {
         for (view, level) in [20 * branch, 20 * (branch / 2), 0].into_iter().enumerate() {
             for timestamp in 0..2_u8 {
@@ -165,7 +165,7 @@ fn pictures_tell_observability() {
         };
         assert_eq!(frame.observability, Some(wanted), "{frame:?}");
     }
-    assert!(dataset.warnings().iter().any(|w| w.contains("the pictures tell it")), "{:?}", dataset.warnings());
+    assert!(dataset.warnings().iter().any(|w| w.contains("it is derived from the images")), "{:?}", dataset.warnings());
 
     set["frames"][0]["observability"] = json!("partial");
     let dataset = read(&set);
@@ -173,7 +173,7 @@ fn pictures_tell_observability() {
     assert!(dataset.frames()[1..].iter().all(|f| f.observability.is_none()) && dataset.warnings().is_empty());
 }
 
-/// A plain `NeRF` set: no scenario, an angle in place of a focal length, sizes from the pictures, names without
+/// A `NeRF` dataset without a scenario is read: an angle as focal length, sizes from the images, names without
 /// extension, three files read as one, and a frame's own intrinsics before those at top level.
 #[test]
 fn plain_set_in_three_files() {
@@ -196,8 +196,8 @@ fn plain_set_in_three_files() {
     assert_eq!(dataset.load_all_images().unwrap().len(), 6);
 }
 
-/// A scenario in three files: parts that number their views each from 0 are counted on, and frames that name no view have
-/// one for each pose. Sizes may be anything from 64 to 512 pixels, and differ.
+/// A scenario in three files is read: views that restart at 0 are renumbered, and frames without a view get one per
+/// pose. Sizes may differ, from 64 to 512 pixels.
 #[test]
 fn scenario_in_three_files() {
     for named in [true, false] {
@@ -239,7 +239,7 @@ fn scenario_in_three_files() {
     }
 }
 
-/// Branch and timestamp without a scenario still tell states apart.
+/// Branch and timestamp identify states without a scenario.
 #[test]
 fn states_without_scenario() {
     let mut set = whole();
@@ -254,14 +254,14 @@ fn states_without_scenario() {
 
 type Change = Box<dyn FnOnce(&mut Value)>;
 
-/// Changes one thing and returns the message.
+/// Applies a change and returns the error message.
 fn mistake(change: impl FnOnce(&mut Value)) -> String {
     let mut set = whole();
     change(&mut set);
     open(&set).unwrap_err()
 }
 
-/// Each kind of bad input has its message: file, place, key, what is wrong, what is allowed.
+/// Each kind of bad input has its message: file, place, key, the error, and the allowed values.
 #[test]
 fn golden_errors() {
     let f3 = "SET/transforms.json: frame 3 (images/b0_t1_v1.png): ";
@@ -281,19 +281,19 @@ fn golden_errors() {
         (at("/frames", json!({})), "SET/transforms.json: top level: key `frames`: must be a list, found an object".into()),
         (
             at("/frames/3/file_path", json!("../b.png")),
-            "SET/transforms.json: frame 3 (../b.png): key `file_path`: must stay inside the set's folder: no leading `/` and no `..`".into(),
+            "SET/transforms.json: frame 3 (../b.png): key `file_path`: must stay inside the dataset folder: no leading `/` and no `..`".into(),
         ),
         (
             at("/frames/3/file_path", json!("/etc/b.png")),
-            "SET/transforms.json: frame 3 (/etc/b.png): key `file_path`: must stay inside the set's folder: no leading `/` and no `..`".into(),
+            "SET/transforms.json: frame 3 (/etc/b.png): key `file_path`: must stay inside the dataset folder: no leading `/` and no `..`".into(),
         ),
         (
             at("/frames/3/file_path", json!("b.jpg")),
-            "SET/transforms.json: frame 3 (b.jpg): key `file_path`: is a .jpg file; only .png pictures are read (`carff dataset import` also takes .jpg)".into(),
+            "SET/transforms.json: frame 3 (b.jpg): key `file_path`: is a .jpg file; only .png images are read (`carff dataset import` also takes .jpg)".into(),
         ),
         (
             without("/frames/3", "file_path"),
-            "SET/transforms.json: frame 3: key `file_path`: is missing; it is the picture's path relative to the set's folder".into(),
+            "SET/transforms.json: frame 3: key `file_path`: is missing; it is the image's path relative to the dataset folder".into(),
         ),
         (without("/frames/3", "transform_matrix"), format!("{f3}key `transform_matrix`: is missing")),
         (
@@ -323,7 +323,7 @@ fn golden_errors() {
         (without("/frames/3", "view_id"), format!("{f3}key `view_id`: is missing; each frame of a scenario names its camera pose")),
         (
             at("/frames/3/view_id", json!(0)),
-            format!("{f3}key `view_id`: view 0 of state 1 is given before, in frame 2 (images/b0_t1_v0.png)"),
+            format!("{f3}key `view_id`: view 0 of state 1 occurs before, in frame 2 (images/b0_t1_v0.png)"),
         ),
         (
             at("/frames/3/view_id", json!(2)),
@@ -367,17 +367,17 @@ fn golden_errors() {
     }
 }
 
-/// A folder that is missing or empty, broken JSON (with its line), a missing picture and a picture of another size
-/// are told apart.
+/// A missing folder, an empty folder, broken JSON (with its line), a missing image and an image of another size have
+/// different messages.
 #[test]
 fn errors_of_files() {
     let dir = tempfile::tempdir().unwrap();
     let message = |dir: &Path| Dataset::open(dir).unwrap_err().to_string();
     assert!(
         message(&dir.path().join("nowhere"))
-            .ends_with("nowhere: not a folder; a data set is a folder with transforms.json and its pictures")
+            .ends_with("nowhere: not a folder; a dataset is a folder with transforms.json and its images")
     );
-    assert!(message(dir.path()).contains("holds none of transforms.json"));
+    assert!(message(dir.path()).contains("contains none of transforms.json"));
     std::fs::write(dir.path().join("transforms.json"), "{\n  \"w\": 8,\n  oops\n}").unwrap();
     assert!(message(dir.path()).contains("transforms.json: not valid JSON") && message(dir.path()).contains("line 3"));
     put(dir.path(), "transforms.json", &whole());
@@ -386,16 +386,18 @@ fn errors_of_files() {
     let dataset = Dataset::open(dir.path()).unwrap();
     let error = dataset.load_all_images().unwrap_err().to_string();
     assert!(
-        error.ends_with("images/b0_t1_v1.png: frame 3 is 9x8 pixels, but its intrinsics (keys `w` and `h`) say 8x8"),
+        error.ends_with("images/b0_t1_v1.png: frame 3 is 9x8 pixels, but its intrinsics (keys `w` and `h`) are 8x8"),
         "{error}"
     );
-    assert!(dataset.load_image(8).unwrap_err().to_string().contains("frame 8 does not exist; the set has 8 frames"));
+    assert!(
+        dataset.load_image(8).unwrap_err().to_string().contains("frame 8 does not exist; the dataset has 8 frames")
+    );
     std::fs::remove_file(picture).unwrap();
     let error = message(dir.path());
     assert!(error.contains("frame 3 (images/b0_t1_v1.png): key `file_path`: there is no file"), "{error}");
 }
 
-/// Lens distortion is not modelled: it is told, not silently dropped.
+/// Lens distortion is not modelled: it causes a warning.
 #[test]
 fn distortion_is_a_warning() {
     let mut set = whole();
@@ -430,7 +432,7 @@ fn written_scenario() -> ScenarioInfo {
     }
 }
 
-/// Writes 2 branches x 1 timestamp x `views` views; pictures come from `paint`.
+/// Writes 2 branches x 1 time step x `views` views; `paint` makes the images.
 fn write(dir: &Path, views: usize, paint: impl Fn(usize, usize) -> Image) {
     let writer = DatasetWriter::create(dir).unwrap();
     let mut records = Vec::new();
@@ -451,7 +453,7 @@ fn write(dir: &Path, views: usize, paint: impl Fn(usize, usize) -> Image) {
     writer.finish(&records, Some(&written_scenario())).unwrap();
 }
 
-/// What is written is read back: frames, cameras, scenario, pictures.
+/// A written dataset is read back: frames, cameras, scenario, images.
 #[test]
 fn written_sets_are_read() {
     let dir = tempfile::tempdir().unwrap();
@@ -467,7 +469,7 @@ fn written_sets_are_read() {
     assert_eq!(dataset.load_image(3).unwrap(), Image::filled(8, 8, [1, 1, 9]));
 }
 
-/// An interrupted run is not a set, and may be run again; a folder of somebody else's is refused and left alone.
+/// An interrupted run is not a dataset, and may be repeated; a folder with other files is refused and not changed.
 #[test]
 fn writing_is_all_or_nothing() {
     let dir = tempfile::tempdir().unwrap();
@@ -476,19 +478,18 @@ fn writing_is_all_or_nothing() {
     let writer = DatasetWriter::create(&set).unwrap();
     writer.write_image("images/x.png", &Image::filled(8, 8, [2; 3])).unwrap();
     drop(writer);
-    assert!(Dataset::open(&set).unwrap_err().to_string().contains("holds none of transforms.json"));
+    assert!(Dataset::open(&set).unwrap_err().to_string().contains("contains none of transforms.json"));
     write(&set, 2, |_, _| Image::filled(8, 8, [3; 3]));
     assert!(!set.join("images/x.png").exists());
     assert_eq!(Dataset::open(&set).unwrap().frames().len(), 4);
 
     std::fs::write(dir.path().join("mine.txt"), "mine").unwrap();
     let error = DatasetWriter::create(dir.path()).unwrap_err().to_string();
-    assert!(error.contains("not a set that this program wrote"), "{error}");
+    assert!(error.contains("not a dataset that this program wrote"), "{error}");
     assert!(DatasetWriter::create(&set).unwrap().write_image("../x.png", &Image::filled(8, 8, [2; 3])).is_err());
 }
 
-/// The report counts, pools errors, computes ceilings, and finds a leak between hidden pictures; without a leak it
-/// does not warn.
+/// The report counts, pools errors, computes ceilings, and warns of a leak between hidden images only if there is one.
 #[test]
 fn report_and_leaks() {
     let dir = tempfile::tempdir().unwrap();
@@ -510,7 +511,7 @@ fn report_and_leaks() {
         assert_eq!(report.hidden_pairs.len(), 1);
         assert_eq!(report.hidden_pairs[0].mean_difference, f64::from(leak));
         assert_eq!(report.warnings.len(), usize::from(leak));
-        // The mean of each pose is off by 50 in view 1 and by leak / 2 in view 0.
+        // The mean image of each pose is off by 50 in view 1 and by leak / 2 in view 0.
         let error = f64::midpoint(50.0_f64.powi(2), (f64::from(leak) / 2.0).powi(2));
         let expected = 10.0 * (255.0_f64.powi(2) / error).log10();
         assert!((report.pose_mean_psnr_db.unwrap() - expected).abs() < 1e-9);
@@ -535,7 +536,7 @@ fn sheet_layout() {
     assert_eq!(sheet.pixel(14, 0), Some([205, 50, 45]));
 }
 
-/// The split of a set keeps the bird's-eye view for training, whatever the seed.
+/// The split of a dataset keeps the bird's-eye view for training at every seed.
 #[test]
 fn split_of_a_set() {
     let dir = tempfile::tempdir().unwrap();
@@ -552,7 +553,7 @@ fn split_of_a_set() {
     }
 }
 
-/// The sets of outside engines are read whole, where they are at hand.
+/// Datasets of outside engines are read completely, if they are available.
 #[test]
 fn outside_sets_if_at_hand() {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data");

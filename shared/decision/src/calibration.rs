@@ -162,7 +162,7 @@ impl Resolved {
 }
 
 /// Combines readings into a belief. Within a component, its samples and its mean have equal weight; components count by
-/// their mixture weights. Each component therefore has its exact weight, whatever share of the samples it received.
+/// their mixture weights. Each component therefore has its exact weight, for any share of the samples.
 pub fn resolve(
     layout: &ProbeLayout,
     weights: &[f32],
@@ -251,7 +251,7 @@ mod tests {
         }
     }
 
-    /// Both places taken is no known state: the reading names none, and still says hazard.
+    /// Both places taken is not a known state: the reading names none, and still reports the hazard.
     #[test]
     fn what_no_state_explains_is_unknown() {
         let p = layout();
@@ -279,7 +279,7 @@ mod tests {
         assert_eq!(shell[0], shell[1]);
     }
 
-    /// Densities that are no numbers count as empty, and never panic.
+    /// Densities that are NaN count as empty, and never panic.
     #[test]
     fn garbage_densities_are_harmless() {
         let p = layout();
@@ -291,7 +291,7 @@ mod tests {
         assert_eq!(out, [0.0, 0.0]);
     }
 
-    /// A component's weight counts exactly, whatever share of the samples it got.
+    /// A component's weight counts exactly, for any share of the samples.
     #[test]
     fn weights_count_exactly() {
         let p = layout();

@@ -31,7 +31,7 @@ pub struct Evidence {
 /// The part of one probed sample that rules look at.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SampleEvidence {
-    /// Whether the sample shows a known state.
+    /// True if the sample shows a known state.
     pub is_known: bool,
     /// Probability that the sample's scene holds the hazard, 0..=1.
     pub hazard_likelihood: f32,
@@ -177,7 +177,7 @@ mod tests {
         assert!(evidence.has_unknown());
     }
 
-    /// A probability that is not a number is kept, whatever other steps hold.
+    /// A probability that is not a number is kept, for any values of the other steps.
     #[test]
     fn invalid_probabilities_are_kept() {
         let mut evidence = Evidence::NONE;

@@ -1,8 +1,8 @@
 //! The places to probe, the points to query in them, and their occupancies.
 //!
-//! A field trained on images learns surfaces: no image shows whether a vehicle is hollow. The points therefore stand in
+//! A field trained on images learns surfaces: no image shows whether a vehicle is hollow. The points are therefore in
 //! upright columns, and a place is as occupied as its median column is opaque: a vehicle stops light nearly everywhere,
-//! haze or a neighbour's shadow only here and there.
+//! haze or a neighbour's shadow only in a few places.
 
 use carff_base::geometry::OrientedBox;
 use serde::{Deserialize, Serialize};
@@ -13,44 +13,44 @@ const COLUMNS: [usize; 2] = [5, 4];
 const COLUMN_POINTS: usize = 8;
 /// Share of a box's length and width that the columns cover: its skin belongs to the surroundings.
 const COLUMNS_FILL: f64 = 0.7;
-/// Where columns begin and end, as shares of the box's height above its bottom: clear of the ground, and over the roof.
+/// Start and end of the columns, as shares of the box's height above its bottom: above the ground, and beyond the roof.
 const COLUMN_SPAN: [f64; 2] = [0.25, 1.05];
-/// Why probing cannot be set up.
+/// Reason why probing cannot be set up.
 #[derive(Debug, thiserror::Error, PartialEq, Eq)]
 pub enum ProbingError {
     /// There is nothing to probe.
     #[error("there is no place to probe: the scenario names no dynamic box and no candidate")]
     NoPlaces,
-    /// A place says of another number of states than there are.
-    #[error("place `{name}` says of {given} states, but there are {states}")]
+    /// A place has another number of states than the scenario.
+    #[error("place `{name}` has {given} states, but there are {states}")]
     States {
-        /// Which place.
+        /// Name of the place.
         name: String,
-        /// How many it says of.
+        /// Number of states of the place.
         given: usize,
-        /// How many there are.
+        /// Number of states of the scenario.
         states: usize,
     },
     /// Occupancies for calibration are missing or misshapen.
     #[error("state {state}: {len} occupancies are not a multiple of {places} places, or none")]
     Observations {
-        /// Which state.
+        /// Index of the state.
         state: usize,
-        /// Values given.
+        /// Number of values.
         len: usize,
-        /// Places.
+        /// Number of places.
         places: usize,
     },
 }
 
-/// A place where something can stand, and the states in which it does.
+/// A place that an actor can occupy, and the states in which it does.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Place {
-    /// What can stand there, for example `actor`.
+    /// Name of the possible occupant, for example `actor`.
     pub name: String,
-    /// Where.
+    /// Box of the place, world space, metres.
     pub oriented_box: OrientedBox,
-    /// Per known state whether it is taken.
+    /// For each known state, true if the place is taken.
     pub occupied_in: Vec<bool>,
 }
 
@@ -84,7 +84,7 @@ pub struct ProbeLayout {
 }
 
 impl ProbeLayout {
-    /// Sets up the points. `hazard_states` says per state whether the right action there is the hazard one.
+    /// Sets up the points. `hazard_states` is true for each state whose right action is the hazard action.
     pub fn new(places: Vec<Place>, hazard_states: Vec<bool>) -> Result<Self, ProbingError> {
         if places.is_empty() {
             return Err(ProbingError::NoPlaces);
@@ -109,27 +109,27 @@ impl ProbeLayout {
         Ok(Self { places, hazard_states, points, point_lengths_m })
     }
 
-    /// The places.
+    /// Returns the places.
     pub fn places(&self) -> &[Place] {
         &self.places
     }
 
-    /// Number of known states.
+    /// Returns the number of known states.
     pub fn state_count(&self) -> usize {
         self.hazard_states.len()
     }
 
-    /// Per state whether the right action there is the hazard one.
+    /// Returns for each state whether its right action is the hazard action.
     pub fn hazard_states(&self) -> &[bool] {
         &self.hazard_states
     }
 
-    /// All points to query, metres, world space; each place has as many in a row.
+    /// Returns all points to query, metres, world space; the points of a place are consecutive.
     pub fn points(&self) -> &[[f32; 3]] {
         &self.points
     }
 
-    /// Densities at [`Self::points`] (1/m) to one occupancy in 0..=1 per place, written to `occupancies`.
+    /// Converts densities at [`Self::points`] (1/m) to one occupancy in 0..=1 per place, written to `occupancies`.
     pub fn occupancies(&self, densities: &[f32], occupancies: &mut [f32]) {
         let columns = COLUMNS[0] * COLUMNS[1];
         let boxes = densities.chunks_exact(columns * COLUMN_POINTS).zip(&self.point_lengths_m);

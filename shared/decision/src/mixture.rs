@@ -43,8 +43,8 @@ pub enum Sampling {
 }
 
 impl Mixture {
-    /// Draws `count` latents. Draw i of a (seed, frame, step) is the same whatever else is drawn; which component it
-    /// comes from depends on `count` too when sampling is stratified.
+    /// Draws `count` latents. Draw i of a (seed, frame, step) is the same for any other draws; with stratified
+    /// sampling, its component depends on `count`.
     pub fn draw(&self, count: usize, sampling: Sampling, seed: u64, frame: u64, step: u32) -> Vec<Draw> {
         // Index u32::MAX: a stream that no sample uses.
         let offset = carff_base::random::uniform(Key { seed, frame, step, sample: u32::MAX });

@@ -13,7 +13,7 @@
 pub struct CalibrationTrial {
     /// Hazard probability, 0..=1.
     pub hazard_probability: f64,
-    /// Whether halting is right.
+    /// True if halting is right.
     pub halt_is_right: bool,
 }
 
@@ -87,9 +87,9 @@ mod tests {
         assert_eq!(unchosen_threshold(0, 0), 0.0);
     }
 
-    /// Separable trials: the threshold separates them, in the middle; overlapping ones: it stands between the two kinds,
-    /// and one odd trial does not carry it to the edge of the others; probabilities that mean nothing: it always halts;
-    /// one kind alone: none.
+    /// The threshold separates separable trials, in the middle. With overlapping trials it is between the two kinds,
+    /// and one outlier does not move it to the edge of the others. With uninformative probabilities it always halts.
+    /// With only one kind there is none.
     #[test]
     fn threshold_separates() {
         let trial = |p, h| CalibrationTrial { hazard_probability: p, halt_is_right: h };

@@ -1,57 +1,57 @@
-//! The checks that all messages share; each error names the field.
+//! Checks for the fields of messages; each error names the field.
 
-/// Why a message was refused. Always names the field.
+/// Reason why a message was refused. It always names the field.
 #[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
 pub enum Invalid {
-    /// NaN or infinite.
+    /// A number is NaN or infinite.
     #[error("`{field}` is not finite")]
     NotFinite {
-        /// Which field.
+        /// Name of the field.
         field: &'static str,
     },
-    /// A number outside its range.
+    /// A number is out of range.
     #[error("`{field}` is {value}, must be in {min}..={max}")]
     OutOfRange {
-        /// Which field.
+        /// Name of the field.
         field: &'static str,
-        /// What was found.
+        /// Value of the field.
         value: f64,
-        /// Smallest value allowed.
+        /// Smallest allowed value.
         min: f64,
-        /// Largest value allowed.
+        /// Largest allowed value.
         max: f64,
     },
-    /// A number that must have one value, or a size that does not fit another.
+    /// A number differs from the only valid value, or a size from another one.
     #[error("`{field}` is {found}, expected {expected}")]
     Mismatch {
-        /// Which field.
+        /// Name of the field.
         field: &'static str,
-        /// What was found.
+        /// Value of the field.
         found: u64,
-        /// What it must be.
+        /// Expected value.
         expected: u64,
     },
-    /// A code that stands for nothing.
+    /// A code is unknown.
     #[error("`{field}` has the unknown code {code}")]
     UnknownCode {
-        /// Which field.
+        /// Name of the field.
         field: &'static str,
-        /// What was found.
+        /// Code in the field.
         code: i64,
     },
 }
 
-/// All are finite.
+/// Checks that all values are finite.
 pub fn finite<'a>(field: &'static str, values: impl IntoIterator<Item = &'a f32>) -> Result<(), Invalid> {
     if values.into_iter().all(|v| v.is_finite()) { Ok(()) } else { Err(Invalid::NotFinite { field }) }
 }
 
-/// All are finite.
+/// Checks that all values are finite.
 pub fn finite_f64<'a>(field: &'static str, values: impl IntoIterator<Item = &'a f64>) -> Result<(), Invalid> {
     if values.into_iter().all(|v| v.is_finite()) { Ok(()) } else { Err(Invalid::NotFinite { field }) }
 }
 
-/// All are finite and in `min..=max`.
+/// Checks that all values are finite and in `min..=max`.
 pub fn within<'a>(
     field: &'static str,
     values: impl IntoIterator<Item = &'a f32>,
@@ -69,12 +69,12 @@ pub fn within<'a>(
     Ok(())
 }
 
-/// In 0..=1.
+/// Checks that a value is in 0..=1.
 pub fn probability(field: &'static str, value: f32) -> Result<(), Invalid> {
     within(field, [&value], 0.0, 1.0)
 }
 
-/// In `min..=max`.
+/// Checks that a value is in `min..=max`.
 pub fn in_range(field: &'static str, value: i64, min: i64, max: i64) -> Result<(), Invalid> {
     if (min..=max).contains(&value) {
         Ok(())
@@ -83,7 +83,7 @@ pub fn in_range(field: &'static str, value: i64, min: i64, max: i64) -> Result<(
     }
 }
 
-/// In `0..=max`.
+/// Checks that a value is in `0..=max`.
 pub fn at_most(field: &'static str, value: u64, max: u64) -> Result<(), Invalid> {
     if value <= max {
         Ok(())
@@ -92,12 +92,12 @@ pub fn at_most(field: &'static str, value: u64, max: u64) -> Result<(), Invalid>
     }
 }
 
-/// The same.
+/// Checks that two values are equal.
 pub fn equals(field: &'static str, found: u64, expected: u64) -> Result<(), Invalid> {
     if found == expected { Ok(()) } else { Err(Invalid::Mismatch { field, found, expected }) }
 }
 
-/// Weights that sum to 1 within 1e-3.
+/// Checks that weights sum to 1 within 1e-3.
 pub fn distribution(field: &'static str, values: &[f32]) -> Result<(), Invalid> {
     within(field, values, 0.0, 1.0)?;
     let sum: f32 = values.iter().sum();

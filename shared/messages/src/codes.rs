@@ -1,4 +1,4 @@
-//! Numbers that stand for names, with checked conversion.
+//! Codes: numbers that represent names, with checked conversion.
 
 use crate::Invalid;
 use schemars::JsonSchema;
@@ -11,20 +11,20 @@ macro_rules! codes {
         pub enum $name { $($(#[$vdoc])* $variant),+ }
 
         impl $name {
-            /// All of them, in the order of their declaration.
+            /// All values in the order of their declaration.
             pub const ALL: [Self; [$($code),+].len()] = [$(Self::$variant),+];
 
-            /// The number that travels.
+            /// Returns the number in messages.
             pub const fn code(self) -> $repr {
                 match self { $(Self::$variant => $code),+ }
             }
 
-            /// The one of this name, if there is one.
+            /// Returns the value of a name, if there is one.
             pub fn from_name(name: &str) -> Option<Self> {
                 Self::ALL.into_iter().find(|known| known.name() == name)
             }
 
-            /// The name in reports and logs.
+            /// Returns the name in reports and logs.
             pub const fn name(self) -> &'static str {
                 match self { $(Self::$variant => $text),+ }
             }
@@ -49,17 +49,17 @@ macro_rules! codes {
 }
 
 codes! {
-    /// The stages of the graph, in the order in which they start: consumers before what feeds them.
+    /// The stages of the graph, in start order: consumers before producers.
     Stage: u32, "stage" {
-        /// Replays or takes pictures.
+        /// Replays or takes images.
         Camera = 1 "camera",
-        /// Picture to posterior.
+        /// Image to posterior.
         Encoder = 2 "encoder",
         /// Posterior to mixture and samples.
         Forecaster = 3 "forecaster",
         /// Samples to belief over states.
         Prober = 4 "prober",
-        /// Samples to pictures.
+        /// Samples to images.
         Renderer = 5 "renderer",
         /// Belief to action.
         Controller = 6 "controller",
@@ -67,31 +67,31 @@ codes! {
 }
 
 codes! {
-    /// What the car does.
+    /// Action of the vehicle.
     ActionCode: u32, "action" {
-        /// Stop, or stay where it is: the safe action.
+        /// Stop, or stay stopped: the safe action.
         Halt = 0 "halt",
-        /// Go on.
+        /// Drive on the planned path.
         Advance = 1 "advance",
     }
 }
 
 codes! {
-    /// Why an action was taken.
+    /// Reason of an action.
     Reason: u32, "reason" {
-        /// A fresh, valid, complete belief said so.
+        /// A fresh, valid, complete belief.
         Belief = 0 "belief",
         /// No belief has arrived yet.
         NoBeliefYet = 1 "no belief yet",
         /// The last belief is older than the deadline.
         StaleBelief = 2 "stale belief",
-        /// The belief that arrived was not valid.
+        /// The last belief was not valid.
         InvalidBelief = 3 "invalid belief",
         /// Steps of the frame's belief are missing.
         IncompleteBelief = 4 "incomplete belief",
         /// Beliefs contradict each other or the clock.
         ContradictoryBelief = 5 "contradictory belief",
-        /// The controller ends.
+        /// The controller is ending.
         Stopping = 6 "stopping",
     }
 }
@@ -101,22 +101,22 @@ codes! {
     #[derive(Default, Serialize, Deserialize, JsonSchema)]
     #[serde(rename_all = "kebab-case")]
     Rule: u32, "rule" {
-        /// Always halt: a planner that trusts nothing it cannot see.
+        /// Always halt: a planner that only trusts visible free space.
         Underconfident = 0 "underconfident",
-        /// Always advance: a planner that believes only what it sees.
+        /// Always advance: a planner that only believes visible actors.
         Overconfident = 1 "overconfident",
-        /// Halt when the samples disagree or any of them shows the hazard.
+        /// Halt if the samples disagree or any of them shows the hazard.
         Paper = 2 "paper",
-        /// Halt when the hazard probability reaches the threshold.
+        /// Halt if the hazard probability reaches the threshold.
         #[default]
         Calibrated = 3 "calibrated",
     }
 }
 
 codes! {
-    /// What a forecast was made from.
+    /// Source of a forecast.
     ForecastSource: u32, "source" {
-        /// The posterior of a camera picture.
+        /// The posterior of a camera image.
         Observed = 0 "observed",
         /// The posterior of the state that probing resolved.
         Probed = 1 "probed",
@@ -153,7 +153,7 @@ impl Observability {
 }
 
 codes! {
-    /// What camera a rendered view is seen from.
+    /// Camera of a rendered view.
     ViewKind: u32, "kind" {
         /// From above.
         BirdsEye = 0 "birds-eye",
@@ -163,23 +163,23 @@ codes! {
 }
 
 codes! {
-    /// How a stage is doing.
+    /// State of a stage's health.
     HealthState: u32, "state" {
         /// Loading.
         Starting = 0 "starting",
         /// Ready or working.
         Ok = 1 "ok",
-        /// Works, but takes longer than its deadline.
+        /// Working, but slower than its deadline.
         Slow = 2 "slow",
         /// Its input has been quiet for longer than the topic's deadline.
         Stale = 3 "stale",
-        /// It reports an error of its own.
+        /// The stage reports its own error.
         Faulty = 4 "faulty",
-        /// Died, and the launcher starts it again.
+        /// The process died, and the launcher restarts it.
         Restarting = 5 "restarting",
-        /// Died for good.
+        /// The process died and is not restarted.
         Lost = 6 "lost",
-        /// Has done its work and ends.
+        /// The work is complete, and the stage ends.
         Done = 7 "done",
     }
 }

@@ -18,7 +18,7 @@ impl Intrinsics {
     }
 }
 
-/// Returns a pose as messages hold it: row-major.
+/// Returns a pose as messages store it: row-major.
 pub fn row_major(world_from_camera: &[[f64; 4]; 4]) -> [f64; 16] {
     std::array::from_fn(|i| world_from_camera[i / 4][i % 4])
 }
@@ -53,7 +53,7 @@ impl ViewMeta {
 mod tests {
     use super::*;
 
-    /// A camera survives the way into a message and back, bit for bit.
+    /// A camera is converted to a message and back without a change, bit for bit.
     #[test]
     fn cameras_round_trip() {
         let camera = PinholeCamera::look_at([3.0, -1.5, 2.0], [0.1, 0.2, 0.3], [0.0, 0.0, 1.0], 64, 48, 70.0);

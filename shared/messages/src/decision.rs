@@ -4,12 +4,12 @@ use crate::check::{at_most, probability};
 use crate::{ActionCode, Header, Invalid, MAX_SAMPLES, Reason, Rule, message};
 use iceoryx2::prelude::ZeroCopySend;
 
-/// What the car does until the next action, and why.
+/// The vehicle's action until the next one, and its reason.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, ZeroCopySend)]
 #[type_name("carff.Action.v1")]
 pub struct Action {
-    /// Header of the frame that it rests on.
+    /// Header of the frame that it is based on.
     pub header: Header,
     /// Code of an [`ActionCode`].
     pub action: u32,
@@ -17,31 +17,31 @@ pub struct Action {
     pub reason: u32,
     /// Code of a [`Rule`].
     pub rule: u32,
-    /// Samples that the belief rested on.
+    /// Number of samples in the belief.
     pub sample_count: u32,
-    /// How sure, 0..=1.
+    /// Confidence of the rule, 0..=1.
     pub confidence: f32,
-    /// Probability that the hazard is met at any step looked ahead, 0..=1.
+    /// Probability of the hazard at any step of the look-ahead, 0..=1.
     pub hazard_probability: f32,
-    /// 1 when this action is the first that rests on its frame; 0 when it repeats or is the safe action.
+    /// 1 for the first action based on its frame; 0 for a repetition or the safe action.
     pub is_decision: u32,
-    /// Not used; 0.
+    /// Unused; 0.
     pub reserved: u32,
-    /// Until when it stands: monotonic clock, nanoseconds.
+    /// End of its validity: monotonic clock, nanoseconds.
     pub valid_until_ns: u64,
-    /// The frame that it rests on; `u64::MAX` for none.
+    /// The frame that it is based on; `u64::MAX` for none.
     pub based_on_frame: u64,
-    /// Time from capture to the decision, nanoseconds; 0 when it rests on no frame.
+    /// Time from capture to the decision, nanoseconds; 0 without a frame.
     pub latency_ns: u64,
 }
 
 impl Action {
-    /// What the car does.
+    /// Returns the action of the vehicle.
     pub fn code(&self) -> Result<ActionCode, Invalid> {
         ActionCode::try_from(self.action)
     }
 
-    /// Why.
+    /// Returns the reason of the action.
     pub fn reason(&self) -> Result<Reason, Invalid> {
         Reason::try_from(self.reason)
     }

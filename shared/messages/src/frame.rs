@@ -1,4 +1,4 @@
-//! Pictures: the camera's frames and the renderer's views. The bytes lie in the slice beside these.
+//! Descriptions of images: the camera's frames and the renderer's views. The bytes are in the payload.
 
 use crate::check::{at_most, finite, finite_f64, in_range, within};
 use crate::{
@@ -42,31 +42,31 @@ impl Intrinsics {
     }
 }
 
-/// Where in a data set a frame comes from: the truth, for reports alone. No stage of the decision path reads it.
+/// Position of a frame in a dataset: the truth, only for reports. No stage of the decision path reads it.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ZeroCopySend)]
 #[type_name("carff.DatasetView.v1")]
 pub struct DatasetView {
-    /// 1 when the rest is known, else 0.
+    /// 1 if the other fields are known, else 0.
     pub known: u32,
     /// Index of the camera pose.
     pub view: i32,
-    /// The hidden course of events.
+    /// The hidden branch.
     pub branch: i32,
-    /// Step of it.
+    /// Time step of the branch.
     pub timestamp: i32,
     /// Number of the drive in this run.
     pub drive: i32,
-    /// Frames of this drive before this one.
+    /// Number of earlier frames of this drive.
     pub frame_in_drive: i32,
     /// Code of an [`Observability`].
     pub observability: i32,
-    /// 1 on the last frame of a timestamp, when a decision on it is counted; else 0.
+    /// 1 for the last frame of a time step, whose decision is counted; else 0.
     pub last_of_timestamp: u32,
 }
 
 impl DatasetView {
-    /// Not from a data set.
+    /// Value of a frame without a dataset.
     pub const UNKNOWN: Self = Self {
         known: 0,
         view: -1,
@@ -112,15 +112,15 @@ impl DatasetView {
 pub struct FrameMeta {
     /// Header, at step 0.
     pub header: Header,
-    /// Pixels in a row.
+    /// Width, pixels.
     pub width_px: u32,
-    /// Rows.
+    /// Height, pixels.
     pub height_px: u32,
     /// Intrinsics for this width and height.
     pub intrinsics: Intrinsics,
     /// Row-major 4x4: camera space (OpenGL axes) to world space (metres).
     pub world_from_camera: [f64; 16],
-    /// Where it comes from, for reports.
+    /// Position in a dataset, for reports.
     pub dataset_view: DatasetView,
 }
 
@@ -149,15 +149,15 @@ impl ImageMeta for FrameMeta {
 pub struct ViewMeta {
     /// Header, at the step of the hypothesis.
     pub header: Header,
-    /// Which sample or component it shows.
+    /// Index of the sample or component that it shows.
     pub hypothesis: u32,
     /// Code of a [`ViewKind`].
     pub kind: u32,
-    /// The state that probing found in it; -1 for none of the known ones.
+    /// The state that probing found; -1 for none of the known ones.
     pub state: i32,
-    /// Pixels in a row.
+    /// Width, pixels.
     pub width_px: u32,
-    /// Rows.
+    /// Height, pixels.
     pub height_px: u32,
     /// Probability of this hypothesis, 0..=1.
     pub probability: f32,
@@ -167,7 +167,7 @@ pub struct ViewMeta {
     pub intrinsics: Intrinsics,
     /// Row-major 4x4: camera space (OpenGL axes) to world space (metres).
     pub world_from_camera: [f64; 16],
-    /// Time that the rendering took, nanoseconds.
+    /// Duration of the rendering, nanoseconds.
     pub stage_latency_ns: u64,
 }
 

@@ -1,14 +1,14 @@
-//! Heartbeats.
+//! Heartbeats of stages.
 
 use crate::{Header, HealthState, Invalid, Stage, message};
 use iceoryx2::prelude::ZeroCopySend;
 
-/// A stage's heartbeat: it lives, how it does, and what it has counted since its start.
+/// A stage's heartbeat: its state and its counts since its start.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ZeroCopySend)]
 #[type_name("carff.Health.v1")]
 pub struct Health {
-    /// Header; the frame is the last one worked on.
+    /// Header; its frame is the last processed frame.
     pub header: Header,
     /// Code of a [`Stage`].
     pub stage: u32,
@@ -16,35 +16,35 @@ pub struct Health {
     pub state: u32,
     /// Process id.
     pub pid: u32,
-    /// Not used; 0.
+    /// Unused; 0.
     pub reserved: u32,
-    /// Valid inputs received.
+    /// Number of valid inputs received.
     pub received: u64,
-    /// Outputs published.
+    /// Number of outputs published.
     pub published: u64,
-    /// Inputs skipped because a newer one was there.
+    /// Number of inputs skipped in favour of newer ones.
     pub skipped: u64,
-    /// Inputs dropped because they were not valid.
+    /// Number of inputs dropped because they were invalid.
     pub invalid: u64,
-    /// Errors of its own.
+    /// Number of the stage's own errors.
     pub errors: u64,
-    /// Time that the last output took, nanoseconds.
+    /// Duration of the last output, nanoseconds.
     pub last_latency_ns: u64,
-    /// Longest time that an output took, nanoseconds.
+    /// Longest duration of an output, nanoseconds.
     pub max_latency_ns: u64,
-    /// When its main loop last went round, or now while it waits for input: monotonic clock, nanoseconds.
+    /// Last round of the main loop, or the current time while it waits for input: monotonic clock, nanoseconds.
     pub last_progress_ns: u64,
     /// Resident memory, bytes.
     pub rss_bytes: u64,
 }
 
 impl Health {
-    /// Which stage.
+    /// Returns the stage.
     pub fn stage(&self) -> Result<Stage, Invalid> {
         Stage::try_from(self.stage)
     }
 
-    /// How it does.
+    /// Returns the state of the stage.
     pub fn state(&self) -> Result<HealthState, Invalid> {
         HealthState::try_from(self.state)
     }

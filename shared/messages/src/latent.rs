@@ -1,4 +1,4 @@
-//! Latents: the posterior, the forecast mixture with its samples, and the belief that probing makes of them.
+//! Messages about latents: the posterior, the forecast with its samples, and the belief.
 
 use crate::check::{at_most, distribution, equals, finite, in_range, probability, within};
 use crate::{
@@ -9,7 +9,7 @@ use iceoryx2::prelude::ZeroCopySend;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// Log-variances beyond this are an error of the sender: a standard deviation of e^-15 or e^15.
+/// Maximum absolute log-variance of a valid message: a standard deviation of e^-15 or e^15.
 const MAX_ABS_LOG_VARIANCE: f32 = 30.0;
 
 /// A diagonal Gaussian over the scene latent: q(z | I) = N(mean, diag exp(log-variance)) (paper section 3.1).
@@ -25,14 +25,14 @@ const MAX_ABS_LOG_VARIANCE: f32 = 30.0;
 #[serde(deny_unknown_fields)]
 #[type_name("carff.Gaussian.v1")]
 pub struct Gaussian {
-    /// Mean.
+    /// Mean of the latent.
     pub mean: [f32; LATENT_DIM],
     /// Natural logarithm of the variance.
     pub log_variance: [f32; LATENT_DIM],
 }
 
 impl Gaussian {
-    /// Mean 0, variance 1.
+    /// Returns mean 0 and variance 1.
     pub const fn standard() -> Self {
         Self { mean: [0.0; LATENT_DIM], log_variance: [0.0; LATENT_DIM] }
     }
@@ -70,7 +70,7 @@ impl Posterior {
 
 message!(Posterior);
 
-/// A mixture over the latent at the next step, with latents drawn from it. Entries beyond the counts mean nothing.
+/// A mixture over the latent at the next step, with latents drawn from it. Entries beyond the counts are unused.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, ZeroCopySend)]
 #[type_name("carff.Forecast.v1")]
@@ -79,15 +79,15 @@ pub struct Forecast {
     pub header: Header,
     /// Code of a [`ForecastSource`].
     pub source: u32,
-    /// Components in use, 1..=4.
+    /// Number of used components, 1..=4.
     pub component_count: u32,
-    /// Samples drawn, 1..=64.
+    /// Number of drawn samples, 1..=64.
     pub sample_count: u32,
-    /// Steps that this frame is looked ahead, 1..=8.
+    /// Number of steps in the look-ahead of this frame, 1..=8.
     pub horizon: u32,
     /// The state that the previous step resolved to; -1 at step 1.
     pub resolved_state: i32,
-    /// Probability of the path followed up to the input, 0..=1; 1 at step 1.
+    /// Probability of the path up to the input, 0..=1; 1 at step 1.
     pub path_probability: f32,
     /// Mixture weights.
     pub weights: [f32; MAX_COMPONENTS],
@@ -95,16 +95,16 @@ pub struct Forecast {
     pub components: [Gaussian; MAX_COMPONENTS],
     /// Drawn latents.
     pub samples: [[f32; LATENT_DIM]; MAX_SAMPLES],
-    /// Which component each sample was drawn from.
+    /// Component that each sample was drawn from.
     pub sample_component: [u8; MAX_SAMPLES],
-    /// Time that the encoder took for this frame, nanoseconds.
+    /// Duration of the encoding of this frame, nanoseconds.
     pub encoder_ns: u64,
     /// Time from the arrival of the input to sending, nanoseconds.
     pub stage_latency_ns: u64,
 }
 
 impl Forecast {
-    /// A forecast with no components and no samples yet, to be filled in.
+    /// Returns a forecast without components and samples, to be filled in.
     pub fn empty(header: Header, source: ForecastSource, horizon: u32) -> Self {
         Self {
             header,
@@ -146,7 +146,7 @@ impl Forecast {
         Ok(())
     }
 
-    /// The samples in use.
+    /// Returns the used samples.
     pub fn samples(&self) -> &[[f32; LATENT_DIM]] {
         &self.samples[..(self.sample_count as usize).min(MAX_SAMPLES)]
     }
@@ -161,21 +161,21 @@ message!(Forecast);
 pub struct ProbeResult {
     /// Index of the state; -1 for none of the known ones.
     pub state: i32,
-    /// How sure, 0..=1.
+    /// Confidence of the state, 0..=1.
     pub confidence: f32,
-    /// Probability that the scene of this latent holds the hazard, 0..=1.
+    /// Probability that the scene of this latent contains the hazard, 0..=1.
     pub hazard_likelihood: f32,
     /// Occupancy of each place, 0..=1.
     pub occupancies: [f32; MAX_PLACES],
 }
 
 impl ProbeResult {
-    /// The known state that the scene of this latent shows, if any.
+    /// Returns the known state that the scene of this latent shows, if any.
     pub fn state(&self) -> Option<usize> {
         usize::try_from(self.state).ok()
     }
 
-    /// A probe that found nothing.
+    /// Result of a probe without a match.
     pub const NONE: Self = Self { state: -1, confidence: 0.0, hazard_likelihood: 0.0, occupancies: [0.0; MAX_PLACES] };
 
     fn check(&self, states: u32, places: u32) -> Result<(), Invalid> {
@@ -186,30 +186,30 @@ impl ProbeResult {
     }
 }
 
-/// The prober's answer to a forecast: a belief over the known states. Entries beyond the counts mean nothing.
+/// The prober's answer to a forecast: a belief over the known states. Entries beyond the counts are unused.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, ZeroCopySend)]
 #[type_name("carff.Belief.v2")]
 pub struct Belief {
     /// Header, at the step of the forecast.
     pub header: Header,
-    /// Steps that this frame is looked ahead, 1..=8.
+    /// Number of steps in the look-ahead of this frame, 1..=8.
     pub horizon: u32,
-    /// States of the scenario, 1..=64.
+    /// Number of states of the scenario, 1..=64.
     pub state_count: u32,
-    /// Places probed, 1..=48.
+    /// Number of probed places, 1..=48.
     pub place_count: u32,
-    /// Mixture components, 1..=4.
+    /// Number of mixture components, 1..=4.
     pub component_count: u32,
-    /// Samples, 1..=64.
+    /// Number of samples, 1..=64.
     pub sample_count: u32,
-    /// 1 when this is the frame's last step (also when the loop ended early), else 0.
+    /// 1 for the frame's last step (also if the look-ahead ended early), else 0.
     pub is_final: u32,
-    /// Probability of each known state. What is missing to 1 is "none of the known states".
+    /// Probability of each known state. The remainder to 1 is "none of the known states".
     pub state_probability: [f32; MAX_STATES],
-    /// Probability that the hazard is there at this step, given the path followed, 0..=1.
+    /// Probability of the hazard at this step, given the path, 0..=1.
     pub hazard_probability: f32,
-    /// Probability of the path followed up to this step's input, 0..=1.
+    /// Probability of the path up to this step's input, 0..=1.
     pub path_probability: f32,
     /// Mixture weights.
     pub component_weights: [f32; MAX_COMPONENTS],
@@ -217,24 +217,24 @@ pub struct Belief {
     pub components: [ProbeResult; MAX_COMPONENTS],
     /// Result for each sample.
     pub samples: [ProbeResult; MAX_SAMPLES],
-    /// Which component each sample was drawn from.
+    /// Component that each sample was drawn from.
     pub sample_component: [u8; MAX_SAMPLES],
     /// The most probable state, fed back as the next step's input; -1 for none of the known ones.
     pub resolved_state: i32,
-    /// Not used; 0.
+    /// Unused; 0.
     pub reserved: u32,
     /// That state's stored posterior.
     pub resolved: Gaussian,
-    /// Time that the encoder took for this frame, nanoseconds.
+    /// Duration of the encoding of this frame, nanoseconds.
     pub encoder_ns: u64,
-    /// Time that the forecaster took for this step, nanoseconds.
+    /// Duration of the forecast of this step, nanoseconds.
     pub forecaster_ns: u64,
     /// Time from the arrival of the forecast to sending, nanoseconds.
     pub stage_latency_ns: u64,
 }
 
 impl Belief {
-    /// A belief with no result yet, to be filled in.
+    /// Returns a belief without results, to be filled in.
     pub fn empty(header: Header, horizon: u32) -> Self {
         Self {
             header,
@@ -260,17 +260,17 @@ impl Belief {
         }
     }
 
-    /// The results of the components in use.
+    /// Returns the results of the used components.
     pub fn components(&self) -> &[ProbeResult] {
         &self.components[..(self.component_count as usize).min(MAX_COMPONENTS)]
     }
 
-    /// Reports whether this is the frame's last step.
+    /// Returns true for the frame's last step.
     pub fn is_final(&self) -> bool {
         self.is_final == 1
     }
 
-    /// The results of the samples in use.
+    /// Returns the results of the used samples.
     pub fn samples(&self) -> &[ProbeResult] {
         &self.samples[..(self.sample_count as usize).min(MAX_SAMPLES)]
     }

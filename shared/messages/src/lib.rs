@@ -1,8 +1,8 @@
-//! The messages that cross process boundaries, and their validation; nothing that sends or receives lives here.
+//! The messages that cross process boundaries, and their validation. This crate does not send or receive.
 //!
 //! Each message is `#[repr(C)]`, `Copy` and made of plain numbers, so that any bit pattern is a value of the type.
-//! What has few meanings (a state, an action) travels as a number and becomes an enum by a checked conversion.
-//! [`Message::validate`] is called on arrival and never panics, whatever the bytes are.
+//! A field with few meanings (a state, an action) is sent as a number and becomes an enum by a checked conversion.
+//! Receivers call [`Message::validate`] on arrival; it never panics, for any bytes.
 //!
 //! ```
 //! use carff_messages::{Gaussian, Header, Message, Posterior};
@@ -13,7 +13,7 @@
 //! assert!(posterior.validate().unwrap_err().to_string().contains("gaussian.mean"));
 //! ```
 //!
-//! Stages of other crates have messages of their own: see [`message!`].
+//! Stages of other crates define their own messages: see [`message!`].
 
 pub mod check;
 mod codes;
@@ -32,56 +32,56 @@ pub use frame::{DatasetView, FrameMeta, Intrinsics, ViewMeta};
 pub use health::Health;
 pub use latent::{Belief, Forecast, Gaussian, Posterior, ProbeResult};
 
-/// Says that a type may lie in shared memory, and under which name. Derive it with `#[repr(C)]` and `#[type_name(..)]`.
+/// Marks a type as suitable for shared memory, with a name. Derive it with `#[repr(C)]` and `#[type_name(..)]`.
 pub use iceoryx2::prelude::ZeroCopySend;
 
 use check::{at_most, equals};
 use std::fmt::Debug;
 
-/// Version of all layouts in this crate. A process drops what carries another one.
+/// Version of all layouts in this crate. A process drops messages of another version.
 pub const SCHEMA_VERSION: u32 = 2;
 /// Dimensions of the scene latent.
 pub const LATENT_DIM: usize = 8;
-/// Most components that a mixture can have.
+/// Maximum number of components of a mixture.
 pub const MAX_COMPONENTS: usize = 4;
-/// Most latents drawn from a mixture.
+/// Maximum number of latents drawn from a mixture.
 pub const MAX_SAMPLES: usize = 64;
-/// Most states (branch, timestamp) that a scenario can have.
+/// Maximum number of states (branch, time step) of a scenario.
 pub const MAX_STATES: usize = 64;
-/// Most boxes that are probed for density.
+/// Maximum number of probed boxes.
 pub const MAX_PLACES: usize = 48;
-/// Most steps that a forecast looks ahead.
+/// Maximum number of steps of a forecast.
 pub const MAX_HORIZON: u32 = 8;
-/// Largest width or height of a picture, pixels.
+/// Maximum width or height of an image, pixels.
 pub const MAX_SIDE_PX: u32 = 4096;
-/// Most bytes that a picture on a topic can have (RGB, 8 bit).
+/// Maximum number of bytes of an image on a topic (RGB, 8 bit).
 pub const MAX_IMAGE_BYTES: usize = 1 << 24;
 
-/// What every message carries: enough to follow one frame through every stage.
+/// Common fields of all messages: enough to follow one frame through every stage.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ZeroCopySend)]
 #[type_name("carff.Header.v1")]
 pub struct Header {
     /// [`SCHEMA_VERSION`] of the sender. Set on send.
     pub schema_version: u32,
-    /// Horizon step: 0 for what was observed, 1 for the first forecast.
+    /// Horizon step: 0 for the observation, 1 for the first forecast.
     pub step: u32,
-    /// The run that it belongs to. Set on send.
+    /// The run of the message. Set on send.
     pub run_id: u64,
-    /// The camera frame that it rests on, counted from 0 in a run.
+    /// The camera frame that the message is based on, counted from 0 in a run.
     pub frame_id: u64,
-    /// Counts the messages of one publisher from 0. Set on send.
+    /// Number of the message from its publisher, from 0. Set on send.
     pub sequence: u64,
-    /// When the camera took the frame: monotonic clock, nanoseconds.
+    /// Capture time of the frame: monotonic clock, nanoseconds.
     pub capture_time_ns: u64,
-    /// When this message was published: monotonic clock, nanoseconds. Set on send.
+    /// Publication time of this message: monotonic clock, nanoseconds. Set on send.
     pub publish_time_ns: u64,
     /// The run's random seed.
     pub seed: u64,
 }
 
 impl Header {
-    /// The header of a frame, at step 0. Sending fills in what it leaves at 0.
+    /// Returns the header of a frame at step 0. Sending fills in the fields that are 0.
     pub fn of_frame(frame_id: u64, capture_time_ns: u64, seed: u64) -> Self {
         Self {
             schema_version: SCHEMA_VERSION,
@@ -95,7 +95,7 @@ impl Header {
         }
     }
 
-    /// The same frame's header at another step.
+    /// Returns the header of the same frame at another step.
     #[must_use]
     pub fn at_step(self, step: u32) -> Self {
         Self { step, ..self }
@@ -110,21 +110,20 @@ impl Header {
 
 /// A message as the transport handles it.
 pub trait Message: ZeroCopySend + Debug + Copy + Send + Sync + 'static {
-    /// The header.
+    /// Returns the header.
     fn header(&self) -> &Header;
-    /// The header, to be stamped on send.
+    /// Returns the header, to be stamped on send.
     fn header_mut(&mut self) -> &mut Header;
     /// Checks all fields: finite, in range, known codes, schema version. Never panics.
     fn validate(&self) -> Result<(), Invalid>;
 }
 
-/// A message that describes the image it comes with. Its default is not valid: a loan holds it until the real one is
-/// written.
+/// A message that describes an image. Its default is not valid: a loan contains it until the real one is written.
 pub trait ImageMeta: Message + Default {
-    /// Width and height of the image, pixels.
+    /// Returns width and height of the image, pixels.
     fn size_px(&self) -> [u32; 2];
 
-    /// Bytes of the image, RGB, 8 bit. Only meaningful once [`Message::validate`] has passed.
+    /// Returns the number of bytes of the image, RGB, 8 bit. Only meaningful after [`Message::validate`] has passed.
     fn image_bytes(&self) -> usize {
         let [width_px, height_px] = self.size_px();
         rgb_bytes(width_px, height_px)
@@ -136,13 +135,14 @@ pub const fn rgb_bytes(width_px: u32, height_px: u32) -> usize {
     width_px as usize * height_px as usize * 3
 }
 
-/// Makes a type a [`Message`]: it has a field `header: Header`, and a method `check(&self) -> Result<(), Invalid>`. Of a
-/// type, `#[type_name]` says name and version: processes that disagree about its layout must disagree about it too.
+/// Implements [`Message`] for a type with a field `header: Header` and a method `check(&self) -> Result<(), Invalid>`.
+/// Change the version in `#[type_name]` whenever the layout changes: processes with different layouts then refuse each
+/// other's topics.
 ///
 /// ```
 /// use carff_messages::{Header, Invalid, Message, ZeroCopySend, check, message};
 ///
-/// /// How fast the car may go.
+/// /// Speed limit of the car.
 /// #[repr(C)]
 /// #[derive(Clone, Copy, Debug, ZeroCopySend)]
 /// #[type_name("example.SpeedLimit.v1")]

@@ -36,7 +36,7 @@ fn frame() -> FrameMeta {
     }
 }
 
-/// Each message built by its constructor is valid, and each of these single wrong fields makes it invalid.
+/// Each message from its constructor is valid, and each single wrong field makes it invalid.
 #[test]
 fn one_wrong_field_is_enough() {
     assert_eq!(forecast().validate(), Ok(()));
@@ -94,7 +94,7 @@ fn one_wrong_field_is_enough() {
     }
 }
 
-/// What lies beyond the counts is not looked at: a NaN there does not make a message invalid.
+/// Entries beyond the counts are ignored: a NaN there does not make a message invalid.
 #[test]
 fn entries_beyond_the_counts_mean_nothing() {
     let mut forecast = forecast();
@@ -107,7 +107,7 @@ fn entries_beyond_the_counts_mean_nothing() {
     assert_eq!(belief.validate(), Ok(()));
 }
 
-/// Codes survive the way there and back; others are refused.
+/// Codes are converted to numbers and back; unknown codes are refused.
 #[test]
 fn codes_round_trip() {
     for state in HealthState::ALL {
@@ -120,14 +120,14 @@ fn codes_round_trip() {
     assert_eq!(ActionCode::Halt.code(), 0, "zeroed memory must read as the safe action");
 }
 
-/// Garbage never panics, and it practically never passes: 300 messages of random bytes per type.
+/// Random bytes never panic and practically never pass: 300 messages per type.
 #[test]
 fn garbage_never_panics() {
     let mut rng = stream(Key { seed: 5, frame: 0, step: 0, sample: 0 });
-    // An interpreter (`make miri`) takes seconds for one.
+    // An interpreter (`make miri`) takes seconds per message.
     let rounds = if cfg!(miri) { 2 } else { 300 };
     for round in 0..rounds {
-        // Half the rounds have plausible headers and counts, so that the deeper checks run on garbage too.
+        // Half of the messages have plausible headers and counts, so that the deeper checks run too.
         let plausible = round % 2 == 0;
         let mut forecast: Forecast = random_bytes::value(&mut rng);
         let mut belief: Belief = random_bytes::value(&mut rng);
@@ -158,7 +158,7 @@ fn garbage_never_panics() {
     }
 }
 
-/// Values of any bit pattern.
+/// Values with random bit patterns.
 mod random_bytes {
     use crate::Message;
     use rand::RngCore;
@@ -171,7 +171,7 @@ mod random_bytes {
         // SAFETY: all bytes are initialised by the line above; the borrow ends before `value` is read.
         let bytes = unsafe { std::slice::from_raw_parts_mut(value.as_mut_ptr().cast::<u8>(), size_of::<T>()) };
         rng.fill_bytes(bytes);
-        // SAFETY: each `Message` of this crate is made of integers and floats alone, for which any bits are valid.
+        // SAFETY: each `Message` of this crate consists only of integers and floats, for which any bits are valid.
         unsafe { value.assume_init() }
     }
 }

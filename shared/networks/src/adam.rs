@@ -1,4 +1,4 @@
-//! Adam whose state can be saved: tch's own optimiser cannot, and a training must resume where it stopped.
+//! An Adam optimiser with a state that can be saved. The state of tch's own optimiser cannot, and training must resume.
 
 use crate::weights::Tensors;
 use tch::{Tensor, nn::VarStore};
@@ -22,7 +22,7 @@ const BETA2: f64 = 0.999;
 const EPSILON: f64 = 1e-8;
 
 impl Adam {
-    /// An optimiser of all trainable variables of the stores; names must not repeat among them.
+    /// Creates an optimiser of all trainable variables of the stores; their names must be unique.
     pub fn new(stores: &[&VarStore], weight_decay: f64) -> Self {
         let mut slots: Vec<Slot> = stores
             .iter()
@@ -40,9 +40,8 @@ impl Adam {
         Self { slots, weight_decay }
     }
 
-    /// One step down the gradient of `loss`, with gradients clipped to a norm of `max_norm` over all variables. A variable
-    /// that the loss does not reach stays as it is, and so do its moments: let to fade meanwhile, they would make its
-    /// next step too long.
+    /// Makes one step down the gradient of `loss`, with gradients clipped to a norm of `max_norm` over all variables.
+    /// Variables without a gradient keep their values and moments: decayed moments would make their next step too long.
     pub fn step(&mut self, loss: &Tensor, learning_rate: f64, max_norm: f64) {
         for slot in &mut self.slots {
             slot.variable.zero_grad();
@@ -74,7 +73,7 @@ impl Adam {
         });
     }
 
-    /// Everything needed to go on: moments and counts of steps.
+    /// Returns the state for a later resume: moments and counts of steps.
     pub fn state(&self) -> Tensors {
         let mut state = Tensors::new();
         for slot in &self.slots {
@@ -85,7 +84,7 @@ impl Adam {
         state
     }
 
-    /// Puts a saved state back; `false` when it belongs to another set of variables.
+    /// Restores a saved state; `false` if it belongs to other variables.
     #[must_use]
     pub fn restore(&mut self, state: &Tensors) -> bool {
         let fits = self.slots.iter().all(|s| {
@@ -116,7 +115,7 @@ mod tests {
         (store, x)
     }
 
-    /// A variable that some losses do not reach ends where it would without those steps.
+    /// A variable without gradients in some steps ends where it would without those steps.
     #[test]
     fn a_variable_out_of_reach_stays() {
         let trained = |others: usize| {
@@ -136,7 +135,7 @@ mod tests {
         assert_eq!(trained(4), trained(0));
     }
 
-    /// A step after restore is the same step as without the interruption, bit for bit.
+    /// A step after a restore equals the step without the interruption, bit for bit.
     #[test]
     fn resumes_exactly() {
         let loss = |x: &Tensor| (x - Tensor::from_slice(&[1.0_f32, -2.0, 0.5])).square().sum(Kind::Float);

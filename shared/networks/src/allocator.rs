@@ -1,7 +1,7 @@
-//! Keeps large tensors in the heap: without it each operation maps fresh pages, and page faults halve the speed.
+//! Keeps large tensors in the heap: otherwise each operation maps new pages, and page faults halve the speed.
 
-/// Tells the C library's allocator to keep blocks of up to 1 GiB in the heap and not to give them back.
-/// Call it once, first thing in a process that computes with tensors. Measured: 2.0x on the default encoder.
+/// Makes the C library's allocator keep blocks of up to 1 GiB in the heap. Call it once, at the start of a process that
+/// computes with tensors. Measured: 2.0x on the default encoder.
 pub fn keep_large_blocks() {
     #[cfg(all(target_os = "linux", target_env = "gnu"))]
     {
@@ -10,7 +10,7 @@ pub fn keep_large_blocks() {
             [(libc::M_MMAP_THRESHOLD, LIMIT), (libc::M_TRIM_THRESHOLD, LIMIT), (libc::M_TOP_PAD, 64 << 20)]
         {
             // SAFETY: mallopt only sets a parameter of the allocator and may be called at any time; a value that it
-            // does not take leaves the old one.
+            // refuses keeps the old one.
             unsafe { libc::mallopt(option, value) };
         }
     }

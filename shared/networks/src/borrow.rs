@@ -1,13 +1,13 @@
-//! Tensors that borrow memory they do not own: the only `unsafe` of this crate.
+//! Tensors that borrow memory: the only `unsafe` code of this crate.
 //!
-//! The camera writes an image once, into shared memory. The tensor made here points at those bytes; nothing is copied
-//! before the first arithmetic operation.
+//! The camera writes an image once, into shared memory. The tensor points to those bytes; nothing is copied before the
+//! first arithmetic operation.
 
 use ndarray::ArrayView3;
 use tch::{Device, Kind, Tensor};
 
-/// Calls `use_it` with a (height, width, channel) tensor of bytes that borrows an image. Its result must not keep the
-/// tensor.
+/// Calls `use_it` with a (height, width, channel) tensor of bytes that borrows an image. The result must not contain
+/// the tensor.
 ///
 /// Returns `None` for an image without bytes, and for one whose axes do not run forward in memory.
 ///

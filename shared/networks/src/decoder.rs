@@ -1,14 +1,14 @@
-//! The pose-conditional VAE's decoder: from a scene latent and a pose's number to that pose's picture (section 3.2).
+//! The pose-conditional VAE's decoder: from a scene latent and a pose index to that pose's image (section 3.2).
 
 use carff_checkpoint::shapes::DecoderConfig;
 use carff_messages::LATENT_DIM;
 use tch::{Tensor, nn, nn::Module};
 
-/// Side of the decoder's pictures, pixels.
+/// Side of the decoder's images, pixels.
 pub const PICTURE_PX: i64 = 128;
 
-/// Inputs of the first layer: the one-hot pose, and its product with the latent, so that each pose has its own map of
-/// the latent. With latent and pose side by side, the decoder stayed at the pose's mean picture.
+/// Number of inputs of the first layer: the one-hot pose, and its product with the latent, so that each pose has its
+/// own map of the latent. With a concatenation of latent and pose, the decoder stayed at the pose's mean image.
 fn joined(poses: i64) -> i64 {
     if poses > 0 { poses * (LATENT_DIM as i64 + 1) } else { LATENT_DIM as i64 }
 }
@@ -27,7 +27,7 @@ pub struct Decoder {
 }
 
 impl Decoder {
-    /// Builds a decoder for `poses` fixed camera poses (0: no pose is given to it).
+    /// Builds a decoder for `poses` fixed camera poses (0: without a pose input).
     pub fn new(path: &nn::Path, config: &DecoderConfig, poses: i64) -> Self {
         let same = nn::ConvConfig { padding: 1, ..Default::default() };
         let c = config.channels;
@@ -39,20 +39,20 @@ impl Decoder {
             up16: nn::conv2d(path / "up16", c, c, 3, same),
             up32: nn::conv2d(path / "up32", c, c * 3 / 4, 3, same),
             up64: nn::conv2d(path / "up64", c * 3 / 4, c * 3 / 8, 3, same),
-            // 12 = 3 colours of 2x2 pixels: the last doubling is a shuffle.
+            // 12 = 3 colours of 2x2 pixels: the last doubling is a pixel shuffle.
             out: nn::conv2d(path / "out", c * 3 / 8, 12, 3, same),
             channels: c,
             poses,
         }
     }
 
-    /// Where it computes.
+    /// Returns the device of the weights.
     pub fn device(&self) -> tch::Device {
         self.join.ws.device()
     }
 
-    /// Latents `[N, 8]` and pose numbers `[N]` (int64) to `[N, 3, 128, 128]`: a picture in 0..=1, or the residual
-    /// over the pose's mean picture, whichever it was trained for.
+    /// Maps latents `[N, 8]` and pose indices `[N]` (int64) to `[N, 3, 128, 128]`: an image in 0..=1, or the residual
+    /// over the pose's mean image, as trained.
     pub fn forward(&self, latents: &Tensor, poses: &Tensor) -> Tensor {
         let input = if self.poses > 0 {
             let one_hot = poses.one_hot(self.poses).to_kind(latents.kind());
@@ -79,7 +79,7 @@ mod tests {
     use super::*;
     use tch::{Device, Kind, nn::VarStore};
 
-    /// A decoder that is told the pose draws another picture for another pose; one that is not draws the same.
+    /// A decoder with a pose input draws different images for different poses; one without draws the same.
     #[test]
     fn pose_condition_is_a_setting() {
         let differs = |pose_condition| {

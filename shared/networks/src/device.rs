@@ -1,9 +1,9 @@
-//! Where tensors are computed: the processor or a CUDA device.
+//! Devices of tensors: the processor or a CUDA device.
 
 use crate::ModelError;
 use tch::{Cuda, Device};
 
-/// What `--device` names: `auto` (the first CUDA device if libtorch finds one, else the processor), `cpu`, or `cuda:N`.
+/// Parses `--device`: `auto` (the first CUDA device if libtorch finds one, else the processor), `cpu`, or `cuda:N`.
 pub fn parse(name: &str) -> Result<Device, ModelError> {
     let devices = Cuda::device_count().max(0) as usize;
     let wrong = |allowed| Err(ModelError::Setting { key: "--device", value: name.to_owned(), allowed });
@@ -11,7 +11,7 @@ pub fn parse(name: &str) -> Result<Device, ModelError> {
         ("auto", _) => Ok(Device::cuda_if_available()),
         ("cpu", _) => Ok(Device::Cpu),
         (_, Some(Ok(number))) if number < devices => Ok(Device::Cuda(number)),
-        (_, Some(Ok(_))) if devices == 0 => wrong("this libtorch finds no CUDA device; take `cpu` or `auto`"),
+        (_, Some(Ok(_))) if devices == 0 => wrong("this libtorch finds no CUDA device; use `cpu` or `auto`"),
         (_, Some(Ok(_))) => wrong("there is no CUDA device of this number"),
         _ => wrong("`auto`, `cpu`, or `cuda:0` and so on"),
     }
@@ -26,7 +26,7 @@ pub fn set_threads(threads: usize) {
 mod tests {
     use super::*;
 
-    /// The processor is always there; a device that is not, or no device's name, is an error that says what is.
+    /// The processor is always available; a missing device, or an invalid name, is an error with the allowed values.
     #[test]
     fn devices_are_named() {
         assert_eq!(parse("cpu").unwrap(), Device::Cpu);

@@ -1,4 +1,4 @@
-//! The pose-conditional VAE's encoder: from one picture to a Gaussian over the scene latent (paper section 3.2).
+//! The pose-conditional VAE's encoder: from one image to a Gaussian over the scene latent (paper section 3.2).
 
 use crate::{
     ModelError,
@@ -9,10 +9,10 @@ use carff_messages::{Gaussian, LATENT_DIM};
 use std::path::Path;
 use tch::{Kind, Tensor, nn, nn::Module};
 
-/// Log-variances are kept inside this range, so that no posterior is a point or the whole space.
+/// Range of log-variances, so that no posterior collapses to a point or covers the whole space.
 pub const LOG_VARIANCE_RANGE: (f64, f64) = (-8.0, 4.0);
 
-/// Backbone and head.
+/// Encoder with backbone and head.
 pub struct Encoder {
     stem: Option<(nn::Conv2D, nn::Conv2D)>,
     backbone: Box<dyn Backbone>,
@@ -31,7 +31,7 @@ struct Head {
 }
 
 impl Encoder {
-    /// Builds the encoder: backbone variables in `backbone_path`, all that learns besides in `head_path`.
+    /// Builds the encoder: backbone variables in `backbone_path`, all other trained variables in `head_path`.
     pub fn new(
         config: &EncoderConfig,
         backbone_path: &nn::Path,
@@ -65,7 +65,7 @@ impl Encoder {
             pool: nn::conv2d(&p / "pool", config.reduce_channels, config.pool_channels, 3, strided),
             hidden: nn::linear(&p / "hidden", config.pool_channels * side * side, config.hidden, linear),
             mean: nn::linear(&p / "mean", config.hidden, LATENT_DIM as i64, linear),
-            // Posteriors start narrow: wide ones drown the mean before it has learnt anything.
+            // Posteriors start narrow: wide ones would hide the mean before it is trained.
             log_variance: nn::linear(
                 &p / "log_variance",
                 config.hidden,
@@ -76,7 +76,7 @@ impl Encoder {
         Ok(Self { stem, backbone, head })
     }
 
-    /// `[N, 3, H, W]` in 0..=1 to backbone features `[N, C, h, w]`, on the encoder's device.
+    /// Maps images `[N, 3, H, W]` in 0..=1 to backbone features `[N, C, h, w]`, on the encoder's device.
     pub fn features(&self, pictures: &Tensor) -> Tensor {
         let pictures = &pictures.to_device(self.head.center.device());
         match &self.stem {
@@ -85,13 +85,13 @@ impl Encoder {
         }
     }
 
-    /// The shape of one picture's features: channels, height, width.
+    /// Returns the shape of one image's features: channels, height, width.
     pub fn feature_shape(&self) -> [i64; 3] {
         [self.backbone.channels(), self.backbone.grid(), self.backbone.grid()]
     }
 
-    /// Backbone features to posterior mean and log-variance, each `[N, 8]`.
-    /// With `dropout` above zero, hidden units are dropped with that probability (training only).
+    /// Maps backbone features to posterior mean and log-variance, each `[N, 8]`. Hidden units are dropped with
+    /// probability `dropout` (training only).
     pub fn posterior(&self, features: &Tensor, dropout: f64) -> (Tensor, Tensor) {
         let x = (features - &self.head.center) * &self.head.scale;
         let x = self.head.reduce.forward(&x).relu();
@@ -102,7 +102,7 @@ impl Encoder {
         (self.head.mean.forward(&x), log_variance)
     }
 
-    /// Makes the head bring features to zero mean and unit deviation per channel, as measured on `features`.
+    /// Makes the head standardise features to zero mean and unit deviation per channel, as measured on `features`.
     pub fn standardise(&mut self, features: &Tensor) {
         tch::no_grad(|| {
             let axes = [0_i64, 2, 3];
@@ -113,7 +113,7 @@ impl Encoder {
         });
     }
 
-    /// The posteriors of pictures `[N, 3, H, W]`.
+    /// Returns the posteriors of images `[N, 3, H, W]`.
     pub fn encode(&self, pictures: &Tensor) -> Vec<Gaussian> {
         tch::no_grad(|| {
             let (mean, log_variance) = self.posterior(&self.features(pictures), 0.0);
@@ -121,18 +121,18 @@ impl Encoder {
         })
     }
 
-    /// The posterior of one picture, `[H, W, 3]` bytes.
+    /// Returns the posterior of one image, `[H, W, 3]` bytes.
     pub fn encode_bytes(&self, picture: &Tensor) -> Option<Gaussian> {
         self.encode(&pictures_from_bytes(&picture.unsqueeze(0))).into_iter().next()
     }
 }
 
-/// `[N, H, W, 3]` bytes to `[N, 3, H, W]` in 0..=1.
+/// Converts `[N, H, W, 3]` bytes to `[N, 3, H, W]` in 0..=1.
 pub fn pictures_from_bytes(bytes: &Tensor) -> Tensor {
     bytes.permute([0, 3, 1, 2]).to_kind(Kind::Float) * (1.0 / 255.0)
 }
 
-/// Two `[N, 8]` tensors to Gaussians.
+/// Converts two `[N, 8]` tensors to Gaussians.
 pub fn gaussians(mean: &Tensor, log_variance: &Tensor) -> Vec<Gaussian> {
     let rows = |t: &Tensor| {
         let mut flat = vec![0.0_f32; t.numel()];

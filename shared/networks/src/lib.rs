@@ -18,39 +18,39 @@ pub mod pretrained;
 pub mod stored;
 pub mod weights;
 
-/// What goes wrong with models and their files.
+/// Errors of models and their files.
 #[derive(Debug, thiserror::Error)]
 pub enum ModelError {
     /// A file could not be read or written.
     #[error("{path}: {source}")]
     File {
-        /// Which file.
+        /// Path of the file.
         path: std::path::PathBuf,
-        /// What the system said.
+        /// Error of the system.
         source: std::io::Error,
     },
-    /// A file is not what it must be.
+    /// The file's contents are not valid.
     #[error("{path}: {what}")]
     Format {
-        /// Which file.
+        /// Path of the file.
         path: std::path::PathBuf,
-        /// What is wrong, and what to do.
+        /// Description of the error, with a remedy.
         what: String,
     },
     /// Tensors that the model needs are missing, unknown or of another shape.
     #[error("the weights do not fit the model: {0}")]
     Mismatch(String),
-    /// A setting is out of its range.
+    /// A setting is out of range.
     #[error("`{key}` = {value}: {allowed}")]
     Setting {
-        /// Which setting.
+        /// Name of the setting.
         key: &'static str,
-        /// What it was.
+        /// Value of the setting.
         value: String,
-        /// What is allowed.
+        /// Allowed values.
         allowed: &'static str,
     },
-    /// libtorch refused an operation.
+    /// libtorch reported an error.
     #[error("libtorch: {0}")]
     Torch(#[from] tch::TchError),
 }

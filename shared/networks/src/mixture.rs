@@ -6,10 +6,10 @@ use carff_decision::Mixture;
 use carff_messages::{Gaussian, LATENT_DIM};
 use tch::{Kind, Tensor, nn, nn::Module};
 
-/// Component log-variances are kept inside this range.
+/// Range of component log-variances.
 pub const LOG_VARIANCE_RANGE: (f64, f64) = (-7.0, 4.0);
 
-/// The network.
+/// The mixture density network.
 #[derive(Debug)]
 pub struct MixtureNet {
     first: nn::Linear,
@@ -46,12 +46,12 @@ impl MixtureNet {
         })
     }
 
-    /// Where it computes.
+    /// Returns the device of the weights.
     pub fn device(&self) -> tch::Device {
         self.first.ws.device()
     }
 
-    /// Posterior means and log-variances, each `[N, 8]`, to log weights `[N, K]`, means `[N, K, 8]` and
+    /// Maps posterior means and log-variances, each `[N, 8]`, to log weights `[N, K]`, means `[N, K, 8]` and
     /// log-variances `[N, K, 8]`.
     pub fn forward(&self, mean: &Tensor, log_variance: &Tensor) -> (Tensor, Tensor, Tensor) {
         let input = Tensor::cat(&[mean.shallow_clone(), log_variance * 0.25], 1);
@@ -65,7 +65,8 @@ impl MixtureNet {
         )
     }
 
-    /// Mean negative log-likelihood of `targets` `[N, 8]` under the forecasts of the inputs (paper equation 6).
+    /// Returns the mean negative log-likelihood of `targets` `[N, 8]` under the forecasts of the inputs (paper equation
+    /// 6).
     pub fn negative_log_likelihood(&self, mean: &Tensor, log_variance: &Tensor, targets: &Tensor) -> Tensor {
         let (log_weights, means, log_variances) = self.forward(mean, log_variance);
         let distance = (targets.unsqueeze(1) - means).square() / log_variances.exp();
@@ -77,12 +78,12 @@ impl MixtureNet {
         -(log_weights + log_density).logsumexp([-1_i64].as_slice(), false).mean(Kind::Float)
     }
 
-    /// The belief over the next latent, for one posterior.
+    /// Returns the forecast over the next latent for one posterior.
     pub fn forecast(&self, posterior: &Gaussian) -> Mixture {
         self.forecast_all(std::slice::from_ref(posterior)).remove(0)
     }
 
-    /// The beliefs over the next latent, for many posteriors at once.
+    /// Returns the forecasts over the next latent for many posteriors at once.
     pub fn forecast_all(&self, posteriors: &[Gaussian]) -> Vec<Mixture> {
         tch::no_grad(|| {
             let flat = |part: fn(&Gaussian) -> &[f32; LATENT_DIM]| {
@@ -109,7 +110,7 @@ mod tests {
     use super::*;
     use tch::{Device, nn::VarStore};
 
-    /// The loss is the closed form: -ln of the weighted sum of normal densities, computed by hand in f64.
+    /// The loss equals the closed form: -ln of the weighted sum of normal densities, computed separately in f64.
     #[test]
     fn likelihood_is_the_closed_form() {
         tch::manual_seed(3);

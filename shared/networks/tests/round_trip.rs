@@ -1,4 +1,4 @@
-//! Contract of weights on disk: what is read computes what was written, to the bit, where numbers fit half precision.
+//! Test of stored weights: a network with read weights computes the same bits, if its numbers fit half precision.
 
 use carff_checkpoint::{Manifest, files, shapes::BackboneKind};
 use carff_messages::Gaussian;
@@ -12,7 +12,7 @@ use carff_networks::{
 use std::path::Path;
 use tch::{Device, Kind, Tensor, nn::VarStore};
 
-/// Rounds a store's variables to what half precision holds.
+/// Rounds a store's variables to half precision.
 fn round(store: &VarStore) -> Tensors {
     tch::no_grad(|| {
         for mut variable in store.variables().into_values() {
@@ -27,7 +27,7 @@ fn random(shape: &[i64]) -> Tensor {
     Tensor::rand(shape, (Kind::Float, Device::Cpu))
 }
 
-/// Encoder (with a frozen backbone in a file of its own, and with one that learns), decoder and mixture density network.
+/// Encoder (with a frozen backbone in its own file, and with a trained backbone), decoder and mixture density network.
 #[test]
 fn networks_come_back_as_they_were() {
     tch::manual_seed(3);

@@ -1,64 +1,64 @@
-//! The runs that live, and joining one of them.
+//! Lists living runs, and joins one of them.
 
 use crate::RunRecord;
 use carff_transport::{Node, OpenError, Run, RunNameError, runtime_dir};
 use std::path::{Path, PathBuf};
 
-/// A run whose launcher lives.
+/// A run with a living launcher.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct LiveRun {
-    /// Its name.
+    /// Name of the run.
     pub name: String,
-    /// Its id, which is in every header.
+    /// Id of the run, which is in every header.
     pub run_id: u64,
-    /// The launcher's process id.
+    /// Process id of the launcher.
     pub pid: u32,
-    /// The graph file.
+    /// Path of the graph file.
     pub graph: PathBuf,
-    /// Folder of the data set.
+    /// Folder of the dataset.
     pub dataset: PathBuf,
     /// Folder of the trained models.
     pub checkpoint: PathBuf,
-    /// When it was started: seconds since 1970.
+    /// Start time: seconds since 1970.
     pub started_unix_s: u64,
 }
 
 impl LiveRun {
-    /// Whether its launcher lives and still runs this very run.
+    /// Returns true if its launcher is alive and still has this run.
     pub fn is_alive(&self) -> bool {
         living(&runtime_dir(), &self.name).is_some_and(|run| run.run_id == self.run_id)
     }
 }
 
-/// Why a run cannot be joined.
+/// Reason why a run cannot be joined.
 #[derive(Debug, thiserror::Error)]
 pub enum AttachError {
-    /// Nothing runs.
-    #[error("no graph runs here: start one with `carff launch` (as the same user: runs of others are not seen)")]
+    /// No graph is running.
+    #[error("no graph is running: start one with `carff launch` (as the same user: other users' runs are hidden)")]
     NoRun,
-    /// Nothing of this name runs.
-    #[error("no run `{name}` lives; there {}", there_are(.living))]
+    /// No run of this name is alive.
+    #[error("no run `{name}` is alive; there {}", there_are(.living))]
     NoSuchRun {
-        /// What was asked for.
+        /// The requested name.
         name: String,
-        /// The names of those that live.
+        /// Names of the living runs.
         living: Vec<String>,
     },
-    /// Several run, and none was named.
-    #[error("several graphs run ({}): name one with --run", .living.join(", "))]
+    /// Several runs are alive, and none was named.
+    #[error("several graphs are running ({}): name one with --run", .living.join(", "))]
     Several {
-        /// Their names.
+        /// Names of the living runs.
         living: Vec<String>,
     },
-    /// No run can have this name.
+    /// The name is not valid for a run.
     #[error(transparent)]
     Name(#[from] RunNameError),
     /// The folder of all runs cannot be read.
     #[error("cannot read {path}: {source}")]
     Folder {
-        /// The folder.
+        /// Path of the folder.
         path: PathBuf,
-        /// What the system said.
+        /// Error of the system.
         source: std::io::Error,
     },
     /// The transport could not join.
@@ -74,16 +74,16 @@ fn there_are(names: &[String]) -> String {
     }
 }
 
-/// A run that has been joined. It is left when this is dropped.
+/// A run that has been joined. Dropping it leaves the run.
 #[derive(Debug)]
 pub struct Attached {
-    /// The membership: topics are opened by it.
+    /// Membership in the run, which opens topics.
     pub node: Node,
-    /// The run.
+    /// The joined run.
     pub live: LiveRun,
 }
 
-/// The runs of this user that live, by name.
+/// Returns the living runs of this user, by name.
 pub fn runs() -> Result<Vec<LiveRun>, AttachError> {
     let folder = runtime_dir();
     let entries = match std::fs::read_dir(&folder) {
@@ -99,7 +99,7 @@ pub fn runs() -> Result<Vec<LiveRun>, AttachError> {
     Ok(runs)
 }
 
-/// Joins a run as `node_name`: the one that is named, or the only one that lives.
+/// Joins the named run, or the only living one, as `node_name`.
 pub fn attach(run: Option<&str>, node_name: &str) -> Result<Attached, AttachError> {
     let mut living = runs()?;
     let names = || living.iter().map(|r| r.name.clone()).collect();
@@ -117,8 +117,8 @@ pub fn attach(run: Option<&str>, node_name: &str) -> Result<Attached, AttachErro
     Ok(Attached { node, live })
 }
 
-/// The run of this name, if its launcher lives: the record that a killed one left names a process that is no more, or
-/// that is not a launcher.
+/// Returns the run of a name if its launcher is alive. The record of a killed launcher names a process that does not
+/// exist, or that is not a launcher.
 fn living(folder: &Path, name: &str) -> Option<LiveRun> {
     let record = RunRecord::from_bytes(&std::fs::read(RunRecord::path(folder, name)).ok()?)?;
     let started = Path::new("/proc").join(record.pid.to_string());
@@ -142,7 +142,7 @@ mod tests {
         RunRecord { pid, run_id: 9, graph, dataset, checkpoint, started_unix_s: 5 }
     }
 
-    /// A record of a process that lives is a run; one of a process that has ended, and garbage, are none.
+    /// A record of a living launcher is a run; a record of an ended process, and garbage, are not.
     #[test]
     fn only_living_launchers_count() {
         let folder = tempfile::tempdir().unwrap();

@@ -1,9 +1,9 @@
-//! Runs seen from outside: listing them, owning one, and joining one as an observer.
+//! Observation of runs: listing them, owning one, and joining one as an observer.
 //!
-//! Probes, recorder and viewer hold what is done with the messages of a run.
+//! Probes, recorder and viewer process the messages of a run.
 //!
-//! An observer takes one of the spare subscriber slots of each topic that it opens ([`carff_transport::Limits`]); opening
-//! fails when no slot is left. An observer may come and go at any time, and no stage waits for it.
+//! An observer takes one of the spare subscriber slots of each topic that it opens ([`carff_transport::Limits`]);
+//! opening fails if no slot is left. Observers may join and leave at any time, and no stage waits for them.
 
 mod attach;
 mod lock;

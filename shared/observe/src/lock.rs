@@ -1,4 +1,4 @@
-//! One owner for a run: its record, locked; and the end of what an earlier owner left.
+//! Ownership of a run: its locked record, and the removal of an earlier owner's leftovers.
 
 use crate::RunRecord;
 use carff_transport::{
@@ -11,50 +11,50 @@ use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-/// How long processes of an earlier owner are given to end, nanoseconds: the stages of a killed launcher end by
-/// themselves, which takes them a moment.
+/// Longest wait for processes of an earlier owner, nanoseconds: the stages of a killed launcher end by themselves after
+/// a moment.
 const ORPHAN_PATIENCE_NS: u64 = 2_000_000_000;
-/// Time between two looks at them.
+/// Interval between two checks of these processes.
 const ORPHAN_LOOK: Duration = Duration::from_millis(20);
 
-/// Why a run cannot be owned.
+/// Reason why a run cannot be owned.
 #[derive(Debug, thiserror::Error)]
 pub enum LockError {
-    /// Another process owns it.
-    #[error("run `{run}` is already running{}: stop it, or give this one another name with {option}", who(.holder.as_deref()))]
+    /// Another process owns the run.
+    #[error("run `{run}` is already running{}: stop it, or use another name with {option}", who(.holder.as_deref()))]
     Held {
-        /// The run.
+        /// Name of the run.
         run: String,
-        /// Its owner, where the record can be read.
+        /// Record of its owner, if it can be read.
         holder: Option<Box<RunRecord>>,
-        /// The option that names a run.
+        /// Option that names a run.
         option: &'static str,
     },
     /// Processes of an earlier owner have not ended.
     #[error(
-        "processes {living:?} of an earlier launch of run `{run}` still live: stop them, or give this one another name \
+        "processes {living:?} of an earlier launch of run `{run}` are still alive: stop them, or use another name \
          with {option}"
     )]
     Orphans {
-        /// The run.
+        /// Name of the run.
         run: String,
-        /// Their process ids.
+        /// Process ids of these processes.
         living: Vec<u32>,
-        /// The option that names a run.
+        /// Option that names a run.
         option: &'static str,
     },
     /// The record cannot be opened or written.
     #[error("cannot write {path}: {source}")]
     Record {
-        /// Its file.
+        /// Path of the record.
         path: PathBuf,
-        /// What the system said.
+        /// Error of the system.
         source: std::io::Error,
     },
     /// The folder of all runs cannot be used.
     #[error(transparent)]
     Folder(#[from] OpenError),
-    /// What an earlier owner left cannot be removed.
+    /// Leftovers of an earlier owner cannot be removed.
     #[error(transparent)]
     Cleanup(#[from] CleanupError),
 }
@@ -63,7 +63,7 @@ fn who(holder: Option<&RunRecord>) -> String {
     holder.map(|h| format!(" (process {}, graph {})", h.pid, h.graph)).unwrap_or_default()
 }
 
-/// Held while a run runs. The system frees it when the process ends, however it ends.
+/// The lock of a running run. The system frees it when the process ends in any way.
 #[derive(Debug)]
 pub struct RunLock {
     path: PathBuf,
@@ -71,8 +71,8 @@ pub struct RunLock {
 }
 
 impl RunLock {
-    /// Takes the lock of a run in the folder of all runs ([`carff_transport::runtime_dir`]) and writes the record, or says
-    /// who holds it. `option` is the one by which this program's user names a run.
+    /// Takes the lock of a run in the folder of all runs ([`carff_transport::runtime_dir`]) and writes the record, or
+    /// returns an error that names the holder. `option` is this program's option that names a run.
     pub fn take(folder: &Path, run: &str, record: &RunRecord, option: &'static str) -> Result<Self, LockError> {
         make_private_dir(folder)?;
         let path = RunRecord::path(folder, run);
@@ -91,7 +91,7 @@ impl RunLock {
                 let holder = std::fs::read(&path).ok().and_then(|bytes| RunRecord::from_bytes(&bytes)).map(Box::new);
                 return Err(LockError::Held { run: run.to_owned(), holder, option });
             }
-            // Whoever held it before may have removed the file in between: then this lock is on a file without a name.
+            // An earlier holder may have removed the file in between: then this lock is on a deleted file.
             let same =
                 std::fs::metadata(&path).is_ok_and(|named| file.metadata().is_ok_and(|held| named.ino() == held.ino()));
             if same {
@@ -102,7 +102,7 @@ impl RunLock {
         }
     }
 
-    /// Makes sure that no process of an earlier owner of the run lives, and removes what it left.
+    /// Checks that no process of an earlier owner of the run is alive, and removes its leftovers.
     pub fn sweep(&self, run: &Run, option: &'static str) -> Result<(), LockError> {
         let patience_ns = monotonic_now_ns() + ORPHAN_PATIENCE_NS;
         while run.folder().is_dir() {
@@ -121,7 +121,7 @@ impl RunLock {
 
 impl Drop for RunLock {
     fn drop(&mut self) {
-        // While the lock is held, the name is ours to remove.
+        // While the lock is held, this process may remove the name.
         let _ = std::fs::remove_file(&self.path);
     }
 }
@@ -130,8 +130,8 @@ impl Drop for RunLock {
 mod tests {
     use super::*;
 
-    /// A second taker is told who holds the lock, and by which option to name another run; once it is dropped, it can be
-    /// taken, and no file is left. While it is held, the record can be read.
+    /// A second taker gets an error with the holder of the lock and the option for another name. After a drop the lock
+    /// is free, and no file is left. While it is held, the record is readable.
     #[test]
     fn one_owner_for_a_run() {
         let folder = tempfile::tempdir().unwrap();

@@ -1,40 +1,40 @@
-//! What a running launcher writes down about itself. The only place that uses bincode: control plane, never data path.
+//! The record of a running launcher. This is the only module that uses bincode: for control, never for data.
 
 use bincode::{Decode, Encode};
 use std::path::{Path, PathBuf};
 
-/// A record is longer than this only by mistake.
+/// Maximum length of a record.
 const MAX_BYTES: usize = 64 * 1024;
 
-/// Who runs a run, on what. Paths are absolute.
+/// Launcher, graph and folders of a run. Paths are absolute.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
 pub struct RunRecord {
-    /// The launcher's process id.
+    /// Process id of the launcher.
     pub pid: u32,
-    /// The run's id.
+    /// Id of the run.
     pub run_id: u64,
-    /// The graph file.
+    /// Path of the graph file.
     pub graph: String,
-    /// Folder of the data set.
+    /// Folder of the dataset.
     pub dataset: String,
     /// Folder of the trained models.
     pub checkpoint: String,
-    /// When it was started: seconds since 1970.
+    /// Start time: seconds since 1970.
     pub started_unix_s: u64,
 }
 
 impl RunRecord {
-    /// The file of a run's record, in the folder of all runs. Its launcher holds a lock on it while the run runs.
+    /// Returns the file of a run's record, in the folder of all runs. Its launcher holds a lock on it during the run.
     pub fn path(folder: &Path, run: &str) -> PathBuf {
         folder.join(format!("{run}.run"))
     }
 
-    /// As bytes.
+    /// Converts the record to bytes.
     pub fn to_bytes(&self) -> Result<Vec<u8>, bincode::error::EncodeError> {
         bincode::encode_to_vec(self, bincode::config::standard())
     }
 
-    /// From bytes; `None` when they are no record (empty, cut off, or of another version).
+    /// Converts bytes to a record; `None` if they are invalid (empty, cut off, or of another version).
     pub fn from_bytes(bytes: &[u8]) -> Option<Self> {
         let config = bincode::config::standard().with_limit::<MAX_BYTES>();
         bincode::decode_from_slice(bytes, config).ok().map(|(record, _)| record)
@@ -45,7 +45,7 @@ impl RunRecord {
 mod tests {
     use super::*;
 
-    /// A record survives the way there and back; any prefix of it is refused, and garbage does not panic.
+    /// A record is converted to bytes and back unchanged; any prefix of it is refused, and garbage does not panic.
     #[test]
     fn round_trip_and_garbage() {
         let record = RunRecord {

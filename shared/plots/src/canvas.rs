@@ -67,7 +67,7 @@ impl Font {
         Ok(width.div_ceil(OVERSAMPLING))
     }
 
-    /// Wraps a text into lines that are no wider than `width_px`, between words, or within a word that is too long.
+    /// Wraps a text into lines of at most `width_px`, between words, or within a word that is too long.
     pub fn wrapped(self, text: &str, width_px: u32) -> Result<Vec<String>, PlotError> {
         let mut lines = Vec::new();
         let mut line = String::new();

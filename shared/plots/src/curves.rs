@@ -23,7 +23,7 @@ pub struct Panel {
     pub log_x: bool,
     /// Logarithmic y axis; points at or below zero are left out.
     pub log_y: bool,
-    /// Whether the y axis includes zero, so that heights can be compared. Without effect on a logarithmic axis.
+    /// Includes zero on the y axis, so that heights can be compared. Has no effect on a logarithmic axis.
     pub from_zero: bool,
     /// The lines.
     pub series: Vec<Series>,

@@ -210,7 +210,7 @@ mod tests {
     }
 
     fn odd_rows() -> Vec<StripRow> {
-        let long = "a caption that is much longer than the picture above it is wide, and so must be broken often";
+        let long = "a caption that is much longer than the image above it is wide, and so must be broken often";
         vec![
             StripRow { caption: vec![long.repeat(12)], cells: vec![cell(8, 200, long), cell(128, 128, long)] },
             StripRow { caption: Vec::new(), cells: vec![cell(300, 20, "short")] },

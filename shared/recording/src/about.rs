@@ -1,4 +1,4 @@
-//! What a recording says of its run.
+//! Metadata of a recorded run.
 
 use std::collections::BTreeMap;
 
@@ -7,22 +7,22 @@ const FORMAT: &str = "1";
 /// Name of the metadata record.
 pub(crate) const METADATA: &str = "carff";
 
-/// The run that was recorded.
+/// Metadata of a recorded run.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct About {
-    /// Its name.
+    /// Name of the run.
     pub run: String,
-    /// Its id.
+    /// Id of the run.
     pub run_id: u64,
     /// Path of the graph file.
     pub graph: String,
-    /// The graph file itself.
+    /// Contents of the graph file.
     pub graph_text: String,
-    /// Folder of the data set.
+    /// Folder of the dataset.
     pub dataset: String,
     /// Folder of the trained models.
     pub checkpoint: String,
-    /// Wall-clock time (nanoseconds since 1970) less monotonic time, when the recording began.
+    /// Difference of wall-clock time (nanoseconds since 1970) and monotonic time at the start of the recording.
     pub wall_offset_ns: u64,
 }
 
@@ -42,7 +42,7 @@ impl About {
         .into()
     }
 
-    /// What the metadata says; `None` for another version.
+    /// Returns the run of the metadata; `None` for another version.
     pub(crate) fn from_metadata(map: &BTreeMap<String, String>) -> Option<Self> {
         let text = |key: &str| map.get(key).cloned();
         if map.get("format").map(String::as_str) != Some(FORMAT) {

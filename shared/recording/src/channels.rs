@@ -1,4 +1,4 @@
-//! The channels that recordings and the live bridge have in common: names, schemas, and what a message is on each.
+//! Channels of recordings and of the live bridge: names, schemas, and encoded messages.
 
 use crate::{StandardMessage, standard_messages};
 use carff_decision::Place;
@@ -7,18 +7,18 @@ use carff_transport::TopicId;
 use foxglove::messages::{CameraCalibration, FrameTransform, RawImage, SceneUpdate};
 use foxglove::{Encode, Schema};
 
-/// A channel: messages of one schema under one name.
+/// A channel: a name with a schema of its messages.
 #[derive(Clone, Debug)]
 pub struct Channel {
-    /// Its name: a topic's, or one for other tools.
+    /// Name of the channel: a topic's name, or a name for other tools.
     pub name: &'static str,
-    /// How messages are encoded: `json` or `protobuf`.
+    /// Encoding of the messages: `json` or `protobuf`.
     pub encoding: String,
-    /// What they look like.
+    /// Schema of the messages.
     pub schema: Option<Schema>,
 }
 
-/// All channels.
+/// Returns all channels.
 pub fn channels() -> Vec<Channel> {
     let mut channels: Vec<Channel> = TopicId::all()
         .map(|topic| {
@@ -41,8 +41,8 @@ fn standard<M: Encode>(name: &'static str) -> Channel {
     Channel { name, encoding: M::get_message_encoding(), schema: M::get_schema() }
 }
 
-/// A message on each channel that it is part of, encoded. Pictures come before what describes them: a reader that meets
-/// the description has the picture. `wall_ns` is its time of publication, nanoseconds since 1970.
+/// Encodes a message for each of its channels. An image comes before its description, so that a reader of the
+/// description has the image. `wall_ns` is its publication time, nanoseconds since 1970.
 pub fn encode(
     topic: TopicId,
     message: AnyMessage<'_>,
@@ -67,7 +67,7 @@ pub fn encode(
 
 fn bytes<M: Encode>(message: &M) -> Vec<u8> {
     let mut bytes = Vec::with_capacity(message.encoded_len().unwrap_or(0));
-    // It fails only when a buffer is full, and a vector grows.
+    // Encoding only fails if a buffer is full, and a vector grows.
     let _ = message.encode(&mut bytes);
     bytes
 }

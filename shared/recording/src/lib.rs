@@ -1,11 +1,12 @@
-//! Runs as MCAP files: writing them while a graph runs, reading them back message by message, and the well-known
-//! robotics schemas that other tools know pictures, calibrations and boxes by.
+//! Recordings of runs as MCAP files: writing while a graph runs, reading message by message, and the standard robotics
+//! schemas of images, calibrations and boxes for other tools.
 //!
-//! A recording holds each message's form ([`carff_messages::forms`]) as JSON on the channel of its topic, with its JSON Schema;
-//! besides, for other tools, `camera/image` and `renderer/image` (`foxglove.RawImage`, which also carry the pictures),
-//! `camera/calibration` (`foxglove.CameraCalibration`), `camera/pose` (`foxglove.FrameTransform`) and `prober/boxes`
-//! (`foxglove.SceneUpdate`), all protobuf. Log times are wall-clock times; the monotonic times are in the forms' headers.
-//! The run, its graph file and its folders are in the metadata record `carff`.
+//! A recording contains each message's form ([`carff_messages::forms`]) as JSON on the channel of its topic, with its
+//! JSON Schema. It also contains protobuf channels for other tools: `camera/image` and `renderer/image`
+//! (`foxglove.RawImage`, which also store the images), `camera/calibration` (`foxglove.CameraCalibration`),
+//! `camera/pose` (`foxglove.FrameTransform`) and `prober/boxes` (`foxglove.SceneUpdate`). Log times are wall-clock
+//! times; the forms' headers contain the monotonic times. The metadata record `carff` contains the run, its graph file
+//! and its folders.
 
 mod about;
 mod channels;
@@ -26,47 +27,47 @@ pub use writer::Writer;
 use carff_messages::forms::FormError;
 use std::path::PathBuf;
 
-/// Why a recording cannot be written or read.
+/// Reason why a recording cannot be written or read.
 #[derive(Debug, thiserror::Error)]
 pub enum RecordingError {
     /// The file cannot be opened, read or written.
     #[error("{path}: {source}")]
     Io {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// What the system said.
+        /// Error of the system.
         source: std::io::Error,
     },
-    /// The file is no recording, or is damaged.
-    #[error("{path} is damaged, or no MCAP file: {cause}")]
+    /// The file is not an MCAP file, or is damaged.
+    #[error("{path} is damaged, or is not an MCAP file: {cause}")]
     Mcap {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// What is wrong.
+        /// Description of the error.
         cause: String,
     },
-    /// The file is an MCAP file, but not one of this program's.
-    #[error("{path} is no recording of this program: it has no metadata `carff`")]
+    /// The file is an MCAP file of another program.
+    #[error("{path} is not a recording of this program: it has no metadata `carff`")]
     Foreign {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
     },
-    /// A message of it cannot be read.
+    /// A message of the file cannot be read.
     #[error("{path}, channel `{channel}`, message {sequence}: {cause}")]
     Message {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// The channel.
+        /// Name of the channel.
         channel: String,
-        /// The message's number on its topic.
+        /// Number of the message on its topic.
         sequence: u32,
-        /// What is wrong.
+        /// Description of the error.
         cause: String,
     },
-    /// The output is there already.
-    #[error("{path} exists: give another name, or remove it")]
+    /// The output file exists.
+    #[error("{path} exists: use another name, or remove it")]
     Exists {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
     },
 }
@@ -86,7 +87,7 @@ impl From<FormError> for MessageError {
     }
 }
 
-/// Why one message cannot be read.
+/// Reason why a message cannot be read.
 struct MessageError(String);
 
 #[cfg(test)]

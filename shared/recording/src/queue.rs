@@ -1,4 +1,4 @@
-//! A queue before the disk: whoever listens to the graph never waits for it.
+//! A queue before the disk, so that subscribers of the graph never wait for the disk.
 
 use crate::{RecordingError, RotatingWriter};
 use carff_messages::forms::OwnedMessage;
@@ -9,17 +9,17 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-/// Most messages that wait.
+/// Maximum number of waiting messages.
 const MESSAGES: usize = 1 << 16;
-/// Longest time that a written message is not safe yet.
+/// Longest time until a written message is safe.
 const FLUSH_EVERY: Duration = Duration::from_secs(1);
 
-/// How many messages went which way.
+/// Counts of written and dropped messages.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct QueueCounts {
-    /// Written to the file.
+    /// Number of messages written to the file.
     pub written: u64,
-    /// Dropped whole, because the disk was too slow.
+    /// Number of messages dropped because the disk was too slow.
     pub dropped: u64,
 }
 
@@ -30,7 +30,7 @@ struct Shared {
     dropped: AtomicU64,
 }
 
-/// Writes a recording on a thread of its own, out of a queue with a limit.
+/// Writes a recording on a separate thread from a bounded queue.
 #[derive(Debug)]
 pub struct RecordingQueue {
     sender: Option<Sender<(TopicId, OwnedMessage)>>,
@@ -40,7 +40,7 @@ pub struct RecordingQueue {
 }
 
 impl RecordingQueue {
-    /// Begins to write; at most `limit_bytes` wait.
+    /// Starts writing; at most `limit_bytes` wait.
     pub fn start(writer: RotatingWriter, limit_bytes: u64) -> std::io::Result<Self> {
         let (sender, receiver) = bounded(MESSAGES);
         let shared = Arc::<Shared>::default();
@@ -50,8 +50,8 @@ impl RecordingQueue {
         Ok(Self { sender: Some(sender), shared, limit_bytes, thread: Some(thread) })
     }
 
-    /// Queues a message, or drops and counts it when too much waits. False when the writer has failed: then
-    /// [`RecordingQueue::finish`] says why.
+    /// Queues a message, or drops and counts it if the queue is full. Returns false if the writer has failed: then
+    /// [`RecordingQueue::finish`] returns the error.
     pub fn push(&self, topic: TopicId, message: OwnedMessage) -> bool {
         let Some(sender) = &self.sender else { return false };
         let bytes = message.as_message().size_bytes() as u64;
@@ -71,7 +71,7 @@ impl RecordingQueue {
         }
     }
 
-    /// The counts so far.
+    /// Returns the counts so far.
     pub fn counts(&self) -> QueueCounts {
         QueueCounts {
             written: self.shared.written.load(Ordering::Relaxed),
@@ -79,7 +79,7 @@ impl RecordingQueue {
         }
     }
 
-    /// Writes what waits, and the index.
+    /// Writes the waiting messages and the index.
     pub fn finish(mut self) -> Result<QueueCounts, RecordingError> {
         self.close()?;
         Ok(self.counts())
@@ -89,7 +89,7 @@ impl RecordingQueue {
         drop(self.sender.take());
         match self.thread.take().map(JoinHandle::join) {
             Some(Ok(result)) => result,
-            // A panic has been told of on standard error.
+            // A panic has been printed to standard error.
             Some(Err(_)) | None => Ok(()),
         }
     }
@@ -97,7 +97,7 @@ impl RecordingQueue {
 
 impl Drop for RecordingQueue {
     fn drop(&mut self) {
-        // Whoever wants to know calls `finish`.
+        // Callers that need the error call `finish`.
         let _ = self.close();
     }
 }

@@ -1,4 +1,4 @@
-//! Reading a recording back, message by message, in the order in which they were written.
+//! Reads a recording message by message, in the order in which the messages were written.
 
 use crate::about::METADATA;
 use crate::{About, MessageError, RecordingError};
@@ -14,28 +14,28 @@ use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
-/// Longest record that is read, bytes: a chunk with an image of the largest size fits in.
+/// Maximum length of a record, bytes: enough for a chunk with an image of the largest size.
 const MAX_RECORD_BYTES: usize = 4 * MAX_IMAGE_BYTES;
-/// Most channels that are remembered.
+/// Maximum number of channels.
 const MAX_CHANNELS: usize = 4096;
 
-/// The channels that hold the images which the messages of a topic describe.
+/// Channels with the images of each image topic.
 const IMAGE_CHANNELS: [(TopicId, &str); 2] = [(TopicId::FRAME, "camera/image"), (TopicId::VIEW, "renderer/image")];
 
 fn image_channel(topic: TopicId) -> Option<&'static str> {
     IMAGE_CHANNELS.into_iter().find_map(|(described, channel)| (described == topic).then_some(channel))
 }
 
-/// A message with its place.
+/// A message with its topic.
 #[derive(Clone, Debug)]
 pub struct Entry {
-    /// The topic.
+    /// Topic of the message.
     pub topic: TopicId,
     /// The message, validated.
     pub message: OwnedMessage,
 }
 
-/// Reads a recording from its begin.
+/// Reads a recording from the beginning.
 pub struct Reader {
     path: PathBuf,
     file: File,
@@ -56,7 +56,7 @@ impl std::fmt::Debug for Reader {
 }
 
 impl Reader {
-    /// Opens a recording, and reads what it says of its run.
+    /// Opens a recording and reads its metadata.
     pub fn open(path: &Path) -> Result<Self, RecordingError> {
         let file = File::open(path).map_err(|source| RecordingError::Io { path: path.to_owned(), source })?;
         let options = LinearReaderOptions::default()
@@ -87,18 +87,18 @@ impl Reader {
         }
     }
 
-    /// The run that was recorded.
+    /// Returns the metadata of the run.
     pub fn about(&self) -> &About {
         &self.about
     }
 
-    /// Whether the file ends in the middle, as when its writer was killed. Known at the end.
+    /// Returns true if the file is incomplete, for example because its writer was killed. Known at the end.
     pub fn is_cut_off(&self) -> bool {
         self.is_cut_off
     }
 
-    /// The next message; `None` at the end.
-    #[allow(clippy::should_implement_trait, reason = "errors do not end it: the next message may be whole")]
+    /// Returns the next message; `None` at the end.
+    #[allow(clippy::should_implement_trait, reason = "errors do not end it: the next message may be valid")]
     pub fn next(&mut self) -> Result<Option<Entry>, RecordingError> {
         while let Some(record) = self.next_record()? {
             let Owned::Message { channel_id, sequence, data } = record else { continue };
@@ -113,7 +113,7 @@ impl Reader {
         Ok(None)
     }
 
-    /// A message of a topic; `None` for what other channels hold.
+    /// Returns a message of a topic; `None` for other channels.
     fn entry(&mut self, channel: &str, sequence: u32, data: &[u8]) -> Result<Option<Entry>, MessageError> {
         if let Some(channel) = IMAGE_CHANNELS.into_iter().map(|(_, image)| image).find(|image| *image == channel) {
             let image = RawImage::decode(data).map_err(|e| MessageError(e.to_string()))?;
@@ -140,7 +140,7 @@ impl Reader {
             match self.inner.next_event() {
                 None => (self.is_cut_off, self.ended) = (!self.has_footer, true),
                 Some(Ok(LinearReadEvent::ReadRequest(bytes))) => {
-                    // No more at a time than a record may have, whatever is asked for.
+                    // Limits the buffer to the maximum length of a record, whatever the file requests.
                     let bytes = bytes.min(MAX_RECORD_BYTES);
                     let read = self
                         .file
@@ -181,7 +181,7 @@ impl Reader {
     }
 }
 
-/// A record that is of use.
+/// A record that the reader uses.
 enum Owned {
     About(About),
     Message { channel_id: u16, sequence: u32, data: Vec<u8> },

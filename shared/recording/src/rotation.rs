@@ -1,4 +1,4 @@
-//! A recording as one file after another, each within limits.
+//! A recording as a sequence of files with limits.
 
 use crate::{About, RecordingError, Writer};
 use carff_decision::Place;
@@ -7,18 +7,18 @@ use carff_transport::TopicId;
 use std::collections::VecDeque;
 use std::path::{Path, PathBuf};
 
-/// When the next file is begun. A limit of `None` is none.
+/// Limits of each file. `None`: unlimited.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Limits {
-    /// Bytes of a file.
+    /// Maximum size of a file, bytes.
     pub file_bytes: Option<u64>,
-    /// Time that a file covers, nanoseconds.
+    /// Maximum time that a file covers, nanoseconds.
     pub file_ns: Option<u64>,
-    /// Files that are kept: the oldest goes when there is one more.
+    /// Maximum number of files; a further file replaces the oldest.
     pub files: Option<usize>,
 }
 
-/// Writes one file after another.
+/// Writes a sequence of files.
 #[derive(Debug)]
 pub struct RotatingWriter {
     first: PathBuf,
@@ -26,31 +26,31 @@ pub struct RotatingWriter {
     places: Vec<Place>,
     limits: Limits,
     writer: Writer,
-    /// When the first message of this file was published.
+    /// Publication time of the file's first message.
     begun_ns: Option<u64>,
     written: VecDeque<PathBuf>,
     files: usize,
 }
 
 impl RotatingWriter {
-    /// Begins with the file `first`; those after it have a number before the extension.
+    /// Starts with the file `first`; later files have a number before the extension.
     pub fn create(first: &Path, about: About, places: Vec<Place>, limits: Limits) -> Result<Self, RecordingError> {
         let writer = Writer::create(first, &about, &places)?;
         let written = VecDeque::from([first.to_owned()]);
         Ok(Self { first: first.to_owned(), about, places, limits, writer, begun_ns: None, written, files: 1 })
     }
 
-    /// The file that is written now.
+    /// Returns the path of the current file.
     pub fn path(&self) -> &Path {
         self.writer.path()
     }
 
-    /// Files so far.
+    /// Returns the number of files so far.
     pub fn files(&self) -> usize {
         self.files
     }
 
-    /// Writes a message, into the next file when this one is full.
+    /// Writes a message; starts the next file if this one is full.
     pub fn write(&mut self, topic: TopicId, message: AnyMessage<'_>) -> Result<(), RecordingError> {
         let now_ns = message.header().publish_time_ns;
         let begun_ns = *self.begun_ns.get_or_insert(now_ns);
@@ -61,7 +61,7 @@ impl RotatingWriter {
         self.writer.write(topic, message)
     }
 
-    /// Makes what was written safe, and begins the next file when this one is too large.
+    /// Makes the written messages safe, and starts the next file if this one is too large.
     pub fn flush(&mut self) -> Result<(), RecordingError> {
         self.writer.flush()?;
         match self.limits.file_bytes {
@@ -70,7 +70,7 @@ impl RotatingWriter {
         }
     }
 
-    /// Writes the last index.
+    /// Writes the index of the last file.
     pub fn finish(self) -> Result<(), RecordingError> {
         self.writer.finish()
     }

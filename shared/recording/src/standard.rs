@@ -1,4 +1,4 @@
-//! The well-known robotics schemas: pictures, calibrations, poses, boxes. Shared by recordings and the live bridge.
+//! Standard robotics schemas: images, calibrations, poses, boxes. Recordings and the live bridge use them.
 
 use carff_decision::Place;
 use carff_messages::forms::AnyMessage;
@@ -11,21 +11,21 @@ use foxglove::messages::{
 /// Name of the fixed coordinate frame.
 const WORLD: &str = "world";
 
-/// A message as other tools know it.
+/// A message in a schema of other tools.
 #[derive(Clone, Debug, PartialEq)]
 pub enum StandardMessage {
-    /// A picture.
+    /// An image.
     Image(RawImage),
     /// A camera's intrinsics.
     Calibration(CameraCalibration),
-    /// Where a camera is. Its axes are those of computer vision: x right, y down, z forward.
+    /// Pose of a camera. Its axes are those of computer vision: x right, y down, z forward.
     Pose(FrameTransform),
-    /// The places that are probed, coloured by the probability that they are taken.
+    /// The probed places, coloured by occupancy probability.
     Boxes(SceneUpdate),
 }
 
-/// What other tools are told of a message: topics and messages. `wall_ns` is its time of publication, nanoseconds since
-/// 1970. `places` are those of the checkpoint.
+/// Returns the standard messages of a message, with their topics. `wall_ns` is its publication time, nanoseconds since
+/// 1970. `places` are the places of the checkpoint.
 pub fn standard_messages(
     message: AnyMessage<'_>,
     places: &[Place],
@@ -48,7 +48,7 @@ pub fn standard_messages(
     }
 }
 
-/// The places, each with the probability that it is taken.
+/// Returns the places, each with its occupancy probability.
 fn boxes(at: Option<Timestamp>, belief: &Belief, places: &[Place]) -> SceneUpdate {
     let states = belief.state_probability.iter().take(belief.state_count as usize);
     let entities = places
@@ -102,8 +102,8 @@ fn pose(at: Option<Timestamp>, world_from_camera: &[f64; 16]) -> FrameTransform 
     }
 }
 
-/// The unit quaternion of a rotation matrix: the largest of the four is computed first, so that nothing is divided by a
-/// small number.
+/// Returns the unit quaternion of a rotation matrix. The largest of its four numbers is computed first, to avoid
+/// division by a small number.
 fn quaternion(r: &[[f64; 3]; 3]) -> Quaternion {
     let [xx, yy, zz] = [r[0][0], r[1][1], r[2][2]];
     let squares = [1.0 + xx + yy + zz, 1.0 + xx - yy - zz, 1.0 - xx + yy - zz, 1.0 - xx - yy + zz];
@@ -117,7 +117,7 @@ fn quaternion(r: &[[f64; 3]; 3]) -> Quaternion {
         _ => [yx, xz_sum, yz, squares[3]],
     };
     let length = (w * w + x * x + y * y + z * z).sqrt();
-    // A matrix that is no rotation at all has none.
+    // A matrix that is not a rotation has no quaternion.
     if length > 0.0 && length.is_finite() {
         Quaternion { x: x / length, y: y / length, z: z / length, w: w / length }
     } else {
@@ -140,7 +140,7 @@ fn entity(at: Option<Timestamp>, place: &Place, taken: f64) -> SceneEntity {
                 orientation: Some(Quaternion { x: 0.0, y: 0.0, z: half_yaw.sin(), w: half_yaw.cos() }),
             }),
             size: Some(Vector3 { x: size[0], y: size[1], z: size[2] }),
-            // From green to red, and the more to be seen the more likely.
+            // From green to red, more opaque for higher probabilities.
             color: Some(Color { r: taken, g: 1.0 - taken, b: 0.1, a: 0.15 + 0.7 * taken }),
         }],
         ..SceneEntity::default()
@@ -161,7 +161,7 @@ mod tests {
         std::array::from_fn(|i| v[i] + w * t[i] + c[i])
     }
 
-    /// The quaternion turns vectors as the matrix does, also for half turns, where a naive formula divides by zero.
+    /// The quaternion rotates vectors as the matrix does, also for half turns, where a naive formula divides by zero.
     #[test]
     fn quaternions_turn_as_their_matrices() {
         let turn = |axis: usize, angle: f64| {

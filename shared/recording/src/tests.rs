@@ -31,7 +31,7 @@ fn header(frame_id: u64) -> Header {
     Header { sequence: frame_id, run_id: 5, publish_time_ns: at_ns + 500, ..Header::of_frame(frame_id, at_ns, 9) }
 }
 
-/// A frame's messages, all different from each other and from those of other frames.
+/// Returns a frame's messages, all different from each other and from those of other frames.
 fn messages(frame_id: u64) -> Vec<(TopicId, OwnedMessage)> {
     let meta = FrameMeta {
         header: header(frame_id),
@@ -108,7 +108,7 @@ fn matches(found: &[Entry], frames: impl Iterator<Item = u64>) -> bool {
             .all(|(f, (topic, m))| f.topic == *topic && same(f.message.as_message(), m.as_message()))
 }
 
-/// What was written is read back bit for bit, pictures and all, in order, with what the file says of its run.
+/// A written recording is read back bit for bit, including images, in order, with the metadata of its run.
 #[test]
 fn recordings_are_read_back() {
     let folder = tempfile::tempdir().unwrap();
@@ -127,8 +127,8 @@ fn recordings_are_read_back() {
     assert!(matches!(Writer::create(&path, &about(), &[]), Err(RecordingError::Exists { .. })));
 }
 
-/// A writer that is gone without an end leaves all that it had flushed, and the reader says that the end is missing;
-/// however many of the last bytes are missing, nothing panics and what is read is right.
+/// A writer that is killed leaves all flushed messages, and the reader reports the missing end. For any number of
+/// missing last bytes, nothing panics and the messages are right.
 #[test]
 fn what_was_flushed_survives() {
     let folder = tempfile::tempdir().unwrap();
@@ -140,7 +140,7 @@ fn what_was_flushed_survives() {
         }
         writer.flush().unwrap();
     }
-    // More, that it has not flushed when it is killed: no destructor runs.
+    // These messages are not flushed when the writer is killed: no destructor runs.
     for (topic, message) in messages(10) {
         writer.write(topic, message.as_message()).unwrap();
     }
@@ -160,7 +160,7 @@ fn what_was_flushed_survives() {
     }
 }
 
-/// Damaged bytes anywhere are an error that names the file, or go unnoticed where they mean nothing; never a panic.
+/// Damaged bytes are an error that names the file, or have no effect; they never panic.
 #[test]
 fn damage_is_told_of() {
     let folder = tempfile::tempdir().unwrap();
@@ -191,7 +191,7 @@ fn damage_is_told_of() {
     assert!(Reader::open(&path).is_err());
 }
 
-/// Full files are followed by numbered ones, each readable by itself, and no more are kept than asked for.
+/// Full files are followed by numbered ones, each readable by itself; the number of files is limited.
 #[test]
 fn files_are_rotated() {
     let folder = tempfile::tempdir().unwrap();
@@ -212,8 +212,8 @@ fn files_are_rotated() {
     assert!(matches(&read(&folder.path().join("run-0003.mcap")).0, 30..35));
 }
 
-/// The queue writes all in order when the disk keeps up; with no room it drops whole messages, counts them, and what is
-/// written is still right.
+/// The queue writes all messages in order if the disk keeps up. A full queue drops whole messages, counts them, and the
+/// written messages are still right.
 #[test]
 fn queues_drop_whole_messages() {
     let folder = tempfile::tempdir().unwrap();
@@ -238,7 +238,7 @@ fn queues_drop_whole_messages() {
     }
 }
 
-/// Other tools find the picture, the calibration, the pose and the boxes under their well-known names.
+/// Other tools find the image, the calibration, the pose and the boxes under their standard names.
 #[test]
 fn other_tools_know_the_schemas() {
     let folder = tempfile::tempdir().unwrap();

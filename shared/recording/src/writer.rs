@@ -1,4 +1,4 @@
-//! Writing one file.
+//! Writes one file of a recording.
 
 use crate::about::METADATA;
 use crate::{About, RecordingError, channels, encode};
@@ -13,10 +13,10 @@ use std::fs::File;
 use std::io::BufWriter;
 use std::path::{Path, PathBuf};
 
-/// Bytes of a chunk before compression.
+/// Size of a chunk before compression, bytes.
 const CHUNK_BYTES: u64 = 1 << 20;
 
-/// Writes one recording. What is not finished is readable up to the last [`Writer::flush`].
+/// Writes one recording. An unfinished file is readable up to the last [`Writer::flush`].
 pub struct Writer {
     path: PathBuf,
     inner: mcap::Writer<NoSeek<BufWriter<File>>>,
@@ -32,8 +32,8 @@ impl std::fmt::Debug for Writer {
 }
 
 impl Writer {
-    /// Makes the file, which must not exist. `places` are those of the checkpoint: their boxes are recorded with each
-    /// belief.
+    /// Creates the file, which must not exist. `places` are the places of the checkpoint: their boxes are recorded with
+    /// each belief.
     pub fn create(path: &Path, about: &About, places: &[Place]) -> Result<Self, RecordingError> {
         let file = File::create_new(path).map_err(|source| match source.kind() {
             std::io::ErrorKind::AlreadyExists => RecordingError::Exists { path: path.to_owned() },
@@ -45,13 +45,12 @@ impl Writer {
             .compression_level(1)
             .chunk_size(Some(CHUNK_BYTES))
             .library("carff")
-            // Chunks are written whole, once they are full: what a killed process leaves behind is not half a chunk whose
-            // length is not known yet.
+            // Only complete chunks are written: a killed process does not leave a partial chunk of unknown length.
             .disable_seeking(true)
             .create(NoSeek::new(BufWriter::new(file)))
             .map_err(failed)?;
         inner.write_metadata(&Metadata { name: METADATA.to_owned(), metadata: about.to_metadata() }).map_err(failed)?;
-        // All channels at once, so that a reader sees what there can be.
+        // All channels at once, so that a reader sees the complete list.
         let mut ids = BTreeMap::new();
         for channel in channels() {
             let schema = match &channel.schema {
@@ -72,17 +71,17 @@ impl Writer {
         Ok(writer)
     }
 
-    /// Where it writes.
+    /// Returns the path of the file.
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// Bytes written so far, without what waits for its chunk to be full.
+    /// Returns the number of bytes written so far, without the current chunk.
     pub fn written_bytes(&self) -> u64 {
         std::fs::metadata(&self.path).map_or(0, |m| m.len())
     }
 
-    /// Writes a message, with all that other tools are told of it.
+    /// Writes a message, with its standard messages for other tools.
     pub fn write(&mut self, topic: TopicId, message: AnyMessage<'_>) -> Result<(), RecordingError> {
         let header = message.header();
         let wall_ns = header.publish_time_ns.saturating_add(self.wall_offset_ns);
@@ -105,7 +104,7 @@ impl Writer {
         Ok(())
     }
 
-    /// Ends the chunk and hands it to the system: from now on a killed process leaves it readable.
+    /// Ends the chunk and passes it to the system: after that, it stays readable if the process is killed.
     pub fn flush(&mut self) -> Result<(), RecordingError> {
         self.inner.flush().map_err(|e| RecordingError::mcap(&self.path, e))
     }

@@ -1,35 +1,36 @@
-//! The arguments that all stages take.
+//! Arguments of all stages.
 
 use clap::Parser;
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
-/// One stage of a CARFF graph. `carff launch` starts them all; by hand, give each the same run name and id.
+/// Run one stage of a CARFF graph. `carff launch` starts all stages; if you start them yourself, use the same run name
+/// and id.
 #[derive(Clone, Debug, PartialEq, Eq, Parser)]
 #[command(version)]
 pub struct StageArgs {
     /// The graph file.
     #[arg(long)]
     pub graph: PathBuf,
-    /// Run name, in place of the graph file's.
+    /// Run name; replaces the graph file's.
     #[arg(long)]
     pub run: Option<String>,
-    /// Run id: the same for all stages of a run.
+    /// Run id: equal for all stages of a run.
     #[arg(long, default_value_t = 0)]
     pub run_id: u64,
-    /// Data set folder, in place of the graph file's.
+    /// Dataset folder; replaces the graph file's.
     #[arg(long)]
     pub dataset: Option<PathBuf>,
-    /// Checkpoint folder, in place of the graph file's.
+    /// Checkpoint folder; replaces the graph file's.
     #[arg(long)]
     pub checkpoint: Option<PathBuf>,
-    /// Camera: how many drives, in place of the graph file's.
+    /// Camera: number of drives; replaces the graph file's.
     #[arg(long)]
     pub drives: Option<u32>,
-    /// Camera: stop after so many frames.
+    /// Camera: stop after this many frames.
     #[arg(long)]
     pub frames: Option<u64>,
-    /// Camera: number of the first frame; it goes on as if it had shown those before.
+    /// Camera: number of the first frame; the camera continues as if it had shown earlier frames.
     #[arg(long, default_value_t = 0)]
     pub first_frame: u64,
     /// End when this process, the parent, ends.
@@ -38,7 +39,7 @@ pub struct StageArgs {
 }
 
 impl StageArgs {
-    /// The arguments of a stage of this run.
+    /// Returns the arguments of a stage of a run.
     pub fn new(graph: &Path, run: &str, run_id: u64) -> Self {
         Self {
             graph: graph.to_owned(),
@@ -53,7 +54,7 @@ impl StageArgs {
         }
     }
 
-    /// The command line that is read back as these arguments, without the program's name.
+    /// Returns the command line of these arguments, without the program's name.
     pub fn to_command_line(&self) -> Vec<OsString> {
         let mut line: Vec<OsString> = vec!["--graph".into(), self.graph.clone().into()];
         let mut add = |name: &str, value: Option<OsString>| {
@@ -77,7 +78,7 @@ impl StageArgs {
 mod tests {
     use super::*;
 
-    /// What the launcher writes is what the stage reads.
+    /// The stage reads the same arguments as the launcher writes.
     #[test]
     fn command_line_round_trips() {
         let mut args = StageArgs::new("a b/graph.toml".as_ref(), "run-1", u64::MAX);

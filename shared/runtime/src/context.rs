@@ -1,4 +1,4 @@
-//! A stage's surroundings: configuration, topics, waiting, and what it says of itself.
+//! A stage's environment: configuration, topics, waiting, and health.
 
 use crate::StageArgs;
 use crate::health::{Heartbeat, Vitals};
@@ -22,7 +22,7 @@ pub fn main(stage: Stage, run: impl FnOnce(&mut StageContext) -> anyhow::Result<
     run_with(stage, StageArgs::parse(), run)
 }
 
-/// The same, with given arguments.
+/// Runs a stage as [`main`] does, with given arguments.
 pub fn run_with(stage: Stage, args: StageArgs, run: impl FnOnce(&mut StageContext) -> anyhow::Result<()>) -> ExitCode {
     match start(stage, args).and_then(|mut context| context.finish(run)) {
         Ok(()) => ExitCode::SUCCESS,
@@ -33,8 +33,8 @@ pub fn run_with(stage: Stage, args: StageArgs, run: impl FnOnce(&mut StageContex
     }
 }
 
-/// The span of the work on a frame: what is logged until it is dropped says of which frame and step. It is there at the
-/// level `debug`; above it costs nothing.
+/// Returns a span for the work on a frame: log lines contain frame and step until it is dropped. It exists at the level
+/// `debug`; at higher levels it costs nothing.
 #[must_use = "the span ends when it is dropped"]
 pub fn frame_span(header: &Header) -> tracing::span::EnteredSpan {
     tracing::debug_span!("frame", frame = header.frame_id, step = header.step).entered()
@@ -47,33 +47,33 @@ fn start(stage: Stage, args: StageArgs) -> anyhow::Result<StageContext> {
     StageContext::new(stage, args, graph)
 }
 
-/// What a stage works with.
+/// Environment of a stage.
 #[derive(Debug)]
 pub struct StageContext {
-    /// Its own configuration is one field of this.
+    /// Configuration of the graph, with the stage's own as one field.
     pub graph: GraphConfig,
-    /// The arguments.
+    /// Arguments of the stage.
     pub args: StageArgs,
-    /// Folder of the data set.
+    /// Folder of the dataset.
     pub dataset: PathBuf,
     /// Folder of the trained models.
     pub checkpoint: PathBuf,
-    /// Threads that it may use.
+    /// Number of threads that it may use.
     pub threads: usize,
     stage: Stage,
     deadline_ns: u64,
     waiter: Waiter,
     vitals: Arc<Vitals>,
     begun: bool,
-    // Dropped in this order: the last heartbeat goes out before the node closes.
+    // Fields are dropped in this order: the last heartbeat is sent before the node closes.
     heartbeat: Option<Heartbeat>,
     node: Node,
 }
 
 impl StageContext {
-    /// Joins the run and starts the heartbeat. [`main`] does this; tests call it in their own process.
+    /// Joins the run and starts the heartbeat. [`main`] calls this; tests call it in their own process.
     pub fn new(stage: Stage, args: StageArgs, graph: GraphConfig) -> anyhow::Result<Self> {
-        // First of all, so that all threads inherit it.
+        // This comes first, so that all threads inherit the settings.
         realtime::schedule(graph.stage(stage), graph.stage_nice(stage));
         let stop = Stop::on_signals().context("cannot handle signals")?;
         let run = Run::new(args.run.as_deref().unwrap_or(&graph.run.name), args.run_id)?;
@@ -99,23 +99,23 @@ impl StageContext {
         })
     }
 
-    /// The run's seed.
+    /// Returns the run's seed.
     pub fn seed(&self) -> u64 {
         self.graph.run.seed
     }
 
-    /// Opens a topic to receive from. Call this before [`StageContext::ready`].
+    /// Opens a topic for receiving. Call this before [`StageContext::ready`].
     pub fn input<P: Payload>(&self, topic: &Topic<P>) -> anyhow::Result<Receiver<P>> {
         let receiver = self.node.receiver(topic)?;
         Ok(if self.graph.run.busy_polling { receiver.polled() } else { receiver })
     }
 
-    /// Opens a topic of messages to send on.
+    /// Opens a topic of messages for sending.
     pub fn output<M: Message>(&self, topic: &Topic<M>) -> anyhow::Result<Publisher<M>> {
         Ok(self.node.publisher(topic)?)
     }
 
-    /// Opens a topic of images of at most `max_bytes` each to send on.
+    /// Opens a topic of images of at most `max_bytes` each for sending.
     pub fn image_output<M: ImageMeta>(
         &self,
         topic: &Topic<Image<M>>,
@@ -124,11 +124,11 @@ impl StageContext {
         Ok(self.node.image_publisher(topic, max_bytes)?)
     }
 
-    /// Says that all topics are open and all models loaded, before any work is done. The launcher waits for it.
+    /// Reports that all topics are open and all models loaded, before any work is done. The launcher waits for it.
     pub fn ready(&mut self) {
-        // Before the first message is written: shared memory that runs full later then harms nobody who is ready.
+        // Memory is reserved before the first message: if shared memory fills up later, no ready stage is affected.
         if let Err(error) = self.node.run().reserve_shared_memory() {
-            tracing::warn!(%error, "shared memory cannot be reserved; should it run full, a stage may be killed");
+            tracing::warn!(%error, "shared memory cannot be reserved; if it fills up, a stage may be killed");
         }
         realtime::settle(self.graph.stage(self.stage));
         self.vitals.set_state(HealthState::Ok);
@@ -139,8 +139,8 @@ impl StageContext {
         tracing::info!(threads = self.threads, "ready");
     }
 
-    /// Sleeps until an input has a message; false when the stage shall end.
-    /// When an input that had begun goes quiet for longer than its topic's deadline, the stage's health says so.
+    /// Sleeps until an input has a message; returns false if the stage must end. If a started input is quiet for longer
+    /// than its topic's deadline, the stage's health becomes stale.
     pub fn wait(&mut self, inputs: &[&dyn Input]) -> anyhow::Result<bool> {
         let patience = inputs.iter().map(|i| i.deadline()).min().unwrap_or(Duration::from_secs(1));
         loop {
@@ -171,12 +171,12 @@ impl StageContext {
         Ok(!self.is_stopped())
     }
 
-    /// Whether the stage shall end: for loops that compute for long without waiting.
+    /// Reports whether the stage shall end, for loops that compute for long without waiting.
     pub fn is_stopped(&self) -> bool {
         self.waiter.stop().is_stopped()
     }
 
-    /// Notes that the work on a frame, begun at `started_ns`, is done. Returns the time it took, nanoseconds.
+    /// Records that the work on a frame, started at `started_ns`, is done. Returns its duration, nanoseconds.
     pub fn worked(&mut self, header: &Header, started_ns: u64) -> u64 {
         let latency_ns = monotonic_now_ns().saturating_sub(started_ns);
         self.begun = true;
@@ -186,12 +186,12 @@ impl StageContext {
         latency_ns
     }
 
-    /// Inputs dropped so far because they were not valid.
+    /// Returns the number of inputs dropped so far because they were invalid.
     pub fn invalid_count(&self) -> u64 {
         self.node.counters().invalid()
     }
 
-    /// Counts and logs an error after which the stage goes on.
+    /// Counts and logs an error after which the stage continues.
     pub fn error(&mut self, error: &anyhow::Error) {
         self.vitals.count_error();
         tracing::error!("{}", sentence(&**error));
@@ -210,13 +210,13 @@ impl StageContext {
 fn die_with_parent(parent_pid: Option<u32>) -> anyhow::Result<()> {
     let Some(expected) = parent_pid else { return Ok(()) };
     set_parent_process_death_signal(Some(Signal::TERM)).context("cannot watch the parent process")?;
-    // It may have died before the line above took effect.
+    // The parent may have died before the line above took effect.
     let parent = getppid().map_or(0, |pid| pid.as_raw_nonzero().get() as u32);
     anyhow::ensure!(parent == expected, "the launcher (process {expected}) has ended");
     Ok(())
 }
 
-/// One line for each event on standard error, `LEVEL message fields` or a JSON object of them; the launcher adds time and
+/// Logs each event as one line on standard error: `LEVEL message fields`, or a JSON object. The launcher adds time and
 /// stage.
 fn init_log(level: LogLevel, format: LogFormat) {
     let level: tracing::Level = level.name().parse().unwrap_or(tracing::Level::INFO);
@@ -226,7 +226,7 @@ fn init_log(level: LogLevel, format: LogFormat) {
         .with_ansi(false)
         .with_target(false)
         .without_time();
-    // It fails only when a log is set up already, which then stays.
+    // It only fails if a log is already set up; that log then stays.
     let _ = match format {
         LogFormat::Text => log.try_init(),
         LogFormat::Json => log.json().flatten_event(true).with_span_list(false).try_init(),
@@ -237,8 +237,7 @@ fn init_log(level: LogLevel, format: LogFormat) {
 mod tests {
     use super::*;
 
-    /// At the default level a frame's span is not even made; at `debug` it is, and says which frame and step in what is
-    /// logged within.
+    /// At the default level a frame's span is not created; at `debug` it is, and its log lines contain frame and step.
     #[test]
     fn frames_have_spans_where_they_are_asked_for() {
         let folder = tempfile::tempdir().unwrap();

@@ -1,4 +1,4 @@
-//! The heartbeat: a thread of its own, so that it goes on while the stage loads or computes.
+//! The heartbeat: a separate thread, so that it continues while the stage loads or computes.
 
 use carff_messages::{Header, Health, HealthState, Stage};
 use carff_transport::{Counters, Publisher, monotonic_now_ns};
@@ -8,13 +8,13 @@ use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-/// Time between two heartbeats.
+/// Interval between two heartbeats.
 const PERIOD: Duration = Duration::from_millis(100);
 
-/// Longest wait for a heartbeat that was asked for: it only keeps a broken transport from hanging the stage.
+/// Longest wait for a requested heartbeat: it only keeps a broken transport from hanging the stage.
 const PATIENCE: Duration = Duration::from_secs(1);
 
-/// What the stage's loop writes and the heartbeat reads.
+/// State that the stage's loop writes and the heartbeat reads.
 #[derive(Debug)]
 pub(crate) struct Vitals {
     state: AtomicU32,
@@ -23,7 +23,7 @@ pub(crate) struct Vitals {
     last_latency_ns: AtomicU64,
     max_latency_ns: AtomicU64,
     last_progress_ns: AtomicU64,
-    /// Sleeping until something comes is no standstill.
+    /// True while the stage waits for input, which is not a hang.
     waiting: AtomicBool,
 }
 
@@ -48,7 +48,7 @@ impl Vitals {
         self.last_progress_ns.store(monotonic_now_ns(), Ordering::Relaxed);
     }
 
-    /// Notes that the loop goes to sleep, or wakes.
+    /// Records that the loop starts or ends a wait.
     pub(crate) fn set_waiting(&self, waiting: bool) {
         self.progress();
         self.waiting.store(waiting, Ordering::Relaxed);
@@ -66,10 +66,10 @@ impl Vitals {
     }
 }
 
-/// A running heartbeat. Its last beat, with the final state, goes out when it is dropped.
+/// A running heartbeat. Dropping it sends the last beat, with the final state.
 #[derive(Debug)]
 pub(crate) struct Heartbeat {
-    /// Asks for a beat at once; the answer says that it has gone out.
+    /// Requests a beat at once; the answer confirms that it has been sent.
     ask: Option<Sender<Sender<()>>>,
     thread: Option<JoinHandle<()>>,
 }
@@ -87,7 +87,7 @@ impl Heartbeat {
             let mut beats = 0;
             let mut beat = || {
                 let mut health = snapshot(stage, seed, &vitals, &counters);
-                // The node counts heartbeats too, which are no work.
+                // The node's counters include heartbeats, which are not work.
                 health.published = health.published.saturating_sub(beats);
                 match publisher.send(health) {
                     Ok(()) => beats += 1,
@@ -99,7 +99,7 @@ impl Heartbeat {
                 match asked.recv_timeout(PERIOD) {
                     Ok(answer) => {
                         beat();
-                        // Who asked may have lost patience.
+                        // The requester may have given up.
                         let _ = answer.send(());
                     }
                     Err(RecvTimeoutError::Timeout) => {}
@@ -110,7 +110,7 @@ impl Heartbeat {
         Ok(Self { ask: Some(ask), thread: Some(thread) })
     }
 
-    /// Sends a heartbeat now, and returns when it is out: what the stage does next is done by a stage of known state.
+    /// Sends a heartbeat now, and returns when it has been sent: the stage's state is known before its next action.
     pub(crate) fn beat(&self) {
         let (answer, answered) = bounded(1);
         if let Some(ask) = &self.ask
@@ -125,7 +125,7 @@ impl Drop for Heartbeat {
     fn drop(&mut self) {
         self.ask = None;
         if let Some(thread) = self.thread.take() {
-            // A panic in there has been printed by then, and the stage is ending anyway.
+            // A panic of the thread has been printed by then, and the stage is ending anyway.
             let _ = thread.join();
         }
     }
@@ -155,7 +155,7 @@ fn snapshot(stage: Stage, seed: u64, vitals: &Vitals, counters: &Counters) -> He
     }
 }
 
-/// This process's resident memory, bytes.
+/// Returns this process's resident memory, bytes.
 fn resident_bytes() -> Option<u64> {
     let text = std::fs::read_to_string("/proc/self/statm").ok()?;
     let pages: u64 = text.split_whitespace().nth(1)?.parse().ok()?;

@@ -1,7 +1,7 @@
-//! What every stage process does the same way: arguments, log, health, waiting, stopping, exit code.
-//! What a stage computes lives in its own crate.
+//! Common parts of all stage processes: arguments, log, health, waiting, stopping, exit code. Each stage's own crate
+//! contains its computation.
 //!
-//! A stage's `main` reads from top to bottom: open topics, say that it is ready, then receive, compute, publish.
+//! A stage's `main` reads from top to bottom: open topics, report ready, then receive, compute, publish.
 //!
 //! ```no_run
 //! use carff_messages::{Gaussian, Posterior, Stage};
@@ -29,7 +29,7 @@
 //! }
 //! ```
 //!
-//! Exit codes: 0 when it has done its work or was asked to stop, 1 after an error (one sentence on standard error),
+//! Exit codes: 0 if it has completed its work or was asked to stop, 1 after an error (one sentence on standard error),
 //! 2 for wrong arguments.
 
 mod args;

@@ -1,50 +1,50 @@
-//! When to do less, and when to do more again: pure logic, without topics and without a clock.
+//! Quality reduction under overload: pure logic, without topics and without a clock.
 //!
-//! Every stage that reads beliefs sees the same signs, how long each frame took and which were skipped, and so comes to
-//! the same level by itself; each gives up what is its own.
+//! Every stage that reads beliefs sees the same signs: the duration of each frame and skipped frames. So all stages
+//! reach the same level independently; each reduces its own work.
 
 use carff_config::{GraphConfig, Quality as Part};
 use carff_messages::Belief;
 
-/// Most times that the wait for getting something back is doubled.
+/// Maximum number of doublings of the wait before a restoration.
 const MAX_DOUBLINGS: u32 = 4;
 
-/// How well the work is done at a level.
+/// Quality of the work at a level.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Quality {
-    /// Views are so many times smaller in width and height.
+    /// Factor by which views are smaller in width and height.
     pub resolution_divisor: u32,
-    /// Latents drawn from each mixture.
+    /// Number of latents drawn from each mixture.
     pub samples: u32,
-    /// Steps looked ahead.
+    /// Number of look-ahead steps.
     pub horizon: u32,
 }
 
-/// Watches frames go by, and says how well to work.
+/// Observes frames and selects the quality.
 #[derive(Clone, Debug)]
 pub struct Overload {
-    /// What each level means; level 0 is what the graph file asks for.
+    /// Quality of each level; level 0 is the graph file's.
     levels: Vec<Quality>,
     level: usize,
     latency_limit_ns: u64,
     window: u32,
     patience: u32,
     doublings: u32,
-    /// Frames and signs in the present window.
+    /// Frames and signs in the current window.
     seen: u32,
     signs: u32,
-    /// Frames without a sign, in a row.
+    /// Number of consecutive frames without a sign.
     calm: u32,
-    /// Frames since something was got back.
+    /// Number of frames since the last restoration.
     since_restored: Option<u32>,
     last_frame: Option<u64>,
     last_sequence: Option<u64>,
-    /// Frames in a row that were no newer than the last one.
+    /// Number of consecutive frames that were not newer than the last one.
     behind: u32,
 }
 
 impl Overload {
-    /// At the graph file's full quality.
+    /// Starts at the graph file's full quality.
     pub fn new(graph: &GraphConfig) -> Self {
         let settings = &graph.overload;
         Self {
@@ -64,10 +64,10 @@ impl Overload {
         }
     }
 
-    /// Takes in a belief; the last step of each frame counts. True when the quality has changed.
+    /// Observes a belief; the last step of each frame counts. Returns true if the quality has changed.
     pub fn observe(&mut self, belief: &Belief) -> bool {
         let header = &belief.header;
-        // What the observer itself has missed was not skipped by the graph.
+        // Messages that the observer itself missed were not skipped by the graph.
         let seen_all = self.last_sequence.is_some_and(|last| header.sequence == last.wrapping_add(1));
         self.last_sequence = Some(header.sequence);
         if !seen_all {
@@ -78,7 +78,7 @@ impl Overload {
         }
         let skipped = match self.last_frame {
             Some(last) if header.frame_id <= last => {
-                // One late frame is none of the news; many are a camera that counts anew.
+                // One late frame is ignored; many mean that the camera has restarted its count.
                 self.behind += 1;
                 if self.behind > self.window {
                     (self.last_frame, self.behind) = (None, 0);
@@ -109,7 +109,7 @@ impl Overload {
         self.level != before
     }
 
-    /// How well to work now.
+    /// Returns the current quality.
     pub fn quality(&self) -> Quality {
         self.levels[self.level]
     }
@@ -118,7 +118,7 @@ impl Overload {
         if self.level + 1 < self.levels.len() {
             self.level += 1;
         }
-        // Given up again soon after it was got back: there was no room after all.
+        // Overload returned soon after the restoration: there was not enough capacity.
         if self.since_restored.take().is_some_and(|since| since <= 4 * self.window) {
             self.doublings = (self.doublings + 1).min(MAX_DOUBLINGS);
         }
@@ -136,7 +136,7 @@ impl Overload {
     }
 }
 
-/// Full quality, then one rung after the other in the configured order.
+/// Returns full quality, then one more reduction per level in the configured order.
 fn levels(graph: &GraphConfig) -> Vec<Quality> {
     let mut quality = Quality { resolution_divisor: 1, samples: graph.run.samples, horizon: graph.run.horizon };
     let mut levels = vec![quality];
@@ -177,7 +177,7 @@ mod tests {
         Overload::new(&GraphConfig::parse(&text, "test.toml".as_ref()).unwrap())
     }
 
-    /// Shows `count` frames from `first` on, each with this latency; returns the changes.
+    /// Observes `count` frames from `first` on, each with this latency; returns the number of changes.
     fn show(overload: &mut Overload, first: u64, count: u64, latency_ms: u64) -> usize {
         (first..first + count)
             .filter(|&id| {
@@ -191,7 +191,7 @@ mod tests {
 
     const ALL: &str = "[overload]\norder = [\"resolution\", \"samples\", \"horizon\"]\nwindow = 4\npatience = 8\n";
 
-    /// Rungs follow the configured order, each one step; nothing is given up that is not named.
+    /// Levels follow the configured order, one step each; quality that the order does not name is kept.
     #[test]
     fn things_are_given_up_in_the_configured_order() {
         let quality = |resolution_divisor, samples, horizon| Quality { resolution_divisor, samples, horizon };
@@ -210,7 +210,7 @@ mod tests {
         assert_eq!(overload("").levels, [quality(1, 10, 2)]);
     }
 
-    /// Late frames bring the level down rung by rung to the last, where it stays; calm brings it back to full quality.
+    /// Late frames lower the quality level by level to the last, where it stays; calm frames restore full quality.
     #[test]
     fn late_frames_lower_it_and_calm_restores_it() {
         let mut overload = overload(ALL);
@@ -220,7 +220,7 @@ mod tests {
         assert_eq!(overload.quality(), overload.levels[0]);
     }
 
-    /// Frames that were skipped are a sign too, however quick the others are; one in many is none.
+    /// Skipped frames are a sign too, even if the others are fast; one in many is not.
     #[test]
     fn skipped_frames_lower_it() {
         let mut overload = overload(ALL);
@@ -234,7 +234,7 @@ mod tests {
         assert_eq!((changes, calm.level), (0, 0));
     }
 
-    /// What has to be given up again at once is waited for longer the next time.
+    /// After a restoration that failed at once, the next wait is longer.
     #[test]
     fn it_does_not_swing() {
         let mut overload = overload(ALL);
@@ -254,7 +254,7 @@ mod tests {
         assert!(waits.windows(2).all(|w| w[1] > w[0]), "{waits:?}");
     }
 
-    /// Messages that the observer missed are no frames that the graph skipped.
+    /// Messages that the observer missed are not frames that the graph skipped.
     #[test]
     fn what_was_not_seen_was_not_skipped() {
         let mut overload = overload(ALL);
@@ -265,7 +265,7 @@ mod tests {
         }
     }
 
-    /// Steps of a frame that was seen, and older frames, count once.
+    /// Steps of an observed frame, and older frames, count once.
     #[test]
     fn a_frame_counts_once() {
         let mut overload = overload(ALL);
@@ -274,7 +274,7 @@ mod tests {
             show(&mut overload, 6, 1, 130);
         }
         assert_eq!(overload.level, 0);
-        // A camera that counts anew is followed all the same.
+        // A camera that restarts its count is followed.
         assert!(show(&mut overload, 0, 40, 130) > 0);
     }
 }

@@ -1,11 +1,11 @@
-//! What the graph file asks of the system for one process: processors, priority, resident memory.
-//! Whatever the system refuses is a warning; the stage goes on without.
+//! System settings from the graph file for one process: processors, priority, resident memory. If the system refuses a
+//! setting, the stage logs a warning and continues without it.
 
 use carff_config::StageConfig;
 use rustix::process::{Resource, getrlimit};
 use std::io;
 
-/// Bytes between two touched places: no page is smaller.
+/// Distance of touched addresses, bytes: no page is smaller.
 const PAGE_BYTES: usize = 4096;
 
 /// Sets processors, niceness and scheduling policy of the calling thread; threads that it starts inherit them.
@@ -21,7 +21,7 @@ pub(crate) fn schedule(settings: &StageConfig, nice: Option<i32>) {
     }
 }
 
-/// Touches heap and locks memory, once all that lasts has been loaded.
+/// Touches the heap and locks memory, once all models have been loaded.
 pub(crate) fn settle(settings: &StageConfig) {
     if settings.prefault_mb > 0 {
         prefault(settings.prefault_mb as usize * (1 << 20));
@@ -54,7 +54,8 @@ fn use_fifo(priority: u32) -> io::Result<()> {
     if result == 0 { Ok(()) } else { Err(io::Error::last_os_error()) }
 }
 
-/// What is mapped now; what comes later too, unless a limit stands: beyond one, a later allocation would fail.
+/// Locks current and future memory; only current memory if there is a limit, because a later allocation beyond it would
+/// fail.
 fn lock_memory() -> io::Result<()> {
     use rustix::mm::MlockAllFlags;
     let unlimited = getrlimit(Resource::Memlock).current.is_none();
@@ -62,9 +63,10 @@ fn lock_memory() -> io::Result<()> {
     Ok(rustix::mm::mlockall(MlockAllFlags::CURRENT | later)?)
 }
 
-/// Takes heap, touches it, and gives it back to the allocator, which keeps blocks of this size for what is asked next.
+/// Allocates and touches heap memory, and frees it to the allocator, which keeps blocks of this size for later
+/// requests.
 fn prefault(bytes: usize) {
-    /// Blocks that the allocator takes from its heap; larger ones it would map, and unmap again.
+    /// Size of blocks that the allocator takes from its heap; it would map and unmap larger ones.
     const BLOCK_BYTES: usize = 64 << 10;
     let mut blocks: Vec<Vec<u8>> = Vec::with_capacity(bytes / BLOCK_BYTES + 1);
     for _ in 0..bytes.div_ceil(BLOCK_BYTES) {
@@ -81,10 +83,10 @@ fn prefault(bytes: usize) {
 mod tests {
     use super::*;
 
-    /// Settings that can be had are in force afterwards; those that cannot are warned of and change nothing.
+    /// Available settings are active afterwards; unavailable ones cause a warning and change nothing.
     #[test]
     fn what_is_asked_for_is_in_force_or_warned_of() {
-        // A thread of its own: the settings are a thread's.
+        // A separate thread, because the settings apply to a thread.
         std::thread::spawn(|| {
             let all = rustix::thread::sched_getaffinity(None).unwrap();
             let first = (0..1024).find(|&cpu| all.is_set(cpu)).unwrap();

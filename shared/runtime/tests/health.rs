@@ -1,4 +1,4 @@
-//! What a stage says of itself.
+//! Tests of a stage's heartbeats.
 
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
@@ -39,7 +39,7 @@ impl Drop for Fixture {
     }
 }
 
-/// Waits for a heartbeat with this property; a watchdog ends a wait for nothing.
+/// Waits for a heartbeat with a property; a watchdog bounds the wait.
 fn heartbeat(
     input: &mut Receiver<carff_messages::Health>,
     wanted: impl Fn(&carff_messages::Health) -> bool,
@@ -57,7 +57,7 @@ fn heartbeat(
     panic!("no such heartbeat");
 }
 
-/// When `ready` returns, the heartbeat that says so is out: who dies in its first frame has been ready.
+/// When `ready` returns, its heartbeat has been sent: a stage that dies in its first frame has been ready.
 #[test]
 fn ready_is_said_before_work_begins() {
     let fixture = Fixture::new("ready");
@@ -72,7 +72,8 @@ fn ready_is_said_before_work_begins() {
     assert_eq!(states.last(), Some(&HealthState::Ok), "{states:?}");
 }
 
-/// From starting to ok, with counts of what was received, skipped and found invalid, while the stage's loop does nothing.
+/// Health goes from starting to ok, with counts of received, skipped and invalid messages, while the stage's loop is
+/// idle.
 #[test]
 fn heartbeats_tell_state_and_counts() {
     let fixture = Fixture::new("counts");
@@ -107,7 +108,7 @@ fn heartbeats_tell_state_and_counts() {
     heartbeat(&mut health, |h| h.state() == Ok(HealthState::Ok) && h.max_latency_ns >= 1_000_000_000);
 }
 
-/// The last heartbeat tells how a stage ended, and the exit code does too.
+/// The last heartbeat and the exit code show how a stage ended.
 #[test]
 fn the_end_is_told() {
     let fixture = Fixture::new("ends");
@@ -115,7 +116,7 @@ fn the_end_is_told() {
     let mut health = node.receiver(topics::health(Stage::Prober)).unwrap();
     let code = run_with(Stage::Prober, fixture.args(), |stage| {
         stage.ready();
-        // Until somebody has connected, nobody hears the last words.
+        // Without a connected receiver, the last heartbeat is lost.
         heartbeat(&mut health, |h| h.state() == Ok(HealthState::Ok));
         Ok(())
     });
@@ -129,7 +130,7 @@ fn the_end_is_told() {
     heartbeat(&mut health, |h| h.state() == Ok(HealthState::Faulty));
 }
 
-/// A stage whose launcher is gone does not start.
+/// A stage whose launcher has ended does not start.
 #[test]
 fn without_its_launcher_a_stage_does_not_start() {
     let fixture = Fixture::new("orphan");

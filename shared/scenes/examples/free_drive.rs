@@ -1,4 +1,4 @@
-//! Renders a free drive into a folder of PNG files, on one thread, and prints what each frame cost and shows.
+//! Renders a free drive into a folder of PNG files on one thread, and prints time and visibility of each frame.
 //!
 //! ```text
 //! cargo run --release -p carff-scenes --example free_drive -- SCENARIO.toml NUMBER SEED OUT_DIR
@@ -9,7 +9,7 @@ use std::time::Instant;
 
 use carff_scenes::Scenario;
 
-/// Frames of each timestamp.
+/// Frames of each time step.
 const FRAMES: usize = 6;
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
@@ -34,7 +34,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     for frame in 0..drive.frame_count() {
         let begin = Instant::now();
         let shown = pool.install(|| scenario.free_frame(&drive, frame))?;
-        let seen = shown.observability.map_or("nothing to see", |o| o.name());
+        let seen = shown.observability.map_or("no actor", |o| o.name());
         println!("frame {frame:>3}  t{}  {seen:<8} {:>6.1} ms", shown.timestamp, begin.elapsed().as_secs_f64() * 1e3);
         shown.image.save_png(&out.join(format!("{frame:03}.png")))?;
     }

@@ -1,4 +1,4 @@
-//! Renders a scenario into a data set, and prints and draws what it holds.
+//! Renders a scenario into a dataset, prints its statistics, and draws its contact sheet.
 //!
 //! ```text
 //! cargo run --release -p carff-scenes --example render_scenario -- SCENARIO.toml OUT_DIR CONTACT_SHEET.png

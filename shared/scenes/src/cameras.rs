@@ -1,5 +1,5 @@
-//! Where a scenario's cameras stand, never inside anything: the fixed ones by evenly spread sequences, free ones at
-//! random in the same ranges.
+//! Poses of a scenario's cameras, outside all solids. Fixed cameras come from evenly spread sequences, random cameras
+//! from the same ranges.
 
 use carff_base::geometry::PinholeCamera;
 use carff_base::random::Key;
@@ -12,27 +12,27 @@ use crate::shapes::Vec3;
 /// A camera pose of the scenario, with its kind.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ScenarioCamera {
-    /// Kind of camera, for example `orbit`.
+    /// Kind of the camera, for example `orbit`.
     pub view_kind: String,
     /// Intrinsics and pose.
     pub camera: PinholeCamera,
 }
 
-/// Of the clearance from static things, the share that is kept above the ground.
+/// Minimum height above the ground, as a share of the clearance from static things.
 const ABOVE_GROUND: f32 = 0.3 / 0.45;
-/// And from where moving things can be.
+/// Minimum distance from moving things, as a share of the same clearance.
 const FROM_MOVING: f32 = 0.05 / 0.45;
-/// Places tried for each camera before giving up.
+/// Maximum number of tries per camera.
 const MAX_TRIES: usize = 400;
 
-/// Spaces where no camera may be.
+/// Spaces that no camera may enter.
 pub(crate) struct Obstacles {
     boxes: Vec<Aabb>,
     lowest: f32,
 }
 
 impl Obstacles {
-    /// `clearance_m` is that of static things.
+    /// Creates the obstacles. `clearance_m` is the clearance from static things.
     pub fn new(clearance_m: f32, still: impl Iterator<Item = Aabb>, moving: impl Iterator<Item = Aabb>) -> Self {
         let grow = |aabb: Aabb, by: f32| Aabb::new(aabb.mins - Vec3::splat(by), aabb.maxs + Vec3::splat(by));
         let still = still.map(|a| grow(a, clearance_m));
@@ -40,7 +40,7 @@ impl Obstacles {
         Self { boxes: still.chain(moving).collect(), lowest: ABOVE_GROUND * clearance_m }
     }
 
-    /// Whether a camera may stand there.
+    /// Returns true if a camera may be at a point.
     pub fn clear(&self, at: [f64; 3]) -> bool {
         let p = Vec3::from_array(at.map(|v| v as f32));
         p.z > self.lowest
@@ -50,7 +50,8 @@ impl Obstacles {
     }
 }
 
-/// Point `index` of an evenly spread sequence in the unit cube of `N` dimensions (Roberts' generalised golden ratio).
+/// Returns point `index` of an evenly spread sequence in the unit cube of `N` dimensions (Roberts' generalised golden
+/// ratio).
 fn spread<const N: usize>(index: usize) -> [f64; N] {
     let mut phi = 2.0_f64;
     for _ in 0..32 {
@@ -67,7 +68,7 @@ fn within(region: &[[f64; 3]; 2], t: [f64; 3]) -> [f64; 3] {
     [0, 1, 2].map(|i| mix([region[0][i], region[1][i]], t[i]))
 }
 
-/// All cameras, or the key of the group that found no room.
+/// Returns all cameras, or the key of the group without enough space.
 pub(crate) fn cameras(
     config: &ScenarioConfig,
     obstacles: &Obstacles,
@@ -97,10 +98,10 @@ fn look(config: &ScenarioConfig, kind: &str, eye: [f64; 3], target: [f64; 3], up
     ScenarioCamera { view_kind: kind.to_owned(), camera }
 }
 
-/// A camera, and where it stands.
+/// A camera with its position.
 type Candidate = ([f64; 3], ScenarioCamera);
 
-/// Takes `count` candidates that stand clear, in the order of their index.
+/// Takes the first `count` candidates without obstacles, in the order of their index.
 fn take_clear(
     count: usize,
     obstacles: &Obstacles,
@@ -159,7 +160,7 @@ fn dash(
     obstacles: &Obstacles,
 ) -> Option<Vec<ScenarioCamera>> {
     take_clear(group.count_per_place, obstacles, |i| {
-        // Turned evenly from the lowest to the highest angle, whatever the count.
+        // Angles are spread evenly from the lowest to the highest, for any count.
         let turn = ((i % group.count_per_place) as f64 + 0.5) / group.count_per_place as f64;
         dash_at(config, group, place, turn, spread(i))
     })
@@ -185,7 +186,7 @@ fn street_at(config: &ScenarioConfig, group: &StreetConfig, eye: [f64; 3], targe
     (eye, look(config, &group.view_kind, eye, target, [0.0, 0.0, 1.0]))
 }
 
-/// The groups that cameras are drawn from, each with its share.
+/// Camera groups, each with its share.
 struct Groups<'a>(Vec<(usize, Group<'a>)>);
 
 impl<'a> Groups<'a> {
@@ -201,7 +202,7 @@ impl<'a> Groups<'a> {
         Self(groups.collect())
     }
 
-    /// One camera that stands clear, or the key of the group that found no room.
+    /// Returns one camera without obstacles, or the key of the group without enough space.
     fn draw(
         &self,
         config: &ScenarioConfig,
@@ -227,8 +228,8 @@ impl<'a> Groups<'a> {
     }
 }
 
-/// `count` cameras drawn at random from the ranges of the fixed ones, each group as often as its share of those; or
-/// the key of the group that found no room.
+/// Returns `count` cameras drawn at random from the ranges of the fixed cameras, each group in proportion to its fixed
+/// cameras; or the key of the group without enough space.
 pub(crate) fn free_cameras(
     config: &ScenarioConfig,
     obstacles: &Obstacles,
@@ -245,7 +246,7 @@ pub(crate) fn free_cameras(
         .collect()
 }
 
-/// One camera drawn as [`free_cameras`] does, from a stream of the caller's.
+/// Returns one camera as [`free_cameras`] draws it, from the caller's random stream.
 pub(crate) fn free_camera(
     config: &ScenarioConfig,
     obstacles: &Obstacles,
@@ -255,18 +256,18 @@ pub(crate) fn free_camera(
     Groups::new(config, places).draw(config, obstacles, rng)
 }
 
-/// How a camera sits on a vehicle's roof.
+/// Mounting pose of a camera on a vehicle's roof.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Mount {
     pub forward_m: f64,
     pub height_m: f64,
-    /// Left of straight ahead, and below the horizon, radians.
+    /// Angle left of straight ahead, and angle below the horizon, radians.
     pub left: f64,
     pub down: f64,
 }
 
 impl Mount {
-    /// Drawn from the ranges of a group.
+    /// Draws a mounting pose from the ranges of a group.
     pub fn draw(group: &DashConfig, rng: &mut impl Rng) -> Self {
         Self {
             forward_m: mix(group.forward_m, rng.random()),
@@ -276,7 +277,7 @@ impl Mount {
         }
     }
 
-    /// Where it is and looks when the vehicle stands at x, y, turned by yaw: eye and target.
+    /// Returns eye and target for a vehicle at x, y, with heading yaw.
     pub fn at(&self, [x, y, yaw]: [f64; 3]) -> ([f64; 3], [f64; 3]) {
         let heading = yaw + self.left;
         let eye = [x + self.forward_m * yaw.cos(), y + self.forward_m * yaw.sin(), self.height_m];
@@ -285,7 +286,7 @@ impl Mount {
     }
 }
 
-/// Names this use of a seed.
+/// Name of the random stream.
 const FREE_STREAM: u32 = Key::named("free", 0, 0).step;
 
 enum Group<'a> {
@@ -323,7 +324,7 @@ impl Group<'_> {
 mod tests {
     use super::*;
 
-    /// The sequence is even: of 64 points, each quarter of the square holds between 12 and 20.
+    /// The sequence is even: of 64 points, each quarter of the square contains between 12 and 20.
     #[test]
     fn spread_is_even() {
         let mut counts = [0; 4];

@@ -1,4 +1,4 @@
-//! The scenario file: what stands where, who drives where, and which cameras look. All lengths are metres, all angles
+//! The scenario file: static objects, moving actors per branch, and cameras. All lengths are metres, all angles
 //! degrees, +Z is up, and the ground is z = 0. Unknown keys and values out of range are errors.
 
 use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
@@ -7,19 +7,19 @@ use serde::{Deserialize, Deserializer};
 use std::borrow::Cow;
 use toml::Spanned;
 
-/// A whole scenario file.
+/// A scenario file.
 #[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ScenarioConfig {
-    /// Name of the scenario, as it appears in data sets and checkpoints.
+    /// Name of the scenario, as it appears in datasets and checkpoints.
     pub name: String,
-    /// Lower and upper corner of the box that matters, metres.
+    /// Lower and upper corner of the region of interest, metres.
     #[serde(deserialize_with = "box3")]
     pub bounds_m: [[f64; 3]; 2],
-    /// Steps of each course of events, 1 to 64.
+    /// Number of time steps of each branch, 1 to 64.
     #[serde(deserialize_with = "count")]
     pub timestamps: usize,
-    /// Names of the courses of events.
+    /// Names of the branches.
     pub branches: Vec<String>,
     /// Names of the branches in which the hazard action is right.
     #[serde(default)]
@@ -28,20 +28,20 @@ pub struct ScenarioConfig {
     /// Index of the camera pose that looks straight down.
     #[schemars(with = "Option<usize>")]
     pub bev_view: Option<Spanned<usize>>,
-    /// What the actions are called.
+    /// Names of the actions.
     #[serde(default)]
     pub actions: ActionsConfig,
-    /// Size and field of view of all pictures.
+    /// Size and field of view of all images.
     #[serde(default)]
     pub picture: PictureConfig,
-    /// The sun.
+    /// Direction and size of the sun.
     #[serde(default)]
     pub sun: SunConfig,
     /// Colour of the open ground, `#rrggbb`.
     #[serde(default = "default_ground", deserialize_with = "colour")]
     #[schemars(with = "Colour", extend("default" = "#5d8a3c"))]
     pub ground_colour: [f32; 3],
-    /// What the open ground is: `grass` or `plain`.
+    /// Surface of the open ground: `grass` or `plain`.
     #[serde(default)]
     pub ground_surface: GroundSurface,
     /// Asphalt strips on the ground.
@@ -53,25 +53,26 @@ pub struct ScenarioConfig {
     /// Raised slabs: pavements, verges, islands.
     #[serde(default)]
     pub slab: Vec<SlabConfig>,
-    /// Buildings.
+    /// Buildings of the scenario.
     #[serde(default)]
     pub building: Vec<BuildingConfig>,
-    /// Trees.
+    /// Trees of the scenario.
     #[serde(default)]
     pub tree: Vec<TreeConfig>,
-    /// Street furniture.
+    /// Street furniture of the scenario.
     #[serde(default)]
     pub prop: Vec<PropConfig>,
-    /// Everything that drives or is parked.
+    /// Moving and parked vehicles.
     #[serde(default)]
     pub vehicle: Vec<VehicleConfig>,
-    /// Things made of simple forms, still or moving.
+    /// Objects made of simple shapes, static or moving.
     #[serde(default)]
     pub object: Vec<ObjectConfig>,
-    /// Least distance of cameras from static things, 0.001 to 100.
+    /// Minimum distance of cameras from static things, 0.001 to 100.
     #[serde(default = "default_clearance", deserialize_with = "clearance")]
     pub clearance_m: f64,
-    /// Light from the sky is blocked by what is nearer than this: about the size of what casts soft shadows, 0.001 to 100.
+    /// Range of ambient occlusion: things within this distance block light from the sky. About the size of objects that
+    /// cast soft shadows, 0.001 to 100.
     #[serde(default = "default_shade_reach", deserialize_with = "clearance")]
     pub shade_reach_m: f64,
     /// Cameras on a dome that look inwards. Views are numbered in the order orbit, overhead, dash, street.
@@ -80,7 +81,7 @@ pub struct ScenarioConfig {
     /// Cameras high above that look down.
     #[serde(default)]
     pub overhead: Vec<OverheadConfig>,
-    /// Cameras above a vehicle's roof, at each of its places.
+    /// Cameras above a vehicle's roof, at each of its positions.
     #[serde(default)]
     pub dash: Vec<DashConfig>,
     /// Cameras spread over a region that look at another region.
@@ -92,9 +93,9 @@ pub struct ScenarioConfig {
 #[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct ActionsConfig {
-    /// What to do in a hazard branch.
+    /// Action in a hazard branch.
     pub hazard: String,
-    /// What to do in the others.
+    /// Action in all other branches.
     pub clear: String,
 }
 
@@ -104,7 +105,7 @@ impl Default for ActionsConfig {
     }
 }
 
-/// Size and field of view of all pictures.
+/// Size and field of view of all images.
 #[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct PictureConfig {
@@ -125,17 +126,17 @@ impl Default for PictureConfig {
     }
 }
 
-/// The sun.
+/// Direction and size of the sun.
 #[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct SunConfig {
     /// Direction to the sun, from +X towards +Y.
     #[serde(deserialize_with = "finite")]
     pub azimuth_deg: f64,
-    /// Height above the horizon, 5 to 90.
+    /// Elevation above the horizon, 5 to 90.
     #[serde(deserialize_with = "elevation")]
     pub elevation_deg: f64,
-    /// Apparent radius: larger makes softer shadows. 0 to 10 (the real one is 0.27).
+    /// Apparent radius: a larger radius makes softer shadows. 0 to 10 (the real radius is 0.27).
     #[serde(deserialize_with = "softness")]
     pub radius_deg: f64,
 }
@@ -156,7 +157,7 @@ pub struct RoadConfig {
     /// End of its centre line (x, y).
     #[serde(deserialize_with = "point2")]
     pub to: [f64; 2],
-    /// Its width.
+    /// Width of the strip.
     #[serde(deserialize_with = "positive")]
     pub width_m: f64,
 }
@@ -171,33 +172,33 @@ pub struct MarkingConfig {
     /// End of its centre line (x, y).
     #[serde(deserialize_with = "point2")]
     pub to: [f64; 2],
-    /// Its width.
+    /// Width of the strip.
     #[serde(deserialize_with = "positive")]
     pub width_m: f64,
     /// Length of a dash; 0 for a solid line.
     #[serde(default, deserialize_with = "not_negative")]
     pub dash_m: f64,
-    /// Length of the gaps.
+    /// Length of a gap.
     #[serde(default, deserialize_with = "not_negative")]
     pub gap_m: f64,
-    /// Its colour, `#rrggbb`.
+    /// Colour of the paint, `#rrggbb`.
     #[serde(default = "default_marking", deserialize_with = "colour")]
     #[schemars(with = "Colour", extend("default" = "#e4e4de"))]
     pub colour: [f32; 3],
 }
 
-/// What the open ground is.
+/// Surface of the open ground.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum GroundSurface {
     /// Grass.
     #[default]
     Grass,
-    /// Its one colour.
+    /// A single colour.
     Plain,
 }
 
-/// What a slab is covered with.
+/// Surface of a slab.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum SlabSurface {
@@ -207,7 +208,7 @@ pub enum SlabSurface {
     Grass,
 }
 
-/// A raised slab, along the axes.
+/// A raised slab, aligned with the axes.
 #[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct SlabConfig {
@@ -217,24 +218,24 @@ pub struct SlabConfig {
     /// Upper corner (x, y).
     #[serde(deserialize_with = "point2")]
     pub max: [f64; 2],
-    /// Its height.
+    /// Height of the slab.
     #[serde(deserialize_with = "positive")]
     pub height_m: f64,
     /// `pavement` or `grass`.
     pub surface: SlabSurface,
 }
 
-/// What walls are made of.
+/// Material of walls.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Walls {
-    /// Courses of brick.
+    /// Rows of bricks.
     Brick,
     /// Smooth plaster.
     Plaster,
 }
 
-/// The form of a roof.
+/// Shape of a roof.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Roof {
@@ -244,7 +245,7 @@ pub enum Roof {
     Gable,
 }
 
-/// Which wall a door is in.
+/// Wall that contains a door.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Side {
@@ -258,11 +259,11 @@ pub enum Side {
     South,
 }
 
-/// A building, along the axes.
+/// A building, aligned with the axes.
 #[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct BuildingConfig {
-    /// Its name, as it appears among the static boxes.
+    /// Name of the building among the static boxes.
     pub name: String,
     /// Lower corner (x, y).
     #[serde(deserialize_with = "point2")]
@@ -273,7 +274,7 @@ pub struct BuildingConfig {
     /// Height of the walls.
     #[serde(deserialize_with = "positive")]
     pub height_m: f64,
-    /// Rows of windows, 1 to 64.
+    /// Number of rows of windows, 1 to 64.
     #[serde(default = "one", deserialize_with = "count")]
     pub storeys: usize,
     /// `brick` or `plaster`.
@@ -306,14 +307,14 @@ pub enum TreeKind {
     Bush,
 }
 
-/// A tree.
+/// A tree on the ground.
 #[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct TreeConfig {
-    /// Where it stands (x, y).
+    /// Position of the trunk (x, y).
     #[serde(deserialize_with = "point2")]
     pub at: [f64; 2],
-    /// Its height.
+    /// Height of the tree.
     #[serde(deserialize_with = "positive")]
     pub height_m: f64,
     /// `round`, `conifer` or `bush`.
@@ -344,10 +345,10 @@ pub enum PropKind {
 pub struct PropConfig {
     /// `lamp`, `bench`, `bin`, `hydrant`, `cone` or `stop`.
     pub kind: PropKind,
-    /// Where it stands (x, y).
+    /// Position on the ground (x, y).
     #[serde(deserialize_with = "point2")]
     pub at: [f64; 2],
-    /// Turn about +Z.
+    /// Rotation about +Z.
     #[serde(default, deserialize_with = "finite")]
     pub yaw_deg: f64,
 }
@@ -362,17 +363,17 @@ pub enum VehicleKind {
     Car,
     /// A van.
     Van,
-    /// A plain box, for tests and abstract scenes.
+    /// A plain cuboid, for tests and abstract scenes.
     Block,
 }
 
-/// A vehicle and its courses.
+/// A vehicle with its courses.
 #[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct VehicleConfig {
-    /// Its name, as it appears among the boxes.
+    /// Name of the vehicle among the boxes.
     pub name: String,
-    /// Its part: `ego`, `actor`, or any other word.
+    /// Role of the vehicle: `ego`, `actor`, or any other word.
     pub role: String,
     /// `pickup`, `car`, `van` or `block`.
     pub kind: VehicleKind,
@@ -383,86 +384,86 @@ pub struct VehicleConfig {
     /// Length, width, height.
     #[serde(deserialize_with = "size3")]
     pub size_m: [f64; 3],
-    /// Whether its presence or motion is what the forecast is about. At most one vehicle is.
+    /// True if its presence or motion is the subject of the forecast. At most one vehicle is dynamic.
     #[serde(default)]
     pub dynamic: bool,
-    /// Where it is. In a branch that no course names, it is absent.
+    /// Poses of the vehicle. In branches without a course, it is absent.
     pub course: Vec<CourseConfig>,
 }
 
-/// Where a vehicle is in some branches.
+/// Poses of a vehicle in some branches.
 #[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct CourseConfig {
     /// Names of the branches.
     #[schemars(with = "Vec<String>")]
     pub branches: Vec<Spanned<String>>,
-    /// One [x, y, yaw in degrees] per timestamp.
+    /// One [x, y, yaw in degrees] per time step.
     #[schemars(with = "Vec<[f64; 3]>")]
     pub poses: Spanned<Vec<[f64; 3]>>,
 }
 
-/// A thing made of simple forms. Their places are in the thing's own axes: +X ahead, +Y left, +Z up.
+/// An object made of simple shapes. Their positions are in the object's own axes: +X ahead, +Y left, +Z up.
 #[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ObjectConfig {
-    /// Its name, as it appears among the boxes.
+    /// Name of the object among the boxes.
     pub name: String,
-    /// Its part: `actor`, `static`, or any other word.
+    /// Role of the object: `actor`, `static`, or any other word.
     pub role: String,
-    /// Whether its presence or motion is what the forecast is about. At most one vehicle or object is.
+    /// True if its presence or motion is the subject of the forecast. At most one vehicle or object is dynamic.
     #[serde(default)]
     pub dynamic: bool,
-    /// Name of the dynamic object, if this one is there and gone with it, as an arm with its hand.
+    /// Name of the dynamic object whose presence this object shares, as an arm shares its hand's.
     #[schemars(with = "Option<String>")]
     pub follows: Option<Spanned<String>>,
-    /// Where it always is, when it has no course: x, y, z, yaw in degrees.
+    /// Constant pose of an object without a course: x, y, z, yaw in degrees.
     #[serde(default, deserialize_with = "pose4")]
     pub at: [f64; 4],
-    /// Cuboids.
+    /// Cuboids of the object.
     #[serde(default, rename = "box")]
     pub boxes: Vec<BoxConfig>,
-    /// Ellipsoids.
+    /// Ellipsoids of the object.
     #[serde(default)]
     pub ellipsoid: Vec<EllipsoidConfig>,
-    /// Cylinders.
+    /// Cylinders of the object.
     #[serde(default)]
     pub cylinder: Vec<RodConfig>,
     /// Cylinders with round ends.
     #[serde(default)]
     pub capsule: Vec<RodConfig>,
-    /// Where it is. In a branch that no course names, it is absent.
+    /// Poses of the object. In branches without a course, it is absent.
     #[serde(default)]
     pub course: Vec<ObjectCourseConfig>,
 }
 
-/// A cuboid.
+/// A cuboid with its colours.
 #[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct BoxConfig {
-    /// Its middle.
+    /// Centre of the cuboid.
     #[serde(deserialize_with = "point3")]
     pub center: [f64; 3],
-    /// Its edges, whole lengths.
+    /// Lengths of its edges.
     #[serde(deserialize_with = "edges")]
     pub size_m: [f64; 3],
     /// Yaw about +Z, pitch (nose down) and roll (left side up), one after the other.
     #[serde(default, deserialize_with = "point3")]
     pub turn_deg: [f64; 3],
-    /// Its colour, `#rrggbb`; with `faces`, that of the joints.
+    /// Colour of the cuboid, `#rrggbb`; with `faces`, colour of the joints.
     #[serde(deserialize_with = "colour")]
     #[schemars(with = "Colour")]
     pub colour: [f32; 3],
-    /// A second colour, in squares.
+    /// A second colour, as a checkerboard.
     pub checks: Option<ChecksConfig>,
-    /// Colours of its sides.
+    /// Colours of its faces.
     pub faces: Option<FacesConfig>,
-    /// Variants of the object that have this part. Default: all.
+    /// Variants of the object with this part. Default: all.
     #[serde(default)]
     pub variants: Vec<String>,
 }
 
-/// Squares of a second colour.
+/// A checkerboard with a second colour.
 #[derive(Clone, Copy, Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ChecksConfig {
@@ -470,42 +471,42 @@ pub struct ChecksConfig {
     #[serde(deserialize_with = "colour")]
     #[schemars(with = "Colour")]
     pub colour: [f32; 3],
-    /// Edge of a square.
+    /// Edge length of a square.
     #[serde(deserialize_with = "positive")]
     pub size_m: f64,
 }
 
-/// Colours of the six sides of a cuboid.
+/// Colours of the six faces of a cuboid.
 #[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct FacesConfig {
-    /// +X, -X, +Y, -Y, +Z, -Z, each `#rrggbb`.
+    /// Colours of +X, -X, +Y, -Y, +Z, -Z, each `#rrggbb`.
     #[serde(deserialize_with = "six_colours")]
     #[schemars(with = "[Colour; 6]")]
     pub colours: [[f32; 3]; 6],
-    /// Squares along each edge, 1 to 64.
+    /// Number of squares along each edge, 1 to 64.
     #[serde(default = "one", deserialize_with = "count")]
     pub tiles: usize,
 }
 
-/// An ellipsoid.
+/// An ellipsoid with its colour.
 #[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct EllipsoidConfig {
-    /// Its middle.
+    /// Centre of the ellipsoid.
     #[serde(deserialize_with = "point3")]
     pub center: [f64; 3],
-    /// Its diameters.
+    /// Diameters along its axes.
     #[serde(deserialize_with = "edges")]
     pub size_m: [f64; 3],
-    /// As that of a box.
+    /// Yaw about +Z, pitch (nose down) and roll (left side up), one after the other.
     #[serde(default, deserialize_with = "point3")]
     pub turn_deg: [f64; 3],
-    /// Its colour, `#rrggbb`.
+    /// Colour of the ellipsoid, `#rrggbb`.
     #[serde(deserialize_with = "colour")]
     #[schemars(with = "Colour")]
     pub colour: [f32; 3],
-    /// Variants of the object that have this part. Default: all.
+    /// Variants of the object with this part. Default: all.
     #[serde(default)]
     pub variants: Vec<String>,
 }
@@ -514,35 +515,35 @@ pub struct EllipsoidConfig {
 #[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct RodConfig {
-    /// Start of its axis. A capsule's round end begins there.
+    /// Start of the axis, without a capsule's round end.
     #[serde(deserialize_with = "point3")]
     pub from: [f64; 3],
-    /// End of its axis.
+    /// End of the axis.
     #[serde(deserialize_with = "point3")]
     pub to: [f64; 3],
-    /// Its radius.
+    /// Radius of the cylinder.
     #[serde(deserialize_with = "positive")]
     pub radius_m: f64,
-    /// Its colour, `#rrggbb`.
+    /// Colour of the cylinder, `#rrggbb`.
     #[serde(deserialize_with = "colour")]
     #[schemars(with = "Colour")]
     pub colour: [f32; 3],
-    /// Variants of the object that have this part. Default: all.
+    /// Variants of the object with this part. Default: all.
     #[serde(default)]
     pub variants: Vec<String>,
 }
 
-/// Where an object is in some branches.
+/// Poses of an object in some branches.
 #[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ObjectCourseConfig {
     /// Names of the branches.
     #[schemars(with = "Vec<String>")]
     pub branches: Vec<Spanned<String>>,
-    /// One [x, y, z, yaw in degrees] per timestamp.
+    /// One [x, y, z, yaw in degrees] per time step.
     #[schemars(with = "Vec<[f64; 4]>")]
     pub poses: Spanned<Vec<[f64; 4]>>,
-    /// One variant per timestamp: which parts it has then. Default: those that name no variant.
+    /// One variant per time step: it selects the object's parts. Default: only parts without a variant.
     #[schemars(with = "Option<Vec<String>>")]
     pub variants: Option<Spanned<Vec<String>>>,
 }
@@ -551,15 +552,15 @@ pub struct ObjectCourseConfig {
 #[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct OrbitConfig {
-    /// Kind of these views, as it appears in data sets.
+    /// Kind of these views, as it appears in datasets.
     pub view_kind: String,
-    /// How many, 1 to 10000.
+    /// Number of cameras, 1 to 10000.
     #[serde(deserialize_with = "many")]
     pub count: usize,
-    /// What they look at.
+    /// Target point of the cameras.
     #[serde(deserialize_with = "point3")]
     pub center: [f64; 3],
-    /// Distance from it, lowest and highest.
+    /// Distance from the target, lowest and highest.
     #[serde(deserialize_with = "range")]
     pub radius_m: [f64; 2],
     /// Angle above the horizon, lowest and highest.
@@ -567,22 +568,22 @@ pub struct OrbitConfig {
     pub elevation_deg: [f64; 2],
 }
 
-/// Cameras high above that look down. The first looks straight down from the middle; the picture's up is +Y.
+/// Cameras high above that look down. The first looks straight down from the middle; the image's up is +Y.
 #[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct OverheadConfig {
-    /// Kind of these views, as it appears in data sets.
+    /// Kind of these views, as it appears in datasets.
     pub view_kind: String,
-    /// How many, 1 to 10000.
+    /// Number of cameras, 1 to 10000.
     #[serde(deserialize_with = "many")]
     pub count: usize,
-    /// Point on the ground below the first (x, y).
+    /// Point on the ground below the first camera (x, y).
     #[serde(deserialize_with = "point2")]
     pub center: [f64; 2],
-    /// Height of the first.
+    /// Height of the first camera.
     #[serde(deserialize_with = "positive")]
     pub height_m: f64,
-    /// How far the others stand aside, at most.
+    /// Maximum horizontal distance of the other cameras from the first.
     #[serde(deserialize_with = "not_negative")]
     pub spread_m: f64,
 }
@@ -591,24 +592,24 @@ pub struct OverheadConfig {
 #[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct DashConfig {
-    /// Kind of these views, as it appears in data sets.
+    /// Kind of these views, as it appears in datasets.
     pub view_kind: String,
     /// Name of the vehicle.
     #[schemars(with = "String")]
     pub vehicle: Spanned<String>,
-    /// How many at each of its places, 1 to 10000.
+    /// Number of cameras at each of its positions, 1 to 10000.
     #[serde(deserialize_with = "many")]
     pub count_per_place: usize,
-    /// Ahead of the vehicle's middle, lowest and highest.
+    /// Distance ahead of the vehicle's centre, lowest and highest.
     #[serde(deserialize_with = "range")]
     pub forward_m: [f64; 2],
-    /// Above the ground, lowest and highest.
+    /// Height above the ground, lowest and highest.
     #[serde(deserialize_with = "range")]
     pub height_m: [f64; 2],
-    /// Left of straight ahead, lowest and highest.
+    /// Angle left of straight ahead, lowest and highest.
     #[serde(deserialize_with = "range")]
     pub left_deg: [f64; 2],
-    /// Below the horizon, lowest and highest.
+    /// Angle below the horizon, lowest and highest.
     #[serde(deserialize_with = "range")]
     pub down_deg: [f64; 2],
 }
@@ -617,20 +618,20 @@ pub struct DashConfig {
 #[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct StreetConfig {
-    /// Kind of these views, as it appears in data sets.
+    /// Kind of these views, as it appears in datasets.
     pub view_kind: String,
-    /// How many, 1 to 10000.
+    /// Number of cameras, 1 to 10000.
     #[serde(deserialize_with = "many")]
     pub count: usize,
-    /// Where they stand: lower and upper corner.
+    /// Region of the cameras: lower and upper corner.
     #[serde(deserialize_with = "box3")]
     pub region: [[f64; 3]; 2],
-    /// Where they look: lower and upper corner.
+    /// Region of the targets: lower and upper corner.
     #[serde(deserialize_with = "box3")]
     pub look_at: [[f64; 3]; 2],
 }
 
-/// How colours are written, for the schema.
+/// Format of colours, for the schema.
 enum Colour {}
 
 impl JsonSchema for Colour {
@@ -679,7 +680,7 @@ fn north() -> Side {
     Side::North
 }
 
-/// `#rrggbb` in sRGB to linear RGB.
+/// Parses `#rrggbb` in sRGB into linear RGB.
 fn parse_colour(text: &str) -> Option<[f32; 3]> {
     let digits = text.strip_prefix('#').filter(|d| d.len() == 6 && d.is_ascii())?;
     let mut rgb = [0.0; 3];

@@ -1,81 +1,81 @@
-//! What can be wrong with a scenario, and where.
+//! Errors of scenarios, with their place.
 
 use std::path::PathBuf;
 
 use carff_dataset::DatasetError;
 
-/// Why a scenario cannot be loaded or rendered.
+/// Reason why a scenario cannot be loaded or rendered.
 #[derive(Debug, thiserror::Error)]
 pub enum ScenarioError {
     /// The file cannot be read.
     #[error("{}: {source}{}", path.display(), carff_base::names::beside(path))]
     Io {
-        /// The scenario file.
+        /// Path of the scenario file.
         path: PathBuf,
-        /// The system's reason.
+        /// Error of the system.
         source: std::io::Error,
     },
-    /// A key that is unknown, missing, of the wrong type or out of range. Names line and column and shows the line.
+    /// A key is unknown, missing, of the wrong type or out of range. The message names line, column and text.
     #[error("{}: {}", path.display(), carff_base::names::explained(&.source.to_string()))]
     Toml {
-        /// The scenario file.
+        /// Path of the scenario file.
         path: PathBuf,
-        /// Line, column, key and what is allowed.
+        /// Line, column, key and the allowed values.
         source: Box<toml::de::Error>,
     },
-    /// Values that are well-formed each but do not fit together.
+    /// Values are valid on their own but contradict each other.
     #[error("{}:{line}: key `{key}`: {problem}", path.display())]
     Key {
-        /// The scenario file.
+        /// Path of the scenario file.
         path: PathBuf,
-        /// Line, from 1.
+        /// Line number, from 1.
         line: usize,
-        /// The key.
+        /// Name of the key.
         key: String,
-        /// What is wrong and what is allowed.
+        /// The error and the allowed values.
         problem: String,
     },
-    /// A branch or timestamp that the scenario does not have.
+    /// The scenario has no such branch or time step.
     #[error("there is no branch {branch} at timestamp {timestamp}; the scenario has {branches} x {timestamps}")]
     NoSuchState {
-        /// Branch asked for.
+        /// Requested branch.
         branch: usize,
-        /// Timestamp asked for.
+        /// Requested time step.
         timestamp: usize,
-        /// Branches there are.
+        /// Number of branches.
         branches: usize,
-        /// Timestamps there are.
+        /// Number of time steps.
         timestamps: usize,
     },
-    /// A camera that cannot take pictures.
+    /// The camera cannot take images.
     #[error("the camera is not usable: {0}")]
     Camera(#[from] carff_base::geometry::CameraError),
-    /// No place was found for a freely drawn camera.
-    #[error("{}: key `{key}`: no place in these ranges stands clear of everything; widen them", path.display())]
+    /// No position was found for a random camera.
+    #[error("{}: key `{key}`: no position in these ranges is free of obstacles; widen them", path.display())]
     NoRoom {
-        /// The scenario file.
+        /// Path of the scenario file.
         path: PathBuf,
-        /// The group of cameras.
+        /// Key of the camera group.
         key: &'static str,
     },
     /// No drive of a kind was found.
     #[error(
         "{}: none of {tries} drawn drives is a {} trial: the scenario needs branches with and without a hazard, and \
-         cameras that see nothing, or all, of the actor before the last timestamp",
+         cameras that see none, or all, of the actor before the last timestamp",
         path.display(), kind.name()
     )]
     NoDrive {
-        /// The scenario file.
+        /// Path of the scenario file.
         path: PathBuf,
-        /// Which kind.
+        /// Kind of the drive.
         kind: carff_dataset::drives::DriveKind,
-        /// How many were drawn.
+        /// Number of drawn drives.
         tries: u32,
     },
-    /// The set cannot be written.
+    /// The dataset cannot be written.
     #[error(transparent)]
     Dataset(#[from] DatasetError),
     /// The caller stopped the rendering.
-    #[error("rendering was stopped; run it again to finish the set")]
+    #[error("rendering was stopped; run it again to finish the dataset")]
     Stopped,
 }

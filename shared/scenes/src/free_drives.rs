@@ -1,14 +1,14 @@
-//! Free drives: what a moving camera sees, from poses that no data set has.
+//! Free drives: images from a moving camera, at poses that are not in any dataset.
 //!
-//! A drive goes through the timestamps of one branch, with so many frames for each. The ego moves all the time: with the
-//! last frame of a timestamp it arrives at that state's place, but for a small deviation to the side, along and in
-//! heading that is drawn for each drive. Everybody else stands where the state says, so that nothing is shown before the
-//! state that shows it. The camera sits on the ego's roof; where no view from there is a trial of the wanted kind (no
-//! place that a building hides is seen to be clear), it is drawn from all of the scenario's ranges and drifts along.
+//! A drive passes through the time steps of one branch, with a fixed number of frames per step. The ego moves
+//! continuously. With the last frame of a time step it reaches the state's pose, except for a small random deviation to
+//! the side, along and in heading. All other actors are at the poses of the current state, so that no frame shows a
+//! later state. The camera is on the ego's roof. If no roof view is a trial of the wanted kind, because a building
+//! hides the place, the camera is drawn from all of the scenario's ranges and drifts.
 //!
-//! All that is drawn for drive `n` comes from the streams (seed, frame `n`, step `drvf`, sample `try`): drives can
-//! be made one by one, in any order. A drive is a trial of its kind as [`carff_dataset::ScenarioInfo::trial_kind`] says, which is judged
-//! on pictures of a third of the width and height.
+//! All random values of drive `n` come from the streams (seed, frame `n`, step `drvf`, sample `try`), so drives can be
+//! made one by one, in any order. [`carff_dataset::ScenarioInfo::trial_kind`] defines the kind of a trial; it is
+//! evaluated on images of a third of the width and height.
 //!
 //! ```no_run
 //! use carff_scenes::Scenario;
@@ -37,28 +37,28 @@ use crate::error::ScenarioError;
 use crate::movers::Pose;
 use crate::scenario::{Placement, Scenario};
 
-/// Names this use of a seed.
+/// Name of the random stream.
 const STREAM: u32 = Key::named("drvf", 0, 0).step;
-/// Drives drawn before giving up.
+/// Maximum number of drawn drives.
 const MAX_TRIES: u32 = 400;
-/// So many of them look for a trial from the ego's roof alone.
+/// Number of tries that only use the ego's roof.
 const ROOF_TRIES: u32 = 2;
 /// Largest deviation of the ego to the side and along its course, metres, and in heading, radians.
 const ASIDE_M: f64 = 0.25;
 const ALONG_M: f64 = 0.35;
 const HEADING: f64 = 0.035;
-/// How far the camera sways about its course, metres and radians, and how often in a timestamp, at most.
+/// Largest sway of the camera about its course, metres and radians, and its largest frequency per time step.
 const SWAY_M: f64 = 0.03;
 const SWAY: f64 = 0.012;
 const SWAYS: f64 = 1.5;
-/// How far a camera that is not on the ego drifts in a timestamp, along each axis, metres.
+/// Drift of a camera that is not on the ego, per time step, along each axis, metres.
 const DRIFT_M: f64 = 0.4;
-/// Truth is judged on pictures so many times smaller, along each side: it costs up to two of them.
+/// Factor by which images for the truth are smaller along each side, because each truth needs up to two images.
 const TRUTH_SHARE: u32 = 3;
-/// Least distance from things in scenarios as large as roads, metres: others are as much smaller as theirs is.
+/// Clearance of scenarios with roads, metres. Random lengths scale with a scenario's own clearance.
 const ROAD_CLEARANCE_M: f64 = 0.45;
 
-/// A drive, planned.
+/// A planned drive.
 #[derive(Clone, Debug, PartialEq)]
 pub struct FreeDrive {
     branch: usize,
@@ -70,85 +70,86 @@ pub struct FreeDrive {
     course: Course,
 }
 
-/// What was drawn for one drive.
+/// Random values of a drive.
 #[derive(Clone, Debug, PartialEq)]
 struct Course {
     aside_m: f64,
     along_m: f64,
     heading: f64,
-    /// Amplitude-free: phase and cycles a timestamp, for x, y, z and yaw.
+    /// Phase and cycles per time step, for x, y, z and yaw.
     sway: [[f64; 2]; 4],
     camera: Carrier,
-    /// Scale of all that is drawn in metres.
+    /// Scale of all random lengths.
     scale: f64,
 }
 
-/// What the camera is on.
+/// Carrier of the camera.
 #[derive(Clone, Debug, PartialEq)]
 enum Carrier {
     /// The roof of the vehicle of this index.
     Roof { vehicle: usize, mount: Mount },
-    /// Nothing: it drifts from a pose by so much a timestamp.
+    /// A free camera that drifts from a pose by a vector per time step.
     Drifting { from: PinholeCamera, drift_m: [f64; 3] },
 }
 
-/// One frame of a drive.
+/// A frame of a drive.
 #[derive(Clone, Debug, PartialEq)]
 pub struct FreeFrame {
-    /// The picture, without sensor noise.
+    /// The image, without sensor noise.
     pub image: Image,
-    /// Where it was taken.
+    /// Pose and intrinsics of the camera.
     pub camera: PinholeCamera,
-    /// Hidden course of events.
+    /// Hidden branch.
     pub branch: usize,
-    /// Step of it.
+    /// Time step of the branch.
     pub timestamp: usize,
-    /// How much of the actor, or of its place, is seen; `None` when nothing in the scenario is dynamic.
+    /// Visibility of the actor or of its place; `None` if nothing in the scenario is dynamic.
     pub observability: Option<Observability>,
-    /// Whether this is the timestamp's last frame, at the state's own place.
+    /// True for the time step's last frame, at the state's own pose.
     pub last_of_timestamp: bool,
 }
 
 impl FreeDrive {
-    /// Hidden course of events.
+    /// Returns the hidden branch.
     pub fn branch(&self) -> usize {
         self.branch
     }
 
-    /// The right answer at [`Self::eligible_timestamp`].
+    /// Returns the right answer at [`Self::eligible_timestamp`].
     pub fn kind(&self) -> DriveKind {
         self.kind
     }
 
-    /// The first timestamp whose decision has one right answer.
+    /// Returns the first time step whose decision has one right answer.
     pub fn eligible_timestamp(&self) -> usize {
         self.eligible_timestamp
     }
 
-    /// Kind of the camera: that of the group that it was drawn from.
+    /// Returns the kind of the camera's group.
     pub fn view_kind(&self) -> &str {
         &self.view_kind
     }
 
-    /// Frames of the whole drive.
+    /// Returns the number of frames of the drive.
     pub fn frame_count(&self) -> usize {
         self.timestamps * self.frames_per_timestamp
     }
 
-    /// The frame whose decision counts: the last one of the eligible timestamp.
+    /// Returns the frame whose decision counts: the last one of the eligible time step.
     pub fn decisive_frame(&self) -> usize {
         (self.eligible_timestamp + 1) * self.frames_per_timestamp - 1
     }
 
-    /// Time of a frame in timestamps: 0 at the first state, whole numbers at the last frame of each timestamp.
+    /// Returns the time of a frame in time steps: 0 at the first state, whole numbers at the last frame of each time
+    /// step.
     fn time(&self, frame: usize) -> f64 {
         (frame + 1) as f64 / self.frames_per_timestamp as f64 - 1.0
     }
 }
 
 impl Scenario {
-    /// Plans drive `number`: even ones are hazard trials, odd ones clear ones; all are clear ones where the scenario has
-    /// no hazard. `frames_per_timestamp` is at least 1. The same arguments give the same drive.
+    /// Plans drive `number`. Even drives are hazard trials, odd ones clear trials; without hazards, all are clear.
+    /// `frames_per_timestamp` is at least 1. The same arguments give the same drive.
     pub fn free_drive(&self, number: u64, frames_per_timestamp: usize, seed: u64) -> Result<FreeDrive, ScenarioError> {
         let info = self.info();
         let hazards = !info.hazard_branches.is_empty();
@@ -214,7 +215,7 @@ impl Scenario {
         })
     }
 
-    /// All frames of a drive, rendered one by one.
+    /// Returns an iterator that renders all frames of a drive.
     pub fn free_frames<'a>(
         &'a self,
         drive: &'a FreeDrive,
@@ -222,7 +223,7 @@ impl Scenario {
         (0..drive.frame_count()).map(|frame| self.free_frame(drive, frame))
     }
 
-    /// Judged on a smaller picture, as it is a share of pixels.
+    /// Evaluates visibility on a smaller image, because it is a share of pixels.
     fn free_observability(
         &self,
         placement: &Placement,
@@ -233,8 +234,8 @@ impl Scenario {
         self.observability_of(placement, timestamp, &camera)
     }
 
-    /// A camera on a roof, from one of the scenario's groups of such cameras; none when there is none, or when its
-    /// vehicle is absent at some timestamp of the branch.
+    /// Returns a roof camera from one of the scenario's groups. Returns `None` if there is no such group, or if its
+    /// vehicle is absent at a time step of the branch.
     fn roof(&self, branch: usize, rng: &mut impl Rng) -> Option<(String, Carrier)> {
         let group = self.config().dash.choose(rng)?;
         let vehicle = self.config().vehicle.iter().position(|v| v.name == *group.vehicle.get_ref())?;
@@ -251,12 +252,12 @@ impl Scenario {
         Ok((drawn.view_kind, Carrier::Drifting { from: drawn.camera, drift_m }))
     }
 
-    /// Whether nothing is where the camera is. One on a roof is above its own vehicle.
+    /// Returns true if the camera is free of obstacles. A roof camera is above its own vehicle.
     fn stands_clear(&self, drive: &FreeDrive, frame: usize) -> bool {
         self.obstacles().clear(self.free_view(drive, frame).0.position_m())
     }
 
-    /// Camera and placement of a frame.
+    /// Returns camera and placement of a frame.
     fn free_view(&self, drive: &FreeDrive, frame: usize) -> (PinholeCamera, Placement) {
         let (time, course) = (drive.time(frame), &drive.course);
         let steps = &self.placements()[drive.branch];
@@ -298,7 +299,7 @@ impl Scenario {
 }
 
 impl Course {
-    /// A pose, with what was drawn for this drive.
+    /// Returns a pose with the drive's deviation.
     fn deviate(&self, pose: Pose) -> Pose {
         let (s, c) = pose.yaw.sin_cos();
         let [x, y, z] = pose.position_m;
@@ -306,15 +307,15 @@ impl Course {
         Pose { position_m, yaw: pose.yaw + self.heading, ..pose }
     }
 
-    /// x, y, z in metres and yaw in radians.
+    /// Returns the sway: x, y, z in metres and yaw in radians.
     fn swaying(&self, time: f64) -> [f64; 4] {
         let amplitudes = [SWAY_M * self.scale, SWAY_M * self.scale, SWAY_M * self.scale, SWAY];
         std::array::from_fn(|i| amplitudes[i] * (self.sway[i][0] + TAU * self.sway[i][1] * time).sin())
     }
 }
 
-/// Where a mover is between timestamps, on straight lines; before the first one, on the first line backwards. `None`
-/// where it is absent.
+/// Returns the pose of a mover between time steps, by linear interpolation; before the first step it extrapolates.
+/// Returns `None` if the mover is absent.
 fn moving(steps: &[Placement], mover: usize, time: f64) -> Option<Pose> {
     let last = steps.len().saturating_sub(2);
     let from = (time.floor().max(0.0) as usize).min(last);

@@ -1,7 +1,7 @@
-//! Scenarios as data, the ray tracer that takes their pictures, and free drives through them.
+//! Scenarios as data, the ray tracer that renders their images, and free drives through them.
 //!
-//! A scenario is a TOML file: what stands where, who moves where in which branch, and which cameras look. Nothing
-//! here knows of models, data-set readers or processes.
+//! A scenario is a TOML file with static objects, actors per branch, and cameras. This crate does not depend on models,
+//! on the dataset's readers, or on processes.
 //!
 //! ```no_run
 //! use carff_scenes::{RenderOptions, Scenario};

@@ -1,14 +1,14 @@
-//! Colours and procedural textures. A texture fades out where its detail is finer than the pixel that looks at it, so
-//! that pictures carry no noise at the pixel scale.
+//! Colours and procedural textures. A texture fades out where its detail is smaller than a pixel's footprint, so that
+//! images have no noise at the pixel scale.
 
 use crate::shapes::Vec3;
 
-/// What light does at a point of a surface.
+/// Optical properties of a surface point.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Surface {
     /// Linear RGB reflectance.
     pub albedo: Vec3,
-    /// Share of the mirrored sky that is added, 0..=1.
+    /// Share of the mirrored sky, 0..=1.
     pub mirror: f32,
     /// Strength of the sun's highlight.
     pub highlight: f32,
@@ -26,7 +26,7 @@ pub(crate) struct Facade {
     pub half: Vec3,
     pub storeys: u32,
     pub window_spacing: f32,
-    /// Wall with the door: 0 = +X, 1 = +Y, 2 = -X, 3 = -Y.
+    /// Index of the door's wall: 0 = +X, 1 = +Y, 2 = -X, 3 = -Y.
     pub door_wall: u32,
     pub brick: bool,
     pub colour: Vec3,
@@ -37,45 +37,45 @@ pub(crate) struct Facade {
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Paint {
     pub colour: Vec3,
-    /// Centre of the solid above the ground and along the vehicle, to get back to vehicle coordinates.
+    /// Centre of the solid above the ground and along the vehicle, for conversion to vehicle coordinates.
     pub offset: Vec3,
     pub half_length: f32,
     pub half_width: f32,
-    /// Axles along x, and the radius of the wheel arch.
+    /// Positions of the axles along x, and the radius of the wheel arch.
     pub axles: [f32; 2],
     pub arch_radius: f32,
     /// Height of head and tail lights.
     pub lights_z: f32,
 }
 
-/// The cabin: glass between sill and roof but for the pillars.
+/// The cabin: glass between sill and roof, except for the pillars.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Cabin {
     pub colour: Vec3,
     pub half: Vec3,
-    /// Pillars along x, cabin coordinates.
+    /// Positions of the pillars along x, cabin coordinates.
     pub pillars: [f32; 3],
 }
 
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum Material {
-    /// One colour with blotches of the given size and strength.
+    /// A colour with blotches of the given size and strength.
     Mottled {
         colour: Vec3,
         size: f32,
         strength: f32,
     },
-    /// One colour.
+    /// A single colour.
     Plain {
         colour: Vec3,
     },
-    /// Two colours in turn, in squares of the given size, in the solid's own axes.
+    /// Two alternating colours in squares of the given size, in the solid's own axes.
     Checks {
         colours: [Vec3; 2],
         size: f32,
     },
-    /// A cuboid whose sides have colours of their own: +X, -X, +Y, -Y, +Z, -Z; `tiles` squares a side, with joints of
-    /// the ground colour between them.
+    /// A cuboid with a colour per face: +X, -X, +Y, -Y, +Z, -Z; `tiles` squares per edge, with joints of the ground
+    /// colour.
     Faces {
         half: Vec3,
         colours: [Vec3; 6],
@@ -96,7 +96,7 @@ pub(crate) enum Material {
     Wall(Facade),
     Paint(Paint),
     Cabin(Cabin),
-    /// Radius of the rim; the rest is tyre. The axle is Y.
+    /// Radius of the rim; the rest is the tyre. The axle is Y.
     Wheel {
         rim: f32,
     },
@@ -118,7 +118,7 @@ fn hash(x: i32, y: i32, z: i32) -> f32 {
     (h >> 8) as f32 / (1 << 24) as f32
 }
 
-/// Smooth noise in -1..=1 with features of size 1.
+/// Returns smooth noise in -1..=1 with features of size 1.
 fn noise(p: Vec3) -> f32 {
     let cell = p.floor();
     let f = p - cell;
@@ -131,12 +131,12 @@ fn noise(p: Vec3) -> f32 {
     2.0 * lerp(layer(z), layer(z + 1), u.z) - 1.0
 }
 
-/// 1 where detail of size `size` is well above the pixel's footprint, falling to 0 where it is below.
+/// Returns 1 for detail of size `size` well above the pixel's footprint, falling to 0 below it.
 fn resolved(size: f32, footprint: f32) -> f32 {
     ((size / footprint - 1.0) / 2.0).clamp(0.0, 1.0)
 }
 
-/// Two octaves of noise, each faded out where it cannot be resolved.
+/// Returns two octaves of noise; each fades out where it cannot be resolved.
 fn blotches(p: Vec3, size: f32, footprint: f32) -> f32 {
     let coarse = resolved(size, footprint);
     let fine = resolved(size * 0.4, footprint);
@@ -150,7 +150,7 @@ fn blotches(p: Vec3, size: f32, footprint: f32) -> f32 {
     value
 }
 
-/// Distance of `x` to the nearest multiple of `period`.
+/// Returns the distance of `x` to the nearest multiple of `period`.
 fn to_joint(x: f32, period: f32) -> f32 {
     let r = (x / period).rem_euclid(1.0);
     r.min(1.0 - r) * period
@@ -165,8 +165,8 @@ pub(crate) fn marking(p: Vec3, colour: Vec3, footprint: f32) -> Surface {
 }
 
 impl Material {
-    /// The surface at `world`, which is `local` in the solid's own axes with outward normal `normal` (local). The
-    /// pixel covers about `footprint` metres there.
+    /// Returns the surface at `world`, which is `local` in the solid's own axes with the local outward normal `normal`.
+    /// The pixel's footprint there is about `footprint` metres.
     pub fn at(&self, world: Vec3, local: Vec3, normal: Vec3, footprint: f32) -> Surface {
         match self {
             Self::Mottled { colour, size, strength } => {
@@ -174,7 +174,7 @@ impl Material {
             }
             Self::Plain { colour } => Surface::matte(*colour),
             Self::Checks { colours, size } => {
-                // A hair's breadth inwards, so that a face that lies on a boundary shows one layer of squares.
+                // Moved slightly inwards, so that a face on a boundary shows one layer of squares.
                 let cell = ((local - normal * (0.01 * size)) / *size).floor();
                 let odd = (cell.x + cell.y + cell.z).rem_euclid(2.0) > 0.5;
                 let (a, b) = if odd { (colours[1], colours[0]) } else { (colours[0], colours[1]) };
@@ -271,7 +271,7 @@ impl Facade {
         }
         let mut shade = 1.0 + 0.16 * blotches(world, 0.9, footprint);
         if self.brick {
-            // Courses of bricks twice the natural size: at these resolutions natural ones would never be seen.
+            // Bricks have twice their natural size: smaller ones would not be visible at these resolutions.
             let course = 0.16;
             let row = (z / course).floor();
             let joint = to_joint(z, course) < 0.016

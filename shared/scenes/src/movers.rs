@@ -1,4 +1,4 @@
-//! What is placed anew in each state: vehicles, and objects made of simple forms.
+//! Movers, whose poses depend on the state: vehicles, and objects made of simple shapes.
 
 use carff_base::geometry::OrientedBox;
 use carff_dataset::NamedBox;
@@ -9,19 +9,19 @@ use crate::materials::Material;
 use crate::scenery::{Body, vec3, vehicle_bodies};
 use crate::shapes::{Form, Solid, Vec3, turn, upright_along};
 
-/// Where a mover is.
+/// Pose of a mover.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Pose {
-    /// Metres, world space; a vehicle's z is not looked at.
+    /// Position, metres, world space; a vehicle's z is ignored.
     pub position_m: [f64; 3],
-    /// Radians about +Z.
+    /// Heading, radians about +Z.
     pub yaw: f64,
-    /// Which of an object's variants it is, as an index into [`Mover::variants`].
+    /// Variant of an object, as an index into [`Mover::variants`].
     pub variant: Option<usize>,
 }
 
 impl Pose {
-    /// Equal for equal poses, and hashable.
+    /// Returns a hashable key that is equal for equal poses.
     pub fn key(&self) -> [u64; 5] {
         let [x, y, z] = self.position_m.map(f64::to_bits);
         [x, y, z, self.yaw.to_bits(), self.variant.map_or(u64::MAX, |v| v as u64)]
@@ -35,23 +35,23 @@ pub(crate) enum Mover<'a> {
     Object(&'a ObjectConfig),
 }
 
-/// A course, whichever file form it has.
+/// A course in either file format.
 pub(crate) struct Course<'a> {
     pub branches: &'a [Spanned<String>],
-    /// Place of `poses` in the file.
+    /// Byte range of `poses` in the file.
     pub poses_at: std::ops::Range<usize>,
-    /// By timestamp: x, y, z in metres, yaw in degrees.
+    /// Poses by time step: x, y, z in metres, yaw in degrees.
     pub poses: Vec<[f64; 4]>,
     pub variants: Option<&'a Spanned<Vec<String>>>,
 }
 
-/// All of a scenario: vehicles, then objects. Their order is that of object indices and placements.
+/// Returns all movers of a scenario: vehicles, then objects. Object indices and placements use this order.
 pub(crate) fn movers(config: &ScenarioConfig) -> impl Iterator<Item = Mover<'_>> {
     config.vehicle.iter().map(Mover::Vehicle).chain(config.object.iter().map(Mover::Object))
 }
 
 impl<'a> Mover<'a> {
-    /// The key of its table in the file.
+    /// Returns the key of its table in the file.
     pub fn key(&self) -> &'static str {
         match self {
             Self::Vehicle(_) => "vehicle",
@@ -73,7 +73,7 @@ impl<'a> Mover<'a> {
         }
     }
 
-    /// The dynamic object that it is there and gone with.
+    /// Returns the name of the dynamic object whose presence it shares.
     pub fn follows(&self) -> Option<&'a Spanned<String>> {
         match self {
             Self::Vehicle(_) => None,
@@ -81,7 +81,7 @@ impl<'a> Mover<'a> {
         }
     }
 
-    /// Where it is in every state, if it is an object without courses.
+    /// Returns the constant pose of an object without courses.
     pub fn still(&self) -> Option<Pose> {
         match self {
             Self::Object(o) if o.course.is_empty() => {
@@ -117,7 +117,7 @@ impl<'a> Mover<'a> {
         }
     }
 
-    /// Names of an object's variants, each once.
+    /// Returns the names of an object's variants, without repetition.
     pub fn variants(&self) -> Vec<&'a str> {
         let Self::Object(o) = self else { return Vec::new() };
         let mut names: Vec<&str> = Vec::new();
@@ -132,7 +132,7 @@ impl<'a> Mover<'a> {
         names
     }
 
-    /// Its solids at a pose.
+    /// Returns its solids at a pose.
     pub fn bodies(&self, pose: Pose, object: u16) -> Vec<Body> {
         let [x, y, z] = pose.position_m;
         match self {
@@ -145,7 +145,7 @@ impl<'a> Mover<'a> {
         }
     }
 
-    /// An object's solids in its own axes.
+    /// Returns an object's solids in its own axes.
     fn parts(&self, variant: Option<usize>) -> Vec<(Solid, Material)> {
         let Self::Object(o) = self else { return Vec::new() };
         let names = self.variants();
@@ -168,7 +168,7 @@ impl<'a> Mover<'a> {
         parts
     }
 
-    /// The box that it fills at a pose; none for an object without parts.
+    /// Returns its bounding box at a pose; `None` for an object without parts.
     pub fn named_box(&self, pose: Pose) -> Option<NamedBox> {
         let [x, y, z] = pose.position_m;
         let (center, half_size, role) = match self {
@@ -181,7 +181,7 @@ impl<'a> Mover<'a> {
                 let (low, high) = boxes
                     .map(|b| (b.mins, b.maxs))
                     .reduce(|(low, high), (mins, maxs)| (low.min(mins), high.max(maxs)))?;
-                // To the tenth of a millimetre, so that no rounding of the sums shows.
+                // Rounded to 0.1 mm, so that rounding errors of the sums do not appear.
                 let round = |v: f32| (f64::from(v) * 1e4).round() / 1e4;
                 let middle = ((low + high) * 0.5).to_array().map(round);
                 let (s, c) = pose.yaw.sin_cos();

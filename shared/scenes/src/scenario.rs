@@ -1,4 +1,4 @@
-//! A loaded scenario: checked, with its solids and cameras made, ready to be rendered.
+//! A loaded scenario: checked, with its solids and cameras, ready to be rendered.
 
 use std::collections::HashMap;
 use std::hash::{DefaultHasher, Hash, Hasher};
@@ -19,30 +19,30 @@ use crate::movers::{Mover, Pose, movers};
 use crate::scenery::{Body, Scenery, scenery};
 use crate::tracer::{Scene, Setting, ray};
 
-/// A view is `full` from this visible fraction on.
+/// Minimum visible fraction of a `full` view.
 pub const FULL_FRACTION: f64 = 0.75;
-/// A view is `full` from this many visible pixels on (of a picture of 128 x 128; fewer or more in proportion).
+/// Minimum number of visible pixels of a `full` view (in an image of 128 x 128; proportional for other sizes).
 pub const FULL_PIXELS: u32 = 12;
-/// A view is `none` up to this visible fraction.
+/// Maximum visible fraction of a `none` view.
 pub const NONE_FRACTION: f64 = 0.02;
-/// A `none` view's pictures with and without the actor differ by at most this mean, of 255.
+/// Maximum mean difference, of 255, between a `none` view's images with and without the actor.
 pub const NONE_MEAN_DIFFERENCE: f64 = 0.02;
-/// The unbounded picture, in which hidden pixels are counted, reaches this many widths beyond each edge.
+/// Size of the extended image in which hidden pixels are counted: this many widths beyond each edge.
 const BEYOND: i64 = 3;
 
-/// What to work out besides the picture.
+/// Results of a rendering in addition to the image.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Detail {
-    /// Picture, depth and object ids.
+    /// Image, depth and object ids.
     Picture,
-    /// Also how much of the actor is seen; costs one more picture where it is hidden.
+    /// Also the visibility of the actor; needs one more image if the actor is hidden.
     Observability,
 }
 
-/// How to render one view.
+/// Options of rendering a view.
 #[derive(Clone, Copy, Debug)]
 pub struct RenderOptions {
-    /// What to work out.
+    /// Results to compute.
     pub detail: Detail,
 }
 
@@ -52,35 +52,34 @@ impl Default for RenderOptions {
     }
 }
 
-/// How much of the actor a view shows.
+/// Visibility of the actor in a view.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ActorView {
-    /// Visible pixels over the pixels that it would cover in an unbounded picture with nothing in between, 0..=1.
+    /// Ratio of visible pixels to the pixels of the unoccluded actor in an unbounded image, 0..=1.
     pub visible_fraction: f32,
-    /// Visible pixels; where the actor is absent, those its place would have.
+    /// Number of visible pixels; if the actor is absent, of its place.
     pub actor_px: u32,
-    /// The class that follows from them.
+    /// The resulting class of visibility.
     pub observability: Observability,
 }
 
-/// One rendered view.
+/// A rendered view.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Rendering {
-    /// The picture.
+    /// Pixels of the view.
     pub image: Image,
     /// Distance along the ray through each pixel's centre, metres, row-major; infinite for the sky.
     pub depth_m: Vec<f32>,
-    /// What the ray through each pixel's centre meets first: 0 sky, 1 ground, then objects as in
-    /// [`Scenario::object_name`].
+    /// First hit of the ray through each pixel's centre: 0 sky, 1 ground, then objects as in [`Scenario::object_name`].
     pub object_id: Vec<u16>,
-    /// How much of the actor it shows; `None` when not asked for or when nothing in the scenario is dynamic.
+    /// Visibility of the actor; `None` if not requested or if nothing in the scenario is dynamic.
     pub actor: Option<ActorView>,
 }
 
-/// What to write besides pictures.
+/// Files to write in addition to images.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Extras {
-    /// Pictures only.
+    /// Images only.
     #[default]
     None,
     /// Also `depth/` (16-bit PNG, millimetres along the ray, 0 for the sky and beyond 65.535 m) and `masks/` (8-bit
@@ -88,10 +87,10 @@ pub enum Extras {
     DepthAndMasks,
 }
 
-/// Where each mover is; absent ones are `None`.
+/// Poses of all movers; an absent mover is `None`.
 pub(crate) type Placement = Vec<Option<Pose>>;
 
-/// Where a vehicle stands in any state (x, y, yaw), each place once.
+/// Returns the distinct poses (x, y, yaw) of a vehicle over all states.
 fn places(config: &ScenarioConfig, placements: &[Vec<Placement>], name: &str) -> Vec<[f64; 3]> {
     let Some(index) = config.vehicle.iter().position(|v| v.name == name) else { return Vec::new() };
     let mut seen: Vec<[f64; 3]> = Vec::new();
@@ -110,7 +109,7 @@ fn key_of(placement: &Placement) -> PlacementKey {
     placement.iter().map(|p| p.as_ref().map(Pose::key)).collect()
 }
 
-/// A scenario, ready to be rendered.
+/// A scenario that is ready to be rendered.
 pub struct Scenario {
     path: PathBuf,
     config: ScenarioConfig,
@@ -119,7 +118,7 @@ pub struct Scenario {
     obstacles: Obstacles,
     cameras: Vec<ScenarioCamera>,
     info: ScenarioInfo,
-    /// By branch, then timestamp.
+    /// Placements by branch, then time step.
     placements: Vec<Vec<Placement>>,
     actor: Option<Actor>,
     scenes: HashMap<PlacementKey, Scene>,
@@ -131,7 +130,7 @@ impl std::fmt::Debug for Scenario {
     }
 }
 
-/// Turns places in the text into line numbers.
+/// Converts positions in the text to line numbers.
 struct Source<'a> {
     path: &'a Path,
     text: &'a str,
@@ -147,7 +146,7 @@ impl Source<'_> {
         self.error(value.span().start, key, problem)
     }
 
-    /// For keys whose place is not kept: the first line that sets it.
+    /// Returns an error at the first line that sets a key, for keys without a stored position.
     fn error_in(&self, key: &str, problem: impl Into<String>) -> ScenarioError {
         let is_key = |line: &str| {
             line.trim_start()
@@ -168,7 +167,7 @@ impl Scenario {
         Self::parse(path, &text)
     }
 
-    /// As [`Scenario::load`], from text; `path` is only named in errors.
+    /// Reads a scenario from text, as [`Scenario::load`] does; `path` only appears in errors.
     pub fn parse(path: &Path, text: &str) -> Result<Self, ScenarioError> {
         let config: ScenarioConfig = toml::from_str(text)
             .map_err(|source| ScenarioError::Toml { path: path.to_owned(), source: Box::new(source) })?;
@@ -201,7 +200,7 @@ impl Scenario {
         );
         let places = |name: &str| places(&config, &placements, name);
         let cameras = cameras(&config, &obstacles, places).map_err(|key| {
-            source.error_in(key, "too few places for these cameras stand clear of everything; widen their ranges")
+            source.error_in(key, "too few positions for these cameras are free of obstacles; widen their ranges")
         })?;
         if let Some(view) = config.bev_view.as_ref().filter(|v| *v.get_ref() >= cameras.len()) {
             return Err(source.error_at(
@@ -226,23 +225,23 @@ impl Scenario {
         })
     }
 
-    /// The file that it was read from.
+    /// Returns the path of its file.
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// Branches, states, boxes and actions, as they are written into data sets.
+    /// Returns branches, states, boxes and actions, as they are written into datasets.
     pub fn info(&self) -> &ScenarioInfo {
         &self.info
     }
 
-    /// The fixed camera poses, in the order of their view index.
+    /// Returns the fixed camera poses, in the order of their view index.
     pub fn cameras(&self) -> &[ScenarioCamera] {
         &self.cameras
     }
 
-    /// The same scenario with `count` cameras drawn at random from the ranges of its fixed ones, and no bird's-eye view:
-    /// poses that none of the fixed ones is, for an encoder that must not know poses by heart.
+    /// Returns the scenario with `count` random cameras from the ranges of its fixed ones, and without a bird's-eye
+    /// view. The poses differ from all fixed ones, for training an encoder that must not memorise poses.
     pub fn with_free_cameras(mut self, count: usize, seed: u64) -> Result<Self, ScenarioError> {
         let places = |name: &str| places(&self.config, &self.placements, name);
         let cameras = free_cameras(&self.config, &self.obstacles, places, count, seed);
@@ -251,13 +250,13 @@ impl Scenario {
         Ok(self)
     }
 
-    /// Object index of a vehicle or object by name, as it appears in [`Rendering::object_id`].
+    /// Returns the object index of a vehicle or object, as it appears in [`Rendering::object_id`].
     pub fn object_of(&self, name: &str) -> Option<u16> {
         let index = movers(&self.config).position(|m| m.name() == name)?;
         Some(self.scenery.next_object + index as u16)
     }
 
-    /// What an object index stands for: `sky`, `ground`, the name of a vehicle or object, or `static`.
+    /// Returns the name of an object index: `sky`, `ground`, the name of a vehicle or object, or `static`.
     pub fn object_name(&self, object: u16) -> &str {
         match object {
             0 => "sky",
@@ -277,22 +276,22 @@ impl Scenario {
         &self.obstacles
     }
 
-    /// By branch, then timestamp.
+    /// Returns the placements by branch, then time step.
     pub(crate) fn placements(&self) -> &[Vec<Placement>] {
         &self.placements
     }
 
-    /// Where a vehicle stands in any state: x, y, yaw.
+    /// Returns the distinct poses of a vehicle over all states: x, y, yaw.
     pub(crate) fn places_of(&self, vehicle: &str) -> Vec<[f64; 3]> {
         places(&self.config, &self.placements, vehicle)
     }
 
-    /// The picture of a placement that need not be a state's.
+    /// Returns the image of any placement.
     pub(crate) fn picture_of(&self, placement: &Placement, camera: &PinholeCamera) -> Image {
         self.scene(placement).image(&self.setting, camera)
     }
 
-    /// How much of the actor is seen in a placement that differs from a state's in who is not the actor.
+    /// Returns the visibility of the actor in a placement whose other movers differ from the state's.
     pub(crate) fn observability_of(
         &self,
         placement: &Placement,
@@ -303,7 +302,7 @@ impl Scenario {
         Some(self.actor_view(&mut shots, placement, timestamp)?.observability)
     }
 
-    /// Takes one picture from any camera.
+    /// Renders an image from any camera.
     pub fn render(
         &self,
         branch: usize,
@@ -316,7 +315,7 @@ impl Scenario {
         self.render_with(&mut shots, branch, timestamp, options.detail)
     }
 
-    /// Everything, with the movers at a placement.
+    /// Returns the scene with the movers at a placement.
     fn scene(&self, placement: &Placement) -> Scene {
         let (still, moving) = placed(&self.config, &self.scenery, placement);
         Scene::new(self.scenery.bodies.iter().cloned().chain(still).chain(moving).collect())
@@ -349,8 +348,8 @@ impl Scenario {
         })
     }
 
-    /// One ray per pixel centre against the actor alone in an unbounded picture, and against everything.
-    /// `None` when nothing is dynamic.
+    /// Casts a ray per pixel centre at only the actor, in an unbounded image, and at the whole scene. Returns `None` if
+    /// nothing is dynamic.
     fn actor_view(&self, shots: &mut Shots, placement: &Placement, timestamp: usize) -> Option<ActorView> {
         let camera = shots.camera;
         let others = counterparts(placement, &self.placements, self.actor.as_ref(), timestamp);
@@ -384,7 +383,7 @@ impl Scenario {
                     }
                     would_be += 1;
                     if (0..w).contains(&x) && (0..h).contains(&y) {
-                        // In the branch with the actor the first hit is the actor itself, at this very distance.
+                        // In a branch with the actor the first hit is the actor itself, at the same distance.
                         let at = (y * w + x) as usize;
                         visible += u32::from(shot.object_id[at] == object || t < shot.depth_m[at]);
                     }
@@ -408,9 +407,9 @@ impl Scenario {
         Some(ActorView { visible_fraction: fraction as f32, actor_px: visible, observability })
     }
 
-    /// Renders every camera in every state into a posed data set, in parallel. `progress` is told how many pictures
-    /// of how many are done, from any thread, and may stop the work. `transforms.json` is written last, so a stopped
-    /// run is not mistaken for a set; the next one goes on with the cameras that are left.
+    /// Renders every camera in every state into a posed dataset, in parallel. `progress` receives the number of
+    /// finished images and of all images, from any thread, and may stop the work. `transforms.json` is written last, so
+    /// a stopped run is not mistaken for a dataset; the next run continues with the remaining cameras.
     pub fn render_dataset(
         &self,
         out_dir: &Path,
@@ -460,14 +459,14 @@ impl Scenario {
         Ok(())
     }
 
-    /// One line that differs when what is rendered does; the program's version stands for how it is.
+    /// Returns a line that identifies the rendered content; the program's version represents the renderer.
     fn identity(&self, extras: Extras) -> String {
         let mut hasher = DefaultHasher::new();
         format!("{:?}", (&self.config, &self.cameras, extras)).hash(&mut hasher);
         format!("{} {} {:016x}", self.info.name, env!("CARGO_PKG_VERSION"), hasher.finish())
     }
 
-    /// What the transforms file says of one camera's pictures, given what they show of the actor, by timestamp, then branch.
+    /// Returns the records of one camera's images, with the actor's visibility by time step, then branch.
     fn records(
         &self,
         view: usize,
@@ -519,21 +518,21 @@ fn frame_name(branch: usize, timestamp: usize, view: usize) -> String {
     format!("b{branch}_t{timestamp}_v{view:03}.png")
 }
 
-/// A camera whose pictures are all written, and what they show of the actor, by timestamp, then branch.
+/// A camera whose images are all written, with the actor's visibility by time step, then branch.
 #[derive(Serialize, Deserialize)]
 struct ViewNote {
     view: usize,
     actors: Vec<Option<ActorView>>,
 }
 
-/// What a camera sees of one placement.
+/// A camera's image of one placement.
 struct Shot {
     image: Image,
     depth_m: Vec<f32>,
     object_id: Vec<u16>,
 }
 
-/// The pictures that one camera has taken, by placement: states that are alike share one.
+/// The images of one camera by placement: equal states share an image.
 struct Shots<'a> {
     scenario: &'a Scenario,
     camera: &'a PinholeCamera,
@@ -562,7 +561,8 @@ fn mean_difference(a: &Image, b: &Image) -> f64 {
     sum as f64 / a.rgb.len().max(1) as f64
 }
 
-/// Pixels that points can fall into: lowest, and one past the highest. All that is allowed when a point is behind.
+/// Returns the pixel range of projected points: lowest, and one past the highest. It is the maximum range if a point is
+/// behind the camera.
 fn reach(camera: &PinholeCamera, points: impl Iterator<Item = [f64; 3]>) -> ([i64; 2], [i64; 2]) {
     let (mut low, mut high) = ([f64::INFINITY; 2], [f64::NEG_INFINITY; 2]);
     let (mut behind, mut ahead) = (false, false);
@@ -585,7 +585,7 @@ fn reach(camera: &PinholeCamera, points: impl Iterator<Item = [f64; 3]>) -> ([i6
     }
 }
 
-/// The solids of still objects, and those of everything else that is placed.
+/// Returns the solids of static objects and of all placed movers.
 fn placed(config: &ScenarioConfig, scenery: &Scenery, placement: &Placement) -> (Vec<Body>, Vec<Body>) {
     let (mut still, mut moving) = (Vec::new(), Vec::new());
     for (i, (mover, pose)) in movers(config).zip(placement).enumerate() {
@@ -596,16 +596,16 @@ fn placed(config: &ScenarioConfig, scenery: &Scenery, placement: &Placement) -> 
     (still, moving)
 }
 
-/// Who the forecast is about, as indices of movers.
+/// The actor of the forecast and its followers, as indices of movers.
 #[derive(Clone, Debug)]
 struct Actor {
     dynamic: usize,
-    /// Those that are there and gone with it.
+    /// Movers that share the actor's presence.
     followers: Vec<usize>,
 }
 
-/// The same placement with the actor gone, where it is there; with the actor at each place that it has at this
-/// timestamp in other branches, where it is not.
+/// Returns counterparts of a placement: without the actor if it is present; else with the actor at each of its poses in
+/// other branches at this time step.
 fn counterparts(
     own: &Placement,
     placements: &[Vec<Placement>],
@@ -633,7 +633,7 @@ fn counterparts(
     all
 }
 
-/// Puts a mover where its courses say; `replaces` puts it there, and says whether it was there already.
+/// Places a mover by its courses; `replaces` sets the pose and returns whether the mover was already placed.
 fn place(
     source: &Source,
     config: &ScenarioConfig,
@@ -687,7 +687,7 @@ fn place(
 
 type Checked = (Vec<Vec<Placement>>, Option<Actor>, Vec<usize>);
 
-/// Cross-references: names, lengths of courses, at most one dynamic mover.
+/// Checks cross-references: names, lengths of courses, at most one dynamic mover.
 fn check(source: &Source, config: &ScenarioConfig) -> Result<Checked, ScenarioError> {
     if config.branches.is_empty() || config.branches.len() > 64 {
         return Err(source.error_in("branches", format!("{} names; from 1 to 64 are allowed", config.branches.len())));
@@ -742,7 +742,7 @@ fn check(source: &Source, config: &ScenarioConfig) -> Result<Checked, ScenarioEr
         if !dynamic.is_some_and(is_leader) {
             let hint =
                 carff_base::names::hint(leader.get_ref(), movers(config).filter(Mover::dynamic).map(|m| m.name()));
-            let problem = format!("`{}` is no other, dynamic vehicle or object{hint}", leader.get_ref());
+            let problem = format!("`{}` is not another, dynamic vehicle or object{hint}", leader.get_ref());
             return Err(source.error_at(leader, "follows", problem));
         }
         followers.push(m);

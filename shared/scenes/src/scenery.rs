@@ -1,4 +1,4 @@
-//! From the scenario file to solids: buildings, trees, furniture and vehicles made of simple forms.
+//! Converts the scenario file to solids: buildings, trees, furniture and vehicles made of simple shapes.
 
 use carff_base::geometry::OrientedBox;
 use carff_dataset::NamedBox;
@@ -10,7 +10,7 @@ use crate::config::{
 use crate::materials::{Cabin, Facade, Material, Paint};
 use crate::shapes::{Form, Solid, Vec3};
 
-/// A solid, what it is made of, and whose it is.
+/// A solid with its material and object index.
 #[derive(Clone, Debug)]
 pub(crate) struct Body {
     pub solid: Solid,
@@ -24,12 +24,12 @@ pub(crate) const SKY: u16 = 0;
 pub(crate) const GROUND: u16 = 1;
 const FIRST_OBJECT: u16 = 2;
 
-/// Everything that never moves, but for objects.
+/// All static solids, except objects.
 #[derive(Clone, Debug)]
 pub(crate) struct Scenery {
     pub bodies: Vec<Body>,
     pub boxes: Vec<NamedBox>,
-    /// First free object index; mover i is this plus i.
+    /// First free object index; mover i has this index plus i.
     pub next_object: u16,
 }
 
@@ -86,7 +86,7 @@ fn block(min: [f64; 2], max: [f64; 2], low: f64, high: f64) -> (Vec3, Vec3) {
     (center, vec3((max[0] - min[0]) / 2.0, (max[1] - min[1]) / 2.0, (high - low) / 2.0))
 }
 
-/// Returns how far the roof rises above the walls.
+/// Adds a building and returns the height of its roof above the walls.
 fn add_building(bodies: &mut Vec<Body>, b: &BuildingConfig, object: u16) -> f64 {
     let (center, half) = block(b.min, b.max, 0.0, b.height_m);
     let colour = Vec3::from_array(b.colour);
@@ -141,7 +141,7 @@ fn add_tree(bodies: &mut Vec<Body>, tree: &TreeConfig, object: u16, index: usize
     let [x, y] = tree.at.map(|v| v as f32);
     let h = tree.height_m as f32;
     let at = |z: f32| Vec3::new(x, y, z);
-    // A little variety from tree to tree, by index, so that it is the same in every run.
+    // Trees vary slightly by index, so that every run gives the same trees.
     let vary = |n: usize| ((index * 7 + n * 13) % 11) as f32 / 10.0 - 0.5;
     let bark = Material::Mottled { colour: Vec3::new(0.12, 0.075, 0.045), size: 0.3, strength: 0.25 };
     let green = Vec3::new(0.055, 0.14, 0.035) * (1.0 + 0.3 * vary(0)) + Vec3::new(0.02, 0.01, 0.0) * vary(5);
@@ -225,7 +225,7 @@ fn add_prop(bodies: &mut Vec<Body>, prop: &PropConfig, object: u16) {
     }
 }
 
-/// A cuboid with its edges cut off by `c`.
+/// Returns a cuboid with edges cut off by `c`.
 fn chamfered(half: Vec3, c: f32) -> Form {
     let mut planes = Vec::with_capacity(12);
     let unit = std::f32::consts::FRAC_1_SQRT_2;
@@ -240,7 +240,7 @@ fn chamfered(half: Vec3, c: f32) -> Form {
     Form::Cut { half, planes }
 }
 
-/// A cabin: front and rear glass lean inwards by `front` and `rear` metres, the sides by `side`.
+/// Returns a cabin: front and rear glass lean inwards by `front` and `rear` metres, the sides by `side`.
 fn cabin(half: Vec3, front: f32, rear: f32, side: f32) -> Form {
     let mut planes = Vec::with_capacity(8);
     let mut lean = |n: Vec3, through: Vec3| {
@@ -252,7 +252,7 @@ fn cabin(half: Vec3, front: f32, rear: f32, side: f32) -> Form {
     lean(Vec3::new(-height, 0.0, rear), Vec3::new(-half.x, 0.0, -half.z));
     lean(Vec3::new(0.0, height, side), Vec3::new(0.0, half.y, -half.z));
     lean(Vec3::new(0.0, -height, side), Vec3::new(0.0, -half.y, -half.z));
-    // The roof's edges, rounded off.
+    // The rounded edges of the roof.
     lean(Vec3::new(1.0, 0.0, 2.2), Vec3::new(half.x - front - 0.12, 0.0, half.z));
     lean(Vec3::new(-1.0, 0.0, 2.2), Vec3::new(-half.x + rear + 0.12, 0.0, half.z));
     lean(Vec3::new(0.0, 1.0, 1.2), Vec3::new(0.0, half.y - side - 0.1, half.z));
@@ -260,7 +260,7 @@ fn cabin(half: Vec3, front: f32, rear: f32, side: f32) -> Form {
     Form::Cut { half, planes }
 }
 
-/// The solids of a vehicle whose middle stands on the ground at x, y (metres), turned by `yaw` (radians).
+/// Returns the solids of a vehicle whose centre is on the ground at x, y (metres), rotated by `yaw` (radians).
 pub(crate) fn vehicle_bodies(vehicle: &VehicleConfig, [x, y, yaw]: [f64; 3], object: u16) -> Vec<Body> {
     let [l, w, h] = vehicle.size_m.map(|v| v as f32);
     let colour = Vec3::from_array(vehicle.colour);

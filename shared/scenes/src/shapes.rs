@@ -1,22 +1,22 @@
-//! Solids and where rays enter them.
+//! Solids and their intersections with rays.
 //!
-//! The tree that finds which solids a ray may meet is parry's `Bvh`: it is kept up, builds by binned surface area
-//! heuristic, and casts rays best first with a user's own leaf test. Its general shape casts (convex solids and
-//! cylinders by GJK iterations) are slower and less exact than closed formulas, so the leaf tests are ours.
+//! Parry's `Bvh` is the tree that finds candidate solids of a ray. It is maintained, builds by binned surface area
+//! heuristic, and casts rays best first with a custom leaf test. Its general shape casts (convex solids and cylinders
+//! by GJK iterations) are slower and less exact than closed formulas, so this module implements the leaf tests.
 
 use parry3d::bounding_volume::Aabb;
 pub(crate) use parry3d::math::Vector as Vec3;
 
-/// The form of a solid, in its own axes, centred at the origin.
+/// The shape of a solid, in its own axes, centred at the origin.
 #[derive(Clone, Debug)]
 pub(crate) enum Form {
     /// A cuboid, by half extents.
     Cuboid(Vec3),
-    /// A cuboid cut by planes: each keeps what satisfies `normal . p <= offset`.
+    /// A cuboid cut by planes: each keeps the points with `normal . p <= offset`.
     Cut { half: Vec3, planes: Vec<(Vec3, f32)> },
     /// A closed cylinder about axis 0, 1 or 2.
     Cylinder { axis: usize, radius: f32, half_length: f32 },
-    /// A closed cone about Z, with radius `base` at the bottom and none at the top.
+    /// A closed cone about Z, with radius `base` at the bottom and 0 at the top.
     Cone { base: f32, half_height: f32 },
     /// An ellipsoid, by radii.
     Ellipsoid(Vec3),
@@ -24,7 +24,7 @@ pub(crate) enum Form {
     Capsule { radius: f32, half_length: f32 },
 }
 
-/// A form, placed and turned.
+/// A shape with its pose.
 #[derive(Clone, Debug)]
 pub(crate) struct Solid {
     pub form: Form,
@@ -33,7 +33,7 @@ pub(crate) struct Solid {
     axes: [Vec3; 3],
 }
 
-/// Where a ray enters a solid.
+/// Entry point of a ray into a solid.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Entry {
     pub t: f32,
@@ -42,17 +42,17 @@ pub(crate) struct Entry {
 }
 
 impl Solid {
-    /// Turned about the vertical axis.
+    /// Creates a solid that is rotated about the vertical axis.
     pub fn new(form: Form, center: Vec3, yaw: f32) -> Self {
         Self::turned(form, center, turn(yaw, 0.0, 0.0))
     }
 
-    /// Turned so that its own X, Y and Z lie along `axes`.
+    /// Creates a solid whose own X, Y and Z are along `axes`.
     pub fn turned(form: Form, center: Vec3, axes: [Vec3; 3]) -> Self {
         Self { form, center, axes }
     }
 
-    /// The same solid, turned about the world's vertical axis by `yaw` and then moved.
+    /// Returns the solid, rotated about the world's vertical axis by `yaw` and then moved.
     pub fn placed(mut self, origin: Vec3, yaw: f32) -> Self {
         let (s, c) = yaw.sin_cos();
         let about = |p: Vec3| Vec3::new(c * p.x - s * p.y, s * p.x + c * p.y, p.z);
@@ -89,7 +89,7 @@ impl Solid {
         Aabb::new(self.center - half, self.center + half)
     }
 
-    /// Where the ray enters, at 0 < t < `limit`; `None` when it misses or starts inside.
+    /// Returns the entry of a ray at 0 < t < `limit`; `None` if it misses or starts inside.
     pub fn enter(&self, origin: Vec3, direction: Vec3, limit: f32) -> Option<Entry> {
         let o = self.to_local(origin - self.center);
         let d = self.to_local(direction);
@@ -104,8 +104,8 @@ impl Solid {
     }
 }
 
-/// Axes turned about Z by `yaw`, then about their own Y by `pitch` (down for positive ones), then about their own X by
-/// `roll`, radians.
+/// Returns axes rotated about Z by `yaw`, then about their own Y by `pitch` (positive is down), then about their own X
+/// by `roll`, radians.
 pub(crate) fn turn(yaw: f32, pitch: f32, roll: f32) -> [Vec3; 3] {
     let ((sy, cy), (sp, cp), (sr, cr)) = (yaw.sin_cos(), pitch.sin_cos(), roll.sin_cos());
     [
@@ -115,7 +115,7 @@ pub(crate) fn turn(yaw: f32, pitch: f32, roll: f32) -> [Vec3; 3] {
     ]
 }
 
-/// Axes of which the third lies along a unit vector.
+/// Returns axes of which the third is along a unit vector.
 pub(crate) fn upright_along(z: Vec3) -> [Vec3; 3] {
     let helper = if z.z.abs() < 0.9 { Vec3::Z } else { Vec3::X };
     let x = helper.cross(z).normalize();
@@ -274,7 +274,7 @@ mod tests {
         solid.enter(Vec3::new(-10.0, y, z), Vec3::new(1.0, 1e-8, 1e-8), f32::MAX)
     }
 
-    /// Each form is entered where its formula says, with the outward normal there.
+    /// A ray enters each shape at the position of its formula, with the outward normal there.
     #[test]
     fn entries_of_known_solids() {
         let up = 0.5;
@@ -308,8 +308,8 @@ mod tests {
         assert!((along_x(&solid, 0.0, -0.5).unwrap().t - 9.0).abs() < 1e-5);
     }
 
-    /// Yaw turns to the left, pitch down, roll the left side up; axes stay square and right-handed; a solid turned by
-    /// them is entered where its turned faces are, and its bounding box holds its corners.
+    /// Yaw turns left, pitch down, and roll the left side up; axes stay orthogonal and right-handed. A ray enters a
+    /// rotated solid at its rotated faces, and the bounding box contains its corners.
     #[test]
     fn turns_are_about_the_own_axes() {
         let quarter = std::f32::consts::FRAC_PI_2;
@@ -321,14 +321,14 @@ mod tests {
         {
             assert!(near(axes[0].cross(axes[1]), axes[2]) && axes[0].dot(axes[1]).abs() < 1e-6);
         }
-        // A rod of 2 x 0.2 x 0.2 half extents, nose down: it stands upright, 0.2 m wide towards the ray.
+        // A rod of 2 x 0.2 x 0.2 half extents, nose down: it is upright, 0.2 m wide towards the ray.
         let rod = Solid::turned(Form::Cuboid(Vec3::new(2.0, 0.2, 0.2)), Vec3::ZERO, turn(0.0, quarter, 0.0));
         assert!((along_x(&rod, 0.0, 1.9).unwrap().t - 9.8).abs() < 1e-4);
         assert!(along_x(&rod, 0.0, 2.1).is_none());
         assert!((rod.aabb().maxs - Vec3::new(0.2, 0.2, 2.0)).length() < 1e-5);
     }
 
-    /// Turning and moving a solid moves its entry and its bounding box alike.
+    /// Rotating and moving a solid moves its entry and its bounding box equally.
     #[test]
     fn placing_turns_and_moves() {
         let solid = Solid::new(Form::Cuboid(Vec3::new(2.0, 1.0, 0.5)), Vec3::new(3.0, 0.0, 0.0), 0.0)

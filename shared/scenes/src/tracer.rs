@@ -1,6 +1,6 @@
-//! Takes pictures: rays, light, anti-aliasing. Every pixel depends on nothing but the scene and the camera, by fixed
-//! sampling patterns, so pictures are the same bytes whatever the number of threads, and two scenes that differ in a
-//! vehicle give the same bytes wherever neither it nor its shadow is seen.
+//! Renders images: rays, light, anti-aliasing. Every pixel depends only on the scene and the camera, with fixed
+//! sampling patterns. So images are the same bytes for any number of threads, and two scenes that differ in a vehicle
+//! give the same bytes wherever neither it nor its shadow is visible.
 
 use carff_base::geometry::PinholeCamera;
 use carff_dataset::Image;
@@ -14,21 +14,21 @@ use crate::scenery::{Body, GROUND, SKY};
 use crate::shapes::Vec3;
 
 const FAR_M: f32 = 2000.0;
-/// Rays of light start this far off a surface, metres, where things are as large as vehicles.
+/// Offset of light rays from a surface, metres, for objects as large as vehicles.
 const START_M: f32 = 2e-3;
-/// How far sky light is blocked there, metres.
+/// Range of ambient occlusion for such objects, metres.
 const VEHICLE_SHADE_REACH_M: f32 = 1.6;
 const SUN: Vec3 = Vec3::new(1.50, 1.42, 1.27);
 const SKY_LIGHT: Vec3 = Vec3::new(0.50, 0.58, 0.70);
 const BOUNCE: Vec3 = Vec3::new(0.20, 0.20, 0.175);
 const ZENITH: Vec3 = Vec3::new(0.22, 0.40, 0.72);
 const HORIZON: Vec3 = Vec3::new(0.62, 0.74, 0.88);
-/// Samples of a pixel, in the order in which they are taken: the first four are a rotated grid, one a quadrant.
+/// Order of a pixel's samples: the first four are a rotated grid, one per quadrant.
 const ORDER: [usize; 16] = [1, 7, 8, 14, 0, 2, 3, 4, 5, 6, 9, 10, 11, 12, 13, 15];
-/// After four samples of one object whose brightness differs by no more, the pixel is done.
+/// Largest difference in brightness of four samples of one object at which a pixel is finished.
 const FLAT_ENOUGH: f32 = 0.045;
 
-/// A straight strip on the ground, ready to be tested.
+/// A straight strip on the ground, prepared for hit tests.
 #[derive(Clone, Debug)]
 struct Strip {
     from: [f32; 2],
@@ -85,16 +85,16 @@ impl Strip {
     }
 }
 
-/// What lies on z = 0, and the sun: the same in all states of a scenario.
+/// The ground at z = 0 and the sun: equal in all states of a scenario.
 #[derive(Clone, Debug)]
 pub(crate) struct Setting {
     roads: Vec<Strip>,
     markings: Vec<Strip>,
     open: Material,
     sun: Vec3,
-    /// Sky light is blocked by what is nearer than this, metres.
+    /// Range of ambient occlusion, metres.
     shade_reach_m: f32,
-    /// Rays of light start this far off a surface, metres.
+    /// Offset of light rays from a surface, metres.
     start_m: f32,
     /// Directions to 16 points of the sun's disc.
     sun_points: [Vec3; 16],
@@ -109,7 +109,7 @@ impl Setting {
         let (u, v) = tangents(sun);
         let radius = config.sun.radius_deg.to_radians().tan() as f32;
         let sun_points = std::array::from_fn(|i| {
-            // A sunflower: evenly spread over the disc; the permutation spreads the first four samples as well.
+            // A sunflower pattern: evenly spread over the disc; the permutation also spreads the first four samples.
             let n = (SHUFFLE[i] as f32) + 0.5;
             let (r, a) = ((n / 16.0).sqrt() * radius, n * 2.399_963);
             (sun + u * (r * a.cos()) + v * (r * a.sin())).normalize()
@@ -143,25 +143,25 @@ impl Setting {
 /// Pairs sub-pixel i with light sample `SHUFFLE[i]`; those of the first four in [`ORDER`] are spread over the disc.
 const SHUFFLE: [usize; 16] = [5, 2, 12, 9, 15, 7, 0, 6, 10, 3, 13, 1, 8, 11, 14, 4];
 
-/// Two unit vectors that stand square to a unit vector and to each other.
+/// Returns two unit vectors orthogonal to a unit vector and to each other.
 fn tangents(n: Vec3) -> (Vec3, Vec3) {
     let helper = if n.z.abs() < 0.9 { Vec3::Z } else { Vec3::X };
     let u = helper.cross(n).normalize();
     (u, n.cross(u))
 }
 
-/// All solids of one state, ready for rays.
+/// All solids of a state, prepared for rays.
 #[derive(Clone)]
 pub(crate) struct Scene {
     bodies: Vec<Body>,
     tree: Bvh,
 }
 
-/// The first thing that a ray meets.
+/// The first hit of a ray.
 #[derive(Clone, Copy)]
 struct Hit {
     t: f32,
-    /// `None`: the ground.
+    /// Index of the hit body; `None`: the ground.
     body: Option<u32>,
 }
 
@@ -200,7 +200,7 @@ impl Scene {
         }
     }
 
-    /// Distance along a ray to the first solid or the ground, metres, and whose it is.
+    /// Returns the distance along a ray to the first solid or the ground, metres, and its object index.
     pub fn probe(&self, origin: Vec3, direction: Vec3) -> (f32, u16) {
         match self.first_hit(origin, direction) {
             None => (f32::INFINITY, SKY),
@@ -209,7 +209,7 @@ impl Scene {
         }
     }
 
-    /// Linear colour and object along one ray; `sample` picks the sun and sky directions.
+    /// Returns linear colour and object along a ray; `sample` selects the sun and sky directions.
     fn shade(&self, setting: &Setting, origin: Vec3, direction: Vec3, pixel_angle: f32, sample: usize) -> (Vec3, u16) {
         let Some(hit) = self.first_hit(origin, direction) else {
             return (sky(direction), SKY);
@@ -217,13 +217,13 @@ impl Scene {
         let p = origin + direction * hit.t;
         let (surface, normal, object) = match hit.body {
             None => {
-                // The footprint across the line of sight; grazing views stretch it, half of which counts.
+                // The footprint across the line of sight; grazing views stretch it, and half of the stretch counts.
                 let stretch = (1.0 / -direction.z).min(6.0).sqrt();
                 (setting.ground(p, hit.t * pixel_angle * stretch), Vec3::Z, GROUND)
             }
             Some(index) => {
                 let body = &self.bodies[index as usize];
-                // The same test as in the search, hence the same entry.
+                // The test equals that of the search, hence the entry is equal.
                 let local_normal = body.solid.enter(origin, direction, FAR_M).map_or(Vec3::Z, |entry| entry.normal);
                 let local = body.solid.to_local(p - body.solid.center);
                 let stretch = (1.0 / body.solid.to_world(local_normal).dot(direction).abs().max(0.03)).min(6.0).sqrt();
@@ -248,12 +248,12 @@ impl Scene {
                 colour += SUN * (surface.highlight * gleam * 0.35);
             }
         }
-        // Distant things fade into the horizon's colour.
+        // Distant objects fade into the horizon's colour.
         let haze = 1.0 - (-hit.t / 320.0).exp();
         (colour + (HORIZON - colour) * haze, object)
     }
 
-    /// A picture: RGB alone.
+    /// Renders an image with only RGB.
     pub fn image(&self, setting: &Setting, camera: &PinholeCamera) -> Image {
         let (w, h) = (camera.width_px as usize, camera.height_px as usize);
         let mut rgb = vec![0_u8; w * h * 3];
@@ -261,8 +261,8 @@ impl Scene {
         Image { width_px: camera.width_px, height_px: camera.height_px, rgb }
     }
 
-    /// A picture: RGB, depth along the ray through each pixel's centre (metres; infinite for the sky), and whose the
-    /// first hit there is.
+    /// Renders an image with RGB, depth along the ray through each pixel's centre (metres; infinite for the sky), and
+    /// the object index of the first hit there.
     pub fn picture(&self, setting: &Setting, camera: &PinholeCamera) -> (Image, Vec<f32>, Vec<u16>) {
         let (w, h) = (camera.width_px as usize, camera.height_px as usize);
         let mut rgb = vec![0_u8; w * h * 3];
@@ -322,7 +322,8 @@ impl Scene {
     }
 }
 
-/// Origin and direction of a camera's ray; no component is exactly zero, so that slab tests never divide 0 by 0.
+/// Returns origin and direction of a camera's ray; no component is exactly zero, so that slab tests never divide 0 by
+/// 0.
 pub(crate) fn ray(camera: &PinholeCamera, x_px: f64, y_px: f64) -> (Vec3, Vec3) {
     let ray = camera.ray(x_px, y_px);
     let direction = ray.direction.map(|d| if d.abs() < 1e-7 { 1e-7_f32.copysign(d) } else { d });
@@ -334,7 +335,7 @@ fn sky(direction: Vec3) -> Vec3 {
     HORIZON + (ZENITH - HORIZON) * t
 }
 
-/// One of 16 directions about a normal, spread with the cosine law.
+/// Returns one of 16 directions about a normal, with cosine distribution.
 fn sky_direction(normal: Vec3, sample: usize) -> Vec3 {
     let (u, v) = tangents(normal);
     let n = SHUFFLE[(sample * 5 + 3) % 16] as f32 + 0.5;
@@ -342,7 +343,7 @@ fn sky_direction(normal: Vec3, sample: usize) -> Vec3 {
     u * (r * a.cos()) + v * (r * a.sin()) + normal * (1.0 - r * r).max(0.0).sqrt()
 }
 
-/// Linear to sRGB, 0..=1.
+/// Converts linear to sRGB, 0..=1.
 fn encode(c: f32) -> f32 {
     let c = c.clamp(0.0, 1.0);
     if c <= 0.003_130_8 { 12.92 * c } else { 1.055 * c.powf(1.0 / 2.4) - 0.055 }

@@ -1,4 +1,4 @@
-//! Contracts of free drives: smooth, never a pose of a data set, the same whenever asked, and with the truth beside them.
+//! Tests of free drives: smooth motion, new poses, reproducible frames, and correct truth.
 
 #![allow(clippy::unwrap_used)] // The helpers below are parts of tests.
 
@@ -16,7 +16,7 @@ fn shipped(name: &str) -> Scenario {
     Scenario::load(&folder.join(name).with_extension("toml")).unwrap()
 }
 
-/// Distance of the places, metres, and angle between the lines of sight, radians.
+/// Returns the distance of the positions, metres, and the angle between the lines of sight, radians.
 fn apart(a: &PinholeCamera, b: &PinholeCamera) -> (f64, f64) {
     let (p, q) = (a.position_m(), b.position_m());
     let distance = (0..3).map(|i| (p[i] - q[i]).powi(2)).sum::<f64>().sqrt();
@@ -24,8 +24,8 @@ fn apart(a: &PinholeCamera, b: &PinholeCamera) -> (f64, f64) {
     (distance, cosine.clamp(-1.0, 1.0).acos())
 }
 
-/// A frame is named by seed, drive and frame: whatever was rendered before it, it has the same bytes, pose and truth.
-/// Another seed or number is another drive.
+/// Seed, drive and frame determine bytes, pose and truth of a frame, independent of earlier renderings. Another seed or
+/// number gives another drive.
 #[test]
 fn frames_are_named_by_seed_drive_and_frame() {
     let scenario = shipped("approaching-intersection");
@@ -44,8 +44,8 @@ fn frames_are_named_by_seed_drive_and_frame() {
     assert!(error.contains("timestamp 3"), "{error}");
 }
 
-/// From frame to frame a camera moves by little, and it does move; no pose is one of the hundred, nor one that encoders
-/// are trained on; the last frame of each timestamp says so.
+/// A camera moves from frame to frame, but by little. No pose equals one of the hundred fixed poses or a training pose
+/// of the encoder. The last frame of each time step is marked.
 #[test]
 fn poses_are_smooth_and_new() {
     let scenario = shipped("approaching-intersection");
@@ -64,9 +64,9 @@ fn poses_are_smooth_and_new() {
         }
         for pair in frames.windows(2) {
             let (distance_m, angle) = apart(&pair[0].camera, &pair[1].camera);
-            // The ego does 3 m in a timestamp of six frames; sway comes on top.
+            // The ego moves 3 m in a time step of six frames; sway is added.
             assert!(distance_m < 0.75 && angle < 0.05, "drive {number}: {distance_m} m, {angle} rad");
-            assert!(distance_m > 1e-3, "drive {number} stands still");
+            assert!(distance_m > 1e-3, "drive {number} does not move");
         }
         if drive.kind() == DriveKind::Hazard {
             assert_eq!(drive.view_kind(), "dash");
@@ -76,8 +76,8 @@ fn poses_are_smooth_and_new() {
     }
 }
 
-/// Hazard and clear trials alternate; a hazard trial is of a hazard branch and shows nothing of the actor, a clear one is
-/// of the other and shows its whole place: so says the state itself, rendered from the same pose.
+/// Hazard and clear trials alternate. A hazard trial is of a hazard branch and hides the actor completely; a clear
+/// trial is of another branch and shows its whole place. A rendering of the state from the same pose confirms it.
 #[test]
 fn the_truth_is_true() {
     let scenario = shipped("approaching-intersection");
@@ -100,7 +100,7 @@ fn the_truth_is_true() {
     }
 }
 
-/// Every shipped scenario can be driven through; those without hazards have clear trials alone.
+/// Every shipped scenario has free drives; scenarios without hazards only have clear trials.
 #[test]
 fn every_shipped_scenario_can_be_driven() {
     for name in ["hand-reaching", "single-approaching-intersection", "toy", "two-lane-merge"] {

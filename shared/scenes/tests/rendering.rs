@@ -1,4 +1,4 @@
-//! Contracts of scenarios and their pictures: determinism, true geometry, what is hidden, and what mistakes are told.
+//! Tests of scenarios and their images: determinism, geometry, occlusion, and error messages.
 
 #![allow(clippy::unwrap_used)] // The helpers below are parts of tests.
 
@@ -10,8 +10,8 @@ use carff_base::geometry::PinholeCamera;
 use carff_dataset::{Dataset, Observability};
 use carff_scenes::{Detail, Extras, RenderOptions, Scenario, ScenarioError};
 
-/// A block may stand behind a wall that hides half of it from the camera at -Y. Nothing else. The sun stands opposite
-/// the camera, so shadows fall towards it.
+/// A scenario with one block, half of which a wall hides from the camera at -Y. The sun is opposite the camera, so
+/// shadows fall towards it.
 const SMALL: &str = r##"
 name = "small"
 bounds_m = [[-3.0, -3.0, 0.0], [3.0, 3.0, 2.0]]
@@ -73,7 +73,8 @@ fn small() -> Scenario {
     Scenario::parse("small.toml".as_ref(), SMALL).unwrap()
 }
 
-/// Far away on -Y, through a long lens, so that the wall's edge at x = 0 is seen nearly in parallel projection.
+/// Returns a distant camera at -Y with a long lens, so that the projection of the wall's edge at x = 0 is almost
+/// parallel.
 fn front() -> PinholeCamera {
     PinholeCamera::look_at([0.0, -60.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 1.0], 256, 128, 8.0)
 }
@@ -82,7 +83,7 @@ fn in_pool<T: Send>(threads: usize, work: impl FnOnce() -> T + Send) -> T {
     rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap().install(work)
 }
 
-/// The same bytes with one thread and with three, and when asked twice.
+/// One thread, three threads and a second rendering give the same bytes.
 #[test]
 fn same_bytes_whatever_the_threads() {
     let scenario = small();
@@ -94,7 +95,7 @@ fn same_bytes_whatever_the_threads() {
     assert_eq!(one, render());
 }
 
-/// Depth is the distance along the ray: on the ground seen from straight above it is height / cosine, on the block's
+/// Depth is the distance along the ray: on the ground, seen straight from above, it is height / cosine; on the block's
 /// top it is less by the block's height.
 #[test]
 fn depth_agrees_with_the_planes() {
@@ -121,8 +122,8 @@ fn depth_agrees_with_the_planes() {
     assert!(rendering.actor.is_none());
 }
 
-/// A block of which a wall hides the left half is half visible, in both branches alike: where it is absent, its place
-/// counts. From above it is wholly visible.
+/// A block whose left half is behind a wall is half visible, in both branches: if it is absent, its place counts. From
+/// above it is fully visible.
 #[test]
 fn half_hidden_is_one_half() {
     let scenario = small();
@@ -136,11 +137,11 @@ fn half_hidden_is_one_half() {
     assert_eq!((above.visible_fraction, above.observability), (1.0, Observability::Full));
 }
 
-/// What lies outside the picture counts as not visible: a camera that cuts the block's place in two sees half of it.
+/// Parts outside the image count as not visible: a camera that cuts the block's place in two sees half of it.
 #[test]
 fn outside_the_picture_is_not_visible() {
     let scenario = small();
-    // From +Y, where no wall stands; turned aside by half its field of view, so that x = 0 is the picture's edge.
+    // From +Y, without a wall in between; rotated by half its field of view, so that x = 0 is the image's edge.
     let turn = 10.0_f64.to_radians();
     let camera =
         PinholeCamera::look_at([0.0, 40.0, 0.5], [40.0 * turn.tan(), 0.0, 0.5], [0.0, 0.0, 1.0], 256, 128, 20.0);
@@ -148,8 +149,8 @@ fn outside_the_picture_is_not_visible() {
     assert!((actor.visible_fraction - 0.5).abs() < 0.05, "{actor:?}");
 }
 
-/// Behind the wall the actor leaves no trace: the pictures with and without it are the same bytes, and the view is
-/// `none`. It is there, though: from the other side they differ.
+/// Behind the wall the actor leaves no trace: the images with and without it are the same bytes, and the view is
+/// `none`. From the other side the images differ.
 #[test]
 fn hidden_pairs_are_equal() {
     let scenario = small();
@@ -165,8 +166,8 @@ fn hidden_pairs_are_equal() {
     assert_ne!(with.image, without.image);
 }
 
-/// A hidden actor whose shadow is seen is not `none`: its shadow gives it away. With a low sun behind it, the shadow
-/// reaches past the end of the wall.
+/// A hidden actor with a visible shadow is not `none`, because the shadow reveals it. With a low sun behind it, the
+/// shadow reaches past the end of the wall.
 #[test]
 fn a_visible_shadow_is_partial() {
     let low_sun = SMALL
@@ -182,7 +183,7 @@ fn a_visible_shadow_is_partial() {
     assert_eq!(without.actor.unwrap().observability, Observability::Partial);
 }
 
-/// Things look like what they are: the block is red, the marking brighter than the asphalt, the sky blue.
+/// Objects have the right colours: the block is red, the marking is brighter than the asphalt, the sky is blue.
 #[test]
 fn colours_are_plausible() {
     let scenario = small();
@@ -199,8 +200,8 @@ fn colours_are_plausible() {
     assert!(b > r + 20);
 }
 
-/// A rendered set is read back with the scenario's states, candidates and cameras; depth and masks lie beside the
-/// pictures and agree with them. A run that is stopped leaves no set.
+/// A rendered dataset is read back with the scenario's states, candidates and cameras; depth and masks match the
+/// images. A stopped run leaves no dataset.
 #[test]
 fn rendered_sets_are_read() {
     let scenario = small();
@@ -236,8 +237,8 @@ fn rendered_sets_are_read() {
     assert_eq!(scenario.object_name(block), "block");
 }
 
-/// A rendering that was interrupted, even in the middle of a note, goes on with the cameras that are left, and ends with the
-/// same files as one that was not. One of another kind starts anew.
+/// An interrupted rendering, even in the middle of a note, continues with the remaining cameras and ends with the same
+/// files as an uninterrupted one. A rendering of another kind starts again.
 #[test]
 fn an_interrupted_rendering_goes_on() {
     let scenario = small();
@@ -252,7 +253,7 @@ fn an_interrupted_rendering_goes_on() {
         result.map(|()| calls.into_inner())
     };
     assert_eq!(rendered(&straight, Extras::None, usize::MAX).unwrap(), 12);
-    // Three cameras of four pictures: of ten pictures, one camera's are whole.
+    // Three cameras of four images: ten images contain all images of one camera only.
     assert!(rendered(&halting, Extras::None, 10).is_err());
     let notes = halting.join("unfinished.jsonl");
     let whole = std::fs::read_to_string(&notes).unwrap();
@@ -267,7 +268,7 @@ fn an_interrupted_rendering_goes_on() {
         files.sort();
         files.into_iter().map(|f| (f.file_name().unwrap().to_owned(), std::fs::read(f).unwrap())).collect::<Vec<_>>()
     };
-    assert!(files(&straight) == files(&halting), "the sets differ");
+    assert!(files(&straight) == files(&halting), "the datasets differ");
 
     assert!(rendered(&halting, Extras::None, 10).is_err());
     assert_eq!(rendered(&halting, Extras::DepthAndMasks, usize::MAX).unwrap(), 12);
@@ -285,7 +286,7 @@ fn bad_requests() {
     assert_eq!(error, "the camera is not usable: `fl_x` must be finite");
 }
 
-/// Each mistake in a scenario file is told with file, line and key.
+/// Each error in a scenario file is reported with file, line and key.
 #[test]
 fn golden_errors() {
     for (from, to, expected) in [
@@ -341,8 +342,8 @@ fn golden_errors() {
     assert!(error.starts_with("nowhere.toml: "), "{error}");
 }
 
-/// The shipped scenario loads and is what the paper's data set is: two branches, three timestamps, a hundred poses,
-/// one bird's-eye view straight down at 50 that sees every place of actor and ego. No camera stands inside a box.
+/// The shipped scenario matches the paper's dataset: two branches, three time steps, a hundred poses, and one
+/// bird's-eye view straight down at 50 that sees every place of actor and ego. No camera is inside a box.
 #[test]
 fn the_shipped_scenario() {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs/scenarios/approaching-intersection.toml");
@@ -377,8 +378,8 @@ fn shipped(name: &str) -> Scenario {
     Scenario::load(&folder.join(name).with_extension("toml")).unwrap()
 }
 
-/// Every shipped scenario has a training and a graph file of its name, a hundred poses of which none is inside a box, and
-/// a bird's-eye view straight down that sees the middle of every box that moves.
+/// Every shipped scenario has a training and a graph file of its name, a hundred poses outside all boxes, and a
+/// bird's-eye view straight down that sees the centre of every moving box.
 #[test]
 fn every_shipped_scenario_is_whole() {
     let configs = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs");
@@ -414,7 +415,7 @@ fn every_shipped_scenario_is_whole() {
     assert_eq!(names, expected);
 }
 
-/// Each scenario has views of the first timestamp that show the actor fully, and views that show nothing of it.
+/// Each scenario has views of the first time step that show the actor fully, and views that hide it completely.
 #[test]
 fn every_shipped_scenario_has_seeing_and_blind_views() {
     for name in
@@ -432,8 +433,8 @@ fn every_shipped_scenario_has_seeing_and_blind_views() {
     }
 }
 
-/// Where a course of events is not decided yet at the first timestamp, both branches are one state and one picture
-/// there, and two afterwards.
+/// If a branch is undecided at the first time step, both branches are one state and one image there, and two
+/// afterwards.
 #[test]
 fn undecided_first_timestamps_look_the_same() {
     for name in ["two-lane-merge", "toy", "hand-reaching"] {
@@ -455,8 +456,8 @@ fn undecided_first_timestamps_look_the_same() {
     }
 }
 
-/// An object is made of its parts, those of its variant alone, wherever its course puts it; what follows the actor is
-/// gone with it; an object without a course is a static box.
+/// An object consists of its parts and those of its current variant, at the pose of its course. A follower shares the
+/// actor's presence. An object without a course is a static box.
 #[test]
 fn objects_are_data() {
     let text = r##"
@@ -535,7 +536,7 @@ spread_m = 0.0
     assert!(info.states[2].boxes.is_empty());
     assert_eq!(info.static_boxes.iter().map(|b| b.name.as_str()).collect::<Vec<_>>(), ["post"]);
 
-    // From -X the side -X is seen, green; the capsule stands on it; 90 degrees to the left, the side +Y, blue.
+    // From -X the side -X is visible, green, with the capsule on top; 90 degrees to the left, the side +Y, blue.
     let camera = PinholeCamera::look_at([-3.0, 0.0, 0.3], [0.0, 0.0, 0.3], [0.0, 0.0, 1.0], 64, 64, 20.0);
     let picture = |t: usize| scenario.render(0, t, &camera, &RenderOptions::default()).unwrap();
     let below = |image: &carff_dataset::Image, z: f64| image.pixel(32, (32.0 - (z - 0.3) * 60.5) as u32).unwrap();
@@ -547,7 +548,7 @@ spread_m = 0.0
     let [r, g, b] = below(&picture(1).image, 0.22);
     assert!(b > 60 && r < b / 2 && g < b / 2, "{r} {g} {b}");
 
-    // A view that sees the tail alone is not blind: the dice's picture without the actor lacks the tail too.
+    // A view that only sees the tail is not blind: the image without the actor lacks the tail too.
     let tail_alone = PinholeCamera::look_at([-0.4, 0.0, 1.0], [-0.4, 0.0, 0.0], [0.0, 1.0, 0.0], 64, 64, 15.0);
     let view = scenario.render(0, 0, &tail_alone, &RenderOptions::default()).unwrap();
     assert_eq!(view.actor.unwrap().actor_px, 0);
@@ -556,7 +557,7 @@ spread_m = 0.0
     for (from, to, expected) in [
         ("variants = [\"tall\", \"tall\"]", "variants = [\"tall\", \"wide\"]", "no part has the variant `wide`"),
         ("variants = [\"tall\", \"tall\"]", "variants = [\"tall\"]", "1 variants; one for each of the 2 timestamps"),
-        ("follows = \"dice\"", "follows = \"post\"", "key `follows`: `post` is no other, dynamic"),
+        ("follows = \"dice\"", "follows = \"post\"", "key `follows`: `post` is not another, dynamic"),
         ("name = \"post\"", "name = \"tail\"", "`tail` is named twice"),
         ("size_m = [0.1, 0.1, 0.1]", "size_m = [0.1, 0.0, 0.1]", "0.001 to 10000 is allowed"),
     ] {

@@ -1,8 +1,8 @@
-//! What a process counts of its own traffic.
+//! Counters of a process's own messages.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
-/// Counts over all ports of one [`crate::Node`], since it was opened.
+/// Counters over all ports of one [`crate::Node`], since it was opened.
 #[derive(Debug, Default)]
 pub struct Counters {
     received: AtomicU64,
@@ -12,22 +12,22 @@ pub struct Counters {
 }
 
 impl Counters {
-    /// Valid messages received.
+    /// Returns the number of valid messages received.
     pub fn received(&self) -> u64 {
         self.received.load(Ordering::Relaxed)
     }
 
-    /// Messages sent.
+    /// Returns the number of messages sent.
     pub fn published(&self) -> u64 {
         self.published.load(Ordering::Relaxed)
     }
 
-    /// Messages passed over because a newer one was there.
+    /// Returns the number of messages skipped in favour of newer ones.
     pub fn skipped(&self) -> u64 {
         self.skipped.load(Ordering::Relaxed)
     }
 
-    /// Messages dropped because they were not valid.
+    /// Returns the number of messages dropped because they were invalid.
     pub fn invalid(&self) -> u64 {
         self.invalid.load(Ordering::Relaxed)
     }
@@ -44,7 +44,7 @@ impl Counters {
         self.skipped.fetch_add(1, Ordering::Relaxed);
     }
 
-    /// Returns how many there are now.
+    /// Counts an invalid message and returns the new count.
     pub(crate) fn count_invalid(&self) -> u64 {
         self.invalid.fetch_add(1, Ordering::Relaxed) + 1
     }

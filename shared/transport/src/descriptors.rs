@@ -1,11 +1,11 @@
-//! The one place that turns iceoryx2's file descriptors into borrowed ones.
+//! Borrows iceoryx2's file descriptors.
 
 use crate::Service;
 use iceoryx2::port::listener::Listener;
 use iceoryx2::prelude::FileDescriptorBased;
 use std::os::fd::BorrowedFd;
 
-/// The descriptor that becomes readable when the listener is notified.
+/// Returns the descriptor that becomes readable when the listener is notified.
 pub(crate) fn of_listener(listener: &Listener<Service>) -> BorrowedFd<'_> {
     // SAFETY: the raw number is only used to borrow it on the next line; nothing closes or owns it here.
     let raw = unsafe { listener.file_descriptor().native_handle() };

@@ -1,149 +1,149 @@
-//! One flat error for each operation.
+//! Errors: one type per operation.
 
 use carff_messages::Invalid;
 use std::path::PathBuf;
 
-/// Why a name cannot be a run's.
+/// Reason why a name is not valid for a run.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("`{name}` is not a run name: give 1 to 24 characters out of a-z, A-Z, 0-9, `-` and `_`")]
+#[error("`{name}` is not a run name: use 1 to 24 characters from a-z, A-Z, 0-9, `-` and `_`")]
 pub struct RunNameError {
-    /// What was given.
+    /// The invalid name.
     pub name: String,
 }
 
-/// Why a node or a port could not be opened.
+/// Reason why a node or a port could not be opened.
 #[derive(Debug, thiserror::Error)]
 pub enum OpenError {
     /// A folder that shared memory needs is missing or not writable.
     #[error("{path} is not writable ({source}): shared memory between the stages needs it; check its owner and mode")]
     NotWritable {
-        /// Which folder.
+        /// Path of the folder.
         path: PathBuf,
-        /// What the system said.
+        /// Error of the system.
         source: std::io::Error,
     },
-    /// Not enough room. Going on would end in SIGBUS.
+    /// Shared memory has not enough free space. Continuing would end in SIGBUS.
     #[error(
-        "{path} has {free_bytes} bytes free and {needed_bytes} are needed for {what}: free some, or make it larger \
+        "{path} has {free_bytes} bytes free and {needed_bytes} are needed for {what}: free some space, or enlarge it \
          (a container has 64 MB by default: start it with --shm-size=256m)"
     )]
     SharedMemoryFull {
-        /// Which folder.
+        /// Path of the folder.
         path: PathBuf,
-        /// For what.
+        /// Purpose of the memory.
         what: String,
-        /// Bytes needed.
+        /// Number of bytes needed.
         needed_bytes: u64,
-        /// Bytes free.
+        /// Number of bytes free.
         free_bytes: u64,
     },
     /// The node could not be created.
-    #[error("cannot join run `{run}`: {cause}; if its folder {path} belongs to another user, take another run name")]
+    #[error("cannot join run `{run}`: {cause}; if its folder {path} belongs to another user, use another run name")]
     Node {
-        /// The run.
+        /// Name of the run.
         run: String,
-        /// The run's folder.
+        /// Path of the run's folder.
         path: PathBuf,
-        /// What iceoryx2 said.
+        /// Error of iceoryx2.
         cause: String,
     },
     /// Another process already has the topic open with other types or limits.
-    #[error("topic `{topic}` exists with another layout or other limits ({cause}): stop the older build that runs")]
+    #[error("topic `{topic}` exists with another layout or other limits ({cause}): stop the other build's processes")]
     Incompatible {
-        /// The topic.
+        /// Name of the topic.
         topic: String,
-        /// What iceoryx2 said.
+        /// Error of iceoryx2.
         cause: String,
     },
-    /// All slots of the topic are taken.
-    #[error("all {max} {what} of topic `{topic}` are taken: stop a probe or a viewer, or another publisher of it")]
+    /// All slots of the topic are in use.
+    #[error("all {max} {what} of topic `{topic}` are in use: stop a probe or a viewer, or another publisher of it")]
     TooMany {
-        /// The topic.
+        /// Name of the topic.
         topic: String,
-        /// What there are too many of.
+        /// Kind of slot.
         what: &'static str,
-        /// How many there can be.
+        /// Number of slots.
         max: usize,
     },
-    /// Anything else.
+    /// Any other error.
     #[error("cannot open topic `{topic}`: {cause}")]
     Topic {
-        /// The topic.
+        /// Name of the topic.
         topic: String,
-        /// What iceoryx2 said.
+        /// Error of iceoryx2.
         cause: String,
     },
 }
 
-/// Why a message was not sent.
+/// Reason why a message was not sent.
 #[derive(Debug, thiserror::Error)]
 pub enum SendError {
-    /// The sender built a message that its receivers would drop.
+    /// The sender built an invalid message, which receivers would drop.
     #[error("refused to send an invalid message on `{topic}`: {source}")]
     Invalid {
-        /// The topic.
+        /// Name of the topic.
         topic: String,
-        /// Which field.
+        /// The invalid field.
         source: Invalid,
     },
-    /// The slice is longer than what the publisher was opened for, or has another size than its description says.
-    #[error("a picture of {found} bytes on `{topic}`, which was opened for at most {max}")]
+    /// The image exceeds the publisher's limit, or its size does not match its description.
+    #[error("an image of {found} bytes on `{topic}`, which was opened for at most {max}")]
     Size {
-        /// The topic.
+        /// Name of the topic.
         topic: String,
-        /// Bytes asked for.
+        /// Number of bytes of the image.
         found: usize,
-        /// Bytes possible.
+        /// Maximum number of bytes.
         max: usize,
     },
-    /// No memory to write into, or the connection is broken.
+    /// No memory is available, or the connection is broken.
     #[error("cannot send on `{topic}`: {cause}")]
     Failed {
-        /// The topic.
+        /// Name of the topic.
         topic: String,
-        /// What iceoryx2 said.
+        /// Error of iceoryx2.
         cause: String,
     },
 }
 
-/// Why receiving failed. A message that is not valid is no error: it is dropped and counted.
+/// Reason why receiving failed. An invalid message is not an error: it is dropped and counted.
 #[derive(Debug, thiserror::Error)]
 #[error("cannot receive on `{topic}`: {cause}")]
 pub struct ReceiveError {
-    /// The topic.
+    /// Name of the topic.
     pub topic: String,
-    /// What iceoryx2 said.
+    /// Error of iceoryx2.
     pub cause: String,
 }
 
-/// Why waiting failed.
+/// Reason why waiting failed.
 #[derive(Debug, thiserror::Error)]
 pub enum WaitError {
-    /// The system refused to wait.
+    /// The system reported an error.
     #[error("cannot wait for input: {0}")]
     Poll(#[from] std::io::Error),
-    /// An input failed.
+    /// Receiving from an input failed.
     #[error(transparent)]
     Receive(#[from] ReceiveError),
 }
 
-/// Why cleaning up failed.
+/// Reason why cleaning up failed.
 #[derive(Debug, thiserror::Error)]
 pub enum CleanupError {
     /// A file could not be listed or removed.
     #[error("cannot remove {path} ({source}): remove it by hand")]
     Remove {
-        /// Which file.
+        /// Path of the file.
         path: PathBuf,
-        /// What the system said.
+        /// Error of the system.
         source: std::io::Error,
     },
     /// The run's nodes could not be listed.
     #[error("cannot list the processes of run `{run}`: {cause}")]
     List {
-        /// The run.
+        /// Name of the run.
         run: String,
-        /// What iceoryx2 said.
+        /// Error of iceoryx2.
         cause: String,
     },
 }

@@ -1,4 +1,4 @@
-//! The present users of each topic, as the transport knows them.
+//! The current users of each topic, as the transport reports them.
 
 use crate::payload::Payload;
 use crate::{Node, OpenError, Service, Topic};
@@ -12,37 +12,37 @@ use std::collections::BTreeMap;
 /// A process that has joined the run.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Member {
-    /// The name that it joined under.
+    /// Name under which it joined.
     pub name: String,
-    /// Its process id.
+    /// Process id of the process.
     pub pid: u32,
 }
 
-/// A topic that some process has open.
+/// A topic that a process has open.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct OpenTopic {
     /// Name within the run.
     pub name: String,
-    /// Name of the message's type; for images, of the type that describes them.
+    /// Name of the message type; for images, of the type that describes them.
     pub message: String,
-    /// The processes that have it open.
+    /// Processes with the topic open.
     pub members: Vec<Member>,
 }
 
-/// The ports on a topic.
+/// The ports of a topic.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Ports {
-    /// Publishers.
+    /// Processes that publish.
     pub publishers: Vec<Member>,
-    /// Subscribers.
+    /// Processes that subscribe.
     pub subscribers: Vec<Member>,
 }
 
-/// By the number that ports name their node with.
+/// Members by the node number that ports contain.
 type Members = BTreeMap<u128, Member>;
 
 impl Node {
-    /// The living processes of the run, this one among them.
+    /// Returns the living processes of the run, including this one.
     pub fn members(&self) -> Result<Vec<Member>, OpenError> {
         Ok(self.members_by_id()?.into_values().collect())
     }
@@ -62,7 +62,7 @@ impl Node {
         Ok(members)
     }
 
-    /// All topics that are open in the run, whatever their messages are, by name.
+    /// Returns all open topics of the run by name, with any message type.
     pub fn open_topics(&self) -> Result<Vec<OpenTopic>, OpenError> {
         let members = self.members_by_id()?;
         let mut topics = Vec::new();
@@ -83,7 +83,7 @@ impl Node {
         Ok(topics)
     }
 
-    /// The ports on a topic; none when no process has it open.
+    /// Returns the ports of a topic; empty if no process has it open.
     pub fn ports<P: Payload>(&self, topic: &Topic<P>) -> Result<Ports, OpenError> {
         let members = self.members_by_id()?;
         // Opening fails when no process has the topic open.

@@ -1,6 +1,6 @@
 //! The typed layer over iceoryx2: topics with their limits, sending, receiving, waiting, and cleaning up.
 //!
-//! `carff-messages` holds the messages and their meaning; the stages hold what is done with them.
+//! `carff-messages` defines the messages; the stages process them.
 //!
 //! A process opens one [`Node`] in a [`Run`]. Every topic is one row of the table in [`topics`]. Sending stamps the
 //! header and wakes the receivers that wait. Receiving drops and counts invalid messages, and gives access to valid ones

@@ -18,7 +18,7 @@ use std::os::unix::fs::{DirBuilderExt, MetadataExt, PermissionsExt};
 use std::path::Path;
 use std::sync::Arc;
 
-/// A process's membership in a run. Open one for each process; all its ports count into its [`Counters`].
+/// A process's membership in a run. Open one per process; all its ports share its [`Counters`].
 #[derive(Debug)]
 pub struct Node {
     inner: iceoryx2::node::Node<Service>,
@@ -27,7 +27,7 @@ pub struct Node {
 }
 
 impl Node {
-    /// Joins a run under a name that others see, and cleans up what dead processes of this run left.
+    /// Joins a run under a visible name, and cleans up after dead processes of this run.
     pub fn open(run: &Run, name: &str) -> Result<Self, OpenError> {
         log::quiet();
         make_private_dir(&crate::runtime_dir())?;
@@ -49,17 +49,17 @@ impl Node {
         &self.inner
     }
 
-    /// The run.
+    /// Returns the run.
     pub fn run(&self) -> &Run {
         &self.run
     }
 
-    /// What all ports of this node have counted.
+    /// Returns the counters of all ports of this node.
     pub fn counters(&self) -> &Arc<Counters> {
         &self.counters
     }
 
-    /// Removes what dead processes of this run left behind. Returns how many were cleaned up.
+    /// Removes leftovers of dead processes of this run. Returns the number of processes.
     pub fn cleanup_dead(&self) -> u64 {
         self.inner.blocking_cleanup_dead_nodes(CLEANUP_PATIENCE).cleanups
     }
@@ -173,11 +173,11 @@ fn too_many(topic: &str, what: &'static str, max: usize) -> OpenError {
     OpenError::TooMany { topic: topic.to_owned(), what, max }
 }
 
-/// Takes away what iceoryx2 (0.10) leaves open to all users in shared memory: the counter of a run's nodes. All else it
-/// makes for this user alone.
+/// Restricts the permissions of the counter of a run's nodes in shared memory, which iceoryx2 (0.10) leaves open to all
+/// users. It creates all other files for this user only.
 fn close_to_others(run: &Run) -> std::io::Result<()> {
     for path in run.shared_memory_files()? {
-        // What has gone meanwhile is open to nobody.
+        // A file that has been removed meanwhile is not accessible.
         let Ok(found) = std::fs::symlink_metadata(&path) else { continue };
         if found.is_file() && found.uid() == rustix::process::getuid().as_raw() && !matches!(found.mode() & 0o077, 0) {
             match std::fs::set_permissions(&path, Permissions::from_mode(0o600)) {
@@ -189,8 +189,8 @@ fn close_to_others(run: &Run) -> std::io::Result<()> {
     Ok(())
 }
 
-/// Makes a folder that only this user can enter, or checks that it is one: a folder (no link to one) of this user, which
-/// nobody else may enter from then on. In a folder that all may write to, somebody else may have made one of that name.
+/// Creates a folder that only this user can enter. An existing folder (not a link) of this user is restricted. In a
+/// folder that all users may write to, another user may have created one of that name, which is an error.
 pub fn make_private_dir(path: &Path) -> Result<(), OpenError> {
     let not_writable = |source| OpenError::NotWritable { path: path.to_owned(), source };
     match std::fs::DirBuilder::new().mode(0o700).create(path) {
@@ -213,8 +213,8 @@ pub fn make_private_dir(path: &Path) -> Result<(), OpenError> {
 mod tests {
     use super::*;
 
-    /// A private folder is made, or taken over from this user and closed to others; a link to one is refused, and so is
-    /// another user's, where this test may make one.
+    /// A private folder is created, or an existing folder of this user is restricted. A link is refused, and so is
+    /// another user's folder, if this test may create one.
     #[test]
     fn private_folders_are_this_users() {
         let base = std::env::temp_dir().join(format!("carff-private-{}", std::process::id()));

@@ -49,7 +49,7 @@ pub trait Payload: Debug + 'static {
     #[doc(hidden)]
     fn message(sample: &Sample<Service, Self::Body, Self::UserHeader>) -> &Self::Message;
 
-    /// The bytes of an image; none of a message by itself.
+    /// Returns the bytes of an image; empty for a message by itself.
     #[doc(hidden)]
     fn bytes(sample: &Sample<Service, Self::Body, Self::UserHeader>) -> &[u8];
 
@@ -59,7 +59,7 @@ pub trait Payload: Debug + 'static {
     where
         Self: Sized;
 
-    /// Checks that a valid message describes an image of so many bytes; 0 for a message by itself.
+    /// Checks that the number of bytes matches the description; 0 for a message by itself.
     #[doc(hidden)]
     fn check_size(message: &Self::Message, bytes: usize) -> Result<(), Invalid>;
 }

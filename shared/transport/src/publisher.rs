@@ -42,8 +42,8 @@ impl<P: Payload> Publisher<P> {
         message.validate().map_err(|source| self.invalid(source))
     }
 
-    /// Counts and wakes. A listener that cannot be woken (dead, or stopped with a full socket) does not stop the sender:
-    /// it finds the message at its next look.
+    /// Counts the message and wakes receivers. A listener that cannot be woken (dead, or stopped with a full socket)
+    /// does not stop the sender; it finds the message at its next check.
     fn sent(&mut self) {
         self.sequence += 1;
         self.counters.count_published();
@@ -72,7 +72,7 @@ impl<M: Message> Publisher<M> {
         self.send_unchecked(message)
     }
 
-    /// Sends without stamp or validation: for replay, and for tests that inject faults.
+    /// Sends without stamping or validation: for replay, and for tests that inject faults.
     pub fn send_unchecked(&mut self, message: M) -> Result<(), SendError> {
         let sample = self.port.loan_uninit().map_err(|e| self.failed(&e))?;
         sample.write_payload(message).send().map_err(|e| self.failed(&e))?;
@@ -81,19 +81,19 @@ impl<M: Message> Publisher<M> {
     }
 }
 
-/// Memory of the publisher that an image is written into, and then sent from.
+/// Memory of the publisher that an image is written into and sent from.
 #[derive(Debug)]
 pub struct ImageLoan<M: ImageMeta> {
     sample: SampleMut<Service, [u8], M>,
 }
 
 impl<M: ImageMeta> ImageLoan<M> {
-    /// The image's bytes, zero at first.
+    /// Returns the image's bytes, initially zero.
     pub fn bytes_mut(&mut self) -> &mut [u8] {
         self.sample.payload_mut()
     }
 
-    /// The image as (height, width, channel); `None` where the loan has another number of bytes.
+    /// Returns the image as (height, width, channel); `None` if the size does not match the loan.
     pub fn image_mut(&mut self, width_px: u32, height_px: u32) -> Option<ArrayViewMut3<'_, u8>> {
         let shape = (height_px as usize, width_px as usize, 3);
         ArrayViewMut3::from_shape(shape, self.sample.payload_mut()).ok()
@@ -133,7 +133,7 @@ impl<M: ImageMeta> Publisher<Image<M>> {
         self.send_image(self.copy(bytes)?, meta)
     }
 
-    /// Sends without stamp or validation: for replay, and for tests that inject faults.
+    /// Sends without stamping or validation: for replay, and for tests that inject faults.
     pub fn send_image_unchecked(&mut self, mut loan: ImageLoan<M>, meta: M) -> Result<(), SendError> {
         *loan.sample.user_header_mut() = meta;
         loan.sample.send().map_err(|e| self.failed(&e))?;

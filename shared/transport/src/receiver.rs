@@ -13,7 +13,7 @@ use std::os::fd::BorrowedFd;
 use std::sync::Arc;
 use std::time::Duration;
 
-/// Most invalid messages that one call drops: a flood of them must not keep a stage from its other work.
+/// Maximum number of invalid messages that one call drops, so that a flood of them cannot block a stage.
 const MAX_DROPS: usize = 64;
 
 /// Receives the messages of one topic.
@@ -23,12 +23,12 @@ pub struct Receiver<P: Payload> {
     deadline: Duration,
     run_id: u64,
     port: Subscriber<Service, P::Body, P::UserHeader>,
-    /// `None` for an input that is polled.
+    /// Listener for wake-ups; `None` for a polled input.
     listener: Option<Listener<Service>>,
     counters: Arc<Counters>,
 }
 
-/// A received message in its sender's memory, which it occupies until it is dropped.
+/// A received message in its sender's memory. The memory stays in use until the sample is dropped.
 #[derive(Debug)]
 pub struct Sample<P: Payload>(iceoryx2::sample::Sample<Service, P::Body, P::UserHeader>);
 
@@ -41,14 +41,14 @@ impl<P: Payload> Deref for Sample<P> {
 }
 
 impl<P: Payload> Sample<P> {
-    /// The bytes of an image; none of a message by itself.
+    /// Returns the bytes of an image; empty for a message by itself.
     pub fn bytes(&self) -> &[u8] {
         P::bytes(&self.0)
     }
 }
 
 impl<M: ImageMeta> Sample<Image<M>> {
-    /// The image as (height, width, channel), borrowed from shared memory.
+    /// Returns the image as (height, width, channel), borrowed from shared memory.
     #[allow(clippy::missing_panics_doc, reason = "an empty view needs no bytes")]
     pub fn image(&self) -> ArrayView3<'_, u8> {
         let [width_px, height_px] = self.size_px().map(|side| side as usize);
@@ -70,15 +70,15 @@ impl<P: Payload> Receiver<P> {
         Self { topic: name, deadline, run_id: run.id(), port, listener: Some(listener), counters }
     }
 
-    /// Stops being woken: senders save the system call, and a wait for this input polls on a core of its own.
+    /// Disables wake-ups: senders save the system call, and a wait for this input polls, which occupies a core.
     #[must_use]
     pub fn polled(mut self) -> Self {
         self.listener = None;
         self
     }
 
-    /// Returns the oldest valid message that waits, if any. After many invalid messages it also returns `None`; the input
-    /// then still has a message, and a wait for it ends at once.
+    /// Returns the oldest waiting valid message. After many invalid messages it also returns `None`; the input then
+    /// still has a message, and the next wait ends at once.
     #[allow(clippy::should_implement_trait, reason = "an iterator would borrow the receiver for a whole loop")]
     pub fn next(&mut self) -> Result<Option<Sample<P>>, ReceiveError> {
         for _ in 0..MAX_DROPS {
@@ -90,12 +90,12 @@ impl<P: Payload> Receiver<P> {
         Ok(None)
     }
 
-    /// Returns the newest valid message that waits, if any, and counts older ones as skipped.
+    /// Returns the newest waiting valid message and counts older ones as skipped.
     pub fn newest(&mut self) -> Result<Option<Sample<P>>, ReceiveError> {
         self.newest_of(|_| ())
     }
 
-    /// Returns the newest valid message that waits, after showing each valid message to `each`, the oldest first.
+    /// Returns the newest waiting valid message, after passing each valid message to `each`, oldest first.
     pub fn newest_of(&mut self, mut each: impl FnMut(&P::Message)) -> Result<Option<Sample<P>>, ReceiveError> {
         let mut newest = None;
         for _ in 0..MAX_DROPS {
@@ -108,18 +108,18 @@ impl<P: Payload> Receiver<P> {
         Ok(newest)
     }
 
-    /// Counts the message, and reports whether it may be used.
+    /// Counts the message and returns whether it is valid.
     fn accepts(&self, sample: &iceoryx2::sample::Sample<Service, P::Body, P::UserHeader>) -> bool {
         let message = P::message(sample);
         let same_run = equals("header.run_id", message.header().run_id, self.run_id);
-        // The size that a message describes only means something once the message is valid.
+        // The size in the description is only meaningful if the message is valid.
         match message.validate().and(same_run).and_then(|()| P::check_size(message, P::bytes(sample).len())) {
             Ok(()) => {
                 self.counters.count_received();
                 true
             }
             Err(error) => {
-                // Each is counted; of a flood, ever fewer are logged.
+                // All are counted; in a flood, fewer and fewer are logged.
                 let count = self.counters.count_invalid();
                 if count <= 8 || count.is_power_of_two() {
                     let publisher = format_args!("{:x}", sample.origin().value());

@@ -1,4 +1,4 @@
-//! Topics whose payload is only known at run time: by name, for probes, recordings and links.
+//! Topics with a payload type that is only known at run time: for probes, recordings and links.
 
 use crate::payload::Payload;
 use crate::{Input, Node, OpenError, Ports, Publisher, ReceiveError, Receiver, Sample, SendError, Topic, topics};
@@ -10,40 +10,41 @@ use std::fmt;
 use std::hash::{Hash, Hasher};
 use std::str::FromStr;
 
-/// A topic of any payload whose message has a JSON form. Every [`Topic`] is one, also that of a user's own stage.
+/// A topic of any payload whose message has a JSON form. Every [`Topic`] implements it, including topics of users'
+/// stages.
 pub trait AnyTopic: fmt::Debug + Sync {
-    /// Name within the run.
+    /// Returns the name within the run.
     fn name(&self) -> &'static str;
 
-    /// Whether its payload is an image.
+    /// Returns true if its payload is an image.
     fn is_image(&self) -> bool;
 
-    /// Name and JSON Schema of its message's form.
+    /// Returns name and JSON Schema of its message's form.
     fn schema(&self) -> (&'static str, Value);
 
     /// Reads a message from the JSON of its form, and takes the bytes of its image, which must have the described size.
     fn read(&self, json: &[u8], bytes: Vec<u8>) -> Result<OwnedMessage, FormError>;
 
-    /// The present publishers and subscribers.
+    /// Returns the current publishers and subscribers.
     fn ports(&self, node: &Node) -> Result<Ports, OpenError>;
 
-    /// Opens the topic to receive from: each message wakes this process, at the cost of a system call to its sender.
+    /// Opens the topic for receiving: each message wakes this process, which costs its sender a system call.
     fn receiver(&self, node: &Node) -> Result<Box<dyn AnyReceiver>, OpenError>;
 
-    /// Opens the topic to poll: its senders wake nobody for it.
+    /// Opens the topic for polling: senders do not wake this process.
     fn polled_receiver(&self, node: &Node) -> Result<Box<dyn AnyReceiver>, OpenError>;
 
-    /// Opens the topic to send on; `max_bytes` is the size of its largest image, and does not matter for messages.
+    /// Opens the topic for sending; `max_bytes` is the size of its largest image, and is ignored for messages.
     fn publisher(&self, node: &Node, max_bytes: usize) -> Result<Box<dyn AnyPublisher>, OpenError>;
 
-    /// Shared memory that a publisher of images of `max_bytes` reserves, bytes.
+    /// Returns the shared memory that a publisher of images of `max_bytes` reserves, bytes.
     #[doc(hidden)]
     fn segment_bytes(&self, max_bytes: usize) -> u64;
 }
 
-/// Sends on a topic of any payload.
+/// A publisher for a topic of any payload.
 pub trait AnyPublisher: fmt::Debug + Send {
-    /// Size of the largest image that it can send, bytes.
+    /// Returns the size of the largest image that it can send, bytes.
     fn max_bytes(&self) -> usize;
 
     /// Stamps, validates and sends a copy of a message. A message of another type than the topic's is an error.
@@ -53,18 +54,18 @@ pub trait AnyPublisher: fmt::Debug + Send {
     fn forward(&mut self, message: AnyMessage<'_>) -> Result<(), SendError>;
 }
 
-/// Receives from a topic of any payload.
+/// A receiver for a topic of any payload.
 pub trait AnyReceiver: Input + fmt::Debug + Send {
-    /// Returns the oldest valid message that waits, if any.
+    /// Returns the oldest waiting valid message.
     fn next(&mut self) -> Result<Option<Box<dyn Received>>, ReceiveError>;
 
-    /// The same receiver, as a wait takes it.
+    /// Returns the receiver as an input for a wait.
     fn as_input(&self) -> &dyn Input;
 }
 
 /// A received message of any type, in its sender's memory.
 pub trait Received: fmt::Debug {
-    /// The message.
+    /// Returns the message.
     fn message(&self) -> AnyMessage<'_>;
 }
 
@@ -154,19 +155,19 @@ where
     }
 }
 
-/// A topic by its name. The topics of the graph come first, in the order of a frame's way.
+/// A topic by its name. The topics of the graph come first, in the order of the data flow.
 #[derive(Clone, Copy, Debug)]
 pub struct TopicId {
-    /// Place in the graph; larger than all for a topic of a user's own.
+    /// Index in the graph; larger than all others for a user's topic.
     index: usize,
     topic: &'static dyn AnyTopic,
 }
 
-/// A name that no topic has.
+/// Error for an unknown topic name.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("there is no topic `{name}`{}. All: {}", carff_base::names::hint(name, TopicId::all().map(TopicId::name)), all_names())]
 pub struct UnknownTopic {
-    /// The name that was asked for.
+    /// The unknown name.
     pub name: String,
 }
 
@@ -187,30 +188,30 @@ impl TopicId {
     pub const VIEW: Self = Self::of_graph(4);
     /// `controller/action`.
     pub const ACTION: Self = Self::of_graph(5);
-    /// The topics from the camera to the action, in the order of a frame's way.
+    /// The topics from the camera to the action, in the order of the data flow.
     pub const FLOW: [Self; 6] = [Self::FRAME, Self::POSTERIOR, Self::FORECAST, Self::BELIEF, Self::VIEW, Self::ACTION];
 
     const fn of_graph(index: usize) -> Self {
         Self { index, topic: topics::FLOW[index] }
     }
 
-    /// A topic of a user's own.
+    /// Returns the id of a user's own topic.
     pub fn of(topic: &'static dyn AnyTopic) -> Self {
         let known = Self::all().find(|known| known.name() == topic.name());
         known.unwrap_or(Self { index: usize::MAX, topic })
     }
 
-    /// The topic of a stage's heartbeats.
+    /// Returns the topic of a stage's heartbeats.
     pub fn health(stage: Stage) -> Self {
         Self { index: Self::FLOW.len() + stage.code() as usize - 1, topic: topics::health(stage) }
     }
 
-    /// All topics of the graph.
+    /// Returns all topics of the graph.
     pub fn all() -> impl Iterator<Item = Self> {
         Self::FLOW.into_iter().chain(Stage::ALL.into_iter().map(Self::health))
     }
 
-    /// The topic that a stage's results are published on.
+    /// Returns the topic of a stage's results.
     pub fn of_stage(stage: Stage) -> Self {
         match stage {
             Stage::Camera => Self::FRAME,
@@ -222,7 +223,7 @@ impl TopicId {
         }
     }
 
-    /// The name within the run.
+    /// Returns the name within the run.
     pub fn name(self) -> &'static str {
         self.topic.name()
     }
@@ -271,7 +272,7 @@ impl fmt::Display for TopicId {
 impl FromStr for TopicId {
     type Err = UnknownTopic;
 
-    /// Reads a topic's full name, or its last part (`belief`) where that is unique.
+    /// Parses a topic's full name, or its last part (`belief`) if that is unique.
     fn from_str(name: &str) -> Result<Self, UnknownTopic> {
         let last = |topic: &Self| topic.name().rsplit('/').next().unwrap_or_default();
         let by_name = Self::all().find(|t| t.name() == name);
@@ -287,7 +288,7 @@ mod tests {
     use super::*;
     use carff_messages::Posterior;
 
-    /// Every name leads back to its topic, the last part of the data's topics too; a slip is told the nearest.
+    /// Every name maps to its topic, also the last part of data topics; a misspelt name suggests the nearest one.
     #[test]
     fn names_lead_to_topics() {
         for topic in TopicId::all() {
@@ -299,7 +300,7 @@ mod tests {
         assert!(told("health/rendrer").contains("did you mean `health/renderer`?"), "{}", told("health/rendrer"));
     }
 
-    /// Each stage has heartbeats of its own name.
+    /// Each stage has a heartbeat topic with its name.
     #[test]
     fn every_stage_has_its_health_topic() {
         for stage in Stage::ALL {
@@ -307,7 +308,7 @@ mod tests {
         }
     }
 
-    /// A user's own topic is of the same kind as the graph's, and comes after them.
+    /// A user's own topic has the same type as the graph's topics, and comes after them.
     #[test]
     fn a_users_topic_is_a_topic() {
         static OPINION: Topic<Posterior> = Topic::new("second-encoder/posterior", topics::MESSAGES, 500);

@@ -27,7 +27,7 @@ pub(crate) trait Classified: std::error::Error {
     fn failure(&self) -> Failure;
 }
 
-/// Opens or creates a service, repeatedly for a while where another process is just creating or removing it.
+/// Opens or creates a service; retries for a while if another process is creating or removing it.
 pub(crate) fn retry<T, E: Classified>(topic: &str, mut open: impl FnMut() -> Result<T, E>) -> Result<T, OpenError> {
     let start = Instant::now();
     loop {
@@ -51,7 +51,7 @@ impl Classified for PublishSubscribeOpenOrCreateError {
         use PublishSubscribeOpenError as Open;
         match self {
             Self::SystemInFlux
-            // It existed when it was looked for, and was gone when it was opened.
+            // The service existed at the check, and was removed before it was opened.
             | Self::PublishSubscribeOpenError(
                 Open::DoesNotExist | Open::IsMarkedForDestruction | Open::HangsInCreation,
             )

@@ -1,4 +1,4 @@
-//! Namespaces: each run has its own folder and its own prefix in shared memory, so that runs never see each other.
+//! Namespaces: each run has its own folder and prefix in shared memory, so that runs never see each other.
 
 use crate::space::SHARED_MEMORY_DIR;
 use crate::{CleanupError, RunNameError, Service};
@@ -7,17 +7,17 @@ use iceoryx2::prelude::{CallbackProgression, Config, FileName, NodeState, Path a
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-/// Longest run name: with it, the paths of the wake-up sockets stay below the system's limit of 107 bytes.
+/// Maximum length of a run name: longer names would make the paths of wake-up sockets exceed the system's 107 bytes.
 const MAX_NAME_BYTES: usize = 24;
 
-/// How long to wait for another thread or process that is cleaning up too.
+/// Longest wait for another thread or process that is also cleaning up.
 pub(crate) const CLEANUP_PATIENCE: Duration = Duration::from_millis(500);
 
-/// How often the list of nodes is read before it counts as unreadable, and the pause in between.
+/// Number of attempts to read the list of nodes, and the pause in between.
 const LIST_TRIES: u32 = 10;
 const LIST_PAUSE: Duration = Duration::from_millis(2);
 
-/// One run of a graph: its name, which names its files, and its id, which is in every header.
+/// A run of a graph: its name, which is part of its file names, and its id, which is in every header.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Run {
     name: String,
@@ -25,34 +25,34 @@ pub struct Run {
 }
 
 impl Run {
-    /// A run's name and id. All processes of a run must be given the same.
+    /// Creates a run from name and id. All processes of a run must use the same values.
     pub fn new(name: &str, id: u64) -> Result<Self, RunNameError> {
         let fits = (1..=MAX_NAME_BYTES).contains(&name.len())
             && name.bytes().all(|b| b.is_ascii_alphanumeric() || b == b'-' || b == b'_');
         if fits { Ok(Self { name: name.to_owned(), id }) } else { Err(RunNameError { name: name.to_owned() }) }
     }
 
-    /// The name.
+    /// Returns the name.
     pub fn name(&self) -> &str {
         &self.name
     }
 
-    /// The id.
+    /// Returns the id.
     pub fn id(&self) -> u64 {
         self.id
     }
 
-    /// The folder of the run's small files. It exists while the run does.
+    /// Returns the folder of the run's small files. It exists while the run does.
     pub fn folder(&self) -> PathBuf {
         runtime_dir().join(&self.name)
     }
 
-    /// What the names of the run's files in shared memory begin with.
+    /// Returns the prefix of the run's files in shared memory.
     pub fn shared_memory_prefix(&self) -> String {
         format!("carff{:08x}_", fnv1a(self.folder().as_os_str().as_encoded_bytes()) as u32)
     }
 
-    /// The run's files in shared memory, now.
+    /// Returns the run's current files in shared memory.
     pub fn shared_memory_files(&self) -> std::io::Result<Vec<PathBuf>> {
         let prefix = self.shared_memory_prefix();
         let mut files = Vec::new();
@@ -65,11 +65,11 @@ impl Run {
         Ok(files)
     }
 
-    /// Sets memory aside for all of the run's files in shared memory, as large as they are. The system otherwise gives
-    /// each page when it is first written, and ends the writer (SIGBUS) when none is left by then.
+    /// Allocates memory for all of the run's files in shared memory at their full size. Otherwise the system allocates
+    /// each page at its first write, and ends the writer (SIGBUS) if no memory is left.
     pub fn reserve_shared_memory(&self) -> std::io::Result<()> {
         for path in self.shared_memory_files()? {
-            // One that has gone meanwhile needs none, and one that may not be written is another's to care for.
+            // A removed file needs no memory, and another user's file is not this run's.
             let Ok(file) = std::fs::OpenOptions::new().read(true).write(true).open(&path) else { continue };
             let bytes = file.metadata()?.len();
             if bytes > 0 {
@@ -90,20 +90,20 @@ impl Run {
     }
 }
 
-/// The folder that holds the folders of all this user's runs.
+/// Returns the folder of this user's run folders.
 pub fn runtime_dir() -> PathBuf {
     Path::new("/tmp").join(format!("carff-{}", rustix::process::getuid().as_raw()))
 }
 
-/// A run's id from its name and the time of its start.
+/// Returns a run's id from its name and start time.
 pub fn run_id_of(name: &str, start_ns: u64) -> u64 {
     let mut bytes = name.as_bytes().to_vec();
     bytes.extend_from_slice(&start_ns.to_le_bytes());
     fnv1a(&bytes)
 }
 
-/// Removes what dead processes of a living run left behind. Returns how many were cleaned up.
-/// Wait for dead children first: a zombie still counts as alive.
+/// Removes leftovers of dead processes of a living run. Returns the number of processes. Reap dead children first: a
+/// zombie counts as alive.
 pub fn cleanup_dead(run: &Run) -> Result<u32, CleanupError> {
     crate::log::quiet();
     let failed = |cause: String| CleanupError::List { run: run.name.clone(), cause };
@@ -119,7 +119,7 @@ pub fn cleanup_dead(run: &Run) -> Result<u32, CleanupError> {
     Ok(cleaned)
 }
 
-/// The processes of a run that live now.
+/// Returns the living processes of a run.
 pub fn living_processes(run: &Run) -> Result<Vec<u32>, CleanupError> {
     crate::log::quiet();
     let failed = |cause: String| CleanupError::List { run: run.name.clone(), cause };
@@ -131,8 +131,8 @@ pub fn living_processes(run: &Run) -> Result<Vec<u32>, CleanupError> {
     Ok(living.collect())
 }
 
-/// All nodes of a run, the dead among them; none once its folder is gone. iceoryx2 gives up when a file or the folder
-/// vanishes while it reads the list, which is what happens when processes end: then it is read again.
+/// Returns all nodes of a run, including dead ones; empty if its folder does not exist. iceoryx2 fails if a file or the
+/// folder disappears while it reads the list, which happens when processes end: then the list is read again.
 pub(crate) fn nodes(run: &Run, config: &Config) -> Result<Vec<NodeState<Service>>, String> {
     let mut tries = 0;
     loop {
@@ -151,7 +151,7 @@ pub(crate) fn nodes(run: &Run, config: &Config) -> Result<Vec<NodeState<Service>
     }
 }
 
-/// Removes all files of a run. Only for whoever knows that no process of the run lives any more.
+/// Removes all files of a run. Call it only when no process of the run is alive.
 pub fn remove_run_leftovers(run: &Run) -> Result<(), CleanupError> {
     let gone = |path: &Path, result: std::io::Result<()>| match result {
         Err(source) if source.kind() != std::io::ErrorKind::NotFound => {
@@ -167,7 +167,7 @@ pub fn remove_run_leftovers(run: &Run) -> Result<(), CleanupError> {
     gone(&run.folder(), std::fs::remove_dir_all(run.folder()))
 }
 
-/// The FNV-1a hash: stable over builds and machines.
+/// Returns the FNV-1a hash, which is stable over builds and machines.
 fn fnv1a(bytes: &[u8]) -> u64 {
     bytes.iter().fold(0xcbf2_9ce4_8422_2325, |hash, &b| (hash ^ u64::from(b)).wrapping_mul(0x0000_0100_0000_01b3))
 }
@@ -176,7 +176,7 @@ fn fnv1a(bytes: &[u8]) -> u64 {
 mod tests {
     use super::*;
 
-    /// Names that would leave the run's folder or break path limits are refused.
+    /// Names that would leave the run's folder or exceed path limits are refused.
     #[test]
     fn names_are_plain_and_short() {
         for name in ["", "a/b", "..", "a b", "ü", &"x".repeat(25)] {
@@ -185,7 +185,7 @@ mod tests {
         assert!(Run::new(&"x".repeat(24), 0).is_ok());
     }
 
-    /// Two runs differ in folder and prefix; no prefix begins another.
+    /// Two runs differ in folder and prefix; no prefix is the start of another.
     #[test]
     fn runs_are_apart() {
         let (a, b) = (Run::new("run", 0).unwrap(), Run::new("run2", 0).unwrap());

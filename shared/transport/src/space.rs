@@ -1,15 +1,15 @@
-//! Looks whether shared memory has room, since memory promised beyond it ends in SIGBUS.
+//! Checks the free space of shared memory, because writing beyond it ends in SIGBUS.
 
 use crate::OpenError;
 use std::path::Path;
 
-/// Where the system keeps shared memory.
+/// Folder of shared memory.
 pub const SHARED_MEMORY_DIR: &str = "/dev/shm";
 
-/// What the rest of a topic (connections, wake-ups) takes, generously.
+/// Upper bound for the rest of a topic (connections, wake-ups).
 pub(crate) const MANAGEMENT_BYTES: u64 = 1 << 20;
 
-/// Checks that `folder` (usually `/dev/shm`) can be written and has `needed_bytes` free for `what`.
+/// Checks that `folder` (usually `/dev/shm`) is writable and has `needed_bytes` free for `what`.
 pub fn check_space(folder: &Path, what: &str, needed_bytes: u64) -> Result<(), OpenError> {
     let not_writable =
         |source: rustix::io::Errno| OpenError::NotWritable { path: folder.to_owned(), source: source.into() };
@@ -31,7 +31,7 @@ pub fn check_space(folder: &Path, what: &str, needed_bytes: u64) -> Result<(), O
 mod tests {
     use super::*;
 
-    /// Too little room and a missing folder are clear errors that say what to do; enough room is none.
+    /// Too little space and a missing folder are errors with a remedy; enough space is not an error.
     #[test]
     fn says_what_is_wrong() {
         let folder = tempfile::tempdir().unwrap();

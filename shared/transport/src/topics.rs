@@ -1,9 +1,9 @@
 //! The table of the graph's topics: name, payload, limits, deadline.
 //!
-//! Each topic has a publish-subscribe service and an event service of the same name for wake-up. Safe overflow is always
-//! on: a full buffer loses its oldest message, and no subscriber can delay a publisher.
+//! Each topic has a publish-subscribe service, and an event service of the same name for wake-ups. Safe overflow is
+//! always enabled: a full buffer loses its oldest message, and no subscriber can delay a publisher.
 //!
-//! A stage of another crate declares its topics in the same way, of messages made with [`carff_messages::message!`]:
+//! Stages of other crates declare topics in the same way, with message types made by [`carff_messages::message!`]:
 //!
 //! ```
 //! use carff_messages::Posterior;
@@ -21,24 +21,24 @@ use std::time::Duration;
 /// The limits of a topic, fixed when its first user opens it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Limits {
-    /// Subscribers: those of the graph, and spare ones for the launcher, recorder, viewer and probes.
+    /// Maximum number of subscribers: those of the graph, and spare ones for launcher, recorder, viewer and probes.
     pub max_subscribers: usize,
-    /// Publishers: one, and one to replace it while the dead one's slot is being freed.
+    /// Maximum number of publishers: one, and one to replace it while a dead one's slot is being freed.
     pub max_publishers: usize,
-    /// Processes that have the topic open.
+    /// Maximum number of processes that have the topic open.
     pub max_nodes: usize,
-    /// Messages that a late subscriber receives.
+    /// Number of past messages that a late subscriber receives.
     pub history: usize,
-    /// Messages that wait for a slow subscriber before the oldest is lost.
+    /// Number of messages that wait for a slow subscriber before the oldest is lost.
     pub buffer: usize,
-    /// Messages that a subscriber can hold at a time.
+    /// Number of messages that a subscriber can hold at a time.
     pub borrowed: usize,
-    /// Messages that a publisher can write at a time.
+    /// Number of messages that a publisher can write at a time.
     pub loaned: usize,
 }
 
 impl Limits {
-    /// Messages for which a publisher reserves memory.
+    /// Returns the number of messages for which a publisher reserves memory.
     pub(crate) fn preallocated(&self) -> usize {
         self.max_subscribers * (self.buffer + self.borrowed) + self.history + self.loaned
     }
@@ -51,60 +51,60 @@ impl Limits {
 pub struct Topic<P> {
     /// Name within the run.
     pub name: &'static str,
-    /// Limits.
+    /// Limits of the topic.
     pub limits: Limits,
-    /// Time without a message, once the topic has begun, after which its receivers call it stale.
+    /// Time without a message, once the topic has begun, after which its receivers report it as stale.
     pub deadline: Duration,
     payload: PhantomData<fn() -> P>,
 }
 
 impl<P> Topic<P> {
-    /// Returns a topic. Its first user fixes the limits, and all others must have the same.
+    /// Returns a topic. Its first user fixes the limits; all others must use the same.
     pub const fn new(name: &'static str, limits: Limits, deadline_ms: u64) -> Self {
         Self { name, limits, deadline: Duration::from_millis(deadline_ms), payload: PhantomData }
     }
 }
 
 impl<P: Payload> Topic<P> {
-    /// Shared memory that a publisher of images of `max_bytes` (0 for messages) reserves, bytes.
+    /// Returns the shared memory that a publisher of images of `max_bytes` (0 for messages) reserves, bytes.
     pub(crate) fn segment_bytes(&self, max_bytes: usize) -> u64 {
-        /// iceoryx2's own header of each sample, with room to align it.
+        /// Size of iceoryx2's own header of each sample, with alignment.
         const SAMPLE_HEADER_BYTES: usize = 64;
         let sample_bytes = size_of::<P::Message>() + max_bytes + SAMPLE_HEADER_BYTES;
         (self.limits.preallocated() * sample_bytes) as u64
     }
 }
 
-/// Small messages of which some receivers want every one.
+/// Limits of small messages; some receivers need every message.
 pub const MESSAGES: Limits =
     Limits { max_subscribers: 10, max_publishers: 2, max_nodes: 14, history: 0, buffer: 16, borrowed: 3, loaned: 2 };
-/// Images: fewer wait, since they are large and only the newest counts.
+/// Limits of images: only a few wait, because they are large and only the newest counts.
 pub const IMAGES: Limits =
     Limits { max_subscribers: 8, max_publishers: 2, max_nodes: 12, history: 0, buffer: 8, borrowed: 2, loaned: 2 };
-/// Status messages: a late receiver gets the latest one.
+/// Limits of status messages: a late receiver gets the latest one.
 pub const STATUS: Limits = Limits { history: 1, ..MESSAGES };
 
 macro_rules! topics {
     ($($(#[$doc:meta])* $const:ident: $payload:ty = $name:literal, $limits:expr, $deadline_ms:literal;)+) => {
         $($(#[$doc])* pub const $const: Topic<$payload> = Topic::new($name, $limits, $deadline_ms);)+
 
-        /// The topics from the camera to the action, in the order of a frame's way.
+        /// The topics from the camera to the action, in the order of the data flow.
         pub(crate) const FLOW: &[&dyn AnyTopic] = &[$(&$const),+];
     };
 }
 
 topics! {
-    /// Camera to encoder.
+    /// Images from camera to encoder.
     FRAME: Image<FrameMeta> = "camera/frame", IMAGES, 500;
-    /// Encoder to forecaster.
+    /// Posteriors from encoder to forecaster.
     POSTERIOR: Posterior = "encoder/posterior", MESSAGES, 500;
-    /// Forecaster to prober and renderer.
+    /// Forecasts from forecaster to prober and renderer.
     FORECAST: Forecast = "forecaster/forecast", MESSAGES, 500;
-    /// Prober to controller, renderer, and back to the forecaster.
+    /// Beliefs from prober to controller, renderer, and back to the forecaster.
     BELIEF: Belief = "prober/belief", MESSAGES, 500;
-    /// Renderer to viewers, recorder and probes.
+    /// Views from renderer to viewers, recorder and probes.
     VIEW: Image<ViewMeta> = "renderer/view", IMAGES, 5000;
-    /// Controller to the vehicle.
+    /// Actions from controller to vehicle.
     ACTION: Action = "controller/action", STATUS, 200;
 }
 

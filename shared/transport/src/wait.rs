@@ -1,4 +1,4 @@
-//! Sleeping until an input has something, a time, or a stop.
+//! Waits for an input, a time, or a stop.
 
 use crate::{ReceiveError, WaitError, monotonic_now_ns};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
@@ -9,35 +9,35 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-/// Most inputs that one wait can have.
+/// Maximum number of inputs of one wait.
 pub const MAX_INPUTS: usize = 15;
 
-/// Something to wait for: a receiver of either kind.
+/// An input that a waiter can wait for: a receiver of either kind.
 pub trait Input {
-    /// The topic.
+    /// Returns the name of the topic.
     fn topic(&self) -> &'static str;
-    /// How long the topic may be quiet, once it has begun.
+    /// Returns the time that the topic may be quiet, once it has begun.
     fn deadline(&self) -> Duration;
-    /// Whether a message waits, valid or not.
+    /// Returns true if a message is waiting, valid or not.
     fn has_waiting(&self) -> Result<bool, ReceiveError>;
-    /// Forgets the wake-ups so far.
+    /// Clears the wake-ups so far.
     fn clear_wake_ups(&self) -> Result<(), ReceiveError>;
-    /// What becomes readable on a wake-up; `None` when there are none, and waiting is spinning.
+    /// Returns the descriptor that becomes readable on a wake-up; `None` for a polled input.
     fn descriptor(&self) -> Option<BorrowedFd<'_>>;
 }
 
-/// Why a wait ended.
+/// Reason why a wait ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Woken {
     /// An input has a message.
     Input,
-    /// The time has come.
+    /// The deadline has passed.
     Timeout,
-    /// The process shall end.
+    /// The process must end.
     Stopped,
 }
 
-/// Says that the process shall end. Clones share one state.
+/// A stop signal for the process. Clones share one state.
 #[derive(Clone, Debug)]
 pub struct Stop {
     flag: Arc<AtomicBool>,
@@ -46,14 +46,14 @@ pub struct Stop {
 }
 
 impl Stop {
-    /// One that only [`Stop::stop`] triggers.
+    /// Creates a stop that only [`Stop::stop`] triggers.
     pub fn new() -> std::io::Result<Self> {
         let (read, write) = UnixStream::pair()?;
         write.set_nonblocking(true)?;
         Ok(Self { flag: Arc::default(), read: Arc::new(read), write: Arc::new(write) })
     }
 
-    /// One that SIGINT and SIGTERM trigger too, whichever thread they reach.
+    /// Creates a stop that SIGINT and SIGTERM also trigger, in whichever thread they arrive.
     pub fn on_signals() -> std::io::Result<Self> {
         let stop = Self::new()?;
         for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
@@ -63,35 +63,35 @@ impl Stop {
         Ok(stop)
     }
 
-    /// Ends all waits, now and later.
+    /// Ends all current and later waits.
     pub fn stop(&self) {
         self.flag.store(true, Ordering::Release);
-        // It fails only when the socket is full: then it is readable already, which is all that is wanted.
+        // It only fails if the socket is full: then it is already readable, which suffices.
         let _ = (&*self.write).write(&[0]);
     }
 
-    /// Whether it has been triggered.
+    /// Returns true if the stop has been triggered.
     pub fn is_stopped(&self) -> bool {
         self.flag.load(Ordering::Acquire)
     }
 }
 
-/// Looks at polled inputs between two looks at the clock.
+/// Number of checks of polled inputs between two reads of the clock.
 const SPINS: u32 = 64;
 
-/// Waits for inputs: it sleeps, or spins when one of them is polled, which is quicker by some 20 to 60 us.
+/// Waits for inputs: it sleeps, or spins if one of them is polled, which is faster by about 20 to 60 us.
 #[derive(Clone, Debug)]
 pub struct Waiter {
     stop: Stop,
 }
 
 impl Waiter {
-    /// One that a stop ends.
+    /// Creates a waiter that a stop ends.
     pub fn new(stop: Stop) -> Self {
         Self { stop }
     }
 
-    /// What ends it.
+    /// Returns the stop that ends its waits.
     pub fn stop(&self) -> &Stop {
         &self.stop
     }
@@ -101,7 +101,7 @@ impl Waiter {
         self.wait_until(inputs, u64::MAX)
     }
 
-    /// The same, until a time on the monotonic clock at most, nanoseconds.
+    /// Waits as [`Self::wait`] does, at most until a time on the monotonic clock, nanoseconds.
     pub fn wait_until(&self, inputs: &[&dyn Input], deadline_ns: u64) -> Result<Woken, WaitError> {
         if inputs.len() > MAX_INPUTS {
             return Err(std::io::Error::from(std::io::ErrorKind::InvalidInput).into());
@@ -119,7 +119,7 @@ impl Waiter {
             if self.stop.is_stopped() {
                 return Ok(Woken::Stopped);
             }
-            // Clear first, then look: what comes in between wakes the poll below.
+            // Clear first, then check: a message in between wakes the poll below.
             for input in inputs {
                 input.clear_wake_ups()?;
             }
@@ -150,7 +150,7 @@ impl Waiter {
             *slot = PollFd::from_borrowed_fd(descriptor, PollFlags::IN);
         }
         let timeout = Timespec {
-            // A year is as good as for ever, and no kernel refuses it.
+            // A year is long enough, and every kernel accepts it.
             tv_sec: (timeout_ns / 1_000_000_000).min(31_536_000) as i64,
             tv_nsec: (timeout_ns % 1_000_000_000) as i64,
         };

@@ -1,4 +1,4 @@
-//! Sending and receiving within one process.
+//! Tests of sending and receiving within one process.
 
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
@@ -10,7 +10,7 @@ use carff_transport::{
 };
 use common::{TestRun, frame, in_seconds, posterior};
 
-/// Newest wins: of three messages the last is received, and the two before it are counted as skipped.
+/// The newest message wins: of three messages the last is received, and two are counted as skipped.
 #[test]
 fn newest_wins_and_skips_are_counted() {
     let run = TestRun::new();
@@ -28,7 +28,7 @@ fn newest_wins_and_skips_are_counted() {
     assert_eq!((counters.published(), counters.received(), counters.skipped()), (3, 3, 2));
 }
 
-/// A slow reader loses the oldest, the sender never fails, and what is left comes in order.
+/// A slow reader loses the oldest messages, the sender never fails, and the remaining messages arrive in order.
 #[test]
 fn overflow_loses_the_oldest_and_never_stops_the_sender() {
     let run = TestRun::new();
@@ -47,7 +47,8 @@ fn overflow_loses_the_oldest_and_never_stops_the_sender() {
     assert_eq!(got, (sent - buffer..sent).collect::<Vec<_>>());
 }
 
-/// Messages with a NaN, of another schema or of another run are dropped and counted; the valid one after them arrives.
+/// Messages with a NaN, of another schema or of another run are dropped and counted; a valid message after them
+/// arrives.
 #[test]
 fn invalid_messages_are_dropped_and_counted() {
     let run = TestRun::new();
@@ -73,7 +74,7 @@ fn invalid_messages_are_dropped_and_counted() {
     assert_eq!((node.counters().invalid(), node.counters().received()), (3, 1));
 }
 
-/// A picture whose size is not what its description says is refused by the sender and dropped by the receiver.
+/// An image whose size differs from its description is refused by the sender and dropped by the receiver.
 #[test]
 fn pictures_must_have_the_size_they_claim() {
     let run = TestRun::new();
@@ -97,7 +98,7 @@ fn pictures_must_have_the_size_they_claim() {
     assert_eq!(node.counters().invalid(), 1);
 }
 
-/// A wait ends by input, by time and by stop; input that came before the wait counts too.
+/// A wait ends by input, by time and by stop; input from before the wait counts too.
 #[test]
 fn waits_end_for_three_reasons() {
     let run = TestRun::new();
@@ -110,7 +111,7 @@ fn waits_end_for_three_reasons() {
     assert_eq!(waiter.wait_until(&[&posteriors, &beliefs], monotonic_now_ns() + 1_000_000).unwrap(), Woken::Timeout);
     output.send(posterior(0)).unwrap();
     for _ in 0..2 {
-        // Still there until it is received.
+        // The message is still there until it is received.
         assert_eq!(waiter.wait_until(&[&posteriors, &beliefs], in_seconds(30)).unwrap(), Woken::Input);
     }
     assert!(posteriors.newest().unwrap().is_some());
@@ -121,7 +122,7 @@ fn waits_end_for_three_reasons() {
     stopper.join().unwrap();
 }
 
-/// Two runs with the same topics at once do not see each other's messages.
+/// Two simultaneous runs with the same topics do not see each other's messages.
 #[test]
 fn runs_do_not_see_each_other() {
     let (run_a, run_b) = (TestRun::new(), TestRun::new());
@@ -134,7 +135,7 @@ fn runs_do_not_see_each_other() {
     assert_eq!(input_a.newest().unwrap().unwrap().header.frame_id, 5);
 }
 
-/// One more subscriber than the table allows gets an error that names the topic and the limit.
+/// One subscriber too many gets an error that names the topic and the limit.
 #[test]
 fn limits_of_the_table_hold() {
     let run = TestRun::new();
@@ -148,7 +149,7 @@ fn limits_of_the_table_hold() {
     node.receiver(&topics::FRAME).unwrap();
 }
 
-/// A segment that shared memory has no room for is refused with an error before it is made.
+/// A segment that does not fit into shared memory is refused before it is created.
 #[test]
 fn an_oversized_segment_is_refused_before_it_is_made() {
     let run = TestRun::new();
@@ -158,7 +159,7 @@ fn an_oversized_segment_is_refused_before_it_is_made() {
     assert!(error.to_string().contains("camera/frame"), "{error}");
 }
 
-/// A node that closes leaves nothing of its topics in shared memory, and nothing at all after the final sweep.
+/// A closed node leaves no topic in shared memory, and no file after the final clean-up.
 #[test]
 fn a_clean_stop_leaves_nothing() {
     let run = TestRun::new();
@@ -174,12 +175,12 @@ fn a_clean_stop_leaves_nothing() {
     carff_transport::remove_run_leftovers(&run.0).unwrap();
     assert!(run.0.shared_memory_files().unwrap().is_empty());
     assert!(!run.0.folder().exists());
-    // Sweeping what is not there is no error.
+    // A clean-up without files is not an error.
     carff_transport::remove_run_leftovers(&Run::new("never-existed", 0).unwrap()).unwrap();
 }
 
-/// A receiver that gives up being woken gets what is sent to it while it waits, finds the end of its wait, and hears a
-/// stop; others on the same topic are still woken.
+/// A receiver without wake-ups receives messages during its wait, times out, and reacts to a stop; others on the same
+/// topic are still woken.
 #[test]
 fn polled_receivers_need_no_wake_up() {
     let run = TestRun::new();
@@ -204,7 +205,7 @@ fn polled_receivers_need_no_wake_up() {
     assert_eq!(waiter.wait(&[&polled]).unwrap(), Woken::Stopped);
 }
 
-/// A picture that is sent from elsewhere arrives whole; one of another size than its description is refused.
+/// An image from other memory arrives complete; one whose size differs from its description is refused.
 #[test]
 fn pictures_are_sent_from_elsewhere() {
     let run = TestRun::new();
@@ -223,7 +224,7 @@ fn pictures_are_sent_from_elsewhere() {
     assert!(input.next().unwrap().is_none());
 }
 
-/// Whoever lists a run's processes while they come and go, and its folder with them, gets a list and never an error.
+/// Listing a run's processes never fails while they and the run's folder come and go.
 #[test]
 fn a_run_that_comes_and_goes_can_be_listed() {
     let run = TestRun::new();

@@ -1,4 +1,4 @@
-//! Sending and receiving between processes, and what is left of those that are killed.
+//! Tests of sending and receiving between processes, and of leftovers of killed processes.
 
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
@@ -11,7 +11,7 @@ use std::io::{BufRead, BufReader, Write};
 const SIDE: u32 = 32;
 const BYTES: usize = (SIDE * SIDE * 3) as usize;
 
-/// What the other process of a test does. Without a role it does nothing: then it is the test program's own run.
+/// Acts as the other process of a test. Without a role it does nothing: that is the test program's own run.
 #[test]
 fn role() {
     let Some((role, run)) = common::role() else { return };
@@ -19,7 +19,7 @@ fn role() {
     let waiter = Waiter::new(stop.clone());
     let node = Node::open(&run, &role).unwrap();
     match role.as_str() {
-        // Sends a picture for each line on standard input.
+        // Sends an image for each line of standard input.
         "camera" => {
             let mut output = node.image_publisher(&topics::FRAME, BYTES).unwrap();
             println!("ready");
@@ -29,14 +29,14 @@ fn role() {
                 output.send_image(loan, frame(i as u64, SIDE, SIDE)).unwrap();
             }
         }
-        // Holds memory in mid-loan until it is killed.
+        // Holds loaned memory until it is killed.
         "loaner" => {
             let output = node.image_publisher(&topics::FRAME, BYTES).unwrap();
             let _loan = output.loan(BYTES).unwrap();
             println!("ready");
             waiter.wait_until(&[], in_seconds(60)).unwrap();
         }
-        // Receives until it is stopped by a signal; then ends cleanly.
+        // Receives until a signal stops it; then ends cleanly.
         "reader" => {
             let mut input = node.receiver(&topics::POSTERIOR).unwrap();
             println!("ready");
@@ -51,7 +51,7 @@ fn role() {
     }
 }
 
-/// The lines that a role prints, without the test harness's own.
+/// Returns the lines that a role prints, without the test harness's own.
 fn lines(child: &mut Role) -> impl Iterator<Item = String> + use<> {
     let stdout = child.0.stdout.take().unwrap();
     BufReader::new(stdout).lines().map_while(Result::ok)
@@ -61,8 +61,8 @@ fn wait_for(lines: &mut impl Iterator<Item = String>, wanted: &str) {
     assert!(lines.any(|line| line.ends_with(wanted)), "the other process ended without `{wanted}`");
 }
 
-/// Zero copy: the address that the receiver reads lies in a mapping of the publisher's data segment, which the other
-/// process created in shared memory, and a second picture at the same address space is read in place too.
+/// Zero copy: the receiver reads an address inside a mapping of the publisher's data segment, which the other process
+/// created in shared memory. A second image is read in place too.
 #[test]
 fn pictures_are_read_in_the_publishers_segment() {
     let run = TestRun::new();
@@ -79,7 +79,7 @@ fn pictures_are_read_in_the_publishers_segment() {
         assert!(picture.bytes().iter().all(|&b| b == i + 1));
         let (first, last) = (picture.bytes().as_ptr() as usize, &raw const picture.bytes()[BYTES - 1] as usize);
         let mapping = mapping_of(first).expect("the address is in a mapping of a file");
-        assert!(mapping.range.contains(&last), "the whole picture lies in it");
+        assert!(mapping.range.contains(&last), "the mapping contains the whole image");
         assert!(mapping.file.contains(&run.0.shared_memory_prefix()), "{}", mapping.file);
         assert!(mapping.file.contains(".data"), "it is a data segment: {}", mapping.file);
     }
@@ -92,7 +92,7 @@ struct Mapping {
     file: String,
 }
 
-/// The file mapping of this process that holds an address.
+/// Returns the file mapping of this process that contains an address.
 fn mapping_of(address: usize) -> Option<Mapping> {
     std::fs::read_to_string("/proc/self/maps").unwrap().lines().find_map(|line| {
         let mut fields = line.split_whitespace();
@@ -103,7 +103,7 @@ fn mapping_of(address: usize) -> Option<Mapping> {
     })
 }
 
-/// A publisher killed in mid-loan does not hold up its successor: after the clean-up a new one sends and is heard.
+/// A publisher that is killed during a loan does not block its successor: after the clean-up a new one can send.
 #[test]
 fn a_publisher_killed_in_mid_loan_is_replaced() {
     let run = TestRun::new();
@@ -123,7 +123,7 @@ fn a_publisher_killed_in_mid_loan_is_replaced() {
     assert_eq!(input.newest().unwrap().unwrap().bytes()[0], 1);
 }
 
-/// A stopped (SIGSTOP) or killed subscriber does not keep the publisher from sending, and a signal ends a wait cleanly.
+/// A stopped (SIGSTOP) or killed subscriber does not block the publisher, and a signal ends a wait cleanly.
 #[test]
 fn no_subscriber_delays_a_publisher_and_signals_end_waits() {
     let run = TestRun::new();
@@ -147,7 +147,7 @@ fn no_subscriber_delays_a_publisher_and_signals_end_waits() {
     wait_for(&mut printed[0], "frame 1999");
 }
 
-/// Killing everything leaves files; whoever knows that all are dead removes them all.
+/// Killing all processes leaves files; the removal for dead runs removes all of them.
 #[test]
 fn leftovers_of_killed_processes_can_be_removed() {
     let run = TestRun::new();

@@ -1,5 +1,6 @@
-//! Every reader of files and messages behind one call: any bytes are accepted or refused with words, and what is
-//! accepted holds what its reader promises. Fuzzing (tests/fuzz) and the tests of kept and mutated inputs feed them.
+//! All readers of files and messages with a common function: any bytes are accepted or refused with a message, and
+//! accepted input satisfies the reader's guarantees. Fuzzing (tests/fuzz) and the tests with kept and mutated inputs
+//! use them.
 
 mod raw;
 mod valid;
@@ -22,19 +23,19 @@ use raw::patch;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-/// What became of an input: accepted, or the words with which it was refused.
+/// Result of an input: accepted, or the message with which it was refused.
 pub type Verdict = Result<(), String>;
 
-/// One reader.
+/// A reader of files or messages.
 #[derive(Clone, Copy, Debug)]
 pub struct Reader {
-    /// Its name, which is also that of its folder of kept inputs.
+    /// Name of the reader, and of its folder of kept inputs.
     pub name: &'static str,
     read: fn(&[u8], &Path) -> Verdict,
     examples: fn(&Path) -> Vec<Vec<u8>>,
 }
 
-/// All of them.
+/// All readers.
 pub const READERS: [Reader; 13] = [
     Reader { name: "messages", read: messages, examples: |_| (0..7).map(|kind| vec![kind]).collect() },
     Reader { name: "graph", read: graph, examples: |_| shipped("configs/graphs", "toml") },
@@ -52,25 +53,25 @@ pub const READERS: [Reader; 13] = [
 ];
 
 impl Reader {
-    /// Reads `bytes` as this reader does, with what files it needs in `folder`, which is this call's alone.
+    /// Reads `bytes` with this reader. `folder` is private to this call, for files that the reader needs.
     ///
     /// # Panics
     ///
-    /// Where a promise is broken: a reader that panics, accepts what it must not, or refuses without words.
+    /// A guarantee is violated: the reader panics, accepts invalid input, or refuses without a message.
     pub fn read(&self, bytes: &[u8], folder: &Path) -> Verdict {
         let verdict = (self.read)(bytes, folder);
         if let Err(words) = &verdict {
-            assert!(!words.trim().is_empty(), "{} refuses without a word", self.name);
+            assert!(!words.trim().is_empty(), "{} refuses without a message", self.name);
         }
         verdict
     }
 
-    /// Inputs that it must accept. `folder` is this call's alone.
+    /// Returns inputs that it must accept. `folder` is private to this call.
     pub fn examples(&self, folder: &Path) -> Vec<Vec<u8>> {
         (self.examples)(folder)
     }
 
-    /// Folder of the inputs that are kept: such as were found to break a reader once, and small ones of each kind.
+    /// Returns the folder of kept inputs: inputs that once broke a reader, and small ones of each kind.
     pub fn kept(&self) -> PathBuf {
         Path::new(env!("CARGO_MANIFEST_DIR")).join("corpus").join(self.name)
     }
@@ -79,7 +80,7 @@ impl Reader {
 const PLANNING: &str = "configs/checkpoints/approaching-intersection/planning.json";
 const MANIFEST: &str = "configs/checkpoints/approaching-intersection/manifest.json";
 
-/// Two states of one branch from one pose.
+/// A dataset of two states of one branch from one pose.
 const SET: &str = r#"{
   "w": 2, "h": 2, "fl_x": 2.0, "fl_y": 2.0, "cx": 1.0, "cy": 1.0,
   "scenario": {
@@ -100,7 +101,7 @@ const SET: &str = r#"{
   ]
 }"#;
 
-/// A plain set of two poses.
+/// A dataset without a scenario, of two poses.
 const PLAIN_SET: &str = r#"{
   "camera_angle_x": 0.9,
   "frames": [
@@ -139,7 +140,7 @@ fn words(error: impl std::error::Error) -> String {
     error.to_string()
 }
 
-/// The first byte says which valid message, the rest which of its bytes are overwritten with what.
+/// The first byte selects a valid message; the others overwrite its bytes.
 fn messages(bytes: &[u8], _: &Path) -> Verdict {
     let (kind, patches) = bytes.split_first().unwrap_or((&0, &[]));
     macro_rules! validated {
@@ -222,12 +223,12 @@ fn dataset(bytes: &[u8], folder: &Path) -> Verdict {
 fn plain_set(bytes: &[u8], folder: &Path) -> Verdict {
     let (from, out) = (folder.join("from"), folder.join("out"));
     fs::create_dir_all(&from).unwrap_or_else(|e| panic!("{}: {e}", from.display()));
-    // It is there when an earlier input was accepted.
+    // The folder exists if an earlier input was accepted.
     let _ = fs::remove_dir_all(&out);
     small_picture(&from);
     put(&from, "transforms.json", bytes);
     import(&from, &out, &ImportOptions::default()).map_err(words)?;
-    Dataset::open(&out).unwrap_or_else(|e| panic!("an imported set is refused: {e}"));
+    Dataset::open(&out).unwrap_or_else(|e| panic!("an imported dataset is refused: {e}"));
     Ok(())
 }
 
@@ -275,7 +276,7 @@ fn manifest(bytes: &[u8], folder: &Path) -> Verdict {
     Ok(())
 }
 
-/// A field that is quickly read.
+/// Returns the configuration of a small field, which can be read quickly.
 fn small_field() -> FieldConfig {
     FieldConfig {
         levels: 2,
@@ -316,7 +317,7 @@ fn recording(bytes: &[u8], folder: &Path) -> Verdict {
         assert!(e.to_string().contains("run.mcap"), "{e}");
         words(e)
     })?;
-    // An error does not end it: the next message may be whole. A file has fewer messages than bytes.
+    // An error does not end it: the next message may be valid. A file has fewer messages than bytes.
     let mut first_error = Ok(());
     for _ in 0..=bytes.len() {
         match reader.next() {

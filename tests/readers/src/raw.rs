@@ -1,7 +1,7 @@
-//! Messages whose bytes are overwritten, as a rogue writer to shared memory may do.
+//! Messages with overwritten bytes, as a rogue writer to shared memory can publish.
 
-/// `$message` (a variable of one of the message structs) with patches: each is an offset (two bytes, little endian), a
-/// length (one byte) and so many bytes. What does not fit is left out.
+/// Applies patches to `$message` (a variable of one of the message structs). A patch is an offset (two bytes, little
+/// endian), a length (one byte) and its bytes. Bytes outside the message are ignored.
 macro_rules! patch {
     ($message:ident, $bytes:expr) => {{
         let mut rest: &[u8] = $bytes;
@@ -9,7 +9,7 @@ macro_rules! patch {
             let offset = usize::from(u16::from_le_bytes([*low, *high])) % size_of_val(&$message);
             let room = size_of_val(&$message) - offset;
             let patch = &tail[..usize::from(*length).min(tail.len())];
-            // SAFETY: `offset` and the count lie within the message, which the patch does not overlap; messages are
+            // SAFETY: `offset` and the count are within the message, which the patch does not overlap; messages are
             // structs of plain numbers, for which any bytes are a value (they are `ZeroCopySend` for the same reason).
             unsafe {
                 std::ptr::copy_nonoverlapping(

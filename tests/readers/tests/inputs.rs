@@ -1,4 +1,4 @@
-//! What every reader does with examples, with kept inputs, and with mutations of both.
+//! Tests of every reader with examples, with kept inputs, and with mutations of both.
 
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
@@ -6,9 +6,9 @@ use carff_base::random::{Key, stream};
 use carff_readers::{READERS, Reader};
 use rand::Rng;
 
-/// Mutations of each input; fuzzing (`make fuzz`) tries millions.
+/// Number of mutations of each input; fuzzing (`make fuzz`) tries millions.
 const MUTATIONS: u64 = 300;
-/// Longer inputs than this are mutated less often, so that all readers take about as long.
+/// Longer inputs than this are mutated less often, so that all readers take a similar time.
 const SHORT_BYTES: usize = 4096;
 
 fn kept(reader: &Reader) -> Vec<Vec<u8>> {
@@ -18,7 +18,7 @@ fn kept(reader: &Reader) -> Vec<Vec<u8>> {
     paths.iter().map(|path| std::fs::read(path).unwrap()).collect()
 }
 
-/// The input with a few bytes or pieces changed: what a broken disk, a wrong hand or an ill will leaves.
+/// Returns the input with a few changed bytes or pieces, as after disk errors, edits or attacks.
 fn mutated(input: &[u8], rng: &mut impl Rng) -> Vec<u8> {
     let mut bytes = input.to_vec();
     for _ in 0..rng.random_range(1..=4) {
@@ -39,7 +39,7 @@ fn mutated(input: &[u8], rng: &mut impl Rng) -> Vec<u8> {
                 drop(bytes.splice(at..end, numbers[rng.random_range(0..numbers.len())].iter().copied()));
             }
             _ => {
-                // One digit becomes another: what is still well formed, and means something else.
+                // One digit becomes another: the result is well formed, with another meaning.
                 let digits: Vec<usize> = (0..bytes.len()).filter(|i| bytes[*i].is_ascii_digit()).collect();
                 if !digits.is_empty() {
                     bytes[digits[rng.random_range(0..digits.len())]] = b'0' + rng.random_range(0..10);
@@ -50,7 +50,7 @@ fn mutated(input: &[u8], rng: &mut impl Rng) -> Vec<u8> {
     bytes
 }
 
-/// Examples are accepted; kept inputs and mutations of all are accepted or refused with words; nothing panics.
+/// Examples are accepted; kept inputs and mutations of all are accepted or refused with a message; nothing panics.
 fn holds(name: &str) {
     let reader = READERS.iter().find(|r| r.name == name).unwrap();
     let folder = tempfile::tempdir().unwrap();
@@ -59,7 +59,7 @@ fn holds(name: &str) {
         assert_eq!(reader.read(example, folder.path()), Ok(()), "example {i}");
     }
     let inputs = [examples, kept(reader)].concat();
-    assert!(!inputs.is_empty(), "there is nothing to read");
+    assert!(!inputs.is_empty(), "there are no inputs");
     let (mut accepted, mut refused) = (0, 0);
     for (i, input) in inputs.iter().enumerate() {
         let _ = reader.read(input, folder.path());
@@ -84,7 +84,7 @@ macro_rules! readers {
             }
         )+
 
-        /// No reader is without its test.
+        /// Every reader has a test.
         #[test]
         fn all_readers_are_tested() {
             assert_eq!(READERS.map(|r| r.name), [$($name),+]);

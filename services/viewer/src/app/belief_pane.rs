@@ -1,4 +1,4 @@
-//! The pane on the right: the belief over the states, what was found at each place, and the maps.
+//! The pane on the right: the belief over the states, the occupancy of each place, and the maps.
 
 use super::scene_pane::TAKEN;
 use super::{Viewer, theme};
@@ -11,11 +11,11 @@ use eframe::egui::{
 const BAR_HEIGHT: f32 = 21.0;
 /// Width of the names of states and places.
 const NAMES: f32 = 96.0;
-/// Width of the numbers behind the bars, and of the second of them.
+/// Width of the numbers after the bars, and of the second of them.
 const NUMBERS: f32 = 98.0;
 const COUNTS: f32 = 53.0;
 
-/// One bar.
+/// A labelled bar.
 struct Bar<'a> {
     name: &'a str,
     share: f32,
@@ -66,7 +66,7 @@ impl Viewer {
             }
         }
         if let Some(unknown) = belief.map(|b| showing(b, None)).filter(|n| *n > 0) {
-            ui.colored_label(palette.error, format!("{unknown} samples show none of the known states"));
+            ui.colored_label(palette.error, format!("{unknown} samples match no known state"));
         }
         if let Some(selection) = chosen.filter(|_| self.session.moment().is_some()) {
             self.is_following = false;
@@ -78,7 +78,7 @@ impl Viewer {
         let palette = theme::palette(ui.ctx());
         ui.horizontal(|ui| {
             ui.label(theme::heading("Places"));
-            ui.weak("light that each box stops");
+            ui.weak("share of light that each box absorbs");
         });
         let found = self.session.moment().and_then(|m| m.found.as_ref());
         for (i, place) in self.session.models().probe.layout().places().iter().enumerate() {
@@ -100,12 +100,12 @@ impl Viewer {
     }
 }
 
-/// How many samples show a state.
+/// Returns the number of samples that show a state.
 fn showing(belief: &Step, state: Option<usize>) -> usize {
     belief.samples.iter().filter(|s| s.reading.state == state).count()
 }
 
-/// Who stands there, and at which steps: those that the names of the states end with.
+/// Returns the actor and steps at a place: the common endings of the states' names.
 fn place_name(name: &str, taken_in: &[&str]) -> String {
     let mut steps: Vec<&str> = taken_in.iter().filter_map(|state| state.rsplit(' ').next()).collect();
     steps.sort_unstable();
@@ -113,7 +113,7 @@ fn place_name(name: &str, taken_in: &[&str]) -> String {
     format!("{name} {}", steps.join(" "))
 }
 
-/// Draws a bar; whether it was pressed.
+/// Draws a bar and returns whether it was pressed.
 fn draw_bar(ui: &mut Ui, bar: &Bar<'_>, sense: Sense) -> bool {
     let palette = theme::palette(ui.ctx());
     let (rect, response) = ui.allocate_exact_size(vec2(ui.available_width(), BAR_HEIGHT), sense);

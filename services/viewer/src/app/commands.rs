@@ -1,67 +1,67 @@
-//! What can be pressed, by mouse or key: one list, for shortcuts and help alike.
+//! Commands for mouse and keys: one list for shortcuts and help.
 
 use eframe::egui::{InputState, Key, KeyboardShortcut, Modifiers};
 
-/// What the window can be told to do.
+/// A command of the window.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Command {
-    /// The scene of the chosen picture's posterior.
+    /// Shows the scene of the chosen image's posterior.
     Toggle,
-    /// Forecast one step.
+    /// Forecasts one step.
     Predict,
-    /// Probe the shown scene.
+    /// Probes the shown scene.
     Probe,
-    /// Probe the shown scene, and forecast from the state that it shows.
+    /// Probes the shown scene and forecasts from the state that it shows.
     ProbeAndPredict,
-    /// Back in the history.
+    /// Goes back in the history.
     Back,
-    /// Forward in the history.
+    /// Goes forward in the history.
     Forward,
-    /// Show the scene before this one.
+    /// Shows the previous scene.
     SceneBefore,
-    /// Show the scene after this one.
+    /// Shows the next scene.
     SceneAfter,
-    /// Take the picture before this one.
+    /// Takes the previous image.
     PictureBefore,
-    /// Take the picture after this one.
+    /// Takes the next image.
     PictureAfter,
-    /// Follow the running graph, or hold its frame.
+    /// Follows the running graph, or holds its frame.
     Follow,
-    /// Look from over a corner.
+    /// Looks from above a corner.
     CameraCorner,
-    /// Look straight down.
+    /// Looks straight down.
     CameraAbove,
-    /// Look from where the picture was taken.
+    /// Looks from the pose of the image.
     CameraPicture,
-    /// Show or hide the boxes that are probed.
+    /// Shows or hides the probed boxes.
     Boxes,
-    /// Show or hide the densities found in them.
+    /// Shows or hides the densities in the boxes.
     Densities,
-    /// Save the window as a picture.
+    /// Saves the window as an image.
     Screenshot,
-    /// Save the scene as a picture.
+    /// Saves the scene as an image.
     SaveView,
-    /// Dark or light.
+    /// Switches between dark and light.
     Theme,
-    /// Show or hide the help.
+    /// Shows or hides the help.
     Help,
-    /// End.
+    /// Closes the window.
     Quit,
 }
 
-/// A command with its key, and what the help says of it.
+/// A command with its key and its help text.
 pub type Entry = (Command, Modifiers, Key, &'static str);
 
 impl Command {
-    /// All of them with their keys and what they do, by topic, in the order of the help.
+    /// All commands with keys and help texts, by topic, in the order of the help.
     pub const ALL: [(&'static str, &'static [Entry]); 4] = [
         (
             "Look ahead",
             &[
-                (Self::Toggle, Modifiers::NONE, Key::T, "Toggle: the scene that the picture stands for"),
-                (Self::Predict, Modifiers::NONE, Key::P, "Predict: forecast one step, or draw it again"),
-                (Self::Probe, Modifiers::NONE, Key::O, "Probe: what stands where, and the belief"),
-                (Self::ProbeAndPredict, Modifiers::NONE, Key::N, "Probe and predict: go on from the shown scene"),
+                (Self::Toggle, Modifiers::NONE, Key::T, "Toggle: show the scene of the image"),
+                (Self::Predict, Modifiers::NONE, Key::P, "Predict: forecast one step, or redraw it"),
+                (Self::Probe, Modifiers::NONE, Key::O, "Probe: occupancy of each place, and the belief"),
+                (Self::ProbeAndPredict, Modifiers::NONE, Key::N, "Probe and predict: continue from the shown scene"),
                 (Self::Back, Modifiers::NONE, Key::OpenBracket, "Back in the history"),
                 (Self::Forward, Modifiers::NONE, Key::CloseBracket, "Forward in the history"),
             ],
@@ -79,11 +79,11 @@ impl Command {
         (
             "View",
             &[
-                (Self::CameraCorner, Modifiers::NONE, Key::Num1, "Look from over a corner"),
+                (Self::CameraCorner, Modifiers::NONE, Key::Num1, "Look from above a corner"),
                 (Self::CameraAbove, Modifiers::NONE, Key::Num2, "Look straight down"),
-                (Self::CameraPicture, Modifiers::NONE, Key::Num3, "Look from where the picture was taken"),
-                (Self::Boxes, Modifiers::NONE, Key::B, "Boxes that are probed"),
-                (Self::Densities, Modifiers::NONE, Key::D, "Densities found in them"),
+                (Self::CameraPicture, Modifiers::NONE, Key::Num3, "Look from the pose of the image"),
+                (Self::Boxes, Modifiers::NONE, Key::B, "Probed boxes"),
+                (Self::Densities, Modifiers::NONE, Key::D, "Densities in the boxes"),
             ],
         ),
         (
@@ -98,13 +98,13 @@ impl Command {
         ),
     ];
 
-    /// The key that does it.
+    /// Returns the keyboard shortcut of the command.
     pub fn shortcut(self) -> Option<KeyboardShortcut> {
         let mut all = Self::ALL.iter().flat_map(|(_, commands)| *commands);
         all.find(|(command, ..)| *command == self).map(|(_, modifiers, key, _)| KeyboardShortcut::new(*modifiers, *key))
     }
 
-    /// What a key is called in the help.
+    /// Returns the name of a key for the help.
     pub fn key_name(modifiers: Modifiers, key: Key) -> String {
         let name = match key {
             Key::OpenBracket => "[",
@@ -117,10 +117,10 @@ impl Command {
         held.iter().filter(|(is_held, _)| *is_held).map(|(_, held)| *held).chain([name]).collect()
     }
 
-    /// The commands whose keys were pressed.
+    /// Returns the commands whose keys were pressed.
     pub fn pressed(input: &mut InputState) -> Vec<Self> {
         let all = Self::ALL.iter().flat_map(|(_, commands)| *commands);
-        // With modifiers first: plain keys also match with Shift held.
+        // Keys with modifiers come first: plain keys also match while Shift is held.
         let (held, plain): (Vec<_>, Vec<_>) = all.partition(|(_, modifiers, ..)| modifiers.any());
         let mut pressed: Vec<Self> = held
             .into_iter()
@@ -140,7 +140,7 @@ mod tests {
     use super::*;
     use std::collections::BTreeSet;
 
-    /// Every command has one key of its own, and every key has a name.
+    /// Every command has its own key, and every key has a name.
     #[test]
     fn keys_are_unique() {
         let all: Vec<_> = Command::ALL.iter().flat_map(|(_, commands)| *commands).collect();

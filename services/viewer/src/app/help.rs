@@ -1,16 +1,16 @@
-//! The help that lies over the window: what can be pressed, and what the mouse does.
+//! The help window: keys and mouse actions.
 
 use super::{Command, theme};
 use eframe::egui::{Align2, Context, Grid, Window};
 
 const MOUSE: [(&str, &str); 4] = [
     ("drag", "turn about the scene"),
-    ("right drag, Shift+drag", "move along the picture"),
+    ("right drag, Shift+drag", "move along the image"),
     ("wheel, pinch", "nearer, farther"),
-    ("drop a PNG file", "toggle that picture"),
+    ("drop a PNG file", "show the scene of that image"),
 ];
 
-/// Shows it; `is_open` becomes false when it is closed.
+/// Shows the help; `is_open` becomes false when the user closes it.
 pub fn show(ctx: &Context, is_open: &mut bool) {
     let palette = theme::palette(ctx);
     Window::new("Keys and mouse")
@@ -45,6 +45,6 @@ pub fn show(ctx: &Context, is_open: &mut bool) {
                     ui.end_row();
                 }
             });
-            ui.weak("Enter does as N. Nothing of this disturbs a running graph: the window only listens.");
+            ui.weak("Enter does the same as N. The window only listens: it never disturbs a running graph.");
         });
 }

@@ -1,5 +1,4 @@
-//! The pane on the left: the picture that all rests on, how to choose it, what the encoder makes of it, and how to
-//! look ahead from it.
+//! The pane on the left: the input image and its choice, its posterior, and the look-ahead.
 
 use super::{Choice, Command, Viewer, theme};
 use carff_dataset::Observability;
@@ -10,7 +9,7 @@ use eframe::egui::{
     vec2,
 };
 
-/// Largest latent that the drawing of a posterior shows.
+/// Largest absolute latent value in the plot of a posterior.
 const LATENT_RANGE: f32 = 3.0;
 
 impl Viewer {
@@ -38,7 +37,7 @@ impl Viewer {
             let (rect, _) = ui.allocate_exact_size(vec2(width, width * 0.75), Sense::hover());
             ui.painter().rect_filled(rect, 8.0, palette.ground);
             let hint = match &self.album {
-                Ok(_) => "Choose a picture below, and press Toggle.".to_owned(),
+                Ok(_) => "Choose an image below, and press Toggle.".to_owned(),
                 Err(why) => why.clone(),
             };
             let mut inner = ui.new_child(eframe::egui::UiBuilder::new().max_rect(rect.shrink(12.0)));
@@ -62,7 +61,7 @@ impl Viewer {
                     None => "",
                 };
                 if !named {
-                    ui.weak(format!("really {}, view {}", models.state_name(state), truth.view));
+                    ui.weak(format!("truth: {}, view {}", models.state_name(state), truth.view));
                 }
                 ui.label(theme::small(seen).color(palette.weak));
             }
@@ -119,13 +118,13 @@ impl Viewer {
         }
     }
 
-    /// Mean and deviation of each of the latent's numbers.
+    /// Draws mean and deviation of each latent dimension.
     fn posterior(&self, ui: &mut Ui) {
         let Some(moment) = self.session.moment() else { return };
         let Gaussian { mean, log_variance } = &moment.source;
         let palette = theme::palette(ui.ctx());
         let name = match moment.source_state {
-            None => "Posterior of the picture".to_owned(),
+            None => "Posterior of the image".to_owned(),
             Some(state) => format!("Fed back: {}", self.session.models().state_name(Some(state))),
         };
         ui.add_space(4.0);
@@ -145,7 +144,7 @@ impl Viewer {
             painter.rect_filled(bar, 2.0, palette.accent.gamma_multiply(0.35));
             painter.hline(x - 4.0..=x + 4.0, y(*mean), Stroke::new(2.0, palette.accent));
         }
-        response.on_hover_text("Mean and one deviation of each of the 8 numbers of the scene latent, -3 to 3");
+        response.on_hover_text("Mean and one standard deviation of each of the 8 latent dimensions, -3 to 3");
     }
 
     fn settings(&mut self, ui: &mut Ui) {
@@ -177,7 +176,7 @@ impl Viewer {
         }
     }
 
-    /// What the running graph's stages last said of themselves.
+    /// Shows the last health report of each stage of the running graph.
     fn stages(&self, ui: &mut Ui) {
         let Some(live) = &self.live else { return };
         let palette = theme::palette(ui.ctx());
@@ -186,7 +185,7 @@ impl Viewer {
             ui.colored_label(palette.error, why);
         }
         if let Some(other) = &self.other_checkpoint {
-            ui.colored_label(palette.hazard, format!("the graph runs another checkpoint: {}", other.display()));
+            ui.colored_label(palette.hazard, format!("the graph uses another checkpoint: {}", other.display()));
         }
         Grid::new("stages").num_columns(3).spacing([10.0, 3.0]).show(ui, |ui| {
             for (stage, health) in &watched.health {

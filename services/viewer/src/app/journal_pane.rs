@@ -1,18 +1,18 @@
-//! The pane at the bottom: what was decided, and how long things took.
+//! The pane at the bottom: decisions and durations.
 
 use super::{Viewer, theme};
 use crate::journal::{Decision, Journal};
 use eframe::egui::{Align, Color32, Grid, Layout, ScrollArea, Ui, vec2};
 use egui_plot::{GridMark, Line, Plot, PlotPoints};
 
-/// Width of the decisions, as a share of the pane's.
+/// Width of the decisions, as a share of the pane.
 const DECISIONS: f32 = 0.5;
-/// What took less is drawn as if it took this long: the axis is logarithmic.
+/// Shorter durations are drawn as this one, because the axis is logarithmic.
 const LEAST_MS: f64 = 0.01;
 
 impl Viewer {
     pub(super) fn journal_pane(&mut self, ui: &mut Ui) {
-        // A running graph's, while one is watched; else the window's own.
+        // Shows the journal of the running graph while one is watched, else the window's own.
         let watched = self.live.as_ref().map(|live| live.watched().journal.clone());
         let journal = watched.as_ref().unwrap_or(&self.session.journal);
         let (width, height) = (ui.available_width(), ui.available_height());
@@ -45,7 +45,7 @@ impl Viewer {
 fn decisions(ui: &mut Ui, journal: &Journal) {
     let palette = theme::palette(ui.ctx());
     if journal.decisions().len() == 0 {
-        ui.weak("none yet: a decision is taken whenever a forecast is probed");
+        ui.weak("none yet: probing a forecast makes a decision");
         return;
     }
     ScrollArea::vertical().auto_shrink(false).id_salt("decisions").show(ui, |ui| {
@@ -70,14 +70,14 @@ fn decisions(ui: &mut Ui, journal: &Journal) {
     });
 }
 
-/// The powers of ten that the axis shows.
+/// Returns the powers of ten on the axis.
 fn decades((low, high): (f64, f64)) -> Vec<GridMark> {
     let shown = low..=high;
     let all = (-2..=6).map(|decade| GridMark { value: f64::from(decade), step_size: 1.0 });
     all.filter(|mark| shown.contains(&mark.value)).collect()
 }
 
-/// The label of a place on the logarithmic axis.
+/// Returns the label of a value on the logarithmic axis.
 fn milliseconds(log10_ms: f64) -> String {
     let ms = 10_f64.powf(log10_ms);
     if ms < 10.0 {

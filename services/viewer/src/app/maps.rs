@@ -1,11 +1,11 @@
-//! The shown scene from above: as it looks, and how dense it is at a height.
+//! The shown scene from above: a rendered image, and a slice of density at a height.
 
 use super::scene_pane::TAKEN;
 use super::theme::Palette;
 use super::{Latent, Viewer, theme};
 use eframe::egui::{Color32, Painter, Pos2, Rect, Sense, Slider, Stroke, TextureId, Ui, pos2, vec2};
 
-/// How long the drawn line of sight is, metres.
+/// Length of the drawn line of sight, metres.
 const SIGHT_M: f64 = 4.0;
 
 impl Viewer {
@@ -63,7 +63,7 @@ impl Viewer {
                 outline(&painter, &corners, stroke);
             }
         }
-        // Where the picture was taken from, and where the scene is looked at from.
+        // The pose of the image, and the pose of the view.
         if let Some(camera) = self.session.moment().and_then(|m| m.input.camera) {
             let m = &camera.world_from_camera;
             sight(&painter, camera.position_m(), [-m[0][2], -m[1][2]], palette.ego, at);
@@ -79,7 +79,7 @@ fn outline(painter: &Painter, corners: &[Pos2; 4], stroke: Stroke) {
     }
 }
 
-/// A camera: a dot, and the line along which it looks. What lies outside of the map is drawn at its edge.
+/// Draws a camera: a dot and its line of sight. Cameras outside the map are drawn at its edge.
 fn sight(painter: &Painter, eye_m: [f64; 3], along: [f64; 2], color: Color32, at: impl Fn([f64; 2]) -> Pos2) {
     let length = along[0].hypot(along[1]).max(1e-9);
     let end = [0, 1].map(|i| eye_m[i] + SIGHT_M * along[i] / length);

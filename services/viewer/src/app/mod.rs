@@ -1,4 +1,4 @@
-//! What is seen and pressed. One pane a file; what it shows is computed elsewhere.
+//! The window: one file per pane. The panes only show values that other modules compute.
 
 mod belief_pane;
 mod commands;
@@ -32,52 +32,52 @@ use std::sync::{Arc, OnceLock};
 use std::time::{Duration, Instant};
 use textures::Textures;
 
-/// Sides of a small picture of a scene, pixels.
+/// Sides of a small image of a scene, pixels.
 const THUMBNAIL_PX: [u32; 2] = [80, 60];
-/// Longest side of the picture from above, pixels.
+/// Longest side of the image from above, pixels.
 const BIRDS_EYE_PX: u32 = 128;
 /// Points along the longer side of a slice.
 const SLICE_PX: u32 = 160;
-/// While a graph is followed, views are drawn at most so often, and all else more seldom still.
+/// Shortest interval between views while a graph is followed. Other images are drawn less often.
 const FOLLOW_VIEW: Duration = Duration::from_millis(200);
 const FOLLOW_REST: Duration = Duration::from_secs(1);
-/// The camera rests once it has not been moved for so long.
+/// The camera is at rest after this time without a movement.
 const REST: Duration = Duration::from_millis(150);
-/// Scenes whose pictures may still come.
+/// Most recent scenes whose images may still arrive.
 const MOST_RECENT: usize = 64;
-/// How long news of a running graph may wait to be drawn.
+/// Longest delay until news of a running graph is drawn.
 const SOON: Duration = Duration::from_millis(100);
-/// How long a message stays.
+/// Display time of a message.
 const MESSAGE: Duration = Duration::from_secs(6);
-/// How often a window in which nothing happens looks whether something does, while a graph is watched.
+/// Interval at which an idle window checks for news while a graph is watched.
 const WATCH: Duration = Duration::from_millis(500);
 
-/// How the window is set up.
+/// Options of the window.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Options {
-    /// Threads for pictures.
+    /// Number of threads that render images.
     pub threads: usize,
-    /// Where screenshots go.
+    /// Folder for screenshots.
     pub folder: PathBuf,
-    /// Dark, light, or as the system says.
+    /// Dark, light, or the system's preference.
     pub theme: ThemePreference,
-    /// Saves one picture of the window and ends: where, and after how long at the earliest.
+    /// Path of one image of the window, and the earliest time to save it. The window then closes.
     pub one_shot: Option<(PathBuf, Duration)>,
 }
 
-/// Wakes the window from other threads, once there is one.
+/// Handle that wakes the window from other threads, once the window exists.
 #[derive(Clone, Default)]
 pub struct Waker(Arc<OnceLock<Context>>);
 
 impl Waker {
-    /// Draws the window anew.
+    /// Redraws the window.
     pub fn wake(&self) {
         if let Some(ctx) = self.0.get() {
             ctx.request_repaint();
         }
     }
 
-    /// Draws the window anew before long, once for all that comes until then.
+    /// Redraws the window soon, once for all news until then.
     pub fn wake_soon(&self) {
         if let Some(ctx) = self.0.get() {
             ctx.request_repaint_after(SOON);
@@ -85,35 +85,35 @@ impl Waker {
     }
 }
 
-/// Which picture of the data set is chosen.
+/// The chosen image of the dataset.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Choice {
-    /// The hidden course of events.
+    /// The hidden branch.
     pub branch: usize,
-    /// Step of it.
+    /// Time step of the branch.
     pub timestamp: usize,
     /// The camera pose.
     pub view: usize,
-    /// How much of the actor it shall show when leafing; `None`: any.
+    /// Visibility of the actor that the previous and next image must have; `None`: any.
     pub shows: Option<Observability>,
 }
 
-/// What is drawn over the scene.
+/// Overlays on the scene.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Overlays {
-    /// The boxes that are probed.
+    /// Shows the probed boxes.
     pub boxes: bool,
-    /// The densities found in them.
+    /// Shows the densities in the boxes.
     pub densities: bool,
 }
 
-/// A scene that was shown, with what was found in it.
+/// A scene that was shown, with the result of probing it.
 struct Recent {
     scene: Scene,
     found: Option<Found>,
 }
 
-/// Of which scenes the pictures are that are seen.
+/// Scenes of the displayed images.
 #[derive(Default)]
 struct DrawnOf {
     view: Latent,
@@ -127,7 +127,7 @@ struct Message {
     since: Instant,
 }
 
-/// What was asked of the painter last, and when.
+/// The last request to the renderer, with its time.
 struct Asked<T> {
     job: Option<T>,
     at: Instant,
@@ -138,7 +138,7 @@ impl<T: PartialEq> Asked<T> {
         Self { job: None, at: Instant::now() }
     }
 
-    /// Whether this is to be asked now. `None` for not before so long.
+    /// Returns whether a job is due; `None` if it must wait.
     fn is_due(&mut self, job: T, not_within: Duration) -> Option<bool> {
         if self.job.as_ref() == Some(&job) {
             return Some(false);
@@ -153,25 +153,25 @@ impl<T: PartialEq> Asked<T> {
 
 type Latent = [f32; LATENT_DIM];
 
-/// The window.
+/// The viewer's window.
 pub struct Viewer {
-    /// What it is about.
+    /// Image, forecasts and probes, independent of the window.
     pub session: Session,
-    /// The camera that a hand moves.
+    /// The camera that the user moves.
     pub camera: OrbitCamera,
-    /// Which picture of the data set is chosen.
+    /// The chosen image of the dataset.
     pub choice: Choice,
-    /// What is drawn over the scene.
+    /// Overlays on the scene.
     pub overlays: Overlays,
-    /// Whether the help lies over the window.
+    /// True while the help is open.
     pub shows_help: bool,
-    /// Whether the running graph's frames are shown as they come.
+    /// True while the frames of the running graph are shown as they arrive.
     pub is_following: bool,
     /// Longest side of the finest view, pixels.
     pub finest_px: u32,
     album: Result<Album, String>,
     live: Option<LiveFeed>,
-    /// The run's models, where they are not those of this window.
+    /// The checkpoint of the run, if it differs from this window's.
     other_checkpoint: Option<PathBuf>,
     worker: RenderWorker,
     waker: Waker,
@@ -179,27 +179,27 @@ pub struct Viewer {
     options: Options,
     slice_height_m: f32,
     message: Option<Message>,
-    /// Size of the view's place in the window, pixels.
+    /// Size of the view in the window, pixels.
     view_px: [u32; 2],
     moved: Option<Instant>,
     asked_view: Asked<(Latent, PinholeCamera, Pace)>,
     asked_birds_eye: Asked<(Latent, PinholeCamera)>,
     asked_slice: Asked<(Latent, f32)>,
     asked_thumbnails: Asked<(Vec<Latent>, PinholeCamera)>,
-    /// Of which scenes the pictures are that are seen.
+    /// Scenes of the displayed images.
     drawn: DrawnOf,
-    /// Scenes that were shown last, the newest at the end: pictures come later than what they are of.
+    /// The scenes shown last, newest at the end. Images arrive later than their requests.
     recent: VecDeque<Recent>,
-    /// The newest view, and what drawing it took.
+    /// The newest view, and its render time.
     view: Option<(Image, f64)>,
-    /// The number of times a view was drawn.
+    /// Number of rendered views.
     views_drawn: u64,
     shot_asked: bool,
     started: Instant,
 }
 
 impl Viewer {
-    /// A window on a session. `album` is the data set to choose pictures from, or why there is none.
+    /// Creates a window on a session. `album` is the dataset to choose images from, or the reason why there is none.
     pub fn new(
         session: Session,
         album: Result<Album, String>,
@@ -246,10 +246,10 @@ impl Viewer {
         })
     }
 
-    /// Draws the window, and does what was pressed in it.
+    /// Draws the window and runs the commands that were given in it.
     pub fn show(&mut self, ctx: &Context) {
         if self.waker.0.set(ctx.clone()).is_ok() {
-            // Fonts count from the next frame on.
+            // Fonts take effect in the next frame.
             theme::install(ctx);
             ctx.set_theme(self.options.theme);
             ctx.request_repaint();
@@ -329,42 +329,42 @@ impl Viewer {
             });
     }
 
-    /// Says something for a while.
+    /// Shows a message for a few seconds.
     fn say(&mut self, text: impl Into<String>, is_error: bool) {
         self.message = Some(Message { text: text.into(), is_error, since: Instant::now() });
     }
 
-    /// What was said last, as long as it is shown.
+    /// Returns the current message.
     pub fn message(&self) -> Option<&str> {
         self.message.as_ref().map(|m| m.text.as_str())
     }
 
-    /// Whether a command would do something now, or why not.
+    /// Returns an error with the reason if a command would have no effect now.
     pub fn can(&self, command: Command) -> Result<(), String> {
         let is = |there: bool, why: &str| if there { Ok(()) } else { Err(why.to_owned()) };
         let history = self.session.history();
         match command {
             Command::Toggle => {
                 let any = self.album.is_ok() || self.session.moment().is_some();
-                is(any, "no picture yet: drop a PNG picture here, give --dataset, or attach to a run")
+                is(any, "no image yet: drop a PNG image here, pass --dataset, or attach to a run")
             }
             Command::Predict => self.session.can_predict().map_err(|e| e.to_string()),
-            Command::Probe => is(self.session.moment().is_some(), "no picture yet: press Toggle"),
+            Command::Probe => is(self.session.moment().is_some(), "no image yet: press Toggle"),
             Command::ProbeAndPredict => self.session.can_advance().map_err(|e| e.to_string()),
             Command::Back => is(history.has_back(), "this is the beginning"),
             Command::Forward => is(history.has_forward(), "this is the end"),
-            Command::PictureBefore | Command::PictureAfter => is(self.album.is_ok(), "no data set to choose from"),
+            Command::PictureBefore | Command::PictureAfter => is(self.album.is_ok(), "no dataset to choose from"),
             Command::Follow => is(self.live.is_some(), "no running graph is attached"),
             Command::CameraPicture => {
                 let known = self.session.moment().is_some_and(|m| m.input.camera.is_some());
-                is(known, "nobody knows where this picture was taken")
+                is(known, "the camera pose of this image is unknown")
             }
-            Command::SaveView => is(self.view.is_some(), "no scene is drawn yet"),
+            Command::SaveView => is(self.view.is_some(), "no scene has been rendered yet"),
             _ => Ok(()),
         }
     }
 
-    /// Does what a command says.
+    /// Runs a command.
     pub fn run(&mut self, command: Command, ctx: &Context) {
         if let Err(why) = self.can(command) {
             self.say(why, true);
@@ -444,10 +444,10 @@ impl Viewer {
         }
     }
 
-    /// The scene of the picture that is shown, before any forecast; of the chosen one where none is shown yet.
+    /// Shows the scene of the current image before any forecast, or of the chosen image if there is no current one.
     fn toggle(&mut self) -> Result<(), String> {
         if std::mem::take(&mut self.is_following) {
-            // The posterior is the graph's own.
+            // The graph supplied the posterior.
             self.session.go_to(0);
             return Ok(());
         }
@@ -457,10 +457,10 @@ impl Viewer {
         }
     }
 
-    /// The scene of the picture that is chosen from the data set.
+    /// Shows the scene of the image that is chosen from the dataset.
     fn toggle_chosen(&mut self) -> Result<(), String> {
         let Choice { branch, timestamp, view, .. } = self.choice;
-        let none = || format!("the data set has no picture of branch {branch}, t{timestamp}, view {view}");
+        let none = || format!("the dataset has no image of branch {branch}, t{timestamp}, view {view}");
         let album = self.album.as_ref().map_err(Clone::clone)?;
         let models = self.session.models();
         let state = models.state(branch, timestamp).ok_or_else(none)?;
@@ -468,7 +468,7 @@ impl Viewer {
         self.toggle_input(input)
     }
 
-    /// Begins with a picture that hides what may come, where the data set has one.
+    /// Starts with an image that does not reveal the branch, if the dataset has one.
     pub fn begin(&mut self) {
         if let Ok(album) = &self.album {
             let state = self.session.models().state(0, 0).unwrap_or(0);
@@ -480,7 +480,7 @@ impl Viewer {
         }
     }
 
-    /// The scene of a picture.
+    /// Shows the scene of an image.
     pub fn toggle_input(&mut self, input: Arc<Input>) -> Result<(), String> {
         self.is_following = false;
         self.session.toggle(input).map_err(|e| e.to_string())
@@ -489,7 +489,7 @@ impl Viewer {
     fn predict(&mut self) -> Result<(), String> {
         if self.is_following {
             self.is_following = false;
-            // What the graph forecast itself.
+            // The graph made these forecasts.
             if self.session.go_to(1) {
                 return Ok(());
             }
@@ -511,7 +511,7 @@ impl Viewer {
         self.session.select(scene.selection).map_err(|e| e.to_string())
     }
 
-    /// The next picture of the data set that shows as much as is asked.
+    /// Shows the next image of the dataset with the chosen visibility.
     fn leaf(&mut self, forwards: bool) -> Result<(), String> {
         let Ok(album) = &self.album else { return Ok(()) };
         let Choice { branch, timestamp, view, shows } = self.choice;
@@ -519,7 +519,7 @@ impl Viewer {
         let next = state.and_then(|state| album.next_view(state, view, forwards, shows));
         let none = || {
             let much = shows.map_or("any", Observability::name);
-            format!("no view of this state shows the actor or its place like that: {much}")
+            format!("no view of this state has the chosen visibility of the actor: {much}")
         };
         self.choice.view = next.ok_or_else(none)?;
         self.toggle_chosen()
@@ -562,7 +562,7 @@ impl Viewer {
         }
     }
 
-    /// Remembers what is shown, so that a picture of it that comes later is marked with what belongs to it.
+    /// Remembers the shown scene, so that images of it that arrive later get the right overlays.
     fn remember(&mut self) {
         let Some(scene) = self.session.shown() else { return };
         let found = self.session.moment().and_then(|m| m.found.clone());
@@ -573,12 +573,12 @@ impl Viewer {
         }
     }
 
-    /// What is known of the scene that a picture is of.
+    /// Returns the remembered scene of an image.
     fn recent(&self, latent: &Latent) -> Option<&Recent> {
         self.recent.iter().rev().find(|recent| recent.scene.latent == *latent)
     }
 
-    /// Pictures that were dropped on the window.
+    /// Loads images that were dropped on the window.
     fn take_files(&mut self, ctx: &Context) {
         let paths: Vec<PathBuf> =
             ctx.input(|input| input.raw.dropped_files.iter().filter_map(|file| file.path.clone()).collect());
@@ -590,7 +590,7 @@ impl Viewer {
         }
     }
 
-    /// Whether all pictures of the shown scene are drawn, or there is none; while a graph is followed, whether any is.
+    /// Returns true if all images of the shown scene are drawn; while a graph is followed, if any is.
     pub fn is_drawn(&self) -> bool {
         if self.is_following {
             return self.view.is_some();
@@ -603,7 +603,7 @@ impl Viewer {
         self.moved.is_some_and(|at| at.elapsed() < REST)
     }
 
-    /// Asks for the pictures that are missing.
+    /// Requests the missing images.
     fn ask(&mut self, ctx: &Context) {
         let Some(scene) = self.session.shown() else { return };
         let latent = scene.latent;
@@ -638,7 +638,7 @@ impl Viewer {
         if pace != Pace::Moving {
             let latents: Vec<Latent> = self.session.scenes().iter().map(|s| s.latent).collect();
             let camera = self.camera.pinhole(THUMBNAIL_PX[0], THUMBNAIL_PX[1]);
-            // Of a graph that is followed they are drawn to the end, else the last of them never would be.
+            // Images of a followed graph are always finished; otherwise the last one would never be.
             let owes = self.is_following && self.worker.owes_thumbnails();
             let not_within = if owes { Duration::MAX } else { of_rest };
             if due(self.asked_thumbnails.is_due((latents.clone(), camera), not_within)) {
@@ -653,20 +653,20 @@ impl Viewer {
         }
     }
 
-    /// The camera that looks straight down on the region that matters, with the region's shape.
+    /// Returns the camera that looks straight down on the region of interest, with the region's aspect ratio.
     fn above(&self) -> PinholeCamera {
         let [low, high] = self.session.models().bounds_m();
         let extent_m = [high[0] - low[0], high[1] - low[1]];
         let longest_m = extent_m[0].max(extent_m[1]);
         let [width_px, height_px] = extent_m.map(|e| ((e / longest_m * f64::from(BIRDS_EYE_PX)) as u32).max(1));
         let mut camera = OrbitCamera::above([low, high]);
-        // Its field of view is that of the shorter side.
+        // Its field of view covers the shorter side.
         let shorter_m = extent_m[0].min(extent_m[1]);
         camera.fov_deg = 2.0 * (shorter_m / 2.0 / camera.distance_m).atan().to_degrees();
         camera.pinhole(width_px, height_px)
     }
 
-    /// Saves the picture of the window that was asked for; asks for the only one of a window that was opened for it.
+    /// Saves a requested image of the window, or requests the one that a one-shot window saves.
     fn take_shot(&mut self, ctx: &Context) {
         let arrived = shots::arrived(ctx);
         if let Some((path, after)) = self.options.one_shot.clone() {
@@ -693,7 +693,7 @@ impl Viewer {
     }
 }
 
-/// The models that a run uses, where they are not those of a session.
+/// Returns the checkpoint of a run if it differs from the session's.
 fn other_checkpoint(live: &LiveFeed, session: &Session) -> Option<PathBuf> {
     let of_run = live.watched().run.checkpoint.clone();
     let whole = |path: &Path| path.canonicalize().unwrap_or_else(|_| path.to_owned());

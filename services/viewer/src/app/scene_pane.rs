@@ -1,4 +1,4 @@
-//! The pane in the middle: the shown scene from the camera that a hand moves, with what probing found in it.
+//! The pane in the middle: the shown scene from the user's camera, with the results of probing.
 
 use super::{Command, Viewer, theme};
 use crate::camera::{FOV_DEG, edges, project_segment};
@@ -9,14 +9,14 @@ use eframe::egui::{
 };
 use std::time::Instant;
 
-/// A place is taken from this occupancy on.
+/// Occupancy from which a place counts as taken.
 pub const TAKEN: f32 = 0.5;
-/// Points zoomed by one notch of the wheel double the nearness in so many.
+/// Points of scrolling that double or halve the distance.
 const SCROLL_PER_DOUBLING: f32 = 240.0;
-/// A point is drawn when so much light is stopped by this length of what is there, metres.
+/// A density is drawn if this length of it absorbs a visible share of the light, metres.
 const LEAST_STOPPED: f32 = 0.04;
 const POINT_LENGTH_M: f32 = 0.25;
-/// Least and most that the finest picture's longest side can be set to, pixels.
+/// Range of the longest side of the finest image, pixels.
 const FINEST_PX: [u32; 2] = [96, 1536];
 
 impl Viewer {
@@ -38,7 +38,7 @@ impl Viewer {
             let camera = self.camera.pinhole(rect.width() as u32, rect.height() as u32);
             self.overlay(&painter, rect, &camera);
         } else {
-            let text = "Toggle a picture to see the scene that it may stand for";
+            let text = "Toggle an image to see a scene that explains it";
             painter.text(rect.center(), Align2::CENTER_CENTER, text, FontId::proportional(14.0), palette.weak);
         }
         self.captions(ui, rect);
@@ -70,7 +70,7 @@ impl Viewer {
         }
     }
 
-    /// Boxes and densities.
+    /// Draws boxes and densities.
     fn overlay(&self, painter: &Painter, rect: Rect, camera: &PinholeCamera) {
         let palette = theme::on_pictures();
         let at = |p: [f64; 2]| rect.min + vec2(p[0] as f32, p[1] as f32);
@@ -114,7 +114,7 @@ impl Viewer {
         }
     }
 
-    /// What is shown, and how fine.
+    /// Draws the captions: name of the scene, and resolution.
     fn captions(&self, ui: &Ui, rect: Rect) {
         let Some(scene) = self.recent(&self.drawn.view).map(|recent| &recent.scene) else { return };
         let painter = ui.painter_at(rect);
@@ -155,7 +155,7 @@ impl Viewer {
                     self.moved = Some(Instant::now());
                 }
                 ui.add(DragValue::new(&mut self.finest_px).range(FINEST_PX[0]..=FINEST_PX[1]).suffix(" px").speed(4))
-                    .on_hover_text("Longest side of the finest picture (drag): coarser ones come first");
+                    .on_hover_text("Longest side of the finest image (drag): coarser images come first");
                 ui.separator();
                 ui.checkbox(&mut self.overlays.boxes, "boxes");
                 ui.checkbox(&mut self.overlays.densities, "densities");
@@ -164,7 +164,7 @@ impl Viewer {
     }
 }
 
-/// Text with a dark ground, readable on any picture.
+/// Draws text on a dark background, readable on any image.
 fn caption(painter: &Painter, at: eframe::egui::Pos2, align: Align2, text: &str, color: Color32, size: f32) {
     let galley = painter.layout_no_wrap(text.to_owned(), FontId::proportional(size), color);
     let rect = align.anchor_size(at, galley.size());

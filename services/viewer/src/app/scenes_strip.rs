@@ -1,4 +1,4 @@
-//! The strip below the scene: all scenes of the step as small pictures; the one that is pressed is shown.
+//! The strip below the scene: thumbnails of all scenes of the step. A click shows a scene.
 
 use super::{Viewer, theme};
 use crate::session::{Scene, steps_ahead};
@@ -16,12 +16,12 @@ impl Viewer {
         ui.horizontal(|ui| {
             ui.label(theme::heading("Scenes"));
             let text = match self.session.moment() {
-                None => "what the picture may stand for, once there is one".to_owned(),
-                Some(moment) if moment.forecast.is_none() => "press Predict to forecast what comes next".to_owned(),
+                None => "scenes that explain the image, after Toggle".to_owned(),
+                Some(moment) if moment.forecast.is_none() => "press Predict to forecast the next step".to_owned(),
                 Some(moment) => {
                     let drawn = moment.forecast.as_ref().map_or(0, |f| f.draws.len());
                     let path = format!("path followed: {:.0} %", 100.0 * moment.path_probability);
-                    format!("{}: the mixture's components, and {drawn} latents drawn; {path}", steps_ahead(moment.step))
+                    format!("{}: the mixture's components and {drawn} drawn latents; {path}", steps_ahead(moment.step))
                 }
             };
             ui.weak(text);

@@ -1,24 +1,24 @@
-//! Pictures of the window and of the scene, as PNG files.
+//! Images of the window and of the scene, as PNG files.
 
 use carff_dataset::Image;
 use eframe::egui::{ColorImage, Context, Event, UserData, ViewportCommand};
 use std::path::{Path, PathBuf};
 
-/// Numbers that are tried for a new file's name.
+/// Highest number that is tried for a new file's name.
 const MOST_FILES: u32 = 10_000;
 
-/// Why a picture could not be saved.
+/// Why an image could not be saved.
 #[derive(Debug, thiserror::Error)]
 pub enum ShotError {
     /// The file could not be written.
     #[error("cannot save {path}: {source}")]
     Save {
-        /// Which file.
+        /// Path of the file.
         path: PathBuf,
-        /// What went wrong.
+        /// Error of the image library.
         source: image::ImageError,
     },
-    /// All names are taken.
+    /// All file names are taken.
     #[error("{folder} has {MOST_FILES} screenshots: remove some")]
     Full {
         /// The folder.
@@ -26,12 +26,12 @@ pub enum ShotError {
     },
 }
 
-/// Asks for a picture of the window; it comes with one of the next frames.
+/// Requests an image of the window; it arrives with one of the next frames.
 pub fn request(ctx: &Context) {
     ctx.send_viewport_cmd(ViewportCommand::Screenshot(UserData::default()));
 }
 
-/// The picture of the window that was asked for, once it is there.
+/// Returns the requested image of the window when it has arrived.
 pub fn arrived(ctx: &Context) -> Option<std::sync::Arc<ColorImage>> {
     ctx.input(|input| {
         input.events.iter().find_map(|event| match event {
@@ -41,7 +41,7 @@ pub fn arrived(ctx: &Context) -> Option<std::sync::Arc<ColorImage>> {
     })
 }
 
-/// A file name in `folder` that is not taken yet.
+/// Returns an unused file name in `folder`.
 pub fn free_name(folder: &Path, kind: &str) -> Result<PathBuf, ShotError> {
     (1..=MOST_FILES)
         .map(|i| folder.join(format!("carff-{kind}-{i:04}.png")))
@@ -49,14 +49,14 @@ pub fn free_name(folder: &Path, kind: &str) -> Result<PathBuf, ShotError> {
         .ok_or_else(|| ShotError::Full { folder: folder.to_owned() })
 }
 
-/// Saves a picture of the window.
+/// Saves an image of the window.
 pub fn save_window(window: &ColorImage, path: &Path) -> Result<(), ShotError> {
     let [width, height] = window.size.map(|side| side as u32);
     let rgb: Vec<u8> = window.pixels.iter().flat_map(|p| [p.r(), p.g(), p.b()]).collect();
     save(&rgb, width, height, path)
 }
 
-/// Saves a picture of a scene.
+/// Saves an image of a scene.
 pub fn save_image(image: &Image, path: &Path) -> Result<(), ShotError> {
     save(&image.rgb, image.width_px, image.height_px, path)
 }
@@ -71,7 +71,7 @@ mod tests {
     use super::*;
     use eframe::egui::Color32;
 
-    /// Names go on by number, what is saved can be read back, and an error names the file.
+    /// File names are numbered in order, saved images can be read back, and an error names the file.
     #[test]
     fn saves_under_free_names() {
         let folder = tempfile::tempdir().unwrap();

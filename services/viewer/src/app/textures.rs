@@ -1,16 +1,16 @@
-//! Pictures on their way to the screen.
+//! Textures of the displayed images.
 
 use super::theme;
 use carff_dataset::Image;
 use eframe::egui::{ColorImage, Context, TextureHandle, TextureId, TextureOptions, Theme};
 
-/// The window's pictures.
+/// The window's images.
 #[derive(Default)]
 pub struct Textures {
     view: Option<TextureHandle>,
     birds_eye: Option<TextureHandle>,
     slice: Option<TextureHandle>,
-    /// What the slice's colours are made of, and for which theme they were made.
+    /// The slice's density image, and the theme of its texture.
     density: Option<(Image, Theme)>,
     thumbnails: Vec<Option<TextureHandle>>,
     input: Option<(Image, TextureHandle)>,
@@ -28,17 +28,17 @@ fn colors(image: &Image) -> ColorImage {
 }
 
 impl Textures {
-    /// A new view.
+    /// Sets the image of the view.
     pub fn set_view(&mut self, ctx: &Context, image: &Image) {
         set(ctx, &mut self.view, "view", colors(image), TextureOptions::LINEAR);
     }
 
-    /// A new picture from above.
+    /// Sets the image from above.
     pub fn set_birds_eye(&mut self, ctx: &Context, image: &Image) {
         set(ctx, &mut self.birds_eye, "birds-eye", colors(image), TextureOptions::LINEAR);
     }
 
-    /// A new slice.
+    /// Sets the slice of density.
     pub fn set_slice(&mut self, ctx: &Context, image: Image) {
         self.density = Some((image, ctx.theme()));
         self.color_slice(ctx);
@@ -52,7 +52,7 @@ impl Textures {
         set(ctx, &mut self.slice, "slice", colored, TextureOptions::LINEAR);
     }
 
-    /// A new small picture.
+    /// Sets a thumbnail.
     pub fn set_thumbnail(&mut self, ctx: &Context, index: usize, image: &Image) {
         if self.thumbnails.len() <= index {
             self.thumbnails.resize_with(index + 1, || None);
@@ -60,17 +60,17 @@ impl Textures {
         set(ctx, &mut self.thumbnails[index], "scene", colors(image), TextureOptions::LINEAR);
     }
 
-    /// The view.
+    /// Returns the texture of the view.
     pub fn view(&self) -> Option<TextureId> {
         self.view.as_ref().map(TextureHandle::id)
     }
 
-    /// The picture from above.
+    /// Returns the texture of the image from above.
     pub fn birds_eye(&self) -> Option<TextureId> {
         self.birds_eye.as_ref().map(TextureHandle::id)
     }
 
-    /// The slice, in the colours of the theme in force.
+    /// Returns the texture of the slice in the colours of the current theme.
     pub fn slice(&mut self, ctx: &Context) -> Option<TextureId> {
         if let Some((_, theme)) = &mut self.density
             && *theme != ctx.theme()
@@ -81,12 +81,12 @@ impl Textures {
         self.slice.as_ref().map(TextureHandle::id)
     }
 
-    /// A small picture.
+    /// Returns the texture of a thumbnail.
     pub fn thumbnail(&self, index: usize) -> Option<TextureId> {
         self.thumbnails.get(index)?.as_ref().map(TextureHandle::id)
     }
 
-    /// The input picture, sharp: it is small, and each of its pixels is one that the encoder sees.
+    /// Returns the texture of the input image without interpolation, so that single pixels are visible.
     pub fn input(&mut self, ctx: &Context, image: &Image) -> TextureId {
         match &mut self.input {
             Some((shown, texture)) if shown == image => texture.id(),

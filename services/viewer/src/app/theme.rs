@@ -1,4 +1,4 @@
-//! How the window looks: fonts, colours, spacing; dark and light.
+//! The look of the window: fonts, colours and spacing, dark and light.
 
 use eframe::egui::{
     self, Color32, Context, CornerRadius, FontData, FontDefinitions, FontFamily, FontId, Frame, IconData, Margin,
@@ -6,34 +6,34 @@ use eframe::egui::{
 };
 use std::sync::Arc;
 
-/// Colours that mean something, for one theme.
+/// Colours by meaning, for one theme.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Palette {
-    /// Behind all.
+    /// Background of the window.
     pub ground: Color32,
-    /// Panes.
+    /// Background of panes.
     pub pane: Color32,
-    /// What lies on a pane.
+    /// Background of elements on a pane.
     pub raised: Color32,
-    /// Thin lines.
+    /// Colour of thin lines.
     pub line: Color32,
-    /// Text that matters less.
+    /// Colour of less important text.
     pub weak: Color32,
-    /// What is chosen, and what can be pressed first.
+    /// Colour of the selection and of the main button.
     pub accent: Color32,
-    /// Text on the accent.
+    /// Colour of text on the accent.
     pub on_accent: Color32,
-    /// Hazard, halt.
+    /// Colour of hazard and halt.
     pub hazard: Color32,
-    /// Clear, advance.
+    /// Colour of clear and advance.
     pub clear: Color32,
-    /// The ego vehicle.
+    /// Colour of the ego vehicle.
     pub ego: Color32,
-    /// Errors.
+    /// Colour of errors.
     pub error: Color32,
-    /// Lines of a plot.
+    /// Colours of the lines of a plot.
     pub lines: [Color32; 5],
-    /// Dense, in a slice: from nothing to all.
+    /// Colours of a slice, from empty to dense.
     pub density: [Color32; 4],
 }
 
@@ -73,7 +73,7 @@ const LIGHT: Palette = Palette {
     density: [rgb(0x00fb_fbfd), rgb(0x00c9_b3e6), rgb(0x00a6_3d6b), rgb(0x002a_1038)],
 };
 
-/// The palette in force.
+/// Returns the palette of the current theme.
 pub fn palette(ctx: &Context) -> &'static Palette {
     match ctx.theme() {
         Theme::Dark => &DARK,
@@ -81,20 +81,20 @@ pub fn palette(ctx: &Context) -> &'static Palette {
     }
 }
 
-/// The palette for what is drawn on pictures: they are the same in both themes.
+/// Returns the palette for overlays on images, which is the same in both themes.
 pub fn on_pictures() -> &'static Palette {
     &DARK
 }
 
 impl Palette {
-    /// The colour of a share of light that is stopped, 0..=1.
+    /// Returns the colour of a share of absorbed light, 0..=1.
     pub fn of_density(&self, share: f32) -> Color32 {
         let place = share.clamp(0.0, 1.0) * (self.density.len() - 1) as f32;
         let first = (place as usize).min(self.density.len() - 2);
         self.density[first].lerp_to_gamma(self.density[first + 1], place - first as f32)
     }
 
-    /// The colour of what stands at a place.
+    /// Returns the colour of the actor at a place.
     pub fn of_place(&self, name: &str) -> Color32 {
         if name == "ego" { self.ego } else { self.hazard }
     }
@@ -111,7 +111,7 @@ pub fn install(ctx: &Context) {
         ("sans", dejavu::sans_condensed::regular()),
         ("bold", dejavu::sans_condensed::bold()),
         ("mono", dejavu::sans_mono::regular()),
-        // The condensed family has fewer signs.
+        // The condensed family has fewer glyphs.
         ("signs", dejavu::sans::regular()),
     ] {
         fonts.font_data.insert(name.to_owned(), Arc::new(FontData::from_static(bytes)));
@@ -180,7 +180,7 @@ fn visuals(theme: Theme, palette: &Palette) -> Visuals {
     v
 }
 
-/// The window's sign: what is seen, and what may come.
+/// Returns the window's icon: the observed scene and its branches.
 pub fn icon() -> IconData {
     const SIDE: u32 = 64;
     let rgba = (0..SIDE * SIDE)
@@ -201,22 +201,22 @@ pub fn icon() -> IconData {
     IconData { rgba, width: SIDE, height: SIDE }
 }
 
-/// A pane's frame.
+/// Returns a pane's frame.
 pub fn pane(palette: &Palette) -> Frame {
     Frame::new().fill(palette.pane).inner_margin(Margin::symmetric(12, 10)).stroke(Stroke::new(1.0, palette.line))
 }
 
-/// A pane's heading.
+/// Formats the heading of a pane.
 pub fn heading(text: impl Into<String>) -> RichText {
     RichText::new(text).text_style(TextStyle::Heading)
 }
 
-/// Bold text of the body's size.
+/// Formats bold text of body size.
 pub fn strong(text: impl Into<String>) -> RichText {
     RichText::new(text).font(FontId::new(12.5, bold()))
 }
 
-/// Small text.
+/// Formats small text.
 pub fn small(text: impl Into<String>) -> RichText {
     RichText::new(text).text_style(TextStyle::Small)
 }

@@ -1,11 +1,11 @@
-//! The bar at the top: the three functions, the history, where pictures come from.
+//! The bar at the top: the three main commands, the history, and the source of images.
 
 use super::{Command, Viewer, theme};
 use crate::live::LiveFeed;
 use crate::session::steps_ahead;
 use eframe::egui::{Align, Button, ComboBox, Layout, RichText, Theme, Ui, vec2};
 
-/// Entries of the history that are shown.
+/// Number of shown entries of the history.
 const CRUMBS: usize = 7;
 
 impl Viewer {
@@ -44,7 +44,7 @@ impl Viewer {
         });
     }
 
-    /// A button that is dead, and says why, while its command would do nothing.
+    /// A button that is disabled while its command has no effect, with the reason as tooltip.
     pub(super) fn command_button(
         &self,
         ui: &mut Ui,
@@ -67,7 +67,7 @@ impl Viewer {
         }
     }
 
-    /// The newest part of the history up to a little after what is shown.
+    /// Shows the newest part of the history, up to a few entries after the current one.
     fn crumbs(&mut self, ui: &mut Ui) {
         let history = self.session.history();
         let (place, len) = (history.place(), history.entries().len());
@@ -87,7 +87,7 @@ impl Viewer {
         }
     }
 
-    /// Where pictures come from: files, or a running graph.
+    /// Shows the source of images: files, or a running graph.
     fn source(&mut self, ui: &mut Ui, commands: &mut Vec<Command>) {
         let palette = theme::palette(ui.ctx());
         let live = self.live.as_ref().map(|live| {
@@ -101,7 +101,7 @@ impl Viewer {
                 wanted = Some(None);
             }
             match carff_observe::runs() {
-                Ok(runs) if runs.is_empty() => drop(ui.weak("no graph runs here")),
+                Ok(runs) if runs.is_empty() => drop(ui.weak("no running graph found")),
                 Ok(runs) => {
                     for run in runs {
                         let is_this = live.as_ref().is_some_and(|(name, _)| *name == run.name);
@@ -134,7 +134,7 @@ impl Viewer {
         }
     }
 
-    /// Watches a run in place of the one before.
+    /// Watches another run.
     fn attach(&mut self, run: String) {
         let waker = self.waker.clone();
         match LiveFeed::attach(Some(run), move || waker.wake_soon()) {

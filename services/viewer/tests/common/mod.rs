@@ -1,6 +1,6 @@
-//! What the viewer's tests share: the shipped checkpoint, and true pictures of its scenario.
+//! Fixtures of the viewer's tests: the shipped checkpoint, and true images of its scenario.
 #![allow(dead_code, reason = "each test program uses a part")]
-#![allow(clippy::unwrap_used, reason = "what fails here fails a test")]
+#![allow(clippy::unwrap_used, reason = "a failure here fails a test")]
 
 use carff_scenes::{RenderOptions, Scenario};
 use carff_viewer::input::Input;
@@ -8,7 +8,7 @@ use carff_viewer::models::Models;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-/// A view that hides the truck's place at the first step, and one straight from above.
+/// A view that hides the truck's place at the first step, and a view straight from above.
 pub const HIDING_VIEW: usize = 2;
 pub const ABOVE_VIEW: usize = 50;
 
@@ -28,7 +28,7 @@ pub fn scenario() -> Scenario {
     Scenario::load(&root().join("configs/scenarios/approaching-intersection.toml")).unwrap()
 }
 
-/// What a camera of the scenario sees in a state.
+/// Returns the image of a state from a camera of the scenario.
 pub fn picture(branch: usize, timestamp: usize, view: usize) -> Arc<Input> {
     let scenario = scenario();
     let camera = scenario.cameras()[view].camera;
@@ -37,7 +37,7 @@ pub fn picture(branch: usize, timestamp: usize, view: usize) -> Arc<Input> {
     Arc::new(Input { camera: Some(camera), frame: view as u64, ..(*input).clone() })
 }
 
-/// A copy of the shipped checkpoint: all files but those that are named, the large ones linked.
+/// Copies the shipped checkpoint without some files; large files are linked.
 pub fn copy_without(files: &[&str]) -> tempfile::TempDir {
     let folder = tempfile::tempdir().unwrap();
     for entry in std::fs::read_dir(checkpoint()).unwrap() {

@@ -1,4 +1,4 @@
-//! Messages whose type is only known at run time.
+//! Messages with a type that is only known at run time.
 
 use super::{ActionForm, BeliefForm, ForecastForm, FormError, FrameForm, HealthForm, PosteriorForm, ViewForm};
 use crate::{Action, Belief, Forecast, FrameMeta, Header, Health, Message, Posterior, ViewMeta};
@@ -11,7 +11,7 @@ use std::fmt::Debug;
 
 /// A message that has a JSON form: probes, recordings and links handle it without knowing its type.
 pub trait Readable: Message {
-    /// The form.
+    /// The JSON form of the message.
     type Form: Serialize + DeserializeOwned + JsonSchema + for<'a> From<&'a Self>;
     /// Name of the form's schema, for example `carff.Belief`.
     const SCHEMA: &'static str;
@@ -50,19 +50,19 @@ pub fn read<M: Readable>(json: &[u8]) -> Result<M, FormError> {
 
 /// A [`Readable`] message of any type.
 pub trait DynMessage: Any + Debug + Send + Sync {
-    /// The header.
+    /// Returns the header.
     fn header(&self) -> &Header;
 
-    /// The header, to be changed.
+    /// Returns the header for changes.
     fn header_mut(&mut self) -> &mut Header;
 
-    /// The message's size in shared memory, bytes.
+    /// Returns the message's size in shared memory, bytes.
     fn size_bytes(&self) -> usize;
 
-    /// The message's form, as JSON.
+    /// Returns the message's form as JSON.
     fn to_json(&self) -> Result<Value, serde_json::Error>;
 
-    /// A copy.
+    /// Returns a copy.
     fn boxed(&self) -> Box<dyn DynMessage>;
 }
 
@@ -106,38 +106,38 @@ pub struct AnyMessage<'a> {
 }
 
 impl<'a> AnyMessage<'a> {
-    /// Wraps a message, and the bytes of the image that it describes.
+    /// Wraps a message and the bytes of the image that it describes.
     pub fn new(message: &'a dyn DynMessage, bytes: &'a [u8]) -> Self {
         Self { message, bytes }
     }
 
-    /// The message, where it is of this type.
+    /// Returns the message if it is of this type.
     pub fn get<M: Readable>(self) -> Option<&'a M> {
         let message: &dyn Any = self.message;
         message.downcast_ref()
     }
 
-    /// The image's bytes; none for a message by itself.
+    /// Returns the image's bytes; empty for a message by itself.
     pub fn bytes(self) -> &'a [u8] {
         self.bytes
     }
 
-    /// The header.
+    /// Returns the header.
     pub fn header(self) -> &'a Header {
         self.message.header()
     }
 
-    /// Its size in shared memory, bytes, image included.
+    /// Returns its size in shared memory, bytes, including the image.
     pub fn size_bytes(self) -> usize {
         self.message.size_bytes() + self.bytes.len()
     }
 
-    /// The message's form as JSON, without an image's bytes.
+    /// Returns the message's form as JSON, without an image's bytes.
     pub fn to_json(self) -> Result<Value, serde_json::Error> {
         self.message.to_json()
     }
 
-    /// A copy that owns its memory.
+    /// Returns a copy that owns its memory.
     pub fn to_owned(self) -> OwnedMessage {
         OwnedMessage { message: self.message.boxed(), bytes: self.bytes.to_vec() }
     }
@@ -151,23 +151,23 @@ pub struct OwnedMessage {
 }
 
 impl OwnedMessage {
-    /// Wraps a message, and the bytes of the image that it describes.
+    /// Wraps a message and the bytes of the image that it describes.
     pub fn new(message: Box<dyn DynMessage>, bytes: Vec<u8>) -> Self {
         Self { message, bytes }
     }
 
-    /// The header, to be changed.
+    /// Returns the header for changes.
     pub fn header_mut(&mut self) -> &mut Header {
         self.message.header_mut()
     }
 
-    /// The message, to be changed, where it is of this type.
+    /// Returns the message for changes, if it is of this type.
     pub fn get_mut<M: Readable>(&mut self) -> Option<&mut M> {
         let message: &mut dyn Any = &mut *self.message;
         message.downcast_mut()
     }
 
-    /// The message, borrowed.
+    /// Returns the message, borrowed.
     pub fn as_message(&self) -> AnyMessage<'_> {
         AnyMessage { message: &*self.message, bytes: &self.bytes }
     }

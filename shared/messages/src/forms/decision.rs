@@ -1,35 +1,35 @@
-//! Actions.
+//! The form of actions.
 
 use super::{FormError, HeaderForm, code_of, name_of};
 use crate::{Action, ActionCode, Message, Reason, Rule};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// What the car does until the next action, and why.
+/// The vehicle's action until the next one, and its reason.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ActionForm {
-    /// Header of the frame that it rests on.
+    /// Header of the frame that it is based on.
     pub header: HeaderForm,
     /// `halt` or `advance`.
     pub action: String,
-    /// Why.
+    /// Reason of the action.
     pub reason: String,
-    /// The decision rule in force.
+    /// The active decision rule.
     pub rule: String,
-    /// Samples that the belief rested on.
+    /// Number of samples in the belief.
     pub sample_count: u32,
-    /// How sure, 0..=1.
+    /// Confidence of the rule, 0..=1.
     pub confidence: f32,
-    /// Probability that the hazard is met at any step looked ahead, 0..=1.
+    /// Probability of the hazard at any step of the look-ahead, 0..=1.
     pub hazard_probability: f32,
-    /// Whether it is the first action that rests on its frame.
+    /// True for the first action based on its frame.
     pub is_decision: bool,
-    /// Until when it stands: monotonic clock, nanoseconds.
+    /// End of its validity: monotonic clock, nanoseconds.
     pub valid_until_ns: u64,
-    /// The frame that it rests on, if any.
+    /// The frame that it is based on, if any.
     pub based_on_frame: Option<u64>,
-    /// Time from capture to the decision, nanoseconds; 0 when it rests on no frame.
+    /// Time from capture to the decision, nanoseconds; 0 without a frame.
     pub latency_ns: u64,
 }
 

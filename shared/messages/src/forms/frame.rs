@@ -1,27 +1,27 @@
-//! What describes pictures.
+//! The forms of image descriptions.
 
 use super::{FormError, HeaderForm, array, code_of, index, name_of, signed};
 use crate::{DatasetView, FrameMeta, Intrinsics, Message, Observability, ViewKind, ViewMeta};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// Where in a data set a frame comes from.
+/// Position of a frame in a dataset.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct DatasetViewForm {
     /// Index of the camera pose.
     pub view: Option<u32>,
-    /// The hidden course of events.
+    /// The hidden branch.
     pub branch: Option<u32>,
-    /// Step of it.
+    /// Time step of the branch.
     pub timestamp: Option<u32>,
     /// Number of the drive in this run.
     pub drive: Option<u32>,
-    /// Frames of this drive before this one.
+    /// Number of earlier frames of this drive.
     pub frame_in_drive: Option<u32>,
-    /// How much of the actor or its place it shows: `unknown`, `none`, `partial` or `full`.
+    /// Visibility of the actor or its place: `unknown`, `none`, `partial` or `full`.
     pub observability: String,
-    /// Whether it is the last frame of a timestamp, when a decision on it is counted.
+    /// True for the last frame of a time step, whose decision is counted.
     pub last_of_timestamp: bool,
 }
 
@@ -31,19 +31,19 @@ pub struct DatasetViewForm {
 pub struct FrameForm {
     /// Header, at step 0.
     pub header: HeaderForm,
-    /// Pixels in a row.
+    /// Width, pixels.
     pub width_px: u32,
-    /// Rows.
+    /// Height, pixels.
     pub height_px: u32,
     /// Intrinsics for this width and height.
     pub intrinsics: Intrinsics,
     /// Row-major 4x4: camera space (OpenGL axes) to world space (metres).
     pub world_from_camera: Vec<f64>,
-    /// Where in a data set it comes from, if known.
+    /// Position in a dataset, if known.
     pub dataset_view: Option<DatasetViewForm>,
 }
 
-/// The word for an observability that is not known.
+/// Name of an unknown observability.
 const UNKNOWN: &str = "unknown";
 
 fn observability_name(code: i32) -> String {
@@ -116,15 +116,15 @@ impl TryFrom<&FrameForm> for FrameMeta {
 pub struct ViewForm {
     /// Header, at the step of the hypothesis.
     pub header: HeaderForm,
-    /// Which sample or component it shows.
+    /// Index of the sample or component that it shows.
     pub hypothesis: u32,
     /// `birds-eye` or `free`.
     pub kind: String,
-    /// The state that probing found in it, if it is a known one.
+    /// The state that probing found, if it is a known one.
     pub state: Option<u32>,
-    /// Pixels in a row.
+    /// Width, pixels.
     pub width_px: u32,
-    /// Rows.
+    /// Height, pixels.
     pub height_px: u32,
     /// Probability of this hypothesis.
     pub probability: f32,
@@ -134,7 +134,7 @@ pub struct ViewForm {
     pub intrinsics: Intrinsics,
     /// Row-major 4x4: camera space (OpenGL axes) to world space (metres).
     pub world_from_camera: Vec<f64>,
-    /// Time that the rendering took, nanoseconds.
+    /// Duration of the rendering, nanoseconds.
     pub stage_latency_ns: u64,
 }
 

@@ -1,11 +1,11 @@
-//! The header.
+//! The form of the header.
 
 use super::FormError;
 use crate::Header;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// What every message carries.
+/// Common fields of all messages.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct HeaderForm {
@@ -13,15 +13,15 @@ pub struct HeaderForm {
     pub schema_version: u32,
     /// The run, as 16 hexadecimal digits.
     pub run_id: String,
-    /// The camera frame that it rests on.
+    /// The camera frame that the message is based on.
     pub frame_id: u64,
-    /// Horizon step: 0 for what was observed, 1 for the first forecast.
+    /// Horizon step: 0 for the observation, 1 for the first forecast.
     pub step: u32,
-    /// Counts the messages of one publisher from 0.
+    /// Number of the message from its publisher, from 0.
     pub sequence: u64,
-    /// When the camera took the frame: monotonic clock, nanoseconds.
+    /// Capture time of the frame: monotonic clock, nanoseconds.
     pub capture_time_ns: u64,
-    /// When this message was published: monotonic clock, nanoseconds.
+    /// Publication time of this message: monotonic clock, nanoseconds.
     pub publish_time_ns: u64,
     /// The run's random seed.
     pub seed: u64,

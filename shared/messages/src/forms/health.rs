@@ -1,4 +1,4 @@
-//! Heartbeats.
+//! The form of heartbeats.
 
 use super::{FormError, HeaderForm, code_of, name_of};
 use crate::{Health, HealthState, Message, Stage};
@@ -9,29 +9,29 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct HealthForm {
-    /// Header; the frame is the last one worked on.
+    /// Header; its frame is the last processed frame.
     pub header: HeaderForm,
-    /// Which stage.
+    /// Name of the stage.
     pub stage: String,
-    /// How it does.
+    /// State of the stage.
     pub state: String,
     /// Process id.
     pub pid: u32,
-    /// Valid inputs received.
+    /// Number of valid inputs received.
     pub received: u64,
-    /// Outputs published.
+    /// Number of outputs published.
     pub published: u64,
-    /// Inputs skipped because a newer one was there.
+    /// Number of inputs skipped in favour of newer ones.
     pub skipped: u64,
-    /// Inputs dropped because they were not valid.
+    /// Number of inputs dropped because they were invalid.
     pub invalid: u64,
-    /// Errors of its own.
+    /// Number of the stage's own errors.
     pub errors: u64,
-    /// Time that the last output took, nanoseconds.
+    /// Duration of the last output, nanoseconds.
     pub last_latency_ns: u64,
-    /// Longest time that an output took, nanoseconds.
+    /// Longest duration of an output, nanoseconds.
     pub max_latency_ns: u64,
-    /// When its main loop last went round, or now while it waits for input: monotonic clock, nanoseconds.
+    /// Last round of the main loop, or the current time while it waits for input: monotonic clock, nanoseconds.
     pub last_progress_ns: u64,
     /// Resident memory, bytes.
     pub rss_bytes: u64,

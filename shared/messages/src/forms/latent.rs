@@ -1,4 +1,4 @@
-//! Posteriors, forecasts, beliefs.
+//! The forms of posteriors, forecasts and beliefs.
 
 use super::{FormError, HeaderForm, array, begin, code_of, index, name_of, signed};
 use crate::{
@@ -48,9 +48,9 @@ impl TryFrom<&PosteriorForm> for Posterior {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ComponentForm {
-    /// Its weight.
+    /// Weight of the component.
     pub weight: f32,
-    /// Its distribution.
+    /// Distribution of the component.
     pub gaussian: Gaussian,
 }
 
@@ -58,9 +58,9 @@ pub struct ComponentForm {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct DrawForm {
-    /// Which component it was drawn from.
+    /// Component that the latent was drawn from.
     pub component: u8,
-    /// The latent.
+    /// The drawn latent.
     pub latent: Vec<f32>,
 }
 
@@ -70,19 +70,19 @@ pub struct DrawForm {
 pub struct ForecastForm {
     /// Header, at step 1 or more.
     pub header: HeaderForm,
-    /// `observed` or `probed`: what it was made from.
+    /// Source of the forecast: `observed` or `probed`.
     pub source: String,
-    /// Steps that this frame is looked ahead.
+    /// Number of steps in the look-ahead of this frame.
     pub horizon: u32,
     /// The state that the previous step resolved to, if any.
     pub resolved_state: Option<u32>,
-    /// Probability of the path followed up to the input.
+    /// Probability of the path up to the input.
     pub path_probability: f32,
     /// The mixture.
     pub components: Vec<ComponentForm>,
     /// The drawn latents.
     pub samples: Vec<DrawForm>,
-    /// Time that the encoder took for this frame, nanoseconds.
+    /// Duration of the encoding of this frame, nanoseconds.
     pub encoder_ns: u64,
     /// Time from the arrival of the input to sending, nanoseconds.
     pub stage_latency_ns: u64,
@@ -150,17 +150,17 @@ impl TryFrom<&ForecastForm> for Forecast {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ProbeForm {
-    /// Which component the latent was drawn from; of a component, itself.
+    /// Component that the latent was drawn from; for a component, its own index.
     pub component: u8,
     /// The component's weight; `null` for a sample.
     pub weight: Option<f32>,
-    /// The state that it shows, if it is a known one.
+    /// The state that the latent shows, if it is a known one.
     pub state: Option<u32>,
-    /// How sure.
+    /// Confidence of the state.
     pub confidence: f32,
-    /// Probability that the scene holds the hazard.
+    /// Probability that the scene contains the hazard.
     pub hazard_likelihood: f32,
-    /// Occupancy of each place, 0..=1. Recordings made before this field had its name call it `densities`.
+    /// Occupancy of each place, 0..=1. Old recordings call this field `densities`.
     #[serde(alias = "densities")]
     pub occupancies: Vec<f32>,
 }
@@ -193,17 +193,17 @@ impl ProbeForm {
 pub struct BeliefForm {
     /// Header, at the step of the forecast.
     pub header: HeaderForm,
-    /// Steps that this frame is looked ahead.
+    /// Number of steps in the look-ahead of this frame.
     pub horizon: u32,
-    /// Whether this is the frame's last step.
+    /// True for the frame's last step.
     pub is_final: bool,
-    /// Places probed.
+    /// Number of probed places.
     pub place_count: u32,
-    /// Probability of each known state; what is missing to 1 is "none of the known states".
+    /// Probability of each known state; the remainder to 1 is "none of the known states".
     pub state_probability: Vec<f32>,
-    /// Probability that the hazard is there at this step.
+    /// Probability of the hazard at this step.
     pub hazard_probability: f32,
-    /// Probability of the path followed up to this step's input.
+    /// Probability of the path up to this step's input.
     pub path_probability: f32,
     /// Result for each component's mean.
     pub components: Vec<ProbeForm>,
@@ -213,9 +213,9 @@ pub struct BeliefForm {
     pub resolved_state: Option<u32>,
     /// That state's stored posterior.
     pub resolved: Gaussian,
-    /// Time that the encoder took for this frame, nanoseconds.
+    /// Duration of the encoding of this frame, nanoseconds.
     pub encoder_ns: u64,
-    /// Time that the forecaster took for this step, nanoseconds.
+    /// Duration of the forecast of this step, nanoseconds.
     pub forecaster_ns: u64,
     /// Time from the arrival of the forecast to sending, nanoseconds.
     pub stage_latency_ns: u64,

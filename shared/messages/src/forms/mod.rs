@@ -1,8 +1,8 @@
 //! The JSON form of each message, and the conversions to it and back.
 //!
-//! People, recordings and other tools read these forms. A form spells codes as names, ends arrays at their counts, and
-//! writes `null` for "none". A message converted to its form and back is the same message bit for bit; entries beyond
-//! the counts become zero. [`schema`] describes a form as JSON Schema.
+//! People, recordings and other tools read these forms. A form writes codes as names, arrays with their used entries,
+//! and `null` for "none". A message converted to its form and back is the same message bit for bit; unused entries
+//! become zero. [`schema`] describes a form as JSON Schema.
 //!
 //! ```
 //! use carff_messages::{Gaussian, Header, Posterior};
@@ -35,57 +35,57 @@ pub use text::as_text;
 use crate::Invalid;
 use schemars::JsonSchema;
 
-/// Why a form is no message.
+/// Reason why a form cannot become a message.
 #[derive(Debug, thiserror::Error)]
 pub enum FormError {
-    /// A name that stands for nothing.
+    /// A name is unknown.
     #[error("`{field}` is `{found}`, must be one of: {known}")]
     UnknownName {
-        /// Which field.
+        /// Name of the field.
         field: &'static str,
-        /// What was found.
+        /// Value of the field.
         found: String,
-        /// What there is.
+        /// Allowed names.
         known: String,
     },
-    /// A list of the wrong length.
+    /// A list has the wrong length.
     #[error("`{field}` has {found} entries, must have {expected}")]
     Length {
-        /// Which field.
+        /// Name of the field.
         field: &'static str,
-        /// What was found.
+        /// Length of the list.
         found: usize,
-        /// What there may be.
+        /// Allowed length.
         expected: String,
     },
-    /// A number that is not written as it should be.
+    /// A number is not in the expected format.
     #[error("`{field}` is `{found}`: it must be 16 hexadecimal digits")]
     Number {
-        /// Which field.
+        /// Name of the field.
         field: &'static str,
-        /// What was found.
+        /// Value of the field.
         found: String,
     },
-    /// The text is not the JSON of this form.
+    /// The text is not valid JSON of this form.
     #[error(transparent)]
     Json(#[from] serde_json::Error),
-    /// The message that it makes is not valid.
+    /// The resulting message is not valid.
     #[error(transparent)]
     Invalid(#[from] Invalid),
 }
 
-/// A form's JSON Schema.
+/// Returns a form's JSON Schema.
 pub fn schema<T: JsonSchema>() -> serde_json::Value {
     schemars::schema_for!(T).to_value()
 }
 
-/// The name of a code; `unknown` for one that stands for nothing.
+/// Returns the name of a code; `unknown` for an unknown code.
 macro_rules! name_of {
     ($kind:ty, $code:expr) => {
         <$kind>::try_from($code).map_or("unknown", <$kind>::name).to_owned()
     };
 }
-/// The code of a name.
+/// Returns the code of a name.
 macro_rules! code_of {
     ($kind:ty, $field:literal, $name:expr) => {
         <$kind>::from_name(&$name).map(<$kind>::code).ok_or_else(|| $crate::forms::FormError::UnknownName {
@@ -97,12 +97,12 @@ macro_rules! code_of {
 }
 use {code_of, name_of};
 
-/// A list as an array of the same length.
+/// Converts a list to an array of the same length.
 fn array<T: Copy, const N: usize>(field: &'static str, list: &[T]) -> Result<[T; N], FormError> {
     list.try_into().map_err(|_| FormError::Length { field, found: list.len(), expected: N.to_string() })
 }
 
-/// A list as the begin of an array.
+/// Converts a list to the start of an array.
 fn begin<T: Copy, const N: usize>(field: &'static str, list: &[T], rest: T) -> Result<[T; N], FormError> {
     if list.len() > N {
         return Err(FormError::Length { field, found: list.len(), expected: format!("at most {N}") });
@@ -112,12 +112,12 @@ fn begin<T: Copy, const N: usize>(field: &'static str, list: &[T], rest: T) -> R
     Ok(array)
 }
 
-/// An index of which -1 stands for none.
+/// Returns an index; -1 is `None`.
 fn index(value: i32) -> Option<u32> {
     u32::try_from(value).ok()
 }
 
-/// The way back; what does not fit is refused by the message's validation.
+/// Converts an index back; the message's validation refuses values that are too large.
 fn signed(value: Option<u32>) -> i32 {
     value.map_or(-1, |v| i32::try_from(v).unwrap_or(i32::MAX))
 }

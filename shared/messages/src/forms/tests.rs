@@ -7,7 +7,7 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 use std::fmt::Debug;
 
-/// Plain arithmetic in place of a generator: bit patterns all over the range of finite numbers.
+/// Returns deterministic numbers with bit patterns over the range of finite numbers.
 fn numbers() -> impl FnMut() -> f32 {
     let mut state = 0x9e37_79b9_7f4a_7c15_u64;
     move || {
@@ -21,7 +21,7 @@ fn numbers() -> impl FnMut() -> f32 {
     }
 }
 
-/// Probabilities, as precise as can be.
+/// Returns a probability with full precision.
 fn probability(next: &mut impl FnMut() -> f32) -> f32 {
     (next().to_bits() >> 8) as f32 / (1 << 24) as f32
 }
@@ -69,7 +69,7 @@ fn belief(next: &mut impl FnMut() -> f32) -> Belief {
     belief
 }
 
-/// Every message survives the way to JSON text and back bit for bit, whatever finite numbers it holds.
+/// Every message is converted to JSON text and back without a change, bit for bit, for any finite numbers.
 #[test]
 fn messages_survive_their_forms() {
     let mut next = numbers();
@@ -152,7 +152,7 @@ fn messages_survive_their_forms() {
     assert_eq!(there_and_back::<_, HealthForm>(&health), health);
 }
 
-/// A form that is no message is refused with its field's name: unknown names, lists too long, invalid numbers.
+/// An invalid form is refused with its field's name: unknown names, lists that are too long, invalid numbers.
 #[test]
 fn what_is_no_message_is_refused() {
     let mut form = BeliefForm::from(&belief(&mut numbers()));
@@ -173,7 +173,7 @@ fn what_is_no_message_is_refused() {
     assert!(error.contains("source") && error.contains("observed, probed"), "{error}");
 }
 
-/// A belief recorded when occupancies were called densities is still read.
+/// A belief from an old recording, with `densities` for occupancies, can be read.
 #[test]
 fn the_old_name_of_occupancies_is_read() {
     let belief = belief(&mut numbers());

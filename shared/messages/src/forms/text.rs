@@ -1,9 +1,9 @@
-//! A form as indented text.
+//! Forms as indented text.
 
 use serde_json::Value;
 use std::fmt::Write;
 
-/// A JSON value as lines of `key: value`, in the manner of YAML; lists of plain values stay on one line.
+/// Formats a JSON value as lines of `key: value`, like YAML; lists of plain values stay on one line.
 pub fn as_text(value: &Value) -> String {
     let mut text = String::new();
     write(&mut text, value, 0);
@@ -15,7 +15,7 @@ fn write(text: &mut String, value: &Value, indent: usize) {
     match value {
         Value::Object(map) => {
             for (key, value) in map {
-                // Writing into a string does not fail.
+                // Writing to a string does not fail.
                 if is_plain(value) {
                     let _ = writeln!(text, "{pad}{key}: {}", plain(value));
                 } else {
@@ -28,7 +28,7 @@ fn write(text: &mut String, value: &Value, indent: usize) {
             for value in list {
                 let mut entry = String::new();
                 write(&mut entry, value, indent + 1);
-                // The first key stands beside the dash.
+                // The first key follows the dash.
                 let _ = write!(text, "{pad}- {}", entry.trim_start());
             }
         }
@@ -53,7 +53,7 @@ fn plain(value: &Value) -> String {
         Value::Bool(false) => "no".to_owned(),
         Value::String(text) => text.clone(),
         Value::Array(list) => format!("[{}]", list.iter().map(plain).collect::<Vec<_>>().join(", ")),
-        // People read as many digits as the messages have.
+        // Numbers are printed with the precision of the messages.
         Value::Number(number) if number.is_f64() => {
             number.as_f64().map_or_else(String::new, |v| (v as f32).to_string())
         }

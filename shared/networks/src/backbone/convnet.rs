@@ -13,7 +13,7 @@ pub struct ConvNet {
 const WIDTHS: [i64; 5] = [3, 32, 64, 96, 112];
 
 impl ConvNet {
-    /// Builds the net with fresh weights.
+    /// Builds the network with random weights.
     pub fn new(path: &nn::Path, input_px: i64) -> Self {
         let layers = WIDTHS
             .windows(2)

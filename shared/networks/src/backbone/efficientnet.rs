@@ -1,7 +1,7 @@
 //! EfficientNet-Lite0 (Tan and Le 2019, Lite variant: no squeeze-and-excite, `ReLU6`), up to stride 16.
 //!
-//! Batch normalisation is folded into the convolutions when the weights are read, also where they learn on: batches are
-//! small, and what the network is told of pictures in general shall stay.
+//! Batch normalisation is folded into the convolutions when the weights are read, even if they are trained further:
+//! batches are small, and the statistics of pretraining should stay.
 
 use super::{Backbone, resize};
 use crate::{
@@ -51,7 +51,7 @@ struct Convolution {
     groups: i64,
 }
 
-/// One convolution and its batch normalisation, by their published names.
+/// A convolution with its batch normalisation, by their published names.
 struct Layer {
     convolution: String,
     norm: String,
@@ -61,14 +61,14 @@ struct Layer {
     groups: i64,
 }
 
-/// The parts of batch normalisation, each of as many numbers as there are output channels.
+/// Tensors of batch normalisation, each with one value per output channel.
 const NORM_PARTS: [&str; 4] = ["weight", "bias", "running_mean", "running_var"];
 
 fn stem_layer() -> Layer {
     Layer { convolution: "_conv_stem".into(), norm: "_bn0".into(), shape: [32, 3, 3, 3], stride: 2, groups: 1 }
 }
 
-/// A block's layers: the expansion, which the first block has not, the depthwise one and the projection.
+/// Returns a block's layers: the expansion (except in the first block), the depthwise layer and the projection.
 fn block_layers(block: usize) -> (Option<Layer>, Layer, Layer) {
     let (kernel, stride, expansion, input, output) = BLOCKS[block];
     let inner = input * expansion;
@@ -87,7 +87,7 @@ fn block_layers(block: usize) -> (Option<Layer>, Layer, Layer) {
 }
 
 impl EfficientNetLite0 {
-    /// The tensors that are read, with their shapes, in the names of the published state dict (`_conv_stem.weight`,
+    /// Returns names and shapes of the tensors that are read, as in the published state dict (`_conv_stem.weight`,
     /// `_blocks.0._bn1.weight`, ..).
     pub fn published() -> Vec<(String, Vec<i64>)> {
         let blocks = (0..BLOCKS.len()).flat_map(|i| {
@@ -103,9 +103,9 @@ impl EfficientNetLite0 {
             .collect()
     }
 
-    /// Reads the weights in the names of [`Self::published`]; others in the file are ignored. With none, the weights are
-    /// random (for tests and for filling from a checkpoint).
-    /// The folded weights are registered in `path`; whoever wants them frozen freezes its store.
+    /// Reads the weights by the names of [`Self::published`]; other tensors are ignored. Without tensors, the weights
+    /// are random (for tests, and for filling from a checkpoint). The folded weights are registered in `path`; to
+    /// freeze them, freeze its store.
     pub fn new(path: &nn::Path, tensors: Option<&Tensors>, input_px: i64) -> Result<Self, ModelError> {
         let tensors = tensors.map(|all| select(all, &Self::published())).transpose()?;
         let read = |layer: &Layer| {
@@ -125,7 +125,8 @@ impl EfficientNetLite0 {
     }
 }
 
-/// A layer's convolution with its normalisation folded in. `tensors` has all of [`EfficientNetLite0::published`].
+/// Returns a layer's convolution with its normalisation folded in. `tensors` has all of
+/// [`EfficientNetLite0::published`].
 fn folded(path: &nn::Path, tensors: Option<&Tensors>, layer: &Layer) -> Convolution {
     let shape = layer.shape;
     let (weight, bias) = match tensors {
@@ -153,7 +154,7 @@ fn folded(path: &nn::Path, tensors: Option<&Tensors>, layer: &Layer) -> Convolut
 }
 
 impl Convolution {
-    /// Convolution with TensorFlow's "same" padding: the odd pixel goes to the right and the bottom.
+    /// Convolves with TensorFlow's "same" padding: the odd pixel is at the right and the bottom.
     fn forward(&self, x: &Tensor) -> Tensor {
         let kernel = self.weight.size()[2];
         let side = x.size()[2];
@@ -175,7 +176,7 @@ impl Convolution {
     }
 }
 
-/// In place: at these sizes a second copy costs as much as the convolution before it.
+/// Works in place: at these sizes a copy costs as much as the convolution.
 fn relu6(mut x: Tensor) -> Tensor {
     x.clamp_(0.0, 6.0)
 }

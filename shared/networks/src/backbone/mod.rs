@@ -1,4 +1,4 @@
-//! Image backbones behind one trait: from a picture to a map of spatial features.
+//! Image backbones with a common trait: from an image to a map of spatial features.
 
 mod convnet;
 mod efficientnet;
@@ -13,17 +13,17 @@ use carff_checkpoint::shapes::{BackboneConfig, BackboneKind};
 use std::path::Path;
 use tch::{Tensor, nn};
 
-/// From pictures to spatial features.
+/// A network from images to spatial features.
 pub trait Backbone: Send {
-    /// `[N, 3, H, W]` in 0..=1, of any size, to `[N, channels, grid, grid]`.
+    /// Maps images `[N, 3, H, W]` in 0..=1, of any size, to `[N, channels, grid, grid]`.
     fn features(&self, pictures: &Tensor) -> Tensor;
-    /// Feature channels.
+    /// Returns the number of feature channels.
     fn channels(&self) -> i64;
-    /// Side of the feature map, in cells.
+    /// Returns the side of the feature map, in cells.
     fn grid(&self) -> i64;
 }
 
-/// Builds a backbone in `path`. With `pretrained`, its weights are read from that file.
+/// Builds a backbone in `path`; `pretrained` is the file of its weights.
 pub fn build(
     config: &BackboneConfig,
     path: &nn::Path,
@@ -54,7 +54,7 @@ pub fn build(
                 return Err(ModelError::Setting {
                     key: "backbone.kind",
                     value: "conv-net".into(),
-                    allowed: "no pretrained weights exist for the convolutional net: leave `pretrained` out",
+                    allowed: "no pretrained weights exist for the convolutional net: omit `pretrained`",
                 });
             }
             Box::new(net)
@@ -62,13 +62,13 @@ pub fn build(
     })
 }
 
-/// Resizes pictures to a square of `side` pixels, bilinearly; leaves them as they are when they fit already.
+/// Resizes images to a square of `side` pixels, bilinearly; images of that size are unchanged.
 pub(crate) fn resize(pictures: &Tensor, side: i64) -> Tensor {
     let size = pictures.size();
     if size[2] == side && size[3] == side {
         pictures.shallow_clone()
     } else if size[2] > side || size[3] > side {
-        // Averaged, so that what is finer than the new pixels leaves no pattern.
+        // Averaging removes detail finer than the new pixels, to avoid aliasing.
         pictures.internal_upsample_bilinear2d_aa([side, side], false, None, None)
     } else {
         pictures.upsample_bilinear2d([side, side], false, None, None)

@@ -33,7 +33,7 @@ struct Block {
 }
 
 impl VisionTransformer {
-    /// Builds the network in `path`; weights in the timm names (`blocks.0.attn.qkv.weight`) or the Hugging Face ones
+    /// Builds the network in `path`, with weights in timm names (`blocks.0.attn.qkv.weight`) or Hugging Face names
     /// (`vit.encoder.layer.0.attention.attention.query.weight`). A classifier in the file is ignored.
     pub fn new(
         path: &nn::Path,
@@ -86,16 +86,16 @@ impl VisionTransformer {
         Ok(net)
     }
 
-    /// The size of a published network, and the side of its pictures in pixels, by its tensors in timm or Hugging Face
-    /// names. Heads leave no trace in them: there is one for each 64 of the width, as in the published sizes from tiny to
-    /// large.
+    /// Returns the size of a published network and the side of its images in pixels, from its tensors in timm or
+    /// Hugging Face names. The tensors do not contain the number of heads: it is one per 64 of the width, as in all
+    /// published sizes.
     pub fn shape_of(tensors: &Tensors) -> Result<(VitConfig, i64), ModelError> {
         let tensors = timm_names(tensors);
         let size = |name: &str| {
             tensors.get(name).map(Tensor::size).ok_or_else(|| ModelError::Mismatch(format!("`{name}` is missing")))
         };
         let unfit = |name: &str, size: &[i64], wanted: &str| {
-            Err(ModelError::Mismatch(format!("`{name}` is {size:?}, {wanted} is wanted")))
+            Err(ModelError::Mismatch(format!("`{name}` is {size:?}, {wanted} is needed")))
         };
         let patch = size("patch_embed.proj.weight")?;
         let (width, patch_px) = match patch[..] {
@@ -107,7 +107,7 @@ impl VisionTransformer {
             [1, tokens, w] if w == width => tokens - 1,
             _ => return unfit("pos_embed", &positions, &format!("[1, patches + 1, {width}]")),
         };
-        // A network of the width that one small tensor claims is made only if what takes the memory is there in that size.
+        // A network is only built if the large tensors exist with the size that a small tensor claims.
         let qkv = size("blocks.0.attn.qkv.weight")?;
         if qkv != [3 * width, width] {
             return unfit("blocks.0.attn.qkv.weight", &qkv, &format!("[{}, {width}]", 3 * width));
@@ -115,7 +115,7 @@ impl VisionTransformer {
         let grid = (tokens.max(0) as f64).sqrt().round() as i64;
         if grid < 1 || grid * grid != tokens {
             return Err(ModelError::Mismatch(format!(
-                "`pos_embed` is for {tokens} patches and a class token: a square of patches is wanted"
+                "`pos_embed` is for {tokens} patches and a class token: a square of patches is needed"
             )));
         }
         let depth = depth(&tensors, "blocks", "norm1.weight");
@@ -154,12 +154,12 @@ impl VisionTransformer {
     }
 }
 
-/// How many blocks there are, by the tensor that each has.
+/// Returns the number of blocks, by a tensor that each block has.
 fn depth(tensors: &Tensors, blocks: &str, each: &str) -> i64 {
     (0..tensors.len()).take_while(|i| tensors.contains_key(&format!("{blocks}.{i}.{each}"))).count() as i64
 }
 
-/// A layer's tensors by their names.
+/// Returns a layer's tensors by their names.
 fn named<'a>(
     layer: &str,
     weight: Option<&'a Tensor>,
@@ -171,7 +171,7 @@ fn named<'a>(
         .flatten()
 }
 
-/// Hugging Face names to timm names; queries, keys and values are put together.
+/// Converts Hugging Face names to timm names; queries, keys and values are concatenated.
 fn timm_names(tensors: &Tensors) -> Tensors {
     let root = if tensors.keys().any(|k| k.starts_with("vit.embeddings.")) { "vit." } else { "" };
     if !tensors.contains_key(&format!("{root}embeddings.cls_token")) {
@@ -204,7 +204,7 @@ fn timm_names(tensors: &Tensors) -> Tensors {
                 .iter()
                 .filter_map(|q| tensors.get(&format!("{root}encoder.layer.{i}.attention.attention.{q}.{part}")))
                 .collect();
-            // Those that do not go together are left out, and told as missing.
+            // Tensors that cannot be concatenated are omitted, and reported as missing.
             if let (3, Ok(joined)) = (parts.len(), Tensor::f_cat(&parts, 0)) {
                 renamed.insert(format!("blocks.{i}.attn.qkv.{part}"), joined);
             }
@@ -269,7 +269,7 @@ mod tests {
         VitConfig { patch_px: 16, width: 12, depth: 2, heads: 3 }
     }
 
-    /// Weights in Hugging Face names and the same ones in timm names give the same features, and tell the same size.
+    /// Equal weights in Hugging Face names and in timm names give equal features and the same size.
     #[test]
     fn both_name_forms_are_read() {
         let store = VarStore::new(Device::Cpu);
@@ -314,8 +314,8 @@ mod tests {
         }
     }
 
-    /// A file whose first tensors claim another size than its blocks have is refused before a network of that size is made;
-    /// queries and keys that do not go together are told, in Hugging Face names too.
+    /// A file whose first tensors claim another size than its blocks have is refused before a network is built.
+    /// Mismatched queries and keys are reported, in Hugging Face names too.
     #[test]
     fn a_size_that_the_blocks_do_not_have_is_refused() {
         let store = VarStore::new(Device::Cpu);
@@ -330,9 +330,9 @@ mod tests {
         };
         let wide: (&str, &[i64]) = ("patch_embed.proj.weight", &[1_000_000, 3, 1, 1]);
         let error = refused(&[wide, ("pos_embed", &[1, 2, 1_000_000])]);
-        assert!(error.contains("`blocks.0.attn.qkv.weight` is [36, 12], [3000000, 1000000] is wanted"), "{error}");
+        assert!(error.contains("`blocks.0.attn.qkv.weight` is [36, 12], [3000000, 1000000] is needed"), "{error}");
         assert!(refused(&[wide]).contains("`pos_embed` is [1, 17, 12]"));
-        assert!(refused(&[("pos_embed", &[1, 1_000_000_000_001, 0])]).contains("[1, patches + 1, 12] is wanted"));
+        assert!(refused(&[("pos_embed", &[1, 1_000_000_000_001, 0])]).contains("[1, patches + 1, 12] is needed"));
         assert!(refused(&[("patch_embed.proj.weight", &[12, 0, 9_000_000, 9_000_000])]).contains("patch_px"));
         assert!(refused(&[("patch_embed.proj.weight", &[12])]).contains("patch_px"));
 
@@ -348,7 +348,7 @@ mod tests {
         assert!(error.contains("`blocks.0.attn.qkv.weight` is missing"), "{error}");
     }
 
-    /// All that is missing or of another shape is named.
+    /// All missing tensors and tensors of another shape are named.
     #[test]
     fn what_does_not_fit_is_named() {
         let store = VarStore::new(Device::Cpu);

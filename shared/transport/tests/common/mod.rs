@@ -1,4 +1,4 @@
-//! What the transport's tests share: runs of their own, messages, and children with a watchdog.
+//! Fixtures of the transport's tests: unique runs, messages, and children with a watchdog.
 
 #![allow(dead_code, reason = "each test file uses a part of it")]
 
@@ -7,7 +7,7 @@ use carff_transport::{Run, monotonic_now_ns, remove_run_leftovers};
 use std::process::{Child, Command, Stdio};
 use std::sync::atomic::{AtomicU32, Ordering};
 
-/// A run that no other test has; its files are removed at the end, also of a failed test.
+/// A unique run; its files are removed at the end, even if the test fails.
 pub struct TestRun(pub Run);
 
 impl TestRun {
@@ -24,7 +24,7 @@ impl Drop for TestRun {
     }
 }
 
-/// In so many seconds from now, on the monotonic clock: a watchdog, never an assertion about speed.
+/// Returns the time in `seconds` seconds on the monotonic clock: a watchdog, never an assertion about speed.
 pub fn in_seconds(seconds: u64) -> u64 {
     monotonic_now_ns() + seconds * 1_000_000_000
 }
@@ -46,7 +46,7 @@ pub fn frame(frame_id: u64, width_px: u32, height_px: u32) -> FrameMeta {
     }
 }
 
-/// This test program again, as another process that plays a role in the given run.
+/// This test program as another process that plays a role in a run.
 pub struct Role(pub Child);
 
 impl Role {
@@ -81,7 +81,7 @@ impl Drop for Role {
     }
 }
 
-/// The role that this process was started for, if any.
+/// Returns the role of this process, if it has one.
 pub fn role() -> Option<(String, Run)> {
     let role = std::env::var("CARFF_TEST_ROLE").ok()?;
     let run = std::env::var("CARFF_TEST_RUN").ok()?;
