@@ -12,11 +12,13 @@ pub mod launch;
 pub mod monitor;
 pub mod planning;
 mod process;
+#[cfg(feature = "recording")]
 pub mod replay;
 pub mod report;
 pub mod schema;
 mod service_manager;
 pub mod shell;
+#[cfg(feature = "recording")]
 pub mod soak;
 pub mod supervise;
 pub mod train;

@@ -10,9 +10,11 @@ use carff_launch::dataset::DatasetCommand;
 use carff_launch::doctor::DoctorArgs;
 use carff_launch::eval::EvalArgs;
 use carff_launch::launch::LaunchArgs;
+#[cfg(feature = "recording")]
 use carff_launch::replay::ReplayArgs;
 use carff_launch::schema::SchemaArgs;
 use carff_launch::shell::{CompletionsArgs, ManArgs};
+#[cfg(feature = "recording")]
 use carff_launch::soak::{InjectArgs, SoakArgs};
 use carff_launch::train::TrainArgs;
 use clap::{CommandFactory, Parser, Subcommand};
@@ -56,7 +58,12 @@ enum Command {
   carff replay run.mcap --rate 0.5
 
 Exit code: 1 when --verify finds a difference.")]
+    #[cfg(feature = "recording")]
     Replay(ReplayArgs),
+    /// Replay a recording (not part of this build).
+    #[cfg(not(feature = "recording"))]
+    #[command(hide = true)]
+    Replay(carff::NotBuilt),
     /// Render and check datasets.
     #[command(
         subcommand,
@@ -104,8 +111,14 @@ Exit code: 1 when --verify finds a difference.")]
     /// Run a graph under a seeded schedule of faults, and check its contract.
     #[command(after_help = "Example: ten minutes of every kind of fault
   carff soak configs/soak/all.toml --minutes 10 --seed 7 --json reports/soak.json")]
+    #[cfg(feature = "recording")]
     Soak(SoakArgs),
+    /// Run a graph under faults (not part of this build).
+    #[cfg(not(feature = "recording"))]
+    #[command(hide = true)]
+    Soak(carff::NotBuilt),
     /// Inject one fault, for a soak.
+    #[cfg(feature = "recording")]
     #[command(hide = true)]
     SoakInject(InjectArgs),
     /// Check the machine and a graph: problems, their consequences, and remedies.
@@ -139,7 +152,10 @@ fn run() -> anyhow::Result<ExitCode> {
     match Cli::parse().command {
         Command::Launch(args) => carff_launch::launch::run(&args),
         Command::Attach(command) => command.run(),
+        #[cfg(feature = "recording")]
         Command::Replay(args) => carff_launch::replay::run(&args),
+        #[cfg(not(feature = "recording"))]
+        Command::Replay(args) => args.run("carff replay"),
         Command::Train(args) => carff_launch::train::run(&args),
         Command::Eval(args) => carff_launch::eval::run(&args),
         Command::Ablate(args) => carff_launch::ablate::run(&args),
@@ -151,7 +167,11 @@ fn run() -> anyhow::Result<ExitCode> {
         Command::Bench(command) => carff_bench::run(command),
         #[cfg(not(feature = "bench"))]
         Command::Bench(args) => args.run("carff bench"),
+        #[cfg(feature = "recording")]
         Command::Soak(args) => carff_launch::soak::run(&args),
+        #[cfg(not(feature = "recording"))]
+        Command::Soak(args) => args.run("carff soak"),
+        #[cfg(feature = "recording")]
         Command::SoakInject(args) => carff_launch::soak::inject(&args).map(|()| ExitCode::SUCCESS),
         Command::Doctor(args) => carff_launch::doctor::run(&args),
         Command::Schema(args) => carff_launch::schema::run(&args).map(|()| ExitCode::SUCCESS),

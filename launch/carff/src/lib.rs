@@ -5,6 +5,7 @@
 
 #[cfg(feature = "bridge")]
 pub mod bridge;
+#[cfg(feature = "recording")]
 pub mod export;
 #[cfg(feature = "film")]
 mod film;
@@ -12,6 +13,7 @@ pub mod log_line;
 pub mod metrics;
 mod not_built;
 pub mod probe;
+#[cfg(feature = "recording")]
 pub mod record;
 mod spans;
 pub mod terminal;
@@ -47,11 +49,21 @@ pub enum Attach {
     #[command(after_help = "Example: all topics for a minute; only beliefs and actions, in six files of ten minutes
   carff record -o run.mcap --seconds 60
   carff record belief action -o drive.mcap --file-seconds 600 --keep 6")]
+    #[cfg(feature = "recording")]
     Record(record::RecordArgs),
+    /// Record a running graph (not part of this build).
+    #[cfg(not(feature = "recording"))]
+    #[command(hide = true)]
+    Record(NotBuilt),
     /// Export images, tables, a film or a trace from a recording.
     #[command(after_help = "Example:
   carff export run.mcap --png images --csv tables --trace trace.json")]
+    #[cfg(feature = "recording")]
     Export(export::ExportArgs),
+    /// Export a recording (not part of this build).
+    #[cfg(not(feature = "recording"))]
+    #[command(hide = true)]
+    Export(NotBuilt),
     /// Serve a run's topics over the Foxglove WebSocket protocol, read-only and on loopback by default.
     #[command(
         after_help = "Example: on the vehicle; then a tunnel from the desk, where Foxglove opens ws://localhost:8765
@@ -78,8 +90,14 @@ impl Attach {
         match self {
             Self::Probe(command) => probe::run(command),
             Self::View(args) => view::run(args),
+            #[cfg(feature = "recording")]
             Self::Record(args) => record::run(args),
+            #[cfg(not(feature = "recording"))]
+            Self::Record(args) => args.run("carff record"),
+            #[cfg(feature = "recording")]
             Self::Export(args) => export::run(args),
+            #[cfg(not(feature = "recording"))]
+            Self::Export(args) => args.run("carff export"),
             #[cfg(feature = "bridge")]
             Self::Bridge(args) => bridge::run(args),
             #[cfg(not(feature = "bridge"))]
