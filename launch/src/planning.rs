@@ -1,7 +1,7 @@
 //! The planning tables of a run's report: from the run's records to `carff_evaluation::run`.
 
-use crate::monitor::FrameRecord;
 use crate::report::RunOutcome;
+use crate::supervision::monitor::FrameRecord;
 use carff_checkpoint::CheckpointPlanning;
 use carff_config::{CameraSource, GraphConfig};
 use carff_dataset::drives::DriveKind;

@@ -1,6 +1,6 @@
 //! The report of a run, as JSON.
 
-use crate::monitor::Records;
+use crate::supervision::monitor::Records;
 use carff_messages::Stage;
 use serde_json::{Map, Value, json};
 use std::collections::BTreeMap;

@@ -3,7 +3,8 @@
 mod compare;
 mod feed;
 
-use crate::launch::{Ended, Feed, LaunchArgs, run_graph};
+use crate::launch::{LaunchArgs, run_graph};
+use crate::supervision::{Ended, Feed, LAUNCHER};
 use anyhow::{Context, ensure};
 use carff::terminal::Terminal;
 use carff_messages::Stage;
@@ -136,7 +137,7 @@ pub fn run(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
     let feed = Feed { without: replaced(&topics), run: Box::new(move |run, stop| player.play(run, stop)) };
     let (ended, _) = run_graph(&launch, Some(feed), &terminal)?;
     if ended == Ended::Interrupted {
-        terminal.log(crate::launch::LAUNCHER, "INFO interrupted: all stages have ended");
+        terminal.log(LAUNCHER, "INFO interrupted: all stages have ended");
         return Ok(ExitCode::from(crate::launch::INTERRUPTED));
     }
     if !args.verify {
