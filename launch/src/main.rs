@@ -250,7 +250,7 @@ mod tests {
     /// The graph file of the book's deployment page is valid, without a warning.
     #[test]
     fn the_graph_in_the_book_is_valid() {
-        let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("debian/vehicle.toml");
+        let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("packaging/debian/vehicle.toml");
         let graph = carff_config::GraphConfig::load(&path).unwrap();
         assert_eq!(graph.warnings(), Vec::<String>::new());
     }

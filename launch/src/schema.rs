@@ -120,7 +120,7 @@ mod tests {
         let horizon = &graph["definitions"]["RunConfig"]["properties"]["horizon"];
         assert!(horizon["description"].as_str().is_some_and(|d| d.contains("1 to 8")), "{horizon}");
         assert_eq!(horizon["default"], 2);
-        let gain = &graph["definitions"]["NoiseConfig"]["properties"]["gain_sigma"];
+        let gain = &graph["definitions"]["SensorNoise"]["properties"]["gain_sigma"];
         assert_eq!(gain["default"], 0.02, "{gain}");
         let scenario = schema(FileKind::Scenario);
         let ground = &scenario["properties"]["ground_colour"];

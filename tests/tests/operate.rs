@@ -144,7 +144,7 @@ fn probes_come_and_go() {
     };
     assert!(matches!(full, OpenError::TooMany { .. }), "{full}");
     let told = carff(&graph, &["probe", "echo", "frame"], &["--count", "1"]).end();
-    told.assert_one_error(&["camera/frame", "taken"]);
+    told.assert_one_error(&["camera/frame", "in use"]);
     crowd.pop();
     probe(&graph, &["echo", "frame"], &["--count", "1"]);
     drop((crowd, here));

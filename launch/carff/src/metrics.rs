@@ -187,7 +187,7 @@ mod tests {
             assert!(name.starts_with("carff_") && name.contains("{run=\"r\"") && name.ends_with('}'), "{line}");
             assert!(value.parse::<f64>().is_ok(), "{line}");
         }
-        assert!(text.contains("carff_runtime_latency_seconds{run=\"r\",stage=\"encoder\"} 0.015"), "{text}");
+        assert!(text.contains("carff_stage_latency_seconds{run=\"r\",stage=\"encoder\"} 0.015"), "{text}");
     }
 
     /// An address that other machines can reach is refused without `--remote`.

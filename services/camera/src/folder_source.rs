@@ -150,7 +150,7 @@ mod tests {
     fn nothing_to_show_is_an_error() {
         let folder = tempfile::tempdir().unwrap();
         let error = FolderSource::open(folder.path(), &graph()).unwrap_err();
-        assert!(error.to_string().contains("no PNG image"), "{error:#}");
+        assert!(error.to_string().contains("no readable PNG image"), "{error:#}");
         let missing = folder.path().join("missing");
         assert!(FolderSource::open(&missing, &graph()).unwrap_err().to_string().contains("missing"));
     }

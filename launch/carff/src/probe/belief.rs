@@ -42,7 +42,8 @@ pub(super) fn run(args: &BeliefArgs) -> anyhow::Result<()> {
                     steps.clear();
                 }
                 steps.push(*belief);
-                if belief.is_final() {
+                // A frame whose first steps came before the probe is not shown.
+                if belief.is_final() && steps.first().is_some_and(|b| b.header.step == 1) {
                     let text = picture(&steps, &names, &decided, colour);
                     // On a terminal the bars stay in place.
                     let begin = if live { "\x1b[H\x1b[J" } else { "" };
