@@ -28,7 +28,7 @@ impl Span {
         let header = message.header();
         let (stage, took_ns) = if message.get::<FrameMeta>().is_some() {
             (Stage::Camera, header.publish_time_ns.saturating_sub(header.capture_time_ns))
-        } else if message.get::<Action>().is_some_and(|m| m.is_decision()) {
+        } else if message.get::<Action>().is_some_and(Action::is_decision) {
             (Stage::Controller, 0)
         } else {
             stage_latency_ns(message)?
