@@ -158,7 +158,8 @@ fn spans(recording: &Path, file: &Path) -> anyhow::Result<usize> {
     Ok(spans.len())
 }
 
-#[cfg(all(test, feature = "film"))]
+#[cfg(test)]
+#[cfg(feature = "film")]
 mod tests {
     use super::*;
     use carff_messages::forms::AnyMessage;
