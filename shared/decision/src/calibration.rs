@@ -12,6 +12,21 @@ const MIN_DEVIATION_SHARE: f64 = 0.2;
 const MIN_MEAN_PROBABILITY: f64 = 0.5;
 
 /// The occupancies that the known states showed: for each place, their distribution when it is taken and when it is free.
+///
+/// ```
+/// use carff_base::geometry::OrientedBox;
+/// use carff_decision::{Calibration, Place, ProbeLayout};
+/// let place = Place {
+///     name: "truck".into(),
+///     oriented_box: OrientedBox { center: [0.0, 0.0, 1.0], half_size: [1.0; 3], yaw: 0.0 },
+///     occupied_in: vec![true, false],
+/// };
+/// let layout = ProbeLayout::new(vec![place], vec![true, false])?;
+/// let calibration = Calibration::fit(&layout, &[vec![0.8, 0.9], vec![0.05, 0.1]])?;
+/// assert!(calibration.separations()[0] > 3.0);
+/// assert_eq!(calibration.read(&layout, &[0.02]).state, Some(1));
+/// # Ok::<(), carff_decision::ProbingError>(())
+/// ```
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Calibration {
     places: Vec<PlaceCalibration>,

@@ -5,6 +5,26 @@ use crate::{ActionCode, Header, Invalid, MAX_SAMPLES, Reason, Rule, message};
 use iceoryx2::prelude::ZeroCopySend;
 
 /// The vehicle's action until the next one, and its reason.
+///
+/// ```
+/// use carff_messages::{Action, ActionCode, Header, Message, Reason, Rule};
+/// let action = Action {
+///     header: Header::of_frame(7, 1_000, 42),
+///     action: ActionCode::Halt.code(),
+///     reason: Reason::Belief.code(),
+///     rule: Rule::Calibrated.code(),
+///     sample_count: 10,
+///     confidence: 0.9,
+///     hazard_probability: 0.9,
+///     is_decision: 1,
+///     reserved: 0,
+///     valid_until_ns: 100_001_000,
+///     based_on_frame: 7,
+///     latency_ns: 20_000,
+/// };
+/// assert!(action.validate().is_ok() && action.is_decision());
+/// assert_eq!(action.code(), Ok(ActionCode::Halt));
+/// ```
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, ZeroCopySend)]
 #[type_name("carff.Action.v1")]

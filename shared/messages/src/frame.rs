@@ -106,6 +106,26 @@ impl DatasetView {
 }
 
 /// Describes a camera frame: RGB, 8 bit, rows from the top (height x width x 3 bytes).
+///
+/// ```
+/// use carff_messages::{DatasetView, FrameMeta, Header, ImageMeta, Intrinsics, Message};
+/// let meta = FrameMeta {
+///     header: Header::of_frame(7, 1_000, 42),
+///     width_px: 128,
+///     height_px: 96,
+///     intrinsics: Intrinsics { fl_x_px: 110.0, fl_y_px: 110.0, cx_px: 64.0, cy_px: 48.0 },
+///     // The camera is 1.6 m above the origin and looks along -z.
+///     world_from_camera: [
+///         1.0, 0.0, 0.0, 0.0, //
+///         0.0, 1.0, 0.0, 1.6, //
+///         0.0, 0.0, 1.0, 0.0, //
+///         0.0, 0.0, 0.0, 1.0,
+///     ],
+///     dataset_view: DatasetView::UNKNOWN,
+/// };
+/// assert!(meta.validate().is_ok());
+/// assert_eq!(meta.image_bytes(), 128 * 96 * 3);
+/// ```
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Default, PartialEq, ZeroCopySend)]
 #[type_name("carff.FrameMeta.v1")]

@@ -71,6 +71,20 @@ impl Posterior {
 message!(Posterior);
 
 /// A mixture over the latent at the next step, with latents drawn from it. Entries beyond the counts are unused.
+///
+/// ```
+/// use carff_messages::{Forecast, ForecastSource, Gaussian, Header, Message};
+/// let header = Header::of_frame(7, 1_000, 42).at_step(1);
+/// let mut forecast = Forecast::empty(header, ForecastSource::Observed, 2);
+/// assert!(forecast.validate().is_err(), "it has no components yet");
+/// (forecast.component_count, forecast.sample_count) = (2, 2);
+/// forecast.weights[..2].copy_from_slice(&[0.75, 0.25]);
+/// forecast.components[1] = Gaussian { mean: [1.0; 8], ..Gaussian::standard() };
+/// forecast.samples[1] = [0.9; 8];
+/// forecast.sample_component[1] = 1;
+/// assert!(forecast.validate().is_ok());
+/// assert_eq!(forecast.samples(), [[0.0; 8], [0.9; 8]]);
+/// ```
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, ZeroCopySend)]
 #[type_name("carff.Forecast.v1")]
@@ -187,6 +201,21 @@ impl ProbeResult {
 }
 
 /// The prober's answer to a forecast: a belief over the known states. Entries beyond the counts are unused.
+///
+/// ```
+/// use carff_messages::{Belief, Header, Message, ProbeResult};
+/// let mut belief = Belief::empty(Header::of_frame(7, 1_000, 42).at_step(1), 2);
+/// (belief.state_count, belief.place_count) = (2, 1);
+/// (belief.component_count, belief.sample_count) = (1, 2);
+/// belief.component_weights[0] = 1.0;
+/// belief.state_probability[..2].copy_from_slice(&[0.5, 0.5]);
+/// belief.samples[0] = ProbeResult { state: 0, confidence: 0.99, hazard_likelihood: 1.0, ..ProbeResult::NONE };
+/// belief.samples[0].occupancies[0] = 0.97;
+/// belief.hazard_probability = 0.5;
+/// assert!(belief.validate().is_ok());
+/// assert!(!belief.is_final());
+/// assert_eq!(belief.samples().iter().map(ProbeResult::state).collect::<Vec<_>>(), [Some(0), None]);
+/// ```
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, ZeroCopySend)]
 #[type_name("carff.Belief.v2")]

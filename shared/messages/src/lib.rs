@@ -58,6 +58,14 @@ pub const MAX_SIDE_PX: u32 = 4096;
 pub const MAX_IMAGE_BYTES: usize = 1 << 24;
 
 /// Common fields of all messages: enough to follow one frame through every stage.
+///
+/// ```
+/// use carff_messages::Header;
+/// let observed = Header::of_frame(7, 1_000, 42);
+/// let forecast = observed.at_step(2);
+/// assert_eq!((forecast.frame_id, forecast.step), (7, 2));
+/// assert!(observed.at_step(9).validate().unwrap_err().to_string().contains("header.step"));
+/// ```
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ZeroCopySend)]
 #[type_name("carff.Header.v1")]

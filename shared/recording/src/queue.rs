@@ -31,6 +31,23 @@ struct Shared {
 }
 
 /// Writes a recording on a separate thread from a bounded queue.
+///
+/// ```
+/// use carff_messages::forms::OwnedMessage;
+/// use carff_messages::{Gaussian, Header, Posterior};
+/// use carff_recording::{About, Limits, RecordingQueue, RotatingWriter};
+/// use carff_transport::TopicId;
+/// # let folder = tempfile::tempdir()?;
+/// # let path = folder.path().join("run.mcap");
+/// let limits = Limits { files: Some(3), file_bytes: Some(1 << 30), ..Limits::default() };
+/// let writer = RotatingWriter::create(&path, About::default(), Vec::new(), limits)?;
+/// let queue = RecordingQueue::start(writer, 64 << 20)?;
+/// let header = Header::of_frame(7, 1_000, 42);
+/// let posterior = Posterior { header, gaussian: Gaussian::standard(), stage_latency_ns: 0 };
+/// assert!(queue.push(TopicId::POSTERIOR, OwnedMessage::new(Box::new(posterior), Vec::new())));
+/// assert_eq!(queue.finish()?.written, 1);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 #[derive(Debug)]
 pub struct RecordingQueue {
     sender: Option<Sender<(TopicId, OwnedMessage)>>,

@@ -17,6 +17,27 @@ use std::path::{Path, PathBuf};
 const CHUNK_BYTES: u64 = 1 << 20;
 
 /// Writes one recording. An unfinished file is readable up to the last [`Writer::flush`].
+///
+/// ```
+/// use carff_messages::forms::AnyMessage;
+/// use carff_messages::{Gaussian, Header, Posterior};
+/// use carff_recording::{About, Reader, Writer};
+/// use carff_transport::TopicId;
+/// # let folder = tempfile::tempdir()?;
+/// # let path = folder.path().join("run.mcap");
+/// let mut writer = Writer::create(&path, &About { run: "crossing".into(), ..About::default() }, &[])?;
+/// let header = Header::of_frame(7, 1_000, 42);
+/// let posterior = Posterior { header, gaussian: Gaussian::standard(), stage_latency_ns: 0 };
+/// writer.write(TopicId::POSTERIOR, AnyMessage::new(&posterior, &[]))?;
+/// writer.finish()?;
+///
+/// let mut reader = Reader::open(&path)?;
+/// assert_eq!(reader.about().run, "crossing");
+/// let entry = reader.next()?.expect("one message was written");
+/// assert_eq!(entry.message.as_message().get::<Posterior>(), Some(&posterior));
+/// assert!(reader.next()?.is_none() && !reader.is_cut_off());
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub struct Writer {
     path: PathBuf,
     inner: mcap::Writer<NoSeek<BufWriter<File>>>,

@@ -21,6 +21,24 @@ pub struct Quality {
 }
 
 /// Observes frames and selects the quality.
+///
+/// ```
+/// use carff_config::GraphConfig;
+/// use carff_messages::{Belief, Header};
+/// use carff_runtime::Overload;
+/// let text = "[run]\nname = \"x\"\ndataset = \"d\"\ncheckpoint = \"c\"\n[overload]\norder = [\"resolution\"]";
+/// let graph = GraphConfig::parse(text, "crossing.toml".as_ref())?;
+/// let mut overload = Overload::new(&graph);
+/// let full = overload.quality();
+/// // Only every second frame reaches the last step.
+/// for n in 0..100 {
+///     let mut header = Header::of_frame(2 * n, 0, 42).at_step(1);
+///     header.sequence = n;
+///     overload.observe(&Belief::empty(header, 1));
+/// }
+/// assert!(overload.quality().resolution_divisor > full.resolution_divisor);
+/// # Ok::<(), carff_config::ConfigError>(())
+/// ```
 #[derive(Clone, Debug)]
 pub struct Overload {
     /// Quality of each level; level 0 is the graph file's.

@@ -82,6 +82,32 @@ impl<M: Message> Publisher<M> {
 }
 
 /// Memory of the publisher that an image is written into and sent from.
+///
+/// ```
+/// use carff_messages::{FrameMeta, Header, Intrinsics};
+/// use carff_transport::{Node, Run, monotonic_now_ns, topics};
+/// # fn main() -> Result<(), Box<dyn std::error::Error>> {
+/// # let name = format!("doc-loan-{}", std::process::id());
+/// let run = Run::new(&name, 1)?;
+/// let node = Node::open(&run, "example")?;
+/// let mut input = node.receiver(&topics::FRAME)?;
+/// let mut output = node.image_publisher(&topics::FRAME, 4 * 2 * 3)?;
+///
+/// let mut loan = output.loan(4 * 2 * 3)?;
+/// let mut image = loan.image_mut(4, 2).expect("the loan has this size");
+/// image[[1, 3, 0]] = 255; // Row 1, column 3, red.
+/// let intrinsics = Intrinsics { fl_x_px: 4.0, fl_y_px: 4.0, cx_px: 2.0, cy_px: 1.0 };
+/// let header = Header::of_frame(0, monotonic_now_ns(), 42);
+/// output.send_image(loan, FrameMeta { header, width_px: 4, height_px: 2, intrinsics, ..FrameMeta::default() })?;
+///
+/// let received = input.newest()?.expect("it was sent above");
+/// assert_eq!(received.image().dim(), (2, 4, 3));
+/// assert_eq!(received.image()[[1, 3, 0]], 255);
+/// # drop((received, input, output, node));
+/// # carff_transport::remove_run_leftovers(&run)?;
+/// # Ok(())
+/// # }
+/// ```
 #[derive(Debug)]
 pub struct ImageLoan<M: ImageMeta> {
     sample: SampleMut<Service, [u8], M>,

@@ -156,6 +156,15 @@ where
 }
 
 /// A topic by its name. The topics of the graph come first, in the order of the data flow.
+///
+/// ```
+/// use carff_transport::{TopicId, UnknownTopic};
+/// let belief: TopicId = "prober/belief".parse()?;
+/// assert_eq!(belief, TopicId::BELIEF);
+/// let error = "beleif".parse::<TopicId>().unwrap_err();
+/// assert!(error.to_string().contains("did you mean `prober/belief`"), "{error}");
+/// # Ok::<(), UnknownTopic>(())
+/// ```
 #[derive(Clone, Copy, Debug)]
 pub struct TopicId {
     /// Index in the graph; larger than all others for a user's topic.

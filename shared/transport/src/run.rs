@@ -18,6 +18,14 @@ const LIST_TRIES: u32 = 10;
 const LIST_PAUSE: Duration = Duration::from_millis(2);
 
 /// A run of a graph: its name, which is part of its file names, and its id, which is in every header.
+///
+/// ```
+/// use carff_transport::Run;
+/// let run = Run::new("crossing-2", 0x5eed)?;
+/// assert!(run.folder().ends_with("crossing-2"));
+/// assert!(Run::new("with/slash", 1).is_err());
+/// # Ok::<(), carff_transport::RunNameError>(())
+/// ```
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Run {
     name: String,

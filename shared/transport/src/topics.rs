@@ -19,6 +19,13 @@ use std::marker::PhantomData;
 use std::time::Duration;
 
 /// The limits of a topic, fixed when its first user opens it.
+///
+/// ```
+/// use carff_transport::{Limits, topics};
+/// // Messages of which a late subscriber needs the latest one, and that one process publishes.
+/// const SETTINGS: Limits = Limits { history: 1, max_publishers: 1, ..topics::MESSAGES };
+/// assert_eq!(SETTINGS.buffer, topics::MESSAGES.buffer);
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Limits {
     /// Maximum number of subscribers: those of the graph, and spare ones for launcher, recorder, viewer and probes.

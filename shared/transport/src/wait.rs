@@ -38,6 +38,16 @@ pub enum Woken {
 }
 
 /// A stop signal for the process. Clones share one state.
+///
+/// ```
+/// use carff_transport::{Stop, Waiter, Woken, monotonic_now_ns};
+/// let stop = Stop::new()?;
+/// let waiter = Waiter::new(stop.clone());
+/// assert_eq!(waiter.wait_until(&[], monotonic_now_ns())?, Woken::Timeout);
+/// stop.stop();
+/// assert_eq!(waiter.wait_until(&[], u64::MAX)?, Woken::Stopped);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 #[derive(Clone, Debug)]
 pub struct Stop {
     flag: Arc<AtomicBool>,

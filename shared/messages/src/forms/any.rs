@@ -144,6 +144,16 @@ impl<'a> AnyMessage<'a> {
 }
 
 /// A message of any type that owns its memory.
+///
+/// ```
+/// use carff_messages::forms::OwnedMessage;
+/// use carff_messages::{Gaussian, Header, Posterior};
+/// let header = Header::of_frame(7, 1_000, 42);
+/// let posterior = Posterior { header, gaussian: Gaussian::standard(), stage_latency_ns: 0 };
+/// let mut message = OwnedMessage::new(Box::new(posterior), Vec::new());
+/// message.get_mut::<Posterior>().expect("it is a posterior").stage_latency_ns = 9;
+/// assert_eq!(message.as_message().get::<Posterior>().map(|p| p.stage_latency_ns), Some(9));
+/// ```
 #[derive(Debug)]
 pub struct OwnedMessage {
     message: Box<dyn DynMessage>,
