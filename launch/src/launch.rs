@@ -6,6 +6,7 @@ use crate::report::{self, ReportFiles, RunOutcome};
 use crate::supervision::monitor::FrameRecord;
 use crate::supervision::{Ended, Feed, LAUNCHER, Supervisor};
 use anyhow::{Context, bail, ensure};
+use carff::runs::log_path;
 use carff::terminal::Terminal;
 use carff_checkpoint::{Manifest, ScenarioIdentity};
 use carff_config::{CameraSource, GraphConfig};
@@ -150,6 +151,7 @@ pub(crate) fn run_graph(
     };
     let lock = RunLock::take(&runtime_dir(), &name, &record, "--run")?;
     lock.sweep(&run, "--run")?;
+    terminal.log_to(&log_path(run.dir(), &name)).context("cannot write the run's log")?;
     let _copy = copied.then(|| write_copy(&graph, &graph_file)).transpose()?;
 
     // A feed brings its own images.

@@ -100,6 +100,7 @@ pub fn json(outcome: &RunOutcome) -> Value {
         "frames_not_recorded": records.frame_count() - records.frames.len() as u64,
         "decisions": decided.len(),
         "actions": records.actions,
+        "actions_not_recorded": records.actions_not_recorded,
         "safe_actions": records.safe_actions,
         "skipped": records.skipped(),
         "skipped_by_stage": by_stage(&|s| Some(stage(s)?.skipped.into())),
@@ -155,6 +156,14 @@ pub fn text(outcome: &RunOutcome, report: &Value) -> String {
         ms("p99"),
         ms("max")
     );
+    let [frames, actions] =
+        ["frames_not_recorded", "actions_not_recorded"].map(|key| report[key].as_u64().unwrap_or(0));
+    if frames + actions > 0 {
+        text += &format!(
+            "not recorded, because the launcher was stopped or slow: {frames} frames, {actions} actions; the counts of \
+             decisions and drives are without them\n"
+        );
+    }
     if let Some(drives) = drives(outcome) {
         text += &format!("\n{}\n", drives.text());
     }

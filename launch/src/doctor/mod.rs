@@ -64,6 +64,8 @@ pub fn examine(args: &DoctorArgs) -> anyhow::Result<Vec<Finding>> {
     let view_bytes = carff_messages::rgb_bytes(renderer.width_px, renderer.height_px);
     let needed_bytes = topics::graph_bytes(crate::launch::FRAME_BYTES, view_bytes);
     findings.extend(checks::shared_memory(&gather::shared_memory(), needed_bytes));
+    let (folder, writable) = gather::run_folder();
+    findings.push(checks::run_folder(&folder, writable));
     let (runs, strays) = gather::runs()?;
     findings.extend(checks::leftovers(&runs, &strays));
 

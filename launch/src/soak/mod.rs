@@ -19,6 +19,7 @@ pub use inject::{InjectArgs, run as inject};
 pub use schedule::{Fault, fault};
 
 use anyhow::{Context, ensure};
+use carff_base::files::check_writable;
 use carff_config::{Kind, SoakConfig};
 use carff_messages::Stage;
 use carff_transport::{Node, Run, SHARED_MEMORY_DIR, Stop, Waiter, monotonic_now_ns};
@@ -79,6 +80,7 @@ pub struct SoakArgs {
 /// Soaks a graph; exit code 0 if the contract always held, 1 at the first violation, 130 on Ctrl-C.
 pub fn run(args: &SoakArgs) -> anyhow::Result<ExitCode> {
     let config = SoakConfig::load(&args.config)?;
+    args.json.as_deref().map_or(Ok(()), check_writable)?;
     ensure!(args.minutes > 0.0 && args.minutes.is_finite(), "--minutes is {}; it must be above 0", args.minutes);
     if !args.own_memory && (config.faults.full_memory > 0 || config.faults.full_disk > 0) {
         with_own_memory();

@@ -4,7 +4,7 @@ use carff_messages::{
     Action, ActionCode, Belief, DatasetView, Forecast, ForecastSource, FrameMeta, Gaussian, Header, Intrinsics,
     Posterior, Reason, Rule,
 };
-use carff_observe::RunRecord;
+use carff_observe::{RunLock, RunRecord};
 use carff_transport::{Node, Run, monotonic_now_ns, remove_run_leftovers, runtime_dir, topics};
 use carff_viewer::live::LiveFeed;
 use std::time::{Duration, Instant};
@@ -41,8 +41,7 @@ fn watches_a_run_from_frame_to_decision() {
         checkpoint: "checkpoint".into(),
         started_unix_s: 1,
     };
-    let path = RunRecord::path(&runtime_dir(), &name);
-    std::fs::write(&path, record.to_bytes().unwrap()).unwrap();
+    let lock = RunLock::take(&runtime_dir(), &name, &record, "--run").unwrap();
     let mut frames = node.image_publisher(&topics::FRAME, 12).unwrap();
     let mut posteriors = node.publisher(&topics::POSTERIOR).unwrap();
     let mut forecasts = node.publisher(&topics::FORECAST).unwrap();
@@ -111,7 +110,7 @@ fn watches_a_run_from_frame_to_decision() {
     let encoder_ms = feed.watched().journal.times().iter().find(|t| t.name == "encoder").map(|t| t.values[0]);
     assert_eq!(encoder_ms, Some([4.0, 3.0]));
 
-    std::fs::remove_file(&path).unwrap();
+    drop(lock);
     let why = wait_for(|| feed.watched().joined.clone().err());
     assert!(why.contains(&name), "{why}");
     drop(feed);

@@ -33,6 +33,7 @@
 mod counters;
 mod descriptors;
 mod error;
+mod folder;
 mod in_use;
 mod log;
 mod node;
@@ -49,13 +50,14 @@ mod wait;
 
 pub use counters::Counters;
 pub use error::{CleanupError, OpenError, ReceiveError, RunNameError, SendError, WaitError};
+pub use folder::{mapping_processes, runtime_dir, runtime_dirs};
 pub use in_use::{Member, OpenTopic, Ports};
 pub use node::{Node, make_private_dir};
 pub use payload::{Image, Payload};
 pub use publisher::{ImageLoan, Publisher};
 pub use receiver::{Receiver, Sample};
 pub use registry::{AnyPublisher, AnyReceiver, AnyTopic, Received, TopicId, UnknownTopic};
-pub use run::{Run, cleanup_dead, living_processes, remove_run_leftovers, run_id_of, runtime_dir};
+pub use run::{Run, cleanup_dead, living_processes, remove_run_leftovers, run_id_of};
 pub use space::{SHARED_MEMORY_DIR, check_space};
 pub use stop::{INTERRUPTED, Stop, exit_on_signals, is_interrupted};
 pub use topics::{Limits, Topic};
