@@ -54,7 +54,9 @@ pub enum RecordingError {
         cause: String,
     },
     /// The file is an MCAP file of another program.
-    #[error("{path} is not a recording of this program: it has neither its metadata nor its topics; its topics: {channels}")]
+    #[error(
+        "{path} is not a recording of this program: it has neither its metadata nor its topics; its topics: {channels}"
+    )]
     Foreign {
         /// Path of the file.
         path: PathBuf,

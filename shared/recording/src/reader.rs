@@ -143,9 +143,9 @@ impl Reader {
         self.is_cut_off
     }
 
-    /// Returns true if the file contains this topic's messages.
+    /// Returns true if the file contains this topic's messages, and the images that they describe.
     pub fn has(&self, topic: TopicId) -> bool {
-        self.holds(Content::Forms(topic))
+        self.needed(topic).all(|content| self.holds(content))
     }
 
     /// Skips all images: messages that describe one have no bytes.
@@ -157,8 +157,7 @@ impl Reader {
     /// Restricts the reader to these topics. Fails if one of them, or its images, is missing.
     pub fn select(&mut self, topics: impl IntoIterator<Item = TopicId>) -> Result<(), RecordingError> {
         let topics: BTreeSet<TopicId> = topics.into_iter().collect();
-        let images = topics.iter().filter(|t| t.is_image() && !self.without_images).map(|t| Content::Images(*t));
-        let needed = topics.iter().map(|t| Content::Forms(*t)).chain(images);
+        let needed = topics.iter().flat_map(|topic| self.needed(*topic));
         let missing: Vec<&str> = needed.filter(|content| !self.holds(*content)).map(Content::name).collect();
         if !missing.is_empty() {
             let (missing, present) = (missing.join("`, `"), self.channel_names());
@@ -220,6 +219,11 @@ impl Reader {
         }
         let message = self.loaded.get_mut(&segment).and_then(|messages| messages.get_mut(number)?.take());
         message.ok_or_else(|| MessageError("the file has changed".to_owned()))
+    }
+
+    fn needed(&self, topic: TopicId) -> impl Iterator<Item = Content> + use<> {
+        let images = (topic.is_image() && !self.without_images).then_some(Content::Images(topic));
+        [Content::Forms(topic)].into_iter().chain(images)
     }
 
     fn holds(&self, content: Content) -> bool {

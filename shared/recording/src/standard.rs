@@ -182,7 +182,11 @@ impl Events {
             let (action, reason) =
                 (m.code().map_or("unknown", ActionCode::name), m.reason().map_or("unknown", Reason::name));
             let frame = m.header.frame_id;
-            (Stage::Controller, level, format!("{action} ({reason}), frame {frame}, hazard {:.3}", m.hazard_probability))
+            (
+                Stage::Controller,
+                level,
+                format!("{action} ({reason}), frame {frame}, hazard {:.3}", m.hazard_probability),
+            )
         };
         let (level, name) = (level.into(), stage.name().to_owned());
         Some(Log { timestamp: Some(at), level, message: text, name, file: String::new(), line: 0 })

@@ -113,7 +113,8 @@ fn boxes_are_all_shown() {
             assert!(entity.texts[0].text.ends_with(label), "{}", entity.texts[0].text);
             assert_eq!(wall_ns(entity.timestamp) + LATE_NS, log_ns);
             let lifetime = entity.lifetime.unwrap();
-            let expires_ns = wall_ns(entity.timestamp) + lifetime.sec() as u64 * 1_000_000_000 + u64::from(lifetime.nsec());
+            let expires_ns =
+                wall_ns(entity.timestamp) + lifetime.sec() as u64 * 1_000_000_000 + u64::from(lifetime.nsec());
             assert_eq!(expires_ns, log_ns + 1_000_000_000);
         }
     }
