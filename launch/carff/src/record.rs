@@ -1,6 +1,7 @@
 //! `carff record`: writes the messages of a running graph into an MCAP file.
 
 use crate::probe::session::{Session, SessionArgs};
+use crate::provenance;
 use crate::terminal::Terminal;
 use anyhow::Context;
 use carff_checkpoint::Manifest;
@@ -9,7 +10,6 @@ use carff_recording::{About, Limits, RecordingQueue, RotatingWriter};
 use carff_transport::TopicId;
 use carff_transport::monotonic_now_ns;
 use clap::Args;
-use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::SystemTime;
@@ -100,6 +100,8 @@ pub(crate) fn wall_offset_ns() -> u64 {
 }
 
 fn about(live: &LiveRun, states: Vec<String>) -> anyhow::Result<About> {
+    let origin = provenance::of(live.started_unix_s, Some(&live.checkpoint));
+    let origin = origin.into_iter().map(|(name, value)| (name.to_owned(), value)).collect();
     Ok(About {
         run: live.name.clone(),
         run_id: live.run_id,
@@ -110,6 +112,6 @@ fn about(live: &LiveRun, states: Vec<String>) -> anyhow::Result<About> {
         checkpoint: live.checkpoint.display().to_string(),
         wall_offset_ns: wall_offset_ns(),
         states,
-        origin: BTreeMap::new(),
+        origin,
     })
 }

@@ -4,7 +4,7 @@ mod compare;
 mod feed;
 
 use crate::launch::{LaunchArgs, run_graph};
-use crate::supervision::{Ended, Feed, LAUNCHER};
+use crate::supervision::{Ended, Feed};
 use anyhow::{Context, bail, ensure};
 use carff::terminal::Terminal;
 use carff_messages::Stage;
@@ -100,7 +100,7 @@ fn replaced(topics: &BTreeSet<TopicId>) -> BTreeSet<Stage> {
 pub fn run(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
     let topics = args.only.clone().map_or_else(|| [TopicId::FRAME].into(), |only| only.0);
     ensure!(!topics.is_empty(), "name at least one topic with --only");
-    let about = check(args, &topics)?;
+    let (about, sent) = check(args, &topics)?;
     let folder = tempfile::tempdir().context("cannot create a temporary folder")?;
     // The recorded configuration, or the original file if it is unchanged: error messages then name that file.
     let graph = match (&args.graph, &about) {
@@ -119,11 +119,10 @@ pub fn run(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
         graph,
         dataset: args.dataset.clone().or_else(|| recorded(|about| &about.dataset)),
         checkpoint: args.checkpoint.clone().or_else(|| recorded(|about| &about.checkpoint)),
-        frames: None,
-        drives: None,
-        report: None,
         run: args.run.clone().or_else(|| about.as_ref().map(|about| about.run.clone())),
         stages: args.stages.clone(),
+        verbose: true,
+        ..LaunchArgs::default()
     };
     let pace = match (args.verify, args.step, args.rate) {
         (true, ..) => Pace::AfterEachDecision,
@@ -134,7 +133,7 @@ pub fn run(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
     let replayed = Arc::new(Mutex::new(Replayed::default()));
     let player = Player {
         recording: args.recording.clone(),
-        topics: topics.clone(),
+        topics: sent,
         pace,
         from_ns: args.from.map_or(0, |s| (s * 1e9) as u64),
         to_ns: args.to.map_or(u64::MAX, |s| (s * 1e9) as u64),
@@ -143,11 +142,7 @@ pub fn run(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
     };
     let feed = Feed { without: replaced(&topics), run: Box::new(move |run, stop| player.play(run, stop)) };
     let (ended, _) = run_graph(&launch, Some(feed), &terminal)?;
-    if ended == Ended::Interrupted {
-        terminal.log(LAUNCHER, "INFO interrupted: all stages have ended");
-        return Ok(ExitCode::from(crate::launch::INTERRUPTED));
-    }
-    if !args.verify {
+    if ended == Ended::Interrupted || !args.verify {
         return Ok(ExitCode::SUCCESS);
     }
     let replayed = std::mem::take(&mut *replayed.lock().unwrap_or_else(std::sync::PoisonError::into_inner));
@@ -156,17 +151,22 @@ pub fn run(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
     Ok(if comparison.is_same() { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }
 
-/// Checks that the recording has the topics of the replay. Returns its metadata.
-fn check(args: &ReplayArgs, topics: &BTreeSet<TopicId>) -> anyhow::Result<Option<About>> {
+/// Checks that the recording has the topics of the replay. Returns its metadata, and the topics that it sends: of all
+/// topics, those that it has.
+fn check(args: &ReplayArgs, topics: &BTreeSet<TopicId>) -> anyhow::Result<(Option<About>, BTreeSet<TopicId>)> {
     let mut reader = Reader::open(&args.recording)?;
-    reader.select(topics.iter().copied())?;
+    let mut sent = topics.clone();
+    if TopicId::FLOW.iter().all(|topic| topics.contains(topic)) && topics.iter().any(|topic| reader.has(*topic)) {
+        sent.retain(|topic| reader.has(*topic));
+    }
+    reader.select(sent.iter().copied())?;
     ensure!(
         !args.verify || COMPARED.iter().any(|topic| reader.has(*topic)),
         "{} has nothing to compare: it has no messages on {}",
         args.recording.display(),
         COMPARED.map(|topic| format!("`{topic}`")).join(", ")
     );
-    Ok(reader.about().cloned())
+    Ok((reader.about().cloned(), sent))
 }
 
 fn write_graph(folder: &Path, text: &str) -> anyhow::Result<PathBuf> {

@@ -19,6 +19,7 @@ mod dataset;
 pub mod drives;
 mod equivalence;
 mod error;
+mod folder;
 mod image;
 mod import;
 mod report;
@@ -34,6 +35,7 @@ pub use dataset::{
 };
 pub use equivalence::{Equivalence, MAX_DIFFERENT_PIXELS, PIXEL_TOLERANCE, looks_same};
 pub use error::DatasetError;
+pub use folder::image_files;
 pub use image::Image;
 pub use import::{ImportOptions, Imported, import};
 pub use report::{DatasetReport, HiddenPair, SheetOptions, contact_sheet};
