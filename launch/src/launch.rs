@@ -6,6 +6,7 @@ use crate::report::{self, ReportFiles, RunOutcome};
 use crate::supervision::monitor::FrameRecord;
 use crate::supervision::{Ended, Feed, LAUNCHER, Supervisor};
 use anyhow::{Context, bail, ensure};
+use carff::provenance;
 use carff::terminal::Terminal;
 use carff_checkpoint::{Manifest, ScenarioIdentity};
 use carff_config::{CameraSource, GraphConfig};
@@ -150,6 +151,7 @@ pub(crate) fn run_graph(
     };
     let lock = RunLock::take(&runtime_dir(), &name, &record, "--run")?;
     lock.sweep(&run, "--run")?;
+    let origin = provenance::of(Some(record.started_unix_s), Some(&checkpoint));
     let _copy = copied.then(|| write_copy(&graph, &graph_file)).transpose()?;
 
     // A feed brings its own images.
@@ -187,6 +189,7 @@ pub(crate) fn run_graph(
         result.map(|ended| {
             let outcome = RunOutcome {
                 run: name,
+                origin,
                 graph_file: args.graph.display().to_string(),
                 graph: graph.clone(),
                 scenario,

@@ -55,7 +55,7 @@ pub fn run(args: &MetricsArgs) -> anyhow::Result<ExitCode> {
     }
     let live = &session.attached.live;
     let name = live.name.clone();
-    let origin = provenance::of(live.started_unix_s, Some(&live.checkpoint));
+    let origin = provenance::of(Some(live.started_unix_s), Some(&live.checkpoint));
     let mut vitals = RunVitals::default();
     let going = vitals.gather(&mut session, |vitals| {
         if let Some(server) = &mut server {
@@ -202,7 +202,7 @@ mod tests {
     }
 
     fn origin() -> Origin {
-        provenance::of(0, None)
+        provenance::of(None, None)
     }
 
     /// The samples of a metric: its labels with their values, and its value.

@@ -17,10 +17,11 @@ pub const VERSION: &str = concat!(env!("CARGO_PKG_VERSION"), " (", env!("CARFF_C
 /// Origin of a result, by name.
 pub type Origin = BTreeMap<&'static str, String>;
 
-/// Returns version and commit of this program, name of this machine, start of the run (ISO 8601), and SHA-256 of the
-/// checkpoint, or the reason why it has none.
-pub fn of(started_unix_s: u64, checkpoint: Option<&Path>) -> Origin {
-    let started = Timestamp::from_second(started_unix_s.try_into().unwrap_or(i64::MAX)).unwrap_or(Timestamp::MAX);
+/// Returns version and commit of this program, name of this machine, start of the run (ISO 8601; now, if it is not
+/// given), and SHA-256 of the checkpoint, or the reason why it has none.
+pub fn of(started_unix_s: Option<u64>, checkpoint: Option<&Path>) -> Origin {
+    let second = started_unix_s.map_or(Timestamp::now().as_second(), |s| s.try_into().unwrap_or(i64::MAX));
+    let started = Timestamp::from_second(second).unwrap_or(Timestamp::MAX);
     let mut origin = Origin::from([
         ("version", env!("CARGO_PKG_VERSION").to_owned()),
         ("commit", COMMIT.to_owned()),
@@ -32,6 +33,14 @@ pub fn of(started_unix_s: u64, checkpoint: Option<&Path>) -> Origin {
         origin.insert("checkpoint_sha256", hash.unwrap_or_else(|e| format!("unknown: {}", sentence(&e))));
     }
     origin
+}
+
+/// Returns the origin as one line of text.
+pub fn text(origin: &Origin) -> String {
+    let of = |name: &str| origin.get(name).map_or("unknown", String::as_str);
+    let checkpoint =
+        origin.get("checkpoint_sha256").map_or(String::new(), |hash| format!(", checkpoint SHA-256 {hash}"));
+    format!("carff {} ({}) on {}, started {}{checkpoint}", of("version"), of("commit"), of("host"), of("started"))
 }
 
 /// Returns the SHA-256 of a folder's files: that of the output of `sha256sum *` in the C locale.
@@ -68,7 +77,7 @@ mod tests {
         std::fs::write(folder.path().join("manifest.json"), "{}").unwrap();
         std::fs::write(folder.path().join("field.safetensors"), "abc").unwrap();
         std::fs::create_dir(folder.path().join("sub")).unwrap();
-        let origin = of(1_700_000_000, Some(folder.path()));
+        let origin = of(Some(1_700_000_000), Some(folder.path()));
         assert_eq!(origin["started"], "2023-11-14T22:13:20Z");
         assert!(VERSION.starts_with(&origin["version"]) && VERSION.contains(&origin["commit"]), "{VERSION}");
         assert!(!origin["host"].is_empty());
@@ -79,8 +88,8 @@ mod tests {
         let listed = Sha256::new().chain_update(format!("{abc}  field.safetensors\n{braces}  manifest.json\n"));
         assert_eq!(origin["checkpoint_sha256"], hex(listed));
         std::fs::write(folder.path().join("manifest.json"), "{ }").unwrap();
-        assert_ne!(of(0, Some(folder.path()))["checkpoint_sha256"], origin["checkpoint_sha256"]);
-        assert!(of(0, Some(&folder.path().join("none")))["checkpoint_sha256"].starts_with("unknown: "));
-        assert!(!of(0, None).contains_key("checkpoint_sha256"));
+        assert_ne!(of(None, Some(folder.path()))["checkpoint_sha256"], origin["checkpoint_sha256"]);
+        assert!(of(None, Some(&folder.path().join("none")))["checkpoint_sha256"].starts_with("unknown: "));
+        assert!(!of(None, None).contains_key("checkpoint_sha256"));
     }
 }

@@ -100,7 +100,7 @@ pub(crate) fn wall_offset_ns() -> u64 {
 }
 
 fn about(live: &LiveRun, states: Vec<String>) -> anyhow::Result<About> {
-    let origin = provenance::of(live.started_unix_s, Some(&live.checkpoint));
+    let origin = provenance::of(Some(live.started_unix_s), Some(&live.checkpoint));
     let origin = origin.into_iter().map(|(name, value)| (name.to_owned(), value)).collect();
     Ok(About {
         run: live.name.clone(),
