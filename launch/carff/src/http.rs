@@ -8,6 +8,8 @@ use std::time::{Duration, Instant};
 
 /// Maximum number of connections.
 const MAX_CONNECTIONS: usize = 32;
+/// Maximum number of new connections in one call, so that a flood of them does not occupy the owner.
+const MAX_ACCEPTED: usize = 256;
 /// Longest time for a request and its response.
 const PATIENCE: Duration = Duration::from_secs(10);
 /// Maximum length of a request.
@@ -15,8 +17,8 @@ const MAX_REQUEST_BYTES: usize = 16 << 10;
 /// Maximum number of a request's header lines.
 const MAX_HEADERS: usize = 64;
 
-/// Status, content type and text of a response.
-pub(crate) type Response = (u16, &'static str, String);
+/// Status with its reason phrase, content type and text of a response.
+pub(crate) type Response = (&'static str, &'static str, String);
 
 /// A listening server. Its owner calls [`Server::serve`] again and again.
 #[derive(Debug)]
@@ -41,7 +43,7 @@ impl Server {
     /// Serves what has arrived, without waiting. `answer` gets method and target of each request.
     pub(crate) fn serve(&mut self, mut answer: impl FnMut(&str, &str) -> Response) {
         self.connections.retain_mut(|connection| connection.advance(&mut answer));
-        loop {
+        for _ in 0..MAX_ACCEPTED {
             let accepted = self.listener.accept();
             if accepted.as_ref().is_err_and(|error| error.kind() == ErrorKind::WouldBlock) {
                 return;
@@ -98,9 +100,12 @@ impl Connection {
                 Ok(Status::Complete(_)) => answer(request.method.unwrap_or_default(), request.path.unwrap_or_default()),
                 Ok(Status::Partial) if count == 0 => return Ok(false),
                 Ok(Status::Partial) if self.request.len() <= MAX_REQUEST_BYTES => continue,
-                _ => (400, "text/plain", "bad request\n".to_owned()),
+                _ => ("400 Bad Request", "text/plain", "bad request\n".to_owned()),
             };
-            self.response = text_of(&response).into_bytes().into();
+            let (status, kind, body) = response;
+            let length = body.len();
+            let head = format!("HTTP/1.1 {status}\r\nContent-Type: {kind}\r\nContent-Length: {length}\r\n");
+            self.response = (head + "Connection: close\r\n\r\n" + &body).into_bytes().into();
             return Ok(true);
         }
     }
@@ -113,19 +118,6 @@ impl Connection {
         self.stream.shutdown(std::net::Shutdown::Write)?;
         Ok(false)
     }
-}
-
-fn text_of((status, kind, body): &Response) -> String {
-    let reason = match status {
-        200 => "OK",
-        404 => "Not Found",
-        405 => "Method Not Allowed",
-        _ => "Bad Request",
-    };
-    let length = body.len();
-    format!(
-        "HTTP/1.1 {status} {reason}\r\nContent-Type: {kind}\r\nContent-Length: {length}\r\nConnection: close\r\n\r\n{body}"
-    )
 }
 
 #[cfg(test)]
@@ -148,7 +140,8 @@ mod tests {
         let mut text = String::new();
         let mut bytes = [0; 4096];
         for _ in 0..10_000 {
-            server.serve(|method, target| (200, "text/plain", format!("{method} {target} {}", "x".repeat(1 << 20))));
+            server
+                .serve(|method, target| ("200 OK", "text/plain", format!("{method} {target} {}", "x".repeat(1 << 20))));
             match client.read(&mut bytes) {
                 Ok(0) => return text,
                 Ok(count) => text.push_str(std::str::from_utf8(&bytes[..count]).unwrap()),

@@ -82,10 +82,10 @@ pub(crate) fn refuse_remote(listen: SocketAddr, remote: bool) -> anyhow::Result<
 /// Returns the response to a request.
 fn answer(method: &str, target: &str, run: &str, origin: &Origin, vitals: &RunVitals) -> Response {
     match (method, target.split('?').next().unwrap_or_default()) {
-        ("GET", "/metrics") => (200, prometheus_text::CONTENT_TYPE, prometheus(run, origin, vitals)),
-        ("GET", "/status") => (200, "application/json", status(run, origin, vitals).to_string()),
-        ("GET", _) => (404, "text/plain", "try /metrics or /status\n".to_owned()),
-        _ => (405, "text/plain", "only GET\n".to_owned()),
+        ("GET", "/metrics") => ("200 OK", prometheus_text::CONTENT_TYPE, prometheus(run, origin, vitals)),
+        ("GET", "/status") => ("200 OK", "application/json", status(run, origin, vitals).to_string()),
+        ("GET", _) => ("404 Not Found", "text/plain", "try /metrics or /status\n".to_owned()),
+        _ => ("405 Method Not Allowed", "text/plain", "only GET\n".to_owned()),
     }
 }
 
@@ -232,6 +232,34 @@ mod tests {
         metrics
     }
 
+    /// Abbreviated units, and units that are not base units.
+    const NO_UNITS: [&str; 24] = [
+        "s",
+        "ms",
+        "us",
+        "ns",
+        "sec",
+        "b",
+        "kb",
+        "mb",
+        "gb",
+        "tb",
+        "pb",
+        "m",
+        "h",
+        "d",
+        "hertz",
+        "cores",
+        "milliseconds",
+        "microseconds",
+        "nanoseconds",
+        "minutes",
+        "hours",
+        "days",
+        "kilobytes",
+        "bits",
+    ];
+
     /// The metrics follow the rules of `promtool check metrics`.
     #[test]
     fn metrics_follow_the_conventions() {
@@ -241,14 +269,11 @@ mod tests {
         vitals.safe_actions.insert("stale belief", 1);
         vitals.histograms.camera_to_action.observe(0.03);
         let text = prometheus("r", &origin(), &vitals);
-        const ABBREVIATED: [&str; 16] =
-            ["s", "ms", "us", "ns", "sec", "b", "kb", "mb", "gb", "tb", "pb", "m", "h", "d", "hertz", "cores"];
-        let not_base = ["milliseconds", "microseconds", "nanoseconds", "minutes", "hours", "days", "kilobytes", "bits"];
         for (name, (kind, series)) in parsed(&text) {
             let words: Vec<&str> = name.split('_').collect();
             assert_eq!(words[0], "carff");
             assert!(name.chars().all(|c| c.is_ascii_lowercase() || c == '_'), "{name}");
-            assert!(!words.iter().any(|w| ABBREVIATED.contains(w) || not_base.contains(w)), "{name}: units");
+            assert!(!words.iter().any(|w| NO_UNITS.contains(w)), "{name}: units");
             assert!(!["counter", "gauge", "histogram", "summary"].iter().any(|t| words.contains(t)), "{name}: type");
             assert_eq!(kind == "counter", name.ends_with("_total"), "{name}");
             assert!(["_bucket", "_count", "_sum"].iter().all(|end| !name.ends_with(end)), "{name}");
@@ -295,9 +320,9 @@ mod tests {
     #[test]
     fn other_requests_are_refused() {
         let answer = |method, target| answer(method, target, "r", &origin(), &vitals());
-        assert_eq!(answer("GET", "/metrics?x=1").0, 200);
-        assert_eq!(answer("GET", "/etc/passwd").0, 404);
-        assert_eq!(answer("POST", "/metrics").0, 405);
+        assert_eq!(answer("GET", "/metrics?x=1").0, "200 OK");
+        assert_eq!(answer("GET", "/etc/passwd").0, "404 Not Found");
+        assert_eq!(answer("POST", "/metrics").0, "405 Method Not Allowed");
         let status: Value = serde_json::from_str(&answer("GET", "/status").2).unwrap();
         assert_eq!(status["stages"]["encoder"]["messages"], 1);
     }
