@@ -6,6 +6,7 @@ use crate::report::{self, ReportFiles, RunOutcome};
 use crate::supervision::monitor::FrameRecord;
 use crate::supervision::{Ended, Feed, LAUNCHER, Supervisor};
 use anyhow::{Context, bail, ensure};
+use carff::provenance;
 use carff::runs::log_path;
 use carff::terminal::Terminal;
 use carff_checkpoint::{Manifest, ScenarioIdentity};
@@ -152,6 +153,7 @@ pub(crate) fn run_graph(
     let lock = RunLock::take(&runtime_dir(), &name, &record, "--run")?;
     lock.sweep(&run, "--run")?;
     terminal.log_to(&log_path(run.dir(), &name)).context("cannot write the run's log")?;
+    let origin = provenance::of(Some(record.started_unix_s), Some(&checkpoint));
     let _copy = copied.then(|| write_copy(&graph, &graph_file)).transpose()?;
 
     // A feed brings its own images.
@@ -189,6 +191,7 @@ pub(crate) fn run_graph(
         result.map(|ended| {
             let outcome = RunOutcome {
                 run: name,
+                origin,
                 graph_file: args.graph.display().to_string(),
                 graph: graph.clone(),
                 scenario,

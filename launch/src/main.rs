@@ -38,7 +38,7 @@ Environment:
 
 /// CARFF: from a camera image to a driving decision, in separate processes.
 #[derive(Debug, Parser)]
-#[command(name = "carff", bin_name = "carff", version, after_help = ENDS)]
+#[command(name = "carff", bin_name = "carff", version = carff::provenance::VERSION, after_help = ENDS)]
 struct Cli {
     #[command(subcommand)]
     command: Command,

@@ -3,6 +3,7 @@
 use crate::planning;
 use crate::supervision::monitor::Records;
 use anyhow::Context;
+use carff::provenance::{self, Origin};
 use carff_base::files::check_writable;
 use carff_checkpoint::Manifest;
 use carff_config::GraphConfig;
@@ -19,6 +20,8 @@ use std::path::{Path, PathBuf};
 pub struct RunOutcome {
     /// Run name.
     pub run: String,
+    /// Program, host, start and checkpoint of the run.
+    pub origin: Origin,
     /// Path of the graph file.
     pub graph_file: String,
     /// Effective configuration.
@@ -93,6 +96,7 @@ pub fn json(outcome: &RunOutcome) -> Value {
     let stage = |s: Stage| records.stages.get(&s);
     let mut report = json!({
         "run": outcome.run,
+        "origin": outcome.origin,
         "graph": outcome.graph_file,
         "seed": outcome.graph.run.seed,
         "interrupted": outcome.interrupted,
@@ -170,6 +174,7 @@ pub fn text(outcome: &RunOutcome, report: &Value) -> String {
     if let Some(figures) = checkpoint_figures(outcome) {
         text += &format!("\nModels, as measured in training\n  {}\n", figures.summary().replace('\n', "\n  "));
     }
+    text += &format!("\n{}\n", provenance::text(&outcome.origin));
     text
 }
 

@@ -25,6 +25,9 @@ fn findings_as_json() {
         assert_eq!(json["errors"], count("error"), "{json:#}");
         assert_eq!(json["warnings"], count("warning"), "{json:#}");
         assert_eq!(output.status.code(), Some(i32::from(count("error") > 0)), "{json:#}");
+        let origin = &json["origin"];
+        assert!(["version", "commit", "host", "started"].iter().all(|key| origin[key].is_string()), "{json:#}");
+        assert_eq!(origin["checkpoint_sha256"].as_str().map(str::len), (graph == &shipped).then_some(64), "{json:#}");
         let about_graph = |f: &&Value| f["area"] == "graph" && f["found"].as_str().unwrap().contains(expected);
         assert!(findings.iter().any(|f| about_graph(&f)), "{json:#}");
     }

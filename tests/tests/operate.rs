@@ -14,6 +14,7 @@ use foxglove::messages::RawImage;
 use rustix::process::Signal;
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
+use std::io::{Read as _, Write as _};
 use std::net::{Ipv4Addr, TcpStream};
 use std::path::Path;
 use std::process::Command;
@@ -161,6 +162,33 @@ fn export(graph: &TestGraph, words: &[&str]) -> Finished {
     Process::start(&mut command).end()
 }
 
+/// Writes a recording as other tools do: sorted by topic, without metadata, and only with the kept topics.
+fn rewrite(from: &Path, to: &Path, kept: impl Fn(&str) -> bool) {
+    let bytes = std::fs::read(from).unwrap();
+    let mut messages: Vec<_> = mcap::MessageStream::new(&bytes).unwrap().map(Result::unwrap).collect();
+    messages.retain(|message| kept(&message.channel.topic));
+    messages.sort_by(|a, b| a.channel.topic.cmp(&b.channel.topic));
+    let mut writer = mcap::Writer::new(std::fs::File::create(to).unwrap()).unwrap();
+    messages.iter().for_each(|message| writer.write(message).unwrap());
+    writer.finish().unwrap();
+}
+
+/// A recording that another tool has rewritten is exported and replayed; what it lacks is named.
+fn rewritten_recordings_are_read(graph: &TestGraph) {
+    rewrite(&graph.path("run.mcap"), &graph.path("sorted.mcap"), |_| true);
+    let replay = |words: &[&str]| carff(graph, &[&["replay"], words].concat(), &[]).end();
+    replay(&["sorted.mcap"]).assert_one_error(&["sorted.mcap", "no metadata", "--graph"]);
+    let same = replay(&["sorted.mcap", "--verify", "--graph", "graph.toml"]);
+    same.assert_success();
+    assert!(same.text.contains("all equal, bit for bit"), "{}", same.text);
+
+    rewrite(&graph.path("run.mcap"), &graph.path("filtered.mcap"), |topic| !topic.ends_with("/image"));
+    export(graph, &["filtered.mcap", "--csv", "filtered"]).assert_success();
+    assert_eq!(rows(&graph.path("filtered/camera-frame.csv")), rows(&graph.path("csv/camera-frame.csv")));
+    replay(&["filtered.mcap"]).assert_one_error(&["filtered.mcap", "no messages on `camera/image`", "camera/frame"]);
+    export(graph, &["filtered.mcap", "--png", "none"]).assert_one_error(&["`camera/image`"]);
+}
+
 /// Returns the number of rows of a table; 0 if it does not exist.
 fn rows(path: &Path) -> usize {
     std::fs::read_to_string(path).map_or(0, |text| text.lines().count().saturating_sub(1))
@@ -200,6 +228,7 @@ fn a_recording_is_decided_again_as_it_was() {
     assert!(frames > 0);
     let pictures = std::fs::read_dir(graph.path("png")).unwrap().flatten();
     assert_eq!(pictures.filter(|e| e.file_name().to_string_lossy().starts_with("frame-")).count(), frames);
+    rewritten_recordings_are_read(&graph);
 }
 
 /// A recorder that is killed leaves its written messages; a second recording of the same name is refused.
@@ -217,6 +246,34 @@ fn a_killed_recorder_leaves_its_recording() {
     recorder.end();
     assert!(readable());
     carff(&graph, &["record"], &["-o", "run.mcap"]).end().assert_one_error(&["run.mcap", "exists"]);
+    stop(&graph, launcher);
+}
+
+/// Connections that send no request do not end `carff metrics`, and do not keep others out, although they are more than
+/// the files that it may open.
+#[test]
+fn metrics_survive_idle_connections() {
+    let (graph, launcher) = running();
+    let mut command = Command::new("sh");
+    command.args(["-c", "ulimit -n 200; exec \"$0\" \"$@\""]).arg(program("carff")).args(["metrics", "--run"]);
+    let mut metrics = Process::start(command.arg(graph.run().name()).args(["--listen", "127.0.0.1:0"]));
+    metrics.wait_for("address", |text| text.contains("/status"));
+    let address = metrics.text().split(['/', ' ']).nth(2).unwrap().to_owned();
+    let connect = |sent: &str| {
+        let mut stream = TcpStream::connect(&address).unwrap();
+        stream.set_read_timeout(Some(WATCHDOG)).unwrap();
+        stream.write_all(sent.as_bytes()).unwrap();
+        stream
+    };
+    let idle: Vec<TcpStream> = (0..250).map(|_| connect("GET /metrics HTTP/1.1\r\nX-")).collect();
+    let mut text = String::new();
+    connect("GET /metrics HTTP/1.1\r\n\r\n").read_to_string(&mut text).unwrap();
+    assert!(text.starts_with("HTTP/1.1 200 OK") && text.contains("carff_frames_total{"), "{text}");
+    let origin = ["version=", "commit=", "host=", "started=", "checkpoint_sha256="];
+    assert!(text.lines().any(|l| l.starts_with("carff_build_info{") && origin.iter().all(|o| l.contains(o))), "{text}");
+    drop(idle);
+    metrics.signal(Signal::INT);
+    assert!(metrics.end().text.lines().count() == 1);
     stop(&graph, launcher);
 }
 

@@ -125,7 +125,7 @@ fn few_open_files() {
         command.arg(launch.get_program()).args(launch.get_args()).current_dir(launch.get_current_dir().unwrap());
         Process::start(&mut command).end()
     };
-    limited("-Hn 64").assert_one_error(&["may open 64 files", "ulimit -n"]);
+    limited("-n 64").assert_one_error(&["may open 64 files", "ulimit -n"]);
     limited("-Sn 64").assert_success();
     graph.assert_nothing_left();
 }

@@ -1,18 +1,19 @@
 //! `carff bridge`: serves the run's topics over the Foxglove WebSocket protocol, read-only, for headless vehicles.
 
 use crate::probe::session::{Session, SessionArgs};
+use crate::record::wall_offset_ns;
 use anyhow::Context;
 use carff_checkpoint::Manifest;
-use carff_recording::{channels, encode};
+use carff_recording::{Encoder, Format};
 use carff_transport::TopicId;
-use carff_transport::monotonic_now_ns;
 use clap::Args;
 use foxglove::{ChannelBuilder, PartialMetadata, RawChannel, WebSocketServer};
 use std::collections::BTreeMap;
+use std::collections::btree_map::Entry;
 use std::net::SocketAddr;
 use std::process::ExitCode;
 use std::sync::Arc;
-use std::time::{Duration, SystemTime};
+use std::time::Duration;
 
 /// Longest time to notify clients of the end.
 const FAREWELL: Duration = Duration::from_secs(1);
@@ -38,7 +39,7 @@ pub fn run(args: &BridgeArgs) -> anyhow::Result<ExitCode> {
     crate::metrics::refuse_remote(args.listen, args.remote)?;
     let mut session = Session::open(&args.session, "bridge")?;
     let topics: Vec<TopicId> = if args.topics.is_empty() { TopicId::all().collect() } else { args.topics.clone() };
-    session.listen(topics)?;
+    session.listen(topics.iter().copied())?;
     let live = session.attached.live.clone();
     let places = Manifest::load(&live.checkpoint).map(|m| m.places).unwrap_or_default();
     // Without capabilities, clients can only read.
@@ -49,25 +50,29 @@ pub fn run(args: &BridgeArgs) -> anyhow::Result<ExitCode> {
         .start_blocking()
         .with_context(|| format!("cannot listen on {}", args.listen))?;
     println!("ws://{}:{}", args.listen.ip(), server.port());
-    let mut open: BTreeMap<&'static str, Arc<RawChannel>> = BTreeMap::new();
-    for channel in channels() {
-        let built =
-            ChannelBuilder::new(channel.name).schema(channel.schema).message_encoding(channel.encoding).build_raw();
-        open.insert(channel.name, built.with_context(|| format!("cannot open the channel `{}`", channel.name))?);
+    let mut open: BTreeMap<String, Arc<RawChannel>> = BTreeMap::new();
+    // Clients see the topics at once. Other channels are opened with their first message.
+    for &topic in &topics {
+        open.insert(topic.name().to_owned(), channel(topic.name(), Format::Form(topic))?);
     }
-    let wall_ns = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default().as_nanos() as u64;
-    let offset_ns = wall_ns.saturating_sub(monotonic_now_ns());
+    let mut encoder = Encoder::new(places, wall_offset_ns());
     let going = session.follow(
         |topic, message| {
             // Nothing is encoded without a client.
-            if server.client_count() > 0 {
-                let message = message.message();
-                let at_ns = message.header().publish_time_ns.saturating_add(offset_ns);
-                for (name, bytes) in encode(topic, message, &places, at_ns)? {
-                    if let Some(channel) = open.get(name).filter(|c| c.has_sinks()) {
-                        channel.log_with_meta(&bytes, PartialMetadata { log_time: Some(at_ns) });
+            if server.client_count() == 0 {
+                return Ok(true);
+            }
+            let message = message.message();
+            let log_time = Some(encoder.wall_ns(message.header().publish_time_ns));
+            for message in encoder.encode(topic, message)? {
+                let channel = match open.entry(message.channel) {
+                    Entry::Occupied(known) => known.into_mut(),
+                    Entry::Vacant(new) => {
+                        let opened = channel(new.key(), message.format)?;
+                        new.insert(opened)
                     }
-                }
+                };
+                channel.log_with_meta(&message.data, PartialMetadata { log_time });
             }
             Ok(true)
         },
@@ -84,4 +89,9 @@ pub fn run(args: &BridgeArgs) -> anyhow::Result<ExitCode> {
     let _ = wait.recv_timeout(FAREWELL);
     session.say_end(going);
     Ok(ExitCode::SUCCESS)
+}
+
+fn channel(name: &str, format: Format) -> anyhow::Result<Arc<RawChannel>> {
+    let built = ChannelBuilder::new(name).schema(format.schema()).message_encoding(format.encoding()).build_raw();
+    built.with_context(|| format!("cannot open the channel `{name}`"))
 }

@@ -3,6 +3,7 @@
 use anyhow::{Context, ensure};
 use carff_messages::{FrameMeta, ImageMeta};
 use carff_recording::Reader;
+use carff_transport::TopicId;
 use openh264::OpenH264API;
 use openh264::encoder::{
     ColorPrimaries, Encoder, EncoderConfig, FrameRate, FrameType, IntraFramePeriod, Profile, QpRange, RateControlMode,
@@ -213,7 +214,7 @@ fn fitting(rgb: &[u8], [width_px, height_px]: [u32; 2]) -> (Cow<'_, [u8]>, [u32;
 
 /// Returns the frames per second, from the median time between frames.
 pub(crate) fn frame_rate_hz(recording: &Path) -> anyhow::Result<f64> {
-    let mut reader = Reader::open(recording)?;
+    let mut reader = Reader::open(recording)?.without_images();
     let (mut before_ns, mut between) = (None, Vec::new());
     while let Some(entry) = reader.next()? {
         if let Some(m) = entry.message.as_message().get::<FrameMeta>() {
@@ -231,6 +232,7 @@ pub(crate) fn frame_rate_hz(recording: &Path) -> anyhow::Result<f64> {
 pub(crate) fn export(recording: &Path, file: &Path) -> anyhow::Result<u64> {
     let rate_hz = frame_rate_hz(recording)?;
     let mut reader = Reader::open(recording)?;
+    reader.select([TopicId::FRAME]).with_context(|| format!("{} contains no camera frame", recording.display()))?;
     let mut film = None;
     while let Some(entry) = reader.next()? {
         let message = entry.message.as_message();
@@ -243,7 +245,7 @@ pub(crate) fn export(recording: &Path, file: &Path) -> anyhow::Result<u64> {
         ensure!(film.size_px() == size_px, "frame {} does not have the size of the first frame", m.header.frame_id);
         film.add(message.bytes(), m.header.capture_time_ns)?;
     }
-    film.with_context(|| format!("{} contains no camera frame", recording.display()))?.finish()
+    film.context("the recording contains no camera frame")?.finish()
 }
 
 #[cfg(test)]

@@ -9,12 +9,14 @@ pub mod bridge;
 pub mod export;
 #[cfg(feature = "film")]
 mod film;
+mod http;
 mod log_file;
 pub mod log_line;
 pub mod metrics;
 mod not_built;
 pub mod probe;
 mod programs;
+pub mod provenance;
 #[cfg(feature = "recording")]
 pub mod record;
 pub mod runs;

@@ -9,7 +9,7 @@ use std::process::ExitCode;
 const LAUNCH: &str = "carff-launch";
 
 #[derive(Debug, Parser)]
-#[command(name = "carff", version)]
+#[command(name = "carff", version = carff::provenance::VERSION)]
 struct Cli {
     #[command(subcommand)]
     command: Attach,

@@ -1,17 +1,25 @@
 //! `carff metrics`: serves a run's metrics over HTTP, for Prometheus and for scripts.
 
+use crate::http::{Response, Server};
 use crate::probe::session::{Session, SessionArgs};
+use crate::provenance::{self, Origin};
 use crate::vitals::{RunVitals, StageVitals};
-use anyhow::{Context, anyhow, ensure};
+use anyhow::{Context, ensure};
 use carff_base::statistics::percentile;
 use carff_messages::Stage;
 use carff_transport::monotonic_now_ns;
 use clap::Args;
+use prometheus_client::encoding::prometheus_text;
+use prometheus_client::metrics::counter::{ConstCounter, Counter};
+use prometheus_client::metrics::family::Family;
+use prometheus_client::metrics::gauge::{ConstGauge, Gauge};
+use prometheus_client::metrics::info::Info;
+use prometheus_client::registry::Registry;
 use serde_json::{Value, json};
-use std::fmt::{Display, Write};
+use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::process::ExitCode;
-use tiny_http::{Header, Method, Response, Server};
+use std::sync::atomic::AtomicU64;
 
 /// Serve a run's metrics.
 #[derive(Clone, Debug, Args)]
@@ -39,29 +47,24 @@ pub fn run(args: &MetricsArgs) -> anyhow::Result<ExitCode> {
     }
     let mut session = Session::open(&session_args, "metrics")?;
     session.listen(RunVitals::topics())?;
-    let server = if args.once {
-        None
-    } else {
-        let server = Server::http(args.listen).map_err(|e| anyhow!("cannot listen on {}: {e}", args.listen))?;
-        println!("http://{}/metrics and /status", server.server_addr());
-        Some(server)
-    };
-    let name = session.attached.live.name.clone();
+    let mut server = None;
+    if !args.once {
+        let bound = Server::bind(args.listen).with_context(|| format!("cannot listen on {}", args.listen))?;
+        println!("http://{}/metrics and /status", bound.address()?);
+        server = Some(bound);
+    }
+    let live = &session.attached.live;
+    let name = live.name.clone();
+    let origin = provenance::of(Some(live.started_unix_s), Some(&live.checkpoint));
     let mut vitals = RunVitals::default();
     let going = vitals.gather(&mut session, |vitals| {
-        while let Some(request) = server.as_ref().map(Server::try_recv).transpose().context("cannot serve")?.flatten() {
-            let (status, kind, body) = answer(request.method(), request.url(), &name, vitals);
-            let mut response = Response::from_string(body).with_status_code(status);
-            if let Ok(header) = Header::from_bytes("Content-Type", kind) {
-                response = response.with_header(header);
-            }
-            // The client may have closed the connection.
-            let _ = request.respond(response);
+        if let Some(server) = &mut server {
+            server.serve(|method, target| answer(method, target, &name, &origin, vitals));
         }
         Ok(true)
     })?;
     if args.once {
-        println!("{}", serde_json::to_string_pretty(&status(&name, &vitals))?);
+        println!("{}", serde_json::to_string_pretty(&status(&name, &origin, &vitals))?);
     }
     session.say_end(going);
     Ok(ExitCode::SUCCESS)
@@ -76,17 +79,19 @@ pub(crate) fn refuse_remote(listen: SocketAddr, remote: bool) -> anyhow::Result<
     Ok(())
 }
 
-/// Returns status, content type and text of the response to a request.
-fn answer(method: &Method, url: &str, run: &str, vitals: &RunVitals) -> (u16, &'static str, String) {
-    match (method, url.split('?').next().unwrap_or_default()) {
-        (Method::Get, "/metrics") => (200, "text/plain; version=0.0.4; charset=utf-8", prometheus(run, vitals)),
-        (Method::Get, "/status") => (200, "application/json", status(run, vitals).to_string()),
-        (Method::Get, _) => (404, "text/plain", "try /metrics or /status\n".to_owned()),
-        _ => (405, "text/plain", "only GET\n".to_owned()),
+/// Returns the response to a request.
+fn answer(method: &str, target: &str, run: &str, origin: &Origin, vitals: &RunVitals) -> Response {
+    match (method, target.split('?').next().unwrap_or_default()) {
+        ("GET", "/metrics") => ("200 OK", prometheus_text::CONTENT_TYPE, prometheus(run, origin, vitals)),
+        ("GET", "/status") => ("200 OK", "application/json", status(run, origin, vitals).to_string()),
+        ("GET", _) => ("404 Not Found", "text/plain", "try /metrics or /status\n".to_owned()),
+        _ => ("405 Method Not Allowed", "text/plain", "only GET\n".to_owned()),
     }
 }
 
-fn status(run: &str, vitals: &RunVitals) -> Value {
+/// Returns the status as JSON. Counts of messages start with the observation; `skipped`, `invalid`, `errors` and
+/// `max_latency_ms` with the stage.
+fn status(run: &str, origin: &Origin, vitals: &RunVitals) -> Value {
     let now_ns = monotonic_now_ns();
     let decided: Vec<f64> = vitals.decided_ms.iter().copied().collect();
     let stages: serde_json::Map<String, Value> = Stage::ALL
@@ -104,6 +109,7 @@ fn status(run: &str, vitals: &RunVitals) -> Value {
         .collect();
     json!({
         "run": run,
+        "origin": origin,
         "frames": vitals.frames,
         "decisions": vitals.decisions,
         "actions": vitals.actions,
@@ -116,52 +122,69 @@ fn status(run: &str, vitals: &RunVitals) -> Value {
     })
 }
 
+type Labels = [(&'static str, &'static str); 1];
+
 /// Returns the metrics in the Prometheus text format.
-fn prometheus(run: &str, vitals: &RunVitals) -> String {
-    let mut text = String::new();
-    let mut family = |name: &str, kind: &str, help: &str, samples: &[(String, String)]| {
-        // Writing into a string does not fail.
-        let _ = writeln!(text, "# HELP carff_{name} {help}\n# TYPE carff_{name} {kind}");
-        for (labels, value) in samples {
-            let comma = if labels.is_empty() { "" } else { "," };
-            let _ = writeln!(text, "carff_{name}{{run=\"{run}\"{comma}{labels}}} {value}");
+fn prometheus(run: &str, origin: &Origin, vitals: &RunVitals) -> String {
+    let mut registry = Registry::with_prefix_and_labels("carff", [("run".into(), run.to_owned().into())].into_iter());
+    let labels: Vec<(&'static str, String)> = origin.clone().into_iter().collect();
+    registry.register("build", "Program, host, start of the run and checkpoint", Info::new(labels));
+    registry.register("frames", "Frames from the camera since this exporter started", ConstCounter::new(vitals.frames));
+    let decisions = ConstCounter::new(vitals.decisions);
+    registry.register("decisions", "Decisions on a frame since this exporter started", decisions);
+    let labelled = |label: &'static str, counts: &BTreeMap<&'static str, u64>| {
+        let family = Family::<Labels, Counter>::default();
+        for (name, count) in counts {
+            family.get_or_create(&[(label, *name)]).inc_by(*count);
         }
+        family
     };
-    let one = |value: &dyn Display| vec![(String::new(), value.to_string())];
-    let labelled = |label: &str, counts: &std::collections::BTreeMap<&'static str, u64>| -> Vec<(String, String)> {
-        counts.iter().map(|(name, count)| (format!("{label}=\"{name}\""), count.to_string())).collect()
-    };
-    family("frames_total", "counter", "Frames from the camera.", &one(&vitals.frames));
-    family("decisions_total", "counter", "Decisions on a frame.", &one(&vitals.decisions));
-    family("actions_total", "counter", "Actions published.", &labelled("action", &vitals.actions));
-    family("safe_actions_total", "counter", "Safe actions by reason.", &labelled("reason", &vitals.safe_actions));
-    family("hazard_probability", "gauge", "Hazard probability of the latest action.", &one(&vitals.hazard_probability));
-    let decided: Vec<f64> = vitals.decided_ms.iter().copied().collect();
-    let quantiles: Vec<(String, String)> = [0.5, 0.9, 0.99]
-        .iter()
-        .filter_map(|&q| percentile(&decided, q).map(|ms| (format!("quantile=\"{q}\""), (ms / 1e3).to_string())))
-        .collect();
-    family("camera_to_action_seconds", "gauge", "Time from capture to decision of the latest decisions.", &quantiles);
-    let now_ns = monotonic_now_ns();
-    let mut of_stages = |name: &str, kind: &str, help: &str, value: &dyn Fn(&StageVitals) -> String| {
-        let samples: Vec<(String, String)> =
-            vitals.stages.iter().map(|(stage, v)| (format!("stage=\"{stage}\""), value(v))).collect();
-        family(name, kind, help, &samples);
-    };
-    of_stages("stage_up", "gauge", "1 when the stage is ok.", &|v| u8::from(v.state_name(now_ns) == "ok").to_string());
-    of_stages("stage_messages_total", "counter", "Messages seen on the stage's topic.", &|v| v.messages.to_string());
-    of_stages("stage_rate_hertz", "gauge", "Recent rate of messages.", &|v| v.rate_hz(now_ns).to_string());
-    of_stages("stage_latency_seconds", "gauge", "Latency of the latest output.", &|v| {
-        (v.latency_ms.back().copied().unwrap_or(0.0) / 1e3).to_string()
-    });
-    of_stages("stage_cpu_cores", "gauge", "Cores in use.", &|v| v.cpu.to_string());
-    of_stages("stage_resident_bytes", "gauge", "Resident memory.", &|v| v.rss_bytes.to_string());
-    of_stages("stage_skipped_total", "counter", "Inputs skipped for newer ones.", &|v| v.counts[0].to_string());
-    of_stages("stage_invalid_total", "counter", "Invalid inputs dropped.", &|v| v.counts[1].to_string());
-    of_stages("stage_errors_total", "counter", "Errors of the stage.", &|v| v.counts[2].to_string());
-    of_stages("stage_restarts_total", "counter", "New processes seen.", &|v| v.restarts.to_string());
-    of_stages("stage_late_total", "counter", "Heartbeats that reported slow or stale.", &|v| v.late.to_string());
+    let actions = labelled("action", &vitals.actions);
+    registry.register("actions", "Actions published since this exporter started", actions);
+    let safe_actions = labelled("reason", &vitals.safe_actions);
+    registry.register("safe_actions", "Safe actions since this exporter started, by reason", safe_actions);
+    let hazard = ConstGauge::new(f64::from(vitals.hazard_probability));
+    registry.register("hazard_probability", "Hazard probability of the latest action, 0 to 1", hazard);
+    let histograms = &vitals.histograms;
+    let camera_to_action = histograms.camera_to_action.clone();
+    registry.register("camera_to_action_seconds", "Time from capture to decision", camera_to_action);
+    let help = "Time from the arrival of an input to the output, as the stage measures it; of camera and controller, \
+                one value for each heartbeat";
+    registry.register("stage_latency_seconds", help, histograms.stages.clone());
+    stages(&mut registry, vitals);
+    let mut text = String::new();
+    // Writing into a string does not fail.
+    let _ = prometheus_text::encode(&mut text, &registry);
     text
+}
+
+/// Registers the metrics that each stage has.
+fn stages(registry: &mut Registry, vitals: &RunVitals) {
+    let now_ns = monotonic_now_ns();
+    let mut gauge = |name: &str, help: &str, value: &dyn Fn(&StageVitals) -> f64| {
+        let family = Family::<Labels, Gauge<f64, AtomicU64>>::default();
+        for (stage, v) in &vitals.stages {
+            family.get_or_create(&[("stage", stage.name())]).set(value(v));
+        }
+        registry.register(name, help, family);
+    };
+    gauge("stage_up", "1 if the stage is ok, else 0", &|v| f64::from(u8::from(v.state_name(now_ns) == "ok")));
+    gauge("stage_latency_max_seconds", "Longest latency since the stage started", &|v| v.max_latency_ms / 1e3);
+    gauge("stage_resident_memory_bytes", "Resident memory", &|v| v.rss_bytes as f64);
+    let mut counter = |name: &str, help: &str, value: &dyn Fn(&StageVitals) -> f64| {
+        let family = Family::<Labels, Counter<f64, AtomicU64>>::default();
+        for (stage, v) in &vitals.stages {
+            family.get_or_create(&[("stage", stage.name())]).inc_by(value(v));
+        }
+        registry.register(name, help, family);
+    };
+    counter("stage_messages", "Messages on the stage's topic since this exporter started", &|v| v.messages as f64);
+    counter("stage_cpu_seconds", "Processor time since the stage started", &|v| v.cpu_ns as f64 / 1e9);
+    counter("stage_skipped", "Inputs skipped for newer ones since the stage started", &|v| v.counts[0] as f64);
+    counter("stage_invalid", "Invalid inputs dropped since the stage started", &|v| v.counts[1] as f64);
+    counter("stage_errors", "Errors since the stage started", &|v| v.counts[2] as f64);
+    counter("stage_restarts", "New processes since this exporter started", &|v| v.restarts as f64);
+    counter("stage_late", "Heartbeats with slow or stale since this exporter started", &|v| v.late as f64);
 }
 
 #[cfg(test)]
@@ -178,16 +201,110 @@ mod tests {
         vitals
     }
 
-    /// Each line is a comment or a sample with labels and a number; the stage with messages is included.
-    #[test]
-    fn metrics_are_in_the_text_format() {
-        let text = prometheus("r", &vitals());
-        for line in text.lines().filter(|l| !l.starts_with('#')) {
-            let (name, value) = line.rsplit_once(' ').unwrap();
-            assert!(name.starts_with("carff_") && name.contains("{run=\"r\"") && name.ends_with('}'), "{line}");
-            assert!(value.parse::<f64>().is_ok(), "{line}");
+    fn origin() -> Origin {
+        provenance::of(None, None)
+    }
+
+    /// The samples of a metric: its labels with their values, and its value.
+    type Samples<'a> = Vec<(Vec<(&'a str, &'a str)>, f64)>;
+
+    /// Parses the text format: each sample follows the help and the type of its metric, and no metric is repeated.
+    fn parsed(text: &str) -> BTreeMap<&str, (&str, BTreeMap<&str, Samples<'_>>)> {
+        let mut metrics: BTreeMap<&str, (&str, BTreeMap<&str, Samples<'_>>)> = BTreeMap::new();
+        let (mut helped, mut current) = ("", "");
+        for line in text.lines() {
+            if let Some((name, help)) = line.strip_prefix("# HELP ").map(|rest| rest.split_once(' ').unwrap()) {
+                assert!(!help.trim().is_empty() && !metrics.contains_key(name), "{line}");
+                helped = name;
+            } else if let Some((name, kind)) = line.strip_prefix("# TYPE ").map(|rest| rest.split_once(' ').unwrap()) {
+                assert!(helped == name && ["counter", "gauge", "histogram"].contains(&kind), "{line}");
+                metrics.insert(name, (kind, BTreeMap::new()));
+                current = name;
+            } else {
+                let (series, value) = line.rsplit_once(' ').unwrap();
+                let (name, labels) = series.strip_suffix('}').unwrap().split_once('{').unwrap();
+                let labels = labels.split(',').map(|label| label.split_once('=').unwrap()).collect();
+                assert!(name.starts_with(current), "{line}");
+                let value = if value == "+Inf" { f64::INFINITY } else { value.parse().unwrap() };
+                metrics.get_mut(current).unwrap().1.entry(name).or_default().push((labels, value));
+            }
         }
-        assert!(text.contains("carff_stage_latency_seconds{run=\"r\",stage=\"encoder\"} 0.015"), "{text}");
+        metrics
+    }
+
+    /// Abbreviated units, and units that are not base units.
+    const NO_UNITS: [&str; 24] = [
+        "s",
+        "ms",
+        "us",
+        "ns",
+        "sec",
+        "b",
+        "kb",
+        "mb",
+        "gb",
+        "tb",
+        "pb",
+        "m",
+        "h",
+        "d",
+        "hertz",
+        "cores",
+        "milliseconds",
+        "microseconds",
+        "nanoseconds",
+        "minutes",
+        "hours",
+        "days",
+        "kilobytes",
+        "bits",
+    ];
+
+    /// The metrics follow the rules of `promtool check metrics`.
+    #[test]
+    fn metrics_follow_the_conventions() {
+        let mut vitals = vitals();
+        vitals.decisions = 3;
+        vitals.actions.insert("halt", 2);
+        vitals.safe_actions.insert("stale belief", 1);
+        vitals.histograms.camera_to_action.observe(0.03);
+        let text = prometheus("r", &origin(), &vitals);
+        for (name, (kind, series)) in parsed(&text) {
+            let words: Vec<&str> = name.split('_').collect();
+            assert_eq!(words[0], "carff");
+            assert!(name.chars().all(|c| c.is_ascii_lowercase() || c == '_'), "{name}");
+            assert!(!words.iter().any(|w| NO_UNITS.contains(w)), "{name}: units");
+            assert!(!["counter", "gauge", "histogram", "summary"].iter().any(|t| words.contains(t)), "{name}: type");
+            assert_eq!(kind == "counter", name.ends_with("_total"), "{name}");
+            assert!(["_bucket", "_count", "_sum"].iter().all(|end| !name.ends_with(end)), "{name}");
+            for (sample, values) in series {
+                for (labels, value) in values {
+                    let has = |label: &str| labels.iter().any(|(name, _)| *name == label);
+                    assert_eq!(labels[0], ("run", "\"r\""), "{sample}");
+                    assert!(!has("quantile") && has("le") == sample.ends_with("_bucket"), "{sample}");
+                    assert!(labels.iter().all(|(l, v)| !l.is_empty() && v.starts_with('"') && v.ends_with('"')));
+                    assert!(value >= 0.0, "{sample}");
+                }
+            }
+        }
+        let line =
+            |begin: &str| text.lines().find(|l| l.starts_with(begin)).unwrap_or_else(|| panic!("{begin}: {text}"));
+        line("carff_build_info{run=\"r\",commit=\"");
+        assert!(
+            line("carff_decisions_total").ends_with(" 3") && line("carff_safe_actions_total").contains("stale belief")
+        );
+        assert_eq!(
+            line("carff_stage_latency_seconds_sum"),
+            "carff_stage_latency_seconds_sum{run=\"r\",stage=\"encoder\"} 0.015"
+        );
+        assert!(line("carff_camera_to_action_seconds_count").ends_with(" 1"));
+    }
+
+    /// Names of runs, hosts and reasons are escaped.
+    #[test]
+    fn labels_are_escaped() {
+        let text = prometheus("a\"b\\c\nd", &origin(), &vitals());
+        assert!(text.contains(r#"carff_frames_total{run="a\"b\\c\nd"} 0"#), "{text}");
     }
 
     /// An address that other machines can reach is refused without `--remote`.
@@ -202,10 +319,11 @@ mod tests {
     /// Unknown paths and other methods than GET are refused.
     #[test]
     fn other_requests_are_refused() {
-        assert_eq!(answer(&Method::Get, "/metrics?x=1", "r", &vitals()).0, 200);
-        assert_eq!(answer(&Method::Get, "/etc/passwd", "r", &vitals()).0, 404);
-        assert_eq!(answer(&Method::Post, "/metrics", "r", &vitals()).0, 405);
-        let status: Value = serde_json::from_str(&answer(&Method::Get, "/status", "r", &vitals()).2).unwrap();
+        let answer = |method, target| answer(method, target, "r", &origin(), &vitals());
+        assert_eq!(answer("GET", "/metrics?x=1").0, "200 OK");
+        assert_eq!(answer("GET", "/etc/passwd").0, "404 Not Found");
+        assert_eq!(answer("POST", "/metrics").0, "405 Method Not Allowed");
+        let status: Value = serde_json::from_str(&answer("GET", "/status").2).unwrap();
         assert_eq!(status["stages"]["encoder"]["messages"], 1);
     }
 }

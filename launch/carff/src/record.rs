@@ -1,6 +1,7 @@
 //! `carff record`: writes the messages of a running graph into an MCAP file.
 
 use crate::probe::session::{Session, SessionArgs};
+use crate::provenance;
 use crate::terminal::Terminal;
 use anyhow::Context;
 use carff_checkpoint::Manifest;
@@ -48,11 +49,11 @@ pub fn run(args: &RecordArgs) -> anyhow::Result<ExitCode> {
     let topics: Vec<TopicId> = if args.topics.is_empty() { TopicId::all().collect() } else { args.topics.clone() };
     session.listen(topics)?;
     let live = &session.attached.live;
-    let places = match Manifest::load(&live.checkpoint) {
-        Ok(manifest) => manifest.places,
+    let (states, places) = match Manifest::load(&live.checkpoint) {
+        Ok(manifest) => (manifest.scenario.state_names(), manifest.places),
         Err(error) => {
-            eprintln!("warning: no boxes are recorded: {error}");
-            Vec::new()
+            eprintln!("warning: neither boxes nor names of states are recorded: {error}");
+            Default::default()
         }
     };
     let limits = Limits {
@@ -60,7 +61,7 @@ pub fn run(args: &RecordArgs) -> anyhow::Result<ExitCode> {
         file_ns: args.file_seconds.map(|s| s * 1_000_000_000),
         files: args.keep.map(|n| n as usize),
     };
-    let writer = RotatingWriter::create(&args.out, about(live)?, places, limits)?;
+    let writer = RotatingWriter::create(&args.out, about(live, states)?, places, limits)?;
     let queue = RecordingQueue::start(writer, args.queue_mb * 1_000_000).context("cannot start the writer")?;
     let terminal = Terminal::new();
     let name = live.name.clone();
@@ -92,8 +93,15 @@ pub fn run(args: &RecordArgs) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-fn about(live: &LiveRun) -> anyhow::Result<About> {
+/// Returns the difference of wall-clock time (nanoseconds since 1970) and monotonic time.
+pub(crate) fn wall_offset_ns() -> u64 {
     let wall_ns = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default().as_nanos() as u64;
+    wall_ns.saturating_sub(monotonic_now_ns())
+}
+
+fn about(live: &LiveRun, states: Vec<String>) -> anyhow::Result<About> {
+    let origin = provenance::of(Some(live.started_unix_s), Some(&live.checkpoint));
+    let origin = origin.into_iter().map(|(name, value)| (name.to_owned(), value)).collect();
     Ok(About {
         run: live.name.clone(),
         run_id: live.run_id,
@@ -102,6 +110,8 @@ fn about(live: &LiveRun) -> anyhow::Result<About> {
             .with_context(|| format!("cannot read the graph file {}", live.graph.display()))?,
         dataset: live.dataset.display().to_string(),
         checkpoint: live.checkpoint.display().to_string(),
-        wall_offset_ns: wall_ns.saturating_sub(monotonic_now_ns()),
+        wall_offset_ns: wall_offset_ns(),
+        states,
+        origin,
     })
 }

@@ -7,6 +7,8 @@ use carff_messages::{
 };
 use carff_transport::TopicId;
 use carff_transport::monotonic_now_ns;
+use prometheus_client::metrics::family::Family;
+use prometheus_client::metrics::histogram::{Histogram, exponential_buckets};
 use std::collections::{BTreeMap, VecDeque};
 
 /// Number of latencies kept for each stage and for the whole loop.
@@ -29,9 +31,9 @@ pub(crate) struct StageVitals {
     pub(crate) messages: u64,
     /// Publish times of its latest messages.
     published_ns: VecDeque<u64>,
-    /// Latencies of its latest outputs, milliseconds.
+    /// Latest latencies, milliseconds: from the arrival of an input to the output, as the stage measures it.
     pub(crate) latency_ms: VecDeque<f64>,
-    /// Longest latency of an output, milliseconds.
+    /// Longest latency since the stage's start, milliseconds.
     pub(crate) max_latency_ms: f64,
     /// Resident memory, bytes.
     pub(crate) rss_bytes: u64,
@@ -43,6 +45,10 @@ pub(crate) struct StageVitals {
     pub(crate) late: u64,
     /// Share of a core, 0 to the number of cores.
     pub(crate) cpu: f64,
+    /// Processor time since the stage's start, nanoseconds.
+    pub(crate) cpu_ns: u64,
+    /// Number of outputs in its last heartbeat.
+    published: u64,
     cpu_seen: Option<(u64, u64)>,
 }
 
@@ -65,11 +71,11 @@ impl StageVitals {
     }
 }
 
-/// Health, decisions and resource use of one run.
+/// Health, decisions and resource use of one run. All counts of messages start with the observation.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct RunVitals {
     pub(crate) stages: BTreeMap<Stage, StageVitals>,
-    /// Number of frames from the camera: the latest frame number plus one.
+    /// Number of frames from the camera.
     pub(crate) frames: u64,
     /// Number of actions by name.
     pub(crate) actions: BTreeMap<&'static str, u64>,
@@ -83,6 +89,24 @@ pub(crate) struct RunVitals {
     pub(crate) hazard_probability: f32,
     /// The latest action and its reason.
     pub(crate) last_action: Option<(&'static str, &'static str)>,
+    pub(crate) histograms: Histograms,
+}
+
+/// Distributions of times, seconds.
+#[derive(Clone, Debug)]
+pub(crate) struct Histograms {
+    /// From capture to decision.
+    pub(crate) camera_to_action: Histogram,
+    /// From the arrival of an input to the output.
+    pub(crate) stages: Family<[(&'static str, &'static str); 1], Histogram, fn() -> Histogram>,
+}
+
+impl Default for Histograms {
+    fn default() -> Self {
+        // From 0.5 ms to 4 s.
+        let histogram = || Histogram::new(exponential_buckets(0.0005, 2.0, 14));
+        Self { camera_to_action: histogram(), stages: Family::new_with_constructor(histogram) }
+    }
 }
 
 fn remember<T>(values: &mut VecDeque<T>, value: T) {
@@ -113,21 +137,32 @@ impl RunVitals {
         if let Some(health) = message.get::<Health>() {
             return self.take_health(health);
         }
+        // Camera and controller report their latency in heartbeats only.
         let (stage, latency_ns) = if message.get::<FrameMeta>().is_some() {
-            self.frames = self.frames.max(header.frame_id + 1);
-            (Stage::Camera, header.publish_time_ns.saturating_sub(header.capture_time_ns))
+            self.frames += 1;
+            (Stage::Camera, None)
         } else if let Some(action) = message.get::<Action>() {
             self.take_action(action);
-            (Stage::Controller, action.latency_ns)
-        } else if let Some(worked) = stage_latency_ns(message) {
-            worked
+            (Stage::Controller, None)
+        } else if let Some((stage, latency_ns)) = stage_latency_ns(message) {
+            (stage, Some(latency_ns))
         } else {
             return;
         };
         let vitals = self.stages.entry(stage).or_default();
         vitals.messages += 1;
         remember(&mut vitals.published_ns, header.publish_time_ns);
-        remember(&mut vitals.latency_ms, latency_ns as f64 / 1e6);
+        if let Some(latency_ns) = latency_ns {
+            self.take_latency(stage, latency_ns);
+        }
+    }
+
+    fn take_latency(&mut self, stage: Stage, latency_ns: u64) {
+        let vitals = self.stages.entry(stage).or_default();
+        let latency_ms = latency_ns as f64 / 1e6;
+        vitals.max_latency_ms = vitals.max_latency_ms.max(latency_ms);
+        remember(&mut vitals.latency_ms, latency_ms);
+        self.histograms.stages.get_or_create(&[("stage", stage.name())]).observe(latency_ns as f64 / 1e9);
     }
 
     fn take_action(&mut self, m: &Action) {
@@ -139,6 +174,7 @@ impl RunVitals {
         if m.is_decision() {
             self.decisions += 1;
             remember(&mut self.decided_ms, m.latency_ns as f64 / 1e6);
+            self.histograms.camera_to_action.observe(m.latency_ns as f64 / 1e9);
         }
         (self.hazard_probability, self.last_action) = (m.hazard_probability, Some((action, reason)));
     }
@@ -148,13 +184,17 @@ impl RunVitals {
         let vitals = self.stages.entry(stage).or_default();
         if vitals.pid != 0 && vitals.pid != m.pid {
             vitals.restarts += 1;
-            vitals.cpu_seen = None;
+            (vitals.cpu_seen, vitals.max_latency_ms, vitals.published) = (None, 0.0, 0);
         }
         vitals.state = m.state().ok();
         vitals.late += u64::from(matches!(vitals.state, Some(HealthState::Slow | HealthState::Stale)));
         (vitals.pid, vitals.rss_bytes, vitals.heard_ns) = (m.pid, m.rss_bytes, m.header.publish_time_ns);
         vitals.counts = [m.skipped, m.invalid, m.errors];
-        vitals.max_latency_ms = m.max_latency_ns as f64 / 1e6;
+        vitals.max_latency_ms = vitals.max_latency_ms.max(m.max_latency_ns as f64 / 1e6);
+        let has_worked = m.published > std::mem::replace(&mut vitals.published, m.published);
+        if has_worked && matches!(stage, Stage::Camera | Stage::Controller) {
+            self.take_latency(stage, m.last_latency_ns);
+        }
     }
 
     /// Adds a run's messages until the run is over, or until `after`, which is called after each reading, returns
@@ -194,6 +234,7 @@ impl RunVitals {
             else {
                 continue;
             };
+            vitals.cpu_ns = used_ns;
             if let Some((before_ns, at_ns)) = vitals.cpu_seen.replace((used_ns, now_ns)) {
                 vitals.cpu = used_ns.saturating_sub(before_ns) as f64 / now_ns.saturating_sub(at_ns).max(1) as f64;
             }
@@ -212,7 +253,7 @@ fn used_ns(stat: &str) -> Option<u64> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use carff_messages::Header;
+    use carff_messages::{Gaussian, Header};
 
     fn health(pid: u32, state: HealthState) -> Health {
         Health {
@@ -247,11 +288,47 @@ mod tests {
         assert_eq!((prober.state_name(2_000), prober.state_name(1_000 + 2 * RATE_NS)), ("ok", "silent"));
     }
 
-    /// Each decision counts once; safe actions count by their reason.
+    /// Counts start with the observation, at any frame number. The latency of a stage is what the stage measures, also
+    /// of the controller, whose actions state the time since the capture; so no latency is above its maximum.
     #[test]
-    fn actions_are_counted() {
+    fn figures_do_not_contradict_each_other() {
         let mut run = RunVitals::default();
-        let mut action = Action {
+        let header = Header { publish_time_ns: 90_000_000, ..Header::of_frame(500, 1_000, 1) };
+        for sequence in 0..3 {
+            run.take(AnyMessage::new(
+                &FrameMeta { header: Header { sequence, ..header }, ..FrameMeta::default() },
+                &[],
+            ));
+            run.take(AnyMessage::new(&action(30_000_000), &[]));
+        }
+        for (stage, published) in [(Stage::Camera, 3), (Stage::Controller, 7), (Stage::Controller, 7)] {
+            let beat = Health {
+                stage: stage.code(),
+                published,
+                last_latency_ns: 100_000,
+                max_latency_ns: 200_000,
+                ..health(5, HealthState::Ok)
+            };
+            run.take(AnyMessage::new(&beat, &[]));
+        }
+        assert_eq!((run.frames, run.decisions), (3, 3));
+        for stage in [Stage::Camera, Stage::Controller] {
+            let vitals = &run.stages[&stage];
+            assert_eq!(
+                (vitals.messages, &vitals.latency_ms, vitals.max_latency_ms),
+                (3, &[0.1].into(), 0.2),
+                "{stage}"
+            );
+        }
+        assert_eq!(run.decided_ms.len(), 3);
+        // The heartbeat with the new maximum comes after the output.
+        let posterior = Posterior { header, gaussian: Gaussian::standard(), stage_latency_ns: 7_000_000 };
+        run.take(AnyMessage::new(&posterior, &[]));
+        assert_eq!(run.stages[&Stage::Encoder].max_latency_ms, 7.0);
+    }
+
+    fn action(latency_ns: u64) -> Action {
+        Action {
             header: Header::of_frame(7, 1, 1),
             action: ActionCode::Advance.code(),
             reason: Reason::Belief.code(),
@@ -263,8 +340,15 @@ mod tests {
             reserved: 0,
             valid_until_ns: 1,
             based_on_frame: 7,
-            latency_ns: 20_000_000,
-        };
+            latency_ns,
+        }
+    }
+
+    /// Each decision counts once; safe actions count by their reason.
+    #[test]
+    fn actions_are_counted() {
+        let mut run = RunVitals::default();
+        let mut action = action(20_000_000);
         run.take(AnyMessage::new(&action, &[]));
         (action.is_decision, action.action, action.reason) = (0, ActionCode::Halt.code(), Reason::StaleBelief.code());
         run.take(AnyMessage::new(&action, &[]));

@@ -9,6 +9,7 @@ mod graph;
 pub use finding::{Area, Finding, Level};
 
 use anyhow::Context;
+use carff::provenance;
 use carff_config::{GraphConfig, RendererConfig, StagesConfig};
 use carff_transport::topics;
 use std::io::IsTerminal;
@@ -35,7 +36,11 @@ pub struct DoctorArgs {
 pub fn run(args: &DoctorArgs) -> anyhow::Result<ExitCode> {
     let findings = examine(args)?;
     let text = if args.json {
-        serde_json::to_string_pretty(&finding::json(&findings))? + "\n"
+        let graph = args.graph.as_deref().and_then(|path| GraphConfig::load(path).ok());
+        let checkpoint = graph.map(|g| g.resolve(args.checkpoint.as_ref().unwrap_or(&g.run.checkpoint)));
+        let mut json = finding::json(&findings);
+        json["origin"] = serde_json::json!(provenance::of(None, checkpoint.as_deref()));
+        serde_json::to_string_pretty(&json)? + "\n"
     } else {
         let colours = std::env::var_os("NO_COLOR").is_none_or(|v| v.is_empty());
         finding::text(&findings, colours && std::io::stdout().is_terminal())

@@ -74,7 +74,7 @@ impl Replayed {
 
     /// Compares all recorded messages about recorded frames.
     pub(super) fn compare(&self, recording: &Path) -> anyhow::Result<Comparison> {
-        let mut reader = Reader::open(recording)?;
+        let mut reader = Reader::open(recording)?.without_images();
         let mut comparison = Comparison::default();
         let mut frames = BTreeSet::new();
         while let Some(entry) = reader.next()? {

@@ -1,7 +1,7 @@
 //! Sends recorded messages in place of their stages.
 
 use super::compare::{COMPARED, Replayed};
-use anyhow::{Context, ensure};
+use anyhow::Context;
 use carff::terminal::Terminal;
 use carff_messages::forms::{AnyMessage, OwnedMessage};
 use carff_messages::{Action, Header, MAX_IMAGE_BYTES};
@@ -102,12 +102,13 @@ impl Player {
         }
         let keys = (self.pace == Pace::OnEnter).then(keys);
         let mut reader = Reader::open(&self.recording)?;
+        reader.select(self.topics.iter().copied())?;
         let mut times = Times::default();
-        let (mut first_ns, mut begun_ns, mut frames) = (None, 0, 0_u64);
-        while let Some(Entry { topic, message }) = reader.next()? {
+        let (mut begun_ns, mut frames) = (0, 0_u64);
+        while let Some(Entry { topic, message, wall_time_ns }) = reader.next()? {
             let header = *message.as_message().header();
-            let at_ns = header.publish_time_ns.saturating_sub(*first_ns.get_or_insert(header.publish_time_ns));
-            if at_ns < self.from_ns || at_ns > self.to_ns || !self.topics.contains(&topic) {
+            let at_ns = wall_time_ns.saturating_sub(reader.first_ns());
+            if at_ns < self.from_ns || at_ns > self.to_ns {
                 continue;
             }
             let is_frame = topic == TopicId::FRAME;
@@ -150,7 +151,6 @@ impl Player {
             }
         }
         self.terminal.status(String::new());
-        ensure!(first_ns.is_some(), "{} contains no message", self.recording.display());
         if reader.is_cut_off() {
             self.terminal.note("the recording is incomplete: it was replayed up to its last message");
         }
@@ -212,6 +212,7 @@ impl Player {
     fn largest_images(&self) -> anyhow::Result<BTreeMap<TopicId, usize>> {
         let mut largest = BTreeMap::from([(TopicId::FRAME, 1), (TopicId::VIEW, 1)]);
         let mut reader = Reader::open(&self.recording)?;
+        reader.select(self.topics.iter().copied().filter(|topic| topic.is_image()))?;
         while let Some(entry) = reader.next().context("the recording cannot be replayed")? {
             let bytes = entry.message.as_message().bytes().len().min(MAX_IMAGE_BYTES);
             let known = largest.entry(entry.topic).or_default();

@@ -5,13 +5,13 @@ mod feed;
 
 use crate::launch::{LaunchArgs, run_graph};
 use crate::supervision::{Ended, Feed};
-use anyhow::{Context, ensure};
+use anyhow::{Context, bail, ensure};
 use carff::terminal::Terminal;
 use carff_messages::Stage;
-use carff_recording::Reader;
+use carff_recording::{About, Reader};
 use carff_transport::TopicId;
 use clap::Args;
-use compare::Replayed;
+use compare::{COMPARED, Replayed};
 use feed::{Pace, Player};
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -98,21 +98,28 @@ fn replaced(topics: &BTreeSet<TopicId>) -> BTreeSet<Stage> {
 
 /// Replays a recording. The exit code is 1 if a comparison found a difference.
 pub fn run(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
-    let about = Reader::open(&args.recording)?.about().clone();
-    let folder = tempfile::tempdir().context("cannot create a temporary folder")?;
-    // The recorded configuration, or the original file if it is unchanged: error messages then name that file.
-    let graph = match &args.graph {
-        Some(graph) => graph.clone(),
-        None if std::fs::read_to_string(&about.graph).is_ok_and(|text| text == about.graph_text) => about.graph.into(),
-        None => write_graph(folder.path(), &about.graph_text)?,
-    };
     let topics = args.only.clone().map_or_else(|| [TopicId::FRAME].into(), |only| only.0);
     ensure!(!topics.is_empty(), "name at least one topic with --only");
+    let (about, sent) = check(args, &topics)?;
+    let folder = tempfile::tempdir().context("cannot create a temporary folder")?;
+    // The recorded configuration, or the original file if it is unchanged: error messages then name that file.
+    let graph = match (&args.graph, &about) {
+        (Some(graph), _) => graph.clone(),
+        (None, Some(about)) if std::fs::read_to_string(&about.graph).is_ok_and(|text| text == about.graph_text) => {
+            PathBuf::from(&about.graph)
+        }
+        (None, Some(about)) => write_graph(folder.path(), &about.graph_text)?,
+        (None, None) => bail!(
+            "{} has no metadata `carff`, because another tool rewrote it: name its graph file with --graph",
+            args.recording.display()
+        ),
+    };
+    let recorded = |folder: fn(&About) -> &String| about.as_ref().map(|about| PathBuf::from(folder(about)));
     let launch = LaunchArgs {
         graph,
-        dataset: Some(args.dataset.clone().unwrap_or_else(|| about.dataset.into())),
-        checkpoint: Some(args.checkpoint.clone().unwrap_or_else(|| about.checkpoint.into())),
-        run: Some(args.run.clone().unwrap_or(about.run)),
+        dataset: args.dataset.clone().or_else(|| recorded(|about| &about.dataset)),
+        checkpoint: args.checkpoint.clone().or_else(|| recorded(|about| &about.checkpoint)),
+        run: args.run.clone().or_else(|| about.as_ref().map(|about| about.run.clone())),
         stages: args.stages.clone(),
         verbose: true,
         ..LaunchArgs::default()
@@ -126,7 +133,7 @@ pub fn run(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
     let replayed = Arc::new(Mutex::new(Replayed::default()));
     let player = Player {
         recording: args.recording.clone(),
-        topics: topics.clone(),
+        topics: sent,
         pace,
         from_ns: args.from.map_or(0, |s| (s * 1e9) as u64),
         to_ns: args.to.map_or(u64::MAX, |s| (s * 1e9) as u64),
@@ -142,6 +149,24 @@ pub fn run(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
     let comparison = replayed.compare(&args.recording)?;
     println!("{comparison}");
     Ok(if comparison.is_same() { ExitCode::SUCCESS } else { ExitCode::FAILURE })
+}
+
+/// Checks that the recording has the topics of the replay. Returns its metadata, and the topics that it sends: of all
+/// topics, those that it has.
+fn check(args: &ReplayArgs, topics: &BTreeSet<TopicId>) -> anyhow::Result<(Option<About>, BTreeSet<TopicId>)> {
+    let mut reader = Reader::open(&args.recording)?;
+    let mut sent = topics.clone();
+    if TopicId::FLOW.iter().all(|topic| topics.contains(topic)) && topics.iter().any(|topic| reader.has(*topic)) {
+        sent.retain(|topic| reader.has(*topic));
+    }
+    reader.select(sent.iter().copied())?;
+    ensure!(
+        !args.verify || COMPARED.iter().any(|topic| reader.has(*topic)),
+        "{} has nothing to compare: it has no messages on {}",
+        args.recording.display(),
+        COMPARED.map(|topic| format!("`{topic}`")).join(", ")
+    );
+    Ok((reader.about().cloned(), sent))
 }
 
 fn write_graph(folder: &Path, text: &str) -> anyhow::Result<PathBuf> {

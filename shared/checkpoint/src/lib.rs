@@ -130,6 +130,11 @@ impl ScenarioIdentity {
         self.branches.len() * self.timestamps
     }
 
+    /// Returns the name of each state: its branch and its time step.
+    pub fn state_names(&self) -> Vec<String> {
+        self.branches.iter().flat_map(|b| (0..self.timestamps).map(move |t| format!("{b}, t{t}"))).collect()
+    }
+
     /// Returns for each state whether its right action is the hazard action.
     pub fn hazard_states(&self) -> Vec<bool> {
         (0..self.state_count()).map(|s| self.hazard_branches.contains(&(s / self.timestamps.max(1)))).collect()

@@ -4,6 +4,8 @@ use std::collections::BTreeMap;
 
 /// Version of the layout of recordings.
 const FORMAT: &str = "1";
+/// Prefix of the keys of the origin.
+const ORIGIN: &str = "origin.";
 /// Name of the metadata record.
 pub(crate) const METADATA: &str = "carff";
 
@@ -24,11 +26,15 @@ pub struct About {
     pub checkpoint: String,
     /// Difference of wall-clock time (nanoseconds since 1970) and monotonic time at the start of the recording.
     pub wall_offset_ns: u64,
+    /// Names of the scenario's states, by state.
+    pub states: Vec<String>,
+    /// Origin of the recording: version and commit of the program, host, start of the run, hash of the checkpoint.
+    pub origin: BTreeMap<String, String>,
 }
 
 impl About {
     pub(crate) fn to_metadata(&self) -> BTreeMap<String, String> {
-        [
+        let known = [
             ("format", FORMAT.to_owned()),
             ("run", self.run.clone()),
             ("run_id", format!("{:016x}", self.run_id)),
@@ -37,9 +43,10 @@ impl About {
             ("dataset", self.dataset.clone()),
             ("checkpoint", self.checkpoint.clone()),
             ("wall_offset_ns", self.wall_offset_ns.to_string()),
-        ]
-        .map(|(key, value)| (key.to_owned(), value))
-        .into()
+            ("states", self.states.join("\n")),
+        ];
+        let origin = self.origin.iter().map(|(key, value)| (format!("{ORIGIN}{key}"), value.clone()));
+        known.map(|(key, value)| (key.to_owned(), value)).into_iter().chain(origin).collect()
     }
 
     /// Returns the run of the metadata; `None` for another version.
@@ -56,6 +63,9 @@ impl About {
             dataset: text("dataset")?,
             checkpoint: text("checkpoint")?,
             wall_offset_ns: map.get("wall_offset_ns")?.parse().ok()?,
+            // Older recordings lack the rest.
+            states: text("states").unwrap_or_default().lines().map(str::to_owned).collect(),
+            origin: map.iter().filter_map(|(k, v)| Some((k.strip_prefix(ORIGIN)?.to_owned(), v.clone()))).collect(),
         })
     }
 }

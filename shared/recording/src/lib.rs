@@ -2,11 +2,19 @@
 //! schemas of images, calibrations and boxes for other tools.
 //!
 //! A recording contains each message's form ([`carff_messages::forms`]) as JSON on the channel of its topic, with its
-//! JSON Schema. It also contains protobuf channels for other tools: `camera/image` and `renderer/image`
-//! (`foxglove.RawImage`, which also store the images), `camera/calibration` (`foxglove.CameraCalibration`),
-//! `camera/pose` (`foxglove.FrameTransform`) and `prober/boxes` (`foxglove.SceneUpdate`). Log times are wall-clock
-//! times; the forms' headers contain the monotonic times. The metadata record `carff` contains the run, its graph file
-//! and its folders.
+//! JSON Schema. It also contains protobuf channels for other tools:
+//!
+//! | channel | schema | content |
+//! |---|---|---|
+//! | `camera/image`, `renderer/CAMERA/stepN/hypothesisM/image` | `foxglove.RawImage` | images, stored only here |
+//! | `camera/calibration`, `renderer/CAMERA/calibration` | `foxglove.CameraCalibration` | intrinsics |
+//! | `camera/pose`, `renderer/CAMERA/pose` | `foxglove.FrameTransform` | world space from camera space |
+//! | `prober/boxes/stepN` | `foxglove.SceneUpdate` | the probed places, with their probability |
+//! | `log` | `foxglove.Log` | changes of a stage's health and of the action |
+//!
+//! Log times are the wall-clock times of publication. Stamps in protobuf messages are the wall-clock times of capture;
+//! of a log entry, that of publication. The forms' headers contain the monotonic times. The metadata record `carff`
+//! contains the run, its graph file, its folders and its origin.
 
 mod about;
 mod channels;
@@ -17,11 +25,10 @@ mod standard;
 mod writer;
 
 pub use about::About;
-pub use channels::{Channel, channels, encode};
+pub use channels::{Encoded, Encoder, Format};
 pub use queue::{QueueCounts, RecordingQueue};
 pub use reader::{Entry, Reader};
 pub use rotation::{Limits, RotatingWriter};
-pub use standard::{StandardMessage, standard_messages};
 pub use writer::Writer;
 
 use carff_messages::forms::FormError;
@@ -47,10 +54,30 @@ pub enum RecordingError {
         cause: String,
     },
     /// The file is an MCAP file of another program.
-    #[error("{path} is not a recording of this program: it has no metadata `carff`")]
+    #[error(
+        "{path} is not a recording of this program: it has neither its metadata nor its topics; its topics: {channels}"
+    )]
     Foreign {
         /// Path of the file.
         path: PathBuf,
+        /// Topics of the file.
+        channels: String,
+    },
+    /// The recording has another format.
+    #[error("{path} is a recording in another format: read it with the version of `carff` that wrote it")]
+    Format {
+        /// Path of the file.
+        path: PathBuf,
+    },
+    /// Topics are missing.
+    #[error("{path} has no messages on `{missing}`; its topics: {present}")]
+    Missing {
+        /// Path of the file.
+        path: PathBuf,
+        /// Names of the missing topics.
+        missing: String,
+        /// Topics of the file.
+        present: String,
     },
     /// A message of the file cannot be read.
     #[error("{path}, channel `{channel}`, message {sequence}: {cause}")]

@@ -1,69 +1,56 @@
-//! Standard robotics schemas: images, calibrations, poses, boxes. Recordings and the live bridge use them.
+//! Messages in the standard robotics schemas: images, calibrations, poses, boxes, logs.
 
 use carff_decision::Place;
 use carff_messages::forms::AnyMessage;
-use carff_messages::{Belief, FrameMeta, ImageMeta, Intrinsics, ViewMeta};
+use carff_messages::{Action, ActionCode, Belief, Health, HealthState, Intrinsics, Reason, Stage};
+use foxglove::messages::log::Level;
 use foxglove::messages::{
-    CameraCalibration, Color, CubePrimitive, FrameTransform, Pose, Quaternion, RawImage, SceneEntity, SceneUpdate,
-    Timestamp, Vector3,
+    CameraCalibration, Color, CubePrimitive, Duration, FrameTransform, Log, Pose, Quaternion, RawImage, SceneEntity,
+    SceneUpdate, TextPrimitive, Timestamp, Vector3,
 };
+use std::collections::BTreeMap;
 
 /// Name of the fixed coordinate frame.
 const WORLD: &str = "world";
+/// Time for which boxes are shown after their publication, nanoseconds. A newer belief of their step replaces them.
+const BOXES_SHOWN_NS: u64 = 1_000_000_000;
+/// Size of the boxes' labels, pixels.
+const LABEL_PX: f64 = 14.0;
 
-/// A message in a schema of other tools.
-#[derive(Clone, Debug, PartialEq)]
-pub enum StandardMessage {
-    /// An image.
-    Image(RawImage),
-    /// A camera's intrinsics.
-    Calibration(CameraCalibration),
-    /// Pose of a camera. Its axes are those of computer vision: x right, y down, z forward.
-    Pose(FrameTransform),
-    /// The probed places, coloured by occupancy probability.
-    Boxes(SceneUpdate),
+/// Converts nanoseconds since 1970.
+pub(crate) fn timestamp(wall_ns: u64) -> Timestamp {
+    Timestamp::new((wall_ns / 1_000_000_000) as u32, (wall_ns % 1_000_000_000) as u32)
 }
 
-/// Returns the standard messages of a message, with their topics. `wall_ns` is its publication time, nanoseconds since
-/// 1970. `places` are the places of the checkpoint.
-pub fn standard_messages(
-    message: AnyMessage<'_>,
-    places: &[Place],
-    wall_ns: u64,
-) -> Vec<(&'static str, StandardMessage)> {
-    let at = Some(Timestamp::new((wall_ns / 1_000_000_000) as u32, (wall_ns % 1_000_000_000) as u32));
-    let bytes = message.bytes();
-    if let Some(meta) = message.get::<FrameMeta>() {
-        vec![
-            ("camera/image", StandardMessage::Image(image(at, "camera", meta.size_px(), bytes))),
-            ("camera/calibration", StandardMessage::Calibration(calibration(at, meta))),
-            ("camera/pose", StandardMessage::Pose(pose(at, &meta.world_from_camera))),
-        ]
-    } else if let Some(meta) = message.get::<ViewMeta>() {
-        vec![("renderer/image", StandardMessage::Image(image(at, "renderer", meta.size_px(), bytes)))]
-    } else if let Some(belief) = message.get::<Belief>().filter(|_| !places.is_empty()) {
-        vec![("prober/boxes", StandardMessage::Boxes(boxes(at, belief, places)))]
-    } else {
-        Vec::new()
-    }
-}
-
-/// Returns the places, each with its occupancy probability.
-fn boxes(at: Option<Timestamp>, belief: &Belief, places: &[Place]) -> SceneUpdate {
+/// Returns the places, each with its occupancy probability at the belief's step.
+pub(crate) fn boxes(captured: Timestamp, belief: &Belief, places: &[Place]) -> SceneUpdate {
+    let header = &belief.header;
+    // A lifetime counts from the time of capture.
+    let shown_ns = header.publish_time_ns.saturating_sub(header.capture_time_ns).saturating_add(BOXES_SHOWN_NS);
+    let lifetime = Duration::new_checked((shown_ns / 1_000_000_000) as i32, (shown_ns % 1_000_000_000) as u32);
     let states = belief.state_probability.iter().take(belief.state_count as usize);
-    let entities = places
-        .iter()
-        .map(|place| {
-            let taken: f32 = states.clone().zip(&place.occupied_in).filter(|(_, taken)| **taken).map(|(p, _)| p).sum();
-            entity(at, place, f64::from(taken.clamp(0.0, 1.0)))
-        })
-        .collect();
-    SceneUpdate { deletions: Vec::new(), entities }
+    let entities = places.iter().enumerate().map(|(index, place)| {
+        let taken: f32 = states.clone().zip(&place.occupied_in).filter(|(_, taken)| **taken).map(|(p, _)| p).sum();
+        let taken = f64::from(taken.clamp(0.0, 1.0));
+        let step = header.step;
+        SceneEntity {
+            timestamp: Some(captured),
+            frame_id: WORLD.to_owned(),
+            // Several places have one name: the possible positions of one actor.
+            id: format!("step {step}, place {index}: {}", place.name),
+            lifetime,
+            cubes: vec![cube(place, taken)],
+            texts: vec![label(place, format!("{}, step {step}: {:.0} %", place.name, 100.0 * taken))],
+            ..SceneEntity::default()
+        }
+    });
+    SceneUpdate { deletions: Vec::new(), entities: entities.collect() }
 }
 
-fn image(at: Option<Timestamp>, frame: &str, [width, height]: [u32; 2], bytes: &[u8]) -> RawImage {
+/// Returns an image of the camera `frame`.
+pub(crate) fn image(captured: Timestamp, frame: &str, [width, height]: [u32; 2], bytes: &[u8]) -> RawImage {
     RawImage {
-        timestamp: at,
+        timestamp: Some(captured),
         frame_id: frame.to_owned(),
         width,
         height,
@@ -73,13 +60,19 @@ fn image(at: Option<Timestamp>, frame: &str, [width, height]: [u32; 2], bytes: &
     }
 }
 
-fn calibration(at: Option<Timestamp>, meta: &FrameMeta) -> CameraCalibration {
-    let Intrinsics { fl_x_px, fl_y_px, cx_px, cy_px } = meta.intrinsics;
+/// Returns the intrinsics of the camera `frame`.
+pub(crate) fn calibration(
+    captured: Timestamp,
+    frame: &str,
+    [width, height]: [u32; 2],
+    intrinsics: &Intrinsics,
+) -> CameraCalibration {
+    let &Intrinsics { fl_x_px, fl_y_px, cx_px, cy_px } = intrinsics;
     CameraCalibration {
-        timestamp: at,
-        frame_id: "camera".to_owned(),
-        width: meta.width_px,
-        height: meta.height_px,
+        timestamp: Some(captured),
+        frame_id: frame.to_owned(),
+        width,
+        height,
         // An ideal pinhole: no distortion.
         distortion_model: String::new(),
         d: Vec::new(),
@@ -89,14 +82,15 @@ fn calibration(at: Option<Timestamp>, meta: &FrameMeta) -> CameraCalibration {
     }
 }
 
-fn pose(at: Option<Timestamp>, world_from_camera: &[f64; 16]) -> FrameTransform {
+/// Returns the pose of the camera `frame`. Its axes are those of computer vision: x right, y down, z forward.
+pub(crate) fn pose(captured: Timestamp, frame: &str, world_from_camera: &[f64; 16]) -> FrameTransform {
     let m = world_from_camera;
     // OpenGL's camera looks along -z with y up: y and z change sign.
     let rotation = [[m[0], -m[1], -m[2]], [m[4], -m[5], -m[6]], [m[8], -m[9], -m[10]]];
     FrameTransform {
-        timestamp: at,
+        timestamp: Some(captured),
         parent_frame_id: WORLD.to_owned(),
-        child_frame_id: "camera".to_owned(),
+        child_frame_id: frame.to_owned(),
         translation: Some(Vector3 { x: m[3], y: m[7], z: m[11] }),
         rotation: Some(quaternion(&rotation)),
     }
@@ -125,25 +119,77 @@ fn quaternion(r: &[[f64; 3]; 3]) -> Quaternion {
     }
 }
 
-fn entity(at: Option<Timestamp>, place: &Place, taken: f64) -> SceneEntity {
+fn cube(place: &Place, taken: f64) -> CubePrimitive {
     let oriented = &place.oriented_box;
     let half_yaw = oriented.yaw / 2.0;
     let [x, y, z] = oriented.center;
     let size = oriented.half_size.map(|half| half * 2.0);
-    SceneEntity {
-        timestamp: at,
-        frame_id: WORLD.to_owned(),
-        id: place.name.clone(),
-        cubes: vec![CubePrimitive {
-            pose: Some(Pose {
-                position: Some(Vector3 { x, y, z }),
-                orientation: Some(Quaternion { x: 0.0, y: 0.0, z: half_yaw.sin(), w: half_yaw.cos() }),
-            }),
-            size: Some(Vector3 { x: size[0], y: size[1], z: size[2] }),
-            // From green to red, more opaque for higher probabilities.
-            color: Some(Color { r: taken, g: 1.0 - taken, b: 0.1, a: 0.15 + 0.7 * taken }),
-        }],
-        ..SceneEntity::default()
+    CubePrimitive {
+        pose: Some(Pose {
+            position: Some(Vector3 { x, y, z }),
+            orientation: Some(Quaternion { x: 0.0, y: 0.0, z: half_yaw.sin(), w: half_yaw.cos() }),
+        }),
+        size: Some(Vector3 { x: size[0], y: size[1], z: size[2] }),
+        // From green to red, more opaque for higher probabilities.
+        color: Some(Color { r: taken, g: 1.0 - taken, b: 0.1, a: 0.15 + 0.7 * taken }),
+    }
+}
+
+/// Returns a text above a place.
+fn label(place: &Place, text: String) -> TextPrimitive {
+    let ([x, y, z], [.., half_height]) = (place.oriented_box.center, place.oriented_box.half_size);
+    let position = Some(Vector3 { x, y, z: z + half_height });
+    let orientation = Some(Quaternion { x: 0.0, y: 0.0, z: 0.0, w: 1.0 });
+    TextPrimitive {
+        pose: Some(Pose { position, orientation }),
+        billboard: true,
+        font_size: LABEL_PX,
+        scale_invariant: true,
+        color: Some(Color { r: 1.0, g: 1.0, b: 1.0, a: 1.0 }),
+        text,
+    }
+}
+
+/// The changes of a run: of each stage's health, and of the action.
+#[derive(Debug, Default)]
+pub(crate) struct Events {
+    health: BTreeMap<Stage, (u32, u64, u64)>,
+    action: Option<(u32, u32)>,
+}
+
+impl Events {
+    /// Returns a log entry if a message changes a stage's health or the action.
+    pub(crate) fn log(&mut self, at: Timestamp, message: AnyMessage<'_>) -> Option<Log> {
+        let (stage, level, text) = if let Some(m) = message.get::<Health>() {
+            let stage = m.stage().ok()?;
+            let now = (m.state, m.invalid, m.errors);
+            if self.health.insert(stage, now) == Some(now) {
+                return None;
+            }
+            let level = match m.state() {
+                Ok(HealthState::Starting | HealthState::Ok | HealthState::Done) => Level::Info,
+                Ok(HealthState::Slow | HealthState::Stale) => Level::Warning,
+                _ => Level::Error,
+            };
+            let state = m.state().map_or("unknown", HealthState::name);
+            (stage, level, format!("{state}; {} invalid inputs, {} errors", m.invalid, m.errors))
+        } else {
+            let m = message.get::<Action>()?;
+            if self.action.replace((m.action, m.reason)) == Some((m.action, m.reason)) {
+                return None;
+            }
+            let level = if m.reason() == Ok(Reason::Belief) { Level::Info } else { Level::Warning };
+            let (action, reason) =
+                (m.code().map_or("unknown", ActionCode::name), m.reason().map_or("unknown", Reason::name));
+            let frame = m.header.frame_id;
+            (
+                Stage::Controller,
+                level,
+                format!("{action} ({reason}), frame {frame}, hazard {:.3}", m.hazard_probability),
+            )
+        };
+        let (level, name) = (level.into(), stage.name().to_owned());
+        Some(Log { timestamp: Some(at), level, message: text, name, file: String::new(), line: 0 })
     }
 }
 
@@ -191,7 +237,7 @@ mod tests {
     fn cameras_look_forward() {
         // Columns: right (-y), up (z), back (-x).
         let m = [0.0, 0.0, -1.0, 5.0, -1.0, 0.0, 0.0, 6.0, 0.0, 1.0, 0.0, 7.0, 0.0, 0.0, 0.0, 1.0];
-        let pose = pose(None, &m);
+        let pose = pose(timestamp(0), "camera", &m);
         let forward = rotate(&pose.rotation.unwrap(), [0.0, 0.0, 1.0]);
         let down = rotate(&pose.rotation.unwrap(), [0.0, 1.0, 0.0]);
         assert!((forward[0] - 1.0).abs() < 1e-12 && (down[2] + 1.0).abs() < 1e-12, "{forward:?} {down:?}");

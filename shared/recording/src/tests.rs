@@ -18,6 +18,8 @@ fn about() -> About {
         dataset: "d".into(),
         checkpoint: "c".into(),
         wall_offset_ns: 1_700_000_000_000_000_000,
+        states: vec!["truck, t0".into(), "nobody, t0".into()],
+        origin: [("commit".to_owned(), "abc".to_owned())].into(),
     }
 }
 
@@ -120,7 +122,7 @@ fn recordings_are_read_back() {
         }
     }
     writer.finish().unwrap();
-    assert_eq!(Reader::open(&path).unwrap().about(), &about());
+    assert_eq!(Reader::open(&path).unwrap().about(), Some(&about()));
     let (entries, cut_off) = read(&path);
     assert!(matches(&entries, 0..40), "{} entries", entries.len());
     assert!(!cut_off);
@@ -265,9 +267,12 @@ fn other_tools_know_the_schemas() {
         ("camera/pose", "foxglove.FrameTransform", "protobuf"),
         ("controller/action", "carff.Action", "jsonschema"),
         ("encoder/posterior", "carff.Posterior", "jsonschema"),
+        ("log", "foxglove.Log", "protobuf"),
         ("prober/belief", "carff.Belief", "jsonschema"),
-        ("prober/boxes", "foxglove.SceneUpdate", "protobuf"),
-        ("renderer/image", "foxglove.RawImage", "protobuf"),
+        ("prober/boxes/step1", "foxglove.SceneUpdate", "protobuf"),
+        ("renderer/birds-eye/calibration", "foxglove.CameraCalibration", "protobuf"),
+        ("renderer/birds-eye/pose", "foxglove.FrameTransform", "protobuf"),
+        ("renderer/birds-eye/step1/hypothesis0/image", "foxglove.RawImage", "protobuf"),
         ("renderer/view", "carff.View", "jsonschema"),
     ];
     assert_eq!(found.len(), expected.len());
@@ -275,3 +280,6 @@ fn other_tools_know_the_schemas() {
         assert_eq!((found.0.as_str(), found.1.as_str(), found.2.as_str()), (topic, schema, encoding));
     }
 }
+
+mod rewritten;
+mod streams;

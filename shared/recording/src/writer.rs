@@ -1,7 +1,7 @@
 //! Writes one file of a recording.
 
 use crate::about::METADATA;
-use crate::{About, RecordingError, channels, encode};
+use crate::{About, Encoded, Encoder, RecordingError};
 use carff_decision::Place;
 use carff_messages::forms::AnyMessage;
 use carff_transport::TopicId;
@@ -32,7 +32,7 @@ const CHUNK_BYTES: u64 = 1 << 20;
 /// writer.finish()?;
 ///
 /// let mut reader = Reader::open(&path)?;
-/// assert_eq!(reader.about().run, "crossing");
+/// assert_eq!(reader.about().map(|about| about.run.as_str()), Some("crossing"));
 /// let entry = reader.next()?.expect("one message was written");
 /// assert_eq!(entry.message.as_message().get::<Posterior>(), Some(&posterior));
 /// assert!(reader.next()?.is_none() && !reader.is_cut_off());
@@ -41,9 +41,8 @@ const CHUNK_BYTES: u64 = 1 << 20;
 pub struct Writer {
     path: PathBuf,
     inner: mcap::Writer<NoSeek<BufWriter<File>>>,
-    channels: BTreeMap<&'static str, u16>,
-    places: Vec<Place>,
-    wall_offset_ns: u64,
+    channels: BTreeMap<String, u16>,
+    encoder: Encoder,
 }
 
 impl std::fmt::Debug for Writer {
@@ -71,22 +70,11 @@ impl Writer {
             .create(NoSeek::new(BufWriter::new(file)))
             .map_err(failed)?;
         inner.write_metadata(&Metadata { name: METADATA.to_owned(), metadata: about.to_metadata() }).map_err(failed)?;
-        // All channels at once, so that a reader sees the complete list.
-        let mut ids = BTreeMap::new();
-        for channel in channels() {
-            let schema = match &channel.schema {
-                Some(schema) => inner.add_schema(&schema.name, &schema.encoding, &schema.data).map_err(failed)?,
-                None => 0,
-            };
-            let id = inner.add_channel(schema, channel.name, &channel.encoding, &BTreeMap::new()).map_err(failed)?;
-            ids.insert(channel.name, id);
-        }
         let mut writer = Self {
             path: path.to_owned(),
             inner,
-            channels: ids,
-            places: places.to_vec(),
-            wall_offset_ns: about.wall_offset_ns,
+            channels: BTreeMap::new(),
+            encoder: Encoder::new(places.to_vec(), about.wall_offset_ns),
         };
         writer.flush()?;
         Ok(writer)
@@ -104,25 +92,41 @@ impl Writer {
 
     /// Writes a message, with its standard messages for other tools.
     pub fn write(&mut self, topic: TopicId, message: AnyMessage<'_>) -> Result<(), RecordingError> {
-        let header = message.header();
-        let wall_ns = header.publish_time_ns.saturating_add(self.wall_offset_ns);
-        let failed = |e: serde_json::Error| RecordingError::Message {
+        let sequence = message.header().sequence as u32;
+        let wall_ns = self.encoder.wall_ns(message.header().publish_time_ns);
+        let encoded = self.encoder.encode(topic, message).map_err(|e| RecordingError::Message {
             path: self.path.clone(),
             channel: topic.name().to_owned(),
-            sequence: header.sequence as u32,
+            sequence,
             cause: e.to_string(),
-        };
-        for (name, data) in encode(topic, message, &self.places, wall_ns).map_err(failed)? {
-            let Some(&channel_id) = self.channels.get(name) else { continue };
+        })?;
+        for message in encoded {
             let header = MessageHeader {
-                channel_id,
-                sequence: header.sequence as u32,
+                channel_id: self.channel(&message).map_err(|e| RecordingError::mcap(&self.path, e))?,
+                sequence,
                 log_time: wall_ns,
                 publish_time: wall_ns,
             };
-            self.inner.write_to_known_channel(&header, &data).map_err(|e| RecordingError::mcap(&self.path, e))?;
+            self.inner
+                .write_to_known_channel(&header, &message.data)
+                .map_err(|e| RecordingError::mcap(&self.path, e))?;
         }
         Ok(())
+    }
+
+    /// Returns the id of a message's channel, which is created for its first message.
+    fn channel(&mut self, message: &Encoded) -> Result<u16, mcap::McapError> {
+        if let Some(&id) = self.channels.get(&message.channel) {
+            return Ok(id);
+        }
+        let schema = match message.format.schema() {
+            Some(schema) => self.inner.add_schema(&schema.name, &schema.encoding, &schema.data)?,
+            None => 0,
+        };
+        let encoding = message.format.encoding();
+        let id = self.inner.add_channel(schema, &message.channel, encoding, &BTreeMap::new())?;
+        self.channels.insert(message.channel.clone(), id);
+        Ok(id)
     }
 
     /// Ends the chunk and passes it to the system: after that, it stays readable if the process is killed.

@@ -55,7 +55,8 @@ fn is_usable(dir: &Path) -> bool {
     let writable = |dir: &Path| rustix::fs::access(dir, rustix::fs::Access::WRITE_OK).is_ok();
     match std::fs::symlink_metadata(dir) {
         Ok(found) => found.is_dir() && found.uid() == rustix::process::getuid().as_raw() && writable(dir),
-        Err(_) => dir.parent().is_some_and(writable),
+        // Only systemd creates the folder of a service.
+        Err(_) => dir != Path::new(SERVICE_DIR) && dir.parent().is_some_and(writable),
     }
 }
 

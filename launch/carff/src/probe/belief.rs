@@ -1,7 +1,7 @@
 //! `carff probe belief`: shows the belief over states as bars.
 
 use super::session::{Session, SessionArgs, colours};
-use carff_checkpoint::Manifest;
+use carff_checkpoint::{Manifest, ScenarioIdentity};
 use carff_messages::{Action, ActionCode, Belief};
 use carff_transport::TopicId;
 use clap::Args;
@@ -25,7 +25,7 @@ pub struct BeliefArgs {
 pub(super) fn run(args: &BeliefArgs) -> anyhow::Result<()> {
     let mut session = Session::open(&args.session, "probe-belief")?;
     session.listen([TopicId::BELIEF, TopicId::ACTION])?;
-    let names = names(Manifest::load(&session.attached.live.checkpoint).ok().as_ref());
+    let states = Manifest::load(&session.attached.live.checkpoint).map_or(Vec::new(), |m| states(&m.scenario));
     let live = std::io::stdout().is_terminal();
     let colour = colours();
     let (mut steps, mut decided, mut shown): (Vec<Belief>, String, u64) = (Vec::new(), String::new(), 0);
@@ -44,7 +44,7 @@ pub(super) fn run(args: &BeliefArgs) -> anyhow::Result<()> {
                 steps.push(*belief);
                 // A frame whose first steps came before the probe is not shown.
                 if belief.is_final() && steps.first().is_some_and(|b| b.header.step == 1) {
-                    let text = picture(&steps, &names, &decided, colour);
+                    let text = picture(&steps, &states, &decided, colour);
                     // On a terminal the bars stay in place.
                     let begin = if live { "\x1b[H\x1b[J" } else { "" };
                     let mut out = std::io::stdout().lock();
@@ -61,10 +61,16 @@ pub(super) fn run(args: &BeliefArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Returns the names of the states; none without a manifest.
-pub(crate) fn names(manifest: Option<&Manifest>) -> Vec<String> {
-    let Some(scenario) = manifest.map(|m| &m.scenario) else { return Vec::new() };
-    scenario.branches.iter().flat_map(|b| (0..scenario.timestamps).map(move |t| format!("{b}, t{t}"))).collect()
+/// A state of the scenario.
+#[derive(Clone, Debug)]
+struct State {
+    name: String,
+    is_hazard: bool,
+}
+
+fn states(scenario: &ScenarioIdentity) -> Vec<State> {
+    let hazards = scenario.hazard_states();
+    scenario.state_names().into_iter().zip(hazards).map(|(name, is_hazard)| State { name, is_hazard }).collect()
 }
 
 fn bar(probability: f32) -> String {
@@ -73,8 +79,8 @@ fn bar(probability: f32) -> String {
     format!("{}{part}", "\u{2588}".repeat(eighths / 8))
 }
 
-/// Formats a frame's beliefs, step by step.
-fn picture(steps: &[Belief], names: &[String], decided: &str, colour: bool) -> String {
+/// Formats a frame's beliefs, step by step: hazard states in red, others in green, and what is not known in no colour.
+fn picture(steps: &[Belief], known: &[State], decided: &str, colour: bool) -> String {
     let paint = |text: &str, code: &str| if colour { format!("\x1b[{code}m{text}\x1b[0m") } else { text.to_owned() };
     let mut text = String::new();
     if let Some(first) = steps.first() {
@@ -88,21 +94,22 @@ fn picture(steps: &[Belief], names: &[String], decided: &str, colour: bool) -> S
         );
         let states = &belief.state_probability[..(belief.state_count as usize).min(belief.state_probability.len())];
         let count = |state: i32| belief.samples().iter().filter(|s| s.state == state).count();
-        let name_of = |state: usize| names.get(state).cloned().unwrap_or_else(|| format!("state {state}"));
+        let name_of = |state: usize| known.get(state).map_or_else(|| format!("state {state}"), |s| s.name.clone());
         let width = (0..states.len()).map(|s| name_of(s).chars().count()).max().unwrap_or(0).max(7);
         let rest = (1.0 - states.iter().sum::<f32>()).max(0.0);
         let rows = states.iter().enumerate().map(|(s, &p)| (name_of(s), p, s as i32));
         for (name, probability, state) in rows.chain([("unknown".to_owned(), rest, -1)]) {
             let resolved = if state == belief.resolved_state && state >= 0 { ">" } else { " " };
-            let likely = belief.samples().iter().find(|s| s.state == state).map_or(0.0, |s| s.hazard_likelihood);
-            let code = if likely >= 0.5 { "31" } else { "32" };
-            let padded = bar(probability);
-            let blank = " ".repeat(BAR.saturating_sub(padded.chars().count()));
+            let bar = bar(probability);
+            let blank = " ".repeat(BAR.saturating_sub(bar.chars().count()));
+            let painted = match usize::try_from(state).ok().and_then(|state| known.get(state)) {
+                Some(State { is_hazard: true, .. }) => paint(&bar, "31"),
+                Some(State { is_hazard: false, .. }) => paint(&bar, "32"),
+                None => bar,
+            };
             let _ = writeln!(
                 text,
-                "{resolved} {name:<width$} {:>6.3} {}{blank} {}",
-                probability,
-                paint(&padded, code),
+                "{resolved} {name:<width$} {probability:>6.3} {painted}{blank} {}",
                 "\u{2022}".repeat(count(state))
             );
         }
@@ -125,11 +132,38 @@ mod tests {
             *sample = ProbeResult { state, ..ProbeResult::NONE };
         }
         belief.resolved_state = 0;
-        let text = picture(&[belief], &["truck, t0".to_owned(), "nobody, t0".to_owned()], "advance", false);
+        let states = [("truck, t0", true), ("nobody, t0", false)]
+            .map(|(name, is_hazard)| State { name: name.into(), is_hazard });
+        let text = picture(&[belief], &states, "advance", false);
         let line = |name: &str| text.lines().find(|l| l.contains(name)).unwrap_or_default().to_owned();
         assert!(line("truck").starts_with("> truck, t0") && line("truck").ends_with("\u{2022}\u{2022}"), "{text}");
         assert!(line("truck").contains(&"\u{2588}".repeat(20)) && line("nobody").contains("0.250"), "{text}");
         assert!(line("unknown").contains("0.250") && line("frame 12").contains("advance"), "{text}");
+    }
+
+    /// The colour of a state is that of its meaning, also if no sample shows it; what is not known has no colour.
+    #[test]
+    fn colours_are_of_the_states() {
+        let scenario = ScenarioIdentity {
+            name: "s".into(),
+            branches: vec!["nobody".into(), "truck".into()],
+            timestamps: 2,
+            hazard_branches: vec![1],
+            poses: 1,
+        };
+        let mut belief = Belief::empty(Header::of_frame(12, 1, 1).at_step(1), 1);
+        (belief.state_count, belief.sample_count, belief.component_count) = (4, 1, 1);
+        belief.state_probability[..4].copy_from_slice(&[0.25, 0.25, 0.25, 0.125]);
+        // Only a harmless state has a sample, which contradicts the scenario.
+        belief.samples[0] = ProbeResult { state: 0, hazard_likelihood: 0.9, ..ProbeResult::NONE };
+        let text = picture(&[belief], &states(&scenario), "advance", true);
+        let line = |text: &str, name: &str| text.lines().find(|l| l.contains(name)).unwrap_or_default().to_owned();
+        for (name, colour) in [("nobody, t0", "32"), ("nobody, t1", "32"), ("truck, t0", "31"), ("truck, t1", "31")] {
+            assert!(line(&text, name).contains(&format!("\x1b[{colour}m")), "{name}: {text:?}");
+        }
+        assert!(!line(&text, "unknown").contains('\x1b'), "{text:?}");
+        let without_manifest = picture(&[belief], &[], "advance", true);
+        assert!(line(&without_manifest, "state 3").contains("0.125") && !without_manifest.contains('\x1b'));
     }
 
     /// A bar is as long as its probability, to an eighth of a character.

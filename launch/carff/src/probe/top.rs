@@ -26,6 +26,10 @@ const ONCE_S: f64 = 3.0;
 /// Number of latencies in a sparkline.
 const SPARKS: usize = 24;
 
+/// Last line of the screen.
+const HINT: &str =
+    "q quits   late: heartbeats that reported slow or stale   max, skipped, invalid, errors: since the stage's start";
+
 const HEAD: [&str; 13] = [
     "stage",
     "state",
@@ -104,7 +108,7 @@ fn summary(live: &LiveRun, vitals: &RunVitals) -> String {
     let (action, reason) = vitals.last_action.unwrap_or(("-", "-"));
     let safe: u64 = vitals.safe_actions.values().sum();
     format!(
-        "run {}   graph {}\nframes {}   decisions {}   camera to action p50 {} ms, p99 {} ms\naction {action} ({reason})   \
+        "run {}   graph {}\nsince the start of this probe: frames {}   decisions {}   camera to action p50 {} ms, p99 {} ms\naction {action} ({reason})   \
          hazard {:.3}   safe actions {safe}\n",
         live.name,
         live.graph.file_name().map(|n| n.to_string_lossy()).unwrap_or_default(),
@@ -176,10 +180,7 @@ fn draw(frame: &mut Frame<'_>, live: &LiveRun, vitals: &RunVitals) {
         .column_spacing(1)
         .block(Block::bordered().title(" stages "));
     frame.render_widget(table, areas[1]);
-    frame.render_widget(
-        Paragraph::new("q quits   late: heartbeats that reported slow or stale").style(colour(Color::DarkGray)),
-        areas[2],
-    );
+    frame.render_widget(Paragraph::new(HINT).style(colour(Color::DarkGray)), areas[2]);
 }
 
 #[cfg(test)]
