@@ -1,6 +1,6 @@
 //! `carff bridge`: serves the run's topics over the Foxglove WebSocket protocol, read-only, for headless vehicles.
 
-use crate::probe::session::{Session, SessionArgs};
+use crate::session::{Session, SessionArgs};
 use anyhow::Context;
 use carff_checkpoint::Manifest;
 use carff_recording::{channels, encode};

@@ -15,6 +15,7 @@ mod not_built;
 pub mod probe;
 #[cfg(feature = "recording")]
 pub mod record;
+pub mod session;
 mod spans;
 pub mod terminal;
 pub mod view;

@@ -1,6 +1,6 @@
 //! `carff metrics`: serves a run's metrics over HTTP, for Prometheus and for scripts.
 
-use crate::probe::session::{Session, SessionArgs};
+use crate::session::{Session, SessionArgs};
 use crate::vitals::{RunVitals, StageVitals};
 use anyhow::{Context, anyhow, ensure};
 use carff_base::statistics::percentile;

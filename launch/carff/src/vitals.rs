@@ -1,6 +1,6 @@
 //! Health, rates and resource use of a run's stages over time, for the full-screen view and the metrics.
 
-use crate::probe::session::{Going, Session};
+use crate::session::{Going, Session};
 use carff_messages::forms::AnyMessage;
 use carff_messages::{
     Action, ActionCode, Belief, Forecast, FrameMeta, Health, HealthState, Posterior, Reason, Stage, ViewMeta,

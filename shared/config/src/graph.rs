@@ -5,6 +5,7 @@
 
 use crate::ConfigError;
 use crate::error::{Source, read};
+use crate::ranges;
 use crate::stages::{LogFormat, StageConfig, StagesConfig};
 use carff_dataset::sensor::SensorNoise;
 use carff_decision::Sampling;
@@ -380,7 +381,7 @@ impl GraphConfig {
     pub fn parse(text: &str, path: &Path) -> Result<Self, ConfigError> {
         let source = Source { path, text };
         source.refuse_moved(&MOVED)?;
-        let mut graph: Self = source.read()?;
+        let mut graph: Self = ranges::read(&source)?;
         graph.check(&source)?;
         let absolute = std::path::absolute(path).unwrap_or_else(|_| path.to_owned());
         graph.project_root = absolute

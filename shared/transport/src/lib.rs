@@ -44,6 +44,7 @@ mod retry;
 mod run;
 mod space;
 mod stop;
+mod topic;
 pub mod topics;
 mod wait;
 
@@ -54,11 +55,11 @@ pub use node::{Node, make_private_dir};
 pub use payload::{Image, Payload};
 pub use publisher::{ImageLoan, Publisher};
 pub use receiver::{Receiver, Sample};
-pub use registry::{AnyPublisher, AnyReceiver, AnyTopic, Received, TopicId, UnknownTopic};
+pub use registry::{AnyPublisher, AnyReceiver, AnyTopic, Received, TopicId, UnknownTopic, graph_bytes};
 pub use run::{Run, cleanup_dead, living_processes, remove_run_leftovers, run_id_of, runtime_dir};
 pub use space::{SHARED_MEMORY_DIR, check_space};
 pub use stop::{INTERRUPTED, Stop, exit_on_signals, is_interrupted};
-pub use topics::{Limits, Topic};
+pub use topic::{Limits, Topic};
 pub use wait::{Input, Waiter, Woken};
 
 /// Returns the present time of the clock that all headers use: `CLOCK_MONOTONIC`, nanoseconds, the same in all processes

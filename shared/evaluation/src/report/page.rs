@@ -1,11 +1,12 @@
 //! The page `README.md`: every table as text, with the images.
 
-use super::{FrequencyTable, Results};
+use super::Results;
 use crate::stats::draws::Frequencies;
 use crate::tables::planning::{PlanningResults, ViewCounts};
 use crate::trials::planning::{Count, PlanningTable};
 use crate::{
-    ByRole, EncoderTable, FieldPictures, PairMeans, PictureTable, ReliabilityBin, SAMPLE_COUNTS, Share, SvmScore,
+    ByRole, EncoderTable, FieldPictures, FrequencyTable, PairMeans, PictureTable, ReliabilityBin, SAMPLE_COUNTS, Share,
+    SvmScore,
 };
 use std::fmt::Write;
 

@@ -1,11 +1,11 @@
 //! Accuracy and recall against the number of samples, and frequencies of open outcomes (tables 3 and 5).
 
 use crate::stats::draws::{
-    Curve, OpenInput, Shown, TrialCurve, accuracy_curve, expected_recall, frequencies, met_all, recall_curve,
-    right_shares,
+    Curve, Frequencies, OpenInput, Shown, TrialCurve, accuracy_curve, expected_recall, frequencies, met_all,
+    recall_curve, right_shares,
 };
 use crate::trials::planning::Planner;
-use crate::{ByRole, EvaluationError, FrequencyTable, Progress, ROLES, Subject, role_name};
+use crate::{ByRole, EvaluationError, Progress, ROLES, Subject, role_name};
 use carff_base::random::Key;
 use carff_checkpoint::FieldProbe;
 use carff_dataset::{Observability, PoseRole};
@@ -81,6 +81,16 @@ struct Trial<'a> {
     posterior: Vec<Shown>,
     /// By number of samples; empty where recall is not measured.
     stratified: Vec<Vec<Shown>>,
+}
+
+/// Frequencies where images leave several outcomes open. Draws are independent, from the forecast of the next step.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct FrequencyTable {
+    /// Frequencies of branches.
+    pub by_branch: Vec<Frequencies>,
+    /// Frequencies of an actor being present. Empty for two branches, where they equal `by_branch`.
+    pub by_presence: Vec<Frequencies>,
 }
 
 /// Both tables; the second one may be a reason why it is missing.
