@@ -1,6 +1,6 @@
 //! An example of a stage outside the shipped graph. It computes a speed limit from the controller's action and from the
-//! share of the scene that is known. It uses public crates only and joins any running graph. The book's chapter "Write a
-//! stage" explains it.
+//! share of the scene that is known. It uses public crates only and joins any running graph. The book's chapter "Write
+//! a stage" explains it.
 
 use carff_messages::{Action, ActionCode, Belief, Header, Invalid, ZeroCopySend, check, message};
 use carff_transport::{Topic, topics};

@@ -74,8 +74,8 @@ pub(crate) fn read(path: &Path, what: &'static str) -> Result<String, ConfigErro
 }
 
 impl Source<'_> {
-    /// Refuses the first key that has a new name. `moved` pairs old names with new ones; a part `*` stands for any name,
-    /// which the new name repeats.
+    /// Refuses the first key that has a new name. `moved` pairs old names with new ones; a part `*` stands for any
+    /// name, which the new name repeats.
     pub(crate) fn refuse_moved(&self, moved: &[(&str, &str)]) -> Result<(), ConfigError> {
         let Ok(table) = self.text.parse::<toml::Table>() else { return Ok(()) };
         for key in dotted_keys(&table, "") {

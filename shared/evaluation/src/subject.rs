@@ -200,7 +200,7 @@ impl Subject {
         format!("{branch} t{}", scenario.timestamp_of(state))
     }
 
-    /// Whether two states look the same from above.
+    /// Returns true if two states look the same from above.
     pub fn same_from_above(&self, a: usize, b: usize) -> bool {
         self.posed.scenario.bev_view.is_some_and(|view| self.posed.equivalence.same(view, a, b))
     }

@@ -81,7 +81,7 @@ pub struct FieldRecord {
 pub struct ThresholdRecord {
     /// The threshold.
     pub threshold: f64,
-    /// Whether the trials determined it.
+    /// True if the trials determined it.
     pub chosen: bool,
     /// Trials.
     pub trials: usize,

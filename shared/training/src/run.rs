@@ -126,7 +126,7 @@ impl Run<'_> {
         writeln!(file, "{line}").map_err(failed)
     }
 
-    /// Whether the user stopped the run.
+    /// Returns true if the user stopped the run.
     pub fn stopped(&self) -> bool {
         self.stop.load(Ordering::Relaxed)
     }

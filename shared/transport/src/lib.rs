@@ -3,8 +3,8 @@
 //! `carff-messages` defines the messages; the stages process them.
 //!
 //! A process opens one [`Node`] in a [`Run`]. Every topic is one row of the table in [`topics`]. Sending stamps the
-//! header and wakes the receivers that wait. Receiving drops and counts invalid messages, and gives access to valid ones
-//! in the sender's memory. A [`Waiter`] sleeps until one of several inputs has a message, a time, or a stop.
+//! header and wakes the receivers that wait. Receiving drops and counts invalid messages, and gives access to valid
+//! ones in the sender's memory. A [`Waiter`] sleeps until one of several inputs has a message, a time, or a stop.
 //!
 //! ```
 //! use carff_messages::{Gaussian, Header, Posterior};
@@ -62,8 +62,8 @@ pub use stop::{INTERRUPTED, Stop, exit_on_signals, is_interrupted};
 pub use topic::{Limits, Topic};
 pub use wait::{Input, Waiter, Woken};
 
-/// Returns the present time of the clock that all headers use: `CLOCK_MONOTONIC`, nanoseconds, the same in all processes
-/// of a machine.
+/// Returns the present time of the clock that all headers use: `CLOCK_MONOTONIC`, nanoseconds, the same in all
+/// processes of a machine.
 pub fn monotonic_now_ns() -> u64 {
     let now = rustix::time::clock_gettime(rustix::time::ClockId::Monotonic);
     now.tv_sec as u64 * 1_000_000_000 + now.tv_nsec as u64

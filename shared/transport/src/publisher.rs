@@ -44,9 +44,7 @@ impl<P: Payload> Publisher<P> {
 
     /// Sends a copy of a message, and of the image that it describes, without stamping or validation.
     pub(crate) fn forward(&mut self, message: P::Message, bytes: &[u8]) -> Result<(), SendError> {
-        if P::IS_IMAGE && bytes.len() > self.max_bytes {
-            return Err(self.size(bytes.len(), self.max_bytes));
-        }
+        self.check_room(bytes.len())?;
         let sample = P::loan(&self.port, message, bytes).map_err(|e| self.failed(&e))?;
         sample.send().map_err(|e| self.failed(&e))?;
         self.sent();
@@ -69,6 +67,10 @@ impl<P: Payload> Publisher<P> {
 
     pub(crate) fn of_another_type(&self) -> SendError {
         SendError::Failed { topic: self.topic.to_owned(), cause: "the message is of another type".to_owned() }
+    }
+
+    fn check_room(&self, bytes: usize) -> Result<(), SendError> {
+        if P::IS_IMAGE && bytes > self.max_bytes { Err(self.size(bytes, self.max_bytes)) } else { Ok(()) }
     }
 
     fn size(&self, found: usize, max: usize) -> SendError {
@@ -141,9 +143,7 @@ impl<M: ImageMeta> ImageLoan<M> {
 impl<M: ImageMeta> Publisher<Image<M>> {
     /// Returns memory for an image of `bytes` bytes, in the segment that the receivers read from.
     pub fn loan(&self, bytes: usize) -> Result<ImageLoan<M>, SendError> {
-        if bytes > self.max_bytes {
-            return Err(self.size(bytes, self.max_bytes));
-        }
+        self.check_room(bytes)?;
         Ok(ImageLoan { sample: self.port.loan_slice(bytes).map_err(|e| self.failed(&e))? })
     }
 
@@ -156,6 +156,7 @@ impl<M: ImageMeta> Publisher<Image<M>> {
 
     /// Stamps the header, validates, and sends a copy of an image.
     pub fn send_bytes(&mut self, bytes: &[u8], mut meta: M) -> Result<(), SendError> {
+        self.check_room(bytes.len())?;
         self.stamp(&mut meta)?;
         self.check_size(bytes.len(), &meta)?;
         self.forward(meta, bytes)

@@ -30,7 +30,7 @@ pub enum Table {
     Recall,
     /// Every decision rule, and the reliability of the hazard probability.
     Planning,
-    /// How often each outcome is drawn where several are open.
+    /// Frequency of each outcome where several are open.
     Frequencies,
     /// t-SNE, reconstructions, curves, beliefs, density.
     Pictures,

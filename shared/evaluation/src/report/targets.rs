@@ -17,7 +17,7 @@ pub struct Target {
     pub wanted: String,
     /// Measured figure.
     pub found: String,
-    /// Whether the target is reached.
+    /// True if the target is reached.
     pub reached: bool,
 }
 

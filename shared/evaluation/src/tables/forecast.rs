@@ -41,7 +41,7 @@ pub struct ForecastTable {
 pub struct RoleCurves {
     /// Share of correct samples, drawn from the forecast of the next step.
     pub accuracy: Curve,
-    /// Whether the most frequent state of the samples is correct.
+    /// Share of trials in which the most frequent state of the samples is correct.
     pub majority_accuracy: Curve,
     /// Share of correct samples, drawn from the encoder's posterior without a forecast: correct about the image's own
     /// state.
@@ -58,9 +58,10 @@ pub struct RoleCurves {
     pub within_band: usize,
     /// Stratified draws from the forecast, as in the running graph.
     pub stratified_recall: Curve,
-    /// Whether stratified draws show all open branches.
+    /// Share of trials in which stratified draws show all open branches.
     pub stratified_recall_of_all: Curve,
-    /// Whether any draw from the encoder's posterior, without a forecast, shows the image's own branch.
+    /// Share of trials in which any draw from the encoder's posterior, without a forecast, shows the image's own
+    /// branch.
     pub posterior_recall: Curve,
 }
 
