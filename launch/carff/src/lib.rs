@@ -20,6 +20,7 @@ pub mod provenance;
 #[cfg(feature = "recording")]
 pub mod record;
 pub mod runs;
+pub mod session;
 mod spans;
 pub mod terminal;
 pub mod view;

@@ -60,6 +60,9 @@ pub struct SoakArgs {
     /// Duration, minutes.
     #[arg(long, default_value_t = 2.0)]
     pub minutes: f64,
+    /// Stop after this number of faults, also before the time is over.
+    #[arg(long)]
+    pub faults: Option<u64>,
     /// Seed of the schedule.
     #[arg(long, default_value_t = 1)]
     pub seed: u64,
@@ -193,7 +196,7 @@ impl Soak<'_> {
         let begun_ns = monotonic_now_ns();
         let end_ns = begun_ns + (self.args.minutes * 60e9) as u64;
         let mut number = 0;
-        while monotonic_now_ns() < end_ns && self.goes_on()? {
+        while monotonic_now_ns() < end_ns && self.args.faults.is_none_or(|most| number < most) && self.goes_on()? {
             let fault = fault(self.config, self.args.seed, number);
             number += 1;
             self.recorder.keep_on(&self.run)?;

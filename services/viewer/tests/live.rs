@@ -29,7 +29,7 @@ fn wait_for<T>(mut look: impl FnMut() -> Option<T>) -> T {
 fn watches_a_run_from_frame_to_decision() {
     let name = format!("viewer-{}", std::process::id());
     let error = LiveFeed::attach(Some(name.clone()), || ()).err().unwrap();
-    assert!(error.to_string().contains(&name) || error.to_string().contains("no graph"), "{error}");
+    assert!(error.to_string().contains(&format!("no run `{name}` is alive")), "{error}");
 
     let run = Run::new(&name, 17).unwrap();
     let node = Node::open(&run, "test").unwrap();
@@ -99,7 +99,6 @@ fn watches_a_run_from_frame_to_decision() {
         confidence: 0.75,
         hazard_probability: 0.75,
         is_decision: 1,
-        reserved: 0,
         valid_until_ns: 0,
         based_on_frame: 4,
         latency_ns: 8_000_000,
