@@ -1,11 +1,11 @@
 //! `carff ablate`: one training with one setting changed at a time, as one table.
 
 use crate::eval;
-use crate::train::{Display, datasets, refuse_another_configuration, stop_on_signals, with_random_poses};
+use crate::train::{Display, datasets, refuse_another_configuration, stop_on_signals, stopped, with_random_poses};
 use anyhow::Context;
 use carff_training::ablation::{AblationTable, Variant, folders, row, write_table};
 use carff_training::{Progress, Run, Training, TrainingConfig, TrainingError};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::process::ExitCode;
 
 /// Options of `carff ablate`.
@@ -41,12 +41,12 @@ pub fn run(args: &AblateArgs) -> anyhow::Result<ExitCode> {
     let (dataset, rendered) = datasets(&config, args.dataset.as_deref())?;
     let threads = u16::try_from(config.threads).unwrap_or(1);
     let options = eval::options(&args.device, threads, config.seed + 1)?;
-    let stop = stop_on_signals()?;
+    let stop = stop_on_signals(&args.out)?;
     std::fs::create_dir_all(&args.out).with_context(|| format!("cannot make {}", args.out.display()))?;
     refuse_another_configuration(&args.out, &config, &dataset)?;
     let display = Display::default();
     let report = |progress: &Progress| display.show(progress);
-    let run = Run { dir: args.out.clone(), on_progress: &report, stop: &stop };
+    let run = Run { dir: args.out.clone(), on_progress: &report, stop: stop.flag() };
     let made = with_random_poses(rendered, &config, &dataset, &run);
     display.finish();
     let random_poses = match made {
@@ -75,7 +75,7 @@ pub fn run(args: &AblateArgs) -> anyhow::Result<ExitCode> {
         refuse_another_configuration(&dir, &variant.apply(&config), &dataset)?;
         let display = Display::default();
         let report = |progress: &Progress| display.show(progress);
-        let run = Run { dir, on_progress: &report, stop: &stop };
+        let run = Run { dir, on_progress: &report, stop: stop.flag() };
         let found = row(&training, variant, &run, options);
         display.finish();
         match found {
@@ -88,9 +88,4 @@ pub fn run(args: &AblateArgs) -> anyhow::Result<ExitCode> {
     }
     println!("table: {}", args.out.join("README.md").display());
     Ok(ExitCode::SUCCESS)
-}
-
-fn stopped(out: &Path) -> ExitCode {
-    eprintln!("stopped; the same command resumes from the states in {}", out.display());
-    ExitCode::from(130)
 }

@@ -5,6 +5,7 @@ pub mod ablate;
 #[cfg(feature = "import")]
 pub mod backbone;
 pub mod dataset;
+mod decisions;
 pub mod doctor;
 pub mod eval;
 pub mod launch;

@@ -1,6 +1,6 @@
 //! Every command of `carff` with its help, completions and manual pages.
 
-use carff::{Attach, exit_code, until_read};
+use carff::{Attach, run_program};
 #[cfg(feature = "bench")]
 use carff_bench::BenchCommand;
 use carff_launch::ablate::AblateArgs;
@@ -145,7 +145,7 @@ A TOML file names its schema in its first line, for editors that know taplo: #:s
 }
 
 fn main() -> ExitCode {
-    until_read(|| exit_code(run()))
+    run_program(run)
 }
 
 fn run() -> anyhow::Result<ExitCode> {

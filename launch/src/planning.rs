@@ -1,36 +1,35 @@
-//! The planning tables of a run's report: from the run's records to `carff_evaluation::run`.
+//! The drives of a run, judged by `carff_evaluation::run`: from the run's records to its inputs.
 
 use crate::report::RunOutcome;
 use crate::supervision::monitor::FrameRecord;
 use carff_checkpoint::CheckpointPlanning;
-use carff_config::{CameraSource, GraphConfig};
+use carff_config::CameraSource;
 use carff_dataset::drives::DriveKind;
 use carff_evaluation::run::{DecidedFrame, JudgedRun, RunPlanning, RunSettings, decisive_frames};
 use carff_messages::{ActionCode, Reason};
 use carff_scenes::Scenario;
-use serde_json::{Map, Value};
 use std::path::Path;
 
-/// Planning tables of a run.
+/// A run with drives, and its models.
 pub struct Planning {
     run: JudgedRun,
     decisive: Vec<(DecidedFrame, DriveKind)>,
-    tables: RunPlanning,
-    text: String,
 }
 
 impl Planning {
-    /// Returns `planning` and `checkpoint_metrics` of the report.
-    pub fn tables(&self) -> anyhow::Result<Map<String, Value>> {
-        let mut tables = Map::new();
-        tables.insert("planning".into(), serde_json::to_value(&self.tables)?);
-        tables.insert("checkpoint_metrics".into(), serde_json::to_value(self.run.checkpoint_figures()?)?);
-        Ok(tables)
+    /// Loads the models of a run; `None` for a run without drives through a scenario.
+    pub fn load(outcome: &RunOutcome) -> anyhow::Result<Option<Self>> {
+        let decisive = decisive(outcome);
+        if decisive.iter().all(|(frame, _)| frame.posterior.is_none()) {
+            return Ok(None);
+        }
+        carff_networks::allocator::keep_large_blocks();
+        Ok(Some(Self { run: JudgedRun::load(settings(outcome)?)?, decisive }))
     }
 
-    /// Returns the tables and the figures of the checkpoint as text.
-    pub fn text(&self) -> &str {
-        &self.text
+    /// Computes every rule over the run's drives and over every eligible view.
+    pub fn tables(&self, progress: impl Fn(String)) -> anyhow::Result<RunPlanning> {
+        Ok(self.run.planning(&self.decisive, progress)?)
     }
 
     /// Draws some of the run's drives into a PNG file.
@@ -39,23 +38,15 @@ impl Planning {
     }
 }
 
-/// Computes the tables; `None` for a run without drives through a scenario.
-pub fn evaluate(outcome: &RunOutcome) -> anyhow::Result<Option<Planning>> {
-    if outcome.records.frames.values().all(|f| f.drive < 0 || f.posterior.is_none()) {
-        return Ok(None);
-    }
-    carff_networks::allocator::keep_large_blocks();
-    let run = JudgedRun::load(settings(outcome)?)?;
-    let decisive = decisive_frames(outcome.records.frames.values().filter_map(decided), run.scenario());
-    let tables = run.planning(&decisive)?;
-    let figures = run.checkpoint_figures()?.summary().replace('\n', "\n  ");
-    let text = format!("{}\nModels, as measured in training\n  {figures}\n", tables.text());
-    Ok(Some(Planning { run, decisive, tables, text }))
+/// Selects the frame of each drive whose decision counts; none for a run without a scenario.
+pub fn decisive(outcome: &RunOutcome) -> Vec<(DecidedFrame, DriveKind)> {
+    let frames = outcome.records.frames.values().filter_map(decided);
+    outcome.scenario.as_ref().map_or_else(Vec::new, |scenario| decisive_frames(frames, scenario))
 }
 
 /// Settings of a run, from its graph file and checkpoint.
 fn settings(outcome: &RunOutcome) -> anyhow::Result<RunSettings> {
-    let graph = GraphConfig::load(Path::new(&outcome.graph))?;
+    let graph = &outcome.graph;
     let known = CheckpointPlanning::load(&outcome.checkpoint)?;
     let free = match (graph.camera.source, graph.scenario_path()) {
         (CameraSource::FreeDrives, Some(path)) => Some(Scenario::load(&path)?),
@@ -75,12 +66,12 @@ fn settings(outcome: &RunOutcome) -> anyhow::Result<RunSettings> {
         horizon: graph.run.horizon,
         noise: graph.camera.noise,
         split_seed: graph.camera.split_seed.unwrap_or(known.split_seed),
-        seed: outcome.seed,
+        seed: graph.run.seed,
     })
 }
 
 /// A frame of a drive on which the controller decided; `None` for any other frame.
-fn decided(frame: &FrameRecord) -> Option<DecidedFrame> {
+pub(crate) fn decided(frame: &FrameRecord) -> Option<DecidedFrame> {
     let action = frame.action?;
     Some(DecidedFrame {
         frame: frame.frame_id,
@@ -121,25 +112,6 @@ mod tests {
             confidence: 0.5,
             latency_ns: 1,
         }
-    }
-
-    fn outcome(frames: impl IntoIterator<Item = FrameRecord>) -> RunOutcome {
-        let frames = frames.into_iter().enumerate().map(|(i, f)| (i as u64, FrameRecord { frame_id: i as u64, ..f }));
-        let mut outcome = RunOutcome::default();
-        outcome.records.frames = frames.collect();
-        outcome
-    }
-
-    /// A run without drives, or without a recorded posterior, has no tables and loads no model.
-    #[test]
-    fn nothing_is_computed_without_drives() {
-        let known = Some(carff_messages::Gaussian::standard());
-        let no_drive = FrameRecord { drive: -1, posterior: known, ..frame() };
-        for outcome in [outcome([]), outcome([no_drive]), outcome([frame()])] {
-            assert!(evaluate(&outcome).unwrap().is_none());
-        }
-        let driven = outcome([FrameRecord { posterior: known, ..frame() }]);
-        assert!(evaluate(&driven).is_err(), "without its graph file a run cannot be judged");
     }
 
     /// Frames outside a drive, without a state, or without a decision do not count; a free drive has no view; every

@@ -1,19 +1,32 @@
-//! The report of a run, as JSON.
+//! The report of a run: its own figures as JSON and text, and the files that hold it.
 
+use crate::planning;
 use crate::supervision::monitor::Records;
+use anyhow::Context;
+use carff_base::files::check_writable;
+use carff_checkpoint::Manifest;
+use carff_config::GraphConfig;
+use carff_dataset::ScenarioInfo;
+use carff_evaluation::CheckpointFigures;
+use carff_evaluation::run::DriveCounts;
 use carff_messages::Stage;
 use serde_json::{Map, Value, json};
 use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
 
-/// A finished run, for the report and for callers that add tables.
-#[derive(Clone, Debug, Default)]
+/// A finished run.
+#[derive(Clone, Debug)]
 pub struct RunOutcome {
     /// Run name.
     pub run: String,
-    /// Graph file.
-    pub graph: String,
-    /// The run's seed.
-    pub seed: u64,
+    /// Path of the graph file.
+    pub graph_file: String,
+    /// Effective configuration.
+    pub graph: GraphConfig,
+    /// Scenario of the dataset, where it has one.
+    pub scenario: Option<ScenarioInfo>,
+    /// True if a signal ended the run.
+    pub interrupted: bool,
     /// Folder of the dataset.
     pub dataset: std::path::PathBuf,
     /// Folder of the trained models.
@@ -38,8 +51,40 @@ pub fn quantiles_ms<'a>(times_ns: impl IntoIterator<Item = &'a u64>) -> Value {
     json!({ "p50": at(0.5), "p99": at(0.99), "max": at(1.0), "count": sorted.len() })
 }
 
-/// Returns the report with `tables` added.
-pub fn json(outcome: &RunOutcome, tables: Map<String, Value>) -> Value {
+/// Files of a report: JSON at the path that the user gave, text and filmstrip next to it.
+#[derive(Clone, Debug)]
+pub struct ReportFiles {
+    /// The report as JSON.
+    pub json: PathBuf,
+    /// The report as text.
+    pub text: PathBuf,
+    /// The filmstrip, a PNG image.
+    pub strip: PathBuf,
+}
+
+impl ReportFiles {
+    /// Names the files, and checks that they can be written.
+    pub fn checked(json: &Path) -> anyhow::Result<Self> {
+        let files = Self { json: json.to_owned(), text: json.with_extension("txt"), strip: json.with_extension("png") };
+        for path in [&files.json, &files.text, &files.strip] {
+            check_writable(path)?;
+        }
+        Ok(files)
+    }
+
+    /// Writes the report.
+    pub fn write(&self, report: &Value, text: &str) -> anyhow::Result<()> {
+        for (path, text) in
+            [(&self.json, &(serde_json::to_string_pretty(report)? + "\n")), (&self.text, &text.to_owned())]
+        {
+            std::fs::write(path, text).with_context(|| format!("cannot write {}", path.display()))?;
+        }
+        Ok(())
+    }
+}
+
+/// Returns the report as JSON.
+pub fn json(outcome: &RunOutcome) -> Value {
     let records = &outcome.records;
     let decided: Vec<u64> = records.frames.values().filter(|f| f.action.is_some()).map(|f| f.latency_ns).collect();
     let by_stage = |value: &dyn Fn(Stage) -> Option<Value>| -> Value {
@@ -48,8 +93,9 @@ pub fn json(outcome: &RunOutcome, tables: Map<String, Value>) -> Value {
     let stage = |s: Stage| records.stages.get(&s);
     let mut report = json!({
         "run": outcome.run,
-        "graph": outcome.graph,
-        "seed": outcome.seed,
+        "graph": outcome.graph_file,
+        "seed": outcome.graph.run.seed,
+        "interrupted": outcome.interrupted,
         "frames": records.frame_count(),
         "frames_not_recorded": records.frame_count() - records.frames.len() as u64,
         "decisions": decided.len(),
@@ -71,10 +117,51 @@ pub fn json(outcome: &RunOutcome, tables: Map<String, Value>) -> Value {
         },
         "memory_mb": by_stage(&|s| Some((stage(s)?.max_rss_bytes as f64 / 1e6).into())),
     });
-    if let Some(report) = report.as_object_mut() {
-        report.extend(tables);
+    if let Some(drives) = drives(outcome) {
+        report["drives"] = json!(drives);
+    }
+    if let Some(figures) = checkpoint_figures(outcome) {
+        report["checkpoint_metrics"] = json!(figures);
     }
     report
+}
+
+/// Correct decisions of the run's drives; `None` for a run without a decisive frame.
+fn drives(outcome: &RunOutcome) -> Option<DriveCounts> {
+    let decisive = planning::decisive(outcome);
+    (!decisive.is_empty()).then(|| {
+        let run = &outcome.graph.run;
+        DriveCounts::of(outcome.graph.controller.rule, run.samples as usize, &decisive)
+    })
+}
+
+/// Figures of the checkpoint, as measured in training; `None` for a checkpoint without readable figures.
+fn checkpoint_figures(outcome: &RunOutcome) -> Option<CheckpointFigures> {
+    CheckpointFigures::of(&Manifest::load(&outcome.checkpoint).ok()?, &outcome.checkpoint).ok()
+}
+
+/// Returns the report as text: counts and latency, the correct decisions of the drives, figures of the checkpoint.
+pub fn text(outcome: &RunOutcome, report: &Value) -> String {
+    let latency = &report["latency_ms"]["camera_to_action"];
+    let ms = |key: &str| latency[key].as_f64().map_or("-".to_owned(), |v| format!("{v:.1}"));
+    let mut text = format!(
+        "{} frames, {} decisions, {} actions, {} skipped, {} restarts; camera to action: p50 {} ms, p99 {} ms, max {} ms\n",
+        report["frames"],
+        report["decisions"],
+        report["actions"],
+        report["skipped"],
+        report["restarts"],
+        ms("p50"),
+        ms("p99"),
+        ms("max")
+    );
+    if let Some(drives) = drives(outcome) {
+        text += &format!("\n{}\n", drives.text());
+    }
+    if let Some(figures) = checkpoint_figures(outcome) {
+        text += &format!("\nModels, as measured in training\n  {}\n", figures.summary().replace('\n', "\n  "));
+    }
+    text
 }
 
 #[cfg(test)]
@@ -88,21 +175,5 @@ mod tests {
         assert_eq!(quantiles_ms(&times), json!({ "p50": 50.0, "p99": 99.0, "max": 100.0, "count": 100 }));
         assert_eq!(quantiles_ms(&[7_000_000])["p99"], json!(7.0));
         assert_eq!(quantiles_ms(&[])["p50"], Value::Null);
-    }
-
-    /// The report has all promised keys, also for a run without events, and tables are added at the top level.
-    #[test]
-    fn promised_keys_are_there() {
-        let mut tables = Map::new();
-        tables.insert("planning".into(), json!({ "drives": {} }));
-        let report = json(&RunOutcome::default(), tables);
-        for key in ["frames", "actions", "skipped", "restarts", "memory_mb", "planning"] {
-            assert!(report.get(key).is_some(), "{key}");
-        }
-        for part in ["camera_to_action", "encoder", "forecaster", "prober", "renderer"] {
-            for quantile in ["p50", "p99", "max"] {
-                assert!(report["latency_ms"][part].get(quantile).is_some(), "{part}.{quantile}");
-            }
-        }
     }
 }

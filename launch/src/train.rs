@@ -7,6 +7,7 @@ use carff_scenes::{Extras, Scenario};
 use carff_training::{
     FreePoses, Phases, Progress, Run, Training, TrainingConfig, TrainingError, forget_run, render_random_poses,
 };
+use carff_transport::{INTERRUPTED, Stop};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde_json::Value;
 use std::{
@@ -14,12 +15,12 @@ use std::{
     io::IsTerminal,
     path::{Path, PathBuf},
     process::ExitCode,
-    sync::{
-        Arc, Mutex,
-        atomic::{AtomicBool, Ordering},
-    },
+    sync::Mutex,
     time::{Duration, Instant},
 };
+
+/// Longest time from a signal to the end of the process.
+const GRACE: Duration = Duration::from_millis(1500);
 
 /// Options of `carff train`.
 #[derive(Debug, clap::Args)]
@@ -76,10 +77,10 @@ pub fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
     refuse_another_configuration(&dir, &config, &dataset)?;
 
     let device = carff_networks::device::parse(&args.device)?;
-    let stop = stop_on_signals()?;
+    let stop = stop_on_signals(&dir)?;
     let display = Display::default();
     let report = |progress: &Progress| display.show(progress);
-    let run = Run { dir: dir.clone(), on_progress: &report, stop: &stop };
+    let run = Run { dir: dir.clone(), on_progress: &report, stop: stop.flag() };
     let phases = match args.stage {
         None => Phases::All,
         Some(StageName::Vae) => Phases::Vae,
@@ -99,22 +100,28 @@ pub fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
             Ok(ExitCode::SUCCESS)
         }
         Err(TrainingError::Stopped) => {
-            debug_assert!(stop.load(Ordering::Relaxed));
-            eprintln!("stopped; the same command resumes from the states saved in {}", dir.display());
-            Ok(ExitCode::from(130))
+            debug_assert!(stop.is_stopped());
+            Ok(stopped(&dir))
         }
         Err(error) => Err(error.into()),
     }
 }
 
-/// A flag that Ctrl-C sets; a second Ctrl-C ends the program at once.
-pub fn stop_on_signals() -> anyhow::Result<Arc<AtomicBool>> {
-    let stop = Arc::new(AtomicBool::new(false));
-    for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
-        signal_hook::flag::register_conditional_shutdown(signal, 130, Arc::clone(&stop))?;
-        signal_hook::flag::register(signal, Arc::clone(&stop))?;
-    }
+/// A stop that signals trigger. It ends the process after [`GRACE`]: long computations look at it seldom, and saved
+/// states are complete at any moment.
+pub fn stop_on_signals(dir: &Path) -> anyhow::Result<Stop> {
+    let stop = Stop::on_signals().context("cannot handle signals")?;
+    let dir = dir.to_owned();
+    stop.exit_after(GRACE, move || {
+        stopped(&dir);
+    })?;
     Ok(stop)
+}
+
+/// Reports that the user stopped a training.
+pub fn stopped(dir: &Path) -> ExitCode {
+    eprintln!("\nstopped; the same command resumes from the states saved in {}", dir.display());
+    ExitCode::from(INTERRUPTED)
 }
 
 /// Folders of the dataset and of the dataset of random poses, if any. Missing ones are rendered from the training

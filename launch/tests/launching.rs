@@ -193,7 +193,7 @@ impl Graph {
     fn command(&self, frames: u64) -> Command {
         let mut command = Command::new(env!("CARGO_BIN_EXE_carff-launch"));
         command
-            .arg("launch")
+            .args(["launch", "--verbose"])
             .arg(self.path("graph.toml"))
             .args(["--frames", &frames.to_string(), "--stages"])
             .arg(self.folder.path())
@@ -232,7 +232,11 @@ fn text(output: &Output) -> String {
 
 /// Returns a launcher that has printed its first decision.
 fn deciding(graph: &Graph) -> Child {
-    let mut child = graph.command(100_000).spawn().unwrap();
+    deciding_as(&mut graph.command(100_000))
+}
+
+fn deciding_as(command: &mut Command) -> Child {
+    let mut child = command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
     let stdout = child.stdout.take().unwrap();
     let mut lines = BufReader::new(stdout).lines().map_while(Result::ok);
     assert!(lines.any(|line| line.contains("hazard 0.25")), "no decision was printed");
@@ -310,14 +314,119 @@ fn a_stage_that_cannot_start_says_why() {
     graph.assert_nothing_left();
 }
 
-/// Ctrl-C ends all processes and leaves nothing behind.
+/// Ctrl-C, SIGTERM and the end of the terminal end all processes and leave nothing behind; the report of the frames so
+/// far is written.
 #[test]
 fn an_interrupt_ends_everything() {
+    for kind in [Signal::INT, Signal::TERM, Signal::HUP] {
+        let graph = Graph::new("none");
+        let mut child = deciding(&graph);
+        assert!(!living_processes(&graph.run()).unwrap().is_empty());
+        signal(&child, kind);
+        assert_eq!(child.wait().unwrap().code(), Some(130), "{kind:?}");
+        graph.assert_nothing_left();
+        let report = graph.report();
+        assert_eq!(report["interrupted"], true, "{report}");
+        assert!(report["decisions"].as_u64().unwrap() > 0, "{report}");
+    }
+}
+
+/// `nohup` keeps a run alive when its terminal ends.
+#[test]
+fn nohup_is_respected() {
     let graph = Graph::new("none");
-    let mut child = deciding(&graph);
-    assert!(!living_processes(&graph.run()).unwrap().is_empty());
-    signal(&child, Signal::INT);
+    let decisions = graph.path("decisions.jsonl");
+    let mut inner = graph.command(100_000);
+    inner.arg("--decisions").arg(&decisions);
+    let mut command = Command::new("nohup");
+    command.arg(inner.get_program()).args(inner.get_args());
+    let mut child = deciding_as(&mut command);
+    signal(&child, Signal::HUP);
+    let count = || std::fs::read_to_string(&decisions).unwrap().lines().count();
+    let before = count();
+    assert!(eventually(|| count() > before + 5), "decisions continue");
+    signal(&child, Signal::TERM);
     assert_eq!(child.wait().unwrap().code(), Some(130));
+    assert!(graph.report()["interrupted"].as_bool().unwrap());
+}
+
+/// A report that cannot be written is refused before any stage starts.
+#[test]
+fn an_unwritable_report_is_refused_first() {
+    let graph = Graph::new("start");
+    for report in ["/proc/nowhere/report.json", "/dev/null/report.json"] {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_carff-launch"));
+        command.arg("launch").arg(graph.path("graph.toml")).arg("--stages").arg(graph.folder.path());
+        let output = command.args(["--report", report]).output().unwrap();
+        assert_eq!(output.status.code(), Some(1));
+        assert!(text(&output).contains(&format!("error: cannot write {report}")), "{}", text(&output));
+        assert!(!text(&output).contains("did not start"), "{}", text(&output));
+    }
+}
+
+/// Each decision is one line of the JSON file, with its source and without the truth; without `--verbose`, a source
+/// without drives prints only changes of the action.
+#[test]
+fn decisions_become_json_lines() {
+    let graph = Graph::new("none");
+    let file = graph.path("decisions.jsonl");
+    let output = graph.command(20).arg("--decisions").arg(&file).output().unwrap();
+    assert!(output.status.success(), "{}", text(&output));
+    let lines: Vec<Value> =
+        std::fs::read_to_string(&file).unwrap().lines().map(|l| serde_json::from_str(l).unwrap()).collect();
+    assert_eq!(lines.len() as u64, graph.report()["decisions"].as_u64().unwrap());
+    let last = lines.last().unwrap();
+    assert_eq!((&last["action"], &last["reason"]), (&"advance".into(), &"belief".into()), "{last}");
+    assert_eq!((last["hazard"].as_f64(), last["source"].is_null()), (Some(0.25), true), "{last}");
+    assert!(last["latency_ms"].as_f64().unwrap() > 0.0 && last["capture_time_ns"].as_u64().unwrap() > 0, "{last}");
+    let keys: Vec<&str> = last.as_object().unwrap().keys().map(String::as_str).collect();
+    assert_eq!(keys, ["action", "capture_time_ns", "drive", "frame", "hazard", "latency_ms", "reason", "source"]);
+}
+
+/// A full standard output does not disturb the run, and its end reports the error.
+#[test]
+fn a_full_output_is_an_error_at_the_end() {
+    let graph = Graph::new("none");
+    let full = std::fs::OpenOptions::new().write(true).open("/dev/full").unwrap();
+    let output = graph.command(20).stdout(full).output().unwrap();
+    assert_eq!(output.status.code(), Some(1), "{}", text(&output));
+    assert!(text(&output).contains("No space left on device"), "{}", text(&output));
+    assert!(!text(&output).contains("panicked"), "{}", text(&output));
+    assert_eq!(graph.report()["frames"], 20);
+    for command in [&["schema", "graph"][..], &["completions", "bash"], &["doctor"]] {
+        let full = std::fs::OpenOptions::new().write(true).open("/dev/full").unwrap();
+        let output = Command::new(env!("CARGO_BIN_EXE_carff-launch")).args(command).stdout(full).output().unwrap();
+        assert_eq!(output.status.code(), Some(1), "{command:?}: {}", text(&output));
+        assert!(!text(&output).contains("panicked"), "{command:?}: {}", text(&output));
+    }
+}
+
+/// Settings of the command line reach the effective configuration, are checked as those of the file, and reach the
+/// stages; a graph file can come from a pipe.
+#[test]
+fn settings_change_the_effective_configuration() {
+    let graph = Graph::new("none");
+    let launch = |args: &[&str]| {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_carff-launch"));
+        text(&command.arg("launch").arg(graph.path("graph.toml")).args(args).output().unwrap())
+    };
+    let printed = launch(&["--print-config", "--set", "run.samples=35", "--set", "stages.encoder.log=\"debug\""]);
+    assert!(printed.contains("samples = 35") && printed.contains("log = \"debug\""), "{printed}");
+    for (setting, wanted) in [
+        ("run.samples=100000", "`run.samples` is 100000; allowed:"),
+        ("run.smaples=3", "unknown field `smaples`"),
+        ("run.samples", "`run.samples` sets nothing"),
+    ] {
+        assert!(launch(&["--set", setting]).contains(wanted), "{}", launch(&["--set", setting]));
+    }
+
+    let piped = graph.command(20);
+    let script = format!("exec \"$0\" launch <(cat {}) \"${{@:3}}\"", graph.path("graph.toml").display());
+    let mut command = Command::new("bash");
+    command.args(["-c", &script]).arg(piped.get_program()).args(piped.get_args().skip(1));
+    let output = command.args(["--set", "run.samples=3"]).output().unwrap();
+    assert!(output.status.success(), "{}", text(&output));
+    assert_eq!(graph.report()["frames"], 20);
     graph.assert_nothing_left();
 }
 

@@ -64,7 +64,12 @@ impl TestGraph {
     /// Returns the command `carff launch` on its graph file, or on another one under its run name.
     pub fn launch(&self, file: &Path, args: &[&str]) -> Command {
         let mut command = Command::new(program("carff"));
-        command.current_dir(self.folder.path()).arg("launch").arg(file).args(["--run", self.run.name()]).args(args);
+        command
+            .current_dir(self.folder.path())
+            .args(["launch", "--verbose"])
+            .arg(file)
+            .args(["--run", self.run.name()])
+            .args(args);
         command
     }
 

@@ -65,6 +65,13 @@ impl Process {
         assert!(holds(&text), "it ended without {what}:\n{text}");
     }
 
+    /// Returns true if it has a handler for a signal.
+    pub fn catches(&self, signal: Signal) -> bool {
+        let status = std::fs::read_to_string(format!("/proc/{}/status", self.id())).unwrap_or_default();
+        let caught = status.lines().find_map(|line| u64::from_str_radix(line.strip_prefix("SigCgt:")?.trim(), 16).ok());
+        caught.unwrap_or(0) & (1 << (signal.as_raw() - 1)) != 0
+    }
+
     /// Sends a signal to it.
     pub fn signal(&self, signal: Signal) {
         kill_process(Pid::from_raw(self.child.id() as i32).unwrap(), signal).unwrap();

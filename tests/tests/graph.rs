@@ -5,7 +5,7 @@
 use carff_dataset::Image;
 use carff_messages::Stage;
 use carff_tests::{
-    PATIENT, Process, TestGraph, WATCHDOG, copy_checkpoint, decisions, eventually, project_root, scenario_set,
+    PATIENT, Process, TestGraph, WATCHDOG, copy_checkpoint, decisions, eventually, program, project_root, scenario_set,
     shipped_checkpoint,
 };
 use rustix::process::{Pid, Signal, kill_process};
@@ -20,7 +20,7 @@ fn the_shipped_graph_drives() {
     let graph = TestGraph::new(&set, &checkpoint, "");
     let shipped = project_root().join("configs/graphs/approaching-intersection.toml");
     let (set, checkpoint) = (set.to_str().unwrap(), checkpoint.to_str().unwrap());
-    let args = ["--drives", "2", "--dataset", set, "--checkpoint", checkpoint, "--report", "report.json"];
+    let args = ["--drives", "2", "--dataset", set, "--checkpoint", checkpoint, "--report", "report.json", "--tables"];
     let finished = Process::start(&mut graph.launch(&shipped, &args)).end();
     finished.assert_success();
     graph.assert_nothing_left();
@@ -82,6 +82,35 @@ fn an_interrupt_leaves_nothing() {
     graph.assert_nothing_left();
 }
 
+/// A signal ends each command in each phase with exit code 130, also while it computes with models.
+#[test]
+fn a_signal_ends_every_command() {
+    let (set, checkpoint) = (scenario_set(), shipped_checkpoint());
+    let (set, checkpoint) = (set.to_str().unwrap(), checkpoint.to_str().unwrap());
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("out");
+    let out = out.to_str().unwrap();
+    let scenario = project_root().join("configs/scenarios/two-lane-merge.toml");
+    let commands = [
+        &["eval", checkpoint, "--dataset", set, "--out", out][..],
+        &["dataset", "render", scenario.to_str().unwrap(), "--out", out],
+        &["bench", "field"],
+        &["bench", "encoder"],
+        &["metrics", "--listen", "127.0.0.1:0"],
+    ];
+    for command in commands {
+        for signal in [Signal::INT, Signal::TERM, Signal::HUP] {
+            let process =
+                Process::start(std::process::Command::new(program("carff")).args(command).current_dir(project_root()));
+            assert!(eventually(|| process.catches(signal)), "{command:?} takes no {signal:?}");
+            process.signal(signal);
+            let finished = process.end();
+            assert_eq!(finished.status.code(), Some(130), "{command:?}, {signal:?}: {}", finished.text);
+            assert!(!finished.text.contains("panicked"), "{command:?}: {}", finished.text);
+        }
+    }
+}
+
 /// With `launcher.log_format = "json"` every line of the log is an object with time, source, level and message,
 /// including the launcher's own lines.
 #[test]
@@ -93,7 +122,7 @@ fn logs_are_json_where_asked_for() {
     launcher.signal(Signal::INT);
     let text = launcher.end().text;
     let lines: Vec<Value> = text.lines().filter_map(|line| serde_json::from_str(line).ok()).collect();
-    assert!(!text.lines().any(|line| line.starts_with('[')), "{text}");
+    assert!(!text.contains("[encoder] ") && !text.contains("[launcher] "), "{text}");
     let said = |source: &str, message: &str| {
         lines.iter().any(|line| {
             let holds = |key: &str, wanted: &str| line[key].as_str().is_some_and(|found| found.contains(wanted));

@@ -22,11 +22,14 @@ mod vitals;
 
 pub use not_built::NotBuilt;
 
-use anyhow::Context;
+use anyhow::{Context, anyhow};
+use carff_transport::{INTERRUPTED, exit_on_signals, is_interrupted};
 use clap::Subcommand;
 use std::any::Any;
 use std::ffi::OsString;
+use std::io::Write;
 use std::os::unix::process::CommandExt;
+use std::panic::AssertUnwindSafe;
 use std::process::{Command, ExitCode};
 
 /// The commands of this crate.
@@ -107,33 +110,39 @@ impl Attach {
     }
 }
 
-/// Returns a program's exit code, and prints an error as one sentence.
-pub fn exit_code(result: anyhow::Result<ExitCode>) -> ExitCode {
-    result.unwrap_or_else(|error| {
-        eprintln!("error: {}", carff_base::errors::sentence(&*error));
-        ExitCode::FAILURE
-    })
-}
-
-/// Runs a program to its end. If the reader of standard output closes the pipe (`| head`), the program ends like others
-/// do: without a message and with exit code 141.
-pub fn until_read(program: impl FnOnce() -> ExitCode) -> ExitCode {
-    let told = std::panic::take_hook();
+/// Runs a program to its end, and returns its exit code. An error is printed as one sentence. After a signal the code is
+/// [`INTERRUPTED`]; a signal also ends each phase that waits for no stop.
+pub fn run_program(program: impl FnOnce() -> anyhow::Result<ExitCode>) -> ExitCode {
+    let print_panic = std::panic::take_hook();
     std::panic::set_hook(Box::new(move |info| {
-        if !says_closed_pipe(info.payload()) {
-            told(info);
+        if failed_output(info.payload()).is_none() {
+            print_panic(info);
         }
     }));
-    std::panic::catch_unwind(std::panic::AssertUnwindSafe(program)).unwrap_or_else(|payload| {
-        if says_closed_pipe(&*payload) { ExitCode::from(141) } else { std::panic::resume_unwind(payload) }
-    })
+    let program = || exit_on_signals().context("cannot handle signals").and_then(|()| program());
+    let result = std::panic::catch_unwind(AssertUnwindSafe(program)).unwrap_or_else(|payload| {
+        match failed_output(&*payload) {
+            // The reader has closed the pipe (`| head`): no message, and the shell's exit code for it.
+            Some(cause) if cause.contains("Broken pipe") => Ok(ExitCode::from(141)),
+            Some(cause) => Err(anyhow!("cannot write to standard output: {cause}")),
+            None => std::panic::resume_unwind(payload),
+        }
+    });
+    let interrupted = is_interrupted();
+    match result {
+        Ok(ExitCode::SUCCESS) if interrupted => ExitCode::from(INTERRUPTED),
+        Ok(code) => code,
+        Err(error) => {
+            // Standard error may be full or closed as well.
+            let _ = writeln!(std::io::stderr(), "error: {}", carff_base::errors::sentence(&*error));
+            if interrupted { ExitCode::from(INTERRUPTED) } else { ExitCode::FAILURE }
+        }
+    }
 }
 
-/// Returns true for the panic of `println!` on a closed pipe.
-fn says_closed_pipe(payload: &(dyn Any + Send)) -> bool {
-    payload
-        .downcast_ref::<String>()
-        .is_some_and(|text| text.starts_with("failed printing to stdout") && text.contains("Broken pipe"))
+/// Returns the cause if a panic is that of `println!` on a standard output that takes no more.
+fn failed_output(payload: &(dyn Any + Send)) -> Option<&str> {
+    payload.downcast_ref::<String>()?.strip_prefix("failed printing to stdout: ")
 }
 
 /// Replaces this process with another program of this project from the same folder; returns if that fails.

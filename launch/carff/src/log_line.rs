@@ -1,19 +1,20 @@
 //! One line of the log of a stage or the launcher, as text or as JSON.
 
 use carff_config::LogFormat;
+use jiff::Timestamp;
 use serde_json::{Map, Value};
 
 /// Levels as stages write them, in text and in JSON.
 const LEVELS: [&str; 5] = ["ERROR", "WARN", "INFO", "DEBUG", "TRACE"];
 
 /// Formats a line for output. `source` is a stage's name or `launcher`. `said` is the line that it wrote: a JSON
-/// object, or text that may begin with a level. Only JSON contains `time`.
-pub(crate) fn formatted(format: LogFormat, time: &str, source: &str, said: &str) -> String {
+/// object, or text that may begin with a level. Text has the time of day (UTC), JSON has date and time.
+pub(crate) fn formatted(format: LogFormat, time: &Timestamp, source: &str, said: &str) -> String {
     match format {
-        LogFormat::Text => format!("[{source}] {said}"),
+        LogFormat::Text => format!("{} [{source}] {}", time.strftime("%H:%M:%S%.3fZ"), said.trim_start()),
         LogFormat::Json => {
             let mut object = fields(said);
-            object.insert("time".into(), time.into());
+            object.insert("time".into(), time.to_string().into());
             object.insert("source".into(), source.into());
             Value::Object(object).to_string()
         }
@@ -45,17 +46,19 @@ fn fields(said: &str) -> Map<String, Value> {
 mod tests {
     use super::*;
 
+    const TIME: Timestamp = Timestamp::constant(1_767_225_600, 0);
+
     fn json(said: &str) -> Value {
-        serde_json::from_str(&formatted(LogFormat::Json, "2026-01-01T00:00:00Z", "encoder", said)).unwrap()
+        serde_json::from_str(&formatted(LogFormat::Json, &TIME, "encoder", said)).unwrap()
     }
 
-    /// Text is passed on unchanged. In JSON every line is an object with time, source, level and message, and keeps the
+    /// Text is passed on with the time and the source. In JSON every line is an object with time, source, level and message, and keeps the
     /// fields of the stage.
     #[test]
     fn every_line_has_its_form() {
         assert_eq!(
-            formatted(LogFormat::Text, "", "encoder", " INFO ready threads=1"),
-            "[encoder]  INFO ready threads=1"
+            formatted(LogFormat::Text, &TIME, "encoder", " INFO ready threads=1"),
+            "00:00:00.000Z [encoder] INFO ready threads=1"
         );
         let ready = json(r#"{"level":"INFO","message":"ready","threads":1}"#);
         assert_eq!(

@@ -2,34 +2,50 @@
 
 use crate::log_line;
 use carff_config::LogFormat;
-use std::io::{IsTerminal, Write};
-use std::sync::{Mutex, OnceLock};
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use std::io::{ErrorKind, IsTerminal, Write};
+use std::sync::OnceLock;
+
+/// Drawings of the status line per second.
+const STATUS_HZ: u8 = 5;
 
 /// The terminal. Lines may come from several threads.
 #[derive(Debug)]
 pub struct Terminal {
-    live: bool,
+    /// The status line, as wide as the terminal; hidden if the output is not a terminal.
+    status: ProgressBar,
     colour: bool,
-    status: Mutex<String>,
     /// Format of the log; text until it is set.
     format: OnceLock<LogFormat>,
+    /// The first error of standard output, other than a closed pipe.
+    failed: OnceLock<std::io::Error>,
 }
 
 impl Terminal {
-    /// Creates the terminal from the process's streams. `NO_COLOR` turns colours off.
+    /// Creates the terminal from the process's streams. `NO_COLOR` and a dumb terminal turn colours off.
     pub fn new() -> Self {
-        let live = std::io::stdout().is_terminal() && std::io::stderr().is_terminal();
+        let dumb = std::env::var_os("TERM").is_none_or(|term| term == "dumb");
+        let live = std::io::stdout().is_terminal() && std::io::stderr().is_terminal() && !dumb;
+        let target = if live { ProgressDrawTarget::stderr_with_hz(STATUS_HZ) } else { ProgressDrawTarget::hidden() };
+        let status = ProgressBar::with_draw_target(None, target);
+        status.set_style(ProgressStyle::with_template("{wide_msg}").unwrap_or_else(|_| ProgressStyle::default_bar()));
         let colour = live && std::env::var_os("NO_COLOR").is_none_or(|v| v.is_empty());
-        Self { live, colour, status: Mutex::default(), format: OnceLock::new() }
+        Self { status, colour, format: OnceLock::new(), failed: OnceLock::new() }
     }
 
     /// Prints a line on standard output.
     pub fn line(&self, text: &str) {
-        let status = self.lock();
-        self.clear();
-        // A closed pipe (`| head`) must not end the run in the middle.
-        let _ = writeln!(std::io::stdout(), "{text}");
-        self.draw(&status);
+        // An error must not end the run in the middle: `check` reports it.
+        if let Err(error) = self.status.suspend(|| writeln!(std::io::stdout(), "{text}"))
+            && error.kind() != ErrorKind::BrokenPipe
+        {
+            let _ = self.failed.set(error);
+        }
+    }
+
+    /// Returns the first error of standard output. A closed pipe (`| head`) is not an error.
+    pub fn check(self: std::sync::Arc<Self>) -> std::io::Result<()> {
+        std::sync::Arc::into_inner(self).and_then(|mut terminal| terminal.failed.take()).map_or(Ok(()), Err)
     }
 
     /// Sets the log's format, once.
@@ -42,47 +58,34 @@ impl Terminal {
     /// level or is a JSON object.
     pub fn log(&self, source: &str, said: &str) {
         let format = self.format.get().copied().unwrap_or_default();
-        self.note(&log_line::formatted(format, &jiff::Timestamp::now().to_string(), source, said));
+        self.note(&log_line::formatted(format, &jiff::Timestamp::now(), source, said));
     }
 
     /// Prints a line on standard error that is not part of the log.
     pub fn note(&self, text: &str) {
-        let status = self.lock();
-        self.clear();
-        let _ = writeln!(std::io::stderr(), "{text}");
-        self.draw(&status);
+        // Without standard error nothing can be reported.
+        let _ = self.status.suspend(|| writeln!(std::io::stderr(), "{text}"));
     }
 
-    /// Sets the status line; empty removes it.
+    /// Sets the status line; empty removes it. It is cut at the terminal's width.
     pub fn status(&self, text: String) {
-        let mut status = self.lock();
-        *status = text;
-        self.clear();
-        self.draw(&status);
+        if text.is_empty() {
+            self.status.finish_and_clear();
+            self.status.reset();
+        } else if self.status.message() != text {
+            self.status.set_message(text);
+        }
     }
 
     /// Returns `text` in red or green if colours are enabled.
     pub fn alarm(&self, text: &str, red: bool) -> String {
         if self.colour { format!("\x1b[{}m{text}\x1b[0m", if red { 31 } else { 32 }) } else { text.to_owned() }
     }
+}
 
-    fn lock(&self) -> std::sync::MutexGuard<'_, String> {
-        self.status.lock().unwrap_or_else(std::sync::PoisonError::into_inner)
-    }
-
-    fn clear(&self) {
-        if self.live {
-            let _ = write!(std::io::stderr(), "\r\x1b[K");
-        }
-    }
-
-    fn draw(&self, status: &str) {
-        if self.live && !status.is_empty() {
-            // No wider than the narrowest usual terminal, because a wrapped line cannot be erased.
-            let text: String = status.chars().take(118).collect();
-            let _ = write!(std::io::stderr(), "{text}");
-            let _ = std::io::stderr().flush();
-        }
+impl Drop for Terminal {
+    fn drop(&mut self) {
+        self.status.finish_and_clear();
     }
 }
 

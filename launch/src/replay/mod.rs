@@ -4,7 +4,7 @@ mod compare;
 mod feed;
 
 use crate::launch::{LaunchArgs, run_graph};
-use crate::supervision::{Ended, Feed, LAUNCHER};
+use crate::supervision::{Ended, Feed};
 use anyhow::{Context, ensure};
 use carff::terminal::Terminal;
 use carff_messages::Stage;
@@ -112,11 +112,10 @@ pub fn run(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
         graph,
         dataset: Some(args.dataset.clone().unwrap_or_else(|| about.dataset.into())),
         checkpoint: Some(args.checkpoint.clone().unwrap_or_else(|| about.checkpoint.into())),
-        frames: None,
-        drives: None,
-        report: None,
         run: Some(args.run.clone().unwrap_or(about.run)),
         stages: args.stages.clone(),
+        verbose: true,
+        ..LaunchArgs::default()
     };
     let pace = match (args.verify, args.step, args.rate) {
         (true, ..) => Pace::AfterEachDecision,
@@ -136,11 +135,7 @@ pub fn run(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
     };
     let feed = Feed { without: replaced(&topics), run: Box::new(move |run, stop| player.play(run, stop)) };
     let (ended, _) = run_graph(&launch, Some(feed), &terminal)?;
-    if ended == Ended::Interrupted {
-        terminal.log(LAUNCHER, "INFO interrupted: all stages have ended");
-        return Ok(ExitCode::from(crate::launch::INTERRUPTED));
-    }
-    if !args.verify {
+    if ended == Ended::Interrupted || !args.verify {
         return Ok(ExitCode::SUCCESS);
     }
     let replayed = std::mem::take(&mut *replayed.lock().unwrap_or_else(std::sync::PoisonError::into_inner));

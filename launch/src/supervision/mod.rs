@@ -17,7 +17,7 @@ mod service_manager;
 use anyhow::{Context, anyhow, bail, ensure};
 use carff::terminal::Terminal;
 use carff_config::{GraphConfig, WhenLost};
-use carff_messages::Stage;
+use carff_messages::{HealthState, Stage};
 use carff_runtime::StageArgs;
 use carff_transport::{Node, Run, Stop, Waiter, Woken, monotonic_now_ns, topics};
 use health::{Ailment, Limits, StageHealth};
@@ -87,7 +87,7 @@ pub(crate) struct Supervisor<'a> {
     stages: Vec<Watched>,
     stage_args: StageArgs,
     folder: PathBuf,
-    decided: &'a dyn Fn(&FrameRecord),
+    decided: &'a mut dyn FnMut(&FrameRecord),
     terminal: Arc<Terminal>,
     watchdog: Watchdog,
     /// Thread of the feed, once it has started.
@@ -108,7 +108,7 @@ impl<'a> Supervisor<'a> {
         stages: (PathBuf, StageArgs),
         stop: &Stop,
         terminal: &Arc<Terminal>,
-        decided: &'a dyn Fn(&FrameRecord),
+        decided: &'a mut dyn FnMut(&FrameRecord),
     ) -> anyhow::Result<Self> {
         let (folder, stage_args) = stages;
         Ok(Self {
@@ -264,7 +264,7 @@ impl<'a> Supervisor<'a> {
     }
 
     fn collect(&mut self) -> anyhow::Result<()> {
-        Ok(self.monitor.drain(self.decided)?)
+        Ok(self.monitor.drain(&mut *self.decided)?)
     }
 
     /// Checks the stages: kills those that hang, restarts those that died, by policy. Returns true when the camera is
@@ -367,13 +367,16 @@ impl<'a> Supervisor<'a> {
     fn show_status(&self) {
         let (records, now_ns) = (&self.monitor.records, monotonic_now_ns());
         let restarts: u32 = self.stages.iter().map(|s| s.budget.restarts()).sum();
-        let stages: Vec<String> =
-            self.stages.iter().map(|w| format!("{} {}", w.stage, w.health.state(now_ns))).collect();
+        let other = self.stages.iter().map(|w| (w.stage, w.health.state(now_ns)));
+        let other: Vec<_> =
+            other.filter(|(_, state)| *state != HealthState::Ok).map(|(s, state)| format!("{s} {state}")).collect();
+        let latest = records.frames.values().rev().find_map(|f| Some((f.action?, f.hazard_probability)));
         self.terminal.status(format!(
-            "frames {} skipped {} restarts {restarts} | {}",
+            "frame {}{} | skipped {}, restarts {restarts} | {}",
             records.frame_count(),
+            latest.map_or(String::new(), |(action, hazard)| format!("  hazard {hazard:.2} {}", action.name())),
             records.skipped(),
-            stages.join(", ")
+            if other.is_empty() { "all stages ok".to_owned() } else { other.join(", ") }
         ));
     }
 

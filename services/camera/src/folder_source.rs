@@ -5,10 +5,10 @@ use anyhow::{Context, anyhow, ensure};
 use carff_base::geometry::PinholeCamera;
 use carff_base::random::Key;
 use carff_config::GraphConfig;
-use carff_dataset::Image;
 use carff_dataset::sensor::{SensorNoise, apply_noise_into};
+use carff_dataset::{Image, image_files};
 use carff_messages::{DatasetView, FrameMeta};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 /// Assumed horizontal field of view, because plain images do not contain it, degrees.
 const FIELD_OF_VIEW_DEG: f64 = 60.0;
@@ -16,7 +16,8 @@ const FIELD_OF_VIEW_DEG: f64 = 60.0;
 /// The images of a folder, in memory.
 #[derive(Debug)]
 pub struct FolderSource {
-    images: Vec<Image>,
+    /// Index of each image in its folder, and the image.
+    images: Vec<(i32, Image)>,
     noise: SensorNoise,
     seed: u64,
     repeat: bool,
@@ -29,16 +30,13 @@ impl FolderSource {
     /// Loads all PNG images of a folder. An image that cannot be read, or has another size than the first, is omitted
     /// with an error that names it. A folder without a usable image is an error.
     pub fn open(folder: &Path, graph: &GraphConfig) -> anyhow::Result<(Self, Vec<anyhow::Error>)> {
-        let entries = std::fs::read_dir(folder).with_context(|| format!("cannot read folder {}", folder.display()))?;
-        let mut paths: Vec<PathBuf> = entries.filter_map(|e| Some(e.ok()?.path())).collect();
-        paths.retain(|p| p.extension().is_some_and(|e| e.eq_ignore_ascii_case("png")));
-        paths.sort();
-        let mut images: Vec<Image> = Vec::new();
+        let paths = image_files(folder).with_context(|| format!("cannot read folder {}", folder.display()))?;
+        let mut images: Vec<(i32, Image)> = Vec::new();
         let mut errors = Vec::new();
-        for path in &paths {
+        for (index, path) in (0..).zip(&paths) {
             match Image::load_png(path) {
                 Ok(image) => match images.first() {
-                    Some(first) if (first.width_px, first.height_px) != (image.width_px, image.height_px) => {
+                    Some((_, first)) if (first.width_px, first.height_px) != (image.width_px, image.height_px) => {
                         errors.push(anyhow!(
                             "{}: {}x{} pixels, but the first image has {}x{}: omitted; scale it",
                             path.display(),
@@ -48,7 +46,7 @@ impl FolderSource {
                             first.height_px
                         ));
                     }
-                    _ => images.push(image),
+                    _ => images.push((index, image)),
                 },
                 Err(error) => errors.push(anyhow::Error::new(error).context("left out")),
             }
@@ -75,7 +73,7 @@ impl FolderSource {
 
 impl Source for FolderSource {
     fn max_image_bytes(&self) -> usize {
-        self.images[0].rgb.len()
+        self.images[0].1.rgb.len()
     }
 
     fn advance(&mut self) -> anyhow::Result<Option<FrameMeta>> {
@@ -85,7 +83,7 @@ impl Source for FolderSource {
         }
         self.current = self.shown % total / self.frames_per_picture;
         self.shown += 1;
-        let image = &self.images[self.current];
+        let (view, image) = &self.images[self.current];
         let camera = PinholeCamera::look_at(
             [0.0; 3],
             [0.0, 1.0, 0.0],
@@ -94,12 +92,12 @@ impl Source for FolderSource {
             image.height_px,
             FIELD_OF_VIEW_DEG,
         );
-        Ok(Some(FrameMeta::of_camera(&camera, DatasetView::UNKNOWN)))
+        Ok(Some(FrameMeta::of_camera(&camera, DatasetView { view: *view, ..DatasetView::UNKNOWN })))
     }
 
     fn write(&mut self, frame_id: u64, picture: &mut [u8]) -> anyhow::Result<()> {
         let key = Key { seed: self.seed, frame: frame_id, step: 0, sample: 0 };
-        Ok(apply_noise_into(&self.images[self.current].rgb, picture, &self.noise, key)?)
+        Ok(apply_noise_into(&self.images[self.current].1.rgb, picture, &self.noise, key)?)
     }
 }
 
@@ -135,14 +133,16 @@ mod tests {
         assert_eq!(errors.len(), 2, "{errors:?}");
         assert!(errors[0].contains("b.png") && errors[1].contains("c.png"), "{errors:?}");
 
-        let mut greys = Vec::new();
+        let (mut greys, mut views) = (Vec::new(), Vec::new());
         let mut picture = vec![0; source.max_image_bytes()];
         while let Some(meta) = source.advance().unwrap() {
             assert_eq!((meta.width_px, meta.height_px), (4, 2));
+            views.push(meta.dataset_view.view);
             source.write(greys.len() as u64, &mut picture).unwrap();
             greys.push(picture[0]);
         }
         assert_eq!(greys, [10, 10, 90, 90]);
+        assert_eq!(views, [0, 0, 3, 3], "the index of the file, also of files that are left out");
     }
 
     /// A folder without a usable image, and a missing folder, are errors that name it.

@@ -7,8 +7,10 @@
 //! | [`statistics`] | percentiles, intervals and PSNR |
 //! | [`names`] | suggestions for unknown names |
 //! | [`errors`] | an error and its causes as one sentence |
+//! | [`files`] | checks of output files |
 
 pub mod errors;
+pub mod files;
 pub mod geometry;
 pub mod names;
 pub mod random;

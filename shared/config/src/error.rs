@@ -43,6 +43,12 @@ pub enum ConfigError {
         /// Current name of the key.
         now: String,
     },
+    /// A setting of the command line cannot be applied.
+    #[error("`{setting}` sets nothing: wanted is `key=value`, such as `run.samples=35`")]
+    Setting {
+        /// The setting.
+        setting: String,
+    },
     /// A value is out of range.
     #[error("{path}:{line}: `{key}` is {value}; allowed: {allowed}")]
     Range {

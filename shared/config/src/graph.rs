@@ -309,6 +309,19 @@ impl Default for OverloadConfig {
     }
 }
 
+/// Sets one dotted key; `None` if the setting has no `=`, or if a part of the key is not a table.
+fn set(table: &mut toml::Table, setting: &str) -> Option<()> {
+    let (key, text) = setting.split_once('=')?;
+    let parsed = toml::from_str::<toml::Table>(&format!("value = {text}")).ok().and_then(|mut t| t.remove("value"));
+    let (tables, name) = key.trim().rsplit_once('.').unwrap_or(("", key.trim()));
+    let mut inner = table;
+    for part in tables.split('.').filter(|part| !part.is_empty()) {
+        inner = inner.entry(part).or_insert_with(|| toml::Table::new().into()).as_table_mut()?;
+    }
+    inner.insert(name.to_owned(), parsed.unwrap_or_else(|| text.into()));
+    Some(())
+}
+
 fn one() -> u64 {
     1
 }
@@ -326,6 +339,41 @@ impl GraphConfig {
     /// Reads and checks a graph file.
     pub fn load(path: &Path) -> Result<Self, ConfigError> {
         Self::parse(&read(path, "graph")?, path)
+    }
+
+    /// Reads a graph file, and sets keys in it: each setting is `key=value` with a dotted key, such as `run.samples=35`.
+    /// The value is TOML, or else a string.
+    ///
+    /// # Errors
+    ///
+    /// As [`Self::load`], and for a setting without `=` or below a key that is not a table.
+    pub fn load_with(path: &Path, settings: &[String]) -> Result<Self, ConfigError> {
+        let text = read(path, "graph")?;
+        if settings.is_empty() {
+            return Self::parse(&text, path);
+        }
+        let mut table: toml::Table = toml::from_str(&text).map_err(|e| Source { path, text: &text }.syntax(&e))?;
+        for setting in settings {
+            set(&mut table, setting).ok_or_else(|| ConfigError::Setting { setting: setting.clone() })?;
+        }
+        Self::parse(&table.to_string(), path)
+    }
+
+    /// Returns the effective configuration as TOML, with absolute paths.
+    ///
+    /// # Errors
+    ///
+    /// If a path is not UTF-8.
+    pub fn to_toml(&self) -> Result<String, toml::ser::Error> {
+        let mut graph = self.clone();
+        graph.run.dataset = self.resolve(&self.run.dataset);
+        graph.run.checkpoint = self.resolve(&self.run.checkpoint);
+        graph.run.scenario = self.scenario_path().map(|path| path.with_extension("").display().to_string());
+        graph.camera.folder = self.camera.folder.as_ref().map(|folder| self.resolve(folder));
+        for path in [&mut graph.run.dataset, &mut graph.run.checkpoint].into_iter().chain(&mut graph.camera.folder) {
+            *path = std::path::absolute(&*path).unwrap_or_else(|_| path.clone());
+        }
+        toml::to_string(&graph)
     }
 
     /// Reads and checks the text of a graph file; errors name `path`, and relative paths are resolved from there.

@@ -43,6 +43,7 @@ mod registry;
 mod retry;
 mod run;
 mod space;
+mod stop;
 pub mod topics;
 mod wait;
 
@@ -56,8 +57,9 @@ pub use receiver::{Receiver, Sample};
 pub use registry::{AnyPublisher, AnyReceiver, AnyTopic, Received, TopicId, UnknownTopic};
 pub use run::{Run, cleanup_dead, living_processes, remove_run_leftovers, run_id_of, runtime_dir};
 pub use space::{SHARED_MEMORY_DIR, check_space};
+pub use stop::{INTERRUPTED, Stop, exit_on_signals, is_interrupted};
 pub use topics::{Limits, Topic};
-pub use wait::{Input, Stop, Waiter, Woken};
+pub use wait::{Input, Waiter, Woken};
 
 /// Returns the present time of the clock that all headers use: `CLOCK_MONOTONIC`, nanoseconds, the same in all processes
 /// of a machine.

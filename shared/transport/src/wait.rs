@@ -1,12 +1,8 @@
 //! Waits for an input, a time, or a stop.
 
-use crate::{ReceiveError, WaitError, monotonic_now_ns};
+use crate::{ReceiveError, Stop, WaitError, monotonic_now_ns};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
-use std::io::Write;
-use std::os::fd::{AsFd, BorrowedFd};
-use std::os::unix::net::UnixStream;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::os::fd::BorrowedFd;
 use std::time::Duration;
 
 /// Maximum number of inputs of one wait.
@@ -35,55 +31,6 @@ pub enum Woken {
     Timeout,
     /// The process must end.
     Stopped,
-}
-
-/// A stop signal for the process. Clones share one state.
-///
-/// ```
-/// use carff_transport::{Stop, Waiter, Woken, monotonic_now_ns};
-/// let stop = Stop::new()?;
-/// let waiter = Waiter::new(stop.clone());
-/// assert_eq!(waiter.wait_until(&[], monotonic_now_ns())?, Woken::Timeout);
-/// stop.stop();
-/// assert_eq!(waiter.wait_until(&[], u64::MAX)?, Woken::Stopped);
-/// # Ok::<(), Box<dyn std::error::Error>>(())
-/// ```
-#[derive(Clone, Debug)]
-pub struct Stop {
-    flag: Arc<AtomicBool>,
-    read: Arc<UnixStream>,
-    write: Arc<UnixStream>,
-}
-
-impl Stop {
-    /// Creates a stop that only [`Stop::stop`] triggers.
-    pub fn new() -> std::io::Result<Self> {
-        let (read, write) = UnixStream::pair()?;
-        write.set_nonblocking(true)?;
-        Ok(Self { flag: Arc::default(), read: Arc::new(read), write: Arc::new(write) })
-    }
-
-    /// Creates a stop that SIGINT and SIGTERM also trigger, in whichever thread they arrive.
-    pub fn on_signals() -> std::io::Result<Self> {
-        let stop = Self::new()?;
-        for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
-            signal_hook::flag::register(signal, stop.flag.clone())?;
-            signal_hook::low_level::pipe::register(signal, stop.write.try_clone()?)?;
-        }
-        Ok(stop)
-    }
-
-    /// Ends all current and later waits.
-    pub fn stop(&self) {
-        self.flag.store(true, Ordering::Release);
-        // It only fails if the socket is full: then it is already readable, which suffices.
-        let _ = (&*self.write).write(&[0]);
-    }
-
-    /// Returns true if the stop has been triggered.
-    pub fn is_stopped(&self) -> bool {
-        self.flag.load(Ordering::Acquire)
-    }
 }
 
 /// Number of checks of polled inputs between two reads of the clock.
@@ -154,7 +101,7 @@ impl Waiter {
     }
 
     fn sleep(&self, inputs: &[&dyn Input], timeout_ns: u64) -> Result<(), WaitError> {
-        let stop = PollFd::from_borrowed_fd(self.stop.read.as_fd(), PollFlags::IN);
+        let stop = self.stop.descriptor();
         let mut descriptors: [PollFd<'_>; MAX_INPUTS + 1] = std::array::from_fn(|_| stop.clone());
         for (slot, descriptor) in descriptors[1..].iter_mut().zip(inputs.iter().filter_map(|i| i.descriptor())) {
             *slot = PollFd::from_borrowed_fd(descriptor, PollFlags::IN);

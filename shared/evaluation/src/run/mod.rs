@@ -100,6 +100,51 @@ pub fn decisive_frames(
     by_drive.into_values().collect()
 }
 
+/// Correct decisions of a run's drives, under the rule and the samples that drove: `drives` of its report.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct DriveCounts {
+    /// Rule of the controller.
+    pub rule: String,
+    /// Requested samples of each step.
+    pub samples: usize,
+    /// Drives in which halting is correct.
+    pub hazard: Count,
+    /// Drives in which advancing is correct.
+    pub clear: Count,
+}
+
+impl DriveCounts {
+    /// Counts the decisive frames.
+    ///
+    /// ```
+    /// use carff_evaluation::run::DriveCounts;
+    /// let counts = DriveCounts::of(carff_messages::Rule::Calibrated, 10, &[]);
+    /// assert_eq!(counts.hazard.trials, 0);
+    /// ```
+    pub fn of(rule: Rule, samples: usize, decisive: &[(DecidedFrame, DriveKind)]) -> Self {
+        let mut counts =
+            Self { rule: rule.name().to_owned(), samples, hazard: Count::default(), clear: Count::default() };
+        for (frame, kind) in decisive {
+            match kind {
+                DriveKind::Hazard => counts.hazard.add(frame.halted),
+                DriveKind::Clear => counts.clear.add(!frame.halted),
+            }
+        }
+        counts
+    }
+
+    /// The counts as text, one line for each kind of drive.
+    pub fn text(&self) -> String {
+        let [hazard, clear] = [self.hazard, self.clear].map(|count| share(Some(count)));
+        format!(
+            "Drives of this run, correct decisions of the rule `{}` with {} samples, 95 % interval\n  \
+             hazard, not visible: halts     {hazard}\n  clear, in full view: advances  {clear}",
+            self.rule, self.samples
+        )
+    }
+}
+
 /// Planning tables of a run: `planning` of its report.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -187,10 +232,18 @@ impl JudgedRun {
     }
 
     /// Computes the planning tables from the decisive frames of the run.
-    pub fn planning(&self, decisive: &[(DecidedFrame, DriveKind)]) -> Result<RunPlanning, EvaluationError> {
+    /// `progress` receives the present step.
+    pub fn planning(
+        &self,
+        decisive: &[(DecidedFrame, DriveKind)],
+        progress: impl Fn(String),
+    ) -> Result<RunPlanning, EvaluationError> {
+        progress("planning tables, 1 of 3: the drives".to_owned());
         let (drives, live) = self.drives_table(decisive);
         let split = PoseSplit::for_dataset(&self.dataset, self.settings.split_seed);
+        progress("planning tables, 2 of 3: every eligible image of trained poses".to_owned());
         let (all_views, of_all) = self.views_table(&split.views(PoseRole::Rest))?;
+        progress("planning tables, 3 of 3: every eligible image of held-out poses".to_owned());
         let (unseen_views, of_unseen) = self.views_table(&split.views(PoseRole::Unseen))?;
         let (drives, free_drives) =
             if self.settings.free.is_some() { (None, Some(drives)) } else { (Some(drives), None) };

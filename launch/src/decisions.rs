@@ -1,0 +1,177 @@
+//! Shows the decisions of a run, and writes them as JSON lines.
+
+use crate::planning::decided;
+use crate::supervision::monitor::FrameRecord;
+use anyhow::{Context, anyhow};
+use carff::terminal::Terminal;
+use carff_config::{CameraSource, GraphConfig};
+use carff_dataset::ScenarioInfo;
+use carff_dataset::drives::DriveKind;
+use carff_evaluation::run::decisive_frames;
+use carff_messages::{ActionCode, Observability, Reason};
+use serde_json::json;
+use std::fs::File;
+use std::io::{LineWriter, Write};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+/// The decisions of a run: one result line for each drive, or, where asked for, one line for each frame.
+pub(crate) struct Decisions {
+    terminal: Arc<Terminal>,
+    verbose: bool,
+    drives: u32,
+    frames_per_timestamp: u32,
+    scenario: Option<ScenarioInfo>,
+    /// Image files of a folder source, by index.
+    images: Vec<PathBuf>,
+    file: Option<(PathBuf, LineWriter<File>)>,
+    failed: Option<anyhow::Error>,
+    /// Decided frames of the current drive.
+    drive: Vec<FrameRecord>,
+    /// The latest action of a source without drives.
+    action: Option<ActionCode>,
+}
+
+impl Decisions {
+    /// Prepares the output; `path` is the file of the JSON lines.
+    pub(crate) fn new(
+        graph: &GraphConfig,
+        drives: u32,
+        verbose: bool,
+        path: Option<&Path>,
+        scenario: Option<ScenarioInfo>,
+        terminal: &Arc<Terminal>,
+    ) -> anyhow::Result<Self> {
+        let create = |path: &Path| -> anyhow::Result<_> {
+            let file = File::create(path).with_context(|| format!("cannot write {}", path.display()))?;
+            Ok((path.to_owned(), LineWriter::new(file)))
+        };
+        let images = match (graph.camera.source, &graph.camera.folder) {
+            (CameraSource::Folder, Some(folder)) => {
+                carff_dataset::image_files(&graph.resolve(folder)).unwrap_or_default()
+            }
+            _ => Vec::new(),
+        };
+        Ok(Self {
+            terminal: terminal.clone(),
+            verbose,
+            drives,
+            frames_per_timestamp: graph.camera.frames_per_timestamp,
+            scenario,
+            images,
+            file: path.map(create).transpose()?,
+            failed: None,
+            drive: Vec::new(),
+            action: None,
+        })
+    }
+
+    /// Takes one decided frame.
+    pub(crate) fn take(&mut self, frame: &FrameRecord) {
+        if let Some((path, file)) = &mut self.file
+            && let Err(error) = writeln!(file, "{}", record(frame, &self.images))
+        {
+            // The run continues; its end reports the error.
+            self.failed = Some(anyhow!(error).context(format!("cannot write {}", path.display())));
+            self.file = None;
+        }
+        let is_change =
+            frame.drive < 0 && self.action.replace(frame.action.unwrap_or(ActionCode::Halt)) != frame.action;
+        if self.verbose || is_change {
+            self.terminal.line(&self.frame_line(frame));
+        }
+        if frame.drive >= 0 {
+            if self.drive.first().is_some_and(|first| first.drive != frame.drive) {
+                self.end_drive();
+            }
+            self.drive.push(frame.clone());
+        }
+    }
+
+    /// Ends the output: prints the last drive, and returns the error that stopped the file.
+    pub(crate) fn finish(mut self) -> anyhow::Result<()> {
+        self.end_drive();
+        self.failed.map_or(Ok(()), Err)
+    }
+
+    fn end_drive(&mut self) {
+        let frames = std::mem::take(&mut self.drive);
+        if let Some(last) = frames.last().filter(|_| !self.verbose) {
+            self.terminal.line(&self.drive_line(last.drive, &frames));
+        }
+    }
+
+    /// Number of a drive, its actions, and its decisive frame where it has one.
+    fn drive_line(&self, drive: i32, frames: &[FrameRecord]) -> String {
+        let halts = frames.iter().filter(|f| f.action != Some(ActionCode::Advance)).count();
+        let mut line = format!("drive {:>3}/{}  {:>3} frames, {halts:>3} halts", drive + 1, self.drives, frames.len());
+        let decisive = self.scenario.as_ref().map(|s| decisive_frames(frames.iter().filter_map(decided), s));
+        if let Some((frame, kind)) = decisive.and_then(|found| found.into_iter().next()) {
+            let right = frame.halted == (kind == DriveKind::Hazard);
+            let (action, verdict) = (action_name(frame.halted), if right { "correct" } else { "WRONG" });
+            line += &format!(
+                "  {:<6} t{}  hazard {:.2}  {}  {}",
+                kind.name(),
+                frame.timestamp,
+                frame.hazard_probability,
+                self.terminal.alarm(action, frame.halted),
+                self.terminal.alarm(verdict, !right)
+            );
+        }
+        line
+    }
+
+    fn frame_line(&self, frame: &FrameRecord) -> String {
+        let halted = frame.action != Some(ActionCode::Advance);
+        let action = self.terminal.alarm(action_name(halted), halted);
+        format!(
+            "{}  hazard {:.2}  {action}  {:>6.1} ms",
+            self.place(frame),
+            frame.hazard_probability,
+            latency_ms(frame)
+        )
+    }
+
+    fn place(&self, frame: &FrameRecord) -> String {
+        if frame.drive < 0 {
+            return format!("frame {:>6}", frame.frame_id);
+        }
+        format!(
+            "drive {:>3}/{}  t{} frame {:>2}/{}  view {:>3}  {:<8}",
+            frame.drive + 1,
+            self.drives,
+            frame.timestamp,
+            frame.frame_in_drive % self.frames_per_timestamp as i32 + 1,
+            self.frames_per_timestamp,
+            frame.view,
+            frame.observability.map_or("unknown", Observability::name)
+        )
+    }
+}
+
+fn action_name(halted: bool) -> &'static str {
+    if halted { "HALT   " } else { "advance" }
+}
+
+fn latency_ms(frame: &FrameRecord) -> f64 {
+    frame.latency_ns as f64 / 1e6
+}
+
+/// A decided frame as one JSON object. `source` is the image file, or the view of the dataset; null for a random pose.
+fn record(frame: &FrameRecord, images: &[PathBuf]) -> serde_json::Value {
+    let view = usize::try_from(frame.view).ok();
+    let source = match view.and_then(|view| images.get(view)) {
+        Some(file) => json!(file),
+        None => json!(view),
+    };
+    json!({
+        "frame": frame.frame_id,
+        "drive": u32::try_from(frame.drive).ok(),
+        "source": source,
+        "capture_time_ns": frame.capture_time_ns,
+        "hazard": frame.hazard_probability,
+        "action": frame.action.map(ActionCode::name),
+        "reason": frame.reason.map(Reason::name),
+        "latency_ms": latency_ms(frame),
+    })
+}
