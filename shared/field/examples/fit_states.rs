@@ -197,7 +197,7 @@ fn main() -> Result<()> {
         .iter()
         .map(|p| {
             let same: Vec<&[u8]> = set.images.iter().filter(|q| q.view == p.view).map(|q| &q.rgb[..]).collect();
-            TrainingView { camera: p.camera, rgb: p.rgb.clone(), changed: changed_pixels(&same, 12) }
+            TrainingView { camera: p.camera, rgb: p.rgb.clone(), changed: changed_pixels(&same, 12), valid: Vec::new() }
         })
         .collect();
     let codes: Vec<[f32; LATENT_DIM]> = (0..set.states).map(|s| normals(100 + s as u64)).collect();

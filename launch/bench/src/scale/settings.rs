@@ -235,7 +235,7 @@ fn write_pictures(from: &Path, to: &Path, side_px: u32) -> anyhow::Result<()> {
     // From all over the folder, so that different states are shown.
     let stride = (paths.len() / PICTURES).max(1);
     for (i, path) in paths.iter().step_by(stride).take(PICTURES).enumerate() {
-        scaled(&Image::load_png(path)?, side_px).save_png(&to.join(format!("{i:03}.png")))?;
+        scaled(&Image::load(path)?, side_px).save_png(&to.join(format!("{i:03}.png")))?;
     }
     Ok(())
 }
