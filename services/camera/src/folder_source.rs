@@ -34,7 +34,7 @@ impl FolderSource {
         let mut images: Vec<(i32, Image)> = Vec::new();
         let mut errors = Vec::new();
         for (index, path) in (0..).zip(&paths) {
-            match Image::load_png(path) {
+            match Image::load(path) {
                 Ok(image) => match images.first() {
                     Some((_, first)) if (first.width_px, first.height_px) != (image.width_px, image.height_px) => {
                         errors.push(anyhow!(

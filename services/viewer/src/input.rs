@@ -46,7 +46,7 @@ impl Input {
     /// Reads an input from a PNG file.
     pub fn load_png(path: &Path) -> Result<Arc<Self>, DatasetError> {
         let title = path.file_name().map_or_else(|| path.display().to_string(), |n| n.to_string_lossy().into_owned());
-        Ok(Self::of_picture(title, Image::load_png(path)?))
+        Ok(Self::of_picture(title, Image::load(path)?))
     }
 }
 

@@ -198,7 +198,7 @@ fn scenes_are_drawn_and_saved() {
     click(&mut harness, "Predict");
     wait_until_drawn(&mut harness);
     press(&mut harness, Modifiers::SHIFT, Key::S);
-    let saved = carff_dataset::Image::load_png(&folder.path().join("carff-scene-0001.png")).unwrap();
+    let saved = carff_dataset::Image::load(&folder.path().join("carff-scene-0001.png")).unwrap();
     assert_eq!(saved.width_px.max(saved.height_px), 96);
     assert!(harness.state().message().unwrap().contains("carff-scene-0001.png"));
 

@@ -41,7 +41,8 @@ pub struct BackboneConfig {
     /// True if the weights are frozen. A small convolutional network from scratch must be trained.
     #[serde(default = "yes")]
     pub frozen: bool,
-    /// Side in pixels to which images are resized before they enter.
+    /// Side in pixels to which images are resized before they enter: a multiple of 32, or of a vision transformer's
+    /// patches.
     #[serde(default = "default_input_px")]
     pub input_px: i64,
     /// Size of a vision transformer; ignored for other kinds.
@@ -88,11 +89,19 @@ pub struct VitConfig {
     pub depth: i64,
     /// Attention heads; must divide the width.
     pub heads: i64,
+    /// Register tokens.
+    #[serde(skip_serializing_if = "is_zero")]
+    pub registers: i64,
+}
+
+#[allow(clippy::trivially_copy_pass_by_ref, reason = "serde passes a reference")]
+fn is_zero(count: &i64) -> bool {
+    *count == 0
 }
 
 impl Default for VitConfig {
     fn default() -> Self {
-        Self { patch_px: 16, width: 1024, depth: 24, heads: 16 }
+        Self { patch_px: 16, width: 1024, depth: 24, heads: 16, registers: 0 }
     }
 }
 

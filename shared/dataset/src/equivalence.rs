@@ -3,7 +3,7 @@
 use rayon::prelude::*;
 
 use crate::dataset::Dataset;
-use crate::image::{Image, looks_same};
+use crate::image::{Image, looks_same, looks_same_where};
 
 /// Visual equivalence of states, per view.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -14,33 +14,34 @@ pub struct Equivalence {
 }
 
 impl Equivalence {
-    /// Compares all pairs of states in each view. `images` are those of [`Dataset::load_all_images`]. A state without
-    /// an image in a view is only equivalent to itself.
+    /// Compares all pairs of states in each view, in the pixels that are valid in both images. `images` are those of
+    /// [`Dataset::load_all_images`]. A state without an image in a view is only equivalent to itself.
     pub fn from_dataset(dataset: &Dataset, images: &[Image]) -> Self {
         let (views, states) = (dataset.view_count(), dataset.state_count());
-        let mut pictures = vec![vec![None; states]; views];
-        for (image, frame) in images.iter().zip(dataset.frames()) {
+        let mut frames = vec![vec![None; states]; views];
+        for (i, frame) in dataset.frames().iter().enumerate().take(images.len()) {
             if let (Some(view), Some(state)) = (frame.view, frame.state) {
-                pictures[view][state] = Some(image);
+                frames[view][state] = Some(i);
             }
         }
-        Self::of_pictures(states, &pictures)
+        Self::of(states, &frames, |&a, &b| looks_same_where(&images[a], &images[b], dataset.valid_in_all(&[a, b])))
     }
 
     /// Compares all pairs of states in each view; `pictures` has a row of `states` images per view.
     pub fn of_pictures(states: usize, pictures: &[Vec<Option<&Image>>]) -> Self {
-        let same = pictures
+        Self::of(states, pictures, |a, b| looks_same(a, b))
+    }
+
+    fn of<T: Sync>(states: usize, rows: &[Vec<Option<T>>], alike: impl Fn(&T, &T) -> bool + Sync) -> Self {
+        let same = rows
             .par_iter()
             .flat_map_iter(|of_view| {
-                let of = |state: usize| of_view.get(state).copied().flatten();
+                let of = |state: usize| of_view.get(state).and_then(Option::as_ref);
                 let mut same = vec![false; states * states];
                 for a in 0..states {
                     same[a * states + a] = true;
                     for b in 0..a {
-                        let equal = match (of(a), of(b)) {
-                            (Some(a), Some(b)) => looks_same(a, b),
-                            _ => false,
-                        };
+                        let equal = of(a).zip(of(b)).is_some_and(|(a, b)| alike(a, b));
                         same[a * states + b] = equal;
                         same[b * states + a] = equal;
                     }

@@ -66,6 +66,9 @@ pub enum DatasetError {
         /// The error and the allowed values.
         problem: String,
     },
+    /// Several images or masks are missing or broken.
+    #[error("{} images or masks cannot be used:{}", .0.len(), listed(.0))]
+    Several(Vec<DatasetError>),
     /// The dataset has no frame of this index.
     #[error("frame {index} does not exist; the dataset has {count} frames")]
     NoSuchFrame {
@@ -83,4 +86,23 @@ pub enum DatasetError {
         /// Path of the folder.
         path: PathBuf,
     },
+}
+
+impl DatasetError {
+    /// Returns `Ok` without errors, and an error that lists them otherwise.
+    pub(crate) fn of_all(mut errors: Vec<Self>) -> Result<(), Self> {
+        match errors.len() {
+            0 => Ok(()),
+            1 => Err(errors.remove(0)),
+            _ => Err(Self::Several(errors)),
+        }
+    }
+}
+
+/// Returns one line for each of the first errors, and the number of further ones.
+fn listed(errors: &[DatasetError]) -> String {
+    let shown = errors.iter().take(20).map(|error| format!("\n  {error}"));
+    let more =
+        (errors.len() > 20).then(|| format!("\n  and {} more; `carff dataset check` lists all", errors.len() - 20));
+    shown.chain(more).collect()
 }

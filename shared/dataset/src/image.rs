@@ -1,12 +1,11 @@
 //! Images in memory and as PNG files.
 
 use std::fs::File;
-use std::io::{BufReader, BufWriter};
+use std::io::{BufReader, BufWriter, Cursor};
 use std::path::Path;
 
-use image::codecs::jpeg::JpegDecoder;
-use image::codecs::png::{PngDecoder, PngEncoder};
-use image::{ColorType, ExtendedColorType, ImageDecoder, ImageEncoder, ImageFormat, ImageReader, Limits};
+use image::codecs::png::PngEncoder;
+use image::{ColorType, DynamicImage, ExtendedColorType, ImageEncoder, ImageFormat, ImageReader, Limits};
 
 use ndarray::{ArrayView3, ArrayViewMut3, s};
 
@@ -77,51 +76,29 @@ impl Image {
         Some(10.0 * (255.0_f64 * 255.0 * self.rgb.len() as f64 / sum).log10())
     }
 
-    /// Reads a PNG image with eight bits per channel. Grey becomes RGB with equal channels. An opaque alpha channel is
-    /// dropped; a transparent pixel is an error, because its background is unknown.
-    pub fn load_png(path: &Path) -> Result<Self, DatasetError> {
+    /// Reads a PNG or JPEG image with eight bits per channel; the content decides, not the name. Grey becomes RGB with
+    /// equal channels. An opaque alpha channel is dropped.
+    ///
+    /// # Errors
+    ///
+    /// Names the file. A transparent pixel is an error, because its background is unknown; so is a cut-off file.
+    pub fn load(path: &Path) -> Result<Self, DatasetError> {
         let problem = |problem: String| DatasetError::Image { path: path.to_owned(), problem };
-        let file = File::open(path).map_err(|source| DatasetError::Io { path: path.to_owned(), source })?;
-        let mut limits = Limits::default();
-        limits.max_image_width = Some(MAX_IMAGE_SIDE_PX);
-        limits.max_image_height = Some(MAX_IMAGE_SIDE_PX);
-        let decoder = PngDecoder::with_limits(BufReader::new(file), limits)
-            .map_err(|error| problem(format!("not a readable PNG image: {error}")))?;
-        let (width_px, height_px) = decoder.dimensions();
-        if width_px > MAX_IMAGE_SIDE_PX || height_px > MAX_IMAGE_SIDE_PX {
-            return Err(problem(format!("{width_px}x{height_px} pixels; at most {MAX_IMAGE_SIDE_PX} a side")));
-        }
-        let color = decoder.color_type();
-        let channels = match color {
-            ColorType::Rgb8 => 3,
-            ColorType::Rgba8 => 4,
-            ColorType::L8 => 1,
-            ColorType::La8 => 2,
+        let decoded = decode(path)?;
+        let opaque = match decoded.color() {
+            ColorType::Rgb8 | ColorType::L8 => None,
+            ColorType::Rgba8 | ColorType::La8 => Some(decoded.to_rgba8()),
             other => return Err(problem(format!("pixel type {other:?}; RGB with 8 bits per channel is needed"))),
         };
-        let mut bytes = vec![0; decoder.total_bytes() as usize];
-        decoder.read_image(&mut bytes).map_err(|error| problem(format!("not a readable PNG image: {error}")))?;
-        let opaque_part = if channels % 2 == 0 {
-            if let Some(at) = bytes.chunks_exact(channels).position(|pixel| pixel[channels - 1] != 255) {
-                let (x, y) = (at % width_px as usize, at / width_px as usize);
-                return Err(problem(format!(
-                    "pixel ({x}, {y}) is transparent; only opaque images are accepted, so compose it over its \
-                     background first"
-                )));
-            }
-            channels - 1
-        } else {
-            channels
-        };
-        let rgb = if channels == 3 {
-            bytes
-        } else {
-            bytes
-                .chunks_exact(channels)
-                .flat_map(|pixel| if opaque_part == 1 { [pixel[0]; 3] } else { [pixel[0], pixel[1], pixel[2]] })
-                .collect()
-        };
-        Ok(Self { width_px, height_px, rgb })
+        if let Some((x, y, _)) = opaque.iter().flat_map(|rgba| rgba.enumerate_pixels()).find(|(_, _, p)| p.0[3] != 255)
+        {
+            return Err(problem(format!(
+                "pixel ({x}, {y}) is transparent; only opaque images are accepted, so compose it over its background \
+                 first"
+            )));
+        }
+        let (width_px, height_px) = (decoded.width(), decoded.height());
+        Ok(Self { width_px, height_px, rgb: decoded.into_rgb8().into_raw() })
     }
 
     /// Writes the image as an 8-bit RGB PNG file.
@@ -133,53 +110,89 @@ impl Image {
 /// Returns true if two images look the same: equal size, and at most [`MAX_DIFFERENT_PIXELS`] pixels differ by more
 /// than [`PIXEL_TOLERANCE`] in any channel.
 pub fn looks_same(a: &Image, b: &Image) -> bool {
+    looks_same_where(a, b, |_| true)
+}
+
+/// Returns [`looks_same`] for the pixels whose index `counts`.
+pub(crate) fn looks_same_where(a: &Image, b: &Image, counts: impl Fn(usize) -> bool) -> bool {
+    let pixels = a.rgb.chunks_exact(3).zip(b.rgb.chunks_exact(3)).enumerate();
+    let differ = |(i, (a, b)): &(usize, (&[u8], &[u8]))| {
+        a.iter().zip(*b).any(|(a, b)| a.abs_diff(*b) > PIXEL_TOLERANCE) && counts(*i)
+    };
     (a.width_px, a.height_px) == (b.width_px, b.height_px)
-        && different_pixels(a, b).take(MAX_DIFFERENT_PIXELS + 1).count() <= MAX_DIFFERENT_PIXELS
-}
-
-fn different_pixels<'a>(a: &'a Image, b: &'a Image) -> impl Iterator<Item = usize> + 'a {
-    a.rgb.chunks_exact(3).zip(b.rgb.chunks_exact(3)).enumerate().filter_map(|(i, (a, b))| {
-        let differs = a.iter().zip(b).any(|(a, b)| a.abs_diff(*b) > PIXEL_TOLERANCE);
-        differs.then_some(i)
-    })
-}
-
-/// Returns true if a file's name is that of a JPEG image.
-fn is_jpeg(path: &Path) -> bool {
-    path.extension().is_some_and(|e| e.eq_ignore_ascii_case("jpg") || e.eq_ignore_ascii_case("jpeg"))
+        && pixels.filter(differ).take(MAX_DIFFERENT_PIXELS + 1).count() <= MAX_DIFFERENT_PIXELS
 }
 
 /// Reads width and height from the header of a PNG or JPEG file, pixels.
 pub(crate) fn dimensions(path: &Path) -> Result<(u32, u32), DatasetError> {
-    let file = File::open(path).map_err(|source| DatasetError::Io { path: path.to_owned(), source })?;
-    let file = BufReader::new(file);
-    let found = if is_jpeg(path) {
-        JpegDecoder::new(file).map(|decoder| decoder.dimensions())
-    } else {
-        PngDecoder::new(file).map(|decoder| decoder.dimensions())
-    };
-    found.map_err(|error| DatasetError::Image {
-        path: path.to_owned(),
-        problem: format!("not a readable image: {error}"),
-    })
+    let io = |source| DatasetError::Io { path: path.to_owned(), source };
+    let reader = ImageReader::new(BufReader::new(File::open(path).map_err(io)?)).with_guessed_format().map_err(io)?;
+    reader.into_dimensions().map_err(|error| unreadable(path, &error.to_string()))
 }
 
 /// Reads a PNG or JPEG file of any pixel type as RGB, over `background` where it is transparent.
 pub(crate) fn load_any(path: &Path, background: [u8; 3]) -> Result<Image, DatasetError> {
-    let problem = |problem: String| DatasetError::Image { path: path.to_owned(), problem };
-    let file = File::open(path).map_err(|source| DatasetError::Io { path: path.to_owned(), source })?;
-    let mut limits = Limits::default();
-    limits.max_image_width = Some(MAX_IMAGE_SIDE_PX);
-    limits.max_image_height = Some(MAX_IMAGE_SIDE_PX);
-    let format = if is_jpeg(path) { ImageFormat::Jpeg } else { ImageFormat::Png };
-    let mut reader = ImageReader::with_format(BufReader::new(file), format);
-    reader.limits(limits);
-    let rgba = reader.decode().map_err(|error| problem(format!("not a readable image: {error}")))?.into_rgba8();
+    let rgba = decode(path)?.into_rgba8();
     let over = |value: u8, below: u8, alpha: u8| {
         ((u32::from(value) * u32::from(alpha) + u32::from(below) * u32::from(255 - alpha) + 127) / 255) as u8
     };
     let rgb = rgba.pixels().flat_map(|p| [0, 1, 2].map(|c| over(p.0[c], background[c], p.0[3]))).collect();
     Ok(Image { width_px: rgba.width(), height_px: rgba.height(), rgb })
+}
+
+/// Reads a mask of an image of this size: false where all its colour channels are zero, as in nerfstudio's `mask_path`.
+pub(crate) fn load_mask(path: &Path, (width_px, height_px): (u32, u32)) -> Result<Vec<bool>, DatasetError> {
+    let mask = decode(path)?.into_rgb16();
+    if mask.dimensions() != (width_px, height_px) {
+        let (w, h) = mask.dimensions();
+        let problem = format!("the mask has {w}x{h} pixels, and its image {width_px}x{height_px}; scale it");
+        return Err(DatasetError::Image { path: path.to_owned(), problem });
+    }
+    Ok(mask.pixels().map(|p| p.0 != [0; 3]).collect())
+}
+
+/// Decodes a PNG or JPEG file by its content.
+fn decode(path: &Path) -> Result<DynamicImage, DatasetError> {
+    let bytes = std::fs::read(path).map_err(|source| DatasetError::Io { path: path.to_owned(), source })?;
+    let format = match image::guess_format(&bytes) {
+        Ok(format @ (ImageFormat::Png | ImageFormat::Jpeg)) => format,
+        Ok(other) => return Err(unreadable(path, &format!("a {other:?} file"))),
+        Err(_) => {
+            return Err(unreadable(path, carff_base::errors::stand_in(&bytes).unwrap_or("it starts like neither")));
+        }
+    };
+    if format == ImageFormat::Jpeg && !has_end_marker(&bytes) {
+        return Err(unreadable(path, "the file is cut off: it has no end marker; copy or export it again"));
+    }
+    let mut limits = Limits::default();
+    limits.max_image_width = Some(MAX_IMAGE_SIDE_PX);
+    limits.max_image_height = Some(MAX_IMAGE_SIDE_PX);
+    let mut reader = ImageReader::with_format(Cursor::new(bytes), format);
+    reader.limits(limits);
+    reader.decode().map_err(|error| unreadable(path, &error.to_string()))
+}
+
+fn unreadable(path: &Path, why: &str) -> DatasetError {
+    DatasetError::Image { path: path.to_owned(), problem: format!("not a readable PNG or JPEG image: {why}") }
+}
+
+/// Returns true if a JPEG file has its end marker. Decoders fill the missing part of a cut-off file with grey.
+fn has_end_marker(bytes: &[u8]) -> bool {
+    let mut at = 2;
+    while let Some(&[marker, code]) = bytes.get(at..at + 2) {
+        at += match (marker, code) {
+            (0xFF, 0xD9) => return true,
+            // Image data: bytes, stuffed bytes, restart markers, fill bytes.
+            (..0xFF, _) | (0xFF, 0xFF) => 1,
+            (0xFF, 0x00 | 0x01 | 0xD0..=0xD8) => 2,
+            // Segments have a length, and may contain a preview with an end marker of its own.
+            (0xFF, _) => match bytes.get(at + 2..at + 4) {
+                Some(&[high, low]) => 2 + usize::from(u16::from_be_bytes([high, low])),
+                _ => return false,
+            },
+        };
+    }
+    false
 }
 
 /// Writes bytes of the given type as a PNG file.
@@ -218,7 +231,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("a.png");
         gradient().save_png(&path).unwrap();
-        assert_eq!(Image::load_png(&path).unwrap(), gradient());
+        assert_eq!(Image::load(&path).unwrap(), gradient());
     }
 
     /// Opaque alpha is dropped, transparency is refused with its position, grey becomes RGB, and 16 bits are refused.
@@ -228,15 +241,15 @@ mod tests {
         let path = dir.path().join("a.png");
         let mut rgba: Vec<u8> = gradient().rgb.chunks(3).flat_map(|p| [p[0], p[1], p[2], 255]).collect();
         write_png(&path, &rgba, 5, 4, ExtendedColorType::Rgba8).unwrap();
-        assert_eq!(Image::load_png(&path).unwrap(), gradient());
+        assert_eq!(Image::load(&path).unwrap(), gradient());
         rgba[7 * 4 + 3] = 254;
         write_png(&path, &rgba, 5, 4, ExtendedColorType::Rgba8).unwrap();
-        let message = Image::load_png(&path).unwrap_err().to_string();
+        let message = Image::load(&path).unwrap_err().to_string();
         assert!(message.contains("a.png: pixel (2, 1) is transparent"), "{message}");
         write_png(&path, &[9; 20], 5, 4, ExtendedColorType::L8).unwrap();
-        assert_eq!(Image::load_png(&path).unwrap(), Image::filled(5, 4, [9; 3]));
+        assert_eq!(Image::load(&path).unwrap(), Image::filled(5, 4, [9; 3]));
         write_png(&path, &[9; 40], 5, 4, ExtendedColorType::L16).unwrap();
-        let message = Image::load_png(&path).unwrap_err().to_string();
+        let message = Image::load(&path).unwrap_err().to_string();
         assert!(message.contains("L16") && message.contains("8 bits per channel"), "{message}");
     }
 
@@ -246,13 +259,13 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("broken.png");
         std::fs::write(&path, b"not an image").unwrap();
-        assert!(Image::load_png(&path).unwrap_err().to_string().contains("broken.png: not a readable PNG"));
+        assert!(Image::load(&path).unwrap_err().to_string().contains("broken.png: not a readable PNG"));
         gradient().save_png(&path).unwrap();
         let bytes = std::fs::read(&path).unwrap();
         std::fs::write(&path, &bytes[..bytes.len() / 2]).unwrap();
-        assert!(Image::load_png(&path).unwrap_err().to_string().contains("broken.png: not a readable PNG"));
+        assert!(Image::load(&path).unwrap_err().to_string().contains("broken.png: not a readable PNG"));
         let missing = dir.path().join("missing.png");
-        assert!(Image::load_png(&missing).unwrap_err().to_string().contains("missing.png"));
+        assert!(Image::load(&missing).unwrap_err().to_string().contains("missing.png"));
     }
 
     /// One channel that is off by 1 in every pixel of a black image gives 10 log10(255^2 * 3) decibels.

@@ -9,10 +9,12 @@ use carff_base::geometry::PinholeCamera;
 use image::imageops::{FilterType, resize};
 use rayon::prelude::*;
 
+use crate::dataset::collected;
 use crate::error::DatasetError;
-use crate::image::{Image, load_any};
+use crate::image::{Image, load_any, load_mask};
+use crate::lens::Lens;
 use crate::scenario::{Frame, ScenarioInfo, StateInfo};
-use crate::transforms::{Distortion, Pictures, read};
+use crate::transforms::read;
 use crate::writer::{DatasetWriter, FrameRecord};
 
 /// Options of an import.
@@ -44,33 +46,29 @@ pub struct Imported {
     pub undistorted: usize,
     /// Number of images that were scaled down.
     pub scaled: usize,
+    /// Number of images with a mask: from the source, or of pixels that the lens does not show.
+    pub masked: usize,
 }
 
 /// Reads a dataset from `from` and writes a dataset of one state to `out`, which must be new, empty, or a dataset that
 /// this program wrote. A dataset that names its scenario is an error.
 pub fn import(from: &Path, out: &Path, options: &ImportOptions) -> Result<Imported, DatasetError> {
-    let set = read(from, Pictures::PngOrJpeg)?;
+    let mut set = read(from)?;
     if set.scenario.is_some() {
         let problem = "the dataset names its scenario: it can be used directly, and need not be imported".to_owned();
         return Err(DatasetError::Image { path: from.to_owned(), problem });
     }
+    DatasetError::of_all(set.faults.drain(..).map(|(_, fault)| fault).collect())?;
     let cameras: Vec<PinholeCamera> = set.frames.iter().map(|f| f.camera).collect();
     let bounds = options.bounds.unwrap_or_else(|| bounds_of(&cameras));
     let writer = DatasetWriter::create(out)?;
-    let written: Vec<_> = set
-        .frames
-        .par_iter()
-        .zip(&set.distortions)
-        .enumerate()
-        .map(|(view, (frame, distortion))| write_frame(&writer, view, frame, distortion, options))
-        .collect();
-    let (mut records, mut undistorted, mut scaled) = (Vec::with_capacity(written.len()), 0, 0);
-    for frame in written {
-        let (record, was_distorted, was_larger) = frame?;
-        records.push(record);
-        undistorted += usize::from(was_distorted);
-        scaled += usize::from(was_larger);
-    }
+    let written: Vec<_> =
+        set.frames.par_iter().enumerate().map(|(view, frame)| write_frame(&writer, view, frame, options)).collect();
+    let written = collected(written)?;
+    let undistorted = set.frames.iter().filter(|frame| frame.lens != Lens::Pinhole).count();
+    let scaled = written.iter().filter(|(_, was_larger)| *was_larger).count();
+    let records: Vec<FrameRecord> = written.into_iter().map(|(record, _)| record).collect();
+    let masked = records.iter().filter(|record| record.mask_path.is_some()).count();
     let name = from.file_name().map_or_else(|| "imported".to_owned(), |n| n.to_string_lossy().into_owned());
     let scenario = ScenarioInfo {
         name,
@@ -86,48 +84,73 @@ pub fn import(from: &Path, out: &Path, options: &ImportOptions) -> Result<Import
         clear_action: "none".to_owned(),
     };
     writer.finish(&records, Some(&scenario))?;
-    Ok(Imported { frames: records.len(), bounds, undistorted, scaled })
+    Ok(Imported { frames: records.len(), bounds, undistorted, scaled, masked })
 }
 
-/// Returns the record, whether the image was distorted, and whether it was too large.
+/// Returns the record, and whether the image was too large.
 fn write_frame(
     writer: &DatasetWriter,
     view: usize,
     frame: &Frame,
-    distortion: &Distortion,
     options: &ImportOptions,
-) -> Result<(FrameRecord, bool, bool), DatasetError> {
+) -> Result<(FrameRecord, bool), DatasetError> {
     let mut image = load_any(&frame.image_path, options.background)?;
-    let mut camera = frame.camera;
-    if (image.width_px, image.height_px) != (camera.width_px, camera.height_px) {
-        // Images may have been scaled after their intrinsics were written: equal aspect ratio, other size.
-        let across = u64::from(image.width_px) * u64::from(camera.height_px);
-        let down = u64::from(image.height_px) * u64::from(camera.width_px);
-        if across.abs_diff(down) > u64::from(camera.width_px.max(camera.height_px)) {
-            let problem = format!(
-                "{}x{} pixels, but its intrinsics (keys `w` and `h`) are for {}x{}",
-                image.width_px, image.height_px, camera.width_px, camera.height_px
-            );
-            return Err(DatasetError::Image { path: frame.image_path.clone(), problem });
-        }
-        camera = camera.resized(image.width_px, image.height_px);
-    }
-    let distorted = distortion.iter().any(|v| v.abs() > 1e-9);
-    if distorted {
-        image = undistort(&image, &camera, distortion, options.background);
+    let mut camera = fitting(&frame.camera, &image, &frame.image_path)?;
+    let size = |image: &Image| (image.width_px, image.height_px);
+    let mask = frame.mask_path.as_ref().map(|path| load_mask(path, size(&image))).transpose()?;
+    let mut valid = mask;
+    if frame.lens != Lens::Pinhole {
+        image = frame.lens.undistorted(&image, &camera);
+        valid = Some(frame.lens.valid(&camera, valid.as_deref()));
     }
     let longest = image.width_px.max(image.height_px);
     let larger = longest > options.max_side_px;
     if larger {
         let side = |px: u32| (u64::from(px) * u64::from(options.max_side_px) / u64::from(longest)).max(1) as u32;
-        image = scaled_down(&image, side(image.width_px), side(image.height_px));
-        camera = camera.resized(image.width_px, image.height_px);
+        let (from, to) = (size(&image), (side(image.width_px), side(image.height_px)));
+        image = scaled_down(&image, to.0, to.1);
+        valid = valid.map(|valid| scaled_mask(&valid, from, to));
+        camera = camera.resized(to.0, to.1);
     }
     let mut record = FrameRecord::new(format!("images/{view:05}.png"), camera);
     record.branch_and_timestamp = Some((0, 0));
     record.view = Some(view);
     writer.write_image(&record.file_path, &image)?;
-    Ok((record, distorted, larger))
+    if let Some(valid) = valid.filter(|valid| valid.contains(&false)) {
+        if !valid.contains(&true) {
+            let problem = "no pixel remains: the mask and the lens exclude all of them".to_owned();
+            return Err(DatasetError::Image { path: frame.image_path.clone(), problem });
+        }
+        let name = format!("masks/{view:05}.png");
+        writer.write_mask(&name, &valid, image.width_px, image.height_px)?;
+        record.mask_path = Some(name);
+    }
+    Ok((record, larger))
+}
+
+/// Returns the camera for the size of its image. Images may have been scaled after their intrinsics were written: equal
+/// aspect ratio, other size.
+fn fitting(camera: &PinholeCamera, image: &Image, path: &Path) -> Result<PinholeCamera, DatasetError> {
+    if (image.width_px, image.height_px) == (camera.width_px, camera.height_px) {
+        return Ok(*camera);
+    }
+    let across = u64::from(image.width_px) * u64::from(camera.height_px);
+    let down = u64::from(image.height_px) * u64::from(camera.width_px);
+    if across.abs_diff(down) > u64::from(camera.width_px.max(camera.height_px)) {
+        let problem = format!(
+            "{}x{} pixels, but its intrinsics (keys `w` and `h`) are for {}x{}",
+            image.width_px, image.height_px, camera.width_px, camera.height_px
+        );
+        return Err(DatasetError::Image { path: path.to_owned(), problem });
+    }
+    Ok(camera.resized(image.width_px, image.height_px))
+}
+
+/// Scales a mask down: a pixel is valid if all pixels that it is made of are.
+fn scaled_mask(valid: &[bool], from: (u32, u32), to: (u32, u32)) -> Vec<bool> {
+    let bytes = valid.iter().map(|&valid| if valid { 255 } else { 0 }).collect();
+    let grey = image::GrayImage::from_raw(from.0, from.1, bytes).unwrap_or_default();
+    resize(&grey, to.0, to.1, FilterType::Triangle).into_raw().into_iter().map(|v| v == 255).collect()
 }
 
 fn scaled_down(image: &Image, width_px: u32, height_px: u32) -> Image {
@@ -139,35 +162,6 @@ fn scaled_down(image: &Image, width_px: u32, height_px: u32) -> Image {
         // The number of bytes always matches the size.
         None => image.clone(),
     }
-}
-
-/// Returns the image that a pinhole camera of the same intrinsics would have taken.
-fn undistort(image: &Image, camera: &PinholeCamera, [k1, k2, k3, k4, p1, p2]: &Distortion, beyond: [u8; 3]) -> Image {
-    let mut result = Image::filled(image.width_px, image.height_px, beyond);
-    let (w, h) = (image.width_px as usize, image.height_px as usize);
-    for (i, pixel) in result.rgb.chunks_exact_mut(3).enumerate() {
-        let x = ((i % w) as f64 + 0.5 - camera.cx_px) / camera.fl_x_px;
-        let y = ((i / w) as f64 + 0.5 - camera.cy_px) / camera.fl_y_px;
-        let r2 = x * x + y * y;
-        let radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4)));
-        let xd = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x);
-        let yd = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y;
-        let (u, v) = (xd * camera.fl_x_px + camera.cx_px - 0.5, yd * camera.fl_y_px + camera.cy_px - 0.5);
-        if !(u > -0.5 && v > -0.5 && u < w as f64 - 0.5 && v < h as f64 - 0.5) {
-            continue;
-        }
-        let (u, v) = (u.clamp(0.0, (w - 1) as f64), v.clamp(0.0, (h - 1) as f64));
-        let (left, top) = (u.floor() as usize, v.floor() as usize);
-        let (right, bottom) = ((left + 1).min(w - 1), (top + 1).min(h - 1));
-        let (a, b) = (u - left as f64, v - top as f64);
-        for (c, value) in pixel.iter_mut().enumerate() {
-            let at = |x: usize, y: usize| f64::from(image.rgb[(y * w + x) * 3 + c]);
-            let upper = at(left, top) * (1.0 - a) + at(right, top) * a;
-            let lower = at(left, bottom) * (1.0 - a) + at(right, bottom) * a;
-            *value = (upper * (1.0 - b) + lower * b).round() as u8;
-        }
-    }
-    result
 }
 
 /// See [`Imported::bounds`]. Parallel cameras have no such point: then it is ahead of them, at the distance of their
@@ -248,34 +242,5 @@ mod tests {
         let side_by_side: Vec<_> = (0..3).map(|i| look([f64::from(i), 0.0, 0.0], [f64::from(i), 5.0, 0.0])).collect();
         let [low, high] = bounds_of(&side_by_side);
         assert!(low[1] > 0.5 && high[1] > 2.0 && (low[0] + high[0] - 2.0).abs() < 1e-6, "{low:?} {high:?}");
-    }
-
-    /// Undistortion inverts the lens: a dot at the distorted position moves to the pinhole camera's position.
-    #[test]
-    fn lenses_are_straightened() {
-        let camera = look([0.0; 3], [0.0, 1.0, 0.0]);
-        let distortion = [-0.25, 0.05, 0.0, 0.0, 0.002, -0.001];
-        let (x, y) = (0.35, -0.2);
-        let r2: f64 = x * x + y * y;
-        let radial = 1.0 + distortion[0] * r2 + distortion[1] * r2 * r2;
-        let xd = x * radial + 2.0 * distortion[4] * x * y + distortion[5] * (r2 + 2.0 * x * x);
-        let yd = y * radial + distortion[4] * (r2 + 2.0 * y * y) + 2.0 * distortion[5] * x * y;
-        let pixel = |x: f64, y: f64| [x * camera.fl_x_px + camera.cx_px, y * camera.fl_y_px + camera.cy_px];
-        let [u, v] = pixel(xd, yd);
-        let mut bent = Image::filled(64, 48, [0; 3]);
-        for (i, p) in bent.rgb.chunks_exact_mut(3).enumerate() {
-            let distance = ((i % 64) as f64 + 0.5 - u).hypot((i / 64) as f64 + 0.5 - v);
-            p.fill((255.0 * (-distance * distance / 4.0).exp()) as u8);
-        }
-        let straight = undistort(&bent, &camera, &distortion, [0; 3]);
-        let (mut sum, mut at) = (0.0, [0.0; 2]);
-        for (i, p) in straight.rgb.chunks_exact(3).enumerate() {
-            let weight = f64::from(p[0]);
-            sum += weight;
-            at[0] += weight * ((i % 64) as f64 + 0.5);
-            at[1] += weight * ((i / 64) as f64 + 0.5);
-        }
-        let [u, v] = pixel(x, y);
-        assert!((at[0] / sum - u).abs() < 0.2 && (at[1] / sum - v).abs() < 0.2, "{at:?} {sum} {u} {v}");
     }
 }

@@ -1,6 +1,6 @@
 //! Posed image datasets: reading, writing, checking, splitting.
 //!
-//! A dataset is a folder with `transforms.json` and its PNG images. The file has the format of instant-ngp and
+//! A dataset is a folder with `transforms.json` and its PNG or JPEG images. The file has the format of instant-ngp and
 //! nerfstudio, with additional keys for the branch and time step of each image. This crate contains no models and no
 //! rendering.
 //!
@@ -15,6 +15,7 @@
 //! # }
 //! ```
 
+mod camera;
 mod dataset;
 pub mod drives;
 mod equivalence;
@@ -22,12 +23,16 @@ mod error;
 mod folder;
 mod image;
 mod import;
+mod lens;
+mod place;
 mod report;
 mod scenario;
+mod scenario_keys;
 mod seen;
 pub mod sensor;
 mod split;
 mod transforms;
+mod views;
 mod writer;
 
 pub use carff_messages::Observability;

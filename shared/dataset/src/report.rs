@@ -54,6 +54,8 @@ pub struct DatasetReport {
     pub ceiling: Option<f64>,
     /// Best possible accuracy for full, partial and none.
     pub ceiling_by_observability: [Option<f64>; 3],
+    /// Number of images with masked pixels, and the share of masked pixels in them.
+    pub masked: Option<(usize, f64)>,
     /// Pairs of images that should look the same because the actor's place is hidden.
     pub hidden_pairs: Vec<HiddenPair>,
     /// Warnings about unusual values.
@@ -111,6 +113,7 @@ impl DatasetReport {
             bev_pose_mean_psnr_db: bev_view.and_then(|view| pose_mean_psnr(dataset, images, Some(view))),
             ceiling: equivalence.ceiling(pairs_where(None)),
             ceiling_by_observability: Observability::ALL.map(|o| equivalence.ceiling(pairs_where(Some(o)))),
+            masked: masked(dataset),
             hidden_pairs,
             warnings,
         }
@@ -126,27 +129,37 @@ fn column(observability: Option<Observability>) -> usize {
     }
 }
 
+fn masked(dataset: &Dataset) -> Option<(usize, f64)> {
+    let masks: Vec<&[bool]> = (0..dataset.frames().len()).filter_map(|i| dataset.valid_pixels(i)).collect();
+    let ignored: usize = masks.iter().map(|mask| mask.iter().filter(|valid| !**valid).count()).sum();
+    let all: usize = masks.iter().map(|mask| mask.len()).sum();
+    (all > 0).then(|| (masks.len(), ignored as f64 / all as f64))
+}
+
 fn pose_mean_psnr(dataset: &Dataset, images: &[Image], only: Option<usize>) -> Option<f64> {
-    let mut by_view: BTreeMap<usize, Vec<&Image>> = BTreeMap::new();
-    for (frame, image) in dataset.frames().iter().zip(images) {
+    let mut by_view: BTreeMap<usize, Vec<usize>> = BTreeMap::new();
+    for (i, frame) in dataset.frames().iter().enumerate().take(images.len()) {
         if let Some(view) = frame.view.filter(|v| only.is_none_or(|only| only == *v)) {
-            by_view.entry(view).or_default().push(image);
+            by_view.entry(view).or_default().push(i);
         }
     }
     let (mut sum, mut count) = (0.0, 0_usize);
     for of_view in by_view.values().filter(|v| v.len() > 1) {
+        let valid = dataset.valid_in_all(of_view);
+        let of_view: Vec<&Image> = of_view.iter().map(|&i| &images[i]).collect();
         let size = of_view[0].rgb.len();
         if of_view.iter().any(|image| image.rgb.len() != size) {
             continue;
         }
         let mut mean = vec![0.0_f64; size];
-        for image in of_view {
+        for image in &of_view {
             mean.iter_mut().zip(&image.rgb).for_each(|(m, v)| *m += f64::from(*v) / of_view.len() as f64);
         }
-        for image in of_view {
-            sum += mean.iter().zip(&image.rgb).map(|(m, v)| (m - f64::from(*v)).powi(2)).sum::<f64>();
-            count += size;
+        for image in &of_view {
+            let values = mean.iter().zip(&image.rgb).enumerate().filter(|(i, _)| valid(i / 3));
+            sum += values.map(|(_, (m, v))| (m - f64::from(*v)).powi(2)).sum::<f64>();
         }
+        count += of_view.len() * 3 * (0..size / 3).filter(|&pixel| valid(pixel)).count();
     }
     (sum > 0.0).then(|| 10.0 * (255.0_f64.powi(2) * count as f64 / sum).log10())
 }
@@ -170,14 +183,16 @@ fn hidden_pairs(dataset: &Dataset, images: &[Image]) -> Vec<HiddenPair> {
                 if alike(branch_a, branch_b) || images[a].rgb.len() != images[b].rgb.len() {
                     continue;
                 }
-                let differences = images[a].rgb.iter().zip(&images[b].rgb).map(|(a, b)| a.abs_diff(*b));
-                let sum: u64 = differences.clone().map(u64::from).sum();
+                let valid = dataset.valid_in_all(&[a, b]);
+                let values = images[a].rgb.iter().zip(&images[b].rgb).enumerate().filter(|(i, _)| valid(i / 3));
+                let differences: Vec<u8> = values.map(|(_, (a, b))| a.abs_diff(*b)).collect();
+                let sum: u64 = differences.iter().map(|&d| u64::from(d)).sum();
                 pairs.push(HiddenPair {
                     view,
                     timestamp,
                     branches: [branch_a, branch_b],
-                    mean_difference: sum as f64 / images[a].rgb.len().max(1) as f64,
-                    max_difference: differences.max().unwrap_or(0),
+                    mean_difference: sum as f64 / differences.len().max(1) as f64,
+                    max_difference: differences.into_iter().max().unwrap_or(0),
                 });
             }
         }
@@ -192,6 +207,9 @@ impl fmt::Display for DatasetReport {
         writeln!(f, "Dataset    {}", self.dir)?;
         let sizes: Vec<String> = self.image_sizes.iter().map(|((w, h), n)| format!("{n} of {w}x{h} px")).collect();
         writeln!(f, "Pictures    {} ({})", self.frames, sizes.join(", "))?;
+        if let Some((images, share)) = self.masked {
+            writeln!(f, "Masks       {images} images; training ignores {} of their pixels", percent(Some(share)))?;
+        }
         let kinds: Vec<String> = self.view_kinds.iter().map(|(kind, n)| format!("{n} {kind}")).collect();
         let kinds = if kinds.is_empty() { String::new() } else { format!(" ({})", kinds.join(", ")) };
         writeln!(f, "Poses       {}{kinds}", self.views)?;

@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use crate::lens::Lens;
 use carff_base::geometry::{OrientedBox, PinholeCamera};
 use carff_messages::Observability;
 use serde::{Deserialize, Serialize};
@@ -11,6 +12,10 @@ use serde::{Deserialize, Serialize};
 pub struct Frame {
     /// Path of the image, absolute or relative to the working directory. It includes the dataset's folder.
     pub image_path: PathBuf,
+    /// Path of the mask of the pixels that training uses (zero: not used), of the image's size.
+    pub mask_path: Option<PathBuf>,
+    /// Lens that took the image. The camera's intrinsics are those of the undistorted image.
+    pub(crate) lens: Lens,
     /// Intrinsics and pose.
     pub camera: PinholeCamera,
     /// State index: branch * timestamps + timestamp.

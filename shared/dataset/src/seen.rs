@@ -1,20 +1,17 @@
 //! Derives the observability of frames from their images, for datasets that do not contain it.
 
+use crate::dataset::Dataset;
 use crate::error::DatasetError;
-use crate::image::{Image, looks_same};
-use crate::scenario::Frame;
+use crate::image::{Image, looks_same_where};
 use carff_messages::Observability;
 use rayon::prelude::*;
 
 /// Returns the observability of each frame by comparison with the other branches' images at its time step from its
-/// view: `none` if all of them look the same, `full` if none does, else `partial`; `None` without another image. `load`
-/// decodes the image of a frame; its first error is returned.
-pub(crate) fn told_by_pictures(
-    frames: &[Frame],
-    views: usize,
-    load: impl Fn(usize) -> Result<Image, DatasetError> + Sync,
-) -> Result<Vec<Option<Observability>>, DatasetError> {
-    let mut of_view: Vec<Vec<usize>> = vec![Vec::new(); views];
+/// view: `none` if all of them look the same, `full` if none does, else `partial`; `None` without another image. The
+/// first error of an image is returned.
+pub(crate) fn told_by_pictures(set: &Dataset) -> Result<Vec<Option<Observability>>, DatasetError> {
+    let frames = set.frames();
+    let mut of_view: Vec<Vec<usize>> = vec![Vec::new(); set.view_count()];
     for (i, frame) in frames.iter().enumerate() {
         if let Some(list) = frame.view.and_then(|view| of_view.get_mut(view)) {
             list.push(i);
@@ -23,14 +20,16 @@ pub(crate) fn told_by_pictures(
     let told: Vec<Vec<(usize, Option<Observability>)>> = of_view
         .par_iter()
         .map(|of_view| {
-            let pictures: Vec<Image> = of_view.iter().map(|&i| load(i)).collect::<Result<_, _>>()?;
+            let pictures: Vec<Image> = of_view.iter().map(|&i| set.load_image(i)).collect::<Result<_, _>>()?;
             let frame_of = |place: usize| &frames[of_view[place]];
             let tell = |own: usize| {
                 let (branch, timestamp) = (frame_of(own).branch, frame_of(own).timestamp);
                 let others = (0..of_view.len())
                     .filter(|&other| frame_of(other).timestamp == timestamp && frame_of(other).branch != branch);
-                let (alike, different): (Vec<usize>, Vec<usize>) =
-                    others.partition(|&other| looks_same(&pictures[own], &pictures[other]));
+                let (alike, different): (Vec<usize>, Vec<usize>) = others.partition(|&other| {
+                    let valid = set.valid_in_all(&[of_view[own], of_view[other]]);
+                    looks_same_where(&pictures[own], &pictures[other], valid)
+                });
                 match (alike.is_empty(), different.is_empty()) {
                     (true, true) => None,
                     (true, false) => Some(Observability::Full),

@@ -42,6 +42,8 @@ pub struct FrameRecord {
     pub view_kind: Option<String>,
     /// Path of its depth image (16-bit grey PNG: millimetres along the ray, 0 without a hit or beyond 65.535 m).
     pub depth_file_path: Option<String>,
+    /// Path of the mask of its valid pixels (8-bit grey PNG: 0 where training ignores the pixel).
+    pub mask_path: Option<String>,
     /// Path of its actor mask (8-bit grey PNG: 255 where the pixel shows the actor).
     pub mask_file_path: Option<String>,
 }
@@ -59,6 +61,7 @@ impl FrameRecord {
             actor_px: None,
             view_kind: None,
             depth_file_path: None,
+            mask_path: None,
             mask_file_path: None,
         }
     }
@@ -200,6 +203,7 @@ impl DatasetWriter {
                     actor_px: f.actor_px,
                     view_kind: f.view_kind.as_deref(),
                     depth_file_path: f.depth_file_path.as_deref(),
+                    mask_path: f.mask_path.as_deref(),
                     mask_file_path: f.mask_file_path.as_deref(),
                     intrinsics: if shared.is_some() { None } else { Some(Intrinsics::of(&f.camera)) },
                 })
@@ -295,6 +299,8 @@ struct FrameFile<'a> {
     view_kind: Option<&'a str>,
     #[serde(skip_serializing_if = "Option::is_none")]
     depth_file_path: Option<&'a str>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    mask_path: Option<&'a str>,
     #[serde(skip_serializing_if = "Option::is_none")]
     mask_file_path: Option<&'a str>,
     #[serde(flatten, skip_serializing_if = "Option::is_none")]

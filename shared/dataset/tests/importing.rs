@@ -97,7 +97,9 @@ fn nerfstudio_layout() {
         &json!({"w": 200, "h": 150, "fl_x": 173.2, "fl_y": 173.0, "cx": 101.0, "cy": 74.0, "k1": -0.1, "k2": 0.01,
             "p1": 0.0, "p2": 0.0, "camera_model": "OPENCV", "frames": frames, "applied_transform": [[1, 0, 0, 0]]}),
     );
-    assert!(Dataset::open(from.path()).is_err(), "JPEG images are only for imports");
+    let direct = Dataset::open(from.path()).unwrap();
+    assert!(direct.warnings()[0].contains("lens distortion (key `k1`) is undone"), "{:?}", direct.warnings());
+    assert!(direct.load_image(0).is_ok() && direct.load_image(3).is_err(), "only an import scales the intrinsics");
     let bounds = [[-1.0, -1.0, 0.0], [1.0, 1.0, 2.0]];
     let options = ImportOptions { max_side_px: 80, bounds: Some(bounds), ..ImportOptions::default() };
     let out = to.path().join("set");
@@ -133,5 +135,5 @@ fn wrong_pictures_are_named() {
     assert!(error.contains("missing.jpg") && error.contains("there is no file"), "{error}");
     std::fs::write(from.path().join("broken.jpg"), "no picture").unwrap();
     let error = attempt("broken.jpg");
-    assert!(error.contains("broken.jpg") && error.contains("not a readable image"), "{error}");
+    assert!(error.contains("broken.jpg") && error.contains("not a readable PNG or JPEG image"), "{error}");
 }

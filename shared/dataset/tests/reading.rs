@@ -280,16 +280,20 @@ fn golden_errors() {
         (at("/frames", json!([])), "SET/transforms.json: top level: key `frames`: is empty; at least one frame is needed".into()),
         (at("/frames", json!({})), "SET/transforms.json: top level: key `frames`: must be a list, found an object".into()),
         (
-            at("/frames/3/file_path", json!("../b.png")),
-            "SET/transforms.json: frame 3 (../b.png): key `file_path`: must stay inside the dataset folder: no leading `/` and no `..`".into(),
+            at("/frames/3/file_path", json!("../../b.png")),
+            "SET/transforms.json: frame 3 (../../b.png): key `file_path`: must be relative, and at most one folder above the dataset's: no leading `/` and one `..` at most".into(),
+        ),
+        (
+            at("/frames/3/file_path", json!("a/../../../b.png")),
+            "SET/transforms.json: frame 3 (a/../../../b.png): key `file_path`: must be relative, and at most one folder above the dataset's: no leading `/` and one `..` at most".into(),
         ),
         (
             at("/frames/3/file_path", json!("/etc/b.png")),
-            "SET/transforms.json: frame 3 (/etc/b.png): key `file_path`: must stay inside the dataset folder: no leading `/` and no `..`".into(),
+            "SET/transforms.json: frame 3 (/etc/b.png): key `file_path`: must be relative, and at most one folder above the dataset's: no leading `/` and one `..` at most".into(),
         ),
         (
-            at("/frames/3/file_path", json!("b.jpg")),
-            "SET/transforms.json: frame 3 (b.jpg): key `file_path`: is a .jpg file; only .png images are read (`carff dataset import` also takes .jpg)".into(),
+            at("/frames/3/file_path", json!("C:/data/b.png")),
+            "SET/transforms.json: frame 3 (C:/data/b.png): key `file_path`: must be relative, and at most one folder above the dataset's: no leading `/` and one `..` at most".into(),
         ),
         (
             without("/frames/3", "file_path"),
@@ -397,13 +401,17 @@ fn errors_of_files() {
     assert!(error.contains("frame 3 (images/b0_t1_v1.png): key `file_path`: there is no file"), "{error}");
 }
 
-/// Lens distortion is not modelled: it causes a warning.
+/// Lens distortion, in the file or in one frame, is undone, with a note on a run's camera.
 #[test]
 fn distortion_is_a_warning() {
     let mut set = whole();
     set["k1"] = json!(0.05);
     let dataset = open(&set).unwrap();
-    assert!(dataset.warnings()[0].contains("lens distortion (key `k1`) is ignored"));
+    assert!(dataset.warnings()[0].contains("lens distortion (key `k1`) is undone in 8 of 8 images"));
+    let mut set = whole();
+    set["frames"][2]["p2"] = json!(0.01);
+    let dataset = open(&set).unwrap();
+    assert!(dataset.warnings()[0].contains("lens distortion (key `p2`) is undone in 1 of 8 images"));
     assert!(open(&whole()).unwrap().warnings().is_empty());
 }
 

@@ -11,7 +11,7 @@ use tch::{Device, Kind, Tensor};
 /// Images that are decoded at a time.
 const BATCH: usize = 60;
 
-/// Quality of decoded images, over all pixels of all images.
+/// Quality of decoded images, over all valid pixels of all images.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DecodedQuality {
@@ -66,14 +66,16 @@ impl Decoding<'_> {
             let chosen: Vec<usize> = chunk.iter().map(|pair| pair.0).collect();
             let (out, means) = self.images(chunk);
             let targets = self.posed.targets(&chosen);
-            let difference = &targets - &means;
+            let valid = self.posed.valid_targets(&chosen);
+            let of_valid = |t: Tensor| valid.as_ref().map_or_else(|| t.shallow_clone(), |valid| &t * valid);
+            let difference = of_valid(&targets - &means);
             let changed = changed_pixels(&difference);
-            let squares = (&out - &targets).square();
+            let squares = of_valid((&out - &targets).square());
             error += squares.sum(Kind::Double).double_value(&[]);
             mean_error += difference.square().sum(Kind::Double).double_value(&[]);
             changed_error += (squares * &changed).sum(Kind::Double).double_value(&[]);
             changed_count += changed.sum(Kind::Double).double_value(&[]) * 3.0;
-            count += targets.numel() as f64;
+            count += valid.map_or(targets.numel() as f64, |valid| valid.sum(Kind::Double).double_value(&[]) * 3.0);
         }
         let psnr = |sum: f64, n: f64| psnr_of_mse(sum / n.max(1.0));
         DecodedQuality {

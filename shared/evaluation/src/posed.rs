@@ -41,7 +41,7 @@ pub struct PosedImages {
     /// Visual equivalence of states, for each view of the dataset.
     pub equivalence: Equivalence,
     random_equivalence: Option<Equivalence>,
-    /// Mean image of each pose over all states, `[V, 3, 128, 128]`, 0..=1.
+    /// Mean image of each pose over the states in which a pixel is valid, `[V, 3, 128, 128]`, 0..=1.
     pub pose_means: Tensor,
     index: Vec<Option<usize>>,
 }
@@ -63,9 +63,9 @@ impl PosedImages {
         let equivalence = Equivalence::from_dataset(&dataset, &images);
         let means: Vec<Tensor> = (0..dataset.view_count())
             .map(|view| {
-                let of_view: Vec<Tensor> =
-                    (0..states).filter_map(|state| index[view * states + state]).map(|i| target(&images[i])).collect();
-                Tensor::stack(&of_view, 0).mean_dim([0_i64].as_slice(), false, Kind::Float)
+                let of_view: Vec<usize> = (0..states).filter_map(|state| index[view * states + state]).collect();
+                let targets = Tensor::stack(&of_view.iter().map(|&i| target(&images[i])).collect::<Vec<_>>(), 0);
+                mean_of_valid(&targets, valid_targets(&dataset, &of_view).as_ref())
             })
             .collect();
         Ok(Self {
@@ -158,6 +158,35 @@ impl PosedImages {
     pub fn targets(&self, chosen: &[usize]) -> Tensor {
         Tensor::stack(&chosen.iter().map(|&i| target(&self.images[i])).collect::<Vec<_>>(), 0)
     }
+
+    /// Flags of the valid pixels of decoder targets, `[N, 1, 128, 128]`, 0 or 1; `None` if all are valid.
+    pub fn valid_targets(&self, chosen: &[usize]) -> Option<Tensor> {
+        valid_targets(&self.dataset, chosen)
+    }
+}
+
+fn valid_targets(dataset: &Dataset, chosen: &[usize]) -> Option<Tensor> {
+    let all = || Tensor::ones([1, PICTURE_PX, PICTURE_PX], (Kind::Float, tch::Device::Cpu));
+    let flags = |frame: &usize| {
+        let Some(mask) = dataset.valid_pixels(*frame) else { return all() };
+        let camera = &dataset.frames()[*frame].camera;
+        let mask = Tensor::from_slice(&mask.iter().map(|&valid| f32::from(u8::from(valid))).collect::<Vec<_>>());
+        // A pixel is valid if all pixels that it is made of are.
+        at_target_size(&mask.view([1, 1, i64::from(camera.height_px), i64::from(camera.width_px)]))
+            .ge(0.999)
+            .to_kind(Kind::Float)
+    };
+    let masked = chosen.iter().any(|&frame| dataset.valid_pixels(frame).is_some());
+    masked.then(|| Tensor::stack(&chosen.iter().map(flags).collect::<Vec<_>>(), 0))
+}
+
+/// Mean over the images `[N, 3, H, W]` in which a pixel is valid, and over all images where it is valid in none.
+fn mean_of_valid(images: &Tensor, valid: Option<&Tensor>) -> Tensor {
+    let over_images = |t: &Tensor| t.sum_dim_intlist([0_i64].as_slice(), false, Kind::Float);
+    let mean = images.mean_dim([0_i64].as_slice(), false, Kind::Float);
+    let Some(valid) = valid else { return mean };
+    let count = over_images(valid);
+    (over_images(&(images * valid)) / count.clamp_min(1.0)).where_self(&count.gt(0.0), &mean)
 }
 
 /// Labels of a dataset with views numbered from `first_view`. The error names what a frame lacks.
@@ -185,11 +214,29 @@ fn labels(
 /// Decoder target of one image `[3, 128, 128]`, 0..=1.
 fn target(image: &Image) -> Tensor {
     let bytes = Tensor::from_slice(&image.rgb).view([1, i64::from(image.height_px), i64::from(image.width_px), 3]);
-    let image = carff_networks::encoder::pictures_from_bytes(&bytes);
+    at_target_size(&carff_networks::encoder::pictures_from_bytes(&bytes))
+}
+
+/// Resizes one image `[1, C, H, W]` to `[C, 128, 128]`.
+fn at_target_size(image: &Tensor) -> Tensor {
     let image = if image.size()[2] == PICTURE_PX && image.size()[3] == PICTURE_PX {
-        image
+        image.shallow_clone()
     } else {
         image.internal_upsample_bilinear2d_aa([PICTURE_PX, PICTURE_PX], false, None, None)
     };
     image.squeeze_dim(0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A pixel's mean is over the images in which it is valid, and over all where it is valid in none.
+    #[test]
+    fn means_are_of_valid_pixels() {
+        let images = Tensor::from_slice(&[0.2_f32, 0.4, 0.6, 0.8, 1.0, 0.0]).view([2, 1, 1, 3]);
+        let valid = Tensor::from_slice(&[1.0_f32, 1.0, 0.0, 1.0, 0.0, 0.0]).view([2, 1, 1, 3]);
+        let mean = mean_of_valid(&images, Some(&valid));
+        assert!(mean.allclose(&Tensor::from_slice(&[0.5_f32, 0.4, 0.3]).view([1, 1, 3]), 1e-6, 1e-6, false));
+    }
 }

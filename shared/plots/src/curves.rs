@@ -354,7 +354,7 @@ mod tests {
         let path = dir.path().join("curves.png");
         for (count, columns, rows) in [(0, 1, 0), (1, 1, 1), (2, 2, 1), (4, 2, 2), (9, 3, 3)] {
             curves(&path, "Training", &vec![panel(vec![(0.0, 1.0), (1.0, 2.0)], false); count]).unwrap();
-            let image = Image::load_png(&path).unwrap();
+            let image = Image::load(&path).unwrap();
             assert_eq!(image.width_px, columns * PANEL_WIDTH + 2 * MARGIN);
             assert_eq!(image.height_px, rows * PANEL_HEIGHT + 3 * MARGIN + TITLE.line_px());
         }

@@ -249,7 +249,7 @@ mod tests {
         let path = dir.path().join("strip.png");
         let rows = odd_rows();
         filmstrip(&path, "Title", "subtitle", &rows).unwrap();
-        let sheet = Image::load_png(&path).unwrap();
+        let sheet = Image::load(&path).unwrap();
         let layout = Layout::new("Title", "subtitle", &rows).unwrap();
         assert_eq!((sheet.width_px, sheet.height_px), (layout.width, layout.height));
         for tile in &layout.tiles {
@@ -273,7 +273,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("strip.png");
         filmstrip(&path, "Nothing", "", &[]).unwrap();
-        assert!(Image::load_png(&path).is_ok());
+        assert!(Image::load(&path).is_ok());
         let mut rows = odd_rows();
         rows[3].cells[1].image.rgb.pop();
         let message = filmstrip(&path, "", "", &rows).unwrap_err().to_string();

@@ -230,7 +230,7 @@ fn rendered_sets_are_read() {
     assert_eq!(frame.actor_px, Some(rendering.actor.unwrap().actor_px));
     let text = std::fs::read_to_string(out.join("transforms.json")).unwrap();
     assert!(text.contains("\"depth_file_path\":\"depth/b0_t1_v001.png\"") && text.contains("\"role\":\"actor\""));
-    let mask = carff_dataset::Image::load_png(&out.join("masks/b0_t1_v001.png")).unwrap();
+    let mask = carff_dataset::Image::load(&out.join("masks/b0_t1_v001.png")).unwrap();
     let block = scenario.object_of("block").unwrap();
     let expected = rendering.object_id.iter().filter(|id| **id == block).count();
     assert!(expected > 0 && mask.rgb.chunks(3).filter(|p| p[0] == 255).count() == expected);

@@ -78,7 +78,7 @@ impl Variant {
             Self::Unfrozen => config.encoder.backbone.frozen = false,
             Self::Transformer => {
                 config.encoder = from_scratch(BackboneKind::Vit, &config.encoder);
-                config.encoder.backbone.vit = VitConfig { patch_px: 16, width: 192, depth: 4, heads: 3 };
+                config.encoder.backbone.vit = VitConfig { patch_px: 16, width: 192, depth: 4, heads: 3, registers: 0 };
                 config.pretrained_backbone = None;
             }
             Self::NoPose => {

@@ -261,7 +261,7 @@ mod tests {
         assert!(!dir.path().join("curves.png").exists());
         std::fs::write(dir.path().join(METRICS), metrics()).unwrap();
         draw(dir.path()).unwrap();
-        let image = carff_dataset::Image::load_png(&dir.path().join("curves.png")).unwrap();
+        let image = carff_dataset::Image::load(&dir.path().join("curves.png")).unwrap();
         assert!(image.width_px > 1000 && image.height_px > 700);
     }
 }

@@ -240,11 +240,13 @@ fn views(posed: &PosedImages, chosen: &[usize]) -> Vec<TrainingView> {
                 .filter_map(|s| posed.at(s, label.view))
                 .map(|j| &posed.images[j].rgb[..])
                 .collect();
-            TrainingView {
-                camera: posed.dataset.frames()[i].camera,
-                rgb: posed.images[i].rgb.clone(),
-                changed: changed_pixels(&same_view, PIXEL_TOLERANCE),
+            let mut changed = changed_pixels(&same_view, PIXEL_TOLERANCE);
+            let mut valid = Vec::new();
+            if let Some(mask) = posed.dataset.valid_pixels(i) {
+                changed.retain(|&pixel| mask[pixel as usize]);
+                valid = (0..mask.len() as u32).filter(|&pixel| mask[pixel as usize]).collect();
             }
+            TrainingView { camera: posed.dataset.frames()[i].camera, rgb: posed.images[i].rgb.clone(), changed, valid }
         })
         .collect()
 }

@@ -286,7 +286,8 @@ fn view_figures(context: Context, field: &Field, role: PoseRole, mut strip: Opti
     for i in posed.with_roles(&[role]) {
         let truth = &posed.images[i];
         let values = renderer.values(field, &posed.dataset.frames()[i].camera, &[0.0; LATENT_DIM]);
-        psnr_db.extend(carff_base::statistics::psnr_db(values, &to_unit(&truth.rgb)));
+        let valid = posed.dataset.valid_in_all(&[i]);
+        psnr_db.extend(carff_base::statistics::psnr_where(values, &to_unit(&truth.rgb), |v| valid(v / 3)));
         let Some(strip) = &mut strip else { continue };
         let size = |t: &carff_dataset::Image| (t.width_px, t.height_px);
         if strip.truths.len() < STRIP_IMAGES && strip.truths.first().is_none_or(|t| size(t) == size(truth)) {

@@ -73,7 +73,7 @@ fn reconstruction_through_the_draw() {
         let settings = VaeTraining { residual, ..VaeTraining::default() };
         agrees("reconstruction", &[random(&[3, 8]), random(&[3, 8])], |t| {
             let made = reparameterised(&t[0], &t[1], &noise).matmul(&map).view([3, 3, 2, 4]);
-            reconstruction_error(&made, &targets, &means, &settings)
+            reconstruction_error(&made, &targets, &means, None, &settings)
         });
     }
 }

@@ -241,7 +241,7 @@ fn small_picture(folder: &Path) {
 
 fn png(bytes: &[u8], folder: &Path) -> Verdict {
     let path = put(folder, "picture.png", bytes);
-    let image = Image::load_png(&path).map_err(|e| {
+    let image = Image::load(&path).map_err(|e| {
         assert!(e.to_string().contains("picture.png"), "{e}");
         words(e)
     })?;

@@ -326,7 +326,7 @@ mod tests {
         for (law, rows) in [(Law::Linear, 3), (Law::Area, 3), (Law::Power, 3), (Law::Power, 1)] {
             let axis = Axis { law, rows: axis().rows[..rows].to_vec(), ..axis() };
             axis.plot(folder.path()).unwrap();
-            assert!(carff_dataset::Image::load_png(&folder.path().join("probes.png")).is_ok());
+            assert!(carff_dataset::Image::load(&folder.path().join("probes.png")).is_ok());
             std::fs::remove_file(folder.path().join("probes.png")).unwrap();
         }
     }

@@ -235,7 +235,7 @@ fn write_images(from: &Path, to: &Path, side_px: u32) -> anyhow::Result<()> {
     // Evenly spread over the folder, so that they show different states.
     let stride = (paths.len() / IMAGES).max(1);
     for (i, path) in paths.iter().step_by(stride).take(IMAGES).enumerate() {
-        scaled(&Image::load_png(path)?, side_px).save_png(&to.join(format!("{i:03}.png")))?;
+        scaled(&Image::load(path)?, side_px).save_png(&to.join(format!("{i:03}.png")))?;
     }
     Ok(())
 }

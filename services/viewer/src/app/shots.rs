@@ -77,7 +77,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let first = free_name(folder.path(), "window").unwrap();
         save_window(&ColorImage::filled([3, 2], Color32::from_rgb(1, 2, 3)), &first).unwrap();
-        assert_eq!(Image::load_png(&first).unwrap(), Image::filled(3, 2, [1, 2, 3]));
+        assert_eq!(Image::load(&first).unwrap(), Image::filled(3, 2, [1, 2, 3]));
         let second = free_name(folder.path(), "window").unwrap();
         assert!(first.ends_with("carff-window-0001.png") && second.ends_with("carff-window-0002.png"));
         let error = save_image(&Image::filled(1, 1, [0; 3]), &folder.path().join("none/x.png")).unwrap_err();

@@ -205,11 +205,13 @@ fn novel_views(subject: &Subject, artist: &mut Artist, role: PoseRole) -> Option
             .map(|i| to_unit(&posed.images[i].rgb))
             .collect();
         let within = actor_pixels(subject, label.state, &camera);
-        psnr.extend(psnr_db(&image, &truth));
-        of_mean.extend(mean_image(&of_pose).and_then(|m| psnr_db(&m, &truth)));
+        let valid = posed.dataset.valid_in_all(&[i]);
+        let psnr_of = |image: &[f32]| psnr_where(image, &truth, |v| valid(v / 3));
+        psnr.extend(psnr_of(&image));
+        of_mean.extend(mean_image(&of_pose).and_then(|m| psnr_of(&m)));
         similar.extend(ssim(&image, &truth, camera.width_px as usize));
         if label.observability == Observability::Full {
-            actor.extend(psnr_where(&image, &truth, |i| within[i / 3]));
+            actor.extend(psnr_where(&image, &truth, |v| within[v / 3] && valid(v / 3)));
         }
     }
     let (psnr_db, mean_picture_db) = (mean(&psnr)?, mean(&of_mean)?);

@@ -18,6 +18,8 @@ pub struct TrainingView {
     pub rgb: Vec<u8>,
     /// Pixels (y * width + x) that differ among states ([`changed_pixels`]); may be empty.
     pub changed: Vec<u32>,
+    /// Pixels that rays are drawn from; empty: all.
+    pub valid: Vec<u32>,
 }
 
 /// Returns the pixels that differ by more than `threshold` (0..=255) in any channel between any two images: RGB of equal
@@ -47,7 +49,7 @@ pub fn changed_pixels(images: &[&[u8]], threshold: u8) -> Vec<u32> {
 /// use carff_field::{RAYS_PER_GROUP, RayBatch, RaySampler, TrainingView};
 /// use carff_base::geometry::PinholeCamera;
 /// let camera = PinholeCamera::look_at([0.0, -5.0, 1.0], [0.0; 3], [0.0, 0.0, 1.0], 4, 4, 60.0);
-/// let view = TrainingView { camera, rgb: vec![255; 4 * 4 * 3], changed: Vec::new() };
+/// let view = TrainingView { camera, rgb: vec![255; 4 * 4 * 3], changed: Vec::new(), valid: Vec::new() };
 /// let mut sampler = RaySampler::new(vec![view], 0.5, 1);
 /// let mut batch = RayBatch::default();
 /// sampler.next_batch(2 * RAYS_PER_GROUP, &mut batch, |_view, _draw| [0.0; 8]);
@@ -68,7 +70,7 @@ impl RaySampler {
         let mut views = views;
         views.retain(|v| {
             let pixels = v.camera.width_px as usize * v.camera.height_px as usize;
-            pixels > 0 && v.rgb.len() == pixels * 3 && v.changed.iter().all(|p| (*p as usize) < pixels)
+            pixels > 0 && v.rgb.len() == pixels * 3 && v.changed.iter().chain(&v.valid).all(|p| (*p as usize) < pixels)
         });
         Self { views, changed_share: changed_share.clamp(0.0, 1.0), seed, drawn: 0 }
     }
@@ -112,10 +114,13 @@ impl RaySampler {
             batch.latents.push(latent_of(at, draw));
             for i in 0..RAYS_PER_GROUP {
                 let r = hash(draw, 1, i as u64);
+                let one_of = |pixels: &[u32]| u64::from(pixels[(r % pixels.len() as u64) as usize]);
                 let pixel = if i < from_changed && !view.changed.is_empty() {
-                    u64::from(view.changed[(r % view.changed.len() as u64) as usize])
-                } else {
+                    one_of(&view.changed)
+                } else if view.valid.is_empty() {
                     r % (width * height)
+                } else {
+                    one_of(&view.valid)
                 };
                 let (x, y) = (pixel % width, pixel / width);
                 batch.rays.push(view.camera.ray(x as f64 + 0.5, y as f64 + 0.5));
@@ -125,5 +130,27 @@ impl RaySampler {
             }
         }
         self.drawn += 1;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Rays go through valid pixels only; with all pixels, the draws are those of a view without a list.
+    #[test]
+    fn rays_go_through_valid_pixels() {
+        let camera = PinholeCamera::look_at([0.0, -5.0, 1.0], [0.0; 3], [0.0, 0.0, 1.0], 8, 8, 60.0);
+        let rgb: Vec<u8> = (0..64).flat_map(|i| [i; 3]).collect();
+        let drawn = |changed: Vec<u32>, valid: Vec<u32>| {
+            let view = TrainingView { camera, rgb: rgb.clone(), changed, valid };
+            let mut batch = RayBatch::default();
+            RaySampler::new(vec![view], 0.5, 1).next_batch(16 * RAYS_PER_GROUP, &mut batch, |_, _| [0.0; 8]);
+            batch.target_rgb.iter().map(|rgb| (rgb[0] * 255.0).round() as u32).collect::<Vec<_>>()
+        };
+        let valid: Vec<u32> = (0..64).filter(|i| i % 8 > 2).collect();
+        let pixels = drawn(vec![5, 60], valid.clone());
+        assert!(pixels.iter().all(|p| valid.contains(p)) && valid.iter().all(|p| pixels.contains(p)));
+        assert_eq!(drawn(vec![5], (0..64).collect()), drawn(vec![5], Vec::new()));
     }
 }

@@ -103,11 +103,25 @@ impl EfficientNetLite0 {
             .collect()
     }
 
-    /// Reads the weights by the names of [`Self::published`]; other tensors are ignored. Without tensors, the weights
-    /// are random (for tests, and for filling from a checkpoint). The folded weights are registered in `path`; to
-    /// freeze them, freeze its store.
+    /// Returns the tensors of [`Self::published`], from published names or timm's.
+    pub(crate) fn select(tensors: &Tensors) -> Result<Tensors, ModelError> {
+        let own = published_names(tensors);
+        let negative = |name: &&String| name.ends_with(".running_var") && own[*name].min().double_value(&[]) < 0.0;
+        if let Some(name) = own.keys().find(negative) {
+            return Err(ModelError::Mismatch(format!("`{name}` has negative variances")));
+        }
+        select(&own, &Self::published(), is_beyond_the_features)
+    }
+
+    /// Reads the weights by the names of [`Self::published`], or by timm's names for `tf_efficientnet_lite0`. Later
+    /// blocks and the classifier are ignored. Without tensors, the weights are random (for tests, and for filling from
+    /// a checkpoint). The folded weights are registered in `path`; to freeze them, freeze its store.
+    ///
+    /// # Errors
+    ///
+    /// [`ModelError::Mismatch`] lists missing and unknown tensors, and tensors of another shape.
     pub fn new(path: &nn::Path, tensors: Option<&Tensors>, input_px: i64) -> Result<Self, ModelError> {
-        let tensors = tensors.map(|all| select(all, &Self::published())).transpose()?;
+        let tensors = tensors.map(Self::select).transpose()?;
         let read = |layer: &Layer| {
             let target = layer.convolution.split('.').fold(path.clone(), |p, part| p / part);
             folded(&target, tensors.as_ref(), layer)
@@ -123,6 +137,56 @@ impl EfficientNetLite0 {
         });
         Ok(Self { stem: read(&stem_layer()), blocks: blocks.collect(), input_px })
     }
+}
+
+/// Returns true for tensors that the feature map does not depend on: later blocks, the classifier, and counters.
+fn is_beyond_the_features(name: &str) -> bool {
+    let parts: Vec<&str> = name.split('.').collect();
+    match parts[..] {
+        ["_conv_head" | "_bn1" | "_fc", ..] | [.., "num_batches_tracked"] => true,
+        ["_blocks", block, ..] => block.parse::<usize>().is_ok_and(|block| block >= BLOCKS.len()),
+        _ => false,
+    }
+}
+
+/// Blocks of each of timm's stages.
+const TIMM_STAGES: [usize; 7] = [1, 2, 2, 3, 3, 4, 1];
+
+/// Converts timm's names to published names; other names are unchanged.
+fn published_names(tensors: &Tensors) -> Tensors {
+    let in_timm = tensors.contains_key("conv_stem.weight");
+    let renamed = |name: &str| if in_timm { published_name(name) } else { None };
+    tensors.iter().map(|(name, t)| (renamed(name).unwrap_or_else(|| name.clone()), t.shallow_clone())).collect()
+}
+
+fn published_name(timm: &str) -> Option<String> {
+    let (layer, part) = timm.rsplit_once('.')?;
+    let layer = match layer.split('.').collect::<Vec<_>>()[..] {
+        ["conv_stem"] => "_conv_stem".into(),
+        ["bn1"] => "_bn0".into(),
+        ["conv_head"] => "_conv_head".into(),
+        ["bn2"] => "_bn1".into(),
+        ["classifier"] => "_fc".into(),
+        ["blocks", stage, block, layer] => {
+            let (stage, block) = (stage.parse::<usize>().ok()?, block.parse::<usize>().ok()?);
+            if block >= *TIMM_STAGES.get(stage)? {
+                return None;
+            }
+            // The first stage has no expansion, so that its layers are counted from the depthwise one.
+            let layer = match (stage, layer) {
+                (0, "conv_pw") | (1.., "conv_pwl") => "_project_conv",
+                (1.., "conv_pw") => "_expand_conv",
+                (_, "conv_dw") => "_depthwise_conv",
+                (1.., "bn1") => "_bn0",
+                (0, "bn1") | (1.., "bn2") => "_bn1",
+                (0, "bn2") | (1.., "bn3") => "_bn2",
+                _ => return None,
+            };
+            format!("_blocks.{}.{layer}", TIMM_STAGES[..stage].iter().sum::<usize>() + block)
+        }
+        _ => return None,
+    };
+    Some(format!("{layer}.{part}"))
 }
 
 /// Returns a layer's convolution with its normalisation folded in. `tensors` has all of

@@ -29,11 +29,13 @@ pub fn build(
     path: &nn::Path,
     pretrained: Option<&Path>,
 ) -> Result<Box<dyn Backbone>, ModelError> {
-    if !(32..=1024).contains(&config.input_px) || config.input_px % 32 != 0 {
+    // A vision transformer checks its own unit, the side of a patch.
+    let unit = if config.kind == BackboneKind::Vit { 1 } else { 32 };
+    if !(unit..=1024).contains(&config.input_px) || config.input_px % unit != 0 {
         return Err(ModelError::Setting {
             key: "backbone.input_px",
             value: config.input_px.to_string(),
-            allowed: "a multiple of 32 from 32 to 1024",
+            allowed: "a multiple of 32 (vision transformer: of `patch_px`), at most 1024",
         });
     }
     let tensors = pretrained.map(weights::read).transpose()?;

@@ -14,6 +14,8 @@ pub struct VisionTransformer {
     patch: nn::Conv2D,
     class_token: Tensor,
     positions: Tensor,
+    /// Tokens without a position, `[1, registers, width]` (Darcet et al. 2024).
+    registers: Option<Tensor>,
     blocks: Vec<Block>,
     norm: nn::LayerNorm,
     width: i64,
@@ -34,7 +36,12 @@ struct Block {
 
 impl VisionTransformer {
     /// Builds the network in `path`, with weights in timm names (`blocks.0.attn.qkv.weight`) or Hugging Face names
-    /// (`vit.encoder.layer.0.attention.attention.query.weight`). A classifier in the file is ignored.
+    /// (`vit.encoder.layer.0.attention.attention.query.weight`). `LayerScale` factors are folded into the layers before
+    /// them. A classifier, a decoder and a mask token in the file are ignored.
+    ///
+    /// # Errors
+    ///
+    /// [`ModelError::Mismatch`] lists missing and unknown tensors, and tensors of another shape.
     pub fn new(
         path: &nn::Path,
         config: &VitConfig,
@@ -47,6 +54,9 @@ impl VisionTransformer {
         }
         if config.patch_px < 1 || input_px % config.patch_px.max(1) != 0 {
             return wrong("backbone.vit.patch_px", config.patch_px, "a divisor of `input_px`, at least 1");
+        }
+        if !(0..=64).contains(&config.registers) {
+            return wrong("backbone.vit.registers", config.registers, "0 to 64");
         }
         if !(1..=64).contains(&config.depth) {
             return wrong("backbone.vit.depth", config.depth, "1 to 64");
@@ -74,6 +84,7 @@ impl VisionTransformer {
             patch: nn::conv2d(path / "patch_embed" / "proj", 3, width, config.patch_px, conv),
             class_token: path.var("cls_token", &[1, 1, width], small),
             positions: path.var("pos_embed", &[1, grid * grid + 1, width], small),
+            registers: (config.registers > 0).then(|| path.var("reg_token", &[1, config.registers, width], small)),
             blocks,
             norm: nn::layer_norm(path / "norm", vec![width], norm_config),
             width,
@@ -81,7 +92,7 @@ impl VisionTransformer {
             grid,
         };
         if let Some(tensors) = tensors {
-            net.fill(&timm_names(tensors))?;
+            net.fill(&timm_form(tensors))?;
         }
         Ok(net)
     }
@@ -90,7 +101,7 @@ impl VisionTransformer {
     /// Hugging Face names. The tensors do not contain the number of heads: it is one per 64 of the width, as in all
     /// published sizes.
     pub fn shape_of(tensors: &Tensors) -> Result<(VitConfig, i64), ModelError> {
-        let tensors = timm_names(tensors);
+        let tensors = timm_form(tensors);
         let size = |name: &str| {
             tensors.get(name).map(Tensor::size).ok_or_else(|| ModelError::Mismatch(format!("`{name}` is missing")))
         };
@@ -101,6 +112,11 @@ impl VisionTransformer {
         let (width, patch_px) = match patch[..] {
             [width, 3, high, wide] if width >= 1 && high >= 1 && high == wide => (width, wide),
             _ => return unfit("patch_embed.proj.weight", &patch, "[width, 3, patch_px, patch_px]"),
+        };
+        let registers = match tensors.get("reg_token").map(Tensor::size).as_deref() {
+            None => 0,
+            Some(&[1, registers, w]) if w == width => registers,
+            Some(size) => return unfit("reg_token", size, &format!("[1, registers, {width}]")),
         };
         let positions = size("pos_embed")?;
         let tokens = match positions[..] {
@@ -119,7 +135,7 @@ impl VisionTransformer {
             )));
         }
         let depth = depth(&tensors, "blocks", "norm1.weight");
-        Ok((VitConfig { patch_px, width, depth, heads: (width / 64).max(1) }, grid * patch_px))
+        Ok((VitConfig { patch_px, width, depth, heads: (width / 64).max(1), registers }, grid * patch_px))
     }
 
     fn fill(&self, tensors: &Tensors) -> Result<(), ModelError> {
@@ -128,6 +144,7 @@ impl VisionTransformer {
             ("pos_embed".into(), &self.positions),
             ("patch_embed.proj.weight".into(), &self.patch.ws),
         ];
+        own.extend(self.registers.iter().map(|registers| ("reg_token".into(), registers)));
         own.extend(self.patch.bs.iter().map(|bias| ("patch_embed.proj.bias".into(), bias)));
         own.extend(named("norm", self.norm.ws.as_ref(), self.norm.bs.as_ref()));
         for (i, block) in self.blocks.iter().enumerate() {
@@ -144,7 +161,7 @@ impl VisionTransformer {
             }
         }
         let wanted: Vec<(String, Vec<i64>)> = own.iter().map(|(name, v)| (name.clone(), v.size())).collect();
-        let tensors = select(tensors, &wanted)?;
+        let tensors = select(tensors, &wanted, is_beyond_the_features)?;
         tch::no_grad(|| {
             for (name, variable) in own {
                 variable.shallow_clone().copy_(&tensors[&name]);
@@ -171,46 +188,84 @@ fn named<'a>(
         .flatten()
 }
 
-/// Converts Hugging Face names to timm names; queries, keys and values are concatenated.
-fn timm_names(tensors: &Tensors) -> Tensors {
-    let root = if tensors.keys().any(|k| k.starts_with("vit.embeddings.")) { "vit." } else { "" };
-    if !tensors.contains_key(&format!("{root}embeddings.cls_token")) {
-        return tensors.iter().map(|(k, t)| (k.clone(), t.shallow_clone())).collect();
-    }
-    let depth = depth(tensors, &format!("{root}encoder.layer"), "layernorm_before.weight");
-    let mut renamed = Tensors::new();
-    let mut rename = |to: String, from: String| {
-        if let Some(t) = tensors.get(&format!("{root}{from}")) {
-            renamed.insert(to, t.shallow_clone());
-        }
+/// Returns true for tensors that the feature map does not depend on: classifiers, decoders and the mask token.
+fn is_beyond_the_features(name: &str) -> bool {
+    let first = name.split('.').next().unwrap_or_default();
+    ["head", "head_dist", "fc_norm", "pre_logits", "classifier", "pooler", "lm_head", "mask_token"].contains(&first)
+        || first.starts_with("decoder")
+}
+
+/// Parts of Hugging Face names and of the `DINOv2` authors' names, with timm's; earlier entries have precedence.
+const TIMM_PARTS: [(&str, &str); 15] = [
+    ("embeddings.cls_token", "cls_token"),
+    ("embeddings.mask_token", "mask_token"),
+    ("embeddings.position_embeddings", "pos_embed"),
+    ("embeddings.patch_embeddings.projection.", "patch_embed.proj."),
+    ("embeddings.register_tokens", "reg_token"),
+    ("register_tokens", "reg_token"),
+    ("encoder.layer.", "blocks."),
+    (".layernorm_before.", ".norm1."),
+    (".layernorm_after.", ".norm2."),
+    (".attention.output.dense.", ".attn.proj."),
+    (".intermediate.dense.", ".mlp.fc1."),
+    (".output.dense.", ".mlp.fc2."),
+    (".layer_scale1.lambda1", ".ls1.gamma"),
+    (".layer_scale2.lambda1", ".ls2.gamma"),
+    ("layernorm.", "norm."),
+];
+
+/// Converts the tensors to timm's names and form: queries, keys and values are concatenated, `LayerScale` is folded,
+/// and the class token has a position. Tensors that cannot be converted keep their names, and are reported as unknown.
+fn timm_form(tensors: &Tensors) -> Tensors {
+    let root = tensors.keys().find_map(|k| k.strip_suffix("embeddings.cls_token")).unwrap_or_default();
+    let renamed = |name: &str| {
+        let name = name.strip_prefix(root).unwrap_or(name);
+        TIMM_PARTS.iter().fold(name.to_owned(), |name, (from, to)| name.replace(from, to))
     };
-    rename("cls_token".into(), "embeddings.cls_token".into());
-    rename("pos_embed".into(), "embeddings.position_embeddings".into());
-    for part in ["weight", "bias"] {
-        rename(format!("patch_embed.proj.{part}"), format!("embeddings.patch_embeddings.projection.{part}"));
-        rename(format!("norm.{part}"), format!("layernorm.{part}"));
-        for i in 0..depth {
-            let from = format!("encoder.layer.{i}");
-            rename(format!("blocks.{i}.norm1.{part}"), format!("{from}.layernorm_before.{part}"));
-            rename(format!("blocks.{i}.norm2.{part}"), format!("{from}.layernorm_after.{part}"));
-            rename(format!("blocks.{i}.attn.proj.{part}"), format!("{from}.attention.output.dense.{part}"));
-            rename(format!("blocks.{i}.mlp.fc1.{part}"), format!("{from}.intermediate.dense.{part}"));
-            rename(format!("blocks.{i}.mlp.fc2.{part}"), format!("{from}.output.dense.{part}"));
+    let mut own: Tensors = tensors.iter().map(|(name, t)| (renamed(name), t.shallow_clone())).collect();
+    for i in 0..depth(&own, "blocks", "norm1.weight") {
+        for part in ["weight", "bias"] {
+            join_queries(&mut own, i, part);
         }
+        fold_scale(&mut own, &format!("blocks.{i}.ls1.gamma"), &format!("blocks.{i}.attn.proj"));
+        fold_scale(&mut own, &format!("blocks.{i}.ls2.gamma"), &format!("blocks.{i}.mlp.fc2"));
     }
-    for part in ["weight", "bias"] {
-        for i in 0..depth {
-            let parts: Vec<&Tensor> = ["query", "key", "value"]
-                .iter()
-                .filter_map(|q| tensors.get(&format!("{root}encoder.layer.{i}.attention.attention.{q}.{part}")))
-                .collect();
-            // Tensors that cannot be concatenated are omitted, and reported as missing.
-            if let (3, Ok(joined)) = (parts.len(), Tensor::f_cat(&parts, 0)) {
-                renamed.insert(format!("blocks.{i}.attn.qkv.{part}"), joined);
-            }
-        }
+    add_class_position(&mut own);
+    own
+}
+
+/// Concatenates a block's queries, keys and values.
+fn join_queries(tensors: &mut Tensors, block: i64, part: &str) {
+    let names = ["query", "key", "value"].map(|q| format!("blocks.{block}.attention.attention.{q}.{part}"));
+    let parts: Vec<&Tensor> = names.iter().filter_map(|name| tensors.get(name)).collect();
+    if let (3, Ok(joined)) = (parts.len(), Tensor::f_cat(&parts, 0)) {
+        names.iter().for_each(|name| drop(tensors.remove(name)));
+        tensors.insert(format!("blocks.{block}.attn.qkv.{part}"), joined);
     }
-    renamed
+}
+
+/// Multiplies a layer's outputs by a `LayerScale` factor (Touvron et al. 2021), and removes the factor.
+fn fold_scale(tensors: &mut Tensors, factor: &str, layer: &str) {
+    let [weight, bias] = ["weight", "bias"].map(|part| format!("{layer}.{part}"));
+    let (Some(f), Some(w), Some(b)) = (tensors.get(factor), tensors.get(&weight), tensors.get(&bias)) else { return };
+    if w.dim() != 2 || f.size() != w.size()[..1] || f.size() != b.size() {
+        return;
+    }
+    let (w, b) = (w * f.unsqueeze(1), b * f);
+    tensors.extend([(weight, w), (bias, b)]);
+    tensors.remove(factor);
+}
+
+/// Adds a position of zero for the class token if only patches have positions (a square number of them).
+fn add_class_position(tensors: &mut Tensors) {
+    let Some(positions) = tensors.get("pos_embed") else { return };
+    if let [1, patches, _] = positions.size()[..]
+        && patches > 0
+        && (patches as f64).sqrt().fract() == 0.0
+    {
+        let zero = positions.narrow(1, 0, 1).zeros_like();
+        tensors.insert("pos_embed".into(), Tensor::cat(&[zero, positions.shallow_clone()], 1));
+    }
 }
 
 impl Block {
@@ -246,6 +301,11 @@ impl Backbone for VisionTransformer {
         let tokens = self.patch.forward(&x).flatten(2, 3).transpose(1, 2);
         let class = self.class_token.expand([n, 1, self.width], false);
         let x = Tensor::cat(&[class, tokens], 1) + &self.positions;
+        // Attention does not depend on the order of tokens: registers follow the patches.
+        let x = match &self.registers {
+            Some(registers) => Tensor::cat(&[x, registers.expand([n, -1, -1], false)], 1),
+            None => x,
+        };
         let x = self.blocks.iter().fold(x, |x, block| block.forward(&x));
         let x = self.norm.forward(&x).to_kind(Kind::Float);
         x.narrow(1, 1, self.grid * self.grid).transpose(1, 2).reshape([n, self.width, self.grid, self.grid])
@@ -266,7 +326,7 @@ mod tests {
     use tch::{Device, nn::VarStore};
 
     fn tiny() -> VitConfig {
-        VitConfig { patch_px: 16, width: 12, depth: 2, heads: 3 }
+        VitConfig { patch_px: 16, width: 12, depth: 2, heads: 3, registers: 0 }
     }
 
     /// Equal weights in Hugging Face names and in timm names give equal features and the same size.

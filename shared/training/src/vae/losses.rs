@@ -11,11 +11,18 @@ pub fn reparameterised(mean: &Tensor, log_variance: &Tensor, noise: &Tensor) -> 
 }
 
 /// Mean squared error of decoded images `[N, 3, H, W]`, times ten. Pixels of `targets` that differ from `means`, the
-/// mean images of the poses, have the weight `foreground_weight`. The decoder's target is the residual over the mean
-/// image where `residual` is set, else the image.
-pub fn reconstruction_error(made: &Tensor, targets: &Tensor, means: &Tensor, settings: &VaeTraining) -> Tensor {
+/// mean images of the poses, have the weight `foreground_weight`; pixels outside of `valid` `[N, 1, H, W]` have none. The
+/// decoder's target is the residual over the mean image where `residual` is set, else the image.
+pub fn reconstruction_error(
+    made: &Tensor,
+    targets: &Tensor,
+    means: &Tensor,
+    valid: Option<&Tensor>,
+    settings: &VaeTraining,
+) -> Tensor {
     let residual = targets - means;
     let weight = changed_pixels(&residual) * (settings.foreground_weight - 1.0) + 1.0;
+    let weight = valid.map_or_else(|| weight.shallow_clone(), |valid| &weight * valid);
     let wanted = if settings.residual { &residual } else { targets };
     ((made - wanted).square() * weight).mean(Kind::Float) * 10.0
 }
@@ -58,6 +65,22 @@ mod tests {
         let zero = Tensor::zeros([2, 8], (Kind::Float, Device::Cpu));
         assert!(kl_divergence(&zero, &zero).double_value(&[]).abs() < 1e-6);
         assert!((kl_divergence(&(&zero + 0.5), &zero).double_value(&[]) - 1.0).abs() < 1e-5);
+    }
+
+    /// Pixels that are not valid have no weight and no gradient.
+    #[test]
+    fn masked_pixels_have_no_loss() {
+        let images = |value: f64| Tensor::zeros([2, 3, 4, 4], (Kind::Float, Device::Cpu)) + value;
+        let settings = VaeTraining::default();
+        let valid = Tensor::ones([2, 1, 4, 4], (Kind::Float, Device::Cpu));
+        let _ = valid.narrow(3, 2, 2).fill_(0.0);
+        let made = images(0.5).set_requires_grad(true);
+        let loss = |valid| reconstruction_error(&made, &images(0.2), &images(0.2), valid, &settings);
+        let (whole, half) = (loss(None).double_value(&[]), loss(Some(&valid)));
+        assert!((half.double_value(&[]) - whole / 2.0).abs() < 1e-6);
+        half.backward();
+        assert_eq!(made.grad().narrow(3, 2, 2).abs().max().double_value(&[]), 0.0);
+        assert!(made.grad().narrow(3, 0, 2).abs().min().double_value(&[]) > 0.0);
     }
 
     /// Views of one state closer together, states further apart: a smaller loss.

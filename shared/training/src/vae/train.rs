@@ -148,7 +148,8 @@ impl<'a> VaePhase<'a> {
         let targets = posed.targets(decoded).to_device(device);
         let means = posed.pose_means.index_select(0, &views).to_device(device);
         let made = self.vae.decoder.forward(latents, &views.to_device(device));
-        reconstruction_error(&made, &targets, &means, self.settings())
+        let valid = posed.valid_targets(decoded).map(|valid| valid.to_device(device));
+        reconstruction_error(&made, &targets, &means, valid.as_ref(), self.settings())
     }
 }
 
