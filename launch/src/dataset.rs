@@ -141,6 +141,7 @@ pub fn render(scenario: &Scenario, out: &Path, extras: Extras) -> anyhow::Result
 }
 
 fn check(dir: &Path, sheet: Option<&Path>, columns: usize) -> anyhow::Result<()> {
+    sheet.map_or(Ok(()), carff_base::files::check_writable)?;
     let (dataset, faults) = Dataset::survey(dir)?;
     for fault in &faults {
         println!("error: {fault}");

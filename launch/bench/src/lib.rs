@@ -56,6 +56,19 @@ pub enum BenchCommand {
     Probes(probes::ProbesArgs),
 }
 
+impl BenchCommand {
+    fn output(&self) -> Option<&OutputArgs> {
+        match self {
+            Self::Field(args) => Some(&args.output),
+            Self::Encoder(args) => Some(&args.output),
+            Self::Ipc(args) => Some(&args.output),
+            Self::Loop(args) => Some(&args.output),
+            Self::Scale(args) => Some(&args.output),
+            Self::IpcPeer(_) | Self::Relay(_) | Self::Probes(_) => None,
+        }
+    }
+}
+
 /// Output of the figures.
 #[derive(Clone, Debug, clap::Args)]
 pub struct OutputArgs {
@@ -69,6 +82,9 @@ pub struct OutputArgs {
 
 /// Runs a benchmark, prints its tables, and writes its figures if requested.
 pub fn run(command: BenchCommand) -> anyhow::Result<ExitCode> {
+    if let Some(path) = command.output().and_then(|output| output.json.as_deref()) {
+        carff_base::files::check_writable(path)?;
+    }
     let (report, output) = match command {
         BenchCommand::Field(args) => (field::run(&args)?, args.output),
         BenchCommand::Encoder(args) => (encoder::run(&args)?, args.output),
