@@ -98,6 +98,7 @@ def fill(tree: Path, target: Path) -> None:
     put(debian / "vehicle.toml", tree / "etc/carff/vehicle.toml")
     for unit in ["carff.service", "carff.target"]:
         put(debian / unit, tree / "lib/systemd/system" / unit)
+    put(debian / "carff.tmpfiles", tree / "usr/lib/tmpfiles.d/carff.conf")
 
     carff = str(target / "release/carff")
     environment = {**os.environ, "LD_LIBRARY_PATH": str(libtorch / "lib")}

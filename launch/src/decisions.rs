@@ -10,6 +10,7 @@ use carff_dataset::drives::DriveKind;
 use carff_evaluation::run::decisive_frames;
 use carff_messages::{ActionCode, Observability, Reason};
 use serde_json::json;
+use std::fmt::Write as _;
 use std::fs::File;
 use std::io::{LineWriter, Write};
 use std::path::{Path, PathBuf};
@@ -109,7 +110,8 @@ impl Decisions {
         if let Some((frame, kind)) = decisive.and_then(|found| found.into_iter().next()) {
             let right = frame.halted == (kind == DriveKind::Hazard);
             let (action, verdict) = (action_name(frame.halted), if right { "correct" } else { "WRONG" });
-            line += &format!(
+            let _ = write!(
+                line,
                 "  {:<6} t{}  hazard {:.2}  {}  {}",
                 kind.name(),
                 frame.timestamp,

@@ -3,6 +3,7 @@
 use crate::dataset::render;
 use crate::train::Display;
 use anyhow::{Context, bail};
+use carff_base::files::check_writable;
 use carff_checkpoint::Manifest;
 use carff_dataset::{Image, drives::DriveKind};
 use carff_evaluation::{EvalOptions, Progress, Subject, Table, evaluate};
@@ -80,6 +81,7 @@ impl From<TableName> for Table {
 
 /// Runs the command.
 pub fn run(args: &EvalArgs) -> anyhow::Result<ExitCode> {
+    check_writable(&args.out.join("results.json"))?;
     let options = options(&args.device, args.threads, args.seed)?;
     // One image at a time gains little from a second thread, and loses much on busy cores.
     carff_networks::device::set_threads(1);

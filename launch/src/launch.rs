@@ -1,12 +1,13 @@
 //! `carff launch`: starts a graph, watches it, prints its decisions, ends it, and writes a report.
 
 use crate::decisions::Decisions;
-use crate::planning::Planning;
-use crate::report::{self, ReportFiles, RunOutcome};
+use crate::planning::{Planning, RunOutcome};
+use crate::report::{self, ReportFiles};
 use crate::supervision::monitor::FrameRecord;
 use crate::supervision::{Ended, Feed, LAUNCHER, Supervisor};
 use anyhow::{Context, bail, ensure};
 use carff::provenance;
+use carff::runs::log_path;
 use carff::terminal::Terminal;
 use carff_checkpoint::{Manifest, ScenarioIdentity};
 use carff_config::{CameraSource, GraphConfig};
@@ -15,7 +16,7 @@ use carff_observe::{RunLock, RunRecord};
 use carff_runtime::StageArgs;
 use carff_scenes::{Extras, Scenario};
 use carff_transport::{
-    Node, Run, Stop, check_space, monotonic_now_ns, remove_run_leftovers, run_id_of, runtime_dir, topics,
+    Node, Run, Stop, check_space, graph_bytes, monotonic_now_ns, remove_run_leftovers, run_id_of, runtime_dir,
 };
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -151,6 +152,7 @@ pub(crate) fn run_graph(
     };
     let lock = RunLock::take(&runtime_dir(), &name, &record, "--run")?;
     lock.sweep(&run, "--run")?;
+    terminal.log_to(&log_path(run.dir(), &name)).context("cannot write the run's log")?;
     let origin = provenance::of(Some(record.started_unix_s), Some(&checkpoint));
     let _copy = copied.then(|| write_copy(&graph, &graph_file)).transpose()?;
 
@@ -167,7 +169,7 @@ pub(crate) fn run_graph(
     // From here on Ctrl-C ends the run in order. Before, no stage runs, and the process may simply end.
     let stop = Stop::on_signals().context("cannot handle signals")?;
     let view_bytes = carff_messages::rgb_bytes(graph.renderer.width_px, graph.renderer.height_px);
-    check_space(Path::new("/dev/shm"), "the graph", topics::graph_bytes(FRAME_BYTES, view_bytes))?;
+    check_space(Path::new("/dev/shm"), "the graph", graph_bytes(FRAME_BYTES, view_bytes))?;
 
     let mut stage_args = StageArgs::new(&graph_file, &name, run.id());
     stage_args.dataset = Some(dataset.clone());

@@ -1,14 +1,42 @@
-//! The drives of a run, judged by `carff_evaluation::run`: from the run's records to its inputs.
+//! A finished run, and the inputs by which `carff_evaluation::run` judges its drives.
 
-use crate::report::RunOutcome;
-use crate::supervision::monitor::FrameRecord;
+use crate::supervision::monitor::{FrameRecord, Records};
+use carff::provenance::Origin;
 use carff_checkpoint::CheckpointPlanning;
-use carff_config::CameraSource;
-use carff_dataset::drives::DriveKind;
+use carff_config::{CameraSource, GraphConfig};
+use carff_dataset::{ScenarioInfo, drives::DriveKind};
 use carff_evaluation::run::{DecidedFrame, JudgedRun, RunPlanning, RunSettings, decisive_frames};
-use carff_messages::{ActionCode, Reason};
+use carff_messages::{ActionCode, Reason, Stage};
 use carff_scenes::Scenario;
-use std::path::Path;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+/// A finished run.
+#[derive(Clone, Debug)]
+pub struct RunOutcome {
+    /// Run name.
+    pub run: String,
+    /// Program, host, start and checkpoint of the run.
+    pub origin: Origin,
+    /// Path of the graph file.
+    pub graph_file: String,
+    /// Effective configuration.
+    pub graph: GraphConfig,
+    /// Scenario of the dataset, where it has one.
+    pub scenario: Option<ScenarioInfo>,
+    /// True if a signal ended the run.
+    pub interrupted: bool,
+    /// Folder of the dataset.
+    pub dataset: PathBuf,
+    /// Folder of the trained models.
+    pub checkpoint: PathBuf,
+    /// Records of the run.
+    pub records: Records,
+    /// Restarts by stage.
+    pub restarts: BTreeMap<Stage, u32>,
+    /// Number of invalid messages that the launcher received.
+    pub invalid: u64,
+}
 
 /// A run with drives, and its models.
 pub struct Planning {

@@ -1,46 +1,16 @@
 //! The report of a run: its own figures as JSON and text, and the files that hold it.
 
-use crate::planning;
-use crate::supervision::monitor::Records;
+use crate::planning::{self, RunOutcome};
 use anyhow::Context;
-use carff::provenance::{self, Origin};
+use carff::provenance;
 use carff_base::files::check_writable;
 use carff_checkpoint::Manifest;
-use carff_config::GraphConfig;
-use carff_dataset::ScenarioInfo;
 use carff_evaluation::CheckpointFigures;
 use carff_evaluation::run::DriveCounts;
 use carff_messages::Stage;
 use serde_json::{Map, Value, json};
-use std::collections::BTreeMap;
+use std::fmt::Write;
 use std::path::{Path, PathBuf};
-
-/// A finished run.
-#[derive(Clone, Debug)]
-pub struct RunOutcome {
-    /// Run name.
-    pub run: String,
-    /// Program, host, start and checkpoint of the run.
-    pub origin: Origin,
-    /// Path of the graph file.
-    pub graph_file: String,
-    /// Effective configuration.
-    pub graph: GraphConfig,
-    /// Scenario of the dataset, where it has one.
-    pub scenario: Option<ScenarioInfo>,
-    /// True if a signal ended the run.
-    pub interrupted: bool,
-    /// Folder of the dataset.
-    pub dataset: std::path::PathBuf,
-    /// Folder of the trained models.
-    pub checkpoint: std::path::PathBuf,
-    /// Records of the run.
-    pub records: Records,
-    /// Restarts by stage.
-    pub restarts: BTreeMap<Stage, u32>,
-    /// Number of invalid messages that the launcher received.
-    pub invalid: u64,
-}
 
 /// Converts times in nanoseconds to p50, p99 and max in milliseconds; null if there are no times.
 pub fn quantiles_ms<'a>(times_ns: impl IntoIterator<Item = &'a u64>) -> Value {
@@ -104,6 +74,7 @@ pub fn json(outcome: &RunOutcome) -> Value {
         "frames_not_recorded": records.frame_count() - records.frames.len() as u64,
         "decisions": decided.len(),
         "actions": records.actions,
+        "actions_not_recorded": records.actions_not_recorded,
         "safe_actions": records.safe_actions,
         "skipped": records.skipped(),
         "skipped_by_stage": by_stage(&|s| Some(stage(s)?.skipped.into())),
@@ -159,13 +130,22 @@ pub fn text(outcome: &RunOutcome, report: &Value) -> String {
         ms("p99"),
         ms("max")
     );
+    let [frames, actions] =
+        ["frames_not_recorded", "actions_not_recorded"].map(|key| report[key].as_u64().unwrap_or(0));
+    if frames + actions > 0 {
+        let _ = writeln!(
+            text,
+            "not recorded, because the launcher was stopped or slow: {frames} frames, {actions} actions; the counts of \
+             decisions and drives are without them"
+        );
+    }
     if let Some(drives) = drives(outcome) {
-        text += &format!("\n{}\n", drives.text());
+        let _ = writeln!(text, "\n{}", drives.text());
     }
     if let Some(figures) = checkpoint_figures(outcome) {
-        text += &format!("\nModels, as measured in training\n  {}\n", figures.summary().replace('\n', "\n  "));
+        let _ = writeln!(text, "\nModels, as measured in training\n  {}", figures.summary().replace('\n', "\n  "));
     }
-    text += &format!("\n{}\n", provenance::text(&outcome.origin));
+    let _ = writeln!(text, "\n{}", provenance::text(&outcome.origin));
     text
 }
 

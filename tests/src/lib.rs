@@ -18,6 +18,7 @@ pub use process::{Finished, Process};
 pub use sets::{copy_checkpoint, picture_set, scenario_set};
 
 use carff_transport::monotonic_now_ns;
+use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -54,6 +55,13 @@ pub fn program(name: &str) -> PathBuf {
         program.display()
     );
     program
+}
+
+/// Reports that this system lacks something that the test needs. The line appears although the test passes: the test
+/// harness captures only `print!` and `eprint!`.
+pub fn skipped(why: &str) {
+    let thread = std::thread::current();
+    let _ = writeln!(std::io::stderr(), "skipped: {}: {why}", thread.name().unwrap_or("test"));
 }
 
 /// Returns true if the condition becomes true before the watchdog's limit.

@@ -82,7 +82,8 @@ fn an_interrupt_leaves_nothing() {
     graph.assert_nothing_left();
 }
 
-/// A signal ends each command in each phase with exit code 130, also while it computes with models.
+/// A signal ends each command in each phase with exit code 130, also while it computes with models. (`carff` becomes
+/// `carff-launch` for the commands that need models.)
 #[test]
 fn a_signal_ends_every_command() {
     let (set, checkpoint) = (scenario_set(), shipped_checkpoint());
@@ -100,8 +101,9 @@ fn a_signal_ends_every_command() {
     ];
     for command in commands {
         for signal in [Signal::INT, Signal::TERM, Signal::HUP] {
-            let process =
-                Process::start(std::process::Command::new(program("carff")).args(command).current_dir(project_root()));
+            let process = Process::start(
+                std::process::Command::new(program("carff-launch")).args(command).current_dir(project_root()),
+            );
             assert!(eventually(|| process.catches(signal)), "{command:?} takes no {signal:?}");
             process.signal(signal);
             let finished = process.end();

@@ -5,7 +5,7 @@
 use carff_observe::attach;
 use carff_tests::{
     Finished, PATIENT_AND_ENDLESS, Process, TestGraph, WATCHDOG, decisions, eventually, program, scenario_set,
-    shipped_checkpoint,
+    shipped_checkpoint, skipped,
 };
 use carff_transport::OpenError;
 use carff_transport::TopicId;
@@ -189,6 +189,12 @@ fn rewritten_recordings_are_read(graph: &TestGraph) {
     export(graph, &["filtered.mcap", "--png", "none"]).assert_one_error(&["`camera/image`"]);
 }
 
+/// Returns hazard probability and action of each printed decision.
+fn decided(text: &str) -> Vec<String> {
+    let decision = |line: &str| Some(line.split_once("hazard ")?.1.rsplit_once("  ")?.0.trim().to_owned());
+    text.lines().filter(|line| line.trim_end().ends_with(" ms")).filter_map(decision).collect()
+}
+
 /// Returns the number of rows of a table; 0 if it does not exist.
 fn rows(path: &Path) -> usize {
     std::fs::read_to_string(path).map_or(0, |text| text.lines().count().saturating_sub(1))
@@ -201,6 +207,7 @@ fn a_recording_is_decided_again_as_it_was() {
     let (graph, launcher) = running();
     let text = std::fs::read_to_string(graph.file()).unwrap();
     carff(&graph, &["record"], &["-o", "run.mcap", "--seconds", "5"]).end().assert_success();
+    let live = decided(&launcher.text());
     stop(&graph, launcher);
 
     let same = replay(&graph, &["--verify"]);
@@ -215,10 +222,11 @@ fn a_recording_is_decided_again_as_it_was() {
     assert!(told, "{}", other.text);
     graph.assert_nothing_left();
 
-    // Replay from the middle of the path: beliefs as recorded, decided upon again.
+    // Replay from the middle of the path: recorded beliefs lead to the recorded decisions, in their order.
     let only = replay(&graph, &["--only", "belief", "--to", "1.5"]);
     only.assert_success();
-    assert!(only.text.contains("hazard ") || only.text.contains("replaying"), "{}", only.text);
+    let (again, mut recorded) = (decided(&only.text), live.iter());
+    assert!(!again.is_empty() && again.iter().all(|decision| recorded.any(|r| r == decision)), "{}", only.text);
     graph.assert_nothing_left();
 
     export(&graph, &["run.mcap", "--png", "png", "--csv", "csv", "--mp4", "film.mp4", "--trace", "t.json"])
@@ -313,7 +321,7 @@ fn a_full_disk_ends_the_recording_alone() {
     };
     std::fs::create_dir(graph.path("disk")).unwrap();
     if !on_small_disk(&format!("{back}true")).status.success() {
-        println!("skipped: this system does not let users mount");
+        skipped("this system does not let users mount");
         stop(&graph, launcher);
         return;
     }
@@ -346,7 +354,7 @@ fn a_slow_disk_costs_messages_alone() {
         command
     };
     if !slow(Path::new("true")).status().is_ok_and(|status| status.success()) {
-        println!("skipped: strace is missing, or may not trace");
+        skipped("strace is missing, or may not trace");
         stop(&graph, launcher);
         return;
     }

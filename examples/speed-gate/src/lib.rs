@@ -1,6 +1,6 @@
 //! An example of a stage outside the shipped graph. It computes a speed limit from the controller's action and from the
-//! share of the scene that is known. It uses public crates only and joins any running graph. The book's chapter "Write a
-//! stage" explains it.
+//! share of the scene that is known. It uses public crates only and joins any running graph. The book's chapter "Write
+//! a stage" explains it.
 
 use carff_messages::{Action, ActionCode, Belief, Header, Invalid, ZeroCopySend, check, message};
 use carff_transport::{Topic, topics};
@@ -57,7 +57,6 @@ mod tests {
             confidence: 1.0,
             hazard_probability: 0.0,
             is_decision: 1,
-            reserved: 0,
             valid_until_ns: 0,
             based_on_frame: 7,
             latency_ns: 0,

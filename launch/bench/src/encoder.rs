@@ -1,8 +1,8 @@
-//! Encoder and forecaster, one frame at a time, as their stages run them.
+//! Measures encoder and forecaster one frame at a time, as their stages run them.
 
 use crate::OutputArgs;
 use crate::report::{Report, number, table};
-use crate::stats::{Contender, Ratio, Times, in_turns, timed};
+use crate::stats::{Contender, Ratio, Times, alternate, timed};
 use anyhow::Context;
 use carff_checkpoint::{
     Manifest,
@@ -18,21 +18,21 @@ use ndarray::ArrayView3;
 use std::path::PathBuf;
 use tch::{Device, Kind, nn::VarStore};
 
-/// Side of the measured picture, pixels.
+/// Side of the measured image, pixels.
 const SIDE_PX: usize = 128;
 /// Latents drawn from a forecast.
 const SAMPLES: usize = 10;
 
-/// Encoder and forecaster, one frame at a time.
+/// Measure encoder and forecaster, one frame at a time.
 #[derive(Clone, Debug, clap::Args)]
 pub struct EncoderArgs {
     /// Checkpoint folder.
     #[arg(long, default_value = "configs/checkpoints/approaching-intersection")]
     checkpoint: PathBuf,
-    /// Leave out the vision transformer, which takes 1.3 GB and seconds a frame.
+    /// Leave out the vision transformer, which takes 1.3 GB and seconds per frame.
     #[arg(long)]
     no_vit: bool,
-    /// Fewer rounds.
+    /// Measure fewer rounds.
     #[arg(long)]
     quick: bool,
     #[command(flatten)]
@@ -62,13 +62,13 @@ pub(crate) fn run(args: &EncoderArgs) -> anyhow::Result<Report> {
         let mut clock = timed(move || {
             std::hint::black_box(encode(encoder, rgb));
         });
-        // The change of threads is no part of the frame.
+        // The change of threads is not part of the frame.
         Box::new(move || {
             tch::set_num_threads(threads);
             clock()
         })
     };
-    let seconds = in_turns(if args.quick { 20 } else { 300 }, &mut [with_threads(1), with_threads(2)]);
+    let seconds = alternate(if args.quick { 20 } else { 300 }, &mut [with_threads(1), with_threads(2)]);
     let backbone = format!("{:?}", manifest.encoder.backbone.kind);
     note(&format!("encoder, {backbone}, 1 thread"), "encoder.", &seconds[0]);
     note(&format!("encoder, {backbone}, 2 threads"), "encoder.two_threads.", &seconds[1]);
@@ -83,7 +83,7 @@ pub(crate) fn run(args: &EncoderArgs) -> anyhow::Result<Report> {
         let mixture = net.forecast(&posterior);
         std::hint::black_box(mixture.draw(SAMPLES, Sampling::Stratified, 1, 2, 1));
     });
-    let seconds = in_turns(if args.quick { 200 } else { 3000 }, &mut [forecast]);
+    let seconds = alternate(if args.quick { 200 } else { 3000 }, &mut [forecast]);
     note(&format!("forecaster, n = {SAMPLES}, 1 thread"), "forecaster.", &seconds[0]);
 
     if !args.no_vit {
@@ -103,7 +103,7 @@ pub(crate) fn run(args: &EncoderArgs) -> anyhow::Result<Report> {
                 clock()
             })
         };
-        let seconds = in_turns(if args.quick { 2 } else { 10 }, &mut [with_threads(1), with_threads(2)]);
+        let seconds = alternate(if args.quick { 2 } else { 10 }, &mut [with_threads(1), with_threads(2)]);
         note("encoder, ViT-L/16 of random weights, 1 thread", "encoder.vit_l16.", &seconds[0]);
         note("encoder, ViT-L/16 of random weights, 2 threads", "encoder.vit_l16.two_threads.", &seconds[1]);
     }
@@ -123,15 +123,15 @@ pub(crate) fn run(args: &EncoderArgs) -> anyhow::Result<Report> {
 
 /// The encoder with its backbone in bf16.
 struct Halved {
-    /// Of each frame.
+    /// Time of each frame, seconds.
     seconds: Vec<f64>,
-    /// Against f32.
+    /// Median time in f32 over median time in bf16.
     ratio: Ratio,
-    /// How far the posterior's mean moves, in its deviations: the most of all coordinates.
+    /// Largest shift of a coordinate of the posterior's mean, in its standard deviations.
     moved: f64,
 }
 
-/// Measures a frozen backbone in bf16, with the head in f32, on one thread; there is none where the backbone learns.
+/// Measures a frozen backbone in bf16, with the head in f32, on one thread; `None` for a backbone that was trained.
 fn in_bf16(args: &EncoderArgs, manifest: &Manifest, encoder: &Encoder, rgb: &[u8]) -> anyhow::Result<Option<Halved>> {
     let file = args.checkpoint.join(carff_checkpoint::files::BACKBONE);
     if !manifest.encoder.backbone.frozen || !file.is_file() {
@@ -155,7 +155,7 @@ fn in_bf16(args: &EncoderArgs, manifest: &Manifest, encoder: &Encoder, rgb: &[u8
         .map(|k| f64::from((off.mean[k] - whole.mean[k]).abs() / (0.5 * whole.log_variance[k]).exp()))
         .fold(0.0, f64::max);
     tch::set_num_threads(1);
-    let seconds = in_turns(
+    let seconds = alternate(
         if args.quick { 20 } else { 100 },
         &mut [
             timed(|| {
@@ -170,7 +170,7 @@ fn in_bf16(args: &EncoderArgs, manifest: &Manifest, encoder: &Encoder, rgb: &[u8
     Ok(seconds.into_iter().nth(1).map(|seconds| Halved { seconds, ratio, moved }))
 }
 
-/// From bytes to posterior, as the encoder stage does it.
+/// Computes the posterior of an image's bytes, as the encoder stage does.
 fn encode(encoder: &Encoder, rgb: &[u8]) -> Option<Gaussian> {
     borrow::with_image(image(rgb)?, |picture| encoder.encode_bytes(picture)).flatten()
 }

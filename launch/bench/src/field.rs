@@ -1,10 +1,10 @@
-//! The field's kernels against the same model in tensor operations and against the machine's limits.
+//! Compares the field's kernels with the same model in tensor operations and with the machine's limits.
 
 use crate::OutputArgs;
 use crate::limits::{matrix_product, triad};
 use crate::reference::{Precision, Rays, ReferenceField, Samples, huber_sum};
 use crate::report::{Report, number, table};
-use crate::stats::{Contender, Ratio, Times, in_turns, timed};
+use crate::stats::{Contender, Ratio, Times, alternate, timed};
 use anyhow::Context;
 use carff_base::geometry::{PinholeCamera, Ray};
 use carff_base::random::{Key, gaussians, uniform};
@@ -18,30 +18,30 @@ use std::path::PathBuf;
 use std::time::Instant;
 use tch::{Kind, Tensor, nn::OptimizerConfig};
 
-/// Hypotheses whose probing is measured.
+/// Number of hypotheses that are probed.
 const HYPOTHESES: usize = 10;
-/// Rays of a training step, and samples of each: 2^17 samples together.
+/// Rays of a training step; with the samples per ray, a step has 2^17 samples.
 const TRAINING_RAYS: usize = 4096;
 const SAMPLES_PER_RAY: usize = 32;
-/// A learning rate that leaves the field as it is: each step is the same work.
+/// Learning rate that leaves the field unchanged, so that each step is the same work.
 const STANDSTILL: f32 = 1e-12;
-/// Points and latents that the networks' rate is measured with: features stay in the second-level cache.
+/// Points for the rate of the networks; with the latents, the features stay in the second-level cache.
 const POINTS: usize = 2048;
 const LATENTS: usize = 32;
 
-/// The field's kernels against the same model in tensor operations and against the machine's limits.
+/// Compare the field's kernels with the same model in tensor operations and with the machine's limits.
 #[derive(Clone, Debug, clap::Args)]
 pub struct FieldArgs {
-    /// Checkpoint folder whose field is measured.
+    /// Folder of the checkpoint whose field is measured.
     #[arg(long, default_value = "configs/checkpoints/approaching-intersection")]
     checkpoint: PathBuf,
-    /// Threads. Default: all cores.
+    /// Number of threads. Default: all cores.
     #[arg(long)]
     threads: Option<usize>,
     /// Side of the bird's-eye view, pixels.
     #[arg(long, default_value_t = 128)]
     side_px: u32,
-    /// Fewer rounds.
+    /// Measure fewer rounds.
     #[arg(long)]
     quick: bool,
     #[command(flatten)]
@@ -57,9 +57,9 @@ pub(crate) fn run(args: &FieldArgs) -> anyhow::Result<Report> {
     let field = carff_checkpoint::load_field(&args.checkpoint, &manifest)?;
     let mut probe = load_field_probe(&args.checkpoint, &manifest)?;
     let states: Vec<[f32; LATENT_DIM]> = manifest.states.iter().map(|s| s.mean).collect();
-    anyhow::ensure!(!states.is_empty(), "checkpoint {}: it knows no states", args.checkpoint.display());
+    anyhow::ensure!(!states.is_empty(), "checkpoint {} has no states", args.checkpoint.display());
     println!(
-        "field of {}: {} numbers, {} instructions ({} for pictures), {} threads\n",
+        "field of {}: {} numbers, {} instructions ({} for images), {} threads\n",
         args.checkpoint.display(),
         field.parameter_count(),
         field.instruction_set().name(),
@@ -73,20 +73,20 @@ pub(crate) fn run(args: &FieldArgs) -> anyhow::Result<Report> {
         precisions: precisions(&field),
     };
 
-    let mut pictures = field.clone();
-    pictures.set_instruction_set(InstructionSet::detect_for_pictures());
+    let mut fast = field.clone();
+    fast.set_instruction_set(InstructionSet::detect_for_pictures());
     let mut report = Report::default();
     report.set_value("field.instruction_set", field.instruction_set().name().into());
-    report.set_value("field.instruction_set_for_pictures", pictures.instruction_set().name().into());
+    report.set_value("field.instruction_set_for_pictures", fast.instruction_set().name().into());
     report.set("field.threads", threads as f64);
-    bench.networks(&field, &pictures, &mut report);
-    bench.rendering(&field, &pictures, &states, &mut report);
+    bench.networks(&field, &fast, &mut report);
+    bench.rendering(&field, &fast, &states, &mut report);
     bench.probes(&mut probe, &states, &mut report);
     bench.training(&field, &states, &mut report)?;
     Ok(report)
 }
 
-/// A camera straight above the bounds, the picture's up = +Y.
+/// Returns a camera straight above the bounds; the image's up is +Y.
 pub(crate) fn birds_eye(config: &FieldConfig, side_px: u32) -> PinholeCamera {
     let [low, high] = config.bounds_m.map(|corner| corner.map(f64::from));
     let centre = [0, 1, 2].map(|i| f64::midpoint(low[i], high[i]));
@@ -97,14 +97,14 @@ pub(crate) fn birds_eye(config: &FieldConfig, side_px: u32) -> PinholeCamera {
     PinholeCamera::look_at(eye, [centre[0], centre[1], low[2]], [0.0, 1.0, 0.0], side_px, side_px, fov_deg)
 }
 
-/// Multiplications and additions of the density network for one sample.
+/// Number of multiplications and additions of the density network for one sample.
 #[derive(Clone, Copy, Debug)]
 struct Operations {
-    /// Of the first layer: once for all latents, where there are several.
+    /// First layer; several latents share it.
     first: f64,
-    /// Of the others, for the density alone (four outputs, of which one counts).
+    /// Other layers, for the density only (four outputs, of which one counts).
     rest: f64,
-    /// Of all layers with all outputs, as rendering needs them.
+    /// All layers with all outputs, as rendering needs them.
     whole: f64,
 }
 
@@ -128,8 +128,8 @@ struct Bench {
 }
 
 impl Bench {
-    /// The density network's rate against the rate of matrix products, in f32 and as for pictures.
-    fn networks(&self, field: &Field, pictures: &Field, report: &mut Report) {
+    /// Compares the density network's rate with that of matrix products, in f32 and with the kernels for images.
+    fn networks(&self, field: &Field, fast: &Field, report: &mut Report) {
         let points: Vec<[f32; 3]> = (0..POINTS).map(|i| random_point(field.config(), i as u64)).collect();
         let latents: Vec<[f32; LATENT_DIM]> = (0..LATENTS).map(|i| random_latent(i as u64)).collect();
         let each = Operations::of(field.config());
@@ -155,11 +155,11 @@ impl Bench {
             ("matrix product 1024^3, bf16", matrix_product(Kind::BFloat16, square)),
             ("matrix product 131072 x width x width, bf16", matrix_product(Kind::BFloat16, layer)),
             ("memory bandwidth (GB/s)", triad(self.threads)),
-            ("density network, native, as for pictures", (native(pictures), operations)),
+            ("density network, native, kernels for images", (native(fast), operations)),
         ];
         let (names, measured): (Vec<_>, Vec<_>) = named.into_iter().unzip();
         let (mut contenders, amounts): (Vec<_>, Vec<_>) = measured.into_iter().unzip();
-        let seconds = in_turns(self.rounds, &mut contenders);
+        let seconds = alternate(self.rounds, &mut contenders);
         let rates: Vec<Times> =
             seconds.iter().zip(&amounts).map(|(s, a)| Times::new(s.iter().map(|s| a / s / 1e9).collect())).collect();
         let mut rows = vec![["rate", "median", "lowest", "highest"].map(str::to_owned)];
@@ -173,7 +173,7 @@ impl Bench {
         let limit = rates[1].median().max(rates[2].median());
         let share = native / limit;
         println!("networks: {} of the measured limit of f32 matrix products", percent(share));
-        if pictures.instruction_set().is_bf16() {
+        if fast.instruction_set().is_bf16() {
             let limit = rates[3].median().max(rates[4].median());
             let share = rates[6].median() / limit;
             println!("with bf16 products: {} of that of bf16 matrix products", percent(share));
@@ -188,8 +188,8 @@ impl Bench {
         report.set("field.limit.bandwidth_gb_s", rates[5].median());
     }
 
-    /// Bird's-eye views of every state.
-    fn rendering(&self, field: &Field, pictures: &Field, states: &[[f32; LATENT_DIM]], report: &mut Report) {
+    /// Renders bird's-eye views of every state.
+    fn rendering(&self, field: &Field, fast: &Field, states: &[[f32; LATENT_DIM]], report: &mut Report) {
         let camera = birds_eye(field.config(), self.side_px);
         let rays: Vec<Ray> = (0..self.side_px * self.side_px)
             .map(|i| camera.ray(f64::from(i % self.side_px) + 0.5, f64::from(i / self.side_px) + 0.5))
@@ -232,7 +232,7 @@ impl Bench {
         let mut buffer = RenderBuffer::new();
         let mut exact = RenderBuffer::new();
         let mut contenders = vec![
-            round_and_round(states.len(), |s| pictures.render(&camera, &states[s], &options, &mut buffer)),
+            round_and_round(states.len(), |s| fast.render(&camera, &states[s], &options, &mut buffer)),
             round_and_round(states.len(), |s| field.render(&camera, &states[s], &options, &mut exact)),
         ];
         let mut chunks = Vec::new();
@@ -241,8 +241,8 @@ impl Bench {
             chunks.push(chunk.min(count as i64));
             contenders.push(round_and_round(states.len(), move |s| frame(reference, s, chunk)));
         }
-        contenders.push(timed(|| pictures.render_hypotheses(&camera, &hypotheses, &options, &mut together)));
-        let mut seconds = in_turns(self.rounds, &mut contenders);
+        contenders.push(timed(|| fast.render_hypotheses(&camera, &hypotheses, &options, &mut together)));
+        let mut seconds = alternate(self.rounds, &mut contenders);
         drop(contenders);
         println!(
             "bird's-eye view {0} x {0}: {1:.0} samples, {2:.0} of them with colour, a frame",
@@ -251,12 +251,12 @@ impl Bench {
         let shared = Times::new(seconds.pop().unwrap_or_default()).median() / HYPOTHESES as f64;
         let in_f32 = seconds.remove(1);
         let native = self.versus("render", count, &chunks, &seconds, report);
-        println!("(tensor operations are given where the samples lie: they need not march)");
-        if pictures.instruction_set().is_bf16() {
+        println!("(tensor operations receive the positions of the samples, so that they need not march)");
+        if fast.instruction_set().is_bf16() {
             let ratio = Ratio::new(&in_f32, &seconds[0]);
             let (mut here, mut exact) = (Vec::new(), Vec::new());
             for z in states {
-                for (field, all) in [(pictures, &mut here), (field, &mut exact)] {
+                for (field, all) in [(fast, &mut here), (field, &mut exact)] {
                     field.render(&camera, z, &options, &mut buffer);
                     all.extend_from_slice(&buffer.rgb);
                 }
@@ -280,10 +280,10 @@ impl Bench {
         report.set("field.render_changing_rays", changing);
         report.set("field.render_samples", count);
         report.set("field.render_colored_samples", kept);
-        self.breakdown(pictures, states, &camera, &samples, report);
+        self.breakdown(fast, states, &camera, &samples, report);
     }
 
-    /// Where rendering's time goes, on one thread: by leaving parts out.
+    /// Splits the time of rendering on one thread into parts, by leaving parts out.
     fn breakdown(
         &self,
         field: &Field,
@@ -310,7 +310,7 @@ impl Bench {
         let (mut buffer, mut without_color) = (RenderBuffer::new(), RenderBuffer::new());
         let mut nothing = RenderBuffer::new();
         let options = RenderOptions::default();
-        // No sample weighs more than 1: then each ray's heaviest alone has a colour.
+        // No sample has a weight above 1: then only the heaviest sample of each ray has a colour.
         let one_color = RenderOptions { min_weight: 2.0, ..options };
         let colored = samples.weight.iter().filter(|w| **w > options.min_weight).count() as f64;
         let up: Vec<Ray> = rays
@@ -321,12 +321,12 @@ impl Bench {
                 spread: r.spread,
             })
             .collect();
-        let seconds = in_turns(
+        let seconds = alternate(
             self.rounds,
             &mut [
                 timed(|| field.render(camera, z, &options, &mut buffer)),
                 timed(|| field.render(camera, z, &one_color, &mut without_color)),
-                // In pieces, as rendering does it: features stay in the cache.
+                // In pieces, as in rendering, so that the features stay in the cache.
                 timed(|| {
                     for (points, out) in points.chunks(512).zip(one.chunks_mut(512)) {
                         field.density(points, z, out);
@@ -342,9 +342,9 @@ impl Bench {
                 }),
             ],
         );
-        let [all, one_color, density, ninefold, rays_alone] =
+        let [all, one_color, density, ninefold, rays_only] =
             [0, 1, 2, 3, 4].map(|i| Times::new(seconds[i].clone()).median());
-        // One more latent costs the layers after the first, for the density alone; the rest is in proportion.
+        // One more latent costs the layers after the first, for the density only; the rest is in proportion.
         let (each, more) = (Operations::of(field.config()), (ninefold - density) / 8.0);
         let network = more * each.whole / each.rest;
         let features = density - more * (each.first + each.rest) / each.rest;
@@ -353,10 +353,10 @@ impl Bench {
             ("features", features),
             ("density_network", network),
             ("color_network", color),
-            ("rays_and_background", rays_alone),
-            ("marching_and_the_rest", all - color - features - network - rays_alone),
+            ("rays_and_background", rays_only),
+            ("marching_and_the_rest", all - color - features - network - rays_only),
         ];
-        let mut rows = vec![["where a frame's time goes (one thread)", "ms", "share"].map(str::to_owned)];
+        let mut rows = vec![["parts of a frame's time (one thread)", "ms", "share"].map(str::to_owned)];
         for (name, part) in parts {
             rows.push([name.replace('_', " "), number(part * 1e3), percent(part / all)]);
             report.set(&format!("field.render_parts_ms.{name}"), part * 1e3);
@@ -366,7 +366,7 @@ impl Bench {
         println!("{}", table(&rows));
     }
 
-    /// Probing ten hypotheses, as the prober does it (one thread), and their densities alone.
+    /// Probes ten hypotheses as the prober does (one thread), and computes only their densities.
     fn probes(&self, probe: &mut FieldProbe, states: &[[f32; LATENT_DIM]], report: &mut Report) {
         let draws: Vec<[f32; LATENT_DIM]> = (0..HYPOTHESES)
             .map(|i| {
@@ -379,7 +379,7 @@ impl Bench {
         let mut densities = vec![0.0; points.len() * draws.len()];
         let mixture = Mixture { weights: Vec::new(), components: Vec::new() };
         let drawn = || draws.iter().map(|z| Draw { latent: *z, component: 0 }).collect::<Vec<_>>();
-        let seconds = in_turns(
+        let seconds = alternate(
             self.rounds * 20,
             &mut [
                 timed(|| {
@@ -388,22 +388,22 @@ impl Bench {
                 timed(|| field.density_prepared(&points, &draws, &mut densities)),
             ],
         );
-        let [step, alone] = [0, 1].map(|i| Times::new(seconds[i].clone()));
+        let [step, densities_only] = [0, 1].map(|i| Times::new(seconds[i].clone()));
         let mut rows = vec![["probing, one thread (ms)", "p50", "p99"].map(str::to_owned)];
         for (name, times) in [
             (format!("{HYPOTHESES} hypotheses at {} points, with readings", points.len()), &step),
-            ("densities alone, features shared".to_owned(), &alone),
+            ("densities only, features shared".to_owned(), &densities_only),
         ] {
             rows.push([name, number(times.median() * 1e3), number(times.quantile(0.99) * 1e3)]);
         }
         println!("{}", table(&rows));
         report.set("field.probe_ms", step.median() * 1e3);
         report.set("field.probe_p99_ms", step.quantile(0.99) * 1e3);
-        report.set("field.probe_densities_ms", alone.median() * 1e3);
+        report.set("field.probe_densities_ms", densities_only.median() * 1e3);
         report.set("field.probe_points", points.len() as f64);
     }
 
-    /// A training step of 2^17 samples, each with a colour and a gradient.
+    /// Measures a training step of 2^17 samples, each with a colour and a gradient.
     fn training(&self, field: &Field, states: &[[f32; LATENT_DIM]], report: &mut Report) -> anyhow::Result<()> {
         let batch = training_batch(field.config(), states);
         let config = TrainerConfig {
@@ -425,7 +425,7 @@ impl Bench {
         let mut samples = RaySamples::default();
         field.samples_along(&batch.rays, &batch.latents[0], &trainer.limits(), &mut samples);
         let count = trainer.step(&batch).kept_samples;
-        anyhow::ensure!(count == samples.ray.len(), "{count} samples in place of {}", samples.ray.len());
+        anyhow::ensure!(count == samples.ray.len(), "{count} samples instead of {}", samples.ray.len());
 
         let references: Vec<ReferenceField> = self.precisions.iter().map(|p| ReferenceField::new(field, *p)).collect();
         let mut contenders: Vec<Contender<'_>> = vec![timed(|| {
@@ -453,14 +453,14 @@ impl Bench {
             chunks.push(rays_at_once * SAMPLES_PER_RAY as i64);
             contenders.push(timed(move || step(&pieces)));
         }
-        let seconds = in_turns(self.rounds.min(9), &mut contenders);
+        let seconds = alternate(self.rounds.min(9), &mut contenders);
         drop(contenders);
         println!("training step of {count} samples, all with colour and gradient");
         self.versus("train", count as f64, &chunks, &seconds, report);
         Ok(())
     }
 
-    /// Prints and notes native kernels against tensor operations; returns the native median, seconds.
+    /// Prints and records native kernels against tensor operations; returns the native median, seconds.
     fn versus(&self, what: &str, count: f64, chunks: &[i64], seconds: &[Vec<f64>], report: &mut Report) -> f64 {
         let medians: Vec<f64> = seconds.iter().map(|s| Times::new(s.clone()).median()).collect();
         let mut rows = vec![["by", "ms", "a second", "ns/sample"].map(str::to_owned)];
@@ -491,7 +491,7 @@ fn precision_name(precision: Precision) -> &'static str {
     }
 }
 
-/// Precisions that are worth measuring: bf16 where the tensor library is not far slower with it than with f32.
+/// Returns the precisions to measure: bf16 only if the tensor library is not far slower with it than with f32.
 fn precisions(field: &Field) -> Vec<Precision> {
     let points: Vec<f32> = (0..1 << 12).flat_map(|i| random_point(field.config(), i)).collect();
     let (points, latent) = (Tensor::from_slice(&points).view([-1, 3]), Tensor::from_slice(&random_latent(0)));
@@ -522,7 +522,7 @@ struct Piece {
     targets: Tensor,
 }
 
-/// A batch in pieces of `size` rays.
+/// Splits a batch into pieces of `size` rays.
 fn pieces(batch: &RayBatch, samples: &RaySamples, size: usize, degree: usize) -> Vec<Piece> {
     let flat = |rows: Vec<f32>, width: i64| Tensor::from_slice(&rows).view([-1, width]);
     (0..batch.rays.len())
@@ -549,7 +549,7 @@ fn pieces(batch: &RayBatch, samples: &RaySamples, size: usize, degree: usize) ->
         .collect()
 }
 
-/// Rays from around the bounds into them, of any state. What they shall see is of no matter for speed.
+/// Returns rays from around the bounds into them, of any state. Their target colours do not affect the speed.
 fn training_batch(config: &FieldConfig, states: &[[f32; LATENT_DIM]]) -> RayBatch {
     let [low, high] = config.bounds_m;
     let mut batch = RayBatch { latents: states.to_vec(), ..RayBatch::default() };
@@ -565,7 +565,7 @@ fn training_batch(config: &FieldConfig, states: &[[f32; LATENT_DIM]]) -> RayBatc
         let target = random_point(config, i as u64);
         let d: [f32; 3] = std::array::from_fn(|k| target[k] - origin[k]);
         let n = d.iter().map(|v| v * v).sum::<f32>().sqrt().max(1e-6);
-        // As wide as a pixel of a picture of 128 by 128 pixels that sees 60 degrees.
+        // The width of a pixel in an image of 128 x 128 pixels with a field of view of 60 degrees.
         batch.rays.push(Ray { origin, direction: d.map(|v| v / n), spread: 0.009 });
         batch.target_rgb.push([at(2), at(3), at(4)]);
         batch.latent_index.push((i % states.len()) as u32);
@@ -585,7 +585,7 @@ fn random_latent(i: u64) -> [f32; LATENT_DIM] {
     gaussians(Key { seed: 5, frame: i, step: 0, sample: 0 })
 }
 
-/// The setting that takes the least time, each tried twice; where a try takes long, no further one is made.
+/// Returns the fastest setting after two trials of each. A long trial is the last one.
 fn best(settings: &[i64], mut action: impl FnMut(i64)) -> i64 {
     const LONG_S: f64 = 4.0;
     let mut least = (f64::INFINITY, settings[0]);
@@ -605,7 +605,7 @@ fn best(settings: &[i64], mut action: impl FnMut(i64)) -> i64 {
     least.1
 }
 
-/// Times an action on another one of `count` things at each turn.
+/// Times an action on the next of `count` items at each turn.
 fn round_and_round<'a>(count: usize, mut action: impl FnMut(usize) + 'a) -> Contender<'a> {
     let mut turn = 0;
     timed(move || {

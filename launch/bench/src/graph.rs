@@ -1,4 +1,4 @@
-//! A graph of all stages, started as the launcher starts it, and listened to message by message.
+//! Starts a graph of all stages as the launcher does, and receives its messages.
 
 use crate::helper::{PATIENCE, ask_to_end, cpu_seconds, end_by};
 use crate::probes::Probes;
@@ -14,32 +14,32 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
-/// Those that listen before those that speak, the camera last.
+/// Receivers start before their senders, the camera last.
 const START_ORDER: [Stage; 6] =
     [Stage::Controller, Stage::Renderer, Stage::Prober, Stage::Forecaster, Stage::Encoder, Stage::Camera];
-/// How often stages are looked at while they start.
+/// Time between two checks of the stages while they start.
 const WATCH_NS: u64 = 50_000_000;
-/// How often messages are looked at.
+/// Time between two readings of the messages.
 const LOOK_NS: u64 = 10_000_000;
-/// How long the last frames are waited for.
+/// Time limit for the last frames.
 const TAIL: Duration = Duration::from_millis(500);
 
-/// Which graph is measured, and on what.
+/// Graph to measure, and its folders.
 #[derive(Clone, Debug, clap::Args)]
 pub(crate) struct GraphArgs {
     /// The graph file.
     #[arg(long, default_value = "configs/graphs/approaching-intersection.toml")]
     graph: PathBuf,
-    /// Data set folder, in place of the graph file's.
+    /// Folder of the dataset. Default: that of the graph file.
     #[arg(long)]
     dataset: Option<PathBuf>,
-    /// Checkpoint folder, in place of the graph file's.
+    /// Folder of the checkpoint. Default: that of the graph file.
     #[arg(long)]
     checkpoint: Option<PathBuf>,
 }
 
 impl GraphArgs {
-    /// Reads the graph file, and finds the folders.
+    /// Reads the graph file, and resolves the folders.
     pub(crate) fn load(&self) -> anyhow::Result<Subject> {
         let graph = GraphConfig::load(&self.graph)?;
         let resolve = |given: &Option<PathBuf>, own: &Path| graph.resolve(given.as_deref().unwrap_or(own));
@@ -51,7 +51,7 @@ impl GraphArgs {
     }
 }
 
-/// A graph, and the folders that it runs on.
+/// A graph and its folders.
 #[derive(Clone, Debug)]
 pub(crate) struct Subject {
     pub(crate) graph: GraphConfig,
@@ -60,45 +60,45 @@ pub(crate) struct Subject {
 }
 
 impl Subject {
-    /// Refuses a data set that is not there.
+    /// Refuses a dataset that does not exist.
     pub(crate) fn check_dataset(&self) -> anyhow::Result<()> {
         let folder = self.dataset.display();
-        ensure!(self.dataset.is_dir(), "data set {folder} is missing: `carff launch` renders it, or give --dataset");
+        ensure!(self.dataset.is_dir(), "dataset {folder} is missing: `carff launch` renders it, or give --dataset");
         Ok(())
     }
 }
 
-/// What to run.
+/// Settings of one measurement.
 #[derive(Clone, Debug)]
 pub(crate) struct Plan<'a> {
     /// The graph, with the settings to measure.
     pub(crate) graph: GraphConfig,
     pub(crate) dataset: &'a Path,
     pub(crate) checkpoint: &'a Path,
-    /// Frames of this time at first do not count.
+    /// Frames of this initial time do not count.
     pub(crate) warm_up: Duration,
     pub(crate) measured: Duration,
-    /// Further subscribers to frames, beliefs and actions, in a process of their own.
+    /// Number of additional subscribers to frames, beliefs and actions, in one process.
     pub(crate) probes: usize,
 }
 
-/// One frame's way; times on the monotonic clock, nanoseconds.
+/// Times of one frame on the monotonic clock, nanoseconds.
 #[derive(Clone, Debug, Default)]
 #[allow(clippy::struct_field_names, reason = "the postfix is the unit")]
 struct Frame {
     captured_ns: u64,
     published_ns: u64,
-    /// Begin and end of the encoder's work.
+    /// Start and end of the encoder's work.
     encoded_ns: Option<(u64, u64)>,
-    /// The same of each step's forecast and probing.
+    /// Start and end of each step's forecast and probing.
     forecast_ns: BTreeMap<u32, (u64, u64)>,
     probed_ns: BTreeMap<u32, (u64, u64)>,
     decided_ns: Option<u64>,
 }
 
 impl Frame {
-    /// Time between the stages: from one's sending to the next one's begin, nanoseconds, by hand-over, of which one may
-    /// come several times. `None` when a message was not seen.
+    /// Returns the time between stages by hand-over: from the publication of a message to the start of the next stage,
+    /// nanoseconds. A hand-over may occur several times. `None` if a message was not received.
     fn gaps_ns(&self) -> Option<Vec<(HandOver, u64)>> {
         let (begin, mut end) = self.encoded_ns?;
         let mut gaps = vec![("camera to encoder", begin.saturating_sub(self.published_ns))];
@@ -114,10 +114,10 @@ impl Frame {
     }
 }
 
-/// From which stage to which.
+/// Sending and receiving stage, as in `camera to encoder`.
 pub(crate) type HandOver = &'static str;
 
-/// What a stage used while it was measured.
+/// Resources of a stage during the measurement.
 #[derive(Clone, Debug)]
 pub(crate) struct Use {
     pub(crate) stage: Stage,
@@ -127,37 +127,38 @@ pub(crate) struct Use {
     pub(crate) resident_bytes: f64,
 }
 
-/// What was measured.
+/// Result of a measurement.
 #[derive(Clone, Debug)]
 pub(crate) struct Measured {
-    /// Camera to action, milliseconds, frame by frame.
+    /// Time from camera to action of each frame, milliseconds.
     pub(crate) latency_ms: Vec<f64>,
-    /// Time between stages as a share of the time from camera to action, over all frames.
+    /// Time between stages as a share of the time from camera to action, of all frames.
     pub(crate) ipc_share: f64,
-    /// The time that each hand-over took, milliseconds, frame by frame.
+    /// Time of each hand-over in each frame, milliseconds.
     pub(crate) hand_overs_ms: BTreeMap<HandOver, Vec<f64>>,
-    /// Frames taken, and those of them that no action rests on.
+    /// Number of captured frames.
     pub(crate) frames: usize,
+    /// Number of captured frames without an action.
     pub(crate) missed: usize,
-    /// Frames a second that the camera reached.
+    /// Frame rate that the camera reached, Hz.
     pub(crate) rate_hz: f64,
-    /// Views that the renderer made.
+    /// Number of views from the renderer.
     pub(crate) views: u64,
     pub(crate) uses: Vec<Use>,
-    /// Cores in use by the process of the probes.
+    /// Cores that the probes' process uses on average.
     pub(crate) probe_cores: f64,
-    /// Messages that the probes read, in all.
+    /// Number of messages that all probes read.
     pub(crate) probed: u64,
 }
 
 impl Measured {
-    /// Whether every frame was decided on, at the rate that was asked for.
+    /// Returns true if every frame was decided, at the requested rate.
     pub(crate) fn held(&self, wanted_hz: f64) -> bool {
         self.missed == 0 && self.frames > 1 && self.rate_hz > 0.98 * wanted_hz
     }
 }
 
-/// Runs a graph for its time and ends it.
+/// Runs a graph for the planned time.
 pub(crate) fn measure(plan: &Plan<'_>) -> anyhow::Result<Measured> {
     let folder = tempfile::tempdir()?;
     let name = format!("bench-{}", std::process::id());
@@ -235,7 +236,7 @@ fn listen(
     let probed = probes.map_or(Ok(0), Probes::finish)?;
 
     let frames: Vec<&Frame> = listener.frames.values().filter(|f| (from_ns..to_ns).contains(&f.captured_ns)).collect();
-    // Frame numbers have no gaps: one that is not there was not even seen.
+    // Frame numbers have no gaps: a missing number is a frame that was not received.
     let (first, last) = (
         listener.frames.iter().find(|(_, f)| f.captured_ns >= from_ns).map_or(0, |(id, _)| *id),
         listener.frames.iter().rfind(|(_, f)| f.captured_ns < to_ns).map_or(0, |(id, _)| *id + 1),
@@ -267,7 +268,7 @@ fn listen(
     })
 }
 
-/// Hears all that a run says. It looks now and then: were it woken by each message, it would take a core from the stages.
+/// Receives all messages of a run, by polling: wake-ups by each message would take a core from the stages.
 struct Listener {
     frames_in: Receiver<Image<FrameMeta>>,
     posteriors: Receiver<Posterior>,
@@ -299,8 +300,8 @@ impl Listener {
     }
 
     fn drain(&mut self) -> anyhow::Result<()> {
-        while let Some(picture) = self.frames_in.next()? {
-            let header = &picture.header;
+        while let Some(image) = self.frames_in.next()? {
+            let header = &image.header;
             let frame = self.frames.entry(header.frame_id).or_default();
             (frame.captured_ns, frame.published_ns) = (header.capture_time_ns, header.publish_time_ns);
         }
@@ -368,20 +369,20 @@ impl Stages {
         self.logs.join(format!("{stage}.log"))
     }
 
-    /// An error when one has ended.
+    /// Fails if a stage has ended.
     fn check(&mut self) -> anyhow::Result<()> {
         for i in 0..self.children.len() {
             let (stage, child) = &mut self.children[i];
             if let Some(status) = child.try_wait()? {
                 let stage = *stage;
                 let log = std::fs::read_to_string(self.log(stage)).unwrap_or_default();
-                bail!("stage `{stage}` has ended ({status}): {}", log.lines().last().unwrap_or("it said nothing"));
+                bail!("stage `{stage}` has ended ({status}): {}", log.lines().last().unwrap_or("its log is empty"));
             }
         }
         Ok(())
     }
 
-    /// Processor time of each so far.
+    /// Returns the processor time of each stage, seconds.
     fn cpu_seconds(&self) -> Vec<f64> {
         self.children.iter().map(|(_, child)| cpu_seconds(child.id())).collect()
     }
@@ -389,7 +390,7 @@ impl Stages {
 
 impl Drop for Stages {
     fn drop(&mut self) {
-        // Who speaks before who listens.
+        // Senders end before their receivers.
         for (_, child) in self.children.iter().rev() {
             ask_to_end(child);
         }
@@ -410,7 +411,8 @@ fn resident_bytes(pid: u32) -> f64 {
 mod tests {
     use super::*;
 
-    /// Time between stages is every gap along the frame's way, over both steps; a frame with a message missing has none.
+    /// The time between stages includes every gap on a frame's way, in both steps. A frame with a missing message has
+    /// no gaps.
     #[test]
     fn gaps_add_up() {
         let mut frame = Frame {
@@ -431,7 +433,7 @@ mod tests {
         assert_eq!(Frame::default().gaps_ns(), None);
     }
 
-    /// A rate is held when no frame was missed and the camera was not late.
+    /// A rate is held if no frame was missed and the camera was not late.
     #[test]
     fn a_held_rate_misses_nothing() {
         let measured = |missed, rate_hz| Measured {

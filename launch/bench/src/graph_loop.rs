@@ -1,4 +1,4 @@
-//! Camera to action, with all stages alive: how long it takes, what it costs, and the highest rate that is held.
+//! Measures camera to action with all stages: time, cost, and the highest rate without a missed frame.
 
 use crate::OutputArgs;
 use crate::graph::{GraphArgs, Measured, Plan, Subject, measure};
@@ -6,25 +6,25 @@ use crate::report::{Report, number, table};
 use crate::stats::Times;
 use std::time::Duration;
 
-/// Settings that are measured: latents drawn, steps looked ahead, frames a second.
+/// A setting: number of samples, look-ahead steps, frames per second.
 const SAMPLES: [u32; 3] = [1, 10, 35];
 const HORIZONS: [u32; 3] = [1, 2, 3];
 const RATES_HZ: [f64; 3] = [10.0, 20.0, 30.0];
-/// The setting whose figures stand for the loop.
+/// Setting whose figures represent the loop.
 const MAIN: Setting = Setting { samples: 10, horizon: 2, rate_hz: 10.0 };
-/// The search for the highest rate ends here, and when it is known to a twentieth.
+/// Upper limit of the search for the highest rate. The search also ends when the rate is known to a twentieth.
 const HIGHEST_HZ: f64 = 640.0;
 const SEARCH_PRECISION: f64 = 1.05;
 
-/// Camera to action, with all stages alive.
+/// Measure the time from camera to action with all stages.
 #[derive(Clone, Debug, clap::Args)]
 pub struct LoopArgs {
     #[command(flatten)]
     subject: GraphArgs,
-    /// Seconds that each setting is measured for; the main one (n = 10, horizon 2, 10 Hz) six times as long.
+    /// Time for each setting, seconds; six times as long for the main one (n = 10, horizon 2, 10 Hz).
     #[arg(long, default_value_t = 10.0)]
     seconds: f64,
-    /// Only the main setting and the highest rate, a few seconds each.
+    /// Measure only the main setting and the highest rate, a few seconds each.
     #[arg(long)]
     quick: bool,
     #[command(flatten)]
@@ -152,7 +152,7 @@ fn row(setting: Setting, measured: &Measured, key: &str, report: &mut Report) ->
     ]
 }
 
-/// The highest rate for which `held` gives something, and what it gave: doubling, then halving the interval.
+/// Searches the highest rate for which `held` returns a value, and returns both: it doubles, then halves the interval.
 fn highest_rate<T>(mut held: impl FnMut(f64) -> anyhow::Result<Option<T>>) -> anyhow::Result<Option<(f64, T)>> {
     let mut best = None;
     let mut rate_hz = MAIN.rate_hz;
@@ -186,7 +186,7 @@ fn highest_rate<T>(mut held: impl FnMut(f64) -> anyhow::Result<Option<T>>) -> an
 mod tests {
     use super::*;
 
-    /// The search ends within a twentieth below the limit, also when the first try fails, and at its end.
+    /// The search ends within a twentieth below the limit, also if the first trial fails, and at its upper limit.
     #[test]
     fn the_highest_rate_is_found() {
         for limit in [1.5, 7.0, 10.0, 33.3, 250.0] {

@@ -1,4 +1,4 @@
-//! Other processes of this program that take part in a measurement, and the processor time of any process.
+//! Helper processes of a measurement, and the processor time of any process.
 
 use anyhow::{Context, ensure};
 use rustix::process::{Pid, Signal, kill_process, set_parent_process_death_signal};
@@ -6,21 +6,21 @@ use std::io::{Read, Write};
 use std::process::{Child, ChildStdout, Command, Stdio};
 use std::time::{Duration, Instant};
 
-/// What a helper writes once it is ready.
+/// Output of a helper that is ready.
 const READY: &[u8] = b".";
-/// How long a helper may take to end.
+/// Time limit for the end of a helper.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(3);
-/// Clock ticks a second in the system's accounts of processor time: fixed on Linux.
+/// Clock ticks per second in the system's processor times: fixed on Linux.
 const TICKS_PER_S: f64 = 100.0;
 
-/// A process of this program. Dropping ends it.
+/// A helper process of this program. Dropping ends it.
 pub(crate) struct Helper {
     child: Child,
     answers: ChildStdout,
 }
 
 impl Helper {
-    /// Starts `carff bench` with these arguments. It is not ready yet.
+    /// Starts `carff bench` with these arguments, without waiting until it is ready.
     pub(crate) fn start(args: &[String]) -> anyhow::Result<Self> {
         let program = std::env::current_exe().context("cannot find this program")?;
         let mut child = Command::new(&program)
@@ -34,7 +34,7 @@ impl Helper {
         Ok(Self { child, answers })
     }
 
-    /// Waits until it says that it is ready.
+    /// Waits until the process reports that it is ready.
     pub(crate) fn wait_ready(&mut self) -> anyhow::Result<()> {
         let mut byte = [0];
         let read = self.answers.read(&mut byte)?;
@@ -42,7 +42,7 @@ impl Helper {
         Ok(())
     }
 
-    /// Processor time that its living threads have used: finer than [`cpu_seconds`], for work of microseconds.
+    /// Returns the processor time of its living threads, seconds. It is finer than [`cpu_seconds`].
     pub(crate) fn cpu_seconds(&self) -> f64 {
         let threads = std::fs::read_dir(format!("/proc/{}/task", self.child.id())).into_iter().flatten().flatten();
         let nanoseconds = threads.filter_map(|thread| {
@@ -52,7 +52,7 @@ impl Helper {
         nanoseconds.sum::<f64>() / 1e9
     }
 
-    /// Asks it to end; returns what it still had to say.
+    /// Asks the process to end, and returns the rest of its output.
     pub(crate) fn finish(mut self) -> anyhow::Result<String> {
         ask_to_end(&self.child);
         let mut said = String::new();
@@ -65,7 +65,7 @@ impl Helper {
 
 impl Drop for Helper {
     fn drop(&mut self) {
-        // Waited for already, its number may be another process's by now.
+        // After a wait, its number may belong to another process.
         if matches!(self.child.try_wait(), Ok(Some(_))) {
             return;
         }
@@ -74,15 +74,15 @@ impl Drop for Helper {
     }
 }
 
-/// Asks a process to end that has not been waited for.
+/// Asks a process to end whose end was not awaited yet.
 pub(crate) fn ask_to_end(child: &Child) {
     if let Some(pid) = Pid::from_raw(child.id() as i32) {
-        // It fails when the process has ended already, which is what is wanted.
+        // It fails if the process has already ended, which is the aim.
         let _ = kill_process(pid, Signal::TERM);
     }
 }
 
-/// Waits for a process that has been told to end, until a time; one that hangs is killed.
+/// Waits until a deadline for the end of a process, and then kills it.
 pub(crate) fn end_by(child: &mut Child, deadline: Instant) {
     while matches!(child.try_wait(), Ok(None)) {
         if Instant::now() >= deadline {
@@ -94,23 +94,23 @@ pub(crate) fn end_by(child: &mut Child, deadline: Instant) {
     }
 }
 
-/// In the helper: ends it when its parent dies.
+/// Ends this helper when its parent dies.
 pub(crate) fn end_with_parent() -> anyhow::Result<()> {
     set_parent_process_death_signal(Some(Signal::KILL)).context("cannot watch the parent process")
 }
 
-/// In the helper: says that it is ready.
+/// Reports from this helper that it is ready.
 pub(crate) fn say_ready() -> anyhow::Result<()> {
     let mut out = std::io::stdout().lock();
     out.write_all(READY)?;
     Ok(out.flush()?)
 }
 
-/// Processor time that a process has used so far, user and system; 0 when there is none.
+/// Returns the processor time of a process, user and system, seconds; 0 if the process does not exist.
 pub(crate) fn cpu_seconds(pid: u32) -> f64 {
     let of = || {
         let stat = std::fs::read_to_string(format!("/proc/{pid}/stat")).ok()?;
-        // The name before may hold anything; behind its bracket user and system time are the 12th and 13th.
+        // The process's name may contain anything. After its bracket, user and system time are the 12th and 13th.
         let (_, rest) = stat.rsplit_once(')')?;
         Some(rest.split_whitespace().skip(11).take(2).filter_map(|v| v.parse::<f64>().ok()).sum::<f64>())
     };

@@ -1,8 +1,8 @@
-//! Measures the program's parts, and the whole loop, on the machine at hand.
+//! Measures the program's parts, and the whole loop, on this machine.
 //!
-//! Whatever is compared is measured in one run, in turns, and compared as a ratio of medians. Nothing here is part of
-//! the tests: times depend on the machine, and on what else it does. Each benchmark prints a table, and can write its
-//! figures as JSON with a description of the machine, and compare them with those of an earlier run.
+//! Comparisons alternate all variants in one run, and report ratios of medians. No test contains a benchmark, because
+//! times depend on the machine and on its load. Each benchmark prints a table. It can also write its figures as JSON,
+//! with a description of the machine, and compare them with an earlier run.
 
 mod encoder;
 mod field;
@@ -22,52 +22,52 @@ use report::Report;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-/// What to measure.
+/// The benchmarks.
 #[derive(Debug, clap::Subcommand)]
 pub enum BenchCommand {
-    /// The field's kernels against the same model in tensor operations and against the machine's limits.
+    /// Compare the field's kernels with the same model in tensor operations and with the machine's limits.
     #[command(after_help = "Example: on one thread, compared with an earlier run
   carff bench field --threads 1 --baseline docs/performance.json")]
     Field(field::FieldArgs),
-    /// Encoder and forecaster, one frame at a time.
-    #[command(after_help = "Example: the shipped networks alone
+    /// Measure encoder and forecaster, one frame at a time.
+    #[command(after_help = "Example: only the shipped networks
   carff bench encoder --no-vit --json reports/performance.json")]
     Encoder(encoder::EncoderArgs),
-    /// From one process to another: this program's topics, bare iceoryx2, Unix sockets, zenoh.
+    /// Measure payloads between processes: this program's topics, bare iceoryx2, Unix sockets, zenoh.
     #[command(after_help = "Example: with the figures as JSON
   carff bench ipc --json reports/performance.json")]
     Ipc(ipc::IpcArgs),
-    /// The other process of `ipc`.
+    /// Run the receiving process of `ipc`.
     #[command(hide = true)]
     IpcPeer(ipc::PeerArgs),
-    /// Camera to action, with all stages alive.
+    /// Measure the time from camera to action with all stages.
     #[command(after_help = "Example: in a minute
   carff bench loop --quick")]
     Loop(graph_loop::LoopArgs),
-    /// How cost grows with samples, horizon, resolution, candidates, stages and probes.
+    /// Measure the growth of cost with samples, horizon, resolution, candidates, stages and probes.
     #[command(after_help = "Example: in a few minutes, with plots
   carff bench scale --quick --plots reports/scale")]
     Scale(scale::ScaleArgs),
-    /// A process of `scale`'s chain of stages.
+    /// Run a process of `scale`'s chain of stages.
     #[command(hide = true)]
     Relay(scale::RelayArgs),
-    /// The process of `scale`'s probes.
+    /// Run the process of `scale`'s probes.
     #[command(hide = true)]
     Probes(probes::ProbesArgs),
 }
 
-/// Where figures go.
+/// Output of the figures.
 #[derive(Clone, Debug, clap::Args)]
 pub struct OutputArgs {
-    /// Write the figures here, as JSON. Figures of other benchmarks that the file holds are kept.
+    /// Write the figures to this JSON file. Its figures of other benchmarks are kept.
     #[arg(long)]
     json: Option<PathBuf>,
-    /// Compare with the figures of an earlier run's JSON, as ratios.
+    /// Compare with the figures in an earlier run's JSON file, as ratios.
     #[arg(long)]
     baseline: Option<PathBuf>,
 }
 
-/// Measures, prints, and writes what was asked for.
+/// Runs a benchmark, prints its tables, and writes its figures if requested.
 pub fn run(command: BenchCommand) -> anyhow::Result<ExitCode> {
     let (report, output) = match command {
         BenchCommand::Field(args) => (field::run(&args)?, args.output),

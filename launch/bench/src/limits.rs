@@ -1,9 +1,9 @@
-//! What the machine can do at best: matrix products in libtorch, and memory bandwidth.
+//! Limits of the machine: matrix products in libtorch, and memory bandwidth.
 
 use crate::stats::{Contender, timed};
 use tch::{Device, Kind, Tensor};
 
-/// A matrix product of `[m, k]` and `[k, n]`, and its operations.
+/// Returns a matrix product of `[m, k]` and `[k, n]`, and its number of operations.
 pub(crate) fn matrix_product<'a>(kind: Kind, [m, k, n]: [i64; 3]) -> (Contender<'a>, f64) {
     let a = (Tensor::rand([m, k], (Kind::Float, Device::Cpu)) - 0.5).to_kind(kind);
     let b = (Tensor::rand([k, n], (Kind::Float, Device::Cpu)) - 0.5).to_kind(kind);
@@ -16,10 +16,10 @@ pub(crate) fn matrix_product<'a>(kind: Kind, [m, k, n]: [i64; 3]) -> (Contender<
     (contender, 2.0 * (m * k * n) as f64)
 }
 
-/// Numbers in each of the three arrays that the bandwidth is measured with: far more than caches hold.
+/// Length of each of the three arrays for the bandwidth: far more than the caches can hold.
 const TRIAD: usize = 1 << 24;
 
-/// a = b + 3 c over large arrays, on `threads` threads, and the bytes that are read and written.
+/// Returns a = b + 3 c over large arrays on `threads` threads, and the number of bytes that it reads and writes.
 pub(crate) fn triad<'a>(threads: usize) -> (Contender<'a>, f64) {
     let (mut a, b, c) = (vec![0.0_f32; TRIAD], vec![1.0_f32; TRIAD], vec![2.0_f32; TRIAD]);
     let contender = timed(move || {

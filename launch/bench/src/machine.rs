@@ -1,13 +1,13 @@
-//! What machine the figures are of.
+//! Describes the machine of the figures.
 
 use serde_json::{Value, json};
 use std::path::Path;
 use std::time::SystemTime;
 
-/// Instruction sets that matter to the kernels, in the system's spelling.
+/// Instruction sets that the kernels use, in the system's spelling.
 const FEATURES: [&str; 9] = ["avx2", "fma", "f16c", "avx512f", "avx512vl", "avx512_bf16", "amx_bf16", "asimd", "bf16"];
 
-/// Processor, its features, cores, memory, system, libtorch, date. What cannot be found out is null.
+/// Returns processor, its features, cores, memory, system, libtorch and date. Unknown values are null.
 pub(crate) fn describe() -> Value {
     let cpuinfo = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
     let field = |name: &str| {
@@ -32,7 +32,7 @@ pub(crate) fn describe() -> Value {
     })
 }
 
-/// The same for people.
+/// Returns the description as a sentence.
 pub(crate) fn sentence(machine: &Value) -> String {
     let text = |key: &str| machine[key].as_str().unwrap_or("unknown").to_owned();
     let features: Vec<&str> = machine["features"].as_array().into_iter().flatten().filter_map(Value::as_str).collect();
@@ -49,7 +49,7 @@ pub(crate) fn sentence(machine: &Value) -> String {
     )
 }
 
-/// The version of the libtorch that this process runs: a file beside the library says it.
+/// Returns the version of the libtorch that this process runs, from a file next to the library.
 fn libtorch_version() -> Option<String> {
     let maps = std::fs::read_to_string("/proc/self/maps").ok()?;
     let library = maps.lines().find(|l| l.contains("libtorch_cpu.so")).and_then(|l| l.split_whitespace().nth(5))?;
@@ -57,7 +57,7 @@ fn libtorch_version() -> Option<String> {
     Some(std::fs::read_to_string(version).ok()?.trim().to_owned())
 }
 
-/// The date of a time since 1970, UTC, in the Gregorian calendar.
+/// Returns the Gregorian date of a time since 1970, UTC.
 fn date(unix_s: u64) -> String {
     // Days since 1 March of the year 0, so that leap days end a year (400 years have 146097 days).
     let days = unix_s / 86_400 + 719_468;
@@ -74,7 +74,7 @@ fn date(unix_s: u64) -> String {
 mod tests {
     use super::*;
 
-    /// Dates are right at the ends of months, in leap years and beyond.
+    /// Dates are correct at the ends of months, and in leap years.
     #[test]
     fn dates_are_right() {
         for (unix_s, want) in [
@@ -91,7 +91,7 @@ mod tests {
         }
     }
 
-    /// The description has what a reader of figures needs.
+    /// The description contains all values that a reader of figures needs.
     #[test]
     fn descriptions_are_complete() {
         let machine = describe();

@@ -1,41 +1,41 @@
-//! Further subscribers to a running graph, as viewers and recorders are, in a process of their own.
+//! Additional subscribers to a running graph, such as viewers and recorders, in one separate process.
 
 use crate::helper::{Helper, end_with_parent, say_ready};
 use anyhow::Context;
 use carff_messages::{Action, Belief, FrameMeta};
 use carff_transport::{Image, Node, Receiver, Run, Stop, Waiter, Woken, topics};
 
-/// The process of `scale`'s probes.
+/// Arguments of the probes' process.
 #[derive(Clone, Debug, clap::Args)]
 pub struct ProbesArgs {
-    /// The run's name.
+    /// Name of the run.
     run: String,
-    /// The run's id.
+    /// Id of the run.
     run_id: u64,
-    /// How many probes.
+    /// Number of probes.
     count: usize,
 }
 
-/// Most probes that the graph's topics have room for beside the graph's own stages and the measuring process.
+/// Returns the maximum number of probes, next to the graph's own stages and the measuring process.
 pub(crate) fn most_probes() -> usize {
     let spare = [
-        // The encoder and the measurement.
+        // Encoder and measurement.
         topics::FRAME.limits.max_subscribers - 2,
-        // Controller, forecaster, renderer, and the measurement.
+        // Controller, forecaster, renderer and measurement.
         topics::BELIEF.limits.max_subscribers - 4,
-        // The measurement.
+        // Measurement.
         topics::ACTION.limits.max_subscribers - 1,
     ];
     spare.into_iter().min().unwrap_or_default()
 }
 
-/// Probes that listen.
+/// Attached probes.
 pub(crate) struct Probes {
     helper: Helper,
 }
 
 impl Probes {
-    /// Attaches `count` probes to a run; returns when all listen.
+    /// Attaches `count` probes to a run, and returns when all are attached.
     pub(crate) fn start(run: &Run, count: usize) -> anyhow::Result<Self> {
         let args = ["probes".to_owned(), run.name().to_owned(), run.id().to_string(), count.to_string()];
         let mut helper = Helper::start(&args)?;
@@ -43,19 +43,19 @@ impl Probes {
         Ok(Self { helper })
     }
 
-    /// Processor time that their process has used.
+    /// Returns the processor time of their process, seconds.
     pub(crate) fn cpu_seconds(&self) -> f64 {
         self.helper.cpu_seconds()
     }
 
-    /// Ends them; returns how many messages they read.
+    /// Ends the probes, and returns the number of messages that they read.
     pub(crate) fn finish(self) -> anyhow::Result<u64> {
-        let said = self.helper.finish()?;
-        said.trim().parse().with_context(|| format!("the probes said `{said}` in place of a count"))
+        let output = self.helper.finish()?;
+        output.trim().parse().with_context(|| format!("the probes' process printed `{output}` instead of a count"))
     }
 }
 
-/// The probes' process: each in a thread of its own, until it is told to end. Then it says how much all have read.
+/// Runs each probe in a thread until standard input ends, and then prints the number of messages that they read.
 pub(crate) fn run(args: &ProbesArgs) -> anyhow::Result<()> {
     end_with_parent()?;
     let stop = Stop::on_signals()?;
@@ -79,7 +79,7 @@ pub(crate) fn run(args: &ProbesArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// One probe: hears frames, beliefs and actions.
+/// A probe that receives frames, beliefs and actions.
 struct Probe {
     frames: Receiver<Image<FrameMeta>>,
     beliefs: Receiver<Belief>,
@@ -95,12 +95,12 @@ impl Probe {
         })
     }
 
-    /// Reads all that comes, every byte of a picture; returns how many messages.
+    /// Reads all messages with every byte of their images, and returns their number.
     fn listen(mut self, waiter: &Waiter) -> anyhow::Result<u64> {
         let mut read = 0;
         while waiter.wait(&[&self.frames, &self.beliefs, &self.actions])? != Woken::Stopped {
-            while let Some(picture) = self.frames.next()? {
-                std::hint::black_box(picture.bytes().iter().fold(0_u64, |sum, byte| sum + u64::from(*byte)));
+            while let Some(image) = self.frames.next()? {
+                std::hint::black_box(image.bytes().iter().fold(0_u64, |sum, byte| sum + u64::from(*byte)));
                 read += 1;
             }
             while let Some(belief) = self.beliefs.next()? {
@@ -120,7 +120,7 @@ impl Probe {
 mod tests {
     use super::*;
 
-    /// As many probes as are said to fit do fit, beside the subscribers that a measured graph has anyway.
+    /// The maximum number of probes fits next to the subscribers of a measured graph, and no more.
     #[test]
     fn so_many_probes_fit() {
         let run = Run::new(&format!("bench-fit-{}", std::process::id()), 1).unwrap();

@@ -1,25 +1,25 @@
-//! Figures by key: as JSON, and compared with those of an earlier run.
+//! Figures by key: written as JSON, and compared with an earlier run.
 
 use anyhow::Context;
 use serde_json::{Map, Value, json};
 use std::fmt::Write;
 use std::path::Path;
 
-/// The figures of one benchmark. Keys are dotted paths below the benchmark's name or names.
+/// The figures of a benchmark. Keys are dotted paths that begin with the benchmark's name.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Report {
     figures: Map<String, Value>,
 }
 
 impl Report {
-    /// Notes a figure: `key` is a path like `field.render_fps`. What is not finite becomes null.
+    /// Records a figure under a path such as `field.render_fps`. A value that is not finite becomes null.
     pub(crate) fn set(&mut self, key: &str, value: f64) {
-        // Six digits are more than any of them is good for.
+        // No figure is more precise than six digits.
         let rounded = format!("{value:.6e}").parse().unwrap_or(value);
         self.set_value(key, json!(rounded));
     }
 
-    /// Notes anything else.
+    /// Records any other value.
     pub(crate) fn set_value(&mut self, key: &str, value: Value) {
         let mut parts: Vec<&str> = key.split('.').collect();
         let Some(last) = parts.pop() else { return };
@@ -35,7 +35,7 @@ impl Report {
         map.insert(last.to_owned(), value);
     }
 
-    /// Writes the figures and the machine. Another benchmark's figures in the file stay when they are of this machine.
+    /// Writes figures and machine. Other benchmarks' figures in the file are kept if they are of this machine.
     pub(crate) fn write(&self, path: &Path, machine: &Value) -> anyhow::Result<()> {
         let without_date = |machine: &Value| {
             let mut machine = machine.clone();
@@ -51,7 +51,7 @@ impl Report {
             if old.get("machine").map(without_date) == Some(without_date(machine)) {
                 all = old;
             } else {
-                println!("{} is of another machine: its figures are replaced", path.display());
+                println!("{} is of another machine; its figures are replaced", path.display());
             }
         }
         all.insert("machine".to_owned(), machine.clone());
@@ -63,7 +63,7 @@ impl Report {
         std::fs::write(path, serde_json::to_string_pretty(&all)? + "\n").with_context(context)
     }
 
-    /// A table of all figures that both have, with their ratios, now over then.
+    /// Returns a table of all common figures with their ratios, new over old.
     pub(crate) fn compared_with(&self, baseline: &Value) -> String {
         let mut rows = vec![["figure", "before", "now", "now / before"].map(str::to_owned)];
         let (mut now, mut then) = (Vec::new(), Vec::new());
@@ -81,13 +81,14 @@ impl Report {
     }
 }
 
-/// Reads figures.
+/// Reads the figures of a file.
 pub(crate) fn read(path: &Path) -> anyhow::Result<Value> {
     let text = std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
-    serde_json::from_str(&text).with_context(|| format!("{} holds no figures as `--json` writes them", path.display()))
+    serde_json::from_str(&text)
+        .with_context(|| format!("{} does not contain figures that `--json` wrote", path.display()))
 }
 
-/// All numbers below a value, by their paths.
+/// Collects all numbers below a value by their paths.
 fn flatten(path: &str, value: &Value, out: &mut Vec<(String, f64)>) {
     match value {
         Value::Object(map) => {
@@ -101,7 +102,7 @@ fn flatten(path: &str, value: &Value, out: &mut Vec<(String, f64)>) {
     }
 }
 
-/// A number with the digits that matter.
+/// Formats a number with three significant digits.
 pub(crate) fn number(value: f64) -> String {
     match value.abs() {
         a if !a.is_finite() => "-".to_owned(),
@@ -112,7 +113,7 @@ pub(crate) fn number(value: f64) -> String {
     }
 }
 
-/// Columns side by side: the first to the left, the others to the right. The first row is the heading.
+/// Formats columns: the first is left-aligned, the others are right-aligned. The first row is the heading.
 pub(crate) fn table<const N: usize>(rows: &[[String; N]]) -> String {
     let widths: [usize; N] =
         std::array::from_fn(|c| rows.iter().map(|row| row[c].chars().count()).max().unwrap_or_default());
@@ -146,7 +147,8 @@ mod tests {
         report
     }
 
-    /// Keys are nested, another benchmark's figures stay on the same machine whatever the date, and go on another.
+    /// Keys are nested. Another benchmark's figures are kept on the same machine at any date, and dropped on another
+    /// one.
     #[test]
     fn files_are_merged_by_machine() {
         let folder = tempfile::tempdir().unwrap();
@@ -167,7 +169,7 @@ mod tests {
         assert!(read(&path).unwrap_err().to_string().contains("figures.json"));
     }
 
-    /// Figures that both runs have are compared as now over then; the rest is left out.
+    /// Common figures are compared as new over old; other figures are left out.
     #[test]
     fn comparison_is_a_ratio() {
         let baseline = json!({ "field": { "render_fps": 20.0, "gone": 1.0 }, "machine": { "cores": 2 } });
@@ -178,7 +180,7 @@ mod tests {
         assert!(report(1.0).compared_with(&json!({})).contains("none"));
     }
 
-    /// Columns line up.
+    /// Columns are aligned.
     #[test]
     fn tables_line_up() {
         let rows = [["a", "bb"], ["long", "1"]].map(|row| row.map(str::to_owned));

@@ -1,8 +1,8 @@
-//! Quantiles, ratios of medians, and measuring in turns.
+//! Quantiles, ratios of medians, and alternating measurements.
 
 use std::time::Instant;
 
-/// Times of one thing, sorted.
+/// Sorted times of one variant.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(crate) struct Times {
     sorted: Vec<f64>,
@@ -15,7 +15,7 @@ impl Times {
         Self { sorted: times }
     }
 
-    /// The smallest time that at least this share (0..=1) of all times does not exceed; NaN when there are none.
+    /// Returns the smallest time that a share (0..=1) of all times does not exceed; NaN without times.
     pub(crate) fn quantile(&self, share: f64) -> f64 {
         let rank = (share * self.sorted.len() as f64).ceil() as usize;
         self.sorted.get(rank.max(1) - 1).copied().unwrap_or(f64::NAN)
@@ -30,8 +30,7 @@ impl Times {
     }
 }
 
-/// How much longer `slow` takes than `fast`, measured in turns: the ratio of medians, and the quartiles of the ratios
-/// of turns.
+/// Ratio of two alternately measured times: that of the medians, and the quartiles of the ratios of turns.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Ratio {
     pub(crate) of_medians: f64,
@@ -40,7 +39,7 @@ pub(crate) struct Ratio {
 }
 
 impl Ratio {
-    /// Both in the order of their turns.
+    /// Compares `slow` with `fast`, both in the order of their turns.
     pub(crate) fn new(slow: &[f64], fast: &[f64]) -> Self {
         let turns = Times::new(slow.iter().zip(fast).map(|(s, f)| s / f).collect());
         Self {
@@ -57,10 +56,10 @@ impl std::fmt::Display for Ratio {
     }
 }
 
-/// Something to be measured: returns the seconds that it took.
+/// A variant to measure: it returns its time, seconds.
 pub(crate) type Contender<'a> = Box<dyn FnMut() -> f64 + 'a>;
 
-/// Wraps an action with a clock.
+/// Returns a variant that times an action.
 pub(crate) fn timed<'a>(mut action: impl FnMut() + 'a) -> Contender<'a> {
     Box::new(move || {
         let start = Instant::now();
@@ -69,13 +68,13 @@ pub(crate) fn timed<'a>(mut action: impl FnMut() + 'a) -> Contender<'a> {
     })
 }
 
-/// Seconds after which a contender is asked no more: one that is far slower than the others needs few turns.
+/// Total time after which a variant gets no more turns, seconds: a slow one needs only a few.
 const PATIENCE_S: f64 = 12.0;
 
-/// Measures all in turns, `rounds` times, after one turn that does not count; every second round goes backwards, so
-/// that none is always the one after another. A slow one takes part in the first rounds alone, at least in one.
-/// Returns the seconds of each, in the order of its turns.
-pub(crate) fn in_turns(rounds: usize, contenders: &mut [Contender<'_>]) -> Vec<Vec<f64>> {
+/// Measures all variants alternately for `rounds` rounds, after a warm-up round. Every second round runs backwards, so
+/// that no variant always follows the same one. A slow variant takes part in the first rounds only, at least in one.
+/// Returns the seconds of each variant, in the order of its turns.
+pub(crate) fn alternate(rounds: usize, contenders: &mut [Contender<'_>]) -> Vec<Vec<f64>> {
     let mut seconds = vec![Vec::with_capacity(rounds); contenders.len()];
     let own_rounds: Vec<usize> =
         contenders.iter_mut().map(|c| ((PATIENCE_S / c()) as usize).clamp(1, rounds.max(1))).collect();
@@ -94,7 +93,7 @@ pub(crate) fn in_turns(rounds: usize, contenders: &mut [Contender<'_>]) -> Vec<V
 mod tests {
     use super::*;
 
-    /// Quantiles are times that occurred: of a thousand, p99 is the 990th, p99.9 the 999th, the last the maximum.
+    /// Quantiles are measured times: of a thousand, p99 is the 990th, p99.9 the 999th, the last the maximum.
     #[test]
     fn quantiles_are_exact() {
         let times = Times::new((1..=1000).rev().map(f64::from).collect());
@@ -105,7 +104,7 @@ mod tests {
         assert_eq!(Times::new(vec![f64::NAN, 1.0]).len(), 1);
     }
 
-    /// The ratio is that of the medians, whatever the order; the spread is that of the turns.
+    /// The ratio is that of the medians in any order; the spread is that of the turns.
     #[test]
     fn ratios_are_of_medians() {
         let ratio = Ratio::new(&[8.0, 4.0, 100.0, 8.0, 8.0], &[2.0, 2.0, 2.0, 1.0, 4.0]);
@@ -113,7 +112,7 @@ mod tests {
         assert_eq!(ratio.to_string(), "4.00x (2.00 to 8.00)");
     }
 
-    /// Each is called once a round and once before, forwards and backwards in turn; a slow one less often.
+    /// Each variant runs once per round and once in the warm-up, in alternating order; a slow one runs less often.
     #[test]
     fn turns_alternate() {
         let calls = std::cell::RefCell::new(String::new());
@@ -124,11 +123,11 @@ mod tests {
                 calls.borrow().len() as f64
             })
         };
-        let seconds = in_turns(2, &mut [contender('a'), contender('b')]);
+        let seconds = alternate(2, &mut [contender('a'), contender('b')]);
         assert_eq!(*calls.borrow(), "ababba");
         assert_eq!(seconds, [[3.0, 6.0], [4.0, 5.0]]);
         let slow: Contender<'_> = Box::new(|| PATIENCE_S);
         let quick: Contender<'_> = Box::new(|| 1e-3);
-        assert_eq!(in_turns(3, &mut [slow, quick]), [vec![PATIENCE_S], vec![1e-3; 3]]);
+        assert_eq!(alternate(3, &mut [slow, quick]), [vec![PATIENCE_S], vec![1e-3; 3]]);
     }
 }

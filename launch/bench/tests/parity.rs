@@ -128,8 +128,8 @@ fn latents_by_point() {
     }
 }
 
-/// With networks in bf16 in either implementation, the logarithm of the density is off by less than 0.1 and colour by less
-/// than 0.03. (In the native one where the processor has the instruction.)
+/// With networks in bf16 in either implementation, the logarithm of the density is off by less than 0.1 and colour by
+/// less than 0.03. (In the native one where the processor has the instruction.)
 #[test]
 fn values_in_bf16_are_near() {
     let (points, directions) = points(500, 20);
@@ -172,8 +172,8 @@ fn rays(count: usize, seed: u64) -> Vec<Ray> {
         .collect()
 }
 
-/// Images agree pixel by pixel, including volume rendering, background, occupancy and early ends, with pixels of no width
-/// and of some width.
+/// Images agree pixel by pixel, including volume rendering, background, occupancy and early ends, with pixels of no
+/// width and of some width.
 #[test]
 fn images_agree() {
     for point_width_m in [0.0, 0.1] {

@@ -1,7 +1,7 @@
 //! `carff bridge`: serves the run's topics over the Foxglove WebSocket protocol, read-only, for headless vehicles.
 
-use crate::probe::session::{Session, SessionArgs};
 use crate::record::wall_offset_ns;
+use crate::session::{Session, SessionArgs};
 use anyhow::Context;
 use carff_checkpoint::Manifest;
 use carff_recording::{Encoder, Format};

@@ -10,29 +10,32 @@ pub mod export;
 #[cfg(feature = "film")]
 mod film;
 mod http;
+mod log_file;
 pub mod log_line;
 pub mod metrics;
 mod not_built;
 pub mod probe;
+mod programs;
 pub mod provenance;
 #[cfg(feature = "recording")]
 pub mod record;
+pub mod runs;
+pub mod session;
 mod spans;
 pub mod terminal;
 pub mod view;
 mod vitals;
 
 pub use not_built::NotBuilt;
+pub use programs::become_program;
 
 use anyhow::{Context, anyhow};
 use carff_transport::{INTERRUPTED, exit_on_signals, is_interrupted};
 use clap::Subcommand;
 use std::any::Any;
-use std::ffi::OsString;
 use std::io::Write;
-use std::os::unix::process::CommandExt;
 use std::panic::AssertUnwindSafe;
-use std::process::{Command, ExitCode};
+use std::process::ExitCode;
 
 /// The commands of this crate.
 #[derive(Debug, Subcommand)]
@@ -45,6 +48,20 @@ pub enum Attach {
   carff probe top"
     )]
     Probe(probe::ProbeCommand),
+    /// List the living runs.
+    #[command(after_help = "Example:
+  carff ps
+  carff ps --json")]
+    Ps(runs::PsArgs),
+    /// Stop a run, as Ctrl-C in its terminal does, and wait for its end.
+    #[command(after_help = "Example: the only run; the run of a name
+  carff stop
+  carff stop approaching-intersection")]
+    Stop(runs::StopArgs),
+    /// Print the log of a run that lives or has ended.
+    #[command(after_help = "Example: follow the only run
+  carff logs --follow")]
+    Logs(runs::LogsArgs),
     /// Open the live window: each forecast scene from any camera.
     #[command(after_help = "Example: on the running graph, or on a checkpoint only
   carff view
@@ -94,6 +111,9 @@ impl Attach {
     pub fn run(&self) -> anyhow::Result<ExitCode> {
         match self {
             Self::Probe(command) => probe::run(command),
+            Self::Ps(args) => runs::ps(args),
+            Self::Stop(args) => runs::stop(args),
+            Self::Logs(args) => runs::logs(args),
             Self::View(args) => view::run(args),
             #[cfg(feature = "recording")]
             Self::Record(args) => record::run(args),
@@ -145,11 +165,4 @@ pub fn run_program(program: impl FnOnce() -> anyhow::Result<ExitCode>) -> ExitCo
 /// Returns the cause if a panic is that of `println!` on a standard output that takes no more.
 fn failed_output(payload: &(dyn Any + Send)) -> Option<&str> {
     payload.downcast_ref::<String>()?.strip_prefix("failed printing to stdout: ")
-}
-
-/// Replaces this process with another program of this project from the same folder; returns if that fails.
-pub fn become_program(name: &str, args: &[OsString]) -> anyhow::Result<ExitCode> {
-    let program = std::env::current_exe()?.with_file_name(name);
-    let error = Command::new(&program).args(args).exec();
-    Err(error).with_context(|| format!("cannot start {}; build it with `make build`", program.display()))
 }

@@ -52,8 +52,8 @@ mod tests {
         serde_json::from_str(&formatted(LogFormat::Json, &TIME, "encoder", said)).unwrap()
     }
 
-    /// Text is passed on with the time and the source. In JSON every line is an object with time, source, level and message, and keeps the
-    /// fields of the stage.
+    /// Text is passed on with the time and the source. In JSON every line is an object with time, source, level and
+    /// message, and keeps the fields of the stage.
     #[test]
     fn every_line_has_its_form() {
         assert_eq!(

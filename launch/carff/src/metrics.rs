@@ -1,8 +1,8 @@
 //! `carff metrics`: serves a run's metrics over HTTP, for Prometheus and for scripts.
 
 use crate::http::{Response, Server};
-use crate::probe::session::{Session, SessionArgs};
 use crate::provenance::{self, Origin};
+use crate::session::{Session, SessionArgs};
 use crate::vitals::{Labels, RunVitals, StageVitals};
 use anyhow::{Context, ensure};
 use carff_base::statistics::percentile;

@@ -1,7 +1,7 @@
 //! `carff record`: writes the messages of a running graph into an MCAP file.
 
-use crate::probe::session::{Session, SessionArgs};
 use crate::provenance;
+use crate::session::{Session, SessionArgs};
 use crate::terminal::Terminal;
 use anyhow::Context;
 use carff_checkpoint::Manifest;

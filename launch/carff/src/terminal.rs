@@ -1,10 +1,12 @@
 //! Lines and one status line on the terminal; only plain lines if the output is not a terminal.
 
+use crate::log_file::LogFile;
 use crate::log_line;
 use carff_config::LogFormat;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use std::io::{ErrorKind, IsTerminal, Write};
-use std::sync::OnceLock;
+use std::path::Path;
+use std::sync::{Mutex, OnceLock, PoisonError};
 
 /// Drawings of the status line per second.
 const STATUS_HZ: u8 = 5;
@@ -17,6 +19,8 @@ pub struct Terminal {
     colour: bool,
     /// Format of the log; text until it is set.
     format: OnceLock<LogFormat>,
+    /// File of the log, where one was requested.
+    log: Mutex<Option<LogFile>>,
     /// The first error of standard output, other than a closed pipe.
     failed: OnceLock<std::io::Error>,
 }
@@ -30,7 +34,7 @@ impl Terminal {
         let status = ProgressBar::with_draw_target(None, target);
         status.set_style(ProgressStyle::with_template("{wide_msg}").unwrap_or_else(|_| ProgressStyle::default_bar()));
         let colour = live && std::env::var_os("NO_COLOR").is_none_or(|v| v.is_empty());
-        Self { status, colour, format: OnceLock::new(), failed: OnceLock::new() }
+        Self { status, colour, format: OnceLock::new(), log: Mutex::default(), failed: OnceLock::new() }
     }
 
     /// Prints a line on standard output.
@@ -48,6 +52,12 @@ impl Terminal {
         std::sync::Arc::into_inner(self).and_then(|mut terminal| terminal.failed.take()).map_or(Ok(()), Err)
     }
 
+    /// Also writes the log to a file from now on.
+    pub fn log_to(&self, path: &Path) -> std::io::Result<()> {
+        *self.log.lock().unwrap_or_else(PoisonError::into_inner) = Some(LogFile::create(path)?);
+        Ok(())
+    }
+
     /// Sets the log's format, once.
     pub fn set_log_format(&self, format: LogFormat) {
         // A process runs one graph, so there is no second choice.
@@ -58,7 +68,10 @@ impl Terminal {
     /// level or is a JSON object.
     pub fn log(&self, source: &str, said: &str) {
         let format = self.format.get().copied().unwrap_or_default();
-        self.note(&log_line::formatted(format, &jiff::Timestamp::now(), source, said));
+        let line = log_line::formatted(format, &jiff::Timestamp::now(), source, said);
+        // A full disk must not disturb the run.
+        let _ = self.log.lock().unwrap_or_else(PoisonError::into_inner).as_mut().map(|log| log.line(&line));
+        self.note(&line);
     }
 
     /// Prints a line on standard error that is not part of the log.

@@ -1,6 +1,6 @@
 //! Health, rates and resource use of a run's stages over time, for the full-screen view and the metrics.
 
-use crate::probe::session::{Going, Session};
+use crate::session::{Going, Session};
 use carff_messages::forms::AnyMessage;
 use carff_messages::{
     Action, ActionCode, Belief, Forecast, FrameMeta, Health, HealthState, Posterior, Reason, Stage, ViewMeta,
@@ -264,7 +264,6 @@ mod tests {
             stage: Stage::Prober.code(),
             state: state.code(),
             pid,
-            reserved: 0,
             received: 0,
             published: 0,
             skipped: 3,
@@ -340,7 +339,6 @@ mod tests {
             confidence: 1.0,
             hazard_probability: 0.1,
             is_decision: 1,
-            reserved: 0,
             valid_until_ns: 1,
             based_on_frame: 7,
             latency_ns,

@@ -238,8 +238,32 @@ pub struct RunFiles {
     pub segment_bytes: u64,
 }
 
-/// Reports living runs and the files of dead runs. `strays` are files in shared memory of no run of this user.
-pub fn leftovers(runs: &[RunFiles], strays: &[PathBuf]) -> Vec<Finding> {
+/// Files in shared memory of no known run of this user.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Strays {
+    /// The files.
+    pub files: Vec<PathBuf>,
+    /// Processes that use them: of a run whose folder is gone.
+    pub users: Vec<u32>,
+}
+
+/// Checks the folder of new runs.
+pub fn run_folder(folder: &Path, writable: bool) -> Finding {
+    let shown = folder.display();
+    if writable {
+        return Finding::ok(Area::Machine, "run folder", format!("{shown} is writable"));
+    }
+    Finding::error(
+        Area::Machine,
+        "run folder",
+        format!("{shown} cannot be written"),
+        "no graph can start, and no probe can join one",
+        "set XDG_RUNTIME_DIR or TMPDIR to a folder that this user can write, with a path of at most 20 bytes",
+    )
+}
+
+/// Reports living runs and the files of dead runs.
+pub fn leftovers(runs: &[RunFiles], strays: &Strays) -> Vec<Finding> {
     let area = Area::SharedMemory;
     let list = |pids: &[u32]| pids.iter().map(u32::to_string).collect::<Vec<_>>().join(" ");
     let mut findings: Vec<Finding> = runs
@@ -274,13 +298,21 @@ pub fn leftovers(runs: &[RunFiles], strays: &[PathBuf]) -> Vec<Finding> {
             ),
         })
         .collect();
-    if !strays.is_empty() {
+    if !strays.users.is_empty() {
+        findings.push(Finding::error(
+            area,
+            "lost folder",
+            format!("processes {} belong to a run whose folder is gone", list(&strays.users)),
+            "no probe sees the run, and none of its stages can restart: a cleaner of temporary files may have removed it",
+            format!("stop the run (kill -INT {}), start it again, and keep the cleaner from its folder", strays.users[0]),
+        ));
+    } else if !strays.files.is_empty() {
         findings.push(Finding::warning(
             area,
             "strays",
-            format!("{} files in shared memory belong to no known run", strays.len()),
+            format!("{} files in shared memory belong to no known run", strays.files.len()),
             "they use memory until they are removed",
-            format!("if no graph runs: rm {}", words(strays.iter().map(PathBuf::as_path))),
+            format!("if no graph runs: rm {}", words(strays.files.iter().map(PathBuf::as_path))),
         ));
     }
     if findings.is_empty() {
@@ -636,10 +668,14 @@ mod tests {
             ..RunFiles::default()
         };
         let small = RunFiles { name: "small".to_owned(), small: vec!["x.run".into()], ..RunFiles::default() };
-        assert_level(&leftovers(&[small], &[])[0], Level::Ok);
+        assert_level(&leftovers(&[small], &Strays::default())[0], Level::Ok);
         let alive = RunFiles { name: "alive".to_owned(), launcher: Some(7), living: vec![7, 8], ..RunFiles::default() };
         let orphan = RunFiles { name: "orphan".to_owned(), living: vec![9, 10], ..RunFiles::default() };
-        let findings = leftovers(&[dead, alive, orphan], &segments);
+        let strays = Strays { files: segments, users: Vec::new() };
+        let findings = leftovers(&[dead, alive, orphan], &strays);
+        let lost = leftovers(&[], &Strays { users: vec![5, 6], ..strays.clone() });
+        assert_eq!(levels(&lost), [("lost folder", Level::Error)]);
+        assert!(lost[0].advice.contains("kill -INT 5"), "a living run is never removed: {lost:?}");
         assert_eq!(
             levels(&findings),
             [
@@ -653,7 +689,7 @@ mod tests {
         assert_eq!(findings[0].advice, "rm -r /dev/shm/carff0123abcd_* /var/carff-1/dead /var/carff-1/dead.run");
         assert_eq!(findings[2].advice, "kill 9 10");
         assert!(findings[3].advice.ends_with("rm /dev/shm/carff0123abcd_*"), "{findings:?}");
-        assert_eq!(levels(&leftovers(&[], &[])), [("leftovers", Level::Ok)]);
+        assert_eq!(levels(&leftovers(&[], &Strays::default())), [("leftovers", Level::Ok)]);
     }
 
     /// Limits only matter if the graph needs more, and privileges lift them.

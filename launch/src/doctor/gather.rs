@@ -1,8 +1,10 @@
 //! Collects facts about the machine, without judging them.
 
-use super::checks::{Allowed, Clock, Logind, RunFiles, SharedMemory};
+use super::checks::{Allowed, Clock, Logind, RunFiles, SharedMemory, Strays};
 use carff_messages::Stage;
-use carff_transport::{Run, SHARED_MEMORY_DIR, living_processes, monotonic_now_ns, runtime_dir};
+use carff_transport::{
+    Run, SHARED_MEMORY_DIR, living_processes, mapping_processes, monotonic_now_ns, runtime_dir, runtime_dirs,
+};
 use rustix::process::{Resource, getrlimit};
 use std::collections::{BTreeMap, BTreeSet};
 use std::os::unix::fs::{MetadataExt, PermissionsExt};
@@ -112,34 +114,37 @@ fn file_system(mounts: &str, folder: &Path) -> String {
         .map_or_else(|| "of unknown type".to_owned(), |(_, kind)| kind)
 }
 
-/// Returns this user's runs, and files in shared memory that look like a run's but belong to none.
-pub fn runs() -> anyhow::Result<(Vec<RunFiles>, Vec<PathBuf>)> {
-    let folder = runtime_dir();
-    let launchers: BTreeMap<String, u32> = carff_observe::runs()?.into_iter().map(|run| (run.name, run.pid)).collect();
-    let mut small: BTreeMap<String, Vec<PathBuf>> = BTreeMap::new();
-    for entry in std::fs::read_dir(&folder).into_iter().flatten().flatten() {
-        if let Some(name) = entry.file_name().to_str() {
-            small.entry(name.strip_suffix(".run").unwrap_or(name).to_owned()).or_default().push(entry.path());
+/// Returns this user's runs in all folders, and files in shared memory that look like a run's but belong to none.
+pub fn runs() -> anyhow::Result<(Vec<RunFiles>, Strays)> {
+    let launchers: BTreeMap<(PathBuf, String), u32> =
+        carff_observe::runs()?.into_iter().map(|run| ((run.dir, run.name), run.pid)).collect();
+    let mut small: BTreeMap<(PathBuf, String), Vec<PathBuf>> = BTreeMap::new();
+    for folder in runtime_dirs() {
+        for entry in std::fs::read_dir(&folder).into_iter().flatten().flatten() {
+            if let Some(name) = entry.file_name().to_str() {
+                let name = name.strip_suffix(".run").unwrap_or(name).to_owned();
+                small.entry((folder.clone(), name)).or_default().push(entry.path());
+            }
         }
     }
     let mut runs = Vec::new();
     let mut known = BTreeSet::new();
-    for (name, small) in small {
+    for (key, small) in small {
         // Names that no run can have belong to other programs.
-        let Ok(run) = Run::new(&name, 0) else { continue };
+        let Ok(run) = Run::within(&key.0, &key.1, 0) else { continue };
         let segments = run.shared_memory_files().unwrap_or_default();
         known.insert(run.shared_memory_prefix());
         runs.push(RunFiles {
-            launcher: launchers.get(&name).copied(),
-            living: if run.folder().is_dir() { living_processes(&run)? } else { Vec::new() },
+            launcher: launchers.get(&key).copied(),
+            living: if run.folder().is_dir() { living_processes(&run)? } else { run.mapping_processes() },
             segment_bytes: segments.iter().filter_map(|path| std::fs::metadata(path).ok()).map(|m| m.len()).sum(),
-            name,
+            name: key.1,
             small,
             segments,
         });
     }
     let uid = rustix::process::getuid().as_raw();
-    let mut strays: Vec<PathBuf> = std::fs::read_dir(SHARED_MEMORY_DIR)
+    let mut files: Vec<PathBuf> = std::fs::read_dir(SHARED_MEMORY_DIR)
         .into_iter()
         .flatten()
         .flatten()
@@ -152,8 +157,19 @@ pub fn runs() -> anyhow::Result<(Vec<RunFiles>, Vec<PathBuf>)> {
         })
         .map(|entry| entry.path())
         .collect();
-    strays.sort();
-    Ok((runs, strays))
+    files.sort();
+    let prefixes: BTreeSet<&str> =
+        files.iter().filter_map(|f| Some(f.file_name()?.to_str()?.split_once('_')?.0)).collect();
+    let users = prefixes.into_iter().flat_map(mapping_processes).collect();
+    Ok((runs, Strays { files, users }))
+}
+
+/// Returns the folder of new runs, and true if it can be written.
+pub fn run_folder() -> (PathBuf, bool) {
+    let folder = runtime_dir();
+    let written = carff_transport::make_private_dir(&folder).is_ok()
+        && carff_base::files::check_writable(&folder.join(".doctor")).is_ok();
+    (folder, written)
 }
 
 /// Returns true for the name of a run's shared memory: `carff`, eight digits, an underscore.

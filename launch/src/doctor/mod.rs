@@ -11,7 +11,7 @@ pub use finding::{Area, Finding, Level};
 use anyhow::Context;
 use carff::provenance;
 use carff_config::{GraphConfig, RendererConfig, StagesConfig};
-use carff_transport::topics;
+use carff_transport::graph_bytes;
 use std::io::IsTerminal;
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -67,8 +67,10 @@ pub fn examine(args: &DoctorArgs) -> anyhow::Result<Vec<Finding>> {
     findings.extend(gather::free_bytes(&here).map(|bytes| checks::disk(&here, bytes)));
 
     let view_bytes = carff_messages::rgb_bytes(renderer.width_px, renderer.height_px);
-    let needed_bytes = topics::graph_bytes(crate::launch::FRAME_BYTES, view_bytes);
+    let needed_bytes = graph_bytes(crate::launch::FRAME_BYTES, view_bytes);
     findings.extend(checks::shared_memory(&gather::shared_memory(), needed_bytes));
+    let (folder, writable) = gather::run_folder();
+    findings.push(checks::run_folder(&folder, writable));
     let (runs, strays) = gather::runs()?;
     findings.extend(checks::leftovers(&runs, &strays));
 

@@ -19,6 +19,7 @@ pub use inject::{InjectArgs, run as inject};
 pub use schedule::{Fault, fault};
 
 use anyhow::{Context, ensure};
+use carff_base::files::check_writable;
 use carff_config::{Kind, SoakConfig};
 use carff_messages::Stage;
 use carff_transport::{Node, Run, SHARED_MEMORY_DIR, Stop, Waiter, monotonic_now_ns};
@@ -59,6 +60,9 @@ pub struct SoakArgs {
     /// Duration, minutes.
     #[arg(long, default_value_t = 2.0)]
     pub minutes: f64,
+    /// Stop after this number of faults, also before the time is over.
+    #[arg(long)]
+    pub faults: Option<u64>,
     /// Seed of the schedule.
     #[arg(long, default_value_t = 1)]
     pub seed: u64,
@@ -79,6 +83,7 @@ pub struct SoakArgs {
 /// Soaks a graph; exit code 0 if the contract always held, 1 at the first violation, 130 on Ctrl-C.
 pub fn run(args: &SoakArgs) -> anyhow::Result<ExitCode> {
     let config = SoakConfig::load(&args.config)?;
+    args.json.as_deref().map_or(Ok(()), check_writable)?;
     ensure!(args.minutes > 0.0 && args.minutes.is_finite(), "--minutes is {}; it must be above 0", args.minutes);
     if !args.own_memory && (config.faults.full_memory > 0 || config.faults.full_disk > 0) {
         with_own_memory();
@@ -191,7 +196,7 @@ impl Soak<'_> {
         let begun_ns = monotonic_now_ns();
         let end_ns = begun_ns + (self.args.minutes * 60e9) as u64;
         let mut number = 0;
-        while monotonic_now_ns() < end_ns && self.goes_on()? {
+        while monotonic_now_ns() < end_ns && self.args.faults.is_none_or(|most| number < most) && self.goes_on()? {
             let fault = fault(self.config, self.args.seed, number);
             number += 1;
             self.recorder.keep_on(&self.run)?;

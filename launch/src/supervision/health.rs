@@ -239,7 +239,6 @@ mod tests {
             stage: Stage::Encoder.code(),
             state: state.code(),
             pid,
-            reserved: 0,
             received: 0,
             published: 0,
             skipped: 0,

@@ -40,6 +40,8 @@ const START_ORDER: [Stage; 6] =
 const WATCH_NS: u64 = 20_000_000;
 /// Interval of the search for leftovers of dead processes: the launcher does not start the probes.
 const CLEANUP_NS: u64 = 1_000_000_000;
+/// Interval in which the run's files are made young again.
+const REFRESH_NS: u64 = 3_600_000_000_000;
 /// A longer pause of the launcher itself counts for no stage.
 const OWN_PAUSE_NS: u64 = 300_000_000;
 /// Multiple of its deadline after which a stage's loop counts as hanging.
@@ -96,6 +98,10 @@ pub(crate) struct Supervisor<'a> {
     watched_ns: u64,
     /// Time of the next search for leftovers.
     cleanup_ns: u64,
+    /// Time of the next refresh of the run's files.
+    refresh_ns: u64,
+    /// True after the loss of the run's folder was reported.
+    folder_is_lost: bool,
     /// The lost stage without which the run continues at a halt, and the cause.
     lost: Option<String>,
 }
@@ -125,6 +131,8 @@ impl<'a> Supervisor<'a> {
             feed: None,
             watched_ns: monotonic_now_ns(),
             cleanup_ns: monotonic_now_ns(),
+            refresh_ns: monotonic_now_ns() + REFRESH_NS,
+            folder_is_lost: false,
             lost: None,
         })
     }
@@ -322,8 +330,23 @@ impl<'a> Supervisor<'a> {
         if now_ns >= self.cleanup_ns {
             self.cleanup_ns = now_ns + CLEANUP_NS;
             self.node.cleanup_dead();
+            self.guard_folder(now_ns);
         }
         Ok(false)
+    }
+
+    /// Keeps cleaners of temporary files from the run's folder, and reports its loss once.
+    fn guard_folder(&mut self, now_ns: u64) {
+        let run = self.node.run();
+        if now_ns >= self.refresh_ns {
+            self.refresh_ns = now_ns + REFRESH_NS;
+            run.refresh();
+        }
+        let is_lost = !run.folder().is_dir();
+        if is_lost && !self.folder_is_lost {
+            self.terminal.log(LAUNCHER, &format!("ERROR {}", lost_folder(run)));
+        }
+        self.folder_is_lost = is_lost;
     }
 
     /// Handles the end of a stage: a restart by its policy, a run without it, or an error.
@@ -333,6 +356,11 @@ impl<'a> Supervisor<'a> {
         let watched = &mut self.stages[index];
         let stage = watched.stage;
         ensure!(watched.health.was_ready(), "stage `{stage}` did not start: {cause}");
+        ensure!(
+            self.node.run().folder().is_dir(),
+            "stage `{stage}` is lost: {cause}; {}",
+            lost_folder(self.node.run())
+        );
         if let Verdict::RestartAt(at_ns) = watched.budget.died(now_ns) {
             watched.restart_at_ns = Some(at_ns);
             watched.health.died();
@@ -413,6 +441,15 @@ impl<'a> Supervisor<'a> {
             self.terminal.log(LAUNCHER, &format!("ERROR {}", carff_base::errors::sentence(&*error)));
         }
     }
+}
+
+fn lost_folder(run: &Run) -> String {
+    format!(
+        "the run's folder {} is gone, so that probes see nothing and no stage can restart: keep cleaners of temporary \
+         files from it (systemd: a line `x {}` in /etc/tmpfiles.d/carff.conf), and start the run again",
+        run.folder().display(),
+        run.dir().display()
+    )
 }
 
 fn how(status: ExitStatus) -> String {

@@ -87,6 +87,10 @@ pub struct Records {
     pub frames: BTreeMap<u64, FrameRecord>,
     /// Number of published actions, both decisions and repeats.
     pub actions: u64,
+    /// Number of published actions that the launcher did not read in time, because it was stopped or slow.
+    pub actions_not_recorded: u64,
+    /// Sequence number of the next action.
+    next_action: u64,
     /// Safe actions by reason.
     pub safe_actions: BTreeMap<&'static str, u64>,
     /// Reductions under overload: beliefs with fewer samples, frames with fewer steps, and views with fewer pixels than
@@ -200,6 +204,9 @@ impl Records {
     /// Returns the frame that was decided on, if the action is a decision.
     fn take_action(&mut self, action: &Action) -> Option<u64> {
         self.actions += 1;
+        // A restarted controller counts from 0 again.
+        self.actions_not_recorded += action.header.sequence.saturating_sub(self.next_action);
+        self.next_action = action.header.sequence + 1;
         self.spoke_ns.insert(Stage::Controller, action.header.publish_time_ns);
         let reason = action.reason().ok()?;
         if reason != Reason::Belief {

@@ -1,8 +1,8 @@
 //! Converts times of another machine to this machine's clock.
 //!
-//! Each machine's monotonic clock counts from its own start. Every message holds its time of sending, and arrives later.
-//! The least difference of the two in the last minute is the difference of the clocks plus the shortest transfer time.
-//! Times are moved by it, so that an age computed here lacks only the shortest transfer time.
+//! Each machine's monotonic clock counts from its own start. Every message holds its time of sending, and arrives
+//! later. The least difference of the two in the last minute is the difference of the clocks plus the shortest transfer
+//! time. Times are moved by it, so that an age computed here lacks only the shortest transfer time.
 
 /// Half of the time that a difference is stored for, nanoseconds: clocks drift apart by some 50 us a second.
 const WINDOW_NS: u64 = 30_000_000_000;

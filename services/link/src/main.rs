@@ -1,10 +1,10 @@
 //! `carff-link` sends topics of a run to another machine, where they are a run again. The tool is optional: no stage
 //! depends on it.
 //!
-//! The sending end is an observer of the run, with spare subscriber slots that no sender waits for. It publishes nothing
-//! in the run, and subscribes to nothing on the network. The receiving end is a run with its own name, record and lock, so
-//! that probes, recorder, viewer and renderers work on it. One zenoh connection joins two given addresses; neither end
-//! searches for others.
+//! The sending end is an observer of the run, with spare subscriber slots that no sender waits for. It publishes
+//! nothing in the run, and subscribes to nothing on the network. The receiving end is a run with its own name, record
+//! and lock, so that probes, recorder, viewer and renderers work on it. One zenoh connection joins two given addresses;
+//! neither end searches for others.
 
 mod address;
 mod clock;

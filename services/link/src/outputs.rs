@@ -76,7 +76,6 @@ mod tests {
                 stage: Stage::Prober.code(),
                 state: HealthState::Ok.code(),
                 pid: 1,
-                reserved: 0,
                 received: 0,
                 published: 0,
                 skipped: 0,

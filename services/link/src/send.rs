@@ -129,7 +129,7 @@ fn forward(attached: &Attached, ways: &mut [Way], waiter: &Waiter) -> anyhow::Re
 struct Way {
     topic: TopicId,
     publisher: Publisher<'static>,
-    /// Whether there is a receiver.
+    /// True if there is a receiver.
     heard: bool,
     sender: u64,
     sequence: u64,

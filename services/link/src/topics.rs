@@ -44,7 +44,8 @@ fn prefix(run: &str) -> String {
 mod tests {
     use super::*;
 
-    /// Each topic's key leads back to it, only in this run; groups hold their topics; an unknown name gets a suggestion.
+    /// Each topic's key leads back to it, only in this run; groups hold their topics; an unknown name gets a
+    /// suggestion.
     #[test]
     fn keys_and_names_lead_to_topics() {
         for topic in TopicId::all() {

@@ -474,7 +474,6 @@ mod tests {
             confidence: 0.5,
             hazard_probability: 0.5,
             is_decision,
-            reserved: 0,
             valid_until_ns: 0,
             based_on_frame: 4,
             latency_ns: 2_500_000,

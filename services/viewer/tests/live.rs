@@ -4,7 +4,7 @@ use carff_messages::{
     Action, ActionCode, Belief, DatasetView, Forecast, ForecastSource, FrameMeta, Gaussian, Header, Intrinsics,
     Posterior, Reason, Rule,
 };
-use carff_observe::RunRecord;
+use carff_observe::{RunLock, RunRecord};
 use carff_transport::{Node, Run, monotonic_now_ns, remove_run_leftovers, runtime_dir, topics};
 use carff_viewer::live::LiveFeed;
 use std::time::{Duration, Instant};
@@ -29,7 +29,7 @@ fn wait_for<T>(mut look: impl FnMut() -> Option<T>) -> T {
 fn watches_a_run_from_frame_to_decision() {
     let name = format!("viewer-{}", std::process::id());
     let error = LiveFeed::attach(Some(name.clone()), || ()).err().unwrap();
-    assert!(error.to_string().contains(&name) || error.to_string().contains("no graph"), "{error}");
+    assert!(error.to_string().contains(&format!("no run `{name}` is alive")), "{error}");
 
     let run = Run::new(&name, 17).unwrap();
     let node = Node::open(&run, "test").unwrap();
@@ -41,8 +41,7 @@ fn watches_a_run_from_frame_to_decision() {
         checkpoint: "checkpoint".into(),
         started_unix_s: 1,
     };
-    let path = RunRecord::path(&runtime_dir(), &name);
-    std::fs::write(&path, record.to_bytes().unwrap()).unwrap();
+    let lock = RunLock::take(&runtime_dir(), &name, &record, "--run").unwrap();
     let mut frames = node.image_publisher(&topics::FRAME, 12).unwrap();
     let mut posteriors = node.publisher(&topics::POSTERIOR).unwrap();
     let mut forecasts = node.publisher(&topics::FORECAST).unwrap();
@@ -100,7 +99,6 @@ fn watches_a_run_from_frame_to_decision() {
         confidence: 0.75,
         hazard_probability: 0.75,
         is_decision: 1,
-        reserved: 0,
         valid_until_ns: 0,
         based_on_frame: 4,
         latency_ns: 8_000_000,
@@ -111,7 +109,7 @@ fn watches_a_run_from_frame_to_decision() {
     let encoder_ms = feed.watched().journal.times().iter().find(|t| t.name == "encoder").map(|t| t.values[0]);
     assert_eq!(encoder_ms, Some([4.0, 3.0]));
 
-    std::fs::remove_file(&path).unwrap();
+    drop(lock);
     let why = wait_for(|| feed.watched().joined.clone().err());
     assert!(why.contains(&name), "{why}");
     drop(feed);

@@ -81,6 +81,29 @@ fn buttons_look_ahead() {
     assert!(harness.state().session.moment().unwrap().forecast.is_none());
 }
 
+/// The window works at its smallest size, at any smaller one that a window manager forces, and while it is resized.
+#[test]
+fn any_size() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut harness = window(Some(HIDING_VIEW), folder.path());
+    click(&mut harness, "Predict");
+    click(&mut harness, "Probe");
+    let sizes =
+        [(900.0, 600.0), (1440.0, 640.0), (1366.0, 768.0), (900.0, 2000.0), (300.0, 200.0), (64.0, 64.0), (1.0, 1.0)];
+    for (width, height) in sizes {
+        harness.set_size(vec2(width, height));
+        harness.run_steps(3);
+    }
+    for height in (1..900).step_by(23) {
+        harness.set_size(vec2(1440.0 - height as f32, height as f32));
+        harness.run_steps(1);
+    }
+    harness.set_size(vec2(900.0, 600.0));
+    harness.run_steps(2);
+    click(&mut harness, "Probe and predict");
+    assert_eq!(step(&harness), 2, "the buttons are there at the smallest size");
+}
+
 /// A pressed thumbnail shows its scene; so does a state of the belief. Marks follow the shown scene.
 #[test]
 fn scenes_are_chosen() {

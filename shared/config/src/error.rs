@@ -1,8 +1,5 @@
 //! Errors that point at the line.
 
-use crate::ranges;
-use schemars::JsonSchema;
-use serde::de::DeserializeOwned;
 use std::path::{Path, PathBuf};
 use toml::de::{DeTable, DeValue};
 
@@ -77,16 +74,8 @@ pub(crate) fn read(path: &Path, what: &'static str) -> Result<String, ConfigErro
 }
 
 impl Source<'_> {
-    /// Reads the text, and checks the ranges that the schema of `T` states.
-    pub(crate) fn read<T: DeserializeOwned + JsonSchema>(&self) -> Result<T, ConfigError> {
-        let config = toml::from_str(self.text).map_err(|e| self.syntax(&e))?;
-        let values = toml::from_str(self.text).map_err(|e| self.syntax(&e))?;
-        ranges::check(self, schemars::schema_for!(T).as_value(), &values)?;
-        Ok(config)
-    }
-
-    /// Refuses the first key that has a new name. `moved` pairs old names with new ones; a part `*` stands for any name,
-    /// which the new name repeats.
+    /// Refuses the first key that has a new name. `moved` pairs old names with new ones; a part `*` stands for any
+    /// name, which the new name repeats.
     pub(crate) fn refuse_moved(&self, moved: &[(&str, &str)]) -> Result<(), ConfigError> {
         let Ok(table) = self.text.parse::<toml::Table>() else { return Ok(()) };
         for key in dotted_keys(&table, "") {

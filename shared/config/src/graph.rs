@@ -1,10 +1,11 @@
 //! The graph file: its tables, their defaults, and the rules that hold between them.
 //!
-//! The doc of each field is the user's doc. A range is written once, as a `schemars` attribute: the JSON Schema shows it,
-//! and reading a file checks it.
+//! The doc of each field is the user's doc. A range is written once, as a `schemars` attribute: the JSON Schema shows
+//! it, and reading a file checks it.
 
 use crate::ConfigError;
 use crate::error::{Source, read};
+use crate::ranges;
 use crate::stages::{LogFormat, StageConfig, StagesConfig};
 use carff_dataset::sensor::SensorNoise;
 use carff_decision::Sampling;
@@ -53,8 +54,8 @@ pub struct RunConfig {
     pub seed: u64,
     /// Folder of the dataset.
     pub dataset: PathBuf,
-    /// Name of a file in `configs/scenarios`. The launcher renders it into `dataset` when that folder is missing. Default:
-    /// none.
+    /// Name of a file in `configs/scenarios`. The launcher renders it into `dataset` when that folder is missing.
+    /// Default: none.
     #[serde(default)]
     pub scenario: Option<String>,
     /// Folder of the trained models.
@@ -86,8 +87,8 @@ pub enum CameraSource {
     /// Drives through a dataset.
     #[default]
     Drives,
-    /// Drives through the scenario itself (`run.scenario`), rendered during the run. The ego moves, and no pose is a pose
-    /// of the dataset.
+    /// Drives through the scenario itself (`run.scenario`), rendered during the run. The ego moves, and no pose is a
+    /// pose of the dataset.
     FreeDrives,
     /// The images of a folder, in the order of their names.
     Folder,
@@ -126,8 +127,8 @@ pub struct CameraConfig {
     pub split_seed: Option<u64>,
     /// Starts again at the end until the run is stopped. Free drives continue with new drives instead. Default false.
     pub repeat: bool,
-    /// Time that the stage waits after the last frame, so that the other stages can finish it, milliseconds, 0 to 60000.
-    /// Default 500.
+    /// Time that the stage waits after the last frame, so that the other stages can finish it, milliseconds, 0 to
+    /// 60000. Default 500.
     #[schemars(range(min = 0, max = 60_000))]
     pub linger_ms: u64,
 }
@@ -200,7 +201,8 @@ pub struct ControllerConfig {
     /// Rate of actions, in addition to the one that follows each belief, 1 to 1000 per second. Default 20.
     #[schemars(range(min = 1.0, max = 1000.0))]
     pub rate_hz: f64,
-    /// Largest age of a belief since capture, and longest validity of a decision; the car then halts. Milliseconds, 1 to
+    /// Largest age of a belief since capture, and longest validity of a decision; the car then halts. Milliseconds, 1
+    /// to
     /// 60000. Default 150.
     pub deadline_ms: u64,
     /// Threshold on the hazard probability for the calibrated rule, 0 to 1. Default: the checkpoint's threshold.
@@ -218,8 +220,8 @@ impl Default for ControllerConfig {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct LauncherConfig {
-    /// Threads that the machine has for encoder, forecaster, prober and renderer together, 1 to 1024; more are warned of.
-    /// Default 4: the first three work on a frame one after the other, so that two cores carry all four.
+    /// Threads that the machine has for encoder, forecaster, prober and renderer together, 1 to 1024; more are warned
+    /// of. Default 4: the first three work on a frame one after the other, so that two cores carry all four.
     #[schemars(range(min = 1, max = 1024))]
     pub thread_budget: u32,
     /// Format of log lines: `text` or `json`. Default `text`.
@@ -227,7 +229,8 @@ pub struct LauncherConfig {
     /// Longest time from the start of a stage until it is ready, milliseconds, 100 to 600000. Default 30000.
     #[schemars(range(min = 100, max = 600_000))]
     pub start_timeout_ms: u64,
-    /// Longest time from an interrupt until a stage has ended; it is then killed. Milliseconds, 50 to 60000. Default 1000.
+    /// Longest time from an interrupt until a stage has ended; it is then killed. Milliseconds, 50 to 60000. Default
+    /// 1000.
     #[schemars(range(min = 50, max = 60_000))]
     pub stop_timeout_ms: u64,
     /// Longest time without a heartbeat, and without progress of a stage's loop (at least ten times the stage's own
@@ -279,15 +282,17 @@ pub enum Quality {
     Horizon,
 }
 
-/// The qualities that the graph gives up when the machine is too slow, in addition to skipping frames, and restores when
-/// it is fast enough again. Decisions then depend on the speed of the machine; each message states its number of samples
-/// and steps.
+/// The qualities that the graph gives up when the machine is too slow, in addition to skipping frames, and restores
+/// when it is fast enough again. Decisions then depend on the speed of the machine; each message states its number of
+/// samples and steps.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct OverloadConfig {
-    /// Order of giving up: `resolution`, `samples`, `horizon`, each at most once. Default: none, only frames are skipped.
+    /// Order of giving up: `resolution`, `samples`, `horizon`, each at most once. Default: none, only frames are
+    /// skipped.
     pub order: Vec<Quality>,
-    /// Share of `controller.deadline_ms` above which a frame's belief is a sign of overload, as a skipped frame is; 0.05 to
+    /// Share of `controller.deadline_ms` above which a frame's belief is a sign of overload, as a skipped frame is;
+    /// 0.05 to
     /// 1. Default 0.8.
     #[schemars(range(min = 0.05, max = 1.0))]
     pub latency_share: f64,
@@ -297,8 +302,8 @@ pub struct OverloadConfig {
     /// Number of newest frames, 2 to 1000; a quality is given up when half of them show a sign of overload. Default 10.
     #[schemars(range(min = 2, max = 1000))]
     pub window: u32,
-    /// Frames without a sign after which a quality is restored, 2 to 100000. The number doubles each time that the quality
-    /// must be given up again at once, up to 16 times. Default 50.
+    /// Frames without a sign after which a quality is restored, 2 to 100000. The number doubles each time that the
+    /// quality must be given up again at once, up to 16 times. Default 50.
     #[schemars(range(min = 2, max = 100_000))]
     pub patience: u32,
 }
@@ -341,8 +346,8 @@ impl GraphConfig {
         Self::parse(&read(path, "graph")?, path)
     }
 
-    /// Reads a graph file, and sets keys in it: each setting is `key=value` with a dotted key, such as `run.samples=35`.
-    /// The value is TOML, or else a string.
+    /// Reads a graph file, and sets keys in it: each setting is `key=value` with a dotted key, such as
+    /// `run.samples=35`. The value is TOML, or else a string.
     ///
     /// # Errors
     ///
@@ -380,7 +385,7 @@ impl GraphConfig {
     pub fn parse(text: &str, path: &Path) -> Result<Self, ConfigError> {
         let source = Source { path, text };
         source.refuse_moved(&MOVED)?;
-        let mut graph: Self = source.read()?;
+        let mut graph: Self = ranges::read(&source)?;
         graph.check(&source)?;
         let absolute = std::path::absolute(path).unwrap_or_else(|_| path.to_owned());
         graph.project_root = absolute
@@ -393,8 +398,8 @@ impl GraphConfig {
         Ok(graph)
     }
 
-    /// Resolves a path of this file: an absolute path is unchanged; a relative one is taken from the current directory if
-    /// it exists there, else from the root of the project.
+    /// Resolves a path of this file: an absolute path is unchanged; a relative one is taken from the current directory
+    /// if it exists there, else from the root of the project.
     pub fn resolve(&self, path: &Path) -> PathBuf {
         if path.is_absolute() || path.exists() { path.to_owned() } else { self.project_root.join(path) }
     }
@@ -443,7 +448,8 @@ impl GraphConfig {
         })
     }
 
-    /// Niceness of a stage's process; `None` where it is inherited. The renderer yields to the decision path by default.
+    /// Niceness of a stage's process; `None` where it is inherited. The renderer yields to the decision path by
+    /// default.
     pub fn stage_nice(&self, stage: Stage) -> Option<i32> {
         self.stage(stage).nice.or((stage == Stage::Renderer).then_some(19))
     }

@@ -19,8 +19,8 @@
 //! # Ok::<(), carff_config::ConfigError>(())
 //! ```
 //!
-//! A relative path in a graph file is resolved in the current directory. Where it does not exist there, it is taken from
-//! the root of the project: the first folder above the graph file that holds a `configs` folder.
+//! A relative path in a graph file is resolved in the current directory. Where it does not exist there, it is taken
+//! from the root of the project: the first folder above the graph file that holds a `configs` folder.
 
 mod error;
 mod graph;

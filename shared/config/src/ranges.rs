@@ -2,12 +2,18 @@
 
 use crate::ConfigError;
 use crate::error::Source;
+use schemars::JsonSchema;
+use serde::de::DeserializeOwned;
 use serde_json::Value as Json;
 use toml::Value;
 
-/// Checks each value of a table against `minimum`, `maximum` and `minItems` in the schema of its key.
-pub(crate) fn check(source: &Source<'_>, schema: &Json, value: &Value) -> Result<(), ConfigError> {
-    Walk { source, definitions: &schema["$defs"] }.check(schema, value, "")
+/// Reads a file's text, and checks each value against `minimum`, `maximum` and `minItems` in the schema of `T`.
+pub(crate) fn read<T: DeserializeOwned + JsonSchema>(source: &Source<'_>) -> Result<T, ConfigError> {
+    let config = toml::from_str(source.text).map_err(|e| source.syntax(&e))?;
+    let values = toml::from_str(source.text).map_err(|e| source.syntax(&e))?;
+    let schema = schemars::schema_for!(T);
+    Walk { source, definitions: &schema.as_value()["$defs"] }.check(schema.as_value(), &values, "")?;
+    Ok(config)
 }
 
 struct Walk<'a> {

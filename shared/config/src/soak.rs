@@ -2,6 +2,7 @@
 
 use crate::ConfigError;
 use crate::error::{Source, read};
+use crate::ranges;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
@@ -173,7 +174,7 @@ impl SoakConfig {
     /// The same for a text; `path` is what errors name.
     pub fn parse(text: &str, path: &Path) -> Result<Self, ConfigError> {
         let source = Source { path, text };
-        let config: Self = source.read()?;
+        let config: Self = ranges::read(&source)?;
         config.check(&source)?;
         Ok(config)
     }

@@ -26,11 +26,9 @@ pub struct StagesConfig {
 /// the system refuses, and continues without it.
 ///
 /// ```
-/// use carff_config::{GraphConfig, RestartPolicy};
-/// use carff_messages::Stage;
-/// let text = "[run]\nname = \"x\"\ndataset = \"d\"\ncheckpoint = \"c\"\n[stages.encoder]\nthreads = 2\nrestart = \"never\"\n";
-/// let graph = GraphConfig::parse(text, "x.toml".as_ref())?;
-/// assert_eq!(graph.stage(Stage::Encoder).threads, 2);
+/// use carff_config::{GraphConfig, RestartPolicy}; use carff_messages::Stage; let text = "[run]\nname = \"x\"\ndataset
+/// = \"d\"\ncheckpoint = \"c\"\n[stages.encoder]\nthreads = 2\nrestart = \"never\"\n"; let graph =
+/// GraphConfig::parse(text, "x.toml".as_ref())?; assert_eq!(graph.stage(Stage::Encoder).threads, 2);
 /// assert_eq!(graph.stage(Stage::Encoder).restart, RestartPolicy::Never);
 /// # Ok::<(), carff_config::ConfigError>(())
 /// ```
@@ -40,8 +38,8 @@ pub struct StageConfig {
     /// Threads that compute, 1 to 256. The controller only uses one. Default 1.
     #[schemars(range(min = 1, max = 256))]
     pub threads: u32,
-    /// Time for one output above which the stage reports that it is slow, milliseconds, 1 to 60000. Default: encoder 60,
-    /// forecaster 20, prober 30, renderer 2000; camera one period of `run.frame_rate_hz`, controller
+    /// Time for one output above which the stage reports that it is slow, milliseconds, 1 to 60000. Default: encoder
+    /// 60, forecaster 20, prober 30, renderer 2000; camera one period of `run.frame_rate_hz`, controller
     /// `controller.deadline_ms`.
     #[schemars(range(min = 1, max = 60_000))]
     pub deadline_ms: Option<u64>,
@@ -59,7 +57,8 @@ pub struct StageConfig {
     /// Priority under `SCHED_FIFO`, 1 to 99; needs a privilege. Default: the ordinary scheduler.
     #[schemars(range(min = 1, max = 99))]
     pub fifo_priority: Option<u32>,
-    /// Keeps all memory resident (`mlockall`) once the models are loaded; needs a privilege or a high limit. Default false.
+    /// Keeps all memory resident (`mlockall`) once the models are loaded; needs a privilege or a high limit. Default
+    /// false.
     pub lock_memory: bool,
     /// Heap that is touched before the first frame, so that no page fault comes later, MiB, 0 to 4096. Default 0.
     #[schemars(range(min = 0, max = 4096))]
@@ -116,7 +115,8 @@ pub enum RestartPolicy {
     Never,
     /// The launcher starts the stage again.
     OnFailure {
-        /// Pause before the first restart, milliseconds, 0 to 60000. It doubles with each further restart, up to 16 times.
+        /// Pause before the first restart, milliseconds, 0 to 60000. It doubles with each further restart, up to 16
+        /// times.
         #[schemars(range(min = 0, max = 60_000))]
         backoff_ms: u64,
         /// Restarts within `within_s` after which the stage counts as lost, 1 to 1000.

@@ -3,12 +3,7 @@
 use rayon::prelude::*;
 
 use crate::dataset::Dataset;
-use crate::image::Image;
-
-/// Two images look the same if at most this many pixels differ by more than [`PIXEL_TOLERANCE`].
-pub const MAX_DIFFERENT_PIXELS: usize = 8;
-/// Largest difference in any channel, of 255, that is ignored.
-pub const PIXEL_TOLERANCE: u8 = 12;
+use crate::image::{Image, looks_same};
 
 /// Visual equivalence of states, per view.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -16,20 +11,6 @@ pub struct Equivalence {
     states: usize,
     /// Flags of views x states x states.
     same: Vec<bool>,
-}
-
-/// Returns true if two images look the same: equal size, and at most [`MAX_DIFFERENT_PIXELS`] pixels differ by more
-/// than [`PIXEL_TOLERANCE`] in any channel.
-pub fn looks_same(a: &Image, b: &Image) -> bool {
-    (a.width_px, a.height_px) == (b.width_px, b.height_px)
-        && different_pixels(a, b).take(MAX_DIFFERENT_PIXELS + 1).count() <= MAX_DIFFERENT_PIXELS
-}
-
-fn different_pixels<'a>(a: &'a Image, b: &'a Image) -> impl Iterator<Item = usize> + 'a {
-    a.rgb.chunks_exact(3).zip(b.rgb.chunks_exact(3)).enumerate().filter_map(|(i, (a, b))| {
-        let differs = a.iter().zip(b).any(|(a, b)| a.abs_diff(*b) > PIXEL_TOLERANCE);
-        differs.then_some(i)
-    })
 }
 
 impl Equivalence {
@@ -103,23 +84,6 @@ impl Equivalence {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    /// Eight pixels may differ, nine may not; a difference of 12 is ignored, one of 13 is not.
-    #[test]
-    fn the_limits_are_exact() {
-        let a = Image::filled(8, 8, [100; 3]);
-        let with = |pixels: usize, difference: u8| {
-            let mut b = a.clone();
-            for i in 0..pixels {
-                b.rgb[i * 3 + i % 3] += difference;
-            }
-            b
-        };
-        assert!(looks_same(&a, &with(8, 13)));
-        assert!(!looks_same(&a, &with(9, 13)));
-        assert!(looks_same(&a, &with(64, 12)));
-        assert!(!looks_same(&a, &Image::filled(8, 9, [100; 3])));
-    }
 
     /// One view of three states, of which two look the same: class sizes 2, 2, 1, ceiling (1/2 + 1/2 + 1) / 3.
     #[test]

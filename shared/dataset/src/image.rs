@@ -10,8 +10,14 @@ use image::{ColorType, ExtendedColorType, ImageDecoder, ImageEncoder, ImageForma
 
 use ndarray::{ArrayView3, ArrayViewMut3, s};
 
-use crate::dataset::MAX_IMAGE_SIDE_PX;
 use crate::error::DatasetError;
+
+/// Maximum width or height of an image, pixels.
+pub const MAX_IMAGE_SIDE_PX: u32 = 8192;
+/// Two images look the same if at most this many pixels differ by more than [`PIXEL_TOLERANCE`].
+pub const MAX_DIFFERENT_PIXELS: usize = 8;
+/// Largest difference in any channel, of 255, that is ignored.
+pub const PIXEL_TOLERANCE: u8 = 12;
 
 /// An 8-bit RGB image, row-major from the top left.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -122,6 +128,20 @@ impl Image {
     pub fn save_png(&self, path: &Path) -> Result<(), DatasetError> {
         write_png(path, &self.rgb, self.width_px, self.height_px, ExtendedColorType::Rgb8)
     }
+}
+
+/// Returns true if two images look the same: equal size, and at most [`MAX_DIFFERENT_PIXELS`] pixels differ by more
+/// than [`PIXEL_TOLERANCE`] in any channel.
+pub fn looks_same(a: &Image, b: &Image) -> bool {
+    (a.width_px, a.height_px) == (b.width_px, b.height_px)
+        && different_pixels(a, b).take(MAX_DIFFERENT_PIXELS + 1).count() <= MAX_DIFFERENT_PIXELS
+}
+
+fn different_pixels<'a>(a: &'a Image, b: &'a Image) -> impl Iterator<Item = usize> + 'a {
+    a.rgb.chunks_exact(3).zip(b.rgb.chunks_exact(3)).enumerate().filter_map(|(i, (a, b))| {
+        let differs = a.iter().zip(b).any(|(a, b)| a.abs_diff(*b) > PIXEL_TOLERANCE);
+        differs.then_some(i)
+    })
 }
 
 /// Returns true if a file's name is that of a JPEG image.
@@ -243,5 +263,22 @@ mod tests {
         let expected = 10.0 * (255.0_f64 * 255.0 * 3.0).log10();
         assert!((black.psnr_db(&off).unwrap() - expected).abs() < 1e-9);
         assert_eq!(black.psnr_db(&Image::filled(4, 5, [0; 3])), None);
+    }
+
+    /// Eight pixels may differ, nine may not; a difference of 12 is ignored, one of 13 is not.
+    #[test]
+    fn the_limits_are_exact() {
+        let a = Image::filled(8, 8, [100; 3]);
+        let with = |pixels: usize, difference: u8| {
+            let mut b = a.clone();
+            for i in 0..pixels {
+                b.rgb[i * 3 + i % 3] += difference;
+            }
+            b
+        };
+        assert!(looks_same(&a, &with(8, 13)));
+        assert!(!looks_same(&a, &with(9, 13)));
+        assert!(looks_same(&a, &with(64, 12)));
+        assert!(!looks_same(&a, &Image::filled(8, 9, [100; 3])));
     }
 }

@@ -9,9 +9,9 @@ use carff_base::geometry::PinholeCamera;
 use image::imageops::{FilterType, resize};
 use rayon::prelude::*;
 
-use crate::dataset::{Frame, ScenarioInfo, StateInfo};
 use crate::error::DatasetError;
 use crate::image::{Image, load_any};
+use crate::scenario::{Frame, ScenarioInfo, StateInfo};
 use crate::transforms::{Distortion, Pictures, read};
 use crate::writer::{DatasetWriter, FrameRecord};
 

@@ -23,6 +23,7 @@ mod folder;
 mod image;
 mod import;
 mod report;
+mod scenario;
 mod seen;
 pub mod sensor;
 mod split;
@@ -30,14 +31,14 @@ mod transforms;
 mod writer;
 
 pub use carff_messages::Observability;
-pub use dataset::{
-    Candidate, Dataset, Frame, MAX_FRAMES, MAX_IMAGE_SIDE_PX, MAX_TRANSFORMS_BYTES, NamedBox, ScenarioInfo, StateInfo,
-};
-pub use equivalence::{Equivalence, MAX_DIFFERENT_PIXELS, PIXEL_TOLERANCE, looks_same};
+pub use dataset::Dataset;
+pub use equivalence::Equivalence;
 pub use error::DatasetError;
 pub use folder::image_files;
-pub use image::Image;
+pub use image::{Image, MAX_DIFFERENT_PIXELS, MAX_IMAGE_SIDE_PX, PIXEL_TOLERANCE, looks_same};
 pub use import::{ImportOptions, Imported, import};
 pub use report::{DatasetReport, HiddenPair, SheetOptions, contact_sheet};
+pub use scenario::{Candidate, Frame, NamedBox, ScenarioInfo, StateInfo};
 pub use split::{PoseRole, PoseSplit};
+pub use transforms::{MAX_FRAMES, MAX_TRANSFORMS_BYTES};
 pub use writer::{DatasetWriter, FrameRecord};

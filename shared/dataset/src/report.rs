@@ -3,9 +3,10 @@
 use std::collections::BTreeMap;
 use std::fmt;
 
-use crate::dataset::{Dataset, ScenarioInfo};
+use crate::dataset::Dataset;
 use crate::equivalence::Equivalence;
 use crate::image::Image;
+use crate::scenario::ScenarioInfo;
 use carff_messages::Observability;
 
 /// Images that should look the same leak their state if their mean difference exceeds this limit, of 255. People cannot

@@ -1,9 +1,8 @@
 //! Derives the observability of frames from their images, for datasets that do not contain it.
 
-use crate::dataset::Frame;
-use crate::equivalence::looks_same;
 use crate::error::DatasetError;
-use crate::image::Image;
+use crate::image::{Image, looks_same};
+use crate::scenario::Frame;
 use carff_messages::Observability;
 use rayon::prelude::*;
 

@@ -7,12 +7,14 @@ use carff_base::geometry::{OrientedBox, PinholeCamera};
 use carff_messages::Observability;
 use serde_json::{Map, Value};
 
-use crate::dataset::{
-    Candidate, Frame, MAX_FRAMES, MAX_IMAGE_SIDE_PX, MAX_TRANSFORMS_BYTES, NamedBox, ScenarioInfo, StateInfo,
-};
 use crate::error::DatasetError;
-use crate::image::dimensions;
+use crate::image::{MAX_IMAGE_SIDE_PX, dimensions};
+use crate::scenario::{Candidate, Frame, NamedBox, ScenarioInfo, StateInfo};
 
+/// Maximum size of a transforms file, bytes.
+pub const MAX_TRANSFORMS_BYTES: u64 = 1 << 29;
+/// Maximum number of frames in a dataset.
+pub const MAX_FRAMES: usize = 1_000_000;
 const MAX_BRANCHES: usize = 1024;
 const MAX_TIMESTAMPS: usize = 4096;
 /// Tolerance between poses of one view in different states (metres, or entries of the rotation).

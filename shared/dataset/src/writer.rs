@@ -10,9 +10,9 @@ use carff_base::geometry::PinholeCamera;
 use image::ExtendedColorType;
 use serde::{Serialize, de::DeserializeOwned};
 
-use crate::dataset::{Candidate, NamedBox, ScenarioInfo};
 use crate::error::DatasetError;
 use crate::image::{Image, write_png};
+use crate::scenario::{Candidate, NamedBox, ScenarioInfo};
 use carff_messages::Observability;
 
 /// Marks a folder as written by this program, so that it may be written again.

@@ -11,7 +11,8 @@ const MIN_DEVIATION_SHARE: f64 = 0.2;
 /// A reading whose best state explains its places worse than this (mean probability of a place) names no state.
 const MIN_MEAN_PROBABILITY: f64 = 0.5;
 
-/// The occupancies that the known states showed: for each place, their distribution when it is taken and when it is free.
+/// The occupancies that the known states showed: for each place, their distribution when it is taken and when it is
+/// free.
 ///
 /// ```
 /// use carff_base::geometry::OrientedBox;
@@ -275,8 +276,8 @@ mod tests {
         assert!(r.hazard_likelihood > 0.5);
     }
 
-    /// A hollow box with a thin roof is as occupied as a solid one; what lies on the ground below, or far over the roof, is
-    /// not in the box.
+    /// A hollow box with a thin roof is as occupied as a solid one; what lies on the ground below, or far over the
+    /// roof, is not in the box.
     #[test]
     fn surfaces_count_like_solids() {
         let p = layout();

@@ -34,8 +34,8 @@ pub fn set_mixture_and_draws(forecast: &mut Forecast, mixture: &Mixture, draws: 
 }
 
 impl Step {
-    /// Returns the belief message of this step, which answers `forecast`. `posterior` represents the resolved state; without
-    /// one there is nothing to look ahead from, and the belief is the frame's last.
+    /// Returns the belief message of this step, which answers `forecast`. `posterior` represents the resolved state;
+    /// without one there is nothing to look ahead from, and the belief is the frame's last.
     pub fn to_belief(&self, forecast: &Forecast, layout: &ProbeLayout, posterior: Option<&Gaussian>) -> Belief {
         let mut belief = Belief::empty(forecast.header, forecast.horizon);
         belief.encoder_ns = forecast.encoder_ns;
@@ -61,8 +61,8 @@ impl Step {
         belief
     }
 
-    /// Returns the step that a valid forecast and the belief that answers it describe. Messages only carry the best state of
-    /// each sample, so that [`Reading::state_probabilities`] is empty. A belief that resolved no state has
+    /// Returns the step that a valid forecast and the belief that answers it describe. Messages only carry the best
+    /// state of each sample, so that [`Reading::state_probabilities`] is empty. A belief that resolved no state has
     /// `usize::MAX` as its resolved state.
     pub fn of_messages(forecast: &Forecast, belief: &Belief) -> Self {
         let (mixture, draws) = mixture_and_draws(forecast);

@@ -125,11 +125,6 @@ impl Evidence {
     }
 }
 
-/// Returns the probability of the path that follows a state, from that of the path to its step (both 0..=1).
-pub fn path_probability(before: f32, state_probability: f32) -> f32 {
-    (before * state_probability).clamp(0.0, 1.0)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;

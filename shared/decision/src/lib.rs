@@ -23,9 +23,9 @@ mod threshold;
 
 pub use calibration::{Calibration, Reading, Resolved, resolve};
 pub use convert::{mixture_and_draws, set_mixture_and_draws};
-pub use evidence::{Evidence, SampleEvidence, path_probability};
+pub use evidence::{Evidence, SampleEvidence};
 pub use layout::{Place, ProbeLayout, ProbingError};
-pub use look_ahead::{DensityField, DensityProbe, Plan, Probed, Step, look_ahead};
+pub use look_ahead::{DensityField, DensityProbe, Plan, Probed, Step, look_ahead, path_probability};
 pub use mixture::{Draw, Mixture, Sampling};
 pub use rule::{Decision, Policy};
 pub use threshold::{CalibrationTrial, choose_threshold, unchosen_threshold};

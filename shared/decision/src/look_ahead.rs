@@ -1,6 +1,6 @@
 //! One step of the belief, and the autoregressive loop over steps (paper section 3.2).
 
-use crate::{Calibration, Draw, Mixture, ProbeLayout, Reading, Resolved, Sampling, path_probability, resolve};
+use crate::{Calibration, Draw, Mixture, ProbeLayout, Reading, Resolved, Sampling, resolve};
 use carff_messages::{Gaussian, LATENT_DIM};
 
 /// A radiance field that reports densities at the points of one probe layout.
@@ -101,6 +101,11 @@ impl<F: DensityField> DensityProbe<F> {
         let resolved = resolve(&self.layout, &mixture.weights, &readings(&components), &readings(&samples), &of);
         Step { mixture, draws, components, samples, resolved, path_probability }
     }
+}
+
+/// Returns the probability of the path that follows a state, from that of the path to its step (both 0..=1).
+pub fn path_probability(before: f32, state_probability: f32) -> f32 {
+    (before * state_probability).clamp(0.0, 1.0)
 }
 
 /// The depth and breadth of a look-ahead, and the names of its random streams.

@@ -24,8 +24,8 @@ const RIDGE: f64 = 1e-4;
 /// Most Newton steps; a dozen are usually enough.
 const MOST_STEPS: usize = 200;
 
-/// Returns the threshold to use without trials: half of the hazard probability of a belief that is even over the branches.
-/// Hazard trials have that probability, and clear trials have next to none.
+/// Returns the threshold to use without trials: half of the hazard probability of a belief that is even over the
+/// branches. Hazard trials have that probability, and clear trials have next to none.
 pub fn unchosen_threshold(hazard_branches: usize, branches: usize) -> f64 {
     0.5 * hazard_branches as f64 / branches.max(1) as f64
 }

@@ -38,7 +38,7 @@ pub struct Decoding<'a> {
     pub posed: &'a PosedImages,
     /// The decoder.
     pub decoder: &'a Decoder,
-    /// Whether the decoder was trained on the residual over the pose's mean image (`true`) or on the image.
+    /// True if the decoder was trained on the residual over the pose's mean image, false if on the image.
     pub residual: bool,
 }
 

@@ -34,7 +34,7 @@ pub use figures::{
 };
 pub use posed::{Label, PosedImages};
 pub use render::{FieldRenderer, to_bytes, to_unit};
-pub use report::{About, FrequencyTable, Gallery, Results, Table, encoder_rows, evaluate};
+pub use report::{Gallery, Results, Table, Target, encoder_rows, evaluate};
 pub use role::{ByRole, ROLES, role_name};
 pub use stats::{
     draws::{Curve, Frequencies, Frequency, expected_recall},
@@ -42,13 +42,12 @@ pub use stats::{
     reliability::{Reliability, ReliabilityBin, reliability},
     ssim::ssim,
 };
-pub use subject::{EvalOptions, Subject};
+pub use subject::{About, EvalOptions, Subject};
 pub use tables::{
     encoder::{EncoderTable, SvmScore, SvmTable, encoder_table},
     field::{FieldPictures, NovelViews, PictureTable},
-    forecast::{ForecastTable, RoleCurves},
+    forecast::{ForecastTable, FrequencyTable, RoleCurves},
     planning::{OneImage, PlanningResults, PlanningViews, ViewCounts},
-    targets::Target,
 };
 pub use trials::{
     Models,

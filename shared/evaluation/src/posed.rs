@@ -7,7 +7,7 @@ use std::path::Path;
 use tch::{Kind, Tensor};
 
 const NO_SCENARIO: &str = "transforms.json has no `scenario`, which lists the states \
-                           (docs/book/src/sets-of-pictures.md shows an example); a dataset of one scene is imported \
+                           (`docs/book/src/sets-of-pictures.md` has an example); a dataset of one scene is imported \
                            without it: `carff dataset import`";
 
 /// Label of one image.
@@ -131,7 +131,7 @@ impl PosedImages {
         }
     }
 
-    /// Whether the image looks like no other state's from its pose.
+    /// Returns true if no other state looks the same from the image's pose.
     pub fn is_unambiguous(&self, image: usize) -> bool {
         let label = self.labels[image];
         self.equivalent_states(label.view, label.state).len() == 1

@@ -6,12 +6,12 @@ use serde::{Deserialize, Serialize};
 /// Roles of the poses, in the order of tables.
 pub const ROLES: [PoseRole; 3] = [PoseRole::Rest, PoseRole::Calibration, PoseRole::Unseen];
 
-/// Name of a role in tables and files.
+/// Returns the name of a role in tables.
 pub fn role_name(role: PoseRole) -> &'static str {
     match role {
         PoseRole::Rest => "trained",
         PoseRole::Calibration => "calibration",
-        PoseRole::Unseen => "unseen",
+        PoseRole::Unseen => "held-out",
     }
 }
 
@@ -68,7 +68,7 @@ impl<T> ByRole<T> {
         ROLES.into_iter().filter_map(|role| Some((role_name(role), self.get(role)?)))
     }
 
-    /// Whether no role has a value.
+    /// Returns true if no role has a value.
     pub fn is_empty(&self) -> bool {
         self.iter().next().is_none()
     }

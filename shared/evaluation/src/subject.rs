@@ -1,7 +1,7 @@
 //! Subject of an evaluation: a checkpoint, a dataset of its scenario, and the posterior of each image.
 
 use crate::trials::planning::{NoisyEncoder, Planner};
-use crate::{About, ByRole, Decoding, EvaluationError, PosedImages, Progress, ROLES};
+use crate::{ByRole, Decoding, EvaluationError, PosedImages, Progress, ROLES};
 use carff_base::random::Key;
 use carff_checkpoint::CheckpointPlanning;
 use carff_checkpoint::{CheckpointError, FieldProbe, Manifest, ScenarioIdentity, files};
@@ -19,7 +19,7 @@ use carff_networks::{
     stored::{load_decoder, load_encoder_on, load_mixture},
 };
 use carff_plots::Panel;
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 use tch::{Device, Tensor};
 
@@ -31,6 +31,34 @@ pub struct EvalOptions {
     /// Threads that render and probe.
     pub threads: usize,
     /// Seed of sensor noise, draws and folds.
+    pub seed: u64,
+}
+
+/// Subject and seeds of an evaluation.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct About {
+    /// Version of the program.
+    pub program_version: String,
+    /// Name of the scenario.
+    pub scenario: String,
+    /// Names of the branches.
+    pub branches: Vec<String>,
+    /// Time steps of a branch.
+    pub timestamps: usize,
+    /// Folder of the checkpoint, as given.
+    pub checkpoint: String,
+    /// Folder of the dataset, as given.
+    pub dataset: String,
+    /// Images of the dataset.
+    pub pictures: usize,
+    /// Number of poses of each role.
+    pub poses: ByRole<usize>,
+    /// Seed of the training.
+    pub training_seed: u64,
+    /// Seed of the split of the poses.
+    pub split_seed: u64,
+    /// Seed of the draws of this evaluation.
     pub seed: u64,
 }
 
@@ -172,7 +200,7 @@ impl Subject {
         format!("{branch} t{}", scenario.timestamp_of(state))
     }
 
-    /// Whether two states look the same from above.
+    /// Returns true if two states look the same from above.
     pub fn same_from_above(&self, a: usize, b: usize) -> bool {
         self.posed.scenario.bev_view.is_some_and(|view| self.posed.equivalence.same(view, a, b))
     }

@@ -1,4 +1,4 @@
-//! What the shipped checkpoint makes of views that show nothing of the place where somebody may be.
+//! Contract of the shipped checkpoint: the belief from views that do not show the actor's place.
 
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
@@ -8,11 +8,11 @@ use carff_evaluation::Models;
 use carff_scenes::{RenderOptions, Scenario};
 use std::path::Path;
 
-/// Somebody and nobody, at the first step.
+/// The branches with and without the actor, at the first step.
 const BRANCHES: [usize; 2] = [0, 1];
 
-/// A view that hides the place gives an even belief, whether somebody is there or not: pictures of the two hold nothing
-/// that tells them apart, and training learnt no pose by heart.
+/// A view that hides the actor's place gives an even belief, with and without the actor. The images of both branches
+/// are the same, and training has not memorised poses.
 #[test]
 fn hidden_views_give_an_even_belief() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).ancestors().nth(2).unwrap();
@@ -36,7 +36,7 @@ fn hidden_views_give_an_even_belief() {
         (hidden, Evidence::of_steps(&steps).hazard_probability())
     };
     let mut pairs = Vec::new();
-    // Every second ego view: enough to see, and quick to render.
+    // Every second ego view: enough views, and quick to render.
     for view in (0..scenario.cameras().len()).filter(|v| scenario.cameras()[*v].view_kind == "dash").step_by(2) {
         let [with, without] = BRANCHES.map(|branch| hazard(view, branch, 0));
         if with.0 && without.0 {
@@ -47,5 +47,5 @@ fn hidden_views_give_an_even_belief() {
     let mean = pairs.iter().map(|(_, a, b)| (a + b) / 2.0).sum::<f64>() / pairs.len() as f64;
     let difference = pairs.iter().map(|(_, a, b)| (a - b).abs()).sum::<f64>() / pairs.len() as f64;
     assert!((0.35..0.65).contains(&mean), "mean hazard probability {mean}: {pairs:?}");
-    assert!(difference < 0.1, "with and without somebody differ by {difference}: {pairs:?}");
+    assert!(difference < 0.1, "with and without the actor differ by {difference}: {pairs:?}");
 }

@@ -62,8 +62,8 @@ pub struct FieldConfig {
     pub background_width: usize,
     /// Added to the raw density before the exponential: density = exp(raw + offset), 1/metre.
     pub density_offset: f32,
-    /// Cells along the side of the occupancy grid; a multiple of 8, 8..=512. A trained field has twice as many as it was
-    /// trained with.
+    /// Cells along the side of the occupancy grid; a multiple of 8, 8..=512. A trained field has twice as many as it
+    /// was trained with.
     pub occupancy_resolution: usize,
     /// Samples of a ray that crosses the bounds along their longest side: sets the step inside the bounds.
     pub samples_across: f32,
@@ -201,8 +201,8 @@ pub struct RenderOptions {
     pub max_samples_per_ray: usize,
     /// A ray ends when its transmittance falls below this.
     pub min_transmittance: f32,
-    /// Samples of less weight than this take the mean colour of their ray's other samples (the heaviest sample always has
-    /// its own colour).
+    /// Samples of less weight than this take the mean colour of their ray's other samples (the heaviest sample always
+    /// has its own colour).
     pub min_weight: f32,
 }
 

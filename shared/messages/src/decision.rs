@@ -17,7 +17,6 @@ use iceoryx2::prelude::ZeroCopySend;
 ///     confidence: 0.9,
 ///     hazard_probability: 0.9,
 ///     is_decision: 1,
-///     reserved: 0,
 ///     valid_until_ns: 100_001_000,
 ///     based_on_frame: 7,
 ///     latency_ns: 20_000,
@@ -45,8 +44,6 @@ pub struct Action {
     pub hazard_probability: f32,
     /// 1 for the first action based on its frame; 0 for a repetition or the safe action.
     pub is_decision: u32,
-    /// Unused; 0.
-    pub reserved: u32,
     /// End of its validity: monotonic clock, nanoseconds.
     pub valid_until_ns: u64,
     /// The frame that it is based on; `u64::MAX` for none.

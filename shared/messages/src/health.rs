@@ -16,8 +16,6 @@ pub struct Health {
     pub state: u32,
     /// Process id.
     pub pid: u32,
-    /// Unused; 0.
-    pub reserved: u32,
     /// Number of valid inputs received.
     pub received: u64,
     /// Number of outputs published.

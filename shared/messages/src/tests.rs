@@ -175,3 +175,15 @@ mod random_bytes {
         unsafe { value.assume_init() }
     }
 }
+
+/// Fields are at the same places as in recordings and processes of this schema version.
+#[test]
+fn layouts_are_fixed() {
+    use std::mem::offset_of;
+    assert_eq!(
+        (offset_of!(Action, is_decision), offset_of!(Action, valid_until_ns), size_of::<Action>()),
+        (80, 88, 112)
+    );
+    assert_eq!((offset_of!(Health, pid), offset_of!(Health, received), size_of::<Health>()), (64, 72, 144));
+    assert_eq!((offset_of!(Belief, resolved_state), offset_of!(Belief, resolved)), (14_296, 14_304));
+}

@@ -26,8 +26,8 @@ pub fn with_image<R>(image: ArrayView3<'_, u8>, use_it: impl FnOnce(&Tensor) -> 
     let sizes: Vec<i64> = image.shape().iter().map(|&size| size as i64).collect();
     let strides: Vec<i64> = image.strides().iter().map(|&stride| stride as i64).collect();
     // SAFETY: the view guarantees that each element which its shape and strides reach is readable, all strides are
-    // positive, and it outlives the call. libtorch only reads through this tensor, and the tensor is dropped before this
-    // function returns.
+    // positive, and it outlives the call. libtorch only reads through this tensor, and the tensor is dropped before
+    // this function returns.
     let tensor = unsafe { Tensor::from_blob(image.as_ptr(), &sizes, &strides, Kind::Uint8, Device::Cpu) };
     Some(use_it(&tensor))
 }

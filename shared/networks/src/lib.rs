@@ -1,7 +1,7 @@
 //! The networks in tch and their weights: encoder, pose-conditional decoder, mixture density network.
 //!
-//! The crate reads and writes weights, also those that others published (feature `import`). It holds no training loop, no
-//! process and no topic.
+//! The crate reads and writes weights, also those that others published (feature `import`). It holds no training loop,
+//! no process and no topic.
 //!
 //! Tensors are `f32` and images `[N, 3, H, W]` in 0..=1, unless a function states otherwise.
 

@@ -1,12 +1,16 @@
 //! Lists living runs, and joins one of them.
 
 use crate::RunRecord;
-use carff_transport::{Node, OpenError, Run, RunNameError, runtime_dir};
+use crate::lock::is_held;
+use carff_transport::{Node, OpenError, Run, RunNameError, runtime_dirs};
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
 /// A run with a living launcher.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct LiveRun {
+    /// Folder of the user's runs that contains the run.
+    pub dir: PathBuf,
     /// Name of the run.
     pub name: String,
     /// Id of the run, which is in every header.
@@ -26,7 +30,13 @@ pub struct LiveRun {
 impl LiveRun {
     /// Returns true if its launcher is alive and still has this run.
     pub fn is_alive(&self) -> bool {
-        living(&runtime_dir(), &self.name).is_some_and(|run| run.run_id == self.run_id)
+        living(&self.dir, &self.name).is_some_and(|run| run.run_id == self.run_id)
+    }
+
+    /// Returns true if the record is gone although the launcher maps the run's shared memory: then nobody can join it.
+    pub fn has_lost_files(&self) -> bool {
+        let run = Run::within(&self.dir, &self.name, self.run_id);
+        !self.is_alive() && run.is_ok_and(|run| run.mapping_processes().contains(&self.pid))
     }
 }
 
@@ -83,24 +93,34 @@ pub struct Attached {
     pub live: LiveRun,
 }
 
-/// Returns the living runs of this user, by name.
+/// Returns the living runs of this user in all [`runtime_dirs`], by name.
 pub fn runs() -> Result<Vec<LiveRun>, AttachError> {
-    let folder = runtime_dir();
-    let entries = match std::fs::read_dir(&folder) {
-        Ok(entries) => entries,
-        Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Ok(Vec::new()),
-        Err(source) => return Err(AttachError::Folder { path: folder, source }),
-    };
-    let mut runs: Vec<LiveRun> = entries
-        .flatten()
-        .filter_map(|entry| living(&folder, entry.file_name().to_str()?.strip_suffix(".run")?))
-        .collect();
+    let mut runs: Vec<LiveRun> = Vec::new();
+    for folder in runtime_dirs() {
+        match std::fs::read_dir(&folder) {
+            Ok(entries) => runs.extend(
+                entries
+                    .flatten()
+                    .filter_map(|entry| living(&folder, entry.file_name().to_str()?.strip_suffix(".run")?)),
+            ),
+            // Folders of other users, and folders that do not exist, contain no run of this user.
+            Err(e) if matches!(e.kind(), ErrorKind::NotFound | ErrorKind::PermissionDenied) => {}
+            Err(source) => return Err(AttachError::Folder { path: folder, source }),
+        }
+    }
     runs.sort_by(|a, b| a.name.cmp(&b.name));
     Ok(runs)
 }
 
 /// Joins the named run, or the only living one, as `node_name`.
 pub fn attach(run: Option<&str>, node_name: &str) -> Result<Attached, AttachError> {
+    let live = find(run)?;
+    let node = Node::open(&Run::within(&live.dir, &live.name, live.run_id)?, node_name)?;
+    Ok(Attached { node, live })
+}
+
+/// Returns the named run, or the only living one.
+pub fn find(run: Option<&str>) -> Result<LiveRun, AttachError> {
     let mut living = runs()?;
     let names = || living.iter().map(|r| r.name.clone()).collect();
     let index = match (run, living.len()) {
@@ -112,17 +132,16 @@ pub fn attach(run: Option<&str>, node_name: &str) -> Result<Attached, AttachErro
         (None, 1) => 0,
         (None, _) => return Err(AttachError::Several { living: names() }),
     };
-    let live = living.swap_remove(index);
-    let node = Node::open(&Run::new(&live.name, live.run_id)?, node_name)?;
-    Ok(Attached { node, live })
+    Ok(living.swap_remove(index))
 }
 
-/// Returns the run of a name if its launcher is alive. The record of a killed launcher names a process that does not
-/// exist, or that is not a launcher.
+/// Returns the run of a name if a launcher holds the lock of its record: process ids mean nothing in another namespace
+/// or after a restart.
 fn living(folder: &Path, name: &str) -> Option<LiveRun> {
-    let record = RunRecord::from_bytes(&std::fs::read(RunRecord::path(folder, name)).ok()?)?;
-    let started = Path::new("/proc").join(record.pid.to_string());
-    started.exists().then(|| LiveRun {
+    let path = RunRecord::path(folder, name);
+    let record = RunRecord::from_bytes(&std::fs::read(&path).ok()?)?;
+    is_held(&path).then(|| LiveRun {
+        dir: folder.to_owned(),
         name: name.to_owned(),
         run_id: record.run_id,
         pid: record.pid,
@@ -136,24 +155,28 @@ fn living(folder: &Path, name: &str) -> Option<LiveRun> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::RunLock;
 
     fn record(pid: u32) -> RunRecord {
         let (graph, dataset, checkpoint) = ("g.toml".to_owned(), "d".to_owned(), "c".to_owned());
         RunRecord { pid, run_id: 9, graph, dataset, checkpoint, started_unix_s: 5 }
     }
 
-    /// A record of a living launcher is a run; a record of an ended process, and garbage, are not.
+    /// A locked record is a run, with any process id; a record without a lock is not, even if a process of its id
+    /// lives; garbage is not.
     #[test]
-    fn only_living_launchers_count() {
+    fn only_locked_records_count() {
         let folder = tempfile::tempdir().unwrap();
-        let write = |name: &str, bytes: &[u8]| std::fs::write(RunRecord::path(folder.path(), name), bytes).unwrap();
-        write("lives", &record(std::process::id()).to_bytes().unwrap());
-        // No process has the largest number.
-        write("killed", &record(u32::MAX).to_bytes().unwrap());
-        write("garbage", b"?");
+        let path = |name: &str| RunRecord::path(folder.path(), name);
+        // No process has the largest number, as if it lived in another namespace.
+        let lock = RunLock::take(folder.path(), "lives", &record(u32::MAX), "--run").unwrap();
+        std::fs::write(path("stale"), record(std::process::id()).to_bytes().unwrap()).unwrap();
+        std::fs::write(path("garbage"), b"?").unwrap();
         assert_eq!(living(folder.path(), "lives").map(|r| r.run_id), Some(9));
-        for name in ["killed", "garbage", "missing"] {
+        for name in ["stale", "garbage", "missing"] {
             assert_eq!(living(folder.path(), name), None, "{name}");
         }
+        drop(lock);
+        assert_eq!(living(folder.path(), "lives"), None);
     }
 }

@@ -9,6 +9,6 @@ mod attach;
 mod lock;
 mod record;
 
-pub use attach::{AttachError, Attached, LiveRun, attach, runs};
+pub use attach::{AttachError, Attached, LiveRun, attach, find, runs};
 pub use lock::{LockError, RunLock};
 pub use record::RunRecord;

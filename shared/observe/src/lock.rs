@@ -17,6 +17,14 @@ const ORPHAN_PATIENCE_NS: u64 = 2_000_000_000;
 /// Interval between two checks of these processes.
 const ORPHAN_LOOK: Duration = Duration::from_millis(20);
 
+/// Number of attempts to take a lock.
+const LOOKS: u32 = 5;
+
+/// Returns true if a process holds the lock of this record, in any namespace of processes.
+pub(crate) fn is_held(record: &Path) -> bool {
+    File::open(record).is_ok_and(|file| flock(&file, FlockOperation::NonBlockingLockShared).is_err())
+}
+
 /// Reason why a run cannot be owned.
 #[derive(Debug, thiserror::Error)]
 pub enum LockError {
@@ -87,7 +95,12 @@ impl RunLock {
                 .custom_flags(OFlags::NOFOLLOW.bits() as i32)
                 .open(&path)
                 .map_err(failed)?;
-            if flock(&file, FlockOperation::NonBlockingLockExclusive).is_err() {
+            // Probes look at a lock by taking it for a moment.
+            let is_free = (0..LOOKS).any(|look| {
+                std::thread::sleep(ORPHAN_LOOK * look.min(1));
+                flock(&file, FlockOperation::NonBlockingLockExclusive).is_ok()
+            });
+            if !is_free {
                 let holder = std::fs::read(&path).ok().and_then(|bytes| RunRecord::from_bytes(&bytes)).map(Box::new);
                 return Err(LockError::Held { run: run.to_owned(), holder, option });
             }
@@ -105,8 +118,13 @@ impl RunLock {
     /// Checks that no process of an earlier owner of the run is alive, and removes its leftovers.
     pub fn sweep(&self, run: &Run, option: &'static str) -> Result<(), LockError> {
         let patience_ns = monotonic_now_ns() + ORPHAN_PATIENCE_NS;
-        while run.folder().is_dir() {
-            let living = living_processes(run)?;
+        loop {
+            // Processes whose folder a cleaner of temporary files has removed still map the shared memory.
+            let mut living = if run.folder().is_dir() { living_processes(run)? } else { Vec::new() };
+            living.extend(run.mapping_processes());
+            living.sort_unstable();
+            living.dedup();
+            living.retain(|&pid| pid != std::process::id());
             if living.is_empty() {
                 break;
             }

@@ -142,7 +142,6 @@ fn snapshot(stage: Stage, seed: u64, vitals: &Vitals, counters: &Counters) -> He
         stage: stage.code(),
         state: vitals.state.load(Ordering::Relaxed),
         pid: std::process::id(),
-        reserved: 0,
         received: counters.received(),
         published: counters.published(),
         skipped: counters.skipped(),

@@ -215,14 +215,6 @@ impl Scenario {
         })
     }
 
-    /// Returns an iterator that renders all frames of a drive.
-    pub fn free_frames<'a>(
-        &'a self,
-        drive: &'a FreeDrive,
-    ) -> impl Iterator<Item = Result<FreeFrame, ScenarioError>> + 'a {
-        (0..drive.frame_count()).map(|frame| self.free_frame(drive, frame))
-    }
-
     /// Evaluates visibility on a smaller image, because it is a share of pixels.
     fn free_observability(
         &self,

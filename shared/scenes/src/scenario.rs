@@ -70,7 +70,7 @@ pub struct Rendering {
     pub image: Image,
     /// Distance along the ray through each pixel's centre, metres, row-major; infinite for the sky.
     pub depth_m: Vec<f32>,
-    /// First hit of the ray through each pixel's centre: 0 sky, 1 ground, then objects as in [`Scenario::object_name`].
+    /// First hit of the ray through each pixel's centre: 0 sky, 1 ground, then static and moving objects (see [`Scenario::object_of`]).
     pub object_id: Vec<u16>,
     /// Visibility of the actor; `None` if not requested or if nothing in the scenario is dynamic.
     pub actor: Option<ActorView>,
@@ -254,18 +254,6 @@ impl Scenario {
     pub fn object_of(&self, name: &str) -> Option<u16> {
         let index = movers(&self.config).position(|m| m.name() == name)?;
         Some(self.scenery.next_object + index as u16)
-    }
-
-    /// Returns the name of an object index: `sky`, `ground`, the name of a vehicle or object, or `static`.
-    pub fn object_name(&self, object: u16) -> &str {
-        match object {
-            0 => "sky",
-            1 => "ground",
-            _ => object
-                .checked_sub(self.scenery.next_object)
-                .and_then(|i| movers(&self.config).nth(i as usize))
-                .map_or("static", |m| m.name()),
-        }
     }
 
     pub(crate) fn config(&self) -> &ScenarioConfig {

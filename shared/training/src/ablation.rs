@@ -155,15 +155,15 @@ fn markdown(table: &AblationTable) -> String {
     let rows: Vec<(String, &EncoderTable)> = table.rows.iter().map(|r| (r.description.clone(), &r.scores)).collect();
     encoder_rows(&mut text, &rows);
     let _ = writeln!(text, "State accuracy up to visual equivalence, place fully visible:\n");
-    let _ = writeln!(text, "| encoder | trained poses, % | unseen poses, % |\n|---|---|---|");
+    let _ = writeln!(text, "| encoder | trained poses, % | held-out poses, % |\n|---|---|---|");
     for row in &table.rows {
         let share = |accuracy: Option<ByObservability>| {
             let full = accuracy.map(|a| a.full).filter(|s| s.trials > 0);
             full.map_or_else(|| "-".to_owned(), |s| format!("{:.1} of {} images", 100.0 * s.accuracy(), s.trials))
         };
         let accuracy = &row.scores.state_accuracy;
-        let [trained, unseen] = [accuracy.trained, accuracy.unseen].map(share);
-        let _ = writeln!(text, "| {} | {trained} | {unseen} |", row.description);
+        let [trained, held_out] = [accuracy.trained, accuracy.unseen].map(share);
+        let _ = writeln!(text, "| {} | {trained} | {held_out} |", row.description);
     }
     text
 }

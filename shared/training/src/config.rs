@@ -187,8 +187,8 @@ pub struct FieldTraining {
     pub resampled_share: f64,
     /// Share of the training in which the resampled share rises from 0.
     pub resampled_ramp: f64,
-    /// Whether a pixel covers its own width (`true`) or a point. With `true`, `point_width_m` of the field becomes the
-    /// median width of the images' pixels in the middle of the bounds.
+    /// True if a pixel covers its own width, false if it covers a point. With `true`, `point_width_m` of the field
+    /// becomes the median width of the images' pixels in the middle of the bounds.
     pub wide_pixels: bool,
     /// The optimiser; `steps` is the length of the training.
     pub trainer: TrainerConfig,

@@ -2,8 +2,7 @@
 
 use crate::{
     TrainingError,
-    records::{FieldRecord, MixtureRecord, Record, VaeRecord},
-    run::{METRICS, names},
+    records::{FieldRecord, METRICS, MixtureRecord, Record, VaeRecord, names},
 };
 use carff_evaluation::{Accuracy, ByObservability};
 use carff_plots::{Panel, Series};

@@ -6,8 +6,8 @@
 use crate::{
     TrainingError,
     config::TrainingConfig,
-    records::FieldRecord,
-    run::{Context, Phase, Report, drive, names, part, prefixed},
+    records::{FieldRecord, names},
+    run::{Context, Phase, Report, drive, part, prefixed},
 };
 use carff_base::random::Key;
 use carff_dataset::PIXEL_TOLERANCE;

@@ -7,8 +7,8 @@
 use crate::{
     TrainingError,
     config::TrainingConfig,
-    records::MixtureRecord,
-    run::{Context, Phase, Report, cosine, names, part, prefixed},
+    records::{MixtureRecord, names},
+    run::{Context, Phase, Report, cosine, part, prefixed},
 };
 use carff_base::random::Key;
 use carff_messages::{Gaussian, LATENT_DIM};

@@ -6,8 +6,8 @@ use crate::{
     field::{Clouds, FieldPhase, saved_field},
     mixture::{Mdn, MixturePhase},
     places::places,
-    records::{self, DoneRecord},
-    run::{Context, Run, drive, names},
+    records::{DoneRecord, names},
+    run::{Context, Run, drive},
     vae::{Inputs, Vae, VaePhase},
 };
 use carff_checkpoint::CheckpointPlanning;
@@ -79,7 +79,7 @@ impl Training<'_> {
             self.train_states(context, phases)?
         };
         save(manifest, &figures, self.out)?;
-        run.record(records::names::DONE, &DoneRecord { metrics: &figures })?;
+        run.record(names::DONE, &DoneRecord { metrics: &figures })?;
         Ok(figures)
     }
 

@@ -9,7 +9,8 @@ use crate::{
     config::TrainingConfig,
     field::{Clouds, FieldPhase},
     places::places,
-    run::{Context, Run, names},
+    records::names,
+    run::{Context, RANDOM_IMAGES, Run},
 };
 use carff_base::geometry::PinholeCamera;
 use carff_base::random::Key;
@@ -19,9 +20,6 @@ use carff_field::{Field, HypothesisBuffer, RenderOptions};
 use carff_messages::{Gaussian, LATENT_DIM};
 use rand::Rng;
 use std::path::{Path, PathBuf};
-
-/// Folder of the dataset in the run's folder.
-pub const FOLDER: &str = "free-poses";
 
 /// Number of nearest poses of which one is the other end of the line from which a pose is drawn.
 const NEIGHBOURS: usize = 6;
@@ -71,7 +69,7 @@ pub fn render_random_poses(
     }
     // Refuses a dataset without places to probe before an hour of work.
     places(&posed.scenario)?;
-    let dir = run.dir.join(FOLDER);
+    let dir = run.dir.join(RANDOM_IMAGES);
     let there = dir.join("transforms.json").is_file() || render(Context { config, posed: &posed, run }, &dir)?;
     Ok(there.then_some(dir))
 }
@@ -95,7 +93,7 @@ fn render(context: Context, dir: &Path) -> Result<bool, TrainingError> {
         return Ok(false);
     }
     let scenario = ScenarioInfo { bev_view: None, ..posed.scenario.clone() };
-    let identity = format!("{FOLDER} {:?} {}", config.free_poses, config.seed);
+    let identity = format!("{RANDOM_IMAGES} {:?} {}", config.free_poses, config.seed);
     let (writer, notes) = DatasetWriter::go_on::<usize>(dir, &identity)?;
     let total = cameras.len();
     let mut records = Vec::with_capacity(total * latents.len());

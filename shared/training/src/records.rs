@@ -3,8 +3,19 @@
 use carff_evaluation::{CheckpointFigures, VaeFigures};
 use serde::{Deserialize, Deserializer, Serialize};
 
-/// Names of the records that are not of a phase.
+/// Name of the metrics file in a run's folder: one JSON object a line.
+pub const METRICS: &str = "metrics.jsonl";
+
+/// Names of the phases in progress, saved states and metrics, and of the records that are not of a phase.
 pub mod names {
+    /// Pose-conditional VAE.
+    pub const VAE: &str = "vae";
+    /// Field.
+    pub const FIELD: &str = "nerf";
+    /// Mixture density network.
+    pub const MIXTURE: &str = "mdn";
+    /// Field that renders random poses.
+    pub const RANDOM_POSES: &str = "free";
     /// Choice of the threshold.
     pub const THRESHOLD: &str = "threshold";
     /// End of the training.
@@ -70,7 +81,7 @@ pub struct FieldRecord {
 pub struct ThresholdRecord {
     /// The threshold.
     pub threshold: f64,
-    /// Whether the trials determined it.
+    /// True if the trials determined it.
     pub chosen: bool,
     /// Trials.
     pub trials: usize,

@@ -1,6 +1,9 @@
 //! Training phases: one loop for all of them, and the folder of a run with its states and metrics.
 
-use crate::{TrainingConfig, TrainingError, curves, features};
+use crate::{
+    TrainingConfig, TrainingError, curves, features,
+    records::{METRICS, names},
+};
 use carff_evaluation::{PosedImages, Progress};
 use carff_messages::{Gaussian, LATENT_DIM};
 use carff_networks::{
@@ -17,20 +20,8 @@ use std::{
 };
 use tch::{Kind, Tensor};
 
-/// Names of the phases in progress, saved states and metrics.
-pub mod names {
-    /// Pose-conditional VAE.
-    pub const VAE: &str = "vae";
-    /// Field.
-    pub const FIELD: &str = "nerf";
-    /// Mixture density network.
-    pub const MIXTURE: &str = "mdn";
-    /// Field that renders random poses.
-    pub const RANDOM_POSES: &str = "free";
-}
-
-/// Name of the metrics file in a run's folder: one JSON object a line, as in [`crate::records`].
-pub const METRICS: &str = "metrics.jsonl";
+/// Folder of the images from random poses in a run's folder.
+pub const RANDOM_IMAGES: &str = "free-poses";
 
 /// File of the posteriors in a run's folder.
 const POSTERIORS: &str = "posteriors.safetensors";
@@ -135,7 +126,7 @@ impl Run<'_> {
         writeln!(file, "{line}").map_err(failed)
     }
 
-    /// Whether the user stopped the run.
+    /// Returns true if the user stopped the run.
     pub fn stopped(&self) -> bool {
         self.stop.load(Ordering::Relaxed)
     }
@@ -233,7 +224,7 @@ pub fn forget_run(dir: &Path) -> Result<(), TrainingError> {
     for path in states.into_iter().chain(others).map(|name| dir.join(name)) {
         gone(path.clone(), std::fs::remove_file(&path))?;
     }
-    let images = dir.join(crate::random_poses::FOLDER);
+    let images = dir.join(RANDOM_IMAGES);
     gone(images.clone(), std::fs::remove_dir_all(&images))
 }
 

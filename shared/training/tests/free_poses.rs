@@ -1,4 +1,4 @@
-//! Contracts of freely drawn poses that a field shows: what they look like, what they are made from, and interruptions.
+//! Contracts of random poses that a field renders: their images, their inputs, and interruptions.
 
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use tch::Device;
 
-/// A block drives along a road, or does not; cameras look at it, or stand behind a wall.
+/// A block drives along a road, or does not; cameras show it, or are behind a wall.
 const SCENARIO: &str = include_str!("../../../tests/data/small-scenario.toml");
 
 const TRAINING: &str = r#"
@@ -57,7 +57,7 @@ impl Place {
         let file = folder.path().join("training.toml");
         std::fs::write(&file, TRAINING).unwrap();
         let config = TrainingConfig::load(&file).unwrap();
-        // A field that is to show other poses needs more than a few to learn from.
+        // A field that renders other poses needs more than a few poses to learn from.
         let many = SCENARIO.replace("count = 8", "count = 40").replace("count = 6", "count = 20");
         let scenario = Scenario::parse(Path::new("small.toml"), &many).unwrap();
         scenario.render_dataset(&folder.path().join("set"), Extras::None, |_, _| ControlFlow::Continue(())).unwrap();
@@ -68,7 +68,7 @@ impl Place {
         self.folder.path().join(name)
     }
 
-    /// Makes the set in the run folder `name`, until `stop_at` (phase, steps done), or to the end.
+    /// Renders the dataset in the run folder `name`, until `stop_at` (phase, steps done), or to the end.
     fn make(&self, name: &str, stop_at: Option<(&str, usize)>) -> Result<Option<PathBuf>, TrainingError> {
         let stop = AtomicBool::new(false);
         let on_progress = |progress: &Progress| {
@@ -82,7 +82,7 @@ impl Place {
     }
 }
 
-/// A set's files, by name.
+/// The files of a dataset by name.
 fn files(dir: &Path) -> BTreeMap<String, Vec<u8>> {
     let mut all = BTreeMap::from([("transforms".to_owned(), std::fs::read(dir.join("transforms.json")).unwrap())]);
     for entry in std::fs::read_dir(dir.join("images")).unwrap() {
@@ -92,8 +92,8 @@ fn files(dir: &Path) -> BTreeMap<String, Vec<u8>> {
     all
 }
 
-/// Every state is shown from each drawn pose, at the encoder's size, about as it looks from there; from some poses the
-/// second step's branches look the same, behind the wall, from others they do not.
+/// Every state is rendered from each random pose at the encoder's size, near to its true image. The second step's
+/// branches look the same from the poses behind the wall, and differ from other poses.
 #[test]
 fn free_poses_show_what_is_there() {
     let mut place = Place::new();
@@ -114,15 +114,15 @@ fn free_poses_show_what_is_there() {
             [0, 1, 2].map(|c| (truth.rgb.iter().skip(c).step_by(3).map(|&v| u64::from(v)).sum::<u64>() / count) as u8);
         alike += usize::from(error(image, &truth) < 0.5 * error(&Image::filled(32, 32, mean), &truth));
     }
-    // From the others it sees what no picture shows, as the top of the wall.
+    // Other poses show parts that no training image shows, such as the top of the wall.
     assert!(alike > 64, "{alike} of 96");
     let looks = Equivalence::from_dataset(&set, &images);
     let hidden = (0..24).filter(|&view| looks.same(view, 1, 3)).count();
     assert!((1..24).contains(&hidden), "{hidden} of 24");
 }
 
-/// States whose pictures are the same from all trained poses are shown alike, to the last bit: nothing that the field
-/// adds tells them apart.
+/// States whose images are the same from all trained poses are rendered the same, to the last bit: the field adds no
+/// difference.
 #[test]
 fn states_that_look_the_same_stay_the_same() {
     let place = Place::new();
@@ -140,7 +140,7 @@ fn states_that_look_the_same_stay_the_same() {
     }
 }
 
-/// A set whose boxes do not tell its states apart cannot be probed, and is refused before anything is made of it.
+/// A dataset whose boxes are the same in several states cannot be probed, and is refused before any work.
 #[test]
 fn a_set_without_boxes_is_refused_at_once() {
     let place = Place::new();
@@ -162,8 +162,7 @@ fn a_set_without_boxes_is_refused_at_once() {
     assert!(!out.exists());
 }
 
-/// What is made does not depend on the pictures of unseen poses: a result on these is one on what nothing was learnt
-/// from.
+/// The rendered images do not depend on the images of held-out poses, so that results on these are valid.
 #[test]
 fn unseen_poses_stay_unseen() {
     let place = Place::new();
@@ -181,8 +180,8 @@ fn unseen_poses_stay_unseen() {
     assert!(files(&place.make("after", None).unwrap().unwrap()) == before);
 }
 
-/// Interrupted while its field trains and while its pictures are made, the set ends with the same bytes; a finished one
-/// is not made again, and a configuration that wants none gets none.
+/// After interruptions while its field trains and while its images are rendered, the dataset has the same bytes. A
+/// finished dataset is not rendered again, and a configuration without random poses gets none.
 #[test]
 fn making_free_poses_resumes() {
     let mut place = Place::new();

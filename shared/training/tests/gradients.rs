@@ -1,4 +1,4 @@
-//! Contract of the loss terms: each one's gradient is how the loss really changes, by central differences.
+//! Contract of the loss terms: their gradients agree with central differences.
 
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
@@ -11,13 +11,13 @@ use carff_training::{
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use tch::{Device, Kind, Tensor, nn::VarStore, no_grad};
 
-/// Half of the distance between the two places at which a loss is compared.
+/// Half of the distance between the two inputs of a central difference.
 const STEP: f64 = 2e-3;
 
-/// How far a difference may be from the gradient, of the input's largest one: f32, and the loss's own curvature.
+/// Allowed error relative to the input's largest gradient, from f32 and the loss's curvature.
 const TOLERANCE: f64 = 0.05;
 
-/// Seeds libtorch's generator, which all tests have in common, and keeps the others from it meanwhile.
+/// Seeds libtorch's generator, which all tests share, and locks it against the other tests.
 fn seeded(seed: i64) -> MutexGuard<'static, ()> {
     static ALONE: Mutex<()> = Mutex::new(());
     let alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
@@ -29,7 +29,8 @@ fn random(shape: &[i64]) -> Tensor {
     Tensor::randn(shape, (Kind::Float, Device::Cpu))
 }
 
-/// Holds the gradient of `loss` at every number of `inputs` to central differences; none may be 0 everywhere.
+/// Compares the gradient of `loss` at every number of `inputs` with central differences; no gradient may be 0
+/// everywhere.
 fn agrees(name: &str, inputs: &[Tensor], loss: impl Fn(&[Tensor]) -> Tensor) {
     let leaves: Vec<Tensor> = inputs.iter().map(|t| t.copy().set_requires_grad(true)).collect();
     loss(&leaves).backward();
@@ -37,7 +38,7 @@ fn agrees(name: &str, inputs: &[Tensor], loss: impl Fn(&[Tensor]) -> Tensor) {
         let gradient: Vec<f64> = leaf.grad().flatten(0, -1).try_into().unwrap();
         let largest = gradient.iter().fold(0.0_f64, |most, g| most.max(g.abs()));
         assert!(largest > 1e-4, "{name}, input {at}: no gradient");
-        for (i, told) in gradient.into_iter().enumerate() {
+        for (i, grad) in gradient.into_iter().enumerate() {
             let moved = |by: f64| {
                 let places: Vec<Tensor> = inputs.iter().map(Tensor::copy).collect();
                 let mut number = places[at].view(-1).get(i as i64);
@@ -45,12 +46,12 @@ fn agrees(name: &str, inputs: &[Tensor], loss: impl Fn(&[Tensor]) -> Tensor) {
                 no_grad(|| loss(&places)).double_value(&[])
             };
             let found = (moved(STEP) - moved(-STEP)) / (2.0 * STEP);
-            assert!((told - found).abs() <= TOLERANCE * largest, "{name}, input {at}, number {i}: {told}, not {found}");
+            assert!((grad - found).abs() <= TOLERANCE * largest, "{name}, input {at}, number {i}: {grad}, not {found}");
         }
     }
 }
 
-/// The divergence, the contrastive term, and the read-out's cross entropy with states that look the same.
+/// Holds for the divergence, the contrastive term, and the read-out's cross entropy with states that look the same.
 #[test]
 fn latent_terms() {
     let _alone = seeded(1);
@@ -61,8 +62,8 @@ fn latent_terms() {
     agrees("read-out", &[random(&[2, 3])], |t| cross_entropy(&t[0], &wanted));
 }
 
-/// The reconstruction, of the picture and of its difference from the mean one, and how it reaches mean and log-variance
-/// through the draw.
+/// Holds for the reconstruction of the image and of its residual over the mean image, also through the draw to mean and
+/// log-variance.
 #[test]
 fn reconstruction_through_the_draw() {
     let _alone = seeded(2);
@@ -77,8 +78,8 @@ fn reconstruction_through_the_draw() {
     }
 }
 
-/// The mixture's negative log-likelihood: by each number of the targets; and along the gradients of the inputs and of
-/// each of the network's weights, as there are kinks on the way to each number of these.
+/// Holds for the mixture's negative log-likelihood: at each number of the targets, and along the gradients of the
+/// inputs and of each of the network's weights, because single numbers of these cross kinks.
 #[test]
 fn likelihood() {
     let _alone = seeded(3);

@@ -1,4 +1,4 @@
-//! Contracts of training: it learns what can be learnt, and an interrupted training ends where a straight one does.
+//! Contracts of training: a small scenario is learnt, and interruptions do not change the result.
 
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
@@ -10,10 +10,10 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
-/// A block drives along a road, or does not; fourteen cameras look at it, eight stand behind a wall.
+/// A block drives along a road, or does not; fourteen cameras show it, eight are behind a wall.
 const SCENARIO: &str = include_str!("../../../tests/data/small-scenario.toml");
 
-/// Nets so small that all three are trained in seconds.
+/// Networks so small that all three are trained in seconds.
 const TRAINING: &str = r#"
 dataset = "set"
 out = "out"
@@ -64,8 +64,8 @@ occupancy_warmup_steps = 100
 threads = 1
 "#;
 
-/// libtorch has one random generator a process: two trainings at once, or a training and a model that is made, would
-/// draw from each other's.
+/// libtorch has one random generator per process: two trainings at once, or a training and the initialisation of a
+/// model, would change each other's draws.
 fn alone() -> MutexGuard<'static, ()> {
     static ALONE: Mutex<()> = Mutex::new(());
     ALONE.lock().unwrap_or_else(PoisonError::into_inner)
@@ -119,8 +119,8 @@ impl Place {
     }
 }
 
-/// From pictures alone to a checkpoint that decides: latents name states, the field shows each state and not another,
-/// the forecast of a state shows its successor, and the calibrated rule halts for the hidden block and else advances.
+/// Training from images only gives a checkpoint that decides. Latents identify states, the field shows each state, and
+/// the forecast of a state shows its successor. The calibrated rule halts only for the hidden block.
 #[test]
 fn training_learns() {
     let place = Place::new();
@@ -139,7 +139,7 @@ fn training_learns() {
     assert_eq!(Models::load(&place.out("learnt")).unwrap().probe.states().len(), 4);
 }
 
-/// A decoder that learns alone leaves the encoder as it is, and gets better.
+/// Training of the decoder only leaves the encoder unchanged and improves the decoder.
 #[test]
 fn the_decoder_learns_alone() {
     let mut place = Place::new();
@@ -154,8 +154,8 @@ fn the_decoder_learns_alone() {
     assert!(psnr_db(&after) > psnr_db(&before) + 0.5, "{before:#?} {after:#?}");
 }
 
-/// A training that is stopped in each of its three stages, while features are computed, and while the decoder learns
-/// alone, and each time goes on, ends with the same bytes as one that is not.
+/// A training that is stopped and continued in each of its three phases, during the features and during the decoder's
+/// own epochs has the same bytes as an uninterrupted one.
 #[test]
 fn training_resumes() {
     let mut place = Place::new();
@@ -167,7 +167,7 @@ fn training_resumes() {
     place.train("straight", None).unwrap();
     for stop_at in [("features", 40), ("vae", 3), ("vae", 7), ("mdn", 100), ("nerf", 60)] {
         assert!(matches!(place.train("halting", Some(stop_at)), Err(TrainingError::Stopped)), "{stop_at:?}");
-        // Kept as long as a training that is interrupted would need them.
+        // They are kept as long as an interrupted training would need them.
         let kept = place.out("halting-run").join(FEATURES).is_file();
         assert_eq!(kept, ["features", "vae"].contains(&stop_at.0), "{stop_at:?}");
     }

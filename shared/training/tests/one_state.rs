@@ -1,5 +1,5 @@
-//! Contracts of sets of one state, as imported ones are (the field alone is trained, and judged on poses it never saw),
-//! and of the training files that ship.
+//! Contracts of datasets of one state, such as imported ones, and of the shipped training files. Only the field is
+//! trained, and it is judged on held-out poses.
 
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
@@ -72,15 +72,15 @@ occupancy_warmup_steps = 100
 threads = 1
 "#;
 
-/// An imported set trains with `--stage nerf` and with all stages alike, shows poses that were kept away better than
-/// their own mean colours, and is refused by stages that have nothing to do.
+/// An imported dataset trains the same with `--stage nerf` and with all phases. Its field renders held-out poses better
+/// than their mean colours. Phases without work refuse it.
 #[test]
 fn an_imported_set_trains_the_field() {
     let folder = tempfile::tempdir().unwrap();
     let path = |name: &str| folder.path().join(name);
     let scenario = Scenario::parse(Path::new("still.toml"), SCENARIO).unwrap();
     scenario.render_dataset(&path("rendered"), Extras::None, |_, _| ControlFlow::Continue(())).unwrap();
-    // Without its scenario it is as plain as anybody's.
+    // Without its scenario it is like any other dataset.
     let text = std::fs::read_to_string(path("rendered/transforms.json")).unwrap();
     let mut plain: serde_json::Value = serde_json::from_str(&text).unwrap();
     plain.as_object_mut().unwrap().remove("scenario");
@@ -115,14 +115,14 @@ fn an_imported_set_trains_the_field() {
         let flat = carff_dataset::Image::filled(image.width_px, image.height_px, mean);
         of_mean += flat.psnr_db(image).unwrap() / images.len() as f64;
     }
-    let unseen = views.unseen.psnr_db.unwrap();
-    assert!(unseen > of_mean + 4.0, "{unseen} dB, mean colours {of_mean} dB");
+    let held_out = views.unseen.psnr_db.unwrap();
+    assert!(held_out > of_mean + 4.0, "{held_out} dB, mean colours {of_mean} dB");
     assert!(path("views.png").is_file() && path("out/field.safetensors").is_file());
-    // A finished training is not done again.
+    // A finished training is not repeated.
     assert_eq!(train(Phases::All).unwrap(), figures);
 }
 
-/// Every shipped training file is valid, names its scenario (but for the one of sets from elsewhere, which have none),
+/// Every shipped training file is valid, names its scenario (except the file for imported datasets, which have none),
 /// and writes to the checkpoint of its own name.
 #[test]
 fn every_shipped_training_file_is_valid() {

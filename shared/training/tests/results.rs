@@ -1,4 +1,4 @@
-//! From a tiny trained scenario to a page: every table that it can have, and a reason for every one that it cannot.
+//! Contracts of the results of a tiny trained scenario: every possible table, and a reason for every other one.
 
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
@@ -15,10 +15,10 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
-/// A block drives along a road, or does not; fourteen cameras look at it, eight stand behind a wall.
+/// A block drives along a road, or does not; fourteen cameras show it, eight are behind a wall.
 const SCENARIO: &str = include_str!("../../../tests/data/small-scenario.toml");
 
-/// Nets so small that they are trained in seconds, and a little.
+/// Networks so small that they are partly trained within seconds.
 const TRAINING: &str = r#"
 dataset = "set"
 out = "out"
@@ -69,7 +69,7 @@ occupancy_warmup_steps = 40
 threads = 1
 "#;
 
-/// libtorch has one random generator a process: two trainings at once would draw from each other's.
+/// libtorch has one random generator per process: two trainings at once would change each other's draws.
 fn alone() -> MutexGuard<'static, ()> {
     static ALONE: Mutex<()> = Mutex::new(());
     ALONE.lock().unwrap_or_else(PoisonError::into_inner)
@@ -123,8 +123,8 @@ impl Place {
     }
 }
 
-/// All tables are there, count what they say they count, are on disk as they are in memory, and the page shows every
-/// picture that was drawn; the same seed gives the same figures; one table alone is one table alone.
+/// All tables exist with consistent counts, the file equals the results in memory, and the page shows every drawn
+/// image. The same seed gives the same figures. A request for one table gives only that table.
 #[test]
 fn every_table_is_made() {
     let place = Place::new(SCENARIO);
@@ -172,8 +172,8 @@ fn every_table_is_made() {
     assert!(again.planning.is_none() && again.encoder.is_none() && again.gallery.is_none());
 }
 
-/// Of a scenario with one branch there is nothing to plan, and no branch to recall; of a checkpoint whose VAE alone is
-/// trained there are no pictures of a field: each is a line with the reason, and no error.
+/// A scenario with one branch has nothing to plan and no branch to recall. A checkpoint with only a trained VAE has no
+/// images of a field. Each missing table is a line with the reason, not an error.
 #[test]
 fn what_cannot_be_is_said() {
     let single = SCENARIO
@@ -190,7 +190,7 @@ fn what_cannot_be_is_said() {
     assert!(page.contains("no branch in which the hazard action is right"), "{page}");
 }
 
-/// Every variant trains and is scored, a row that is there is read again, and the table names them all.
+/// Every variant is trained and scored, an existing row is read again, and the table names all variants.
 #[test]
 fn every_variant_has_a_row() {
     let mut place = Place::new(SCENARIO);

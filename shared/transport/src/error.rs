@@ -37,6 +37,17 @@ pub enum OpenError {
         /// Number of bytes free.
         free_bytes: u64,
     },
+    /// The process may open too few files.
+    #[error(
+        "this process may open {limit} files, and a graph needs up to {needed}: raise the limit (`ulimit -n {needed}`, \
+         or LimitNOFILE= of the systemd unit)"
+    )]
+    OpenFiles {
+        /// Number of files that the process may open.
+        limit: u64,
+        /// Number of files that a process of a graph needs.
+        needed: u64,
+    },
     /// The node could not be created.
     #[error("cannot join run `{run}`: {cause}; if its folder {path} belongs to another user, use another run name")]
     Node {

@@ -3,8 +3,8 @@
 //! `carff-messages` defines the messages; the stages process them.
 //!
 //! A process opens one [`Node`] in a [`Run`]. Every topic is one row of the table in [`topics`]. Sending stamps the
-//! header and wakes the receivers that wait. Receiving drops and counts invalid messages, and gives access to valid ones
-//! in the sender's memory. A [`Waiter`] sleeps until one of several inputs has a message, a time, or a stop.
+//! header and wakes the receivers that wait. Receiving drops and counts invalid messages, and gives access to valid
+//! ones in the sender's memory. A [`Waiter`] sleeps until one of several inputs has a message, a time, or a stop.
 //!
 //! ```
 //! use carff_messages::{Gaussian, Header, Posterior};
@@ -33,6 +33,7 @@
 mod counters;
 mod descriptors;
 mod error;
+mod folder;
 mod in_use;
 mod log;
 mod node;
@@ -44,25 +45,27 @@ mod retry;
 mod run;
 mod space;
 mod stop;
+mod topic;
 pub mod topics;
 mod wait;
 
 pub use counters::Counters;
 pub use error::{CleanupError, OpenError, ReceiveError, RunNameError, SendError, WaitError};
+pub use folder::{mapping_processes, runtime_dir, runtime_dirs};
 pub use in_use::{Member, OpenTopic, Ports};
 pub use node::{Node, make_private_dir};
 pub use payload::{Image, Payload};
 pub use publisher::{ImageLoan, Publisher};
 pub use receiver::{Receiver, Sample};
-pub use registry::{AnyPublisher, AnyReceiver, AnyTopic, Received, TopicId, UnknownTopic};
-pub use run::{Run, cleanup_dead, living_processes, remove_run_leftovers, run_id_of, runtime_dir};
+pub use registry::{AnyPublisher, AnyReceiver, AnyTopic, Received, TopicId, UnknownTopic, graph_bytes};
+pub use run::{Run, cleanup_dead, living_processes, remove_run_leftovers, run_id_of};
 pub use space::{SHARED_MEMORY_DIR, check_space};
 pub use stop::{INTERRUPTED, Stop, exit_on_signals, is_interrupted};
-pub use topics::{Limits, Topic};
+pub use topic::{Limits, Topic};
 pub use wait::{Input, Waiter, Woken};
 
-/// Returns the present time of the clock that all headers use: `CLOCK_MONOTONIC`, nanoseconds, the same in all processes
-/// of a machine.
+/// Returns the present time of the clock that all headers use: `CLOCK_MONOTONIC`, nanoseconds, the same in all
+/// processes of a machine.
 pub fn monotonic_now_ns() -> u64 {
     let now = rustix::time::clock_gettime(rustix::time::ClockId::Monotonic);
     now.tv_sec as u64 * 1_000_000_000 + now.tv_nsec as u64

@@ -1,11 +1,11 @@
 //! A process's membership in a run.
 
+use crate::folder::Kept;
 use crate::payload::{Image, Opened, Payload, Unopened};
 use crate::retry::retry;
 use crate::run::CLEANUP_PATIENCE;
-use crate::space::{MANAGEMENT_BYTES, SHARED_MEMORY_DIR, check_space};
-use crate::topics::Limits;
-use crate::{Counters, OpenError, Publisher, Receiver, Run, Service, Topic, log};
+use crate::space::{MANAGEMENT_BYTES, SHARED_MEMORY_DIR, check_open_files, check_space};
+use crate::{Counters, Limits, OpenError, Publisher, Receiver, Run, Service, Topic, log};
 use carff_messages::{ImageMeta, Message};
 use iceoryx2::port::listener::{Listener, ListenerCreateError};
 use iceoryx2::port::notifier::{Notifier, NotifierCreateError};
@@ -24,14 +24,18 @@ pub struct Node {
     inner: iceoryx2::node::Node<Service>,
     run: Run,
     counters: Arc<Counters>,
+    /// Locks that keep the folders from cleaners.
+    _kept: [Kept; 2],
 }
 
 impl Node {
     /// Joins a run under a visible name, and cleans up after dead processes of this run.
     pub fn open(run: &Run, name: &str) -> Result<Self, OpenError> {
         log::quiet();
-        make_private_dir(&crate::runtime_dir())?;
+        make_private_dir(run.dir())?;
         make_private_dir(&run.folder())?;
+        let kept = [Kept::new(run.dir()), Kept::new(&run.folder())];
+        check_open_files()?;
         check_space(Path::new(SHARED_MEMORY_DIR), "joining the run", MANAGEMENT_BYTES)?;
         let failed = |cause: String| OpenError::Node { run: run.name().to_owned(), path: run.folder(), cause };
         let config = run.config().map_err(failed)?;
@@ -42,7 +46,7 @@ impl Node {
             .create::<Service>()
             .map_err(|e| failed(e.to_string()))?;
         close_to_others(run).map_err(|e| failed(e.to_string()))?;
-        Ok(Self { inner, run: run.clone(), counters: Arc::default() })
+        Ok(Self { inner, run: run.clone(), counters: Arc::default(), _kept: kept })
     }
 
     pub(crate) fn inner(&self) -> &iceoryx2::node::Node<Service> {

@@ -1,12 +1,14 @@
 //! The two forms of a message in shared memory: by itself, or as the user header of an image.
 
-use crate::{Publisher, SendError, Service};
+use crate::Service;
 use carff_messages::check::equals;
 use carff_messages::{ImageMeta, Invalid, Message};
-use iceoryx2::port::ReceiveError;
+use iceoryx2::port::publisher::Publisher;
 use iceoryx2::port::subscriber::Subscriber;
+use iceoryx2::port::{LoanError, ReceiveError};
 use iceoryx2::prelude::{AllocationStrategy, IceoryxSend, ZeroCopySend};
 use iceoryx2::sample::Sample;
+use iceoryx2::sample_mut::SampleMut;
 use iceoryx2::service::builder::publish_subscribe::{
     Builder, PublishSubscribeOpenError, PublishSubscribeOpenOrCreateError,
 };
@@ -53,11 +55,9 @@ pub trait Payload: Debug + 'static {
     #[doc(hidden)]
     fn bytes(sample: &Sample<Service, Self::Body, Self::UserHeader>) -> &[u8];
 
-    /// Sends a copy of a message and of the image that it describes, without stamp or validation.
+    /// Copies a message, and the image that it describes, into the port's memory.
     #[doc(hidden)]
-    fn forward(publisher: &mut Publisher<Self>, message: Self::Message, bytes: &[u8]) -> Result<(), SendError>
-    where
-        Self: Sized;
+    fn loan(port: &Port<Self>, message: Self::Message, bytes: &[u8]) -> Loaned<Self>;
 
     /// Checks that the number of bytes matches the description; 0 for a message by itself.
     #[doc(hidden)]
@@ -70,6 +70,10 @@ pub type Unopened<P> = Builder<<P as Payload>::Body, <P as Payload>::UserHeader,
 pub type Opened<P> = PortFactory<Service, <P as Payload>::Body, <P as Payload>::UserHeader>;
 #[doc(hidden)]
 pub type PublisherFactory<'a, P> = PortFactoryPublisher<'a, Service, <P as Payload>::Body, <P as Payload>::UserHeader>;
+#[doc(hidden)]
+pub type Port<P> = Publisher<Service, <P as Payload>::Body, <P as Payload>::UserHeader>;
+#[doc(hidden)]
+pub type Loaned<P> = Result<SampleMut<Service, <P as Payload>::Body, <P as Payload>::UserHeader>, LoanError>;
 #[doc(hidden)]
 pub type Received<P> = Result<Option<Sample<Service, <P as Payload>::Body, <P as Payload>::UserHeader>>, ReceiveError>;
 
@@ -104,8 +108,8 @@ impl<M: Message> Payload for M {
         &[]
     }
 
-    fn forward(publisher: &mut Publisher<Self>, message: M, _bytes: &[u8]) -> Result<(), SendError> {
-        publisher.send_unchecked(message)
+    fn loan(port: &Port<Self>, message: M, _bytes: &[u8]) -> Loaned<Self> {
+        Ok(port.loan_uninit()?.write_payload(message))
     }
 
     fn check_size(_message: &M, bytes: usize) -> Result<(), Invalid> {
@@ -144,8 +148,10 @@ impl<M: ImageMeta> Payload for Image<M> {
         sample.payload()
     }
 
-    fn forward(publisher: &mut Publisher<Self>, message: M, bytes: &[u8]) -> Result<(), SendError> {
-        publisher.send_image_unchecked(publisher.copy(bytes)?, message)
+    fn loan(port: &Port<Self>, message: M, bytes: &[u8]) -> Loaned<Self> {
+        let mut sample = port.loan_slice_uninit(bytes.len())?.write_from_slice(bytes);
+        *sample.user_header_mut() = message;
+        Ok(sample)
     }
 
     fn check_size(message: &M, bytes: usize) -> Result<(), Invalid> {

@@ -1,6 +1,6 @@
 //! Sending: stamp, write in place, wake.
 
-use crate::payload::{Image, Payload};
+use crate::payload::{Image, Payload, Port};
 use crate::{Counters, Run, SendError, Service, Topic, monotonic_now_ns};
 use carff_messages::{Header, ImageMeta, Invalid, Message, SCHEMA_VERSION};
 use iceoryx2::port::notifier::Notifier;
@@ -14,7 +14,7 @@ pub struct Publisher<P: Payload> {
     topic: &'static str,
     run_id: u64,
     sequence: u64,
-    port: iceoryx2::port::publisher::Publisher<Service, P::Body, P::UserHeader>,
+    port: Port<P>,
     notifier: Notifier<Service>,
     counters: Arc<Counters>,
     pub(crate) max_bytes: usize,
@@ -24,7 +24,7 @@ impl<P: Payload> Publisher<P> {
     pub(crate) fn new(
         topic: &Topic<P>,
         run: &Run,
-        port: iceoryx2::port::publisher::Publisher<Service, P::Body, P::UserHeader>,
+        port: Port<P>,
         notifier: Notifier<Service>,
         counters: Arc<Counters>,
         max_bytes: usize,
@@ -40,6 +40,15 @@ impl<P: Payload> Publisher<P> {
         header.sequence = self.sequence;
         header.publish_time_ns = monotonic_now_ns();
         message.validate().map_err(|source| self.invalid(source))
+    }
+
+    /// Sends a copy of a message, and of the image that it describes, without stamping or validation.
+    pub(crate) fn forward(&mut self, message: P::Message, bytes: &[u8]) -> Result<(), SendError> {
+        self.check_room(bytes.len())?;
+        let sample = P::loan(&self.port, message, bytes).map_err(|e| self.failed(&e))?;
+        sample.send().map_err(|e| self.failed(&e))?;
+        self.sent();
+        Ok(())
     }
 
     /// Counts the message and wakes receivers. A listener that cannot be woken (dead, or stopped with a full socket)
@@ -60,6 +69,14 @@ impl<P: Payload> Publisher<P> {
         SendError::Failed { topic: self.topic.to_owned(), cause: "the message is of another type".to_owned() }
     }
 
+    fn check_room(&self, bytes: usize) -> Result<(), SendError> {
+        if P::IS_IMAGE && bytes > self.max_bytes { Err(self.size(bytes, self.max_bytes)) } else { Ok(()) }
+    }
+
+    fn size(&self, found: usize, max: usize) -> SendError {
+        SendError::Size { topic: self.topic.to_owned(), found, max }
+    }
+
     fn failed(&self, error: &dyn std::error::Error) -> SendError {
         SendError::Failed { topic: self.topic.to_owned(), cause: error.to_string() }
     }
@@ -74,10 +91,7 @@ impl<M: Message> Publisher<M> {
 
     /// Sends without stamping or validation: for replay, and for tests that inject faults.
     pub fn send_unchecked(&mut self, message: M) -> Result<(), SendError> {
-        let sample = self.port.loan_uninit().map_err(|e| self.failed(&e))?;
-        sample.write_payload(message).send().map_err(|e| self.failed(&e))?;
-        self.sent();
-        Ok(())
+        self.forward(message, &[])
     }
 }
 
@@ -129,34 +143,28 @@ impl<M: ImageMeta> ImageLoan<M> {
 impl<M: ImageMeta> Publisher<Image<M>> {
     /// Returns memory for an image of `bytes` bytes, in the segment that the receivers read from.
     pub fn loan(&self, bytes: usize) -> Result<ImageLoan<M>, SendError> {
-        if bytes > self.max_bytes {
-            return Err(self.size(bytes, self.max_bytes));
-        }
+        self.check_room(bytes)?;
         Ok(ImageLoan { sample: self.port.loan_slice(bytes).map_err(|e| self.failed(&e))? })
     }
 
     /// Stamps the header, validates, sends the written image, and wakes the receivers that wait.
     pub fn send_image(&mut self, loan: ImageLoan<M>, mut meta: M) -> Result<(), SendError> {
         self.stamp(&mut meta)?;
-        let (found, described) = (loan.sample.payload().len(), meta.image_bytes());
-        if found != described {
-            return Err(self.size(found, described));
-        }
+        self.check_size(loan.sample.payload().len(), &meta)?;
         self.send_image_unchecked(loan, meta)
     }
 
-    /// Returns a copy of an image in such memory, which is not cleared first.
-    pub(crate) fn copy(&self, bytes: &[u8]) -> Result<ImageLoan<M>, SendError> {
-        if bytes.len() > self.max_bytes {
-            return Err(self.size(bytes.len(), self.max_bytes));
-        }
-        let sample = self.port.loan_slice_uninit(bytes.len()).map_err(|e| self.failed(&e))?;
-        Ok(ImageLoan { sample: sample.write_from_slice(bytes) })
+    /// Stamps the header, validates, and sends a copy of an image.
+    pub fn send_bytes(&mut self, bytes: &[u8], mut meta: M) -> Result<(), SendError> {
+        self.check_room(bytes.len())?;
+        self.stamp(&mut meta)?;
+        self.check_size(bytes.len(), &meta)?;
+        self.forward(meta, bytes)
     }
 
-    /// Stamps the header, validates, and sends a copy of an image.
-    pub fn send_bytes(&mut self, bytes: &[u8], meta: M) -> Result<(), SendError> {
-        self.send_image(self.copy(bytes)?, meta)
+    fn check_size(&self, found: usize, meta: &M) -> Result<(), SendError> {
+        let described = meta.image_bytes();
+        if found == described { Ok(()) } else { Err(self.size(found, described)) }
     }
 
     /// Sends without stamping or validation: for replay, and for tests that inject faults.
@@ -165,9 +173,5 @@ impl<M: ImageMeta> Publisher<Image<M>> {
         loan.sample.send().map_err(|e| self.failed(&e))?;
         self.sent();
         Ok(())
-    }
-
-    fn size(&self, found: usize, max: usize) -> SendError {
-        SendError::Size { topic: self.topic.to_owned(), found, max }
     }
 }

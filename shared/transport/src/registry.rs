@@ -124,12 +124,12 @@ where
         let mut typed: P::Message = *message.get().ok_or_else(|| self.of_another_type())?;
         self.stamp(&mut typed)?;
         P::check_size(&typed, message.bytes().len()).map_err(|source| self.invalid(source))?;
-        P::forward(self, typed, message.bytes())
+        self.forward(typed, message.bytes())
     }
 
     fn forward(&mut self, message: AnyMessage<'_>) -> Result<(), SendError> {
         let typed = message.get().ok_or_else(|| self.of_another_type())?;
-        P::forward(self, *typed, message.bytes())
+        self.forward(*typed, message.bytes())
     }
 }
 
@@ -186,23 +186,19 @@ fn all_names() -> String {
 
 impl TopicId {
     /// `camera/frame`.
-    pub const FRAME: Self = Self::of_graph(0);
+    pub const FRAME: Self = Self { index: 0, topic: &topics::FRAME };
     /// `encoder/posterior`.
-    pub const POSTERIOR: Self = Self::of_graph(1);
+    pub const POSTERIOR: Self = Self { index: 1, topic: &topics::POSTERIOR };
     /// `forecaster/forecast`.
-    pub const FORECAST: Self = Self::of_graph(2);
+    pub const FORECAST: Self = Self { index: 2, topic: &topics::FORECAST };
     /// `prober/belief`.
-    pub const BELIEF: Self = Self::of_graph(3);
+    pub const BELIEF: Self = Self { index: 3, topic: &topics::BELIEF };
     /// `renderer/view`.
-    pub const VIEW: Self = Self::of_graph(4);
+    pub const VIEW: Self = Self { index: 4, topic: &topics::VIEW };
     /// `controller/action`.
-    pub const ACTION: Self = Self::of_graph(5);
+    pub const ACTION: Self = Self { index: 5, topic: &topics::ACTION };
     /// The topics from the camera to the action, in the order of the data flow.
     pub const FLOW: [Self; 6] = [Self::FRAME, Self::POSTERIOR, Self::FORECAST, Self::BELIEF, Self::VIEW, Self::ACTION];
-
-    const fn of_graph(index: usize) -> Self {
-        Self { index, topic: topics::FLOW[index] }
-    }
 
     /// Returns the id of a user's own topic.
     pub fn of(topic: &'static dyn AnyTopic) -> Self {
@@ -290,6 +286,20 @@ impl FromStr for TopicId {
         }
         Err(UnknownTopic { name: name.to_owned() })
     }
+}
+
+/// Returns the shared memory that a whole graph reserves, bytes, with camera frames and rendered views of these sizes.
+/// The launcher checks it once, before it starts a stage.
+pub fn graph_bytes(frame_bytes: usize, view_bytes: usize) -> u64 {
+    let of = |topic: TopicId| {
+        let image_bytes = match topic {
+            _ if topic == TopicId::FRAME => frame_bytes,
+            _ if topic == TopicId::VIEW => view_bytes,
+            _ => 0,
+        };
+        topic.segment_bytes(image_bytes) + crate::space::MANAGEMENT_BYTES
+    };
+    TopicId::all().map(of).sum()
 }
 
 #[cfg(test)]

@@ -1,5 +1,6 @@
 //! Namespaces: each run has its own folder and prefix in shared memory, so that runs never see each other.
 
+use crate::folder::{self, runtime_dir};
 use crate::space::SHARED_MEMORY_DIR;
 use crate::{CleanupError, RunNameError, Service};
 use iceoryx2::node::NodeView;
@@ -28,16 +29,27 @@ const LIST_PAUSE: Duration = Duration::from_millis(2);
 /// ```
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Run {
+    dir: PathBuf,
     name: String,
     id: u64,
 }
 
 impl Run {
-    /// Creates a run from name and id. All processes of a run must use the same values.
+    /// Creates a run from name and id, in the folder of this user's new runs. All processes of a run must use the same
+    /// values.
     pub fn new(name: &str, id: u64) -> Result<Self, RunNameError> {
+        Self::within(&runtime_dir(), name, id)
+    }
+
+    /// Creates a run in one of [`crate::runtime_dirs`].
+    pub fn within(dir: &Path, name: &str, id: u64) -> Result<Self, RunNameError> {
         let fits = (1..=MAX_NAME_BYTES).contains(&name.len())
             && name.bytes().all(|b| b.is_ascii_alphanumeric() || b == b'-' || b == b'_');
-        if fits { Ok(Self { name: name.to_owned(), id }) } else { Err(RunNameError { name: name.to_owned() }) }
+        if fits {
+            Ok(Self { dir: dir.to_owned(), name: name.to_owned(), id })
+        } else {
+            Err(RunNameError { name: name.to_owned() })
+        }
     }
 
     /// Returns the name.
@@ -52,7 +64,23 @@ impl Run {
 
     /// Returns the folder of the run's small files. It exists while the run does.
     pub fn folder(&self) -> PathBuf {
-        runtime_dir().join(&self.name)
+        self.dir.join(&self.name)
+    }
+
+    /// Returns the folder that contains the run's folder.
+    pub fn dir(&self) -> &Path {
+        &self.dir
+    }
+
+    /// Makes the files of a living run young again. Call it about once an hour: some cleaners of temporary files go by
+    /// age only.
+    pub fn refresh(&self) {
+        folder::refresh(&self.folder());
+    }
+
+    /// Returns the processes that map the run's shared memory, also if its folder is gone.
+    pub fn mapping_processes(&self) -> Vec<u32> {
+        folder::mapping_processes(&self.shared_memory_prefix())
     }
 
     /// Returns the prefix of the run's files in shared memory.
@@ -96,11 +124,6 @@ impl Run {
         config.global.set_root_path(&folder);
         Ok(config)
     }
-}
-
-/// Returns the folder of this user's run folders.
-pub fn runtime_dir() -> PathBuf {
-    Path::new("/tmp").join(format!("carff-{}", rustix::process::getuid().as_raw()))
 }
 
 /// Returns a run's id from its name and start time.

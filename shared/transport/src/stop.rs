@@ -1,6 +1,7 @@
 //! Ends the process in order: a stop that a signal triggers, and the rule for the times when nothing waits for one.
 
-use rustix::event::{PollFd, PollFlags};
+use rustix::event::{PollFd, PollFlags, poll};
+use rustix::io::retry_on_intr;
 use signal_hook::SigId;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 use signal_hook::{flag, low_level};
@@ -90,9 +91,9 @@ impl Stop {
     /// Ends the process with [`INTERRUPTED`] if it still runs `grace` after the stop: for work that looks at the stop
     /// seldom. `last` runs first.
     pub fn exit_after(&self, grace: Duration, last: impl FnOnce() + Send + 'static) -> std::io::Result<()> {
-        let waiter = crate::Waiter::new(self.clone());
+        let stop = self.clone();
         let watch = move || {
-            if matches!(waiter.wait(&[]), Ok(crate::Woken::Stopped)) {
+            if retry_on_intr(|| poll(&mut [stop.descriptor()], None)).is_ok() {
                 std::thread::sleep(grace);
                 last();
                 low_level::exit(i32::from(INTERRUPTED));

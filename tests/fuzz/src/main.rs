@@ -1,5 +1,5 @@
-//! Feeds the reader named by the variable `CARFF_READER` with whatever reaches new code in it. The variable
-//! `CARFF_SEEDS` names a folder that its examples are written to first. `make fuzz` calls this for every reader.
+//! Fuzzes the reader that the variable `CARFF_READER` names. The variable `CARFF_SEEDS` names a folder, to which the
+//! reader's examples are written first. `make fuzz` runs this program for every reader.
 
 #![no_main]
 

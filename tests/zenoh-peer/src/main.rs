@@ -1,16 +1,16 @@
 //! Sends and receives payloads by zenoh's shared memory, for `carff bench ipc`.
 //!
-//! `carff-zenoh-peer send FOLDER` starts the receiving process and does what its standard input says: `open BYTES`,
-//! answered by a dot; `run COUNT sleeping|busy PAUSE_US`, answered by the times, in nanoseconds, as 64-bit words;
-//! `end`. As with all that is compared, the time is from before the sender asks for memory to after the receiver has
-//! read the last byte, and the receiver acknowledges by a pipe, which is not part of the time.
+//! `carff-zenoh-peer send FOLDER` starts the receiving process and reads commands from standard input. It answers `open
+//! BYTES` with a dot, and `run COUNT sleeping|busy PAUSE_US` with the times (nanoseconds, u64). `end` ends it. As for
+//! the other transports, the time starts before the sender requests memory, and ends after the receiver has read the
+//! last byte. The receiver acknowledges through a pipe, which is not part of the time.
 //!
-//! The protocol is that of launch/bench/src/ipc, written again here: a library for both would tie this package's lock file
-//! to the main one, which it is apart from so that zenoh's crates are nobody's but its own.
+//! The protocol repeats that of launch/bench/src/ipc. A common library would tie this package's lock file to the main
+//! one, and the separate lock file keeps zenoh's crates out of the workspace.
 //!
-//! The two processes speak by a Unix socket in the folder and by shared memory; neither looks for others nor listens
-//! on a network. While the two spin, zenoh's own threads still sleep until the socket wakes them, and need a core then:
-//! so here one that spins offers its core after every look, without which zenoh takes milliseconds where cores are few.
+//! The two processes use a Unix socket in the folder and shared memory. They neither search for others nor listen on a
+//! network. zenoh's own threads sleep until the socket wakes them, and then need a core. A polling process therefore
+//! yields its core after every check: otherwise zenoh takes milliseconds on a machine with few cores.
 
 mod receiver;
 mod sender;
@@ -31,12 +31,12 @@ fn main() -> anyhow::Result<()> {
     }
 }
 
-/// How the receiver waits for a payload, and the sender for its acknowledgement.
+/// Way in which the receiver waits for a payload, and the sender for its acknowledgement.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Waiting {
-    /// It sleeps and is woken.
+    /// Sleeps until it is woken.
     Sleeping,
-    /// It spins, and lets others run between two looks.
+    /// Polls, and yields its core between two checks.
     Busy,
 }
 
@@ -45,7 +45,7 @@ impl Waiting {
         match word {
             "sleeping" => Ok(Self::Sleeping),
             "busy" => Ok(Self::Busy),
-            _ => bail!("no such way of waiting: {word}"),
+            _ => bail!("unknown way of waiting: {word}"),
         }
     }
 
@@ -57,16 +57,16 @@ impl Waiting {
     }
 }
 
-/// Which of the two ends opens a session.
+/// The end that opens a session.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum End {
-    /// It listens on the socket.
+    /// Listens on the socket.
     Receiver,
-    /// It connects, once the receiver listens.
+    /// Connects after the receiver listens.
     Sender,
 }
 
-/// A session with the other end alone, with shared memory on, and zenoh's transport that is made for short times.
+/// Opens a session with only the other end, with shared memory and zenoh's low-latency transport.
 fn session(folder: &Path, end: End) -> anyhow::Result<Session> {
     let socket = folder.join("zenoh.socket");
     let socket = socket.to_str().context("the folder's path is not UTF-8")?;
@@ -84,12 +84,12 @@ fn session(folder: &Path, end: End) -> anyhow::Result<Session> {
         ("connect/exit_on_failure", "true"),
         ("scouting/multicast/enabled", "false"),
         ("scouting/gossip/enabled", "false"),
-        // The two exclude each other.
+        // These two settings exclude each other.
         ("transport/unicast/qos/enabled", "false"),
         ("transport/unicast/lowlatency", "true"),
         ("transport/shared_memory/enabled", "true"),
         ("transport/shared_memory/mode", "\"init\""),
-        // Payloads lie in shared memory from the start: nothing is to be copied there behind our back.
+        // Payloads are in shared memory from the start, so that zenoh must not copy them there.
         ("transport/shared_memory/transport_optimization/enabled", "false"),
     ] {
         config.insert_json5(key, value).map_err(anyhow::Error::from_boxed).with_context(|| format!("setting {key}"))?;
@@ -97,12 +97,12 @@ fn session(folder: &Path, end: End) -> anyhow::Result<Session> {
     zenoh::open(config).wait().map_err(anyhow::Error::from_boxed).context("cannot open a zenoh session")
 }
 
-/// The key under which payloads of one size go.
+/// Returns the key of payloads of one size.
 fn key(bytes: usize) -> String {
     format!("carff/bench/payload/{bytes}")
 }
 
-/// The clock that all processes of a machine share, nanoseconds.
+/// Returns the time of the clock that all processes of a machine share, nanoseconds.
 fn monotonic_now_ns() -> u64 {
     let now = clock_gettime(ClockId::Monotonic);
     now.tv_sec as u64 * 1_000_000_000 + now.tv_nsec as u64

@@ -1,4 +1,4 @@
-//! The receiving process: does what its standard input says, answers on its standard output.
+//! The receiving process: takes commands from standard input, and answers on standard output.
 
 use crate::{End, Waiting, key, monotonic_now_ns, session};
 use anyhow::{Context, bail, ensure};
@@ -11,7 +11,7 @@ use zenoh::sample::Sample;
 
 type Samples = Subscriber<FifoChannelHandler<Sample>>;
 
-/// Runs until its standard input ends.
+/// Runs until standard input ends.
 pub(crate) fn run(folder: &Path) -> anyhow::Result<()> {
     let session = session(folder, End::Receiver)?;
     let mut opened: Option<(Samples, usize)> = None;
@@ -75,7 +75,7 @@ fn receive(samples: &Samples, waiting: Waiting) -> anyhow::Result<Sample> {
     }
 }
 
-/// Reads the whole payload, in the same way as for all that is compared; returns the time in its first bytes.
+/// Reads the whole payload in the same way as the other transports, and returns the time in its first bytes.
 fn read(payload: &[u8]) -> u64 {
     let words = payload.as_chunks().0.iter().map(|word| u64::from_le_bytes(*word));
     std::hint::black_box(words.clone().fold(0, u64::wrapping_add));
@@ -86,7 +86,7 @@ fn read(payload: &[u8]) -> u64 {
 mod tests {
     use super::*;
 
-    /// The time is that of the first eight bytes, lowest first, whatever follows; a payload too short has none.
+    /// The time is in the first eight bytes, little-endian. A shorter payload has no time.
     #[test]
     fn time_is_in_the_first_bytes() {
         let mut payload = vec![7; 27];

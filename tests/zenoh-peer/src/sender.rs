@@ -1,4 +1,4 @@
-//! The sending process: starts the other one, and tells it what to wait for.
+//! The sending process, which starts and controls the receiving process.
 
 use crate::{End, Waiting, key, monotonic_now_ns, session};
 use anyhow::{Context, bail, ensure};
@@ -14,14 +14,15 @@ use zenoh::qos::{CongestionControl, Reliability};
 use zenoh::shm::{GarbageCollect, PosixShmProviderBackend, ShmProvider, ShmProviderBuilder};
 use zenoh::{Session, Wait};
 
-/// Payloads that the shared memory has room for. One at a time is under way; zenoh takes memory back when all is used.
+/// Number of payloads that fit into the shared memory. One is in use at a time; zenoh frees memory only when all is
+/// used.
 const POOL: usize = 4;
-/// What the shared memory has at least, bytes.
+/// Minimum size of the shared memory, bytes.
 const SMALLEST_POOL: usize = 1 << 16;
-/// How long the two may take to find each other.
+/// Time limit for the connection.
 const PATIENCE: Duration = Duration::from_secs(10);
 
-/// Runs until its standard input ends.
+/// Runs until standard input ends.
 pub(crate) fn run(folder: &Path) -> anyhow::Result<()> {
     let mut receiver = Receiver::start(folder)?;
     let session = session(folder, End::Sender)?;
@@ -55,20 +56,20 @@ pub(crate) fn run(folder: &Path) -> anyhow::Result<()> {
     remove_leftovers()
 }
 
-/// Removes the names of the shared memory that this process still holds. When zenoh itself cleans up, at the end of the
-/// process, it takes this memory for being in use, and leaves it for the next program with zenoh.
+/// Removes the names of the shared memory that this process still holds. zenoh's own cleanup at the end of the process
+/// treats this memory as in use, and leaves it for the next program with zenoh.
 fn remove_leftovers() -> anyhow::Result<()> {
     for descriptor in std::fs::read_dir("/proc/self/fd")? {
         let Ok(path) = std::fs::read_link(descriptor?.path()) else { continue };
         if path.starts_with("/dev/shm") && path.extension().is_some_and(|e| e == "zenoh") {
-            // Removed already where two descriptors are of one file.
+            // It may be removed already, because two descriptors can refer to one file.
             let _ = std::fs::remove_file(&path);
         }
     }
     Ok(())
 }
 
-/// Sends so many payloads, each once the one before is acknowledged. Returns the times as the receiver gives them.
+/// Sends `count` payloads, each after the acknowledgement of the previous one. Returns the receiver's times unchanged.
 fn measure(
     opened: &mut Opened<'_>,
     receiver: &mut Receiver,
@@ -90,7 +91,7 @@ fn measure(
     Ok(times)
 }
 
-/// What sends payloads of one size.
+/// Sender of payloads of one size.
 struct Opened<'a> {
     publisher: Publisher<'a>,
     memory: ShmProvider<PosixShmProviderBackend>,
@@ -143,7 +144,7 @@ struct Receiver {
 }
 
 impl Receiver {
-    /// Starts it; it listens when this returns.
+    /// Starts the process, and returns when it listens.
     fn start(folder: &Path) -> anyhow::Result<Self> {
         let program = std::env::current_exe().context("cannot find this program")?;
         let mut child = Command::new(&program)
@@ -161,7 +162,7 @@ impl Receiver {
         Ok(receiver)
     }
 
-    /// Reads what the receiver says, as many bytes as there is room for.
+    /// Fills `bytes` with the receiver's answer.
     fn answer(&mut self, bytes: &mut [u8], waiting: Waiting) -> anyhow::Result<()> {
         let mut filled = 0;
         while filled < bytes.len() {
@@ -182,7 +183,7 @@ impl Receiver {
 
 impl Drop for Receiver {
     fn drop(&mut self) {
-        // It ends by itself when told; one that hangs does not.
+        // It ends on request, unless it hangs.
         let _ = writeln!(self.commands, "end");
         for _ in 0..100 {
             if !matches!(self.child.try_wait(), Ok(None)) {

@@ -1,4 +1,4 @@
-//! Payloads by iceoryx2 with nothing around it, with the limits of the camera's topic.
+//! Sends payloads through iceoryx2 without a wrapper, with the limits of the camera's topic.
 
 use super::{Receiver, Sender, Size, Waiting};
 use anyhow::Context;
@@ -12,14 +12,14 @@ use iceoryx2::prelude::{
 use iceoryx2::service::port_factory::{event, publish_subscribe};
 use std::path::Path;
 
-/// What the names of this run's files in shared memory begin with.
+/// Prefix of this run's files in shared memory.
 fn prefix(folder: &Path) -> String {
     let name = folder.file_name().unwrap_or_default().to_string_lossy();
     let letters: String = name.chars().filter(char::is_ascii_alphanumeric).take(16).collect();
     format!("carff-bench-{letters}_")
 }
 
-/// Removes what iceoryx2 leaves in shared memory when its last node is gone; both processes have ended.
+/// Removes the files that iceoryx2 leaves in shared memory after its last node, once both processes have ended.
 pub(crate) fn clean_up(folder: &Path) -> std::io::Result<()> {
     for entry in std::fs::read_dir(SHARED_MEMORY_DIR)? {
         let entry = entry?;
@@ -31,7 +31,7 @@ pub(crate) fn clean_up(folder: &Path) -> std::io::Result<()> {
 }
 
 struct Services {
-    pictures: publish_subscribe::PortFactory<ipc::Service, [u8], ()>,
+    images: publish_subscribe::PortFactory<ipc::Service, [u8], ()>,
     wake_ups: event::PortFactory<ipc::Service>,
     _node: Node<ipc::Service>,
 }
@@ -51,7 +51,7 @@ impl Services {
             .context("cannot create an iceoryx2 node")?;
         let service = ServiceName::new("payload").map_err(|e| anyhow::anyhow!("service name: {e:?}"))?;
         let limits = topics::FRAME.limits;
-        let pictures = node
+        let images = node
             .service_builder(&service)
             .publish_subscribe::<[u8]>()
             .max_subscribers(limits.max_subscribers)
@@ -65,7 +65,7 @@ impl Services {
             .context("cannot open the iceoryx2 service")?;
         let wake_ups =
             node.service_builder(&service).event().open_or_create().context("cannot open the iceoryx2 event")?;
-        Ok(Self { pictures, wake_ups, _node: node })
+        Ok(Self { images, wake_ups, _node: node })
     }
 }
 
@@ -80,7 +80,7 @@ impl BareSender {
         let services = Services::open(folder)?;
         Ok(Self {
             publisher: services
-                .pictures
+                .images
                 .publisher_builder()
                 .initial_max_slice_len(size.bytes())
                 .max_loaned_samples(topics::FRAME.limits.loaned)
@@ -95,7 +95,7 @@ impl BareSender {
 impl Sender for BareSender {
     fn send(&mut self, payload: &[u8], waiting: Waiting) -> anyhow::Result<()> {
         self.publisher.loan_slice_uninit(payload.len())?.write_from_slice(payload).send()?;
-        // Nobody listens where the receiver spins.
+        // A polling receiver has no listener.
         if waiting == Waiting::Sleeping {
             self.notifier.notify()?;
         }
@@ -113,7 +113,7 @@ impl BareReceiver {
     pub(crate) fn open(folder: &Path) -> anyhow::Result<Self> {
         let services = Services::open(folder)?;
         Ok(Self {
-            subscriber: services.pictures.subscriber_builder().create().context("no iceoryx2 subscriber")?,
+            subscriber: services.images.subscriber_builder().create().context("no iceoryx2 subscriber")?,
             listener: services.wake_ups.listener_builder().create().context("no iceoryx2 listener")?,
             _services: services,
         })

@@ -1,4 +1,4 @@
-//! The sending process: starts the other one, and tells it what to wait for.
+//! The sending process, which starts and controls the receiving process.
 
 use super::{Pair, Sender, Size, Transport, Waiting, times_us};
 use crate::helper::{PATIENCE, end_by};
@@ -12,7 +12,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
 use std::time::{Duration, Instant};
 
-/// A peer and the sender to it.
+/// A receiving process and the sender to it.
 pub(crate) struct Driver {
     transport: Transport,
     folder: PathBuf,
@@ -39,7 +39,7 @@ impl Driver {
         Ok(Self { transport, folder: folder.to_owned(), sender: None, payload: Vec::new(), child, commands, answers })
     }
 
-    /// Reads what the peer says, as many bytes as there is room for.
+    /// Fills `bytes` with the peer's answer.
     fn answer(&mut self, bytes: &mut [u8], waiting: Waiting) -> anyhow::Result<()> {
         let mut filled = 0;
         while filled < bytes.len() {

@@ -1,9 +1,9 @@
-//! From one process to another: this program's topics, bare iceoryx2, Unix sockets, zenoh.
+//! Measures payloads from one process to another: this program's topics, bare iceoryx2, Unix sockets, zenoh.
 //!
-//! A payload is written by one process and read by another. The time is from before the sender asks for memory to after
-//! the receiver has read the last byte, on the one monotonic clock. The receiver acknowledges by a pipe, the same for
-//! all, which is not part of the time; then the next payload goes out. zenoh's two processes are those of a program of
-//! its own; while they work, this one sleeps.
+//! One process writes a payload, and another reads it. The time starts before the sender requests memory. It ends after
+//! the receiver has read the last byte, on the same monotonic clock. The receiver then acknowledges through a pipe,
+//! which is not part of the time, and the next payload follows. zenoh's two processes belong to a separate program,
+//! during whose work this process sleeps.
 
 mod bare;
 mod driver;
@@ -20,46 +20,46 @@ pub(crate) use peer::peer;
 use std::path::{Path, PathBuf};
 use zenoh::ZenohPair;
 
-/// Payloads, bytes: in powers of two, brought to whole pixels.
+/// Sizes of the payloads, bytes: powers of two, rounded to whole pixels.
 const SIZES: [usize; 5] = [64, 1 << 10, 1 << 14, 1 << 18, 1 << 22];
-/// Turns that each transport takes at each size.
+/// Number of turns of each transport at each size.
 const TURNS: usize = 10;
 
-/// From one process to another: this program's topics, bare iceoryx2, Unix sockets, zenoh.
+/// Measure payloads between processes: this program's topics, bare iceoryx2, Unix sockets, zenoh.
 #[derive(Clone, Debug, clap::Args)]
 pub struct IpcArgs {
-    /// Payloads for each transport, size and way of waiting; a tenth of them at 256 KiB and more.
+    /// Number of payloads for each transport, size and way of waiting; a tenth of it from 256 KiB on.
     #[arg(long, default_value_t = 10_000)]
     messages: usize,
-    /// Pause between two payloads, microseconds: with a pause, cores go to sleep and must be woken.
+    /// Pause between two payloads, microseconds. In a pause, cores sleep and must be woken.
     #[arg(long, default_value_t = 0)]
     pause_us: u64,
-    /// A tenth of the payloads.
+    /// Send a tenth of the payloads.
     #[arg(long)]
     quick: bool,
-    /// The program with zenoh's two ends, which `make bench-peer` builds; when not given, `carff-zenoh-peer` beside
-    /// this program, and no zenoh if it is not there.
+    /// Program with zenoh's two ends, built by `make bench-peer`. Default: `carff-zenoh-peer` in this program's folder.
+    /// If the default does not exist, zenoh is left out.
     #[arg(long)]
     zenoh: Option<PathBuf>,
     #[command(flatten)]
     pub(crate) output: OutputArgs,
 }
 
-/// The other process of `ipc`.
+/// Runs the receiving process of `ipc`.
 #[derive(Clone, Debug, clap::Args)]
 pub struct PeerArgs {
-    /// By what payloads come.
+    /// Transport of the payloads.
     transport: Transport,
-    /// Folder that both processes know.
+    /// Folder that both processes use.
     folder: PathBuf,
 }
 
-/// By what payloads go.
+/// Transport of the payloads.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub(crate) enum Transport {
     /// This program's typed topics.
     Typed,
-    /// iceoryx2 with nothing around it.
+    /// iceoryx2 without a wrapper.
     Bare,
     /// A Unix stream socket.
     Unix,
@@ -84,7 +84,7 @@ impl Transport {
         }
     }
 
-    /// Opens the sender's end; the receiver's is open already.
+    /// Opens the sender's end after the receiver's.
     fn sender(self, folder: &Path, size: Size) -> anyhow::Result<Box<dyn Sender>> {
         Ok(match self {
             Self::Typed => Box::new(typed::TypedSender::open(folder, size)?),
@@ -102,12 +102,12 @@ impl Transport {
     }
 }
 
-/// How the receiver waits.
+/// Way in which the receiver waits.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Waiting {
-    /// It sleeps and is woken.
+    /// Sleeps until it is woken.
     Sleeping,
-    /// It spins.
+    /// Polls in a loop.
     Busy,
 }
 
@@ -122,7 +122,7 @@ impl Waiting {
     }
 }
 
-/// The size of a payload as a picture, so that a picture topic takes it.
+/// Size of a payload as an image, so that an image topic accepts it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Size {
     width_px: u32,
@@ -130,7 +130,7 @@ pub(crate) struct Size {
 }
 
 impl Size {
-    /// As near to so many bytes as whole pixels allow; of sizes that are equally near, the one closest to a square.
+    /// Returns the size that is nearest to a number of bytes; of equally near sizes, the one closest to a square.
     fn near(bytes: usize) -> Self {
         let pixels = bytes as f64 / 3.0;
         let square = pixels.sqrt().floor().max(1.0) as u32;
@@ -147,39 +147,39 @@ impl Size {
     }
 }
 
-/// Two processes and a way from one to the other.
+/// Two processes and the transport between them.
 trait Pair {
-    /// In keys of figures.
+    /// Returns the name in keys of figures.
     fn name(&self) -> &'static str;
 
-    /// In tables.
+    /// Returns the name in tables.
     fn title(&self) -> &'static str;
 
-    /// Opens both ends anew, for payloads of this size.
+    /// Reopens both ends for payloads of this size.
     fn open(&mut self, size: Size) -> anyhow::Result<()>;
 
-    /// Sends so many payloads, each once the one before is acknowledged. Returns the times, microseconds.
+    /// Sends `count` payloads, each after the acknowledgement of the previous one. Returns the times, microseconds.
     fn run(&mut self, count: usize, waiting: Waiting, pause_us: u64) -> anyhow::Result<Vec<f64>>;
 }
 
 /// The sender's end.
 pub(crate) trait Sender {
-    /// Writes the payload and sends it, waking a receiver that sleeps.
+    /// Writes and sends a payload, and wakes a sleeping receiver.
     fn send(&mut self, payload: &[u8], waiting: Waiting) -> anyhow::Result<()>;
 }
 
 /// The receiver's end.
 pub(crate) trait Receiver {
-    /// Gets ready to wait in this way, before anything is sent.
+    /// Prepares this way of waiting, before the first payload.
     fn prepare(&mut self, _waiting: Waiting) -> anyhow::Result<()> {
         Ok(())
     }
 
-    /// Waits for a payload and hands it out where it lies.
+    /// Waits for a payload, and lends it in place to `read`.
     fn receive(&mut self, waiting: Waiting, read: &mut dyn FnMut(&[u8])) -> anyhow::Result<()>;
 }
 
-/// What a receiver measured, in nanoseconds, eight bytes each, the lowest first: in microseconds.
+/// Converts a receiver's times (nanoseconds, u64, little-endian) to microseconds.
 fn times_us(bytes: &[u8]) -> Vec<f64> {
     bytes.as_chunks().0.iter().map(|ns| u64::from_le_bytes(*ns) as f64 / 1e3).collect()
 }
@@ -271,7 +271,7 @@ pub(crate) fn run(args: &IpcArgs) -> anyhow::Result<Report> {
     Ok(report)
 }
 
-/// What was measured at one size and way of waiting: times in microseconds, by transport and turn.
+/// Times at one size and way of waiting, microseconds, by transport and turn.
 struct Cell {
     size: Size,
     waiting: Waiting,
@@ -283,7 +283,7 @@ impl Cell {
         Times::new(self.turns[transport].concat())
     }
 
-    /// Against bare iceoryx2: by the medians of the turns.
+    /// Returns the ratio to bare iceoryx2 by the medians of the turns.
     fn ratio_to_bare(&self, transport: usize) -> Ratio {
         let medians =
             |i: usize| -> Vec<f64> { self.turns[i].iter().map(|turn| Times::new(turn.clone()).median()).collect() };
@@ -296,14 +296,14 @@ impl Cell {
 mod tests {
     use super::*;
 
-    /// Times come as whole nanoseconds, eight bytes each, and are told in microseconds.
+    /// Times arrive as whole nanoseconds of eight bytes, and are reported in microseconds.
     #[test]
     fn times_are_in_microseconds() {
         let bytes: Vec<u8> = [1_500_u64, 0, 1 << 40].iter().flat_map(|ns| ns.to_le_bytes()).collect();
         assert_eq!(times_us(&bytes), [1.5, 0.0, 1_099_511_627.776]);
     }
 
-    /// Payloads are near to what was asked for, and no picture is wider or higher than topics allow.
+    /// Payloads are near the requested size, and no image is wider or higher than topics allow.
     #[test]
     fn sizes_are_near() {
         for bytes in SIZES {

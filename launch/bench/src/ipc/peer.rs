@@ -1,4 +1,4 @@
-//! The receiving process: does what its standard input says, answers on its standard output.
+//! The receiving process: takes commands from standard input, and answers on standard output.
 
 use super::{PeerArgs, Receiver, Size, Waiting};
 use anyhow::{Context, bail};
@@ -6,7 +6,7 @@ use carff_transport::monotonic_now_ns;
 use rustix::process::{Signal, set_parent_process_death_signal};
 use std::io::{BufRead, Write};
 
-/// Runs until its standard input ends.
+/// Runs until standard input ends.
 pub(crate) fn peer(args: &PeerArgs) -> anyhow::Result<()> {
     set_parent_process_death_signal(Some(Signal::KILL)).context("cannot watch the parent process")?;
     let mut receiver: Option<Box<dyn Receiver>> = None;
@@ -47,7 +47,7 @@ pub(crate) fn peer(args: &PeerArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Reads the whole payload; returns the time in its first bytes.
+/// Reads the whole payload, and returns the time in its first bytes.
 fn read(payload: &[u8]) -> u64 {
     let words = payload.as_chunks().0.iter().map(|word| u64::from_le_bytes(*word));
     std::hint::black_box(words.clone().fold(0, u64::wrapping_add));

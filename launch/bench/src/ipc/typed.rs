@@ -1,4 +1,4 @@
-//! Payloads by this program's typed topics: the camera's.
+//! Sends payloads through this program's typed topics, as images of the camera.
 
 use super::{Receiver, Sender, Size, Waiting};
 use anyhow::Context;
@@ -6,14 +6,14 @@ use carff_messages::{DatasetView, FrameMeta, Header, Intrinsics};
 use carff_transport::{Image, Node, Publisher, Run, Stop, Waiter, monotonic_now_ns, remove_run_leftovers, topics};
 use std::path::Path;
 
-/// The run that both processes join, named after the folder that they share.
+/// Returns the run of both processes, named after their common folder.
 fn run_of(folder: &Path) -> anyhow::Result<Run> {
     let name = folder.file_name().unwrap_or_default().to_string_lossy();
     let letters: String = name.chars().filter(char::is_ascii_alphanumeric).take(16).collect();
     Ok(Run::new(&format!("bench-{letters}"), 1)?)
 }
 
-/// Removes what the run leaves behind; all its processes have ended.
+/// Removes the leftovers of the run, once all its processes have ended.
 pub(crate) fn clean_up(folder: &Path) -> anyhow::Result<()> {
     Ok(remove_run_leftovers(&run_of(folder)?)?)
 }
@@ -78,8 +78,8 @@ impl Receiver for TypedReceiver {
     fn receive(&mut self, _waiting: Waiting, read: &mut dyn FnMut(&[u8])) -> anyhow::Result<()> {
         let receiver = self.receiver.as_mut().context("no receiver is open")?;
         self.waiter.wait(&[receiver])?;
-        let picture = receiver.newest()?.context("a payload was not valid")?;
-        read(picture.bytes());
+        let image = receiver.newest()?.context("a payload was not valid")?;
+        read(image.bytes());
         Ok(())
     }
 }

@@ -1,4 +1,4 @@
-//! Payloads by a Unix stream socket.
+//! Sends payloads through a Unix stream socket.
 
 use super::{Receiver, Sender, Size, Waiting};
 use anyhow::Context;
@@ -38,7 +38,7 @@ pub(crate) struct UnixReceiver {
 impl UnixReceiver {
     pub(crate) fn open(folder: &Path, size: Size) -> anyhow::Result<Self> {
         let path = socket(folder);
-        // One of another size was here before.
+        // The socket of another size may exist.
         let _ = std::fs::remove_file(&path);
         let listener = UnixListener::bind(&path).with_context(|| format!("cannot listen on {}", path.display()))?;
         Ok(Self { listener, stream: None, buffer: vec![0; size.bytes()] })
@@ -55,7 +55,7 @@ impl Receiver for UnixReceiver {
         let mut filled = 0;
         while filled < self.buffer.len() {
             match stream.read(&mut self.buffer[filled..]) {
-                Ok(0) => anyhow::bail!("the sender has gone"),
+                Ok(0) => anyhow::bail!("the sender has ended"),
                 Ok(n) => filled += n,
                 Err(e) if e.kind() == ErrorKind::WouldBlock => std::hint::spin_loop(),
                 Err(e) if e.kind() == ErrorKind::Interrupted => {}

@@ -1,6 +1,6 @@
-//! Payloads by zenoh, with its shared memory on: the two ends are a program of their own, tests/zenoh-peer.
+//! Measures zenoh with shared memory through the program `tests/zenoh-peer`.
 //!
-//! So none of zenoh's crates is one of this program's.
+//! The separate program keeps zenoh's crates out of this one.
 
 use super::{Pair, Size, Waiting, times_us};
 use crate::helper::{PATIENCE, end_by};
@@ -10,24 +10,24 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
 use std::time::Instant;
 
-/// What the program is called.
+/// Name of the program.
 const PROGRAM: &str = "carff-zenoh-peer";
 
-/// The program: the one that was asked for, or the one beside this program. Where there is none, says so.
+/// Returns the requested program, or the one in this program's folder. Prints a line if the latter does not exist.
 pub(crate) fn program(asked: Option<&Path>) -> anyhow::Result<Option<PathBuf>> {
     if let Some(path) = asked {
-        ensure!(path.is_file(), "{} is not there: `make bench-peer` builds it", path.display());
+        ensure!(path.is_file(), "{} does not exist; build it with `make bench-peer`", path.display());
         return Ok(Some(path.to_owned()));
     }
-    let beside = std::env::current_exe().context("cannot find this program")?.with_file_name(PROGRAM);
-    if beside.is_file() {
-        return Ok(Some(beside));
+    let default = std::env::current_exe().context("cannot find this program")?.with_file_name(PROGRAM);
+    if default.is_file() {
+        return Ok(Some(default));
     }
-    println!("zenoh is left out: {} is not there; `make bench-peer` builds it\n", beside.display());
+    println!("zenoh is left out: {} does not exist; build it with `make bench-peer`\n", default.display());
     Ok(None)
 }
 
-/// The sending process, which starts the receiving one.
+/// The sending process, which starts the receiving process.
 pub(crate) struct ZenohPair {
     child: Child,
     commands: ChildStdin,
@@ -48,7 +48,7 @@ impl ZenohPair {
         Ok(Self { child, commands, answers })
     }
 
-    /// Has the sender do something, and sleeps until it has answered with so many bytes.
+    /// Sends a command to the sender, and sleeps until its answer is complete.
     fn ask(&mut self, command: &str, answer: &mut [u8]) -> anyhow::Result<()> {
         let asked = writeln!(self.commands, "{command}").and_then(|()| self.answers.read_exact(answer));
         match asked {
@@ -91,7 +91,7 @@ impl Drop for ZenohPair {
 mod tests {
     use super::*;
 
-    /// A program that was asked for must be there; the error says how to build it. None asked for, none beside: none.
+    /// A requested program must exist: the error names the command that builds it. The default program may be missing.
     #[test]
     fn program_is_found_or_left_out() {
         let folder = tempfile::tempdir().unwrap();
@@ -102,7 +102,7 @@ mod tests {
         assert_eq!(program(None).unwrap(), None);
     }
 
-    /// A program that ends at once is an error that says so, whichever of the two pipes notices first.
+    /// A program that ends at once is reported as ended, no matter which of the two pipes detects it first.
     #[test]
     fn an_ended_program_is_an_error() {
         let folder = tempfile::tempdir().unwrap();

@@ -2,8 +2,8 @@
 //!
 //! The same latent-conditioned hash grid and networks as [`carff_field::Field`], built from its tensors, with gradients
 //! by automatic differentiation. It does no operation that is not needed: the latent's share is folded into the first
-//! layers' biases, and all levels of the grid are gathered at once. Parity tests compare the native kernels with it, and
-//! the benchmarks measure both.
+//! layers' biases, and all levels of the grid are gathered at once. Parity tests compare the native kernels with it,
+//! and the benchmarks measure both.
 //!
 //! Shapes: N points or samples, R rays. All tensors are on the processor.
 
@@ -128,15 +128,16 @@ impl ReferenceField {
         self.activate(&self.geometry(points_m, None, latent))
     }
 
-    /// Computes density `[N]` and colour `[N, 3]` (0..=1) at `points_m` `[N, 3]` for unit viewing `directions` `[N, 3]`.
+    /// Computes density `[N]` and colour `[N, 3]` (0..=1) at `points_m` `[N, 3]` for unit viewing `directions` `[N,
+    /// 3]`.
     pub fn density_and_color(&self, points_m: &Tensor, directions: &Tensor, latent: &Tensor) -> (Tensor, Tensor) {
         let geometry = self.geometry(points_m, None, latent);
         let harmonics = spherical_harmonics(directions, self.config.direction_degree);
         (self.activate(&geometry), self.color(&geometry, &harmonics, latent))
     }
 
-    /// Computes the density network's outputs `[N, 1 + geometry features]`, raw density first, in the networks' arithmetic.
-    /// Points are `widths_m` `[N]` wide; without them, as wide as in the configuration.
+    /// Computes the density network's outputs `[N, 1 + geometry features]`, raw density first, in the networks'
+    /// arithmetic. Points are `widths_m` `[N]` wide; without them, as wide as in the configuration.
     pub(crate) fn geometry(&self, points_m: &Tensor, widths_m: Option<&Tensor>, latent: &Tensor) -> Tensor {
         let features = self.encoding.features(&self.table, points_m, widths_m).to_kind(self.precision.kind());
         let hidden = self.density[0].forward_with(&features, &self.normalized(latent)).relu();

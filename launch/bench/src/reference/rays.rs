@@ -106,8 +106,8 @@ impl ReferenceField {
         beyond.index_add(0, &samples.ray, &(color * weight.unsqueeze(1)))
     }
 
-    /// Renders pixels `[R, 3]` without gradients, `chunk` samples at a time. Samples of weight `min_weight` or less take the
-    /// mean colour of their ray's other samples (the heaviest sample always has its own colour).
+    /// Renders pixels `[R, 3]` without gradients, `chunk` samples at a time. Samples of weight `min_weight` or less
+    /// take the mean colour of their ray's other samples (the heaviest sample always has its own colour).
     pub fn render(&self, rays: &Rays, samples: &Samples, latent: &Tensor, min_weight: f64, chunk: i64) -> Tensor {
         let chunks = |count: i64| (0..count).step_by(chunk.max(1) as usize).map(move |at| (at, chunk.min(count - at)));
         tch::no_grad(|| {

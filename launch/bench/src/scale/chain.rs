@@ -1,8 +1,8 @@
-//! A chain of processes that hand a picture on: what each further stage costs the transport.
+//! Measures the transport's cost per stage with a chain of processes that pass an image on.
 //!
-//! One chain of the greatest length runs. Each relay takes a picture out of one run's frame topic, reads it, and writes
-//! it into the next run's, or into the run that leads back, when the picture says that the chain ends there. So all
-//! lengths are measured with the same processes, in turns, and none is woken that has nothing to do.
+//! Only the longest chain runs. Each relay reads an image from the frame topic of one run. It writes the image to the
+//! next run, or to the run that leads back if the image's chain ends there. The same processes therefore measure all
+//! lengths alternately, and no relay is woken without work.
 
 use super::{Axis, Law, Row};
 use crate::helper::{Helper, end_with_parent, say_ready};
@@ -13,52 +13,52 @@ use carff_transport::{
     Image, Node, Publisher, Receiver, Run, Stop, Waiter, Woken, monotonic_now_ns, remove_run_leftovers, topics,
 };
 
-/// Relays of the longest chain.
+/// Number of relays of the longest chain.
 const MOST_RELAYS: usize = 8;
-/// Side of the picture, pixels: that of the shipped data set.
+/// Side of the image, pixels: that of the shipped dataset.
 const SIDE_PX: u32 = 128;
-const PICTURE_BYTES: usize = (SIDE_PX * SIDE_PX * 3) as usize;
-/// Pictures of a turn of one length.
-const PICTURES_A_TURN: usize = 50;
-/// How long a picture is waited for.
+const IMAGE_BYTES: usize = (SIDE_PX * SIDE_PX * 3) as usize;
+/// Number of images in a turn of one length.
+const IMAGES_PER_TURN: usize = 50;
+/// Time limit for an image.
 const PATIENCE_NS: u64 = 5_000_000_000;
-/// All runs of a chain have this id: they differ in their names.
+/// Id of all runs of a chain, which differ in their names.
 const RUN_ID: u64 = 1;
 
-/// A process of `scale`'s chain of stages.
+/// Arguments of a relay process.
 #[derive(Clone, Debug, clap::Args)]
 pub struct RelayArgs {
-    /// The chain's name.
+    /// Name of the chain.
     chain: String,
     /// Place in the chain, from 1.
     place: usize,
-    /// Relays of the chain.
+    /// Number of relays of the chain.
     length: usize,
 }
 
-/// The run that leads into the relay at a place.
+/// Returns the run that leads into the relay at a place.
 fn run_into(chain: &str, place: usize) -> anyhow::Result<Run> {
     Ok(Run::new(&format!("{chain}-h{place}"), RUN_ID)?)
 }
 
-/// The run that leads back from the relay at a place.
+/// Returns the run that leads back from the relay at a place.
 fn run_back(chain: &str, place: usize) -> anyhow::Result<Run> {
     Ok(Run::new(&format!("{chain}-b{place}"), RUN_ID)?)
 }
 
-/// Where a relay sends a picture.
+/// Destination of a relay's image.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum To {
     Next,
     Back,
 }
 
-/// Where the relay at `place` sends a picture that shall pass `relays` of them. There is nothing behind the last one.
+/// Returns the destination of the relay at `place` for an image that must pass `relays` relays, at most all of them.
 fn route(place: usize, length: usize, relays: u64) -> To {
     if place as u64 >= relays || place >= length { To::Back } else { To::Next }
 }
 
-/// A publisher and its node, which it must not outlive.
+/// A publisher and its node. The node must outlive it.
 struct Output {
     publisher: Publisher<Image<FrameMeta>>,
     _node: Node,
@@ -67,7 +67,7 @@ struct Output {
 impl Output {
     fn open(run: &Run) -> anyhow::Result<Self> {
         let node = Node::open(run, "sender")?;
-        Ok(Self { publisher: node.image_publisher(&topics::FRAME, PICTURE_BYTES)?, _node: node })
+        Ok(Self { publisher: node.image_publisher(&topics::FRAME, IMAGE_BYTES)?, _node: node })
     }
 
     fn send(&mut self, bytes: &[u8], meta: FrameMeta) -> anyhow::Result<()> {
@@ -90,7 +90,7 @@ impl Incoming {
     }
 }
 
-/// The relay's process: hands pictures on until it is told to end.
+/// Passes images on until standard input ends.
 pub(crate) fn relay(args: &RelayArgs) -> anyhow::Result<()> {
     end_with_parent()?;
     let waiter = Waiter::new(Stop::on_signals()?);
@@ -100,26 +100,26 @@ pub(crate) fn relay(args: &RelayArgs) -> anyhow::Result<()> {
         if args.place < args.length { Some(Output::open(&run_into(&args.chain, args.place + 1)?)?) } else { None };
     say_ready()?;
     while waiter.wait(&[&input.receiver])? != Woken::Stopped {
-        while let Some(picture) = input.receiver.next()? {
-            let meta = *picture;
+        while let Some(image) = input.receiver.next()? {
+            let meta = *image;
             let output = match (route(args.place, args.length, meta.header.seed), &mut next) {
                 (To::Next, Some(next)) => next,
                 _ => &mut back,
             };
-            output.send(picture.bytes(), meta)?;
+            output.send(image.bytes(), meta)?;
         }
     }
     Ok(())
 }
 
-/// Where pictures go in, and where they come back from each place. Dropping it removes all runs.
+/// The sending end of a chain, and the ends that lead back from each place. Dropping removes all runs.
 struct Chain {
     name: String,
     // Dropped first: all ports of this process, then the relays, then the runs' files.
     ports: Option<(Output, Vec<Incoming>)>,
     relays: Vec<Helper>,
     waiter: Waiter,
-    picture: Vec<u8>,
+    image: Vec<u8>,
     sent: u64,
 }
 
@@ -130,7 +130,7 @@ impl Chain {
             ports: None,
             relays: Vec::new(),
             waiter: Waiter::new(Stop::on_signals()?),
-            picture: (0..PICTURE_BYTES).map(|i| (i * 31) as u8).collect(),
+            image: (0..IMAGE_BYTES).map(|i| (i * 31) as u8).collect(),
             sent: 0,
         };
         for place in 1..=length {
@@ -146,7 +146,7 @@ impl Chain {
         Ok(chain)
     }
 
-    /// Sends a picture through so many relays; returns the milliseconds from before it is written to after it is read.
+    /// Sends an image through `relays` relays. Returns the time from before its writing to after its reading, ms.
     fn pass(&mut self, relays: usize) -> anyhow::Result<f64> {
         let (output, back) = self.ports.as_mut().context("the chain is not open")?;
         let back = &mut back.get_mut(relays - 1).context("the chain is shorter than that")?.receiver;
@@ -159,17 +159,17 @@ impl Chain {
             dataset_view: DatasetView::UNKNOWN,
             ..FrameMeta::default()
         };
-        output.send(&self.picture, meta)?;
+        output.send(&self.image, meta)?;
         let woken = self.waiter.wait_until(&[&*back], started_ns + PATIENCE_NS)?;
         ensure!(woken != Woken::Stopped, "interrupted");
-        let picture = back.newest()?.with_context(|| format!("a picture was lost on its way past {relays} relays"))?;
-        ensure!(picture.header.frame_id == self.sent, "a picture came back late");
-        std::hint::black_box(picture.bytes().iter().fold(0_u64, |sum, byte| sum + u64::from(*byte)));
+        let image = back.newest()?.with_context(|| format!("an image was lost on its way past {relays} relays"))?;
+        ensure!(image.header.frame_id == self.sent, "an image came back late");
+        std::hint::black_box(image.bytes().iter().fold(0_u64, |sum, byte| sum + u64::from(*byte)));
         self.sent += 1;
         Ok((monotonic_now_ns() - started_ns) as f64 / 1e6)
     }
 
-    /// Processor time that the first relays have used.
+    /// Returns the processor time of the first relays, seconds.
     fn cpu_seconds(&self, relays: usize) -> f64 {
         self.relays.iter().take(relays).map(Helper::cpu_seconds).sum()
     }
@@ -182,7 +182,7 @@ impl Drop for Chain {
         self.relays.clear();
         for place in 1..=length {
             for run in [run_into(&self.name, place), run_back(&self.name, place)].into_iter().flatten() {
-                // What cannot be removed now is removed by the next run of this name.
+                // The next run of this name removes the rest.
                 let _ = remove_run_leftovers(&run);
             }
         }
@@ -196,7 +196,7 @@ struct Passed {
     cpu_s: f64,
 }
 
-/// Measures all lengths in turns, every second round backwards.
+/// Measures all lengths alternately, every second round backwards.
 pub(crate) fn measure(quick: bool) -> anyhow::Result<Axis> {
     let rounds = if quick { 4 } else { 40 };
     let mut chain = Chain::start(MOST_RELAYS)?;
@@ -206,7 +206,7 @@ pub(crate) fn measure(quick: bool) -> anyhow::Result<Axis> {
         for i in 0..MOST_RELAYS {
             let i = if round % 2 == 0 { i } else { MOST_RELAYS - 1 - i };
             let before_s = chain.cpu_seconds(i + 1);
-            let times = (0..PICTURES_A_TURN).map(|_| chain.pass(i + 1)).collect::<anyhow::Result<Vec<_>>>()?;
+            let times = (0..IMAGES_PER_TURN).map(|_| chain.pass(i + 1)).collect::<anyhow::Result<Vec<_>>>()?;
             if round > 0 {
                 passed[i].cpu_s += chain.cpu_seconds(i + 1) - before_s;
                 passed[i].milliseconds.extend(times);
@@ -220,7 +220,7 @@ pub(crate) fn measure(quick: bool) -> anyhow::Result<Axis> {
         each: "relay",
         law: Law::Linear,
         cost_key: "cpu_ms",
-        cost_label: "CPU of the relays (ms a picture)",
+        cost_label: "CPU of the relays (ms per image)",
         rows: passed
             .into_iter()
             .enumerate()
@@ -237,23 +237,23 @@ mod tests {
     use super::*;
     use std::collections::HashSet;
 
-    /// A picture that shall pass so many relays of a chain passes just these, in order, and comes back from the last;
-    /// one that asks for more than there are comes back from the end.
+    /// An image passes exactly the requested relays of a chain in order, and comes back from the last one. If more
+    /// relays are requested than exist, it comes back from the end.
     #[test]
-    fn pictures_pass_as_many_relays_as_asked() {
+    fn images_pass_the_requested_relays() {
         for length in 1..=MOST_RELAYS {
             for relays in 1..=MOST_RELAYS + 2 {
                 let mut place = 1;
                 while route(place, length, relays as u64) == To::Next {
                     place += 1;
-                    assert!(place <= length, "nothing is behind the last relay");
+                    assert!(place <= length, "the image goes past the last relay");
                 }
                 assert_eq!(place, relays.min(length));
             }
         }
     }
 
-    /// All runs of a chain have names of their own, short enough for the largest process id.
+    /// All runs of a chain have different names, short enough for the largest process id.
     #[test]
     fn each_hop_has_its_own_run() {
         let chain = format!("bench-{}", 1 << 22);

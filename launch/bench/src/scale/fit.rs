@@ -1,8 +1,8 @@
-//! How a cost grows: a straight line or a power, by least squares.
+//! Fits the growth of a cost as a straight line or a power, by least squares.
 
 use crate::report::number;
 
-/// The shape of a growth.
+/// Shape of a growth.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Law {
     /// y = base + rate x.
@@ -17,18 +17,18 @@ pub(crate) enum Law {
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Fit {
     pub(crate) law: Law,
-    /// y at x = 0, of a power at x = 1.
+    /// y at x = 0; for a power, at x = 1.
     pub(crate) base: f64,
-    /// Slope, of a power the exponent.
+    /// Slope; for a power, the exponent.
     pub(crate) rate: f64,
-    /// Share of the variance that it explains, 0..=1, of logarithms where it is a power; NaN when there is none, and of
-    /// less than three points, through which any line goes.
+    /// Explained share of the variance (for a power, of the logarithms), 0..=1. NaN without variance, and for fewer
+    /// than three points, which any line fits.
     pub(crate) r_squared: f64,
 }
 
 impl Fit {
-    /// Fits points `(x, y)`. Those that are not finite, or for a power not positive, are left out. `None` when fewer
-    /// than two different x remain.
+    /// Fits points `(x, y)`. Points that are not finite, or for a power not positive, are left out. Returns `None` if
+    /// fewer than two different x remain.
     pub(crate) fn new(law: Law, points: &[(f64, f64)]) -> Option<Self> {
         let straight = |(x, y): (f64, f64)| match law {
             Law::Linear => (x, y),
@@ -42,7 +42,7 @@ impl Fit {
         let (mean_x, mean_y) = (mean(&|p| p.0), mean(&|p| p.1));
         let (xx, yy) = (mean(&|p| (p.0 - mean_x).powi(2)), mean(&|p| (p.1 - mean_y).powi(2)));
         let xy = mean(&|p| (p.0 - mean_x) * (p.1 - mean_y));
-        // Of no points, it is NaN.
+        // NaN without points.
         if xx.is_nan() || xx <= 1e-12 * mean_x.powi(2).max(1e-12) {
             return None;
         }
@@ -53,7 +53,7 @@ impl Fit {
         Some(Self { law, base, rate, r_squared })
     }
 
-    /// The fitted y.
+    /// Returns the fitted y.
     pub(crate) fn at(&self, x: f64) -> f64 {
         match self.law {
             Law::Linear => self.base + self.rate * x,
@@ -62,7 +62,7 @@ impl Fit {
         }
     }
 
-    /// The formula in words: `unit` is that of y, `each` what x counts, for example "sample".
+    /// Returns the formula as text: `unit` is that of y, `each` that of x, for example "sample".
     pub(crate) fn sentence(&self, unit: &str, each: &str) -> String {
         let r_squared = number(self.r_squared);
         match self.law {
@@ -77,7 +77,7 @@ impl Fit {
     }
 }
 
-/// Two digits that matter, however small: a slope may be far below one.
+/// Formats a number with two significant digits: a slope may be far below one.
 fn precise(value: f64) -> String {
     if (0.1..100.0).contains(&value) || value == 0.0 { number(value) } else { format!("{value:.1e}") }
 }
@@ -90,7 +90,7 @@ mod tests {
         (a - b).abs() < 1e-9 * b.abs().max(1.0)
     }
 
-    /// Points on a line, and on a power, are found as they are, whatever lies outside of what can be fitted.
+    /// Points on a line or a power are fitted exactly, and points that cannot be fitted are ignored.
     #[test]
     fn exact_points_are_fitted_exactly() {
         let line: Vec<(f64, f64)> = [1.0, 2.0, 5.0, 50.0].map(|x| (x, 20.0 + 0.3 * x)).to_vec();
@@ -114,7 +114,7 @@ mod tests {
         assert!(near(fit.base, 1.5) && near(fit.rate, 0.5) && near(fit.r_squared, 0.25), "{fit:?}");
     }
 
-    /// One x alone, or no point, has no growth; equal values have a slope of none.
+    /// A single x, or no point, has no growth. Equal values have a slope of zero.
     #[test]
     fn no_growth() {
         for law in [Law::Linear, Law::Area, Law::Power] {
@@ -124,11 +124,11 @@ mod tests {
             let flat = Fit::new(law, &[(1.0, 2.0), (4.0, 2.0)]).unwrap();
             assert_eq!(flat.rate, 0.0);
             assert!(flat.r_squared.is_nan());
-            assert!(Fit::new(law, &[(1.0, 2.0), (4.0, 3.0)]).unwrap().r_squared.is_nan(), "two points say nothing");
+            assert!(Fit::new(law, &[(1.0, 2.0), (4.0, 3.0)]).unwrap().r_squared.is_nan(), "any line fits two points");
         }
     }
 
-    /// Formulas are written with their signs and enough digits.
+    /// Formulas have their signs and enough digits.
     #[test]
     fn formulas_are_readable() {
         let fit = |law, base, rate| Fit { law, base, rate, r_squared: 0.991 };

@@ -1,9 +1,9 @@
-//! Axes that functions of the library show: side of a rendered view, places that are probed. One thread, as the
-//! stages run them by default.
+//! Axes that are measured on library functions: side of a rendered view, and number of probed places. They run on one
+//! thread, as in the stages by default.
 
 use super::{Axis, Law, Row};
 use crate::field::birds_eye;
-use crate::stats::{Contender, Times, in_turns, timed};
+use crate::stats::{Contender, Times, alternate, timed};
 use anyhow::ensure;
 use carff_checkpoint::{FieldProbe, Manifest, PreparedField, load_field_probe};
 use carff_decision::{Calibration, Draw, Mixture, Place, ProbeLayout};
@@ -14,20 +14,20 @@ use std::path::Path;
 
 const SIDES_PX: [u32; 7] = [32, 48, 64, 96, 128, 192, 256];
 const SIDES_PX_QUICK: [u32; 4] = [32, 64, 128, 256];
-/// Numbers of places; messages carry up to 48, the library any number.
+/// Numbers of places. A message has at most 48; the library has no limit.
 const PLACES: [u32; 8] = [1, 2, 4, 8, 16, 24, 32, 64];
 const PLACES_QUICK: [u32; 4] = [1, 8, 32, 64];
-/// Hypotheses that are probed: the default number of samples.
+/// Number of probed hypotheses: the default number of samples.
 const HYPOTHESES: usize = 10;
-/// Repeated places are moved by this, metres, so that no point is the same as another.
+/// Shift of repeated places, metres, so that all points differ.
 const SHIFT_M: f64 = 0.31;
 
-/// Time of rendering over the side of a view.
+/// Measures the time of rendering over the side of a view.
 pub(crate) fn views(checkpoint: &Path, quick: bool) -> anyhow::Result<Axis> {
     let manifest = Manifest::load(checkpoint)?;
     let field = carff_checkpoint::load_field(checkpoint, &manifest)?;
     let states: Vec<[f32; LATENT_DIM]> = manifest.states.iter().map(|s| s.mean).collect();
-    ensure!(!states.is_empty(), "checkpoint {}: it knows no states", checkpoint.display());
+    ensure!(!states.is_empty(), "checkpoint {} has no states", checkpoint.display());
     let (sides, rounds): (&[u32], _) = if quick { (&SIDES_PX_QUICK, 2) } else { (&SIDES_PX, 40) };
     let options = RenderOptions { threads: 1, ..RenderOptions::default() };
     let rows = measured(sides, rounds, |side_px| {
@@ -46,16 +46,16 @@ pub(crate) fn views(checkpoint: &Path, quick: bool) -> anyhow::Result<Axis> {
         each: "px",
         law: Law::Power,
         cost_key: "cpu_ms",
-        cost_label: "CPU (ms a view)",
+        cost_label: "CPU (ms per view)",
         rows,
     })
 }
 
-/// Time of probing over the number of places.
+/// Measures the time of probing over the number of places.
 pub(crate) fn candidates(checkpoint: &Path, quick: bool) -> anyhow::Result<Axis> {
     let manifest = Manifest::load(checkpoint)?;
     let mut base = load_field_probe(checkpoint, &manifest)?;
-    ensure!(!manifest.states.is_empty(), "checkpoint {}: it knows no states", checkpoint.display());
+    ensure!(!manifest.states.is_empty(), "checkpoint {} has no states", checkpoint.display());
     let seen: Vec<Vec<f32>> = manifest.states.iter().map(|s| base.probe(&s.mean).occupancies).collect();
     let (counts, rounds): (&[u32], _) = if quick { (&PLACES_QUICK, 20) } else { (&PLACES, 200) };
     let latents: Vec<[f32; LATENT_DIM]> =
@@ -63,7 +63,7 @@ pub(crate) fn candidates(checkpoint: &Path, quick: bool) -> anyhow::Result<Axis>
     let mut rows = measured(counts, rounds, |count| {
         let places = repeated(base.layout().places(), count as usize);
         let layout = ProbeLayout::new(places, base.layout().hazard_states().to_vec())?;
-        // What was seen at the places that are repeated; how well it fits is of no matter for speed.
+        // The occupancies of the repeated places; their fit does not affect the speed.
         let seen: Vec<Vec<f32>> =
             seen.iter().map(|row| row.iter().copied().cycle().take(count as usize).collect()).collect();
         let calibration = Calibration::fit(&layout, &seen)?;
@@ -87,12 +87,12 @@ pub(crate) fn candidates(checkpoint: &Path, quick: bool) -> anyhow::Result<Axis>
         each: "place",
         law: Law::Linear,
         cost_key: "cpu_ms",
-        cost_label: "CPU (ms a step)",
+        cost_label: "CPU (ms per step)",
         rows,
     })
 }
 
-/// As many places as asked for: the given ones over and over, moved a little each time.
+/// Returns `count` places: the given ones repeatedly, with a shift per repetition.
 fn repeated(places: &[Place], count: usize) -> Vec<Place> {
     let moved = |i: usize, place: &Place| {
         let mut place = place.clone();
@@ -102,7 +102,7 @@ fn repeated(places: &[Place], count: usize) -> Vec<Place> {
     places.iter().cycle().take(count).enumerate().map(|(i, place)| moved(i, place)).collect()
 }
 
-/// Measures an action for each value, in turns: wall-clock time, and processor time of the whole process.
+/// Measures an action for all values alternately: wall-clock time, and processor time of the whole process.
 fn measured<A: FnMut()>(
     values: &[u32],
     rounds: usize,
@@ -119,7 +119,7 @@ fn measured<A: FnMut()>(
             seconds
         }));
     }
-    let seconds = in_turns(rounds, &mut contenders);
+    let seconds = alternate(rounds, &mut contenders);
     drop(contenders);
     let milliseconds = |seconds: Vec<f64>| Times::new(seconds.iter().map(|s| s * 1e3).collect());
     Ok(values
@@ -141,7 +141,7 @@ mod tests {
     use super::*;
     use carff_base::geometry::OrientedBox;
 
-    /// Any number of places: the given ones first, then the same at another place each time.
+    /// Any number of places is possible: first the given ones, then shifted copies.
     #[test]
     fn places_are_repeated_but_never_the_same() {
         let place = |x: f64| Place {
@@ -159,7 +159,7 @@ mod tests {
         }
     }
 
-    /// Each value is measured as often as there are rounds, in its order, and both clocks run.
+    /// Each value is measured once per round, in order, and both clocks run.
     #[test]
     fn every_value_is_measured() {
         let rows = measured(&[3, 5], 4, |count| {

@@ -1,8 +1,7 @@
-//! How cost grows: with samples, horizon, resolution, candidates, stages and probes.
+//! Measures the growth of cost with samples, horizon, resolution, candidates, stages and probes.
 //!
-//! What a whole graph shows is measured on one, with all stages live; what a function of the library shows, on the
-//! function; what the transport shows, on a chain of processes. The values of an axis are measured in turns. Each axis
-//! gives a table, a fitted growth, figures and a plot.
+//! Each axis is measured on a running graph, on a library function, or on a chain of processes. The values of an axis
+//! are measured alternately. Each axis has a table, a fitted growth, figures and a plot.
 
 mod chain;
 mod fit;
@@ -20,46 +19,46 @@ use fit::{Fit, Law};
 use settings::GraphBench;
 use std::path::{Path, PathBuf};
 
-/// Steps in which a fitted growth is drawn.
+/// Number of segments of a drawn fit.
 const FIT_STEPS: u32 = 60;
 
-/// How cost grows with samples, horizon, resolution, candidates, stages and probes.
+/// Measure the growth of cost with samples, horizon, resolution, candidates, stages and probes.
 #[derive(Clone, Debug, clap::Args)]
 pub struct ScaleArgs {
     #[command(flatten)]
     subject: GraphArgs,
-    /// Seconds that each setting of the graph is measured for, in two rounds.
+    /// Time for each setting of the graph in two rounds, seconds.
     #[arg(long, default_value_t = 20.0)]
     seconds: f64,
-    /// Fewer settings, one round, a second each.
+    /// Measure fewer settings, in one round, for a second each.
     #[arg(long)]
     quick: bool,
-    /// Only these, separated by commas. Default: all.
+    /// Axes, separated by commas. Default: all.
     #[arg(long, value_delimiter = ',')]
     axes: Vec<AxisName>,
-    /// Folder for the plots, one PNG for each axis.
+    /// Folder for the plots, one PNG file per axis.
     #[arg(long, default_value = "reports/scale")]
     plots: PathBuf,
     #[command(flatten)]
     pub(crate) output: OutputArgs,
 }
 
-/// What is varied.
+/// Varied quantity.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub(crate) enum AxisName {
-    /// Latents drawn from each mixture, in a running graph.
+    /// Number of latents from each mixture, in a running graph.
     Samples,
-    /// Steps looked ahead, in a running graph.
+    /// Number of look-ahead steps, in a running graph.
     Horizon,
-    /// Side of the camera's picture, in a running graph.
+    /// Side of the camera image, in a running graph.
     Picture,
     /// Side of a rendered view.
     View,
-    /// Places that are probed.
+    /// Number of probed places.
     Candidates,
-    /// Processes that hand a picture on.
+    /// Number of processes that pass an image on.
     Stages,
-    /// Further subscribers to a running graph.
+    /// Number of additional subscribers to a running graph.
     Probes,
 }
 
@@ -68,20 +67,20 @@ impl AxisName {
         [Self::Samples, Self::Horizon, Self::Picture, Self::View, Self::Candidates, Self::Stages, Self::Probes];
 }
 
-/// What was measured along one axis.
+/// Measurements along one axis.
 #[derive(Clone, Debug)]
 pub(crate) struct Axis {
-    /// Names its figures and its plot.
+    /// Name in figures and plots.
     key: &'static str,
     title: &'static str,
     x_label: &'static str,
-    /// What x counts, in a formula.
+    /// Unit of x in a formula.
     each: &'static str,
     law: Law,
-    /// The second figure beside time: its key and its name.
+    /// Key of the second figure in addition to time.
     cost_key: &'static str,
     cost_label: &'static str,
-    /// In rising x.
+    /// Rows in rising x.
     rows: Vec<Row>,
 }
 
@@ -92,17 +91,17 @@ pub(crate) struct Row {
     p50_ms: f64,
     p99_ms: f64,
     max_ms: f64,
-    /// Times that these are of.
+    /// Number of times behind the quantiles.
     counted: usize,
-    /// Frames that were not decided on; only a graph has them.
+    /// Number of frames without a decision; only for a graph.
     missed: Option<usize>,
     cost: f64,
-    /// Further figures by their keys.
+    /// Additional figures by key.
     more: Vec<(&'static str, f64)>,
 }
 
 impl Row {
-    /// From times in milliseconds.
+    /// Summarises times in milliseconds.
     fn new(x: u32, times: &Times, cost: f64) -> Self {
         let [p50_ms, p99_ms, max_ms] = [0.5, 0.99, 1.0].map(|q| times.quantile(q));
         Self { x, p50_ms, p99_ms, max_ms, counted: times.len(), missed: None, cost, more: Vec::new() }
@@ -114,7 +113,7 @@ pub(crate) fn run(args: &ScaleArgs) -> anyhow::Result<Report> {
     let names: Vec<AxisName> =
         AxisName::ALL.into_iter().filter(|name| args.axes.is_empty() || args.axes.contains(name)).collect();
     let subject = args.subject.load()?;
-    // Refused before the long part, not after it.
+    // Fails before the long part, not after it.
     std::fs::create_dir_all(&args.plots)
         .with_context(|| format!("cannot create the plots' folder {}", args.plots.display()))?;
 
@@ -143,7 +142,7 @@ pub(crate) fn run(args: &ScaleArgs) -> anyhow::Result<Report> {
 }
 
 impl Axis {
-    /// How the median time and the cost grow.
+    /// Fits the growth of the median time and of the cost.
     fn fits(&self) -> [Option<Fit>; 2] {
         let points = |y: fn(&Row) -> f64| self.rows.iter().map(|r| (f64::from(r.x), y(r))).collect::<Vec<_>>();
         [points(|r| r.p50_ms), points(|r| r.cost)].map(|points| Fit::new(self.law, &points))
@@ -168,7 +167,7 @@ impl Axis {
         rows
     }
 
-    /// One line of text.
+    /// Returns the growth as one line of text.
     fn growth(&self) -> String {
         let [time, cost] = self.fits();
         let sentence = |fit: Option<Fit>, unit: &str| {
@@ -206,7 +205,7 @@ impl Axis {
         }
     }
 
-    /// Evenly spaced x from the first to the last, of logarithms where asked for.
+    /// Returns evenly spaced x from the first to the last value; on request, evenly spaced in their logarithms.
     fn between(&self, log: bool) -> Vec<f64> {
         let (Some(first), Some(last)) = (self.rows.first(), self.rows.last()) else { return Vec::new() };
         let (first, last) = (f64::from(first.x), f64::from(last.x));
@@ -214,7 +213,7 @@ impl Axis {
         (0..=FIT_STEPS).map(|i| at(f64::from(i) / f64::from(FIT_STEPS))).collect()
     }
 
-    /// Draws `<key>.png`: times to the left, cost to the right, each with its fit.
+    /// Draws `<key>.png`: times on the left, cost on the right, each with its fit.
     fn plot(&self, folder: &Path) -> anyhow::Result<()> {
         let log = self.law != Law::Linear;
         let series = |name: &str, y: fn(&Row) -> f64| Series {
@@ -239,7 +238,7 @@ impl Axis {
                 log_x: log,
                 log_y: self.law == Law::Power,
                 from_zero: true,
-                // What was measured is drawn over the fit.
+                // Measurements are drawn over the fit.
                 series: fitted.into_iter().chain(measured).collect(),
             }
         };
@@ -278,7 +277,7 @@ mod tests {
         }
     }
 
-    /// All figures of an axis are in the report under its key and value, with the growth.
+    /// All figures of an axis, and its growth, are in the report under key and value.
     #[test]
     fn figures_are_noted_by_axis_and_value() {
         let folder = tempfile::tempdir().unwrap();
@@ -295,9 +294,9 @@ mod tests {
         assert_eq!((figure("fit/cores/slope"), figure("fit/cores/r_squared")), (0.25, 1.0));
     }
 
-    /// The table has a row for each value, and the sentence says the slopes.
+    /// The table has a row for each value, and the sentence contains the slopes.
     #[test]
-    fn growth_is_said_in_words() {
+    fn growth_is_a_sentence() {
         let axis = axis();
         let rows = axis.table();
         assert_eq!(rows.len(), 4);
@@ -306,11 +305,11 @@ mod tests {
             axis.growth(),
             "probes: p50 = 0.500 + 2.00 ms a probe (R² 1.00); cores = 0.500 + 0.250 cores a probe (R² 1.00)"
         );
-        let alone = Axis { rows: axis.rows[..1].to_vec(), ..axis };
-        assert!(alone.growth().contains("no growth can be fitted"));
+        let single = Axis { rows: axis.rows[..1].to_vec(), ..axis };
+        assert!(single.growth().contains("no growth can be fitted"));
     }
 
-    /// A fit is drawn from the first to the last value, in even steps of what its axis shows.
+    /// A fit is drawn from the first to the last value, in even steps on its axis.
     #[test]
     fn fits_span_the_values() {
         let mut axis = axis();
@@ -320,7 +319,7 @@ mod tests {
         assert!((x[0] - 32.0).abs() < 1e-9 && (x[20] - 64.0).abs() < 1e-9 && (x[60] - 256.0).abs() < 1e-9, "{x:?}");
     }
 
-    /// A plot is drawn for any law, also of a single value.
+    /// A plot is drawn for any law, and also for a single value.
     #[test]
     fn plots_are_drawn() {
         let folder = tempfile::tempdir().unwrap();

@@ -1,5 +1,5 @@
-//! Axes that a running graph shows: samples, horizon, size of the camera's picture, attached probes. All stages live,
-//! ten frames a second.
+//! Axes that are measured on a running graph: samples, horizon, size of the camera image, attached probes. All stages
+//! run at ten frames per second.
 
 use super::{Axis, AxisName, Law, Row};
 use crate::graph::{Measured, Plan, Subject, measure};
@@ -15,35 +15,35 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 const RATE_HZ: f64 = 10.0;
-/// No deadline cuts a frame off, however late: its time is what is measured.
+/// No deadline drops a frame, because its time is the measurement.
 const DEADLINE_MS: u64 = 60_000;
 const SAMPLES: [u32; 8] = [1, 2, 5, 10, 20, 35, 50, MAX_SAMPLES as u32];
 const SAMPLES_QUICK: [u32; 3] = [1, 10, MAX_SAMPLES as u32];
 const HORIZONS: [u32; 5] = [1, 2, 3, 5, MAX_HORIZON];
 const HORIZONS_QUICK: [u32; 2] = [2, MAX_HORIZON];
-const PICTURES_PX: [u32; 5] = [64, 128, 256, 512, 1024];
-const PICTURES_PX_QUICK: [u32; 2] = [128, 512];
-/// Pictures that are shown at each size.
-const PICTURES: usize = 12;
+const IMAGES_PX: [u32; 5] = [64, 128, 256, 512, 1024];
+const IMAGES_PX_QUICK: [u32; 2] = [128, 512];
+/// Number of images at each size.
+const IMAGES: usize = 12;
 
 /// One setting of the graph.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 struct Setting {
     samples: u32,
     horizon: u32,
-    /// Side of the pictures, which then come from a folder; `None` for the data set's drives.
-    picture_px: Option<u32>,
+    /// Side of images from a folder; `None` for the dataset's drives.
+    image_px: Option<u32>,
     probes: u32,
 }
 
-/// What the axes have in common.
-const MAIN: Setting = Setting { samples: 10, horizon: 2, picture_px: None, probes: 0 };
+/// Setting that the axes share.
+const MAIN: Setting = Setting { samples: 10, horizon: 2, image_px: None, probes: 0 };
 
 impl Display for Setting {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         write!(f, "n {}, horizon {}", self.samples, self.horizon)?;
-        if let Some(side_px) = self.picture_px {
-            write!(f, ", pictures of {side_px} x {side_px}")?;
+        if let Some(side_px) = self.image_px {
+            write!(f, ", images of {side_px} x {side_px}")?;
         }
         if self.probes > 0 {
             write!(f, ", {} probes", self.probes)?;
@@ -52,12 +52,12 @@ impl Display for Setting {
     }
 }
 
-/// What was measured with one setting, in all its rounds.
+/// Measurements of one setting in all rounds.
 #[derive(Clone, Debug, Default)]
 struct Sum {
     latency_ms: Vec<f64>,
     missed: usize,
-    /// Of the decision path, and of the renderer, which takes what is left, whatever the setting.
+    /// Cores of the decision path, and of the renderer, which uses the remaining time at any setting.
     cores: Vec<f64>,
     renderer_cores: Vec<f64>,
     probe_cores: Vec<f64>,
@@ -90,16 +90,16 @@ impl Sum {
     }
 }
 
-/// The graph that is measured, and for how long.
+/// Graph to measure, and the time for it.
 pub(crate) struct GraphBench {
     pub(crate) subject: Subject,
     pub(crate) quick: bool,
-    /// Seconds for each setting, all rounds together.
+    /// Time for each setting in all rounds, seconds.
     pub(crate) seconds: f64,
 }
 
 impl GraphBench {
-    /// Measures the settings of all these axes in turns; a setting of several axes is measured once.
+    /// Measures the settings of all axes alternately. A setting of several axes is measured once.
     pub(crate) fn measure(&self, axes: &[AxisName]) -> anyhow::Result<Vec<Axis>> {
         let axes: Vec<(Axis, Vec<(u32, Setting)>)> = axes.iter().filter_map(|axis| self.axis(*axis)).collect();
         let settings = distinct(axes.iter().flat_map(|(_, points)| points.iter().map(|(_, setting)| *setting)));
@@ -108,8 +108,8 @@ impl GraphBench {
         }
         self.subject.check_dataset()?;
         let folder = tempfile::tempdir()?;
-        for side_px in settings.iter().filter_map(|s| s.picture_px) {
-            write_pictures(&self.subject.dataset.join("images"), &folder.path().join(side_px.to_string()), side_px)?;
+        for side_px in settings.iter().filter_map(|s| s.image_px) {
+            write_images(&self.subject.dataset.join("images"), &folder.path().join(side_px.to_string()), side_px)?;
         }
         let rounds = if self.quick { 1 } else { 2 };
         let mut sums = vec![Sum::default(); settings.len()];
@@ -136,7 +136,7 @@ impl GraphBench {
             .collect())
     }
 
-    /// An axis without its figures yet, and its settings; `None` when the graph does not show it.
+    /// Returns an axis without figures, and its settings; `None` for an axis that is not measured on a graph.
     fn axis(&self, name: AxisName) -> Option<(Axis, Vec<(u32, Setting)>)> {
         fn choose(quick: bool, few: &[u32], all: &[u32]) -> Vec<u32> {
             if quick { few.to_vec() } else { all.to_vec() }
@@ -155,18 +155,18 @@ impl GraphBench {
             AxisName::Horizon => (
                 "horizon",
                 "Horizon: camera to action",
-                "steps looked ahead",
+                "look-ahead steps",
                 "step",
                 Law::Linear,
                 choose(self.quick, &HORIZONS_QUICK, &HORIZONS),
             ),
             AxisName::Picture => (
                 "picture",
-                "Camera picture: camera to action",
-                "side of the picture (px)",
+                "Camera image: camera to action",
+                "side of the image (px)",
                 "px",
                 Law::Area,
-                choose(self.quick, &PICTURES_PX_QUICK, &PICTURES_PX),
+                choose(self.quick, &IMAGES_PX_QUICK, &IMAGES_PX),
             ),
             AxisName::Probes => (
                 "probes",
@@ -181,7 +181,7 @@ impl GraphBench {
         let setting = |x: u32| match name {
             AxisName::Samples => Setting { samples: x, ..MAIN },
             AxisName::Horizon => Setting { horizon: x, ..MAIN },
-            AxisName::Picture => Setting { picture_px: Some(x), ..MAIN },
+            AxisName::Picture => Setting { image_px: Some(x), ..MAIN },
             _ => Setting { probes: x, ..MAIN },
         };
         let (cost_key, cost_label) = ("cores", "cores in use, less the renderer");
@@ -189,17 +189,17 @@ impl GraphBench {
         Some((axis, values.into_iter().map(|x| (x, setting(x))).collect()))
     }
 
-    fn run(&self, setting: Setting, pictures: &Path, seconds: f64) -> anyhow::Result<Measured> {
+    fn run(&self, setting: Setting, images: &Path, seconds: f64) -> anyhow::Result<Measured> {
         let mut graph = self.subject.graph.clone();
         graph.run.samples = setting.samples;
         graph.run.horizon = setting.horizon;
         graph.run.frame_rate_hz = RATE_HZ;
         graph.camera.repeat = true;
         graph.controller.deadline_ms = DEADLINE_MS;
-        if let Some(side_px) = setting.picture_px {
+        if let Some(side_px) = setting.image_px {
             graph.camera.source = CameraSource::Folder;
-            graph.camera.folder = Some(pictures.join(side_px.to_string()));
-            // A real sensor's noise takes no time; that of the simulated one takes the longer, the more pixels.
+            graph.camera.folder = Some(images.join(side_px.to_string()));
+            // A real sensor's noise takes no time. The time of simulated noise grows with the number of pixels.
             graph.camera.noise = SensorNoise::OFF;
         }
         measure(&Plan {
@@ -214,7 +214,7 @@ impl GraphBench {
     }
 }
 
-/// Each once, in the order of their first coming.
+/// Returns each setting once, in the order of first occurrence.
 fn distinct(settings: impl Iterator<Item = Setting>) -> Vec<Setting> {
     settings.fold(Vec::new(), |mut all, setting| {
         if !all.contains(&setting) {
@@ -224,23 +224,23 @@ fn distinct(settings: impl Iterator<Item = Setting>) -> Vec<Setting> {
     })
 }
 
-/// Brings the first pictures of a folder to a square of this side, in a folder of their own.
-fn write_pictures(from: &Path, to: &Path, side_px: u32) -> anyhow::Result<()> {
+/// Writes scaled squares of a folder's images to another folder.
+fn write_images(from: &Path, to: &Path, side_px: u32) -> anyhow::Result<()> {
     let entries = std::fs::read_dir(from).with_context(|| format!("cannot read folder {}", from.display()))?;
     let mut paths: Vec<PathBuf> = entries.filter_map(|e| Some(e.ok()?.path())).collect();
     paths.retain(|path| path.extension().is_some_and(|e| e.eq_ignore_ascii_case("png")));
     paths.sort();
-    ensure!(!paths.is_empty(), "folder {} holds no PNG picture", from.display());
+    ensure!(!paths.is_empty(), "folder {} contains no PNG image", from.display());
     std::fs::create_dir_all(to)?;
-    // From all over the folder, so that different states are shown.
-    let stride = (paths.len() / PICTURES).max(1);
-    for (i, path) in paths.iter().step_by(stride).take(PICTURES).enumerate() {
+    // Evenly spread over the folder, so that they show different states.
+    let stride = (paths.len() / IMAGES).max(1);
+    for (i, path) in paths.iter().step_by(stride).take(IMAGES).enumerate() {
         scaled(&Image::load_png(path)?, side_px).save_png(&to.join(format!("{i:03}.png")))?;
     }
     Ok(())
 }
 
-/// A square of the nearest pixels.
+/// Scales an image to a square, by the nearest pixels.
 fn scaled(image: &Image, side_px: u32) -> Image {
     let pixel = |i: u32| {
         let at = |k: u32, length_px: u32| (u64::from(k) * u64::from(length_px) / u64::from(side_px)) as u32;
@@ -254,7 +254,7 @@ mod tests {
     use super::*;
     use carff_config::GraphConfig;
 
-    /// A setting that several axes share is measured once, and each axis has all its own settings.
+    /// A setting of several axes is measured once, and each axis has all its settings.
     #[test]
     fn shared_settings_are_measured_once() {
         let graph = GraphConfig::parse("[run]\nname = \"t\"\ndataset = \"d\"\ncheckpoint = \"c\"", Path::new("t.toml"));
@@ -272,7 +272,7 @@ mod tests {
             let axes: Vec<_> = names.iter().map(|name| bench.axis(*name).unwrap().1).collect();
             let all = distinct(axes.iter().flatten().map(|(_, setting)| *setting));
             assert_eq!(all.iter().filter(|s| **s == MAIN).count(), 1);
-            // Samples, horizon and probes all begin at the one main setting.
+            // Samples, horizon and probes all include the main setting.
             assert_eq!(all.len(), axes.iter().map(Vec::len).sum::<usize>() - 2);
             assert!(axes.iter().flatten().all(|(_, setting)| all.contains(setting)));
             assert!(axes.iter().all(|points| points.is_sorted_by_key(|(x, _)| *x) && points.len() > 1));
@@ -280,7 +280,7 @@ mod tests {
         }
     }
 
-    /// Rounds are put together: all frames, all that were missed, the mean of the cores, the renderer's apart.
+    /// Rounds are combined: the sums of frames and misses, and the means of the cores, with the renderer apart.
     #[test]
     fn rounds_add_up() {
         let round = |latency_ms: &[f64], missed, cores| Measured {
@@ -307,9 +307,9 @@ mod tests {
         assert_eq!(sum.row(5, false).more, row.more[..1]);
     }
 
-    /// A picture is the same at its own size, and each of its pixels a square at twice the size.
+    /// An image is unchanged at its own size, and each of its pixels is a square at twice the size.
     #[test]
-    fn pictures_are_scaled_by_whole_pixels() {
+    fn images_are_scaled_by_whole_pixels() {
         let image = Image { width_px: 2, height_px: 2, rgb: (0..12).collect() };
         assert_eq!(scaled(&image, 2), image);
         let twice = scaled(&image, 4);

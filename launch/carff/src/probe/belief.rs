@@ -1,6 +1,6 @@
 //! `carff probe belief`: shows the belief over states as bars.
 
-use super::session::{Session, SessionArgs, colours};
+use crate::session::{Session, SessionArgs, colours};
 use carff_checkpoint::{Manifest, ScenarioIdentity};
 use carff_messages::{Action, ActionCode, Belief};
 use carff_transport::TopicId;

@@ -1,6 +1,6 @@
 //! `carff probe echo`: shows messages as text or JSON lines.
 
-use super::session::{Session, SessionArgs};
+use crate::session::{Session, SessionArgs};
 use carff_messages::forms::as_text;
 use carff_transport::TopicId;
 use clap::Args;

@@ -2,7 +2,7 @@
 
 use super::file_in;
 use super::inline::{Inline, columns};
-use super::session::{Session, SessionArgs, colours};
+use crate::session::{Session, SessionArgs, colours};
 use anyhow::{Context, bail, ensure};
 use carff_messages::forms::AnyMessage;
 use carff_messages::{FrameMeta, ImageMeta, ViewKind, ViewMeta};

@@ -1,8 +1,8 @@
 //! `carff probe hz`, `bw` and `delay`: measure a topic.
 
 use super::TopicArgs;
-use super::session::{Session, since_capture_ms};
 use super::structure::columns;
+use crate::session::{Session, since_capture_ms};
 use crate::terminal::Terminal;
 use carff_base::statistics::{mean, percentile_of_sorted};
 use carff_transport::monotonic_now_ns;

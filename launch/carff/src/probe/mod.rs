@@ -6,13 +6,11 @@ mod echo;
 pub(crate) mod image;
 mod inline;
 mod measure;
-pub(crate) mod session;
 mod structure;
 mod top;
 mod trace;
 
-pub use session::SessionArgs;
-
+use crate::session::SessionArgs;
 use carff_transport::TopicId;
 use clap::{Args, Subcommand};
 use std::path::PathBuf;

@@ -1,6 +1,6 @@
 //! `carff probe list` and `graph`: the topics of a run and the processes that use them.
 
-use super::session::{Going, Session, SessionArgs};
+use crate::session::{Going, Session, SessionArgs};
 use anyhow::Context;
 use carff_messages::SCHEMA_VERSION;
 use carff_transport::{Member, monotonic_now_ns};

@@ -1,7 +1,7 @@
 //! `carff probe top`: shows all stages on one screen.
 
-use super::session::{Session, SessionArgs};
 use super::structure::columns;
+use crate::session::{Session, SessionArgs};
 use crate::vitals::{RunVitals, StageVitals};
 use anyhow::{Context, ensure};
 use carff_base::statistics::percentile;
@@ -191,6 +191,7 @@ mod tests {
 
     fn live() -> LiveRun {
         LiveRun {
+            dir: "/run/carff".into(),
             name: "a-run".into(),
             run_id: 1,
             pid: 1,

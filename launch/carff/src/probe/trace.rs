@@ -1,7 +1,7 @@
 //! `carff probe trace`: follows one frame through the stages.
 
-use super::session::{Session, SessionArgs};
 use super::structure::columns;
+use crate::session::{Session, SessionArgs};
 use crate::spans::{Span, trace_events};
 use anyhow::{Context, ensure};
 use carff_messages::Stage;

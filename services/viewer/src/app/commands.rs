@@ -1,6 +1,6 @@
 //! Commands for mouse and keys: one list for shortcuts and help.
 
-use eframe::egui::{InputState, Key, KeyboardShortcut, Modifiers};
+use eframe::egui::{InputState, Key, Modifiers};
 
 /// A command of the window.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -98,12 +98,6 @@ impl Command {
         ),
     ];
 
-    /// Returns the keyboard shortcut of the command.
-    pub fn shortcut(self) -> Option<KeyboardShortcut> {
-        let mut all = Self::ALL.iter().flat_map(|(_, commands)| *commands);
-        all.find(|(command, ..)| *command == self).map(|(_, modifiers, key, _)| KeyboardShortcut::new(*modifiers, *key))
-    }
-
     /// Returns the name of a key for the help.
     pub fn key_name(modifiers: Modifiers, key: Key) -> String {
         let name = match key {
@@ -147,8 +141,5 @@ mod tests {
         let keys: BTreeSet<String> = all.iter().map(|(_, m, k, _)| Command::key_name(*m, *k)).collect();
         assert_eq!(keys.len(), all.len());
         assert!(keys.contains("Ctrl+Q") && keys.contains("Shift+S") && keys.contains("["));
-        for (command, modifiers, key, _) in all {
-            assert_eq!(command.shortcut(), Some(KeyboardShortcut::new(*modifiers, *key)));
-        }
     }
 }

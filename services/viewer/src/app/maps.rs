@@ -84,6 +84,10 @@ fn sight(painter: &Painter, eye_m: [f64; 3], along: [f64; 2], color: Color32, at
     let length = along[0].hypot(along[1]).max(1e-9);
     let end = [0, 1].map(|i| eye_m[i] + SIGHT_M * along[i] / length);
     let inside = painter.clip_rect().shrink(4.0);
+    // A small window may leave no room for the map.
+    if !inside.is_positive() {
+        return;
+    }
     let (from, to) = (at([eye_m[0], eye_m[1]]), at(end));
     let dot = inside.clamp(from);
     painter.line_segment([dot, dot + (to - from)], Stroke::new(1.5, color));

@@ -2,21 +2,21 @@
 
 mod gallery;
 mod page;
+mod targets;
 
-use crate::stats::draws::Frequencies;
 use crate::tables::{
     encoder::{EncoderTable, encoder_table},
     field::{PictureTable, picture_table},
-    forecast::{self, ForecastTable},
+    forecast::{self, ForecastTable, FrequencyTable},
     planning::{self, PlanningResults},
-    targets::{self, Target},
 };
-use crate::{ByRole, EvaluationError, Progress, Reliability, Subject};
+use crate::{About, ByRole, EvaluationError, Progress, Reliability, Subject};
 pub use gallery::Gallery;
 pub use page::encoder_rows;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::Path;
+pub use targets::Target;
 
 /// A table, in the order of the page.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
@@ -30,7 +30,7 @@ pub enum Table {
     Recall,
     /// Every decision rule, and the reliability of the hazard probability.
     Planning,
-    /// How often each outcome is drawn where several are open.
+    /// Frequency of each outcome where several are open.
     Frequencies,
     /// t-SNE, reconstructions, curves, beliefs, density.
     Pictures,
@@ -85,44 +85,6 @@ pub struct Results {
     pub gallery: Option<Gallery>,
     /// Tables that are left out, each with the reason.
     pub left_out: BTreeMap<String, String>,
-}
-
-/// Subject and seeds of an evaluation.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct About {
-    /// Version of the program.
-    pub program_version: String,
-    /// Name of the scenario.
-    pub scenario: String,
-    /// Names of the branches.
-    pub branches: Vec<String>,
-    /// Time steps of a branch.
-    pub timestamps: usize,
-    /// Folder of the checkpoint, as given.
-    pub checkpoint: String,
-    /// Folder of the dataset, as given.
-    pub dataset: String,
-    /// Images of the dataset.
-    pub pictures: usize,
-    /// Number of poses of each role.
-    pub poses: ByRole<usize>,
-    /// Seed of the training.
-    pub training_seed: u64,
-    /// Seed of the split of the poses.
-    pub split_seed: u64,
-    /// Seed of the draws of this evaluation.
-    pub seed: u64,
-}
-
-/// Frequencies where images leave several outcomes open. Draws are independent, from the forecast of the next step.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct FrequencyTable {
-    /// Frequencies of branches.
-    pub by_branch: Vec<Frequencies>,
-    /// Frequencies of an actor being present. Empty for two branches, where they equal `by_branch`.
-    pub by_presence: Vec<Frequencies>,
 }
 
 /// Computes the requested tables and writes `results.json`, `README.md` and their images into `out`.

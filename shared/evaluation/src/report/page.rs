@@ -1,11 +1,12 @@
 //! The page `README.md`: every table as text, with the images.
 
-use super::{FrequencyTable, Results};
+use super::Results;
 use crate::stats::draws::Frequencies;
 use crate::tables::planning::{PlanningResults, ViewCounts};
 use crate::trials::planning::{Count, PlanningTable};
 use crate::{
-    ByRole, EncoderTable, FieldPictures, PairMeans, PictureTable, ReliabilityBin, SAMPLE_COUNTS, Share, SvmScore,
+    ByRole, EncoderTable, FieldPictures, FrequencyTable, PairMeans, PictureTable, ReliabilityBin, SAMPLE_COUNTS, Share,
+    SvmScore,
 };
 use std::fmt::Write;
 
@@ -14,22 +15,22 @@ pub fn page(results: &Results) -> String {
     let mut page = String::new();
     let about = &results.subject;
     let _ = writeln!(page, "# {}: results\n", about.scenario);
-    let [trained, calibration, unseen] =
+    let [trained, calibration, held_out] =
         [about.poses.trained, about.poses.calibration, about.poses.unseen].map(Option::unwrap_or_default);
     let _ = writeln!(
         page,
         "Checkpoint `{}` on dataset `{}`: {} branches ({}) of {} steps, {} images from {} poses. {trained} poses were \
          used for training only (*trained*), {calibration} for training and the threshold (*calibration*), and \
-         {unseen} were held out (*unseen*). Seeds: training {}, split {}, draws of this evaluation {}. All tables \
-         separate *trained* and *unseen* poses. Nothing on this page chose a setting. `results.json` has every \
-         figure.\n",
+         {held_out} were held out (*held-out*, in files `unseen`). Seeds: training {}, split {}, draws of this \
+         evaluation {}. All tables separate *trained* and *held-out* poses. Nothing on this page chose a setting. \
+         `results.json` has every figure.\n",
         about.checkpoint,
         about.dataset,
         about.branches.len(),
         about.branches.join(", "),
         about.timestamps,
         about.pictures,
-        trained + calibration + unseen,
+        trained + calibration + held_out,
         about.training_seed,
         about.split_seed,
         about.seed
@@ -132,10 +133,10 @@ fn pictures(page: &mut String, table: &PictureTable) {
     if !table.novel_views.is_empty() {
         let _ = writeln!(
             page,
-            "### Dataset poses\n\nThe field from the poses of the dataset, with the latent of the state. Unseen poses \
-             were held out from its training. The mean image of a pose over all states is made of true images: it has \
-             the background, but no state. Where little changes the possible gain is small, and on unseen poses the \
-             mean image uses data that the field never had.\n"
+            "### Dataset poses\n\nThe field from the poses of the dataset, with the latent of the state. Its \
+             training did not use the held-out poses. The mean image of a pose over all states is made of true images: \
+             it has the background, but no state. Where little changes, the possible gain is small. On held-out poses, \
+             the mean image uses data that the field never had.\n"
         );
         head(page, &["poses", "images", "PSNR, dB", "mean image, dB", "gain, dB", "SSIM", "inside the actors, dB"]);
         for (part, v) in table.novel_views.iter() {
@@ -201,8 +202,8 @@ pub fn encoder_rows(page: &mut String, rows: &[(String, &EncoderTable)]) {
          state. *SVM*: exact-state accuracy of a support vector machine (RBF, C = 1, gamma = 1 / (8 variance)) on \
          latents; its ceiling is below 100 % where states look the same. Trained poses: 10 folds by image, as in the \
          paper, where duplicates of a left-out image stay in the training folds under other states and keep the \
-         accuracy below the ceiling; and 10 folds by pose, without duplicates. Unseen poses: fitted on all trained \
-         poses.\n"
+         accuracy below the ceiling; and 10 folds by pose, without duplicates. Held-out poses: fitted on all \
+         trained poses.\n"
     );
     head(
         page,
@@ -217,7 +218,7 @@ pub fn encoder_rows(page: &mut String, rows: &[(String, &EncoderTable)]) {
             "up to equivalence, %",
             "by pose, %",
             "up to equivalence, %",
-            "SVM, % of ceiling %, unseen",
+            "SVM, % of ceiling %, held-out",
             "up to equivalence, %",
         ],
     );
@@ -244,7 +245,7 @@ pub fn encoder_rows(page: &mut String, rows: &[(String, &EncoderTable)]) {
     if let Some((_, t)) = rows.first() {
         let _ = writeln!(
             page,
-            "\n{} images of trained poses, {} of unseen poses, {} decoded from the latent of another pose.\n",
+            "\n{} images of trained poses, {} of held-out poses, {} decoded from the latent of another pose.\n",
             t.svm.trained.pictures, t.svm.unseen.pictures, t.novel_view.pictures
         );
     }
@@ -531,6 +532,6 @@ mod tests {
         assert_tables_are_even(&page);
         assert!(page.contains("| a t0 | **30.0** | 20.0 |") && !page.contains("\n| a t1 "), "{page}");
         assert!(page.contains("| paper | 10 | - | 1/1 (21 to 100 %) |"), "{page}");
-        assert!(page.contains("| unseen | - | - | - |"), "{page}");
+        assert!(page.contains("| held-out | - | - | - |"), "{page}");
     }
 }

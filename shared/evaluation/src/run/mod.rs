@@ -73,7 +73,7 @@ pub struct DecidedFrame {
     pub observability: Option<Observability>,
     /// Posterior of the encoder, where it was recorded.
     pub posterior: Option<Gaussian>,
-    /// Whether the action was anything but an advance.
+    /// True if the action was not an advance.
     pub halted: bool,
     /// Hazard probability of the decision.
     pub hazard_probability: f32,

@@ -30,7 +30,7 @@ impl Shown {
         (0..64).filter(move |s| self.0 >> s & 1 == 1)
     }
 
-    /// Whether any of the states satisfies a condition.
+    /// Returns true if any of the states satisfies a condition.
     pub fn any(self, satisfies: impl FnMut(usize) -> bool) -> bool {
         self.states().any(satisfies)
     }

@@ -1,11 +1,11 @@
 //! Accuracy and recall against the number of samples, and frequencies of open outcomes (tables 3 and 5).
 
 use crate::stats::draws::{
-    Curve, OpenInput, Shown, TrialCurve, accuracy_curve, expected_recall, frequencies, met_all, recall_curve,
-    right_shares,
+    Curve, Frequencies, OpenInput, Shown, TrialCurve, accuracy_curve, expected_recall, frequencies, met_all,
+    recall_curve, right_shares,
 };
 use crate::trials::planning::Planner;
-use crate::{ByRole, EvaluationError, FrequencyTable, Progress, ROLES, Subject, role_name};
+use crate::{ByRole, EvaluationError, Progress, ROLES, Subject, role_name};
 use carff_base::random::Key;
 use carff_checkpoint::FieldProbe;
 use carff_dataset::{Observability, PoseRole};
@@ -41,7 +41,7 @@ pub struct ForecastTable {
 pub struct RoleCurves {
     /// Share of correct samples, drawn from the forecast of the next step.
     pub accuracy: Curve,
-    /// Whether the most frequent state of the samples is correct.
+    /// Share of trials in which the most frequent state of the samples is correct.
     pub majority_accuracy: Curve,
     /// Share of correct samples, drawn from the encoder's posterior without a forecast: correct about the image's own
     /// state.
@@ -58,9 +58,10 @@ pub struct RoleCurves {
     pub within_band: usize,
     /// Stratified draws from the forecast, as in the running graph.
     pub stratified_recall: Curve,
-    /// Whether stratified draws show all open branches.
+    /// Share of trials in which stratified draws show all open branches.
     pub stratified_recall_of_all: Curve,
-    /// Whether any draw from the encoder's posterior, without a forecast, shows the image's own branch.
+    /// Share of trials in which any draw from the encoder's posterior, without a forecast, shows the image's own
+    /// branch.
     pub posterior_recall: Curve,
 }
 
@@ -81,6 +82,16 @@ struct Trial<'a> {
     posterior: Vec<Shown>,
     /// By number of samples; empty where recall is not measured.
     stratified: Vec<Vec<Shown>>,
+}
+
+/// Frequencies where images leave several outcomes open. Draws are independent, from the forecast of the next step.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct FrequencyTable {
+    /// Frequencies of branches.
+    pub by_branch: Vec<Frequencies>,
+    /// Frequencies of an actor being present. Empty for two branches, where they equal `by_branch`.
+    pub by_presence: Vec<Frequencies>,
 }
 
 /// Both tables; the second one may be a reason why it is missing.

@@ -4,7 +4,6 @@ pub mod encoder;
 pub mod field;
 pub mod forecast;
 pub mod planning;
-pub mod targets;
 
 /// At most `count` entries, evenly spread.
 pub fn spread(all: &[usize], count: usize) -> Vec<usize> {

@@ -125,7 +125,7 @@ mod tests {
         assert_eq!(state_names(&scenario, &all), ["truck, t0", "truck, t1", "nobody, t0", "nobody, t1"]);
     }
 
-    /// A camera too large for a filmstrip is made smaller and sees the same; a small one stays as it is.
+    /// A camera too large for a filmstrip is scaled down with the same field of view; a small one is unchanged.
     #[test]
     fn large_cameras_are_limited() {
         let camera = PinholeCamera::look_at([0.0, 0.0, 9.0], [0.0; 3], [0.0, 1.0, 0.0], 1024, 512, 60.0);

@@ -167,7 +167,7 @@ impl PlanningTable {
         ]
     }
 
-    /// Whether nothing was counted.
+    /// Returns true if nothing was counted.
     pub fn is_empty(&self) -> bool {
         self.rules().iter().all(|(_, by_samples)| by_samples.is_empty())
     }

@@ -17,8 +17,8 @@ pub(crate) struct AdamStep {
     pub decay: f32,
 }
 
-/// One step of Adam over `parameters` with the sum of `gradients`, which are zeroed. When `sparse`, parameters without a
-/// gradient keep their value and their moments.
+/// One step of Adam over `parameters` with the sum of `gradients`, which are zeroed. When `sparse`, parameters without
+/// a gradient keep their value and their moments.
 #[inline(always)]
 pub(crate) fn step<const FMA: bool>(
     step: AdamStep,

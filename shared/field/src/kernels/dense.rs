@@ -1,8 +1,8 @@
 //! Fully connected layers over blocks, forward and backward.
 //!
-//! These bodies take plain slices and the strides of their blocks, where [`super::dispatch`] takes views: only of slices
-//! that are arguments of the compiled function does the compiler know that they do not overlap, and without that it
-//! does not vectorise the sums.
+//! These bodies take plain slices and the strides of their blocks, where [`super::dispatch`] takes views: only of
+//! slices that are arguments of the compiled function does the compiler know that they do not overlap, and without that
+//! it does not vectorise the sums.
 
 // See above.
 #![allow(clippy::too_many_arguments)]
@@ -36,8 +36,8 @@ fn row(block: &[f32], r: usize) -> &[f32; LANES] {
     block[r * LANES..].first_chunk().expect("a block holds all its rows")
 }
 
-/// One fully connected layer: y = W^T x + b, clamped from below at zero when `relu`. Blocks of `y` may have more rows than
-/// the layer has outputs.
+/// One fully connected layer: y = W^T x + b, clamped from below at zero when `relu`. Blocks of `y` may have more rows
+/// than the layer has outputs.
 #[inline(always)]
 pub(crate) fn forward<const FMA: bool>(
     weights: &[f32],
@@ -87,8 +87,8 @@ pub(crate) fn bias_relu<const FMA: bool>(x: &[f32], bias: &[f32], y: &mut [f32],
     }
 }
 
-/// Gradient by a layer's inputs: dx = W dy for the first `rows` inputs (a multiple of 4). With the input's own activations
-/// as `relu_of`, in the layout of `dx`, the gradient is zero wherever they are not positive.
+/// Gradient by a layer's inputs: dx = W dy for the first `rows` inputs (a multiple of 4). With the input's own
+/// activations as `relu_of`, in the layout of `dx`, the gradient is zero wherever they are not positive.
 #[inline(always)]
 pub(crate) fn backward_input<const FMA: bool>(
     weights: &[f32],

@@ -202,8 +202,8 @@ pub(crate) fn bias_relu(set: InstructionSet, bias: &[f32], x: Blocks<'_>, y: Blo
     bias_relu_slices(set, x.as_slice(), bias, y.into_mut_slice(), x.stride());
 }
 
-/// Computes the gradient by a layer's inputs, dx = W dy, for as many inputs as `layer` has weights of (a multiple of 4).
-/// With the input's own activations as `relu_of`, the gradient is zero wherever they are not positive; their blocks
+/// Computes the gradient by a layer's inputs, dx = W dy, for as many inputs as `layer` has weights of (a multiple of
+/// 4). With the input's own activations as `relu_of`, the gradient is zero wherever they are not positive; their blocks
 /// have as many rows as those of `dx`.
 pub(crate) fn dense_backward_input(
     set: InstructionSet,
@@ -332,8 +332,8 @@ mod tests {
         }
     }
 
-    /// With bf16 products a layer is the sum of the rounded numbers' products, for any number of blocks and inputs: also
-    /// odd numbers, and more inputs than are packed at once. (Only where the processor has the instruction.)
+    /// With bf16 products a layer is the sum of the rounded numbers' products, for any number of blocks and inputs:
+    /// also odd numbers, and more inputs than are packed at once. (Only where the processor has the instruction.)
     #[test]
     fn bf16_layers_are_the_sums_of_rounded_numbers() {
         let set = InstructionSet::detect_for_pictures();

@@ -146,9 +146,9 @@ impl LatentSamples {
 }
 
 impl Samples {
-    /// Marches all rays until each is opaque or at its end, under each latent. Positions and features of samples are the
-    /// same for all latents. In blocks where the states do not differ, all latents use the first latent's densities.
-    /// `jitter(ray)` gives the start in steps, 0..1.
+    /// Marches all rays until each is opaque or at its end, under each latent. Positions and features of samples are
+    /// the same for all latents. In blocks where the states do not differ, all latents use the first latent's
+    /// densities. `jitter(ray)` gives the start in steps, 0..1.
     pub fn march(&mut self, march: &March<'_>, scratch: &mut MarchScratch, jitter: impl Fn(usize) -> f32) {
         self.begin(march, jitter);
         while let Some(wave) = self.place_wave(march) {

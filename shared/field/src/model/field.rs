@@ -135,8 +135,8 @@ impl Field {
         self.set
     }
 
-    /// Sets the instruction set that the kernels run on; a new field runs on [`InstructionSet::detect`]. Fields that only
-    /// render images may run on [`InstructionSet::detect_for_pictures`].
+    /// Sets the instruction set that the kernels run on; a new field runs on [`InstructionSet::detect`]. Fields that
+    /// only render images may run on [`InstructionSet::detect_for_pictures`].
     pub fn set_instruction_set(&mut self, set: InstructionSet) {
         self.set = set;
         self.pairs.clear();
@@ -263,8 +263,8 @@ impl Field {
         tensors
     }
 
-    /// Makes a field from the tensors of [`Self::tensors`]. The error lists every key that is missing, unknown, of another
-    /// shape or not finite.
+    /// Makes a field from the tensors of [`Self::tensors`]. The error lists every key that is missing, unknown, of
+    /// another shape or not finite.
     pub fn from_tensors(
         config: FieldConfig,
         tensors: impl IntoIterator<Item = (String, Vec<usize>, Vec<f32>)>,

@@ -73,8 +73,8 @@ impl Dense {
         }
     }
 
-    /// Backward of [`Self::fold`]: from the gradient by the folded biases, adds the gradient by biases and latent rows to
-    /// `gradient`, and the gradient by the latent to `latent_gradient`.
+    /// Backward of [`Self::fold`]: from the gradient by the folded biases, adds the gradient by biases and latent rows
+    /// to `gradient`, and the gradient by the latent to `latent_gradient`.
     pub fn fold_backward(
         &self,
         numbers: &[f32],
@@ -136,8 +136,8 @@ pub(crate) enum Output {
     Logistic,
 }
 
-/// A network of `N` fully connected layers (2 or 3) with rectifiers between them. Its first layer takes the latent, which
-/// is folded into that layer's biases ([`Dense::fold`]).
+/// A network of `N` fully connected layers (2 or 3) with rectifiers between them. Its first layer takes the latent,
+/// which is folded into that layer's biases ([`Dense::fold`]).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Mlp<const N: usize> {
     pub layers: [Dense; N],

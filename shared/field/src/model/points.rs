@@ -12,8 +12,8 @@ use crate::kernels::dispatch;
 /// Outputs of the last layer that are computed: the raw density, and padding to a kernel's tile.
 const LAST_OUTPUTS: usize = 4;
 
-/// Points to evaluate again and again: their features through the first layer of the density network, before any latent.
-/// Only valid for the field that prepared them.
+/// Points to evaluate again and again: their features through the first layer of the density network, before any
+/// latent. Only valid for the field that prepared them.
 #[derive(Clone, Debug, Default)]
 pub struct PreparedPoints {
     count: usize,
@@ -64,8 +64,8 @@ impl Field {
         prepared
     }
 
-    /// Computes the density (1/metre) at prepared points under each latent: `out[latent * points + point]`. Latents that do
-    /// not fit into `out` are left out, extra room is left unchanged.
+    /// Computes the density (1/metre) at prepared points under each latent: `out[latent * points + point]`. Latents
+    /// that do not fit into `out` are left out, extra room is left unchanged.
     pub fn density_prepared(&self, points: &PreparedPoints, latents: &[[f32; LATENT_DIM]], out: &mut [f32]) {
         let projected = points.projected.blocks(self.width(), points.count.div_ceil(LANES));
         SCRATCH.with_borrow_mut(|scratch| {

@@ -62,8 +62,8 @@ pub(crate) fn set_network_tensor(layout: &Layout, networks: &mut [f32], name: &s
     }
 }
 
-/// Passes `tensors` to `set` after checking that they have the names and shapes of `wanted` and finite values. `set` may
-/// refuse a tensor with a sentence. The error lists all differences.
+/// Passes `tensors` to `set` after checking that they have the names and shapes of `wanted` and finite values. `set`
+/// may refuse a tensor with a sentence. The error lists all differences.
 pub(crate) fn load_tensors(
     wanted: &[(String, Vec<usize>)],
     tensors: impl IntoIterator<Item = (String, Vec<usize>, Vec<f32>)>,

@@ -52,9 +52,9 @@ impl Field {
 
     /// Renders the images of `camera` under each of several latents.
     ///
-    /// Rays that meet no cell in which the states differ ([`Field::changing`]) are only rendered under the first latent.
-    /// The others are marched once for all other latents, which share the first one's densities in cells in which the
-    /// states do not differ.
+    /// Rays that meet no cell in which the states differ ([`Field::changing`]) are only rendered under the first
+    /// latent. The others are marched once for all other latents, which share the first one's densities in cells in
+    /// which the states do not differ.
     pub fn render_hypotheses(
         &self,
         camera: &PinholeCamera,

@@ -53,8 +53,8 @@ impl FieldTrainer {
         cells.iter().zip(largest).filter(|(_, density)| *density > threshold).map(|(cell, _)| *cell).collect()
     }
 
-    /// Computes how much the states' means over each cell differ: the largest difference in the opacity of a step inside
-    /// the bounds and in colour times opacity.
+    /// Computes how much the states' means over each cell differ: the largest difference in the opacity of a step
+    /// inside the bounds and in colour times opacity.
     fn state_differences(&self, cells: &[u32]) -> Vec<f32> {
         let rounds: Vec<u64> = (0..COMPARED_POINTS).map(|point| hash(self.config.seed, 0xc4a9, point)).collect();
         self.pool.flat_map_chunks(cells, CELLS_PIECE, |cells| {

@@ -10,7 +10,8 @@ pub(super) const CELLS_PIECE: usize = 512;
 const SEARCHED_CELLS: usize = 4096;
 
 impl FieldTrainer {
-    /// Updates the densities of cells under every state's latent, and the grid by them, when the current step asks for it.
+    /// Updates the densities of cells under every state's latent, and the grid by them, when the current step asks for
+    /// it.
     pub(super) fn refresh_occupancy(&mut self) {
         let c = &self.config;
         let (warmup, interval) = (c.occupancy_warmup_steps, c.occupancy_interval.max(1));

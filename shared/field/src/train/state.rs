@@ -37,8 +37,8 @@ impl FieldTrainer {
         TrainerState { step: self.step, tensors }
     }
 
-    /// Makes a trainer that continues from a state. `field` is the field of that step. The error lists every key that is
-    /// missing, unknown, of another shape or not finite.
+    /// Makes a trainer that continues from a state. `field` is the field of that step. The error lists every key that
+    /// is missing, unknown, of another shape or not finite.
     pub fn from_state(
         field: Field,
         config: TrainerConfig,

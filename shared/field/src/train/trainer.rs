@@ -110,8 +110,8 @@ impl FieldTrainer {
         rise * c.final_factor.powf(part)
     }
 
-    /// Does one step of training on a batch. Ignores entries beyond the shortest list, rays whose latent does not exist,
-    /// and rays with values that are not finite.
+    /// Does one step of training on a batch. Ignores entries beyond the shortest list, rays whose latent does not
+    /// exist, and rays with values that are not finite.
     pub fn step(&mut self, batch: &RayBatch) -> StepReport {
         self.refresh_occupancy();
         let report = self.accumulate(batch);

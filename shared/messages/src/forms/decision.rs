@@ -64,7 +64,6 @@ impl TryFrom<&ActionForm> for Action {
             confidence: form.confidence,
             hazard_probability: form.hazard_probability,
             is_decision: form.is_decision.into(),
-            reserved: 0,
             valid_until_ns: form.valid_until_ns,
             based_on_frame: form.based_on_frame.unwrap_or(u64::MAX),
             latency_ns: form.latency_ns,

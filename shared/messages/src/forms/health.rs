@@ -66,7 +66,6 @@ impl TryFrom<&HealthForm> for Health {
             stage: code_of!(Stage, "stage", form.stage)?,
             state: code_of!(HealthState, "state", form.state)?,
             pid: form.pid,
-            reserved: 0,
             received: form.received,
             published: form.published,
             skipped: form.skipped,

@@ -5,7 +5,8 @@ use crate::{
     TrainingError,
     augmentation::Augmentation,
     features::{self, FeatureFile},
-    run::{Context, names},
+    records::names,
+    run::Context,
 };
 use carff_dataset::sensor::SensorNoise;
 use carff_evaluation::Progress;

@@ -7,8 +7,8 @@ use super::{
 use crate::{
     TrainingError,
     config::VaeTraining,
-    records::VaeRecord,
-    run::{Context, Phase, Report, cosine, names},
+    records::{VaeRecord, names},
+    run::{Context, Phase, Report, cosine},
 };
 use carff_base::random::Key;
 use carff_evaluation::PosedImages;

@@ -1,6 +1,6 @@
 //! The common part of all probes: joining a run, reading at intervals, and detecting the end.
 
-use anyhow::Context;
+use anyhow::{Context, ensure};
 use carff_messages::Header;
 use carff_observe::{Attached, attach};
 use carff_transport::{AnyReceiver, Received, Stop, TopicId, Waiter, monotonic_now_ns};
@@ -107,6 +107,12 @@ impl Session {
         if now_ns >= self.alive_ns {
             self.alive_ns = now_ns + ALIVE_NS;
             if !self.attached.live.is_alive() {
+                let name = &self.attached.live.name;
+                ensure!(
+                    !self.attached.live.has_lost_files(),
+                    "the files of run `{name}` are gone although it runs: a cleaner of temporary files may have removed \
+                     them; start the run again"
+                );
                 return Ok(Going::RunEnded);
             }
         }

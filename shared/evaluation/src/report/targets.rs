@@ -1,6 +1,6 @@
 //! Target figures of a scenario against measured ones. Missed targets are shown like reached ones.
 
-use crate::Results;
+use super::Results;
 use crate::trials::planning::{BySamples, Count, PlanningTable};
 use carff_dataset::drives::DriveKind;
 use serde::{Deserialize, Serialize};
@@ -17,7 +17,7 @@ pub struct Target {
     pub wanted: String,
     /// Measured figure.
     pub found: String,
-    /// Whether the target is reached.
+    /// True if the target is reached.
     pub reached: bool,
 }
 
