@@ -133,9 +133,10 @@ pub fn text(outcome: &RunOutcome, report: &Value) -> String {
     let [frames, actions] =
         ["frames_not_recorded", "actions_not_recorded"].map(|key| report[key].as_u64().unwrap_or(0));
     if frames + actions > 0 {
-        text += &format!(
+        let _ = writeln!(
+            text,
             "not recorded, because the launcher was stopped or slow: {frames} frames, {actions} actions; the counts of \
-             decisions and drives are without them\n"
+             decisions and drives are without them"
         );
     }
     if let Some(drives) = drives(outcome) {
@@ -144,7 +145,7 @@ pub fn text(outcome: &RunOutcome, report: &Value) -> String {
     if let Some(figures) = checkpoint_figures(outcome) {
         let _ = writeln!(text, "\nModels, as measured in training\n  {}", figures.summary().replace('\n', "\n  "));
     }
-    text += &format!("\n{}\n", provenance::text(&outcome.origin));
+    let _ = writeln!(text, "\n{}", provenance::text(&outcome.origin));
     text
 }
 

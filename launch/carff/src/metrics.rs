@@ -3,7 +3,7 @@
 use crate::http::{Response, Server};
 use crate::provenance::{self, Origin};
 use crate::session::{Session, SessionArgs};
-use crate::vitals::{RunVitals, StageVitals};
+use crate::vitals::{Labels, RunVitals, StageVitals};
 use anyhow::{Context, ensure};
 use carff_base::statistics::percentile;
 use carff_messages::Stage;
@@ -121,8 +121,6 @@ fn status(run: &str, origin: &Origin, vitals: &RunVitals) -> Value {
         "stages": stages,
     })
 }
-
-type Labels = [(&'static str, &'static str); 1];
 
 /// Returns the metrics in the Prometheus text format.
 fn prometheus(run: &str, origin: &Origin, vitals: &RunVitals) -> String {

@@ -92,13 +92,16 @@ pub(crate) struct RunVitals {
     pub(crate) histograms: Histograms,
 }
 
+/// A label of a metric, with its value.
+pub(crate) type Labels = [(&'static str, &'static str); 1];
+
 /// Distributions of times, seconds.
 #[derive(Clone, Debug)]
 pub(crate) struct Histograms {
     /// From capture to decision.
     pub(crate) camera_to_action: Histogram,
     /// From the arrival of an input to the output.
-    pub(crate) stages: Family<[(&'static str, &'static str); 1], Histogram, fn() -> Histogram>,
+    pub(crate) stages: Family<Labels, Histogram, fn() -> Histogram>,
 }
 
 impl Default for Histograms {

@@ -19,6 +19,8 @@ enum Place {
 /// A message of a file: topic, encoding, schema, header, data.
 type Copied = (String, String, mcap::Schema<'static>, MessageHeader, Vec<u8>);
 
+type Options = fn() -> WriteOptions;
+
 fn recording(folder: &Path) -> std::path::PathBuf {
     let path = folder.join("run.mcap");
     let mut writer = Writer::create(&path, &about(), &places()).unwrap();
@@ -82,7 +84,7 @@ fn all_messages_are_read_from_any_layout() {
         .zip(&original)
         .map(|(i, m)| (m.0.clone(), m.1.clone(), m.2.clone(), MessageHeader { log_time: i, ..m.3 }, m.4.clone()))
         .collect();
-    let layouts: [(&str, fn() -> WriteOptions); 6] = [
+    let layouts: [(&str, Options); 6] = [
         ("zstd", || WriteOptions::new().chunk_size(Some(2_000))),
         ("lz4", || WriteOptions::new().compression(Some(Compression::Lz4)).chunk_size(Some(50_000))),
         ("plain", || WriteOptions::new().compression(None)),
