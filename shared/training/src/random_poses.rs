@@ -12,7 +12,7 @@ use crate::{
     records::names,
     run::{Context, RANDOM_IMAGES, Run},
 };
-use carff_base::geometry::PinholeCamera;
+use carff_base::geometry::{PinholeCamera, cross, dot};
 use carff_base::random::Key;
 use carff_dataset::{DatasetWriter, FrameRecord, Image, ScenarioInfo};
 use carff_evaluation::{PosedImages, Progress, to_bytes};
@@ -252,14 +252,6 @@ fn fitted(camera: &PinholeCamera, most_px: u32) -> PinholeCamera {
 /// An axis of a camera in world space: right, up, back.
 fn axis(camera: &PinholeCamera, column: usize) -> [f64; 3] {
     [0, 1, 2].map(|row| camera.world_from_camera[row][column])
-}
-
-fn dot(a: [f64; 3], b: [f64; 3]) -> f64 {
-    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-}
-
-fn cross(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
-    [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 }
 
 fn unit(v: [f64; 3]) -> [f64; 3] {
