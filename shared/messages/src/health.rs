@@ -1,7 +1,6 @@
 //! Heartbeats of stages.
 
-use crate::forms::fields;
-use crate::{Header, HealthState, Invalid, Stage, message};
+use crate::{Header, HealthState, Invalid, Stage, fields, message};
 use iceoryx2::prelude::ZeroCopySend;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};

@@ -19,6 +19,7 @@ pub mod check;
 mod codes;
 mod convert;
 mod decision;
+mod fields;
 pub mod forms;
 mod frame;
 mod health;
@@ -78,7 +79,7 @@ pub struct Header {
     /// Horizon step: 0 for the observation, 1 for the first forecast.
     pub step: u32,
     /// The run of the message; in JSON, 16 hexadecimal digits. Set on send.
-    #[serde(with = "forms::fields::hex")]
+    #[serde(with = "fields::hex")]
     #[schemars(with = "String")]
     pub run_id: u64,
     /// The camera frame that the message is based on, counted from 0 in a run.

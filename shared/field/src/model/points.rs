@@ -80,8 +80,8 @@ impl Field {
         self.density_by_latent(&points_m[..count], std::slice::from_ref(latent), &mut out[..count]);
     }
 
-    /// Computes the density (1/metre) at a height, metres, over the bounds: width, height and rows of an image with +X to
-    /// the right, +Y up, and `longest_px` points along its longer side.
+    /// Computes the density (1/metre) at a height, metres, over the bounds: width, height and rows of an image with +X
+    /// to the right, +Y up, and `longest_px` points along its longer side.
     pub fn density_slice(&self, latent: &[f32; LATENT_DIM], height_m: f32, longest_px: u32) -> (u32, u32, Vec<f32>) {
         let [low, high] = self.config().bounds_m;
         let extent_m = [high[0] - low[0], high[1] - low[1]];

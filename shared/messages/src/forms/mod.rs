@@ -2,7 +2,8 @@
 //!
 //! People, recordings and other tools read these forms. A form writes codes as names, arrays with their used entries,
 //! and `null` for "none". A message converted to its form and back is the same message bit for bit; unused entries
-//! become zero. [`schema`] describes a form as JSON Schema. A message without optional fields and lists is its own form.
+//! become zero. [`schema`] describes a form as JSON Schema. A message without optional fields and lists is its own
+//! form.
 //!
 //! ```
 //! use carff_messages::forms::{Readable, read};
@@ -17,7 +18,6 @@
 
 mod any;
 mod decision;
-pub(crate) mod fields;
 mod frame;
 mod latent;
 mod text;
@@ -75,11 +75,11 @@ macro_rules! name_of {
 }
 /// Returns the code of a name.
 macro_rules! code_of {
-    ($kind:ty, $field:expr, $name:expr) => {
+    ($kind:ty, $field:literal, $name:expr) => {
         <$kind>::from_name(&$name).map(<$kind>::code).ok_or_else(|| $crate::forms::FormError::UnknownName {
             field: $field,
             found: $name.to_owned(),
-            known: <$kind>::ALL.iter().map(|c| c.name()).collect::<Vec<_>>().join(", "),
+            known: <$kind>::names(),
         })
     };
 }

@@ -1,8 +1,7 @@
-//! Forms of single fields, for `#[serde(with = ..)]`.
+//! JSON forms of single fields, for `#[serde(with = ..)]`.
 
 #![allow(clippy::trivially_copy_pass_by_ref, reason = "serde passes fields by reference")]
 
-use super::{code_of, name_of};
 use crate::{HealthState, Stage};
 use serde::de::{Deserialize, Deserializer, Error};
 use serde::ser::Serializer;
@@ -25,15 +24,18 @@ macro_rules! named {
     ($module:ident: $kind:ident) => {
         /// A code as its name.
         pub(crate) mod $module {
-            use super::{Deserialize, Deserializer, Error, Serializer, code_of, name_of, $kind};
+            use super::{Deserialize, Deserializer, Error, Serializer, $kind};
 
             pub(crate) fn serialize<S: Serializer>(code: &u32, serializer: S) -> Result<S::Ok, S::Error> {
-                serializer.serialize_str(&name_of!($kind, *code))
+                serializer.serialize_str($kind::try_from(*code).map_or("unknown", $kind::name))
             }
 
             pub(crate) fn deserialize<'de, D: Deserializer<'de>>(deserializer: D) -> Result<u32, D::Error> {
                 let name = String::deserialize(deserializer)?;
-                code_of!($kind, stringify!($module), name).map_err(D::Error::custom)
+                $kind::from_name(&name).map($kind::code).ok_or_else(|| {
+                    let (field, known) = (stringify!($module), $kind::names());
+                    D::Error::custom(format!("`{field}` is `{name}`, must be one of: {known}"))
+                })
             }
         }
     };
