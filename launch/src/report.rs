@@ -4,6 +4,7 @@ use crate::planning::{self, RunOutcome};
 use anyhow::Context;
 use carff::provenance;
 use carff_base::files::check_writable;
+use carff_base::statistics::percentile;
 use carff_checkpoint::Manifest;
 use carff_evaluation::CheckpointFigures;
 use carff_evaluation::run::DriveCounts;
@@ -14,14 +15,9 @@ use std::path::{Path, PathBuf};
 
 /// Converts times in nanoseconds to p50, p99 and max in milliseconds; null if there are no times.
 pub fn quantiles_ms<'a>(times_ns: impl IntoIterator<Item = &'a u64>) -> Value {
-    let mut sorted: Vec<u64> = times_ns.into_iter().copied().collect();
-    sorted.sort_unstable();
-    // The smallest time that is at least as large as this share of all times.
-    let at = |share: f64| {
-        let rank = (share * sorted.len() as f64).ceil() as usize;
-        sorted.get(rank.max(1) - 1).map(|&ns| ns as f64 / 1e6)
-    };
-    json!({ "p50": at(0.5), "p99": at(0.99), "max": at(1.0), "count": sorted.len() })
+    let times_ms: Vec<f64> = times_ns.into_iter().map(|&ns| ns as f64 / 1e6).collect();
+    let at = |share: f64| percentile(&times_ms, share);
+    json!({ "p50": at(0.5), "p99": at(0.99), "max": at(1.0), "count": times_ms.len() })
 }
 
 /// Files of a report: JSON at the path that the user gave, text and filmstrip next to it.

@@ -1,5 +1,6 @@
 //! Quantiles, ratios of medians, and alternating measurements.
 
+use carff_base::statistics::percentile_of_sorted;
 use std::time::Instant;
 
 /// Sorted times of one variant.
@@ -17,8 +18,7 @@ impl Times {
 
     /// Returns the smallest time that a share (0..=1) of all times does not exceed; NaN without times.
     pub(crate) fn quantile(&self, share: f64) -> f64 {
-        let rank = (share * self.sorted.len() as f64).ceil() as usize;
-        self.sorted.get(rank.max(1) - 1).copied().unwrap_or(f64::NAN)
+        percentile_of_sorted(&self.sorted, share).unwrap_or(f64::NAN)
     }
 
     pub(crate) fn median(&self) -> f64 {

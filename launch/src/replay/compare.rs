@@ -1,6 +1,6 @@
 //! Compares a replayed graph's posteriors, forecasts, beliefs and decisions with the recorded ones.
 
-use carff_messages::forms::{ActionForm, AnyMessage, BeliefForm, ForecastForm, HeaderForm, PosteriorForm};
+use carff_messages::forms::AnyMessage;
 use carff_messages::{Action, Belief, Forecast, Posterior};
 use carff_recording::Reader;
 use carff_transport::TopicId;
@@ -31,39 +31,27 @@ pub(super) struct Comparison {
     cut_off: bool,
 }
 
-fn without_times(header: &mut HeaderForm) {
-    header.run_id.clear();
-    (header.sequence, header.capture_time_ns, header.publish_time_ns) = (0, 0, 0);
-}
-
 /// Returns a message without its times; `None` for topics that are not compared.
 fn timeless(message: AnyMessage<'_>) -> Option<(Place, Value)> {
     let header = message.header();
-    let (mut frame, mut step) = (header.frame_id, header.step);
-    let (topic, value) = if let Some(m) = message.get::<Posterior>() {
-        let mut form = PosteriorForm::from(m);
-        without_times(&mut form.header);
-        form.stage_latency_ns = 0;
-        (TopicId::POSTERIOR, serde_json::to_value(form))
-    } else if let Some(m) = message.get::<Forecast>() {
-        let mut form = ForecastForm::from(m);
-        without_times(&mut form.header);
-        (form.encoder_ns, form.stage_latency_ns) = (0, 0);
-        (TopicId::FORECAST, serde_json::to_value(form))
-    } else if let Some(m) = message.get::<Belief>() {
-        let mut form = BeliefForm::from(m);
-        without_times(&mut form.header);
-        (form.encoder_ns, form.forecaster_ns, form.stage_latency_ns) = (0, 0, 0);
-        (TopicId::BELIEF, serde_json::to_value(form))
+    let place = if message.get::<Posterior>().is_some() {
+        (TopicId::POSTERIOR, header.frame_id, header.step)
+    } else if message.get::<Forecast>().is_some() {
+        (TopicId::FORECAST, header.frame_id, header.step)
+    } else if message.get::<Belief>().is_some() {
+        (TopicId::BELIEF, header.frame_id, header.step)
     } else {
         let action = message.get::<Action>().filter(|action| action.is_decision())?;
-        let mut form = ActionForm::from(action);
-        without_times(&mut form.header);
-        (form.valid_until_ns, form.latency_ns) = (0, 0);
-        (frame, step) = (action.based_on_frame, 0);
-        (TopicId::ACTION, serde_json::to_value(form))
+        (TopicId::ACTION, action.based_on_frame, 0)
     };
-    Some(((topic, frame, step), value.unwrap_or_default()))
+    let mut value = message.to_json().unwrap_or_default();
+    if let Some(header) = value["header"].as_object_mut() {
+        header.retain(|key, _| !key.ends_with("_ns") && !["run_id", "sequence"].contains(&key.as_str()));
+    }
+    if let Some(fields) = value.as_object_mut() {
+        fields.retain(|key, _| !key.ends_with("_ns"));
+    }
+    Some((place, value))
 }
 
 impl Replayed {

@@ -2,6 +2,7 @@
 
 use super::SoakArgs;
 use super::watch::Notes;
+use carff_base::statistics::percentile;
 use carff_config::Contract;
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
@@ -71,13 +72,6 @@ impl Lives {
     }
 }
 
-/// Returns the value that a share of all does not exceed.
-fn quantile(values: &[f64], share: f64) -> Option<f64> {
-    let mut sorted = values.to_vec();
-    sorted.sort_by(f64::total_cmp);
-    sorted.get(((share * sorted.len() as f64).ceil() as usize).max(1) - 1).copied()
-}
-
 impl Outcome {
     /// Assigns the recoveries from number `first` to a kind of fault.
     pub(super) fn note_recoveries(&mut self, kind: &'static str, first: usize) {
@@ -93,7 +87,7 @@ impl Outcome {
         self.growth_percent_per_hour = growth.map(|(percent, _)| percent);
         let (latency_ms, frames) = (&notes.latency_ms, contract.p99_frames);
         if latency_ms.len() >= 2 * frames && frames > 0 {
-            let p99 = |values: &[f64]| quantile(values, 0.99).unwrap_or(f64::NAN);
+            let p99 = |values: &[f64]| percentile(values, 0.99).unwrap_or(f64::NAN);
             let (first, last) = (p99(&latency_ms[..frames]), p99(&latency_ms[latency_ms.len() - frames..]));
             self.drift_percent = Some(100.0 * (last - first) / first);
         }
@@ -125,7 +119,7 @@ impl Outcome {
             "evidence": self.evidence,
             "worst_recovery_ms": self.recoveries_ms.iter().copied().reduce(f64::max),
             "worst_recovery_ms_by_kind": self.worst_recoveries_ms,
-            "median_recovery_ms": quantile(&self.recoveries_ms, 0.5),
+            "median_recovery_ms": percentile(&self.recoveries_ms, 0.5),
             "worst_start_ms": self.worst_start_ms,
             "worst_safe_action_ms": ms(notes.judge.worst_safe_action_ns),
             "worst_action_gap_ms": ms(notes.judge.worst_gap_ns),
@@ -133,7 +127,7 @@ impl Outcome {
             "decisions_not_judged": notes.judge.unjudged,
             "leaked_files": self.leaked_files,
             "rss_growth_percent_per_hour": self.growth_percent_per_hour,
-            "p99_ms": quantile(&notes.latency_ms, 0.99),
+            "p99_ms": percentile(&notes.latency_ms, 0.99),
             "p99_drift_percent": self.drift_percent,
             "schedule": self.schedule,
         })
@@ -196,7 +190,7 @@ mod tests {
     fn quantiles_occurred() {
         let values: Vec<f64> = (1..=200).rev().map(f64::from).collect();
         assert_eq!(
-            (quantile(&values, 0.5), quantile(&values, 0.99), quantile(&[], 0.5)),
+            (percentile(&values, 0.5), percentile(&values, 0.99), percentile(&[], 0.5)),
             (Some(100.0), Some(198.0), None)
         );
     }

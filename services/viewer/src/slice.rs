@@ -9,16 +9,7 @@ const DEPTH_M: f32 = 0.25;
 /// Returns the share of light that 0.25 m of the scene absorbs at a height: black none, white all. The image covers the
 /// region of interest, +X to the right, +Y up, with `longest_px` points along its longer side.
 pub fn density_slice(field: &Field, latent: &[f32; LATENT_DIM], height_m: f32, longest_px: u32) -> Image {
-    let [low, high] = field.config().bounds_m;
-    let extent_m = [high[0] - low[0], high[1] - low[1]];
-    let pixel_m = extent_m[0].max(extent_m[1]) / longest_px.max(1) as f32;
-    let [width_px, height_px] = extent_m.map(|e| ((e / pixel_m).round() as u32).max(1));
-    let points: Vec<[f32; 3]> = (0..height_px)
-        .flat_map(|y| (0..width_px).map(move |x| (x, y)))
-        .map(|(x, y)| [low[0] + (x as f32 + 0.5) * pixel_m, high[1] - (y as f32 + 0.5) * pixel_m, height_m])
-        .collect();
-    let mut densities = vec![0.0; points.len()];
-    field.density(&points, latent, &mut densities);
+    let (width_px, height_px, densities) = field.density_slice(latent, height_m, longest_px);
     let rgb = densities.iter().flat_map(|d| [(255.0 * (1.0 - (-d.max(0.0) * DEPTH_M).exp())) as u8; 3]).collect();
     Image { width_px, height_px, rgb }
 }

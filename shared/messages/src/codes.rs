@@ -24,6 +24,11 @@ macro_rules! codes {
                 Self::ALL.into_iter().find(|known| known.name() == name)
             }
 
+            /// Returns all names, separated by commas.
+            pub(crate) fn names() -> String {
+                Self::ALL.map(Self::name).join(", ")
+            }
+
             /// Returns the name in reports and logs.
             pub const fn name(self) -> &'static str {
                 match self { $(Self::$variant => $text),+ }

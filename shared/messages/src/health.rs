@@ -1,18 +1,25 @@
 //! Heartbeats of stages.
 
-use crate::{Header, HealthState, Invalid, Stage, message};
+use crate::{Header, HealthState, Invalid, Stage, fields, message};
 use iceoryx2::prelude::ZeroCopySend;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
 
 /// A stage's heartbeat: its state and its counts since its start.
 #[repr(C)]
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ZeroCopySend)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ZeroCopySend, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
 #[type_name("carff.Health.v1")]
 pub struct Health {
     /// Header; its frame is the last processed frame.
     pub header: Header,
-    /// Code of a [`Stage`].
+    /// Code of a [`Stage`]; in JSON, its name.
+    #[serde(with = "fields::stage")]
+    #[schemars(with = "String")]
     pub stage: u32,
-    /// Code of a [`HealthState`].
+    /// Code of a [`HealthState`]; in JSON, its name.
+    #[serde(with = "fields::state")]
+    #[schemars(with = "String")]
     pub state: u32,
     /// Process id.
     pub pid: u32,

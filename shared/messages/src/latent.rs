@@ -50,7 +50,8 @@ impl Gaussian {
 
 /// The encoder's answer to a frame: the posterior over the scene latent.
 #[repr(C)]
-#[derive(Clone, Copy, Debug, PartialEq, ZeroCopySend)]
+#[derive(Clone, Copy, Debug, PartialEq, ZeroCopySend, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
 #[type_name("carff.Posterior.v1")]
 pub struct Posterior {
     /// Header, at step 0.

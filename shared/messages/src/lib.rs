@@ -19,6 +19,7 @@ pub mod check;
 mod codes;
 mod convert;
 mod decision;
+mod fields;
 pub mod forms;
 mod frame;
 mod health;
@@ -36,6 +37,8 @@ pub use latent::{Belief, Forecast, Gaussian, Posterior, ProbeResult};
 pub use iceoryx2::prelude::ZeroCopySend;
 
 use check::{at_most, equals};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
 use std::fmt::Debug;
 
 /// Version of all layouts in this crate. A process drops messages of another version.
@@ -67,14 +70,17 @@ pub const MAX_IMAGE_BYTES: usize = 1 << 24;
 /// assert!(observed.at_step(9).validate().unwrap_err().to_string().contains("header.step"));
 /// ```
 #[repr(C)]
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ZeroCopySend)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ZeroCopySend, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
 #[type_name("carff.Header.v1")]
 pub struct Header {
-    /// [`SCHEMA_VERSION`] of the sender. Set on send.
+    /// Version of the message's layout, [`SCHEMA_VERSION`]. Set on send.
     pub schema_version: u32,
     /// Horizon step: 0 for the observation, 1 for the first forecast.
     pub step: u32,
-    /// The run of the message. Set on send.
+    /// The run of the message; in JSON, 16 hexadecimal digits. Set on send.
+    #[serde(with = "fields::hex")]
+    #[schemars(with = "String")]
     pub run_id: u64,
     /// The camera frame that the message is based on, counted from 0 in a run.
     pub frame_id: u64,

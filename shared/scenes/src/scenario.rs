@@ -70,7 +70,8 @@ pub struct Rendering {
     pub image: Image,
     /// Distance along the ray through each pixel's centre, metres, row-major; infinite for the sky.
     pub depth_m: Vec<f32>,
-    /// First hit of the ray through each pixel's centre: 0 sky, 1 ground, then static and moving objects (see [`Scenario::object_of`]).
+    /// First hit of the ray through each pixel's centre: 0 sky, 1 ground, then static and moving objects (see
+    /// [`Scenario::object_of`]).
     pub object_id: Vec<u16>,
     /// Visibility of the actor; `None` if not requested or if nothing in the scenario is dynamic.
     pub actor: Option<ActorView>,

@@ -41,7 +41,7 @@ const ROWS: usize = 8;
 const SAMPLES: usize = 10;
 const HYPOTHESES: usize = 4;
 /// Points along the longer side of a density slice.
-const SLICE_PX: usize = 160;
+const SLICE_PX: u32 = 160;
 /// Path length through the field that gives a slice its opacity, metres: the field's surfaces are thin.
 const SLICE_DEPTH_M: f32 = 0.25;
 const HAZARD: [u8; 3] = [236, 140, 20];
@@ -162,18 +162,9 @@ fn density(subject: &Subject, path: &Path) -> Result<bool, EvaluationError> {
 
 /// Horizontal slice of the field.
 fn slice(field: &Field, latent: &[f32; LATENT_DIM], height_m: f32) -> Image {
-    let [low, high] = field.config().bounds_m;
-    let extent = [high[0] - low[0], high[1] - low[1]];
-    let pixel_m = extent[0].max(extent[1]) / SLICE_PX as f32;
-    let [width, height] = extent.map(|e| ((e / pixel_m).round() as usize).max(1));
-    let points: Vec<[f32; 3]> = (0..height)
-        .flat_map(|y| (0..width).map(move |x| (x, y)))
-        .map(|(x, y)| [low[0] + (x as f32 + 0.5) * pixel_m, high[1] - (y as f32 + 0.5) * pixel_m, height_m])
-        .collect();
-    let mut densities = vec![0.0; points.len()];
-    field.density(&points, latent, &mut densities);
+    let (width_px, height_px, densities) = field.density_slice(latent, height_m, SLICE_PX);
     let rgb = densities.iter().flat_map(|d| [(255.0 * (-d.max(0.0) * SLICE_DEPTH_M).exp()) as u8; 3]).collect();
-    Image { width_px: width as u32, height_px: height as u32, rgb }
+    Image { width_px, height_px, rgb }
 }
 
 /// Images that leave more than one branch open: trained poses first, in the order of poses, then held-out poses.

@@ -80,6 +80,22 @@ impl Field {
         self.density_by_latent(&points_m[..count], std::slice::from_ref(latent), &mut out[..count]);
     }
 
+    /// Computes the density (1/metre) at a height, metres, over the bounds: width, height and rows of an image with +X
+    /// to the right, +Y up, and `longest_px` points along its longer side.
+    pub fn density_slice(&self, latent: &[f32; LATENT_DIM], height_m: f32, longest_px: u32) -> (u32, u32, Vec<f32>) {
+        let [low, high] = self.config().bounds_m;
+        let extent_m = [high[0] - low[0], high[1] - low[1]];
+        let pixel_m = extent_m[0].max(extent_m[1]) / longest_px.max(1) as f32;
+        let [width_px, height_px] = extent_m.map(|e| ((e / pixel_m).round() as u32).max(1));
+        let points: Vec<[f32; 3]> = (0..height_px)
+            .flat_map(|y| (0..width_px).map(move |x| (x, y)))
+            .map(|(x, y)| [low[0] + (x as f32 + 0.5) * pixel_m, high[1] - (y as f32 + 0.5) * pixel_m, height_m])
+            .collect();
+        let mut densities = vec![0.0; points.len()];
+        self.density(&points, latent, &mut densities);
+        (width_px, height_px, densities)
+    }
+
     /// Computes the density (1/metre) at world points (metres) under each of several latents:
     /// `out[latent * points + point]`. Latents that do not fit into `out` are left out, extra room is left unchanged.
     pub fn density_by_latent(&self, points_m: &[[f32; 3]], latents: &[[f32; LATENT_DIM]], out: &mut [f32]) {

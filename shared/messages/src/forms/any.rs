@@ -1,6 +1,6 @@
 //! Messages with a type that is only known at run time.
 
-use super::{ActionForm, BeliefForm, ForecastForm, FormError, FrameForm, HealthForm, PosteriorForm, ViewForm};
+use super::{ActionForm, BeliefForm, ForecastForm, FormError, FrameForm, ViewForm};
 use crate::{Action, Belief, Forecast, FrameMeta, Header, Health, Message, Posterior, ViewMeta};
 use schemars::JsonSchema;
 use serde::Serialize;
@@ -12,9 +12,12 @@ use std::fmt::Debug;
 /// A message that has a JSON form: probes, recordings and links handle it without knowing its type.
 pub trait Readable: Message {
     /// The JSON form of the message.
-    type Form: Serialize + DeserializeOwned + JsonSchema + for<'a> From<&'a Self>;
+    type Form: Serialize + DeserializeOwned + JsonSchema;
     /// Name of the form's schema, for example `carff.Belief`.
     const SCHEMA: &'static str;
+
+    /// Converts the message into its form.
+    fn to_form(&self) -> Self::Form;
 
     /// Converts a form into a valid message.
     fn of_form(form: &Self::Form) -> Result<Self, FormError>;
@@ -26,6 +29,10 @@ macro_rules! readable {
             type Form = $form;
             const SCHEMA: &'static str = $schema;
 
+            fn to_form(&self) -> $form {
+                self.into()
+            }
+
             fn of_form(form: &$form) -> Result<Self, FormError> {
                 form.try_into()
             }
@@ -33,14 +40,36 @@ macro_rules! readable {
     };
 }
 
+/// Messages that are their own form.
+macro_rules! plain {
+    ($($message:ty = $schema:literal;)+) => {
+        $(impl Readable for $message {
+            type Form = Self;
+            const SCHEMA: &'static str = $schema;
+
+            fn to_form(&self) -> Self {
+                *self
+            }
+
+            fn of_form(form: &Self) -> Result<Self, FormError> {
+                form.validate()?;
+                Ok(*form)
+            }
+        })+
+    };
+}
+
+plain! {
+    Posterior = "carff.Posterior";
+    Health = "carff.Health";
+}
+
 readable! {
     FrameMeta: FrameForm = "carff.Frame";
-    Posterior: PosteriorForm = "carff.Posterior";
     Forecast: ForecastForm = "carff.Forecast";
     Belief: BeliefForm = "carff.Belief";
     ViewMeta: ViewForm = "carff.View";
     Action: ActionForm = "carff.Action";
-    Health: HealthForm = "carff.Health";
 }
 
 /// Reads a message from the JSON of its form.
@@ -80,7 +109,7 @@ impl<M: Readable> DynMessage for M {
     }
 
     fn to_json(&self) -> Result<Value, serde_json::Error> {
-        serde_json::to_value(M::Form::from(self))
+        serde_json::to_value(self.to_form())
     }
 
     fn boxed(&self) -> Box<dyn DynMessage> {

@@ -1,7 +1,7 @@
 //! The form of actions.
 
-use super::{FormError, HeaderForm, code_of, name_of};
-use crate::{Action, ActionCode, Message, Reason, Rule};
+use super::{FormError, code_of, name_of};
+use crate::{Action, ActionCode, Header, Message, Reason, Rule};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 #[serde(deny_unknown_fields)]
 pub struct ActionForm {
     /// Header of the frame that it is based on.
-    pub header: HeaderForm,
+    pub header: Header,
     /// `halt` or `advance`.
     pub action: String,
     /// Reason of the action.
@@ -36,7 +36,7 @@ pub struct ActionForm {
 impl From<&Action> for ActionForm {
     fn from(action: &Action) -> Self {
         Self {
-            header: (&action.header).into(),
+            header: action.header,
             action: name_of!(ActionCode, action.action),
             reason: name_of!(Reason, action.reason),
             rule: name_of!(Rule, action.rule),
@@ -56,7 +56,7 @@ impl TryFrom<&ActionForm> for Action {
 
     fn try_from(form: &ActionForm) -> Result<Self, FormError> {
         let action = Self {
-            header: (&form.header).try_into()?,
+            header: form.header,
             action: code_of!(ActionCode, "action", form.action)?,
             reason: code_of!(Reason, "reason", form.reason)?,
             rule: code_of!(Rule, "rule", form.rule)?,

@@ -1,7 +1,7 @@
 //! The forms of image descriptions.
 
-use super::{FormError, HeaderForm, array, code_of, index, name_of, signed};
-use crate::{DatasetView, FrameMeta, Intrinsics, Message, Observability, ViewKind, ViewMeta};
+use super::{FormError, array, code_of, index, name_of, signed};
+use crate::{DatasetView, FrameMeta, Header, Intrinsics, Message, Observability, ViewKind, ViewMeta};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -30,7 +30,7 @@ pub struct DatasetViewForm {
 #[serde(deny_unknown_fields)]
 pub struct FrameForm {
     /// Header, at step 0.
-    pub header: HeaderForm,
+    pub header: Header,
     /// Width, pixels.
     pub width_px: u32,
     /// Height, pixels.
@@ -62,7 +62,7 @@ impl From<&FrameMeta> for FrameForm {
     fn from(meta: &FrameMeta) -> Self {
         let view = &meta.dataset_view;
         Self {
-            header: (&meta.header).into(),
+            header: meta.header,
             width_px: meta.width_px,
             height_px: meta.height_px,
             intrinsics: meta.intrinsics,
@@ -98,7 +98,7 @@ impl TryFrom<&FrameForm> for FrameMeta {
             },
         };
         let meta = Self {
-            header: (&form.header).try_into()?,
+            header: form.header,
             width_px: form.width_px,
             height_px: form.height_px,
             intrinsics: form.intrinsics,
@@ -115,7 +115,7 @@ impl TryFrom<&FrameForm> for FrameMeta {
 #[serde(deny_unknown_fields)]
 pub struct ViewForm {
     /// Header, at the step of the hypothesis.
-    pub header: HeaderForm,
+    pub header: Header,
     /// Index of the sample or component that it shows.
     pub hypothesis: u32,
     /// `birds-eye` or `free`.
@@ -141,7 +141,7 @@ pub struct ViewForm {
 impl From<&ViewMeta> for ViewForm {
     fn from(meta: &ViewMeta) -> Self {
         Self {
-            header: (&meta.header).into(),
+            header: meta.header,
             hypothesis: meta.hypothesis,
             kind: name_of!(ViewKind, meta.kind),
             state: index(meta.state),
@@ -161,7 +161,7 @@ impl TryFrom<&ViewForm> for ViewMeta {
 
     fn try_from(form: &ViewForm) -> Result<Self, FormError> {
         let meta = Self {
-            header: (&form.header).try_into()?,
+            header: form.header,
             hypothesis: form.hypothesis,
             kind: code_of!(ViewKind, "kind", form.kind)?,
             state: signed(form.state),

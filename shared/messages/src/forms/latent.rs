@@ -1,48 +1,12 @@
 //! The forms of posteriors, forecasts and beliefs.
 
-use super::{FormError, HeaderForm, array, begin, code_of, index, name_of, signed};
+use super::{FormError, array, begin, code_of, index, name_of, signed};
 use crate::{
-    Belief, Forecast, ForecastSource, Gaussian, LATENT_DIM, MAX_COMPONENTS, MAX_PLACES, MAX_SAMPLES, Message,
-    Posterior, ProbeResult,
+    Belief, Forecast, ForecastSource, Gaussian, Header, LATENT_DIM, MAX_COMPONENTS, MAX_PLACES, MAX_SAMPLES, Message,
+    ProbeResult,
 };
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-
-/// The encoder's answer to a frame.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields)]
-pub struct PosteriorForm {
-    /// Header, at step 0.
-    pub header: HeaderForm,
-    /// The latent's distribution.
-    pub gaussian: Gaussian,
-    /// Time from the arrival of the frame to sending, nanoseconds.
-    pub stage_latency_ns: u64,
-}
-
-impl From<&Posterior> for PosteriorForm {
-    fn from(posterior: &Posterior) -> Self {
-        Self {
-            header: (&posterior.header).into(),
-            gaussian: posterior.gaussian,
-            stage_latency_ns: posterior.stage_latency_ns,
-        }
-    }
-}
-
-impl TryFrom<&PosteriorForm> for Posterior {
-    type Error = FormError;
-
-    fn try_from(form: &PosteriorForm) -> Result<Self, FormError> {
-        let posterior = Self {
-            header: (&form.header).try_into()?,
-            gaussian: form.gaussian,
-            stage_latency_ns: form.stage_latency_ns,
-        };
-        posterior.validate()?;
-        Ok(posterior)
-    }
-}
 
 /// A component of a mixture.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -69,7 +33,7 @@ pub struct DrawForm {
 #[serde(deny_unknown_fields)]
 pub struct ForecastForm {
     /// Header, at step 1 or more.
-    pub header: HeaderForm,
+    pub header: Header,
     /// Source of the forecast: `observed` or `probed`.
     pub source: String,
     /// Number of steps in the look-ahead of this frame.
@@ -92,7 +56,7 @@ impl From<&Forecast> for ForecastForm {
     fn from(f: &Forecast) -> Self {
         let components = (f.component_count as usize).min(MAX_COMPONENTS);
         Self {
-            header: (&f.header).into(),
+            header: f.header,
             source: name_of!(ForecastSource, f.source),
             horizon: f.horizon,
             resolved_state: index(f.resolved_state),
@@ -127,7 +91,7 @@ impl TryFrom<&ForecastForm> for Forecast {
             .collect::<Result<Vec<_>, _>>()?;
         let drawn_from: Vec<u8> = form.samples.iter().map(|s| s.component).collect();
         let forecast = Self {
-            header: (&form.header).try_into()?,
+            header: form.header,
             source: code_of!(ForecastSource, "source", form.source)?,
             component_count: components.len() as u32,
             sample_count: latents.len() as u32,
@@ -192,7 +156,7 @@ impl ProbeForm {
 #[serde(deny_unknown_fields)]
 pub struct BeliefForm {
     /// Header, at the step of the forecast.
-    pub header: HeaderForm,
+    pub header: Header,
     /// Number of steps in the look-ahead of this frame.
     pub horizon: u32,
     /// True for the frame's last step.
@@ -226,7 +190,7 @@ impl From<&Belief> for BeliefForm {
         let places = (b.place_count as usize).min(MAX_PLACES);
         let components = (b.component_count as usize).min(MAX_COMPONENTS);
         Self {
-            header: (&b.header).into(),
+            header: b.header,
             horizon: b.horizon,
             is_final: b.is_final(),
             place_count: b.place_count,
@@ -262,7 +226,7 @@ impl TryFrom<&BeliefForm> for Belief {
         let (components, samples) = (results(&form.components)?, results(&form.samples)?);
         let weights: Vec<f32> = form.components.iter().map(|c| c.weight.unwrap_or(0.0)).collect();
         let drawn_from: Vec<u8> = form.samples.iter().map(|s| s.component).collect();
-        let mut belief = Self::empty((&form.header).try_into()?, form.horizon);
+        let mut belief = Self::empty(form.header, form.horizon);
         belief.is_final = form.is_final.into();
         belief.state_count = form.state_probability.len() as u32;
         belief.place_count = form.place_count;

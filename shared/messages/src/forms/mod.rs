@@ -2,34 +2,30 @@
 //!
 //! People, recordings and other tools read these forms. A form writes codes as names, arrays with their used entries,
 //! and `null` for "none". A message converted to its form and back is the same message bit for bit; unused entries
-//! become zero. [`schema`] describes a form as JSON Schema.
+//! become zero. [`schema`] describes a form as JSON Schema. A message without optional fields and lists is its own
+//! form.
 //!
 //! ```
+//! use carff_messages::forms::{Readable, read};
 //! use carff_messages::{Gaussian, Header, Posterior};
-//! use carff_messages::forms::PosteriorForm;
 //! let header = Header::of_frame(7, 1_000, 42);
 //! let posterior = Posterior { header, gaussian: Gaussian::standard(), stage_latency_ns: 5 };
-//! let text = serde_json::to_string(&PosteriorForm::from(&posterior))?;
+//! let text = serde_json::to_string(&posterior.to_form())?;
 //! assert!(text.contains(r#""frame_id":7"#));
-//! let back = Posterior::try_from(&serde_json::from_str::<PosteriorForm>(&text)?)?;
-//! assert_eq!(back, posterior);
+//! assert_eq!(read::<Posterior>(text.as_bytes())?, posterior);
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
 
 mod any;
 mod decision;
 mod frame;
-mod header;
-mod health;
 mod latent;
 mod text;
 
 pub use any::{AnyMessage, DynMessage, OwnedMessage, Readable, read};
 pub use decision::ActionForm;
 pub use frame::{DatasetViewForm, FrameForm, ViewForm};
-pub use header::HeaderForm;
-pub use health::HealthForm;
-pub use latent::{BeliefForm, ComponentForm, DrawForm, ForecastForm, PosteriorForm, ProbeForm};
+pub use latent::{BeliefForm, ComponentForm, DrawForm, ForecastForm, ProbeForm};
 pub use text::as_text;
 
 use crate::Invalid;
@@ -58,14 +54,6 @@ pub enum FormError {
         /// Allowed length.
         expected: String,
     },
-    /// A number is not in the expected format.
-    #[error("`{field}` is `{found}`: it must be 16 hexadecimal digits")]
-    Number {
-        /// Name of the field.
-        field: &'static str,
-        /// Value of the field.
-        found: String,
-    },
     /// The text is not valid JSON of this form.
     #[error(transparent)]
     Json(#[from] serde_json::Error),
@@ -91,7 +79,7 @@ macro_rules! code_of {
         <$kind>::from_name(&$name).map(<$kind>::code).ok_or_else(|| $crate::forms::FormError::UnknownName {
             field: $field,
             found: $name.to_owned(),
-            known: <$kind>::ALL.iter().map(|c| c.name()).collect::<Vec<_>>().join(", "),
+            known: <$kind>::names(),
         })
     };
 }

@@ -3,9 +3,6 @@ use crate::{
     Action, Belief, DatasetView, Forecast, ForecastSource, FrameMeta, Gaussian, Header, Health, Intrinsics, Posterior,
     ProbeResult, ViewMeta,
 };
-use serde::Serialize;
-use serde::de::DeserializeOwned;
-use std::fmt::Debug;
 
 /// Returns deterministic numbers with bit patterns over the range of finite numbers.
 fn numbers() -> impl FnMut() -> f32 {
@@ -39,13 +36,26 @@ fn gaussian(next: &mut impl FnMut() -> f32) -> Gaussian {
     Gaussian { mean: std::array::from_fn(|_| next()), log_variance: std::array::from_fn(|_| probability(next) * -9.7) }
 }
 
-fn there_and_back<M, F>(message: &M) -> M
-where
-    F: for<'a> From<&'a M> + Serialize + DeserializeOwned + JsonSchema,
-    M: for<'a> TryFrom<&'a F, Error = FormError> + Debug,
-{
-    let text = serde_json::to_string(&F::from(message)).unwrap();
-    M::try_from(&serde_json::from_str::<F>(&text).unwrap()).unwrap()
+fn there_and_back<M: Readable>(message: &M) -> M {
+    read(serde_json::to_string(&message.to_form()).unwrap().as_bytes()).unwrap()
+}
+
+fn health() -> Health {
+    Health {
+        header: header(),
+        stage: 4,
+        state: 2,
+        pid: 77,
+        received: 1,
+        published: 2,
+        skipped: 3,
+        invalid: 4,
+        errors: 5,
+        last_latency_ns: 6,
+        max_latency_ns: 7,
+        last_progress_ns: 8,
+        rss_bytes: 9,
+    }
 }
 
 fn belief(next: &mut impl FnMut() -> f32) -> Belief {
@@ -75,10 +85,10 @@ fn messages_survive_their_forms() {
     let mut next = numbers();
     for _ in 0..200 {
         let posterior = Posterior { header: header(), gaussian: gaussian(&mut next), stage_latency_ns: 7 };
-        assert_eq!(there_and_back::<_, PosteriorForm>(&posterior), posterior);
+        assert_eq!(there_and_back(&posterior), posterior);
 
         let belief = belief(&mut next);
-        assert_eq!(there_and_back::<_, BeliefForm>(&belief), belief);
+        assert_eq!(there_and_back(&belief), belief);
 
         let mut forecast = Forecast::empty(header().at_step(2), ForecastSource::Probed, 3);
         (forecast.component_count, forecast.sample_count, forecast.resolved_state) = (2, 5, 4);
@@ -88,7 +98,7 @@ fn messages_survive_their_forms() {
             forecast.samples[i].fill_with(&mut next);
             forecast.sample_component[i] = (i % 2) as u8;
         }
-        assert_eq!(there_and_back::<_, ForecastForm>(&forecast), forecast);
+        assert_eq!(there_and_back(&forecast), forecast);
 
         let frame = FrameMeta {
             header: header(),
@@ -98,9 +108,9 @@ fn messages_survive_their_forms() {
             world_from_camera: std::array::from_fn(|_| f64::from(next()) / 3.0),
             dataset_view: DatasetView { known: 1, view: 3, observability: 2, ..DatasetView::UNKNOWN },
         };
-        assert_eq!(there_and_back::<_, FrameForm>(&frame), frame);
+        assert_eq!(there_and_back(&frame), frame);
         let nowhere = FrameMeta { dataset_view: DatasetView::UNKNOWN, ..frame };
-        assert_eq!(there_and_back::<_, FrameForm>(&nowhere), nowhere);
+        assert_eq!(there_and_back(&nowhere), nowhere);
 
         let view = ViewMeta {
             header: header().at_step(1),
@@ -115,7 +125,7 @@ fn messages_survive_their_forms() {
             world_from_camera: frame.world_from_camera,
             stage_latency_ns: 9,
         };
-        assert_eq!(there_and_back::<_, ViewForm>(&view), view);
+        assert_eq!(there_and_back(&view), view);
 
         let action = Action {
             header: header(),
@@ -130,24 +140,9 @@ fn messages_survive_their_forms() {
             based_on_frame: u64::MAX,
             latency_ns: 0,
         };
-        assert_eq!(there_and_back::<_, ActionForm>(&action), action);
+        assert_eq!(there_and_back(&action), action);
     }
-    let health = Health {
-        header: header(),
-        stage: 4,
-        state: 2,
-        pid: 77,
-        received: 1,
-        published: 2,
-        skipped: 3,
-        invalid: 4,
-        errors: 5,
-        last_latency_ns: 6,
-        max_latency_ns: 7,
-        last_progress_ns: 8,
-        rss_bytes: 9,
-    };
-    assert_eq!(there_and_back::<_, HealthForm>(&health), health);
+    assert_eq!(there_and_back(&health()), health());
 }
 
 /// An invalid form is refused with its field's name: unknown names, lists that are too long, invalid numbers.
@@ -161,14 +156,25 @@ fn what_is_no_message_is_refused() {
     assert!(Belief::try_from(&form).unwrap_err().to_string().contains("hazard_probability"));
 
     let posterior = Posterior { header: header(), gaussian: Gaussian::standard(), stage_latency_ns: 0 };
-    let mut form = serde_json::to_value(PosteriorForm::from(&posterior)).unwrap();
+    let mut form = serde_json::to_value(posterior).unwrap();
     form["gaussian"]["mean"].as_array_mut().unwrap().pop();
-    assert!(serde_json::from_value::<PosteriorForm>(form).unwrap_err().to_string().contains("array of length 8"));
+    assert!(serde_json::from_value::<Posterior>(form).unwrap_err().to_string().contains("array of length 8"));
 
     let mut form = ForecastForm::from(&Forecast::empty(header().at_step(1), ForecastSource::Observed, 1));
     form.source = "guessed".to_owned();
     let error = Forecast::try_from(&form).unwrap_err().to_string();
     assert!(error.contains("source") && error.contains("observed, probed"), "{error}");
+
+    let health = serde_json::to_string(&health()).unwrap();
+    for (right, wrong, named) in [
+        (r#""stage":"prober""#, r#""stage":"probr""#, "`stage` is `probr`, must be one of: camera"),
+        (r#""state":"slow""#, r#""state":"tired""#, "`state` is `tired`"),
+        (r#""run_id":"fffffffffffffffc""#, r#""run_id":"no run""#, "`no run` must be 16 hexadecimal digits"),
+    ] {
+        assert!(health.contains(right), "{health}");
+        let error = read::<Health>(health.replace(right, wrong).as_bytes()).unwrap_err().to_string();
+        assert!(error.contains(named), "{error}");
+    }
 }
 
 /// A belief from an old recording, with `densities` for occupancies, can be read.
