@@ -230,3 +230,13 @@ fn masked_differences_do_not_count() {
         assert_eq!(report.pose_mean_psnr_db.is_none(), masked);
     }
 }
+
+/// A large camera of a small image costs nothing.
+#[test]
+fn the_size_of_an_image_is_its_own() {
+    let dir = tempfile::tempdir().unwrap();
+    put(dir.path(), &Image::filled(2, 2, [9; 3]), &json!({"w": 8192, "h": 8192, "k1": 0.1}), &json!({}));
+    let set = Dataset::open(dir.path()).unwrap();
+    assert_eq!(set.valid_pixels(0), None);
+    assert!(set.load_image(0).unwrap_err().to_string().contains("is 2x2 pixels, but its intrinsics"));
+}
