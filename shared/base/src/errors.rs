@@ -21,8 +21,8 @@ pub fn sentence(error: &(dyn Error + 'static)) -> String {
     sentence
 }
 
-/// Returns a description, with a remedy, of a file that tools leave in place of the wanted data: a Git LFS pointer or a
-/// web page. `head` is the start of the file, 64 bytes or more.
+/// Returns a description, with a remedy, of a file that tools leave in place of the wanted data: a Git LFS pointer, a
+/// web page, or the XML reply of a server. `head` is the start of the file, 64 bytes or more.
 ///
 /// ```
 /// let pointer = b"version https://git-lfs.github.com/spec/v1\noid sha256:0";
@@ -34,8 +34,7 @@ pub fn stand_in(head: &[u8]) -> Option<&'static str> {
     if text.starts_with("version https://git-lfs.github.com/spec") {
         return Some("a Git LFS pointer, not the data; run `git lfs pull` in the repository that it is from");
     }
-    ["<!doctype", "<html", "<?xml", "<head"]
-        .iter()
-        .any(|start| text.starts_with(start))
-        .then_some("a web page, not the data; download the file from its direct (`raw` or `resolve`) address")
+    ["<!doctype", "<html", "<?xml", "<head"].iter().any(|start| text.starts_with(start)).then_some(
+        "a web page or an XML reply, not the data; download the file from its direct (`raw` or `resolve`) address",
+    )
 }

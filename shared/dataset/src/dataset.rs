@@ -8,7 +8,7 @@ use carff_base::geometry::PinholeCamera;
 use rayon::prelude::*;
 
 use crate::error::DatasetError;
-use crate::image::{Image, load_mask};
+use crate::image::{Image, dimensions, load_mask};
 use crate::lens::Lens;
 use crate::scenario::{Frame, ScenarioInfo};
 use crate::seen;
@@ -168,23 +168,26 @@ fn load(index: usize, frame: &Frame) -> Result<Image, DatasetError> {
 /// Valid pixels of a frame; `None`: all.
 type Mask = Option<Arc<[bool]>>;
 
-/// Reads the masks of all frames. Frames with equal lenses and without a mask share one.
+/// Reads the masks of all frames. Frames with equal lenses and without a mask share one. An image of another size than its
+/// camera has none, because it cannot be loaded.
 fn masks(frames: &[Frame]) -> Result<Vec<Mask>, DatasetError> {
     let key = |frame: &Frame| {
         format!("{:?}", (frame.lens, PinholeCamera { world_from_camera: [[0.0; 4]; 4], ..frame.camera }))
     };
+    let size = |frame: &Frame| (frame.camera.width_px, frame.camera.height_px);
+    let fits = |frame: &Frame| dimensions(&frame.image_path).is_ok_and(|found| found == size(frame));
     let mut of_lens: HashMap<String, Arc<[bool]>> = HashMap::new();
-    for frame in frames.iter().filter(|f| f.lens != Lens::Pinhole && f.mask_path.is_none()) {
+    for frame in frames.iter().filter(|f| f.lens != Lens::Pinhole && f.mask_path.is_none() && fits(f)) {
         of_lens.entry(key(frame)).or_insert_with(|| frame.lens.valid(&frame.camera, None).into());
     }
     let mask = |frame: &Frame| {
-        let camera = &frame.camera;
         let valid: Arc<[bool]> = match (&frame.mask_path, frame.lens) {
             (None, Lens::Pinhole) => return Ok(None),
-            (None, _) => of_lens[&key(frame)].clone(),
-            (Some(path), lens) => {
-                lens.valid(camera, Some(&load_mask(path, (camera.width_px, camera.height_px))?)).into()
-            }
+            (None, _) => match of_lens.get(&key(frame)).filter(|_| fits(frame)) {
+                Some(shared) => shared.clone(),
+                None => return Ok(None),
+            },
+            (Some(path), lens) => lens.valid(&frame.camera, Some(&load_mask(path, size(frame))?)).into(),
         };
         if !valid.contains(&true) {
             let path = frame.mask_path.as_ref().unwrap_or(&frame.image_path).clone();

@@ -178,7 +178,7 @@ fn masks_are_used() {
     assert!(refused(dir.path()).contains("frame 0 (a.png): key `mask_path`: there is no file"));
     std::fs::create_dir(dir.path().join("masks")).unwrap();
     let path = dir.path().join("masks/a.png");
-    mask(&|x, y| if x < 100 && y >= 40 { 0 } else { 1 }).save(&path).unwrap();
+    mask(&|x, y| u8::from(x >= 100 || y < 40)).save(&path).unwrap();
     let direct = Dataset::open(dir.path()).unwrap();
     let (counts, set) = imported(dir.path(), 240);
     assert_eq!((counts.masked, counts.undistorted), (1, 0));
@@ -187,7 +187,7 @@ fn masks_are_used() {
         assert_eq!(set.load_image(0).unwrap(), dot([100.0, 100.0]), "the image remains whole");
     }
     let (_, small) = imported(dir.path(), 120);
-    assert!((0..120 * 90).zip(small.valid_pixels(0).unwrap()).all(|(i, &v)| !v || !(i % 120 < 50 && i / 120 >= 20)));
+    assert!((0..120 * 90).zip(small.valid_pixels(0).unwrap()).all(|(i, &v)| !(v && i % 120 < 50 && i / 120 >= 20)));
 
     mask(&|_, _| 255).save(&path).unwrap();
     assert_eq!(Dataset::open(dir.path()).unwrap().valid_pixels(0), None);
@@ -229,4 +229,14 @@ fn masked_differences_do_not_count() {
         assert_eq!(report.hidden_pairs.first().map(|pair| pair.max_difference), masked.then_some(0));
         assert_eq!(report.pose_mean_psnr_db.is_none(), masked);
     }
+}
+
+/// A large camera of a small image costs nothing.
+#[test]
+fn the_size_of_an_image_is_its_own() {
+    let dir = tempfile::tempdir().unwrap();
+    put(dir.path(), &Image::filled(2, 2, [9; 3]), &json!({"w": 8192, "h": 8192, "k1": 0.1}), &json!({}));
+    let set = Dataset::open(dir.path()).unwrap();
+    assert_eq!(set.valid_pixels(0), None);
+    assert!(set.load_image(0).unwrap_err().to_string().contains("is 2x2 pixels, but its intrinsics"));
 }

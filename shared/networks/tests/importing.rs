@@ -363,10 +363,9 @@ fn timm_names_of_an_efficientnet_are_read() {
                 }
                 let layer = match (layer, stage) {
                     ("_depthwise_conv", _) => "conv_dw",
-                    ("_bn1", 0) => "bn1",
+                    ("_bn1", 0) | ("_bn0", _) => "bn1",
                     ("_project_conv", 0) | ("_expand_conv", _) => "conv_pw",
                     ("_bn2", 0) | ("_bn1", _) => "bn2",
-                    ("_bn0", _) => "bn1",
                     ("_project_conv", _) => "conv_pwl",
                     ("_bn2", _) => "bn3",
                     _ => unreachable!(),

@@ -239,7 +239,7 @@ fn join_queries(tensors: &mut Tensors, block: i64, part: &str) {
     let names = ["query", "key", "value"].map(|q| format!("blocks.{block}.attention.attention.{q}.{part}"));
     let parts: Vec<&Tensor> = names.iter().filter_map(|name| tensors.get(name)).collect();
     if let (3, Ok(joined)) = (parts.len(), Tensor::f_cat(&parts, 0)) {
-        names.iter().for_each(|name| drop(tensors.remove(name)));
+        tensors.retain(|name, _| !names.contains(name));
         tensors.insert(format!("blocks.{block}.attn.qkv.{part}"), joined);
     }
 }
