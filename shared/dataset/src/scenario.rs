@@ -7,6 +7,9 @@ use carff_base::geometry::{OrientedBox, PinholeCamera};
 use carff_messages::Observability;
 use serde::{Deserialize, Serialize};
 
+/// Maximum number of frames in a dataset.
+pub const MAX_FRAMES: usize = 1_000_000;
+
 /// An image of a dataset with its camera and state.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Frame {

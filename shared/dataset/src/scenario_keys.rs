@@ -7,8 +7,8 @@ use serde_json::{Map, Value};
 
 use crate::error::DatasetError;
 use crate::place::{Place, numbers, present};
+use crate::scenario::MAX_FRAMES;
 use crate::scenario::{Candidate, NamedBox, ScenarioInfo, StateInfo};
-use crate::transforms::MAX_FRAMES;
 
 const MAX_BRANCHES: usize = 1024;
 const MAX_TIMESTAMPS: usize = 4096;

@@ -11,14 +11,13 @@ use crate::error::DatasetError;
 use crate::image::dimensions;
 use crate::lens::Lens;
 use crate::place::{Place, present};
+use crate::scenario::MAX_FRAMES;
 use crate::scenario::{Frame, ScenarioInfo};
 use crate::scenario_keys::{read_scenario, read_state};
 use crate::views::{check_views, derive_states_without_scenario, number_views_by_pose, number_views_of_parts};
 
 /// Maximum size of a transforms file, bytes.
 pub const MAX_TRANSFORMS_BYTES: u64 = 1 << 29;
-/// Maximum number of frames in a dataset.
-pub const MAX_FRAMES: usize = 1_000_000;
 
 pub(crate) struct Transforms {
     pub frames: Vec<Frame>,
