@@ -278,6 +278,37 @@ fn a_run_ends_with_a_report_and_leaves_nothing() {
     graph.assert_nothing_left();
 }
 
+/// In a terminal of 80 columns, each status line fits, is drawn in place, and shows only whole values.
+#[test]
+fn a_narrow_terminal() {
+    let graph = Graph::new("none");
+    let inner = graph.command(60);
+    let words = std::iter::once(inner.get_program()).chain(inner.get_args().filter(|arg| *arg != "--verbose"));
+    let line = words.map(|word| format!("'{}'", word.to_str().unwrap())).collect::<Vec<_>>().join(" ");
+    let mut command = Command::new("script");
+    command.args(["-qec", &format!("stty cols 80 rows 24; exec {line}"), "/dev/null"]).env("TERM", "xterm");
+    let output = command.stdin(Stdio::null()).output().unwrap();
+    assert!(output.status.success(), "{}", text(&output));
+    let shown = String::from_utf8_lossy(&output.stdout);
+    let plain = without_escapes(&shown);
+    let statuses: Vec<&str> = plain.split(['\r', '\n']).filter(|line| line.contains("skipped 0, restarts 0")).collect();
+    assert!(!statuses.is_empty(), "{shown:?}");
+    assert!(statuses.iter().all(|line| line.trim_end().chars().count() <= 80), "{statuses:?}");
+    assert!(!plain.lines().any(|line| line.trim_end().ends_with("all stages ok")), "a status scrolls by: {shown:?}");
+}
+
+/// Removes the control sequences of a terminal.
+fn without_escapes(text: &str) -> String {
+    let mut plain = String::new();
+    let mut rest = text;
+    while let Some(at) = rest.find('\x1b') {
+        plain += &rest[..at];
+        let end = rest[at + 2..].find(|c: char| c.is_ascii_alphabetic()).map_or(rest.len(), |end| at + 2 + end + 1);
+        rest = &rest[end.min(rest.len())..];
+    }
+    plain + rest
+}
+
 /// A stage that dies during a run is restarted, the run completes, and the report counts the restart.
 #[test]
 fn a_dead_stage_is_started_again() {

@@ -24,7 +24,8 @@ pub struct Outputs {
     /// Write a CSV file per topic into this folder, with a column per field.
     #[arg(long, value_name = "DIR")]
     pub csv: Option<PathBuf>,
-    /// Write the camera's frames as a film (H.264). Each frame is shown from its capture until the next one.
+    /// Write the camera's frames as a film (H.264), each with its decision, its belief and the latest rendered hypothesis
+    /// from above. A frame is shown from its capture until the next one.
     #[arg(long, value_name = "FILE")]
     pub mp4: Option<PathBuf>,
     /// Write the times of all stages and frames in the trace event format, for ui.perfetto.dev.

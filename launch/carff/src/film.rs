@@ -1,7 +1,10 @@
 //! Films: images as H.264 in an MP4 file, each shown from its own time until the next image.
 
 use anyhow::{Context, ensure};
-use carff_messages::{FrameMeta, ImageMeta};
+use carff_checkpoint::Manifest;
+use carff_dataset::Image;
+use carff_messages::{Action, ActionCode, Belief, FrameMeta, ImageMeta, Reason, ViewKind, ViewMeta};
+use carff_plots::{Bar, Board};
 use carff_recording::Reader;
 use carff_transport::TopicId;
 use openh264::OpenH264API;
@@ -228,24 +231,138 @@ pub(crate) fn frame_rate_hz(recording: &Path) -> anyhow::Result<f64> {
     Ok(median_ns.map_or(LONE_FRAME_HZ, |ns| 1e9 / ns))
 }
 
-/// Writes the camera's frames of a recording as a film. Returns their number.
+/// Writes the camera's frames of a recording as a film, each with the decision and the belief about it, and with the
+/// latest rendered hypothesis from above, where the recording has them. Returns the number of frames.
 pub(crate) fn export(recording: &Path, file: &Path) -> anyhow::Result<u64> {
     let rate_hz = frame_rate_hz(recording)?;
     let mut reader = Reader::open(recording)?;
-    reader.select([TopicId::FRAME]).with_context(|| format!("{} contains no camera frame", recording.display()))?;
+    ensure!(reader.has(TopicId::FRAME), "{} contains no camera frame", recording.display());
+    let states = reader.about().map_or_else(Vec::new, |about| about.states.clone());
+    let wanted = [TopicId::FRAME, TopicId::BELIEF, TopicId::ACTION, TopicId::VIEW];
+    let present: Vec<TopicId> = wanted.into_iter().filter(|topic| reader.has(*topic)).collect();
+    reader.select(present)?;
+    let checkpoint = reader.about().map(|about| PathBuf::from(&about.checkpoint));
+    let manifest = checkpoint.and_then(|folder| Manifest::load(&folder).ok());
+    let hazards = manifest.map_or_else(Vec::new, |manifest| manifest.scenario.hazard_states());
+    let view_px = first_view_px(recording)?;
+    let mut scene = Scene { states, hazards, view_px, frame: None, belief: None, action: None, view: None };
     let mut film = None;
     while let Some(entry) = reader.next()? {
         let message = entry.message.as_message();
-        let Some(m) = message.get::<FrameMeta>() else { continue };
-        let size_px = m.size_px();
-        let film = match &mut film {
+        if let Some(meta) = message.get::<FrameMeta>() {
+            scene.show(&mut film, file, rate_hz)?;
+            let [width_px, height_px] = meta.size_px();
+            let image = Image { width_px, height_px, rgb: message.bytes().to_vec() };
+            (scene.frame, scene.belief, scene.action) = (Some((*meta, image)), None, None);
+        } else if let Some(belief) = message.get::<Belief>().filter(|belief| belief.header.step == 1) {
+            scene.belief = Some(*belief);
+        } else if let Some(action) = message.get::<Action>().filter(|action| action.is_decision()) {
+            scene.action = Some(*action);
+        } else if let Some(view) = message.get::<ViewMeta>().filter(|view| view.kind == ViewKind::BirdsEye.code()) {
+            let [width_px, height_px] = view.size_px();
+            scene.view = Some((*view, Image { width_px, height_px, rgb: message.bytes().to_vec() }));
+        }
+    }
+    scene.show(&mut film, file, rate_hz)?;
+    film.context("the recording contains no camera frame")?.finish()
+}
+
+/// Returns the size of the first hypothesis from above; `None` if the recording has none.
+fn first_view_px(recording: &Path) -> anyhow::Result<Option<[u32; 2]>> {
+    let mut reader = Reader::open(recording)?.without_images();
+    while let Some(entry) = reader.next()? {
+        let view = entry.message.as_message().get::<ViewMeta>().copied();
+        if let Some(view) = view.filter(|view| view.kind == ViewKind::BirdsEye.code()) {
+            return Ok(Some(view.size_px()));
+        }
+    }
+    Ok(None)
+}
+
+/// Returns an image at another size, each pixel from the nearest one.
+fn resized(image: &Image, [width_px, height_px]: [u32; 2]) -> Image {
+    let pixel = |x: u32, y: u32| {
+        let (x, y) = (x * image.width_px / width_px, y * image.height_px / height_px);
+        let at = ((y * image.width_px + x) * 3) as usize;
+        image.rgb[at..at + 3].iter().copied()
+    };
+    let rgb = (0..height_px).flat_map(|y| (0..width_px).flat_map(move |x| pixel(x, y))).collect();
+    Image { width_px, height_px, rgb }
+}
+
+/// The newest frame and what is known about it.
+struct Scene {
+    /// Names of the states, and which of them are hazards, where the checkpoint is at hand.
+    states: Vec<String>,
+    hazards: Vec<bool>,
+    /// Size of rendered hypotheses; overload makes some of them smaller.
+    view_px: Option<[u32; 2]>,
+    frame: Option<(FrameMeta, Image)>,
+    belief: Option<Belief>,
+    action: Option<Action>,
+    view: Option<(ViewMeta, Image)>,
+}
+
+impl Scene {
+    /// Adds the frame to the film.
+    fn show(&mut self, film: &mut Option<FilmWriter>, file: &Path, rate_hz: f64) -> anyhow::Result<()> {
+        let Some((meta, image)) = self.frame.take() else { return Ok(()) };
+        let board = self.board(&meta, image).draw()?;
+        let size_px = [board.width_px, board.height_px];
+        let film = match film {
             Some(film) => film,
             None => film.insert(FilmWriter::create(file, size_px, rate_hz)?),
         };
-        ensure!(film.size_px() == size_px, "frame {} does not have the size of the first frame", m.header.frame_id);
-        film.add(message.bytes(), m.header.capture_time_ns)?;
+        let frame = meta.header.frame_id;
+        ensure!(film.size_px() == size_px, "frame {frame} does not have the size of the first frame");
+        film.add(&board.rgb, meta.header.capture_time_ns)
     }
-    film.context("the recording contains no camera frame")?.finish()
+
+    fn board(&self, meta: &FrameMeta, image: Image) -> Board {
+        let frame = meta.header.frame_id;
+        let above = self.view_px.map(|size_px| match &self.view {
+            Some((view, image)) => {
+                let state = self.state_name(view.state);
+                let caption = format!("frame {}: {state}, {:.0} %", view.header.frame_id, 100.0 * view.probability);
+                (caption, resized(image, size_px))
+            }
+            None => ("no rendered hypothesis yet".to_owned(), Image::filled(size_px[0], size_px[1], [228, 230, 234])),
+        });
+        let action = self.action.filter(|action| action.based_on_frame == frame);
+        let belief = self.belief.filter(|belief| belief.header.frame_id == frame);
+        let halts = action.is_some_and(|action| action.code() != Ok(ActionCode::Advance));
+        let decision =
+            action.map_or("no decision", |a| if a.code() == Ok(ActionCode::Advance) { "advance" } else { "HALT" });
+        let reason = action.and_then(|action| action.reason().ok()).map_or("-", Reason::name);
+        let hazard = belief.map_or("-".to_owned(), |b| format!("{:.2}", b.hazard_probability));
+        Board {
+            images: [Some((format!("camera, frame {frame}"), image)), above].into_iter().flatten().collect(),
+            decision: decision.to_owned(),
+            alarm: halts,
+            lines: vec![
+                format!("reason: {reason}"),
+                format!("hazard probability: {hazard}"),
+                "belief, next step:".into(),
+            ],
+            bars: self.bars(belief.as_ref()),
+        }
+    }
+
+    /// One bar for each state, and one for what is not known.
+    fn bars(&self, belief: Option<&Belief>) -> Vec<Bar> {
+        let share = |state: usize| belief.and_then(|b| b.state_probability.get(state).copied()).unwrap_or(0.0);
+        let hazard = |state: usize| self.hazards.get(state).copied();
+        let known: Vec<Bar> = (0..self.states.len())
+            .map(|state| Bar { name: self.states[state].clone(), share: share(state), hazard: hazard(state) })
+            .collect();
+        let rest = belief.map_or(0.0, |_| (1.0 - known.iter().map(|bar| bar.share).sum::<f32>()).max(0.0));
+        known.into_iter().chain([Bar { name: "unknown".into(), share: rest, hazard: None }]).collect()
+    }
+
+    fn state_name(&self, state: i32) -> String {
+        let known = usize::try_from(state).ok().and_then(|state| self.states.get(state));
+        known.map_or_else(|| "unknown".to_owned(), Clone::clone)
+    }
 }
 
 #[cfg(test)]

@@ -2,8 +2,8 @@
 
 use carff_config::GraphConfig;
 use carff_messages::{
-    Action, ActionCode, Belief, FrameMeta, Gaussian, Health, HealthState, Observability, Posterior, Reason, Stage,
-    ViewMeta,
+    Action, ActionCode, Belief, DatasetView, FrameMeta, Gaussian, Header, Health, HealthState, Observability,
+    Posterior, Reason, Stage, ViewMeta,
 };
 use carff_transport::{Image, Node, OpenError, ReceiveError, Receiver, topics};
 use std::collections::{BTreeMap, VecDeque};
@@ -41,6 +41,29 @@ pub struct FrameRecord {
     pub confidence: f32,
     /// Time from capture to the publication of the decision, nanoseconds; 0 without a decision.
     pub latency_ns: u64,
+}
+
+impl FrameRecord {
+    /// Creates the record of a frame without a decision.
+    fn of(header: &Header, view: &DatasetView) -> Self {
+        Self {
+            frame_id: header.frame_id,
+            view: view.view,
+            branch: view.branch,
+            timestamp: view.timestamp,
+            drive: view.drive,
+            frame_in_drive: view.frame_in_drive,
+            last_of_timestamp: view.is_last_of_timestamp(),
+            observability: Observability::of_code(view.observability).ok().flatten(),
+            capture_time_ns: header.capture_time_ns,
+            posterior: None,
+            action: None,
+            reason: None,
+            hazard_probability: 0.0,
+            confidence: 0.0,
+            latency_ns: 0,
+        }
+    }
 }
 
 /// Health reports of a stage, summed over its restarts.
@@ -152,24 +175,10 @@ impl Records {
 
     fn take_frame(&mut self, meta: &FrameMeta) {
         self.spoke_ns.insert(Stage::Camera, meta.header.publish_time_ns);
-        let view = &meta.dataset_view;
-        let record = FrameRecord {
-            frame_id: meta.header.frame_id,
-            view: view.view,
-            branch: view.branch,
-            timestamp: view.timestamp,
-            drive: view.drive,
-            frame_in_drive: view.frame_in_drive,
-            last_of_timestamp: view.is_last_of_timestamp(),
-            observability: Observability::of_code(view.observability).ok().flatten(),
-            capture_time_ns: meta.header.capture_time_ns,
-            posterior: None,
-            action: None,
-            reason: None,
-            hazard_probability: 0.0,
-            confidence: 0.0,
-            latency_ns: 0,
-        };
+        self.record(FrameRecord::of(&meta.header, &meta.dataset_view));
+    }
+
+    fn record(&mut self, record: FrameRecord) {
         self.frames.insert(record.frame_id, record);
         while self.frames.len() > self.wanted.keep {
             self.frames.pop_first();
@@ -214,6 +223,11 @@ impl Records {
         }
         if !action.is_decision() {
             return None;
+        }
+        // A replay of later messages has no camera.
+        if !self.spoke_ns.contains_key(&Stage::Camera) && !self.frames.contains_key(&action.based_on_frame) {
+            let header = Header { frame_id: action.based_on_frame, ..action.header };
+            self.record(FrameRecord::of(&header, &DatasetView::UNKNOWN));
         }
         let frame = self.frames.get_mut(&action.based_on_frame)?;
         frame.action = action.code().ok();

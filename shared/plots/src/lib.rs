@@ -1,4 +1,4 @@
-//! Charts and filmstrips as PNG files: layout, axes and text.
+//! Charts, filmstrips and boards as images: layout, axes and text.
 //!
 //! The font is part of the program, so that an image looks the same on every machine.
 //!
@@ -11,10 +11,12 @@
 //! # Ok::<(), carff_plots::PlotError>(())
 //! ```
 
+mod board;
 mod canvas;
 mod curves;
 mod filmstrip;
 
+pub use board::{Bar, Board};
 pub use curves::{Marks, Panel, Series, curves};
 pub use filmstrip::{StripCell, StripRow, filmstrip};
 
