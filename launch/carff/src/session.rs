@@ -1,9 +1,10 @@
 //! The common part of all probes: joining a run, reading at intervals, and detecting the end.
 
-use anyhow::{Context, ensure};
+use anyhow::{Context, anyhow, ensure};
+use carff_base::names::hint;
 use carff_messages::Header;
 use carff_observe::{Attached, attach};
-use carff_transport::{AnyReceiver, Received, Stop, TopicId, Waiter, monotonic_now_ns};
+use carff_transport::{AnyReceiver, OpenTopic, Received, Stop, TopicId, Waiter, monotonic_now_ns};
 use clap::Args;
 
 /// Time between two readings: short enough that no buffer (8 images) overflows at 400 messages per second.
@@ -65,6 +66,22 @@ impl Session {
             stop,
             until_ns: args.seconds.map(|s| now_ns + (s * 1e9) as u64),
             alive_ns: now_ns + ALIVE_NS,
+        })
+    }
+
+    /// Returns the topic of a name, or of its last part if that is unique: a topic of the graph, or one that a stage of
+    /// the run has open.
+    pub(crate) fn topic(&self, name: &str) -> anyhow::Result<TopicId> {
+        if let Ok(topic) = name.parse() {
+            return Ok(topic);
+        }
+        let open = self.attached.node.open_topics().context("cannot list the topics")?;
+        let last: Vec<&OpenTopic> = open.iter().filter(|t| t.name.rsplit('/').next() == Some(name)).collect();
+        let found = open.iter().find(|topic| topic.name == name).or(if let [one] = last[..] { Some(one) } else { None });
+        found.map(OpenTopic::id).ok_or_else(|| {
+            let mut all: Vec<&str> = TopicId::all().map(TopicId::name).collect();
+            all.extend(open.iter().map(|topic| topic.name.as_str()).filter(|name| name.parse::<TopicId>().is_err()));
+            anyhow!("there is no topic `{name}`{}. All: {}", hint(name, all.iter().copied()), all.join(", "))
         })
     }
 
@@ -144,8 +161,12 @@ impl Session {
         }
     }
 
-    /// Reports the end of the run on standard error.
+    /// Reports dropped messages, and the end of the run, on standard error.
     pub(crate) fn say_end(&self, going: Going) {
+        let invalid = self.attached.node.counters().invalid();
+        if invalid > 0 {
+            eprintln!("{invalid} messages were dropped: their header or content is not valid");
+        }
         if going == Going::RunEnded {
             eprintln!("run `{}` has ended", self.attached.live.name);
         }

@@ -11,7 +11,6 @@ mod top;
 mod trace;
 
 use crate::session::SessionArgs;
-use carff_transport::TopicId;
 use clap::{Args, Subcommand};
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -76,8 +75,8 @@ pub enum ProbeCommand {
 /// A topic, and the time limit.
 #[derive(Clone, Debug, Args)]
 pub struct TopicArgs {
-    /// Topic: `prober/belief`, or `belief` for short.
-    pub topic: TopicId,
+    /// Topic that `carff probe list` shows: `prober/belief`, or `belief` for short.
+    pub topic: String,
     /// The run, and the time limit.
     #[command(flatten)]
     pub session: SessionArgs,
