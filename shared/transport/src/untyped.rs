@@ -5,9 +5,7 @@
 use crate::in_use::OpenTopic;
 use crate::node::failed;
 use crate::payload::{Image, Loaned, Opened, Payload, Port, PublisherFactory, Received, Unopened};
-use crate::{
-    AnyPublisher, AnyReceiver, AnyTopic, Limits, Node, OpenError, Ports, Receiver, Service, Topic, TopicId,
-};
+use crate::{AnyPublisher, AnyReceiver, AnyTopic, Limits, Node, OpenError, Ports, Receiver, Service, Topic, TopicId};
 use carff_messages::forms::{FormError, OwnedMessage, Readable};
 use carff_messages::{
     Action, Belief, Forecast, FrameMeta, Header, Health, Invalid, Posterior, ViewMeta, ZeroCopySend, message,

@@ -1,9 +1,11 @@
 //! `carff probe echo`: shows messages as text or JSON lines.
 
+use crate::complete;
 use crate::session::{Session, SessionArgs};
 use carff_messages::forms::as_text;
 use carff_transport::HeaderOnly;
 use clap::Args;
+use clap_complete::engine::ArgValueCandidates;
 use std::io::Write;
 
 /// Show a topic's messages.
@@ -11,6 +13,7 @@ use std::io::Write;
 pub struct EchoArgs {
     /// Topic: `prober/belief`, or `belief` for short. For images, only their description is shown; of a type that this
     /// program does not know, only the header.
+    #[arg(add = ArgValueCandidates::new(complete::topics))]
     pub topic: String,
     /// Print one line of JSON per message.
     #[arg(long)]

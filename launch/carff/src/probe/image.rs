@@ -2,12 +2,14 @@
 
 use super::file_in;
 use super::inline::{Inline, columns};
+use crate::complete;
 use crate::session::{Session, SessionArgs, colours};
 use anyhow::{Context, bail, ensure};
 use carff_messages::forms::AnyMessage;
 use carff_messages::{FrameMeta, ImageMeta, ViewKind, ViewMeta};
 use carff_transport::TopicId;
 use clap::Args;
+use clap_complete::engine::ArgValueCandidates;
 use std::io::Write as _;
 use std::path::PathBuf;
 
@@ -15,6 +17,7 @@ use std::path::PathBuf;
 #[derive(Clone, Debug, Args)]
 pub struct ImageArgs {
     /// Topic: `camera/frame`, `renderer/view`, or images of the same types from another stage.
+    #[arg(add = ArgValueCandidates::new(complete::topics))]
     pub topic: String,
     /// Folder for PNG files; without it images are shown in the terminal.
     #[arg(short, long)]

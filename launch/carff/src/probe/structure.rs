@@ -206,10 +206,7 @@ mod tests {
             subscribers: subscribers.iter().map(|&s| s.to_owned()).collect(),
             rate_hz: Some(10.0),
         };
-        vec![
-            topic(TopicId::FRAME, &["camera"], &["encoder", "probe-image"]),
-            topic(TopicId::of(&OWN), &["gate"], &[]),
-        ]
+        vec![topic(TopicId::FRAME, &["camera"], &["encoder", "probe-image"]), topic(TopicId::of(&OWN), &["gate"], &[])]
     }
 
     /// Each format names every process and topic, with arrows from publisher to topic to subscriber.

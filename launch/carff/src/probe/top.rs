@@ -399,7 +399,11 @@ mod tests {
     #[test]
     fn narrow_screens_hide_whole_columns() {
         for (width, vitals, least) in [
-            (80, RunVitals::default(), &["state", "rate", "latency", "errors", "restarts", "CPU", "memory", "late"][..]),
+            (
+                80,
+                RunVitals::default(),
+                &["state", "rate", "latency", "errors", "restarts", "CPU", "memory", "late"][..],
+            ),
             (100, RunVitals::default(), &["max", "skipped"][..]),
             (140, RunVitals::default(), &["invalid", "recent latency"][..]),
             (80, busy(), &["state", "rate", "latency", "errors", "restarts"][..]),
@@ -415,7 +419,10 @@ mod tests {
                 let line = screen.lines().find(|l| l.contains(&begin)).unwrap_or_default();
                 for (column, _) in &fit {
                     let text = column.text(row);
-                    assert!(line.contains(&format!("{text} ")) || line.contains(&format!("{text}\u{2502}")), "{text}: {line}");
+                    assert!(
+                        line.contains(&format!("{text} ")) || line.contains(&format!("{text}\u{2502}")),
+                        "{text}: {line}"
+                    );
                 }
             }
             for fact in summary(&live(), &vitals) {
@@ -436,7 +443,9 @@ mod tests {
         assert_eq!(order(&shape), flow.iter().rev().copied().collect::<Vec<_>>());
         assert!(shape.obey(KeyCode::Char('r'), KeyModifiers::NONE));
         assert_eq!(order(&shape), flow);
-        assert!(shape.obey(KeyCode::Char('s'), KeyModifiers::NONE) && shape.obey(KeyCode::Char('r'), KeyModifiers::NONE));
+        assert!(
+            shape.obey(KeyCode::Char('s'), KeyModifiers::NONE) && shape.obey(KeyCode::Char('r'), KeyModifiers::NONE)
+        );
         assert_eq!((shape.sort, order(&shape)), (Column::Stage, flow));
         let text = plain(&live(), &busy(), &shape, usize::MAX);
         assert!(text.lines().any(|l| l.trim_end() == "skipped  stage"), "{text}");
