@@ -33,6 +33,7 @@ UNSAFE_MODULES = {
     "shared/runtime/src/realtime.rs": "sched_setscheduler",
     "tests/readers/src/raw.rs": "overwrites bytes of messages",
     "shared/transport/src/descriptors.rs": "file descriptors of iceoryx2's listeners",
+    "shared/transport/src/untyped.rs": "reads the header of messages whose type is not known",
 }
 
 

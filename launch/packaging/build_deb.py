@@ -96,7 +96,7 @@ def fill(tree: Path, target: Path) -> None:
         print("the package has no bill of materials: cargo-cyclonedx is not installed (see `make sbom`)")
     debian = ROOT / "launch/packaging/debian"
     put(debian / "vehicle.toml", tree / "etc/carff/vehicle.toml")
-    for unit in ["carff.service", "carff.target"]:
+    for unit in ["carff.service", "carff-metrics.service", "carff-record.service", "carff.target"]:
         put(debian / unit, tree / "lib/systemd/system" / unit)
     put(debian / "carff.tmpfiles", tree / "usr/lib/tmpfiles.d/carff.conf")
 

@@ -149,6 +149,7 @@ fn main() -> ExitCode {
 }
 
 fn run() -> anyhow::Result<ExitCode> {
+    carff_launch::shell::answer_shell(Cli::command);
     match Cli::parse().command {
         Command::Launch(args) => carff_launch::launch::run(&args),
         Command::Attach(command) => command.run(),
@@ -175,10 +176,7 @@ fn run() -> anyhow::Result<ExitCode> {
         Command::SoakInject(args) => carff_launch::soak::inject(&args).map(|()| ExitCode::SUCCESS),
         Command::Doctor(args) => carff_launch::doctor::run(&args),
         Command::Schema(args) => carff_launch::schema::run(&args).map(|()| ExitCode::SUCCESS),
-        Command::Completions(args) => {
-            carff_launch::shell::completions(&args, Cli::command());
-            Ok(ExitCode::SUCCESS)
-        }
+        Command::Completions(args) => carff_launch::shell::completions(&args).map(|()| ExitCode::SUCCESS),
         Command::Man(args) => carff_launch::shell::man(&args, Cli::command()).map(|()| ExitCode::SUCCESS),
         Command::Dataset(command) => carff_launch::dataset::run(command).map(|()| ExitCode::SUCCESS),
     }
@@ -255,6 +253,33 @@ mod tests {
         assert_eq!(graph.warnings(), Vec::<String>::new());
     }
 
+    fn completed(words: &[&str]) -> Vec<String> {
+        let words: Vec<std::ffi::OsString> = words.iter().map(Into::into).collect();
+        let at = words.len() - 1;
+        let found = clap_complete::engine::complete(&mut Cli::command(), words, at, None).unwrap();
+        found.iter().map(|candidate| candidate.get_value().to_string_lossy().into_owned()).collect()
+    }
+
+    /// Shells are offered commands that are not hidden, topics where a topic belongs, and files only where a file does.
+    /// File names with blanks stay whole.
+    #[test]
+    fn completions_offer_what_belongs_there() {
+        let commands = completed(&["carff", ""]);
+        assert!(commands.contains(&"probe".to_owned()) && !commands.iter().any(|c| c == "soak-inject"), "{commands:?}");
+        for words in [&["carff", "probe", "echo", "pro"][..], &["carff", "record", "-o", "x.mcap", "pro"]] {
+            assert_eq!(completed(words), ["prober/belief"], "{words:?}");
+        }
+        assert!(completed(&["carff", "view", "--scr"]).contains(&"--screenshot".to_owned()));
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("a b.mcap");
+        std::fs::write(&file, "").unwrap();
+        let begin = folder.path().join("a").display().to_string();
+        assert_eq!(completed(&["carff", "replay", &begin]), [file.display().to_string()]);
+        for words in [["carff", "stop", &begin], ["carff", "logs", &begin]] {
+            assert_eq!(completed(&words), Vec::<String>::new(), "{words:?}");
+        }
+    }
+
     /// The description is consistent (names and shortcuts do not clash), and its completions and pages can be
     /// generated.
     #[test]
@@ -269,5 +294,7 @@ mod tests {
         carff_launch::shell::man(&ManArgs { dir: folder.path().join("man1") }, Cli::command()).unwrap();
         let page = std::fs::read_to_string(folder.path().join("man1/carff-launch.1")).unwrap();
         assert!(page.contains("carff launch configs/graphs"), "{page}");
+        let page = std::fs::read_to_string(folder.path().join("man1/carff-view.1")).unwrap();
+        assert!(page.contains("screenshot") && page.contains("theme"), "{page}");
     }
 }

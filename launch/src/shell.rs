@@ -1,7 +1,14 @@
 //! `carff completions` and `carff man`: shell completions and man pages, generated from the command's description.
 
 use anyhow::Context;
+use clap_complete::CompleteEnv;
+use clap_complete::env::Shells;
 use std::path::PathBuf;
+
+/// Environment variable by which a shell asks for completions.
+const REQUEST: &str = "CARFF_COMPLETE";
+/// Name of the command.
+const NAME: &str = "carff";
 
 /// Print a shell's completions.
 #[derive(Clone, Debug, clap::Args)]
@@ -17,12 +24,20 @@ pub struct ManArgs {
     pub dir: PathBuf,
 }
 
-/// Prints the completions of a command.
-pub fn completions(args: &CompletionsArgs, mut command: clap::Command) {
-    let name = command.get_name().to_owned();
+/// Prints the script by which a shell asks this program for completions.
+pub fn completions(args: &CompletionsArgs) -> anyhow::Result<()> {
+    let (shells, name) = (Shells::builtins(), args.shell.to_string());
+    let shell = shells.completer(&name).with_context(|| format!("there are no completions for {name}"))?;
     let mut script = Vec::new();
-    clap_complete::generate(args.shell, &mut command, name, &mut script);
-    print!("{}", String::from_utf8_lossy(&script));
+    shell.write_registration(REQUEST, NAME, NAME, NAME, &mut script)?;
+    // Without it, bash does not quote file names that contain blanks.
+    print!("{}", String::from_utf8_lossy(&script).replace("complete -o nospace", "complete -o filenames -o nospace"));
+    Ok(())
+}
+
+/// Answers a shell that asks for completions, and ends the process; returns if none does.
+pub fn answer_shell(command: fn() -> clap::Command) {
+    CompleteEnv::with_factory(command).var(REQUEST).bin(NAME).completer(NAME).complete();
 }
 
 /// Writes the man pages of a command and its subcommands.

@@ -63,7 +63,8 @@ def main() -> None:
         run("dpkg", "--install", package)
         uid = pwd.getpwnam("carff").pw_uid
         say(f"installed, user carff is {uid}")
-        units = ["/lib/systemd/system/carff.service", "/lib/systemd/system/carff.target"]
+        units = [f"/lib/systemd/system/{unit}"
+                 for unit in ["carff.service", "carff-metrics.service", "carff-record.service", "carff.target"]]
         run("systemd-analyze", "verify", *units)
         exposure = run("systemd-analyze", "security", "--offline=true", units[0], check=False).stdout.strip()
         say(exposure.splitlines()[-1])

@@ -7,8 +7,34 @@ use carff_tests::{
 };
 use carff_transport::topics;
 use rustix::process::Signal;
+use serde_json::Value;
 use speed_gate::{FREE_M_S, SPEED_LIMIT, SpeedLimit};
 use std::process::Command;
+
+/// Every probe takes the stage's topic, whose message type it does not know, with and without the first part of its
+/// name.
+fn probes_take_what_list_shows(graph: &TestGraph) {
+    let probe = |words: &[&str]| {
+        let run = ["--run", graph.run().name()];
+        let finished = Process::start(Command::new(program("carff")).arg("probe").args(words).args(run)).end();
+        finished.assert_success();
+        finished.text
+    };
+    let list: Value = serde_json::from_str(&probe(&["list", "--json", "--seconds", "2"])).unwrap();
+    let own = list.as_array().unwrap().iter().find(|t| t["topic"] == SPEED_LIMIT.name).unwrap();
+    assert!(own["type"] == "speed-gate.SpeedLimit.v1" && own["publishers"][0] == "speed-gate", "{own}");
+    assert!(own["rate_hz"].as_f64().unwrap() > 0.0, "{own}");
+    for (words, shown) in [
+        (["hz", SPEED_LIMIT.name, "--seconds", "2"], "Hz"),
+        (["bw", SPEED_LIMIT.name, "--seconds", "2"], "per second"),
+        (["delay", "limit", "--seconds", "2"], "age on arrival"),
+        (["echo", "limit", "--count", "2"], "frame_id"),
+    ] {
+        let text = probe(&words);
+        assert!(text.contains(shown) && !text.contains("dropped"), "{words:?}: {text}");
+        assert_eq!(words[0] == "echo", text.contains("does not know `speed-gate.SpeedLimit.v1`"), "{text}");
+    }
+}
 
 /// The stage joins the shipped graph only by its name and publishes its own valid messages, each about the frame of an
 /// action. It leaves on request and the graph continues; another one ends by itself when the graph ends. Nothing is
@@ -49,6 +75,7 @@ fn a_stage_of_its_own_joins_and_leaves() {
         let both = found.iter().filter(|l| frames.contains(&l.header.frame_id)).count();
         assert!(both > 0, "no limit is based on the frame of a received action: {found:?}");
     }
+    probes_take_what_list_shows(&graph);
     first.signal(Signal::TERM);
     let finished = first.end();
     finished.assert_success();

@@ -1,13 +1,16 @@
 //! `carff bridge`: serves the run's topics over the Foxglove WebSocket protocol, read-only, for headless vehicles.
 
+use crate::complete;
 use crate::record::wall_offset_ns;
-use crate::session::{Session, SessionArgs};
+use crate::session::{Session, Sessions, WaitArgs};
 use anyhow::Context;
 use carff_checkpoint::Manifest;
+use carff_observe::find;
 use carff_recording::{Encoder, Format};
 use carff_transport::TopicId;
 use clap::Args;
-use foxglove::{ChannelBuilder, PartialMetadata, RawChannel, WebSocketServer};
+use clap_complete::engine::ArgValueCandidates;
+use foxglove::{ChannelBuilder, PartialMetadata, RawChannel, WebSocketServer, WebSocketServerHandle};
 use std::collections::BTreeMap;
 use std::collections::btree_map::Entry;
 use std::net::SocketAddr;
@@ -28,23 +31,22 @@ pub struct BridgeArgs {
     #[arg(long)]
     pub remote: bool,
     /// Topics to serve; all by default.
+    #[arg(add = ArgValueCandidates::new(complete::graph_topics))]
     pub topics: Vec<TopicId>,
-    /// The run, and the time limit.
+    /// The run, the time limit, and the runs after it.
     #[command(flatten)]
-    pub session: SessionArgs,
+    pub runs: WaitArgs,
 }
 
-/// Serves until a stop is requested, the time is over, or the run ends.
+/// Serves until a stop is requested, the time is over, or the run ends; with `--wait`, each run.
 pub fn run(args: &BridgeArgs) -> anyhow::Result<ExitCode> {
     crate::metrics::refuse_remote(args.listen, args.remote)?;
-    let mut session = Session::open(&args.session, "bridge")?;
+    let mut sessions = Sessions::new(&args.runs, "bridge")?;
     let topics: Vec<TopicId> = if args.topics.is_empty() { TopicId::all().collect() } else { args.topics.clone() };
-    session.listen(topics.iter().copied())?;
-    let live = session.attached.live.clone();
-    let places = Manifest::load(&live.checkpoint).map(|m| m.places).unwrap_or_default();
+    let run = find(args.runs.session.run.as_deref()).map(|live| live.name).ok().or(args.runs.session.run.clone());
     // Without capabilities, clients can only read.
     let server = WebSocketServer::new()
-        .name(format!("carff run {}", live.name))
+        .name(run.map_or("carff".to_owned(), |run| format!("carff run {run}")))
         .bind(args.listen.ip().to_string(), args.listen.port())
         .capabilities([])
         .start_blocking()
@@ -55,6 +57,30 @@ pub fn run(args: &BridgeArgs) -> anyhow::Result<ExitCode> {
     for &topic in &topics {
         open.insert(topic.name().to_owned(), channel(topic.name(), Format::Form(topic))?);
     }
+    while let Some(session) = sessions.next(|| {})? {
+        serve(session, &topics, &server, &mut open)?;
+    }
+    // The server waits for its clients, and a client that does not read would block it indefinitely.
+    let stopping = server.stop();
+    let (stopped, wait) = std::sync::mpsc::sync_channel(1);
+    std::thread::spawn(move || {
+        stopping.wait_blocking();
+        // The receiver is gone after the time limit.
+        let _ = stopped.send(());
+    });
+    let _ = wait.recv_timeout(FAREWELL);
+    Ok(ExitCode::SUCCESS)
+}
+
+/// Serves one run to the clients of the server.
+fn serve(
+    mut session: Session,
+    topics: &[TopicId],
+    server: &WebSocketServerHandle,
+    open: &mut BTreeMap<String, Arc<RawChannel>>,
+) -> anyhow::Result<()> {
+    session.listen(topics.iter().copied())?;
+    let places = Manifest::load(&session.attached.live.checkpoint).map(|m| m.places).unwrap_or_default();
     let mut encoder = Encoder::new(places, wall_offset_ns());
     let going = session.follow(
         |topic, message| {
@@ -78,17 +104,8 @@ pub fn run(args: &BridgeArgs) -> anyhow::Result<ExitCode> {
         },
         || Ok(()),
     )?;
-    // The server waits for its clients, and a client that does not read would block it indefinitely.
-    let stopping = server.stop();
-    let (stopped, wait) = std::sync::mpsc::sync_channel(1);
-    std::thread::spawn(move || {
-        stopping.wait_blocking();
-        // The receiver is gone after the time limit.
-        let _ = stopped.send(());
-    });
-    let _ = wait.recv_timeout(FAREWELL);
     session.say_end(going);
-    Ok(ExitCode::SUCCESS)
+    Ok(())
 }
 
 fn channel(name: &str, format: Format) -> anyhow::Result<Arc<RawChannel>> {

@@ -3,7 +3,7 @@
 #[cfg(feature = "film")]
 use crate::film;
 use crate::probe::image::named_image;
-use crate::spans::{Span, trace_events};
+use crate::spans::{recorded_spans, trace_events};
 use anyhow::Context;
 use carff_checkpoint::Manifest;
 use carff_recording::{About, Entry, Reader};
@@ -205,12 +205,8 @@ fn tables(recording: &Path, folder: &Path) -> anyhow::Result<Vec<(PathBuf, u64)>
 }
 
 fn spans(recording: &Path, file: &Path) -> anyhow::Result<usize> {
-    let mut reader = Reader::open(recording)?.without_images();
-    let mut spans = Vec::new();
-    while let Some(entry) = reader.next()? {
-        spans.extend(Span::of(entry.message.as_message()));
-    }
-    let trace = serde_json::to_string(&trace_events(reader.about().map_or("unknown", |about| &about.run), &spans))?;
+    let (run, spans) = recorded_spans(recording)?;
+    let trace = serde_json::to_string(&trace_events(&run, &spans))?;
     std::fs::write(file, trace).with_context(|| format!("cannot write {}", file.display()))?;
     Ok(spans.len())
 }

@@ -5,6 +5,7 @@
 
 #[cfg(feature = "bridge")]
 pub mod bridge;
+mod complete;
 #[cfg(feature = "recording")]
 pub mod export;
 #[cfg(feature = "film")]
@@ -62,15 +63,20 @@ pub enum Attach {
     #[command(after_help = "Example: follow the only run
   carff logs --follow")]
     Logs(runs::LogsArgs),
-    /// Open the live window: each forecast scene from any camera.
-    #[command(after_help = "Example: on the running graph, or on a checkpoint only
-  carff view
-  carff view --checkpoint configs/checkpoints/approaching-intersection")]
+    /// Open the live window: each forecast scene of an image, from any camera. Images come from a dataset or, with --run,
+    /// from a running graph, which the window does not delay.
+    #[command(after_help = "Example: on a dataset; on the only running graph, as a file
+  carff view --dataset data/approaching-intersection
+  carff view --run
+  carff view --run --screenshot window.png")]
     View(view::ViewArgs),
     /// Record a running graph into an MCAP file.
     #[command(after_help = "Example: all topics for a minute; only beliefs and actions, in six files of ten minutes
   carff record -o run.mcap --seconds 60
-  carff record belief action -o drive.mcap --file-seconds 600 --keep 6")]
+  carff record belief action -o drive.mcap --file-seconds 600 --keep 6
+
+Example: each run that starts, into a file of its own
+  carff record --wait -o drive.mcap")]
     #[cfg(feature = "recording")]
     Record(record::RecordArgs),
     /// Record a running graph (not part of this build).
@@ -114,7 +120,7 @@ impl Attach {
             Self::Ps(args) => runs::ps(args),
             Self::Stop(args) => runs::stop(args),
             Self::Logs(args) => runs::logs(args),
-            Self::View(args) => view::run(args),
+            Self::View(_) => view::run(),
             #[cfg(feature = "recording")]
             Self::Record(args) => record::run(args),
             #[cfg(not(feature = "recording"))]

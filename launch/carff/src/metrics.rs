@@ -2,7 +2,7 @@
 
 use crate::http::{Response, Server};
 use crate::provenance::{self, Origin};
-use crate::session::{Session, SessionArgs};
+use crate::session::{Sessions, WaitArgs};
 use crate::vitals::{Labels, RunVitals, StageVitals};
 use anyhow::{Context, ensure};
 use carff_base::statistics::percentile;
@@ -31,42 +31,49 @@ pub struct MetricsArgs {
     #[arg(long)]
     pub remote: bool,
     /// Print the status once, as JSON, after 3 seconds (or --seconds), and serve nothing.
-    #[arg(long)]
+    #[arg(long, conflicts_with = "wait")]
     pub once: bool,
-    /// The run, and the time limit.
+    /// The run, the time limit, and the runs after it.
     #[command(flatten)]
-    pub session: SessionArgs,
+    pub runs: WaitArgs,
 }
 
-/// Serves until a stop is requested, the time is over, or the run ends.
+/// Serves until a stop is requested, the time is over, or the run ends; with `--wait`, also while no run is alive.
 pub fn run(args: &MetricsArgs) -> anyhow::Result<ExitCode> {
     refuse_remote(args.listen, args.remote)?;
-    let mut session_args = args.session.clone();
+    let mut runs = args.runs.clone();
     if args.once {
-        session_args.seconds = session_args.seconds.or(Some(3.0));
+        runs.session.seconds = runs.session.seconds.or(Some(3.0));
     }
-    let mut session = Session::open(&session_args, "metrics")?;
-    session.listen(RunVitals::topics())?;
+    let mut sessions = Sessions::new(&runs, "metrics")?;
     let mut server = None;
     if !args.once {
         let bound = Server::bind(args.listen).with_context(|| format!("cannot listen on {}", args.listen))?;
         println!("http://{}/metrics and /status", bound.address()?);
         server = Some(bound);
     }
-    let live = &session.attached.live;
-    let name = live.name.clone();
-    let origin = provenance::of(Some(live.started_unix_s), Some(&live.checkpoint));
-    let mut vitals = RunVitals::default();
-    let going = vitals.gather(&mut session, |vitals| {
+    let mut last = runs.session.run.clone();
+    while let Some(mut session) = sessions.next(|| {
         if let Some(server) = &mut server {
-            server.serve(|method, target| answer(method, target, &name, &origin, vitals));
+            server.serve(|method, target| answer(method, target, last.as_deref(), None));
         }
-        Ok(true)
-    })?;
-    if args.once {
-        println!("{}", serde_json::to_string_pretty(&status(&name, &origin, &vitals))?);
+    })? {
+        session.listen(RunVitals::topics())?;
+        let live = session.attached.live.clone();
+        let origin = provenance::of(Some(live.started_unix_s), Some(&live.checkpoint));
+        let mut vitals = RunVitals::default();
+        let going = vitals.gather(&mut session, |vitals| {
+            if let Some(server) = &mut server {
+                server.serve(|method, target| answer(method, target, Some(&live.name), Some((&origin, vitals))));
+            }
+            Ok(true)
+        })?;
+        if args.once {
+            println!("{}", serde_json::to_string_pretty(&status(&live.name, &origin, &vitals))?);
+        }
+        session.say_end(going);
+        last = Some(live.name);
     }
-    session.say_end(going);
     Ok(ExitCode::SUCCESS)
 }
 
@@ -79,14 +86,37 @@ pub(crate) fn refuse_remote(listen: SocketAddr, remote: bool) -> anyhow::Result<
     Ok(())
 }
 
-/// Returns the response to a request.
-fn answer(method: &str, target: &str, run: &str, origin: &Origin, vitals: &RunVitals) -> Response {
+/// Returns the response to a request, with the observed run's name, and what was observed if it is alive.
+fn answer(method: &str, target: &str, run: Option<&str>, seen: Option<(&Origin, &RunVitals)>) -> Response {
+    let name = run.unwrap_or_default();
+    let metrics = || seen.map_or_else(|| down(run), |(origin, vitals)| prometheus(name, origin, vitals));
+    let status = || seen.map_or_else(|| json!({ "run": null }), |(origin, vitals)| status(name, origin, vitals));
     match (method, target.split('?').next().unwrap_or_default()) {
-        ("GET", "/metrics") => ("200 OK", prometheus_text::CONTENT_TYPE, prometheus(run, origin, vitals)),
-        ("GET", "/status") => ("200 OK", "application/json", status(run, origin, vitals).to_string()),
+        ("GET", "/metrics") => ("200 OK", prometheus_text::CONTENT_TYPE, metrics()),
+        ("GET", "/status") => ("200 OK", "application/json", status().to_string()),
         ("GET", _) => ("404 Not Found", "text/plain", "try /metrics or /status\n".to_owned()),
         _ => ("405 Method Not Allowed", "text/plain", "only GET\n".to_owned()),
     }
+}
+
+/// Returns the metrics while no run is alive.
+fn down(run: Option<&str>) -> String {
+    text(registry(run, 0.0))
+}
+
+/// Returns a registry with the metric that is always there.
+fn registry(run: Option<&str>, up: f64) -> Registry {
+    let labels = run.map(|run| ("run".into(), run.to_owned().into()));
+    let mut registry = Registry::with_prefix_and_labels("carff", labels.into_iter());
+    registry.register("up", "1 if a run is alive and observed, else 0", ConstGauge::new(up));
+    registry
+}
+
+fn text(registry: Registry) -> String {
+    let mut text = String::new();
+    // Writing into a string does not fail.
+    let _ = prometheus_text::encode(&mut text, &registry);
+    text
 }
 
 /// Returns the status as JSON. Counts of messages start with the observation; `skipped`, `invalid`, `errors` and
@@ -124,7 +154,7 @@ fn status(run: &str, origin: &Origin, vitals: &RunVitals) -> Value {
 
 /// Returns the metrics in the Prometheus text format.
 fn prometheus(run: &str, origin: &Origin, vitals: &RunVitals) -> String {
-    let mut registry = Registry::with_prefix_and_labels("carff", [("run".into(), run.to_owned().into())].into_iter());
+    let mut registry = registry(Some(run), 1.0);
     let labels: Vec<(&'static str, String)> = origin.clone().into_iter().collect();
     registry.register("build", "Program, host, start of the run and checkpoint", Info::new(labels));
     registry.register("frames", "Frames from the camera since this exporter started", ConstCounter::new(vitals.frames));
@@ -150,10 +180,7 @@ fn prometheus(run: &str, origin: &Origin, vitals: &RunVitals) -> String {
                 one value for each heartbeat";
     registry.register("stage_latency_seconds", help, histograms.stages.clone());
     stages(&mut registry, vitals);
-    let mut text = String::new();
-    // Writing into a string does not fail.
-    let _ = prometheus_text::encode(&mut text, &registry);
-    text
+    text(registry)
 }
 
 /// Registers the metrics that each stage has.
@@ -314,10 +341,19 @@ mod tests {
         assert!(refuse_remote("0.0.0.0:1".parse().unwrap(), true).is_ok());
     }
 
+    /// Without a run the exporter answers that it is down, for the run that it saw last.
+    #[test]
+    fn no_run_is_a_metric() {
+        let answer = |run| answer("GET", "/metrics", run, None).2;
+        assert!(answer(None).contains("\ncarff_up 0"), "{}", answer(None));
+        assert!(answer(Some("r")).contains("carff_up{run=\"r\"} 0"), "{}", answer(Some("r")));
+        assert!(prometheus("r", &origin(), &vitals()).contains("carff_up{run=\"r\"} 1"));
+    }
+
     /// Unknown paths and other methods than GET are refused.
     #[test]
     fn other_requests_are_refused() {
-        let answer = |method, target| answer(method, target, "r", &origin(), &vitals());
+        let answer = |method, target| answer(method, target, Some("r"), Some((&origin(), &vitals())));
         assert_eq!(answer("GET", "/metrics?x=1").0, "200 OK");
         assert_eq!(answer("GET", "/etc/passwd").0, "404 Not Found");
         assert_eq!(answer("POST", "/metrics").0, "405 Method Not Allowed");

@@ -1,8 +1,8 @@
 //! `carff record`: writes the messages of a running graph into an MCAP file.
 
-use crate::provenance;
-use crate::session::{Session, SessionArgs};
+use crate::session::{Session, Sessions, WaitArgs};
 use crate::terminal::Terminal;
+use crate::{complete, provenance};
 use anyhow::Context;
 use carff_checkpoint::Manifest;
 use carff_observe::LiveRun;
@@ -10,7 +10,8 @@ use carff_recording::{About, Limits, RecordingQueue, RotatingWriter};
 use carff_transport::TopicId;
 use carff_transport::monotonic_now_ns;
 use clap::Args;
-use std::path::PathBuf;
+use clap_complete::engine::ArgValueCandidates;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::SystemTime;
 
@@ -21,8 +22,9 @@ const STATUS_NS: u64 = 1_000_000_000;
 #[derive(Clone, Debug, Args)]
 pub struct RecordArgs {
     /// Topics to record; all by default.
+    #[arg(add = ArgValueCandidates::new(complete::graph_topics))]
     pub topics: Vec<TopicId>,
-    /// File to write; it must not exist.
+    /// File to write; it must not exist. With --wait, the names of the files also have the run and the start (UTC).
     #[arg(short, long)]
     pub out: PathBuf,
     /// Begin another file at this size, megabytes.
@@ -38,14 +40,30 @@ pub struct RecordArgs {
     /// and counted.
     #[arg(long, default_value_t = 64, value_parser = clap::value_parser!(u64).range(1..))]
     pub queue_mb: u64,
-    /// The run, and the time limit.
+    /// The run, the time limit, and the runs after it.
     #[command(flatten)]
-    pub session: SessionArgs,
+    pub runs: WaitArgs,
 }
 
-/// Records until a stop is requested, the time is over, or the run ends.
+/// Records until a stop is requested, the time is over, or the run ends; with `--wait`, each run.
 pub fn run(args: &RecordArgs) -> anyhow::Result<ExitCode> {
-    let mut session = Session::open(&args.session, "recorder")?;
+    let mut sessions = Sessions::new(&args.runs, "recorder")?;
+    while let Some(session) = sessions.next(|| {})? {
+        let out = if args.runs.wait { out_of(&args.out, &session.attached.live.name) } else { args.out.clone() };
+        record(args, session, &out)?;
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+/// Returns the file of one run of several.
+fn out_of(out: &Path, run: &str) -> PathBuf {
+    let stem = out.file_stem().unwrap_or_default().to_string_lossy();
+    let extension = out.extension().map_or("mcap".into(), |extension| extension.to_string_lossy());
+    out.with_file_name(format!("{stem}-{run}-{}.{extension}", jiff::Timestamp::now().strftime("%Y%m%dT%H%M%SZ")))
+}
+
+/// Records one run.
+fn record(args: &RecordArgs, mut session: Session, out: &Path) -> anyhow::Result<()> {
     let topics: Vec<TopicId> = if args.topics.is_empty() { TopicId::all().collect() } else { args.topics.clone() };
     session.listen(topics)?;
     let live = &session.attached.live;
@@ -61,7 +79,7 @@ pub fn run(args: &RecordArgs) -> anyhow::Result<ExitCode> {
         file_ns: args.file_seconds.map(|s| s * 1_000_000_000),
         files: args.keep.map(|n| n as usize),
     };
-    let writer = RotatingWriter::create(&args.out, about(live, states)?, places, limits)?;
+    let writer = RotatingWriter::create(out, about(live, states)?, places, limits)?;
     let queue = RecordingQueue::start(writer, args.queue_mb * 1_000_000).context("cannot start the writer")?;
     let terminal = Terminal::new();
     let name = live.name.clone();
@@ -87,10 +105,12 @@ pub fn run(args: &RecordArgs) -> anyhow::Result<ExitCode> {
         },
     )?;
     terminal.status(String::new());
-    let counts = queue.finish().context("the recording ended early; its file is readable")?;
-    println!("{}: {} messages of run {name}, {} dropped", args.out.display(), counts.written, counts.dropped);
     session.say_end(going);
-    Ok(ExitCode::SUCCESS)
+    // The next launch of the run waits for its processes: a slow disk must not delay it.
+    drop(session);
+    let counts = queue.finish().context("the recording ended early; its file is readable")?;
+    println!("{}: {} messages of run {name}, {} dropped", out.display(), counts.written, counts.dropped);
+    Ok(())
 }
 
 /// Returns the difference of wall-clock time (nanoseconds since 1970) and monotonic time.

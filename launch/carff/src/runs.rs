@@ -1,8 +1,10 @@
 //! `carff ps`, `stop` and `logs`: the living runs of this user, their end, and their log.
 
+use crate::complete;
 use anyhow::{Context, bail, ensure};
 use carff_observe::{LiveRun, runs};
 use carff_transport::{Run, Stop, Waiter, Woken, monotonic_now_ns, runtime_dirs};
+use clap_complete::engine::ArgValueCandidates;
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::json;
 use std::fs::File;
@@ -26,6 +28,7 @@ pub struct PsArgs {
 #[derive(Clone, Debug, clap::Args)]
 pub struct StopArgs {
     /// Name of the run; optional if only one runs.
+    #[arg(add = ArgValueCandidates::new(complete::runs))]
     run: Option<String>,
     /// Longest wait for its end, seconds.
     #[arg(long, default_value_t = 30)]
@@ -36,6 +39,7 @@ pub struct StopArgs {
 #[derive(Clone, Debug, clap::Args)]
 pub struct LogsArgs {
     /// Name of a run, also of one that has ended; optional if only one runs.
+    #[arg(add = ArgValueCandidates::new(complete::runs))]
     run: Option<String>,
     /// Continue with new lines until the run ends.
     #[arg(long, short)]

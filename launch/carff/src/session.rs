@@ -1,10 +1,16 @@
 //! The common part of all probes: joining a run, reading at intervals, and detecting the end.
 
-use anyhow::{Context, ensure};
+use crate::complete;
+use anyhow::{Context, anyhow, ensure};
+use carff_base::names::hint;
 use carff_messages::Header;
-use carff_observe::{Attached, attach};
-use carff_transport::{AnyReceiver, Received, Stop, TopicId, Waiter, monotonic_now_ns};
+use carff_observe::{AttachError, Attached, LiveRun, attach, find};
+use carff_transport::{
+    AnyReceiver, OpenTopic, Received, Run, Stop, TopicId, Waiter, living_processes, monotonic_now_ns,
+};
 use clap::Args;
+use clap_complete::engine::ArgValueCandidates;
+use std::mem::replace;
 
 /// Time between two readings: short enough that no buffer (8 images) overflows at 400 messages per second.
 const LOOK_NS: u64 = 10_000_000;
@@ -15,11 +21,74 @@ const ALIVE_NS: u64 = 200_000_000;
 #[derive(Clone, Debug, Default, Args)]
 pub struct SessionArgs {
     /// Name of the run; optional if only one runs.
-    #[arg(long)]
+    #[arg(long, add = ArgValueCandidates::new(complete::runs))]
     pub run: Option<String>,
     /// Stop after this time, seconds.
     #[arg(long, value_parser = positive)]
     pub seconds: Option<f64>,
+}
+
+/// The run, the time limit, and the runs after it.
+#[derive(Clone, Debug, Default, Args)]
+pub struct WaitArgs {
+    /// The run, and the time limit.
+    #[command(flatten)]
+    pub session: SessionArgs,
+    /// Wait until a run starts, and wait again after its end, until a stop is requested or the time is over.
+    #[arg(long)]
+    pub wait: bool,
+}
+
+/// The runs that a command observes, one after another.
+#[derive(Debug)]
+pub(crate) struct Sessions<'a> {
+    args: &'a WaitArgs,
+    /// The name under which it joins.
+    name: &'static str,
+    stop: Stop,
+    until_ns: Option<u64>,
+    has_joined: bool,
+}
+
+impl<'a> Sessions<'a> {
+    /// Returns the runs to join under the name `name`. Without `--wait` there must be one.
+    pub(crate) fn new(args: &'a WaitArgs, name: &'static str) -> anyhow::Result<Self> {
+        if !args.wait {
+            find(args.session.run.as_deref())?;
+        }
+        let stop = Stop::on_signals().context("cannot handle signals")?;
+        let until_ns = args.session.seconds.map(|s| monotonic_now_ns() + (s * 1e9) as u64);
+        Ok(Self { args, name, stop, until_ns, has_joined: false })
+    }
+
+    /// Joins the next run; `idle` is called again and again while there is none. Returns none after the last one.
+    pub(crate) fn next(&mut self, mut idle: impl FnMut()) -> anyhow::Result<Option<Session>> {
+        let (waiter, run) = (Waiter::new(self.stop.clone()), self.args.session.run.as_deref());
+        if replace(&mut self.has_joined, true) && !self.args.wait {
+            return Ok(None);
+        }
+        while self.args.wait {
+            if self.stop.is_stopped() || self.until_ns.is_some_and(|until_ns| monotonic_now_ns() >= until_ns) {
+                return Ok(None);
+            }
+            match find(run) {
+                Ok(live) if is_started(&live) => break,
+                Ok(_) | Err(AttachError::NoRun | AttachError::NoSuchRun { .. }) => {}
+                Err(error) => return Err(error.into()),
+            }
+            idle();
+            waiter.wait_until(&[], monotonic_now_ns() + ALIVE_NS)?;
+        }
+        let session = Session::open(&self.args.session, self.name)?;
+        Ok(Some(Session { until_ns: self.until_ns, ..session }))
+    }
+}
+
+/// Returns true if the launcher has joined its run. Before that it removes what an earlier launch has left, and takes
+/// other processes of the run for leftovers.
+fn is_started(live: &LiveRun) -> bool {
+    let processes = Run::within(&live.dir, &live.name, live.run_id).ok().and_then(|run| living_processes(&run).ok());
+    processes.is_some_and(|processes| processes.contains(&live.pid))
 }
 
 fn positive(text: &str) -> Result<f64, String> {
@@ -65,6 +134,23 @@ impl Session {
             stop,
             until_ns: args.seconds.map(|s| now_ns + (s * 1e9) as u64),
             alive_ns: now_ns + ALIVE_NS,
+        })
+    }
+
+    /// Returns the topic of a name, or of its last part if that is unique: a topic of the graph, or one that a stage of
+    /// the run has open.
+    pub(crate) fn topic(&self, name: &str) -> anyhow::Result<TopicId> {
+        if let Ok(topic) = name.parse() {
+            return Ok(topic);
+        }
+        let open = self.attached.node.open_topics().context("cannot list the topics")?;
+        let last: Vec<&OpenTopic> = open.iter().filter(|t| t.name.rsplit('/').next() == Some(name)).collect();
+        let found =
+            open.iter().find(|topic| topic.name == name).or(if let [one] = last[..] { Some(one) } else { None });
+        found.map(OpenTopic::id).ok_or_else(|| {
+            let mut all: Vec<&str> = TopicId::all().map(TopicId::name).collect();
+            all.extend(open.iter().map(|topic| topic.name.as_str()).filter(|name| name.parse::<TopicId>().is_err()));
+            anyhow!("there is no topic `{name}`{}. All: {}", hint(name, all.iter().copied()), all.join(", "))
         })
     }
 
@@ -144,8 +230,12 @@ impl Session {
         }
     }
 
-    /// Reports the end of the run on standard error.
+    /// Reports dropped messages, and the end of the run, on standard error.
     pub(crate) fn say_end(&self, going: Going) {
+        let invalid = self.attached.node.counters().invalid();
+        if invalid > 0 {
+            eprintln!("{invalid} messages were dropped: their header or content is not valid");
+        }
         if going == Going::RunEnded {
             eprintln!("run `{}` has ended", self.attached.live.name);
         }

@@ -5,6 +5,8 @@ use crate::vitals::stage_latency_ns;
 use carff_messages::forms::AnyMessage;
 use carff_messages::{Action, ActionCode, Belief, Forecast, FrameMeta, Reason, Stage, ViewMeta};
 use serde_json::{Value, json};
+#[cfg(feature = "recording")]
+use std::path::Path;
 
 /// A stage's work on a frame.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -44,6 +46,17 @@ impl Span {
             what: what(message),
         })
     }
+}
+
+/// Returns the run of a recording, and the work of its stages.
+#[cfg(feature = "recording")]
+pub(crate) fn recorded_spans(recording: &Path) -> anyhow::Result<(String, Vec<Span>)> {
+    let mut reader = carff_recording::Reader::open(recording)?.without_images();
+    let mut spans = Vec::new();
+    while let Some(entry) = reader.next()? {
+        spans.extend(Span::of(entry.message.as_message()));
+    }
+    Ok((reader.about().map_or("unknown", |about| &about.run).to_owned(), spans))
 }
 
 /// The result that a message carries, in a few words.

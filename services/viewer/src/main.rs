@@ -1,12 +1,13 @@
 //! `carff-viewer`: the live window.
 
 use anyhow::{Context, bail};
+use carff_observe::{First, Look, ViewArgs};
 use carff_viewer::app::{Command, Options, Viewer, Waker, icon};
 use carff_viewer::input::{Album, Input};
 use carff_viewer::live::LiveFeed;
 use carff_viewer::models::Models;
 use carff_viewer::session::Session;
-use clap::{Parser, ValueEnum};
+use clap::Parser;
 use eframe::egui::{ThemePreference, ViewportBuilder};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -28,55 +29,9 @@ const NICE: i32 = 5;
     after_help = "Examples:\n  carff-viewer --dataset data/approaching-intersection\n  carff-viewer --run\n  \
                   carff-viewer --picture frame.png --do predict --do probe --screenshot scene.png"
 )]
-struct Args {
-    /// Folder of the trained models. Default: the models of the run, or the shipped ones.
-    #[arg(long)]
-    checkpoint: Option<PathBuf>,
-    /// Folder of the dataset to choose images from. Default: the dataset that the models were trained on, if it exists.
-    #[arg(long)]
-    dataset: Option<PathBuf>,
-    /// Watch a running graph: the one of this name, or, without a name, the only one.
-    #[arg(long, num_args = 0..=1, default_missing_value = "", value_name = "NAME")]
-    run: Option<String>,
-    /// A PNG image to start with.
-    #[arg(long, value_name = "FILE", conflicts_with = "run")]
-    picture: Option<PathBuf>,
-    /// Command to run first; can be given several times.
-    #[arg(long = "do", value_name = "WHAT")]
-    first: Vec<First>,
-    /// Threads for drawing. Default: the number of cores; one while a run is watched.
-    #[arg(long)]
-    threads: Option<usize>,
-    /// Colours of the window. Default: the system's preference.
-    #[arg(long)]
-    theme: Option<Look>,
-    /// Folder for screenshots.
-    #[arg(long, default_value = ".")]
-    folder: PathBuf,
-    /// Save the window as this PNG file when everything is drawn, and exit.
-    #[arg(long, value_name = "FILE")]
-    screenshot: Option<PathBuf>,
-    /// With --screenshot: wait at least this many seconds.
-    #[arg(long, default_value_t = 0.0, requires = "screenshot")]
-    after: f32,
-    /// Size of the window, points.
-    #[arg(long, num_args = 2, value_names = ["WIDTH", "HEIGHT"], default_values_t = [1440.0, 900.0])]
-    size: Vec<f32>,
-}
-
-/// A command to run first.
-#[derive(Clone, Copy, Debug, ValueEnum)]
-enum First {
-    Toggle,
-    Predict,
-    Probe,
-    ProbeAndPredict,
-}
-
-#[derive(Clone, Copy, Debug, ValueEnum)]
-enum Look {
-    Dark,
-    Light,
+struct Cli {
+    #[command(flatten)]
+    args: ViewArgs,
 }
 
 fn main() -> ExitCode {
@@ -88,7 +43,7 @@ fn main() -> ExitCode {
         .with_target(false)
         .without_time()
         .try_init();
-    match run(Args::parse()) {
+    match run(Cli::parse().args) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("error: {}", carff_base::errors::sentence(&*error));
@@ -97,7 +52,7 @@ fn main() -> ExitCode {
     }
 }
 
-fn run(args: Args) -> anyhow::Result<()> {
+fn run(args: ViewArgs) -> anyhow::Result<()> {
     let waker = Waker::default();
     let live = match args.run {
         Some(name) => {

@@ -8,7 +8,9 @@
 mod attach;
 mod lock;
 mod record;
+mod view;
 
 pub use attach::{AttachError, Attached, LiveRun, attach, find, runs};
 pub use lock::{LockError, RunLock};
 pub use record::RunRecord;
+pub use view::{First, Look, ViewArgs};

@@ -1,12 +1,13 @@
 //! The current users of each topic, as the transport reports them.
 
-use crate::payload::Payload;
+use crate::payload::{Opened, Payload};
 use crate::{Node, OpenError, Service, Topic};
 use iceoryx2::node::{NodeState, NodeView};
 use iceoryx2::prelude::{CallbackProgression, PortFactory};
 use iceoryx2::service::Service as _;
 use iceoryx2::service::dynamic_config::publish_subscribe::DynamicConfig;
 use iceoryx2::service::static_config::messaging_pattern::MessagingPattern;
+use iceoryx2::service::static_config::publish_subscribe::StaticConfig;
 use std::collections::BTreeMap;
 
 /// A process that has joined the run.
@@ -25,8 +26,7 @@ pub struct OpenTopic {
     pub name: String,
     /// Name of the message type; for images, of the type that describes them.
     pub message: String,
-    /// Processes with the topic open.
-    pub members: Vec<Member>,
+    pub(crate) config: StaticConfig,
 }
 
 /// The ports of a topic.
@@ -64,7 +64,6 @@ impl Node {
 
     /// Returns all open topics of the run by name, with any message type.
     pub fn open_topics(&self) -> Result<Vec<OpenTopic>, OpenError> {
-        let members = self.members_by_id()?;
         let mut topics = Vec::new();
         Service::list(self.inner().config(), |service| {
             let details = &service.static_details;
@@ -72,9 +71,7 @@ impl Node {
                 let types = topic.message_type_details();
                 let header = types.user_header.type_name().to_string();
                 let message = if header == "()" { types.payload.type_name().to_string() } else { header };
-                let nodes = service.dynamic_details.iter().flat_map(|d| &d.nodes);
-                let members = nodes.filter_map(|n| members.get(&n.node_id().value()).cloned()).collect();
-                topics.push(OpenTopic { name: details.name().to_string(), message, members });
+                topics.push(OpenTopic { name: details.name().to_string(), message, config: *topic });
             }
             CallbackProgression::Continue
         })
@@ -85,9 +82,12 @@ impl Node {
 
     /// Returns the ports of a topic; empty if no process has it open.
     pub fn ports<P: Payload>(&self, topic: &Topic<P>) -> Result<Ports, OpenError> {
-        let members = self.members_by_id()?;
         // Opening fails when no process has the topic open.
-        let opened = P::open(self.unopened(topic)?);
+        self.ports_of::<P>(P::open(self.unopened(topic)?).ok().as_ref())
+    }
+
+    pub(crate) fn ports_of<P: Payload>(&self, opened: Option<&Opened<P>>) -> Result<Ports, OpenError> {
+        let members = self.members_by_id()?;
         Ok(opened.map(|service| list(service.dynamic_config(), &members)).unwrap_or_default())
     }
 }

@@ -47,6 +47,7 @@ mod space;
 mod stop;
 mod topic;
 pub mod topics;
+mod untyped;
 mod wait;
 
 pub use counters::Counters;
@@ -62,6 +63,7 @@ pub use run::{Run, cleanup_dead, living_processes, remove_run_leftovers, run_id_
 pub use space::{SHARED_MEMORY_DIR, check_space};
 pub use stop::{INTERRUPTED, Stop, exit_on_signals, is_interrupted};
 pub use topic::{Limits, Topic};
+pub use untyped::HeaderOnly;
 pub use wait::{Input, Waiter, Woken};
 
 /// Returns the present time of the clock that all headers use: `CLOCK_MONOTONIC`, nanoseconds, the same in all

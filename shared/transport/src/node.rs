@@ -70,14 +70,21 @@ impl Node {
 
     /// Opens a topic to receive from.
     pub fn receiver<P: Payload>(&self, topic: &Topic<P>) -> Result<Receiver<P>, OpenError> {
+        self.receiver_of(topic, &self.service(topic)?)
+    }
+
+    pub(crate) fn receiver_of<P: Payload>(
+        &self,
+        topic: &Topic<P>,
+        service: &Opened<P>,
+    ) -> Result<Receiver<P>, OpenError> {
         let Topic { name, limits, .. } = *topic;
-        let subscriber =
-            self.service(topic)?.subscriber_builder().buffer_size(limits.buffer).create().map_err(|e| match e {
-                SubscriberCreateError::ExceedsMaxSupportedSubscribers => {
-                    too_many(name, "subscribers", limits.max_subscribers)
-                }
-                _ => failed(name, &e),
-            })?;
+        let subscriber = service.subscriber_builder().buffer_size(limits.buffer).create().map_err(|e| match e {
+            SubscriberCreateError::ExceedsMaxSupportedSubscribers => {
+                too_many(name, "subscribers", limits.max_subscribers)
+            }
+            _ => failed(name, &e),
+        })?;
         Ok(Receiver::new(topic, &self.run, subscriber, self.listener(name, limits)?, self.counters.clone()))
     }
 
@@ -169,7 +176,7 @@ pub(crate) fn service_name(topic: &str) -> Result<ServiceName, OpenError> {
         .map_err(|e| OpenError::Topic { topic: topic.to_owned(), cause: format!("its name is not allowed: {e:?}") })
 }
 
-fn failed(topic: &str, error: &dyn std::error::Error) -> OpenError {
+pub(crate) fn failed(topic: &str, error: &dyn std::error::Error) -> OpenError {
     OpenError::Topic { topic: topic.to_owned(), cause: error.to_string() }
 }
 

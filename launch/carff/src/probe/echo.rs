@@ -1,16 +1,20 @@
 //! `carff probe echo`: shows messages as text or JSON lines.
 
+use crate::complete;
 use crate::session::{Session, SessionArgs};
 use carff_messages::forms::as_text;
-use carff_transport::TopicId;
+use carff_transport::HeaderOnly;
 use clap::Args;
+use clap_complete::engine::ArgValueCandidates;
 use std::io::Write;
 
 /// Show a topic's messages.
 #[derive(Clone, Debug, Args)]
 pub struct EchoArgs {
-    /// Topic: `prober/belief`, or `belief` for short. For images, only their description is shown.
-    pub topic: TopicId,
+    /// Topic: `prober/belief`, or `belief` for short. For images, only their description is shown; of a type that this
+    /// program does not know, only the header.
+    #[arg(add = ArgValueCandidates::new(complete::topics))]
+    pub topic: String,
     /// Print one line of JSON per message.
     #[arg(long)]
     pub json: bool,
@@ -27,7 +31,8 @@ pub struct EchoArgs {
 
 pub(super) fn run(args: &EchoArgs) -> anyhow::Result<()> {
     let mut session = Session::open(&args.session, "probe-echo")?;
-    session.listen([args.topic])?;
+    let topic = session.topic(&args.topic)?;
+    session.listen([topic])?;
     let (mut seen, mut shown) = (0, 0);
     let mut out = std::io::stdout().lock();
     let going = session.follow(
@@ -35,6 +40,10 @@ pub(super) fn run(args: &EchoArgs) -> anyhow::Result<()> {
             seen += 1;
             if (seen - 1) % args.every != 0 {
                 return Ok(true);
+            }
+            if shown == 0 && message.message().get::<HeaderOnly>().is_some() {
+                let (message, _) = topic.schema();
+                eprintln!("topic `{topic}`: this program does not know `{message}`; it shows only the header");
             }
             let value = message.message().to_json()?;
             // A closed pipe (`| head`) is the end, not an error.

@@ -2,20 +2,23 @@
 
 use super::file_in;
 use super::inline::{Inline, columns};
+use crate::complete;
 use crate::session::{Session, SessionArgs, colours};
 use anyhow::{Context, bail, ensure};
 use carff_messages::forms::AnyMessage;
 use carff_messages::{FrameMeta, ImageMeta, ViewKind, ViewMeta};
 use carff_transport::TopicId;
 use clap::Args;
+use clap_complete::engine::ArgValueCandidates;
 use std::io::Write as _;
 use std::path::PathBuf;
 
 /// Show images.
 #[derive(Clone, Debug, Args)]
 pub struct ImageArgs {
-    /// Topic: `camera/frame` or `renderer/view`.
-    pub topic: TopicId,
+    /// Topic: `camera/frame`, `renderer/view`, or images of the same types from another stage.
+    #[arg(add = ArgValueCandidates::new(complete::topics))]
+    pub topic: String,
     /// Folder for PNG files; without it images are shown in the terminal.
     #[arg(short, long)]
     pub out: Option<PathBuf>,
@@ -32,20 +35,21 @@ pub struct ImageArgs {
 
 pub(super) fn run(args: &ImageArgs) -> anyhow::Result<()> {
     ensure!(
-        args.topic.is_image(),
-        "topic `{}` has no images: use `{}` or `{}`",
-        args.topic,
-        TopicId::FRAME,
-        TopicId::VIEW
-    );
-    ensure!(
         args.out.is_some() || args.inline != Inline::Auto || colours(),
         "the output is not a terminal with colours: name a folder for PNG files with -o, or a protocol with --as"
     );
     let inline = if args.out.is_some() { args.inline } else { args.inline.resolved() };
     let columns = columns();
     let mut session = Session::open(&args.session, "probe-image")?;
-    session.listen([args.topic])?;
+    let topic = session.topic(&args.topic)?;
+    let (message, _) = topic.schema();
+    ensure!(
+        [TopicId::FRAME, TopicId::VIEW].iter().any(|known| known.schema().0 == message),
+        "topic `{topic}` has no images that this program knows: use `{}` or `{}`",
+        TopicId::FRAME,
+        TopicId::VIEW
+    );
+    session.listen([topic])?;
     let mut shown = 0;
     let going = session.follow(
         |_, message| {

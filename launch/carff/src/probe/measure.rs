@@ -123,10 +123,11 @@ fn in_bytes(bytes: f64) -> String {
 
 pub(super) fn run(args: &TopicArgs, quantity: Quantity) -> anyhow::Result<()> {
     let mut session = Session::open(&args.session, "probe-measure")?;
+    let topic = session.topic(&args.topic)?;
     if quantity == Quantity::Delay {
-        session.listen_woken(args.topic)?;
+        session.listen_woken(topic)?;
     } else {
-        session.listen([args.topic])?;
+        session.listen([topic])?;
     }
     // Messages from the topic's history have an old age.
     session.take(|_, _| Ok(()))?;
@@ -152,7 +153,7 @@ pub(super) fn run(args: &TopicArgs, quantity: Quantity) -> anyhow::Result<()> {
             Ok(())
         },
     )?;
-    print!("{} of {}\n{}", args.topic, session.attached.live.name, series.borrow().summary(quantity));
+    print!("{topic} of {}\n{}", session.attached.live.name, series.borrow().summary(quantity));
     session.say_end(going);
     Ok(())
 }

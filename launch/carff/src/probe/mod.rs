@@ -10,9 +10,10 @@ mod structure;
 mod top;
 mod trace;
 
+use crate::complete;
 use crate::session::SessionArgs;
-use carff_transport::TopicId;
 use clap::{Args, Subcommand};
+use clap_complete::engine::ArgValueCandidates;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
@@ -65,19 +66,22 @@ pub enum ProbeCommand {
     Belief(belief::BeliefArgs),
     /// Trace one frame: the times at which it entered and left each stage, and the decision.
     #[command(
-        after_help = "Example: the next frame, and a minute of frames for ui.perfetto.dev\n  carff probe trace next\n  carff probe trace next --seconds 60 --perfetto trace.json"
+        after_help = "Example: the next frame; a minute of frames for ui.perfetto.dev; a frame of a recording\n  carff probe trace next\n  carff probe trace next --seconds 60 --perfetto trace.json\n  carff probe trace 5 --recording run.mcap"
     )]
     Trace(trace::TraceArgs),
     /// Show all stages on one screen: state, rate, latency, CPU, memory, restarts, missed deadlines.
-    #[command(after_help = "Example: once, as plain text\n  carff probe top --once")]
+    #[command(
+        after_help = "Example: once, as plain text\n  carff probe top --once\n  carff probe top --columns stage,state,rate,errors --sort errors"
+    )]
     Top(top::TopArgs),
 }
 
 /// A topic, and the time limit.
 #[derive(Clone, Debug, Args)]
 pub struct TopicArgs {
-    /// Topic: `prober/belief`, or `belief` for short.
-    pub topic: TopicId,
+    /// Topic that `carff probe list` shows: `prober/belief`, or `belief` for short.
+    #[arg(add = ArgValueCandidates::new(complete::topics))]
+    pub topic: String,
     /// The run, and the time limit.
     #[command(flatten)]
     pub session: SessionArgs,

@@ -27,12 +27,10 @@ pub enum GraphFormat {
 /// A topic of a run and its current users.
 #[derive(Clone, Debug, PartialEq)]
 struct TopicInUse {
-    name: String,
+    topic: TopicId,
     message: String,
     publishers: Vec<String>,
     subscribers: Vec<String>,
-    /// Members of unknown direction: those of topics outside the shipped graph.
-    users: Vec<String>,
     /// Messages per second; none if not measured.
     rate_hz: Option<f64>,
 }
@@ -41,8 +39,7 @@ pub(super) fn list(args: &SessionArgs, as_json: bool) -> anyhow::Result<()> {
     let seconds = args.seconds.unwrap_or(COUNT_S);
     let mut session = Session::open(&SessionArgs { seconds: Some(seconds), ..args.clone() }, PROBE)?;
     let mut topics = in_use(&session)?;
-    let ours: Vec<TopicId> = topics.iter().filter_map(|t| t.name.parse().ok()).collect();
-    session.listen(ours)?;
+    session.listen(topics.iter().map(|t| t.topic))?;
     // Messages from the topic's history are not part of the rate.
     session.take(|_, _| Ok(()))?;
     let started_ns = monotonic_now_ns();
@@ -56,8 +53,7 @@ pub(super) fn list(args: &SessionArgs, as_json: bool) -> anyhow::Result<()> {
     )?;
     let counted_s = (monotonic_now_ns() - started_ns) as f64 / 1e9;
     for topic in &mut topics {
-        topic.rate_hz =
-            topic.name.parse().ok().map(|id: TopicId| counts.get(&id).copied().unwrap_or(0) as f64 / counted_s);
+        topic.rate_hz = Some(counts.get(&topic.topic).copied().unwrap_or(0) as f64 / counted_s);
     }
     if as_json {
         println!("{}", serde_json::to_string_pretty(&topics.iter().map(TopicInUse::json).collect::<Value>())?);
@@ -92,38 +88,25 @@ fn in_use(session: &Session) -> anyhow::Result<Vec<TopicInUse>> {
         members.iter().filter(|m| m.pid != here).map(|m| m.name.clone()).collect()
     };
     let mut topics = Vec::new();
-    for topic in node.open_topics().context("cannot list the topics")? {
-        let mut found = TopicInUse {
-            message: topic.message,
-            publishers: Vec::new(),
-            subscribers: Vec::new(),
-            users: Vec::new(),
-            rate_hz: None,
-            name: topic.name,
-        };
-        match found.name.parse::<TopicId>() {
-            Ok(id) => {
-                let ports = id.ports(node)?;
-                (found.publishers, found.subscribers) = (names(&ports.publishers), names(&ports.subscribers));
-            }
-            Err(_) => found.users = names(&topic.members),
-        }
-        topics.push(found);
+    for open in node.open_topics().context("cannot list the topics")? {
+        let topic = open.id();
+        let ports = topic.ports(node)?;
+        let (publishers, subscribers) = (names(&ports.publishers), names(&ports.subscribers));
+        topics.push(TopicInUse { topic, message: open.message, publishers, subscribers, rate_hz: None });
     }
     // The data path first, in its order.
-    topics.sort_by_key(|t| t.name.parse::<TopicId>().ok().map_or((1, TopicId::FRAME), |id| (0, id)));
+    topics.sort_by_key(|t| t.topic);
     Ok(topics)
 }
 
 impl TopicInUse {
     fn json(&self) -> Value {
         json!({
-            "topic": self.name,
+            "topic": self.topic.name(),
             "type": self.message,
             "schema_version": SCHEMA_VERSION,
             "publishers": self.publishers,
             "subscribers": self.subscribers,
-            "users": self.users,
             "rate_hz": self.rate_hz,
         })
     }
@@ -148,9 +131,9 @@ fn table(topics: &[TopicInUse]) -> String {
     let head = ["topic", "type", "schema", "from", "to", "rate"].map(str::to_owned).to_vec();
     let rows = topics.iter().map(|t| {
         let list = |names: &[String]| if names.is_empty() { "-".to_owned() } else { names.join(" ") };
-        let to = if t.users.is_empty() { list(&t.subscribers) } else { format!("? {}", t.users.join(" ")) };
         let rate = t.rate_hz.map_or("-".to_owned(), |hz| format!("{hz:.1} Hz"));
-        vec![t.name.clone(), t.message.clone(), SCHEMA_VERSION.to_string(), list(&t.publishers), to, rate]
+        let (from, to) = (list(&t.publishers), list(&t.subscribers));
+        vec![t.topic.name().to_owned(), t.message.clone(), SCHEMA_VERSION.to_string(), from, to, rate]
     });
     columns(&std::iter::once(head).chain(rows).collect::<Vec<_>>())
 }
@@ -158,8 +141,8 @@ fn table(topics: &[TopicInUse]) -> String {
 fn text(run: &str, topics: &[TopicInUse]) -> String {
     let mut text = format!("run {run}\n");
     for topic in topics {
-        let _ = writeln!(text, "{} ({})", topic.name, topic.message);
-        for (arrow, names) in [("<-", &topic.publishers), ("->", &topic.subscribers), ("--", &topic.users)] {
+        let _ = writeln!(text, "{} ({})", topic.topic, topic.message);
+        for (arrow, names) in [("<-", &topic.publishers), ("->", &topic.subscribers)] {
             for name in names {
                 let _ = writeln!(text, "  {arrow} {name}");
             }
@@ -169,7 +152,7 @@ fn text(run: &str, topics: &[TopicInUse]) -> String {
 }
 
 fn processes(topics: &[TopicInUse]) -> BTreeSet<&String> {
-    topics.iter().flat_map(|t| t.publishers.iter().chain(&t.subscribers).chain(&t.users)).collect()
+    topics.iter().flat_map(|t| t.publishers.iter().chain(&t.subscribers)).collect()
 }
 
 fn dot(topics: &[TopicInUse]) -> String {
@@ -178,15 +161,12 @@ fn dot(topics: &[TopicInUse]) -> String {
         let _ = writeln!(text, "  {process:?};");
     }
     for topic in topics {
-        let _ = writeln!(text, "  {:?} [shape=ellipse, style=solid];", topic.name);
+        let _ = writeln!(text, "  {:?} [shape=ellipse, style=solid];", topic.topic.name());
         for name in &topic.publishers {
-            let _ = writeln!(text, "  {name:?} -> {:?};", topic.name);
+            let _ = writeln!(text, "  {name:?} -> {:?};", topic.topic.name());
         }
         for name in &topic.subscribers {
-            let _ = writeln!(text, "  {:?} -> {name:?};", topic.name);
-        }
-        for name in &topic.users {
-            let _ = writeln!(text, "  {:?} -> {name:?} [dir=none];", topic.name);
+            let _ = writeln!(text, "  {:?} -> {name:?};", topic.topic.name());
         }
     }
     text + "}\n"
@@ -199,16 +179,13 @@ fn mermaid(topics: &[TopicInUse]) -> String {
         let _ = writeln!(text, "  p_{}[{process}]", id(process));
     }
     for topic in topics {
-        let name = id(&topic.name);
-        let _ = writeln!(text, "  t_{name}([{}])", topic.name);
+        let name = id(topic.topic.name());
+        let _ = writeln!(text, "  t_{name}([{}])", topic.topic);
         for process in &topic.publishers {
             let _ = writeln!(text, "  p_{} --> t_{name}", id(process));
         }
         for process in &topic.subscribers {
             let _ = writeln!(text, "  t_{name} --> p_{}", id(process));
-        }
-        for process in &topic.users {
-            let _ = writeln!(text, "  t_{name} --- p_{}", id(process));
         }
     }
     text
@@ -217,20 +194,19 @@ fn mermaid(topics: &[TopicInUse]) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use carff_messages::Posterior;
+    use carff_transport::{Topic, topics};
 
     fn two() -> Vec<TopicInUse> {
-        let topic = |name: &str, publishers: &[&str], subscribers: &[&str], users: &[&str]| TopicInUse {
-            name: name.to_owned(),
+        static OWN: Topic<Posterior> = Topic::new("my/topic", topics::MESSAGES, 500);
+        let topic = |topic: TopicId, publishers: &[&str], subscribers: &[&str]| TopicInUse {
+            topic,
             message: "carff.X.v1".to_owned(),
             publishers: publishers.iter().map(|&s| s.to_owned()).collect(),
             subscribers: subscribers.iter().map(|&s| s.to_owned()).collect(),
-            users: users.iter().map(|&s| s.to_owned()).collect(),
             rate_hz: Some(10.0),
         };
-        vec![
-            topic("camera/frame", &["camera"], &["encoder", "probe-image"], &[]),
-            topic("my/topic", &[], &[], &["gate"]),
-        ]
+        vec![topic(TopicId::FRAME, &["camera"], &["encoder", "probe-image"]), topic(TopicId::of(&OWN), &["gate"], &[])]
     }
 
     /// Each format names every process and topic, with arrows from publisher to topic to subscriber.
@@ -243,11 +219,11 @@ mod tests {
         );
         let mermaid = mermaid(&two());
         assert!(
-            mermaid.contains("p_camera --> t_camera_frame") && mermaid.contains("t_my_topic --- p_gate"),
+            mermaid.contains("p_camera --> t_camera_frame") && mermaid.contains("p_gate --> t_my_topic"),
             "{mermaid}"
         );
         let text = text("r", &two());
-        assert!(text.contains("<- camera") && text.contains("-> probe-image") && text.contains("-- gate"), "{text}");
+        assert!(text.contains("<- camera") && text.contains("-> probe-image") && text.contains("<- gate"), "{text}");
         let table = table(&two());
         assert!(
             table.lines().nth(1).is_some_and(|l| l.contains("encoder probe-image") && l.contains("10.0 Hz")),

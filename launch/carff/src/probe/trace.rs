@@ -3,12 +3,12 @@
 use super::structure::columns;
 use crate::session::{Session, SessionArgs};
 use crate::spans::{Span, trace_events};
-use anyhow::{Context, ensure};
+use anyhow::{Context, bail, ensure};
 use carff_messages::Stage;
 use carff_transport::TopicId;
 use carff_transport::monotonic_now_ns;
 use clap::Args;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
 /// Time to wait for a frame's views after its decision, nanoseconds.
@@ -45,12 +45,40 @@ pub struct TraceArgs {
     /// Write the times of all frames to this file, in the trace event format, for ui.perfetto.dev.
     #[arg(long)]
     pub perfetto: Option<PathBuf>,
+    /// Trace a frame of this recording instead of a running graph.
+    #[cfg(feature = "recording")]
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["run", "seconds", "perfetto"])]
+    pub recording: Option<PathBuf>,
     /// The run, and the time limit.
     #[command(flatten)]
     pub session: SessionArgs,
 }
 
+/// Prints the way of a recorded frame; `next` is the first one.
+#[cfg(feature = "recording")]
+fn recorded(args: &TraceArgs, recording: &Path) -> anyhow::Result<()> {
+    let (_, spans) = crate::spans::recorded_spans(recording)?;
+    let frames = || spans.iter().filter(|s| s.stage == Stage::Camera).map(|s| s.frame_id);
+    let (first, last) = (frames().min(), frames().max());
+    let file = recording.display();
+    let frame = match args.frame {
+        Frame::Number(number) => number,
+        Frame::Next => first.with_context(|| format!("{file} has no frame of the camera"))?,
+    };
+    let spans: Vec<Span> = spans.iter().filter(|s| s.frame_id == frame).cloned().collect();
+    if spans.is_empty() {
+        let range = first.zip(last).map_or("no frames".to_owned(), |(first, last)| format!("frames {first} to {last}"));
+        bail!("{file} does not have frame {frame}; it has {range}");
+    }
+    print_way(frame, spans);
+    Ok(())
+}
+
 pub(super) fn run(args: &TraceArgs) -> anyhow::Result<()> {
+    #[cfg(feature = "recording")]
+    if let Some(recording) = &args.recording {
+        return recorded(args, recording);
+    }
     let mut session = Session::open(&args.session, "probe-trace")?;
     session.listen(TopicId::FLOW)?;
     session.take(|_, _| Ok(()))?;
@@ -95,18 +123,27 @@ pub(super) fn run(args: &TraceArgs) -> anyhow::Result<()> {
         println!("{}: {} spans; open it at ui.perfetto.dev or chrome://tracing", path.display(), all.len());
     }
     let frame = wanted.get().context("no frame arrived: check with `carff probe list` that the camera runs")?;
-    let mut spans: Vec<Span> = all.into_iter().filter(|s| s.frame_id == frame).collect();
+    let spans: Vec<Span> = all.into_iter().filter(|s| s.frame_id == frame).collect();
     session.say_end(going);
     if let (Some(later), true) = (missed, spans.is_empty()) {
-        ensure!(to_file, "frame {frame} has passed, and the camera is at frame {later}: name a later frame, or `next`");
+        ensure!(
+            to_file,
+            "frame {frame} has passed, and a running graph keeps no past frames (the camera is at {later}): trace it in a \
+             recording (`carff record -o run.mcap`, then `carff probe trace {frame} --recording run.mcap`), or name a \
+             later frame, or `next`"
+        );
     }
     ensure!(!spans.is_empty(), "frame {frame} did not arrive");
+    print_way(frame, spans);
+    Ok(())
+}
+
+fn print_way(frame: u64, mut spans: Vec<Span>) {
     spans.sort_by_key(|s| (s.end_ns, s.stage));
     print!("{}", way(frame, &spans));
     if !spans.iter().any(|s| s.stage == Stage::Controller) {
         println!("no decision: a later frame arrived before this one was processed");
     }
-    Ok(())
 }
 
 /// Formats a frame's spans as a table with a chart, milliseconds since capture.
@@ -159,6 +196,29 @@ mod tests {
             "{text}"
         );
         assert!(line("controller").ends_with("halt"), "{text}");
+    }
+
+    /// A frame of a recording is found by its number, `next` is the first one, and an error names the recorded frames.
+    #[test]
+    #[cfg(feature = "recording")]
+    fn recorded_frames_are_traced() {
+        use carff_messages::forms::AnyMessage;
+        use carff_messages::{FrameMeta, Header};
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("r.mcap");
+        let mut writer = carff_recording::Writer::create(&path, &Default::default(), &[]).unwrap();
+        for frame in 5..8 {
+            let header = Header { publish_time_ns: frame + 1, ..Header::of_frame(frame, frame, 1) };
+            let mut meta = FrameMeta { header, width_px: 2, height_px: 1, ..FrameMeta::default() };
+            (meta.intrinsics.fl_x_px, meta.intrinsics.fl_y_px) = (1.0, 1.0);
+            writer.write(TopicId::FRAME, AnyMessage::new(&meta, &[0; 6])).unwrap();
+        }
+        writer.finish().unwrap();
+        let args = |frame| TraceArgs { frame, perfetto: None, recording: None, session: SessionArgs::default() };
+        recorded(&args(Frame::Number(6)), &path).unwrap();
+        recorded(&args(Frame::Next), &path).unwrap();
+        let error = recorded(&args(Frame::Number(9)), &path).unwrap_err().to_string();
+        assert!(error.contains("frame 9") && error.contains("5 to 7"), "{error}");
     }
 
     /// A frame is a number or `next`.
