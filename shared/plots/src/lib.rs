@@ -1,4 +1,4 @@
-//! Charts and filmstrips as PNG files: layout, axes and text.
+//! Charts, filmstrips and contact sheets as PNG files: layout, axes and text.
 //!
 //! The font is part of the program, so that an image looks the same on every machine.
 //!
@@ -14,9 +14,11 @@
 mod canvas;
 mod curves;
 mod filmstrip;
+mod sheet;
 
 pub use curves::{Marks, Panel, Series, curves};
 pub use filmstrip::{StripCell, StripRow, filmstrip};
+pub use sheet::labelled_sheet;
 
 /// Longest side of a drawn image, pixels.
 pub const MAX_SIDE_PX: u32 = 8192;

@@ -69,10 +69,10 @@ impl Command {
         (
             "Choose",
             &[
-                (Self::SceneBefore, Modifiers::NONE, Key::ArrowLeft, "Scene before"),
-                (Self::SceneAfter, Modifiers::NONE, Key::ArrowRight, "Scene after"),
-                (Self::PictureBefore, Modifiers::NONE, Key::PageUp, "Picture before"),
-                (Self::PictureAfter, Modifiers::NONE, Key::PageDown, "Picture after"),
+                (Self::SceneBefore, Modifiers::NONE, Key::ArrowLeft, "Previous scene"),
+                (Self::SceneAfter, Modifiers::NONE, Key::ArrowRight, "Next scene"),
+                (Self::PictureBefore, Modifiers::NONE, Key::PageUp, "Previous image"),
+                (Self::PictureAfter, Modifiers::NONE, Key::PageDown, "Next image"),
                 (Self::Follow, Modifiers::NONE, Key::Space, "Follow the running graph, or hold its frame"),
             ],
         ),

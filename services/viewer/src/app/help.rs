@@ -45,6 +45,18 @@ pub fn show(ctx: &Context, is_open: &mut bool) {
                     ui.end_row();
                 }
             });
-            ui.weak("Enter does the same as N. The window only listens: it never disturbs a running graph.");
+            ui.label(theme::strong("Colours").color(palette.accent));
+            for (color, meaning) in [
+                (palette.hazard, "hazard state, halt, and the places of the actor"),
+                (palette.clear, "clear state, advance"),
+                (palette.ego, "the ego vehicle, and the camera of the image"),
+                (palette.accent, "the shown scene, and the camera of the view"),
+                (palette.error, "unknown state, or an error"),
+            ] {
+                theme::legend(ui, &[(color, meaning)]);
+            }
+            ui.label("In the scene, bold boxes are taken places, and dots are densities. A half-transparent object");
+            ui.label("means that the sample is between two states.");
+            ui.weak("Esc closes this help. Enter does the same as N. The window never disturbs a running graph.");
         });
 }

@@ -279,7 +279,7 @@ impl Viewer {
             .frame(frame)
             .show_separator_line(false)
             .resizable(true)
-            .default_height(176.0)
+            .default_height((ctx.screen_rect().height() * 0.2).clamp(110.0, 176.0))
             .height_range(90.0..=420.0)
             .show(ctx, |ui| self.journal_pane(ui));
         SidePanel::left("input")
@@ -300,6 +300,9 @@ impl Viewer {
         CentralPanel::default()
             .frame(egui::Frame::new().fill(palette.ground))
             .show(ctx, |ui| self.scene_pane(ui, commands));
+        if ctx.input(|input| input.key_pressed(egui::Key::Escape)) {
+            (self.shows_help, self.message) = (false, None);
+        }
         if self.shows_help {
             help::show(ctx, &mut self.shows_help);
         }

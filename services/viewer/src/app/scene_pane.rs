@@ -142,7 +142,7 @@ impl Viewer {
                 for (command, name) in [
                     (Command::CameraCorner, "Corner"),
                     (Command::CameraAbove, "Above"),
-                    (Command::CameraPicture, "As pictured"),
+                    (Command::CameraPicture, "Image's camera"),
                 ] {
                     self.command_button(ui, command, Button::new(name), commands);
                 }
