@@ -8,7 +8,7 @@ use eframe::egui::{
     Align2, Color32, FontId, Rect, ScrollArea, Sense, Stroke, TextStyle, Ui, WidgetInfo, WidgetType, vec2,
 };
 
-const BAR_HEIGHT: f32 = 18.0;
+const BAR_HEIGHT: f32 = 17.0;
 /// Width of the names of states and places.
 const NAMES: f32 = 96.0;
 /// Width of the numbers after the bars, and of the second of them.
@@ -29,6 +29,7 @@ impl Viewer {
     pub(super) fn belief_pane(&mut self, ui: &mut Ui) {
         ScrollArea::vertical().auto_shrink(false).show(ui, |ui| {
             ui.spacing_mut().item_spacing.y = 2.0;
+            ui.spacing_mut().interact_size.y = 16.0;
             self.belief(ui);
             ui.add_space(4.0);
             self.places(ui);

@@ -12,7 +12,7 @@ use eframe::egui::{
 /// Largest absolute latent value in the plot of a posterior.
 const LATENT_RANGE: f32 = 3.0;
 /// Largest height of the image, as a share of the pane, and the least such height: the settings below need room.
-const IMAGE_SHARE: f32 = 0.3;
+const IMAGE_SHARE: f32 = 0.26;
 const LEAST_IMAGE: f32 = 96.0;
 
 impl Viewer {
@@ -100,7 +100,7 @@ impl Viewer {
             self.command_button(ui, Command::PictureAfter, Button::new("›"), commands);
         });
         ui.horizontal(|ui| {
-            ui.weak("leaf through");
+            ui.weak("browse");
             let name = |shows: Option<Observability>| match shows {
                 None => "all views",
                 Some(Observability::Full) => "actor seen",
@@ -162,7 +162,7 @@ impl Viewer {
             ui.weak("horizon");
             ui.add(Slider::new(&mut settings.horizon, 1..=MAX_HORIZON));
             ui.end_row();
-            ui.weak("drawn");
+            ui.weak("sampling");
             let name = |sampling| match sampling {
                 Sampling::Stratified => "stratified",
                 Sampling::Independent => "independent",
