@@ -81,7 +81,7 @@ impl Command {
             &[
                 (Self::CameraCorner, Modifiers::NONE, Key::Num1, "Look from above a corner"),
                 (Self::CameraAbove, Modifiers::NONE, Key::Num2, "Look straight down"),
-                (Self::CameraPicture, Modifiers::NONE, Key::Num3, "Look from the pose of the image"),
+                (Self::CameraPicture, Modifiers::NONE, Key::Num3, "Look from the image's pose"),
                 (Self::Boxes, Modifiers::NONE, Key::B, "Probed boxes"),
                 (Self::Densities, Modifiers::NONE, Key::D, "Densities in the boxes"),
             ],
