@@ -169,7 +169,9 @@ fn describe(dataset: &Dataset, sheet: Option<&Path>, columns: usize) -> anyhow::
         }
     }
     if let Some(path) = sheet {
-        contact_sheet(dataset, &images, SheetOptions { columns, ..SheetOptions::default() }).save_png(path)?;
+        let sheet = contact_sheet(dataset, &images, SheetOptions { columns, ..SheetOptions::default() });
+        let title = dataset.scenario().map_or_else(|| dataset.dir().display().to_string(), |s| s.name.clone());
+        carff_plots::labelled_sheet(&sheet, &title)?.save_png(path)?;
         println!("Contact sheet: {}", path.display());
     }
     Ok(())

@@ -104,6 +104,20 @@ fn any_size() {
     assert_eq!(step(&harness), 2, "the buttons are there at the smallest size");
 }
 
+/// On a screen of 1366 x 768 the settings, the belief and the maps are visible without scrolling.
+#[test]
+fn nothing_is_below_the_fold() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut harness = window(Some(HIDING_VIEW), folder.path());
+    harness.set_size(vec2(1366.0, 768.0));
+    click(&mut harness, "Predict");
+    click(&mut harness, "Probe");
+    let bottom = harness.get_by_label("Decisions").rect().top();
+    for label in ["seed", "density at", "camera of the view", "camera of the image", "hazard state"] {
+        assert!(harness.get_by_label(label).rect().bottom() <= bottom, "{label}");
+    }
+}
+
 /// A pressed thumbnail shows its scene; so does a state of the belief. Marks follow the shown scene.
 #[test]
 fn scenes_are_chosen() {
@@ -149,6 +163,9 @@ fn keys_do_the_same() {
     assert!(harness.query_by_label("Probe: occupancy of each place, and the belief").is_some());
     press(&mut harness, Modifiers::NONE, Key::F1);
     assert!(harness.query_by_label("Probe: occupancy of each place, and the belief").is_none());
+    press(&mut harness, Modifiers::NONE, Key::F1);
+    press(&mut harness, Modifiers::NONE, Key::Escape);
+    assert!(!harness.state().shows_help && harness.state().message().is_none());
     press(&mut harness, Modifiers::NONE, Key::L);
     assert_eq!(harness.ctx.theme(), Theme::Light);
     press(&mut harness, Modifiers::NONE, Key::B);

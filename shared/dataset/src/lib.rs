@@ -42,7 +42,7 @@ pub use error::DatasetError;
 pub use folder::image_files;
 pub use image::{Image, MAX_DIFFERENT_PIXELS, MAX_IMAGE_SIDE_PX, PIXEL_TOLERANCE, looks_same};
 pub use import::{ImportOptions, Imported, import};
-pub use report::{DatasetReport, HiddenPair, SheetOptions, contact_sheet};
+pub use report::{ContactSheet, DatasetReport, HiddenPair, SheetOptions, contact_sheet};
 pub use scenario::{Candidate, Frame, MAX_FRAMES, NamedBox, ScenarioInfo, StateInfo};
 pub use split::{PoseRole, PoseSplit};
 pub use transforms::MAX_TRANSFORMS_BYTES;

@@ -204,9 +204,9 @@ impl fmt::Display for DatasetReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let decibels = |v: Option<f64>| v.map_or_else(|| "-".to_owned(), |v| format!("{v:.2} dB"));
         let percent = |v: Option<f64>| v.map_or_else(|| "-".to_owned(), |v| format!("{:.1} %", v * 100.0));
-        writeln!(f, "Dataset    {}", self.dir)?;
+        writeln!(f, "Dataset     {}", self.dir)?;
         let sizes: Vec<String> = self.image_sizes.iter().map(|((w, h), n)| format!("{n} of {w}x{h} px")).collect();
-        writeln!(f, "Pictures    {} ({})", self.frames, sizes.join(", "))?;
+        writeln!(f, "Images      {} ({})", self.frames, sizes.join(", "))?;
         if let Some((images, share)) = self.masked {
             writeln!(f, "Masks       {images} images; training ignores {} of their pixels", percent(Some(share)))?;
         }
@@ -291,23 +291,48 @@ impl Default for SheetOptions {
     }
 }
 
-/// Border colours of a contact sheet: green `full`, yellow `partial`, red `none`, grey unknown.
-const LEGEND: [[u8; 3]; 4] = [[40, 160, 60], [230, 190, 30], [205, 50, 45], [128, 128, 128]];
+/// Border colours of a contact sheet with their meanings: how much of the actor's place an image shows.
+const FRAMES: [([u8; 3], &str); 4] = [
+    ([40, 160, 60], "actor's place visible (full)"),
+    ([230, 190, 30], "partly hidden (partial)"),
+    ([205, 50, 45], "hidden (none)"),
+    ([128, 128, 128], "unknown"),
+];
 const BORDER_PX: u32 = 2;
+
+/// A contact sheet, with the texts of its legend.
+#[derive(Clone, Debug)]
+pub struct ContactSheet {
+    /// The images in rows and columns.
+    pub image: Image,
+    /// Name of each row.
+    pub rows: Vec<String>,
+    /// Name of each column; empty if the columns have no common view.
+    pub columns: Vec<String>,
+    /// Distance from one image's left and top edge to those of the next, pixels.
+    pub pitch_px: [u32; 2],
+    /// Colours of the frames with their meanings; only those in use.
+    pub frames: Vec<([u8; 3], &'static str)>,
+}
 
 /// Draws a contact sheet: a row per state and a column per view. The views are spread over the kinds of cameras, the
 /// bird's-eye view first. Each image's border shows its observability: green full, yellow partial, red none, grey
 /// unknown. A dataset without views is shown in the order of its frames.
-pub fn contact_sheet(dataset: &Dataset, images: &[Image], options: SheetOptions) -> Image {
-    let columns = options.columns.max(1);
-    let rows: Vec<Vec<usize>> = if dataset.view_count() == 0 {
-        let all: Vec<usize> = (0..images.len()).collect();
-        all.chunks(columns).take(options.max_rows.max(1)).map(<[usize]>::to_vec).collect()
+pub fn contact_sheet(dataset: &Dataset, images: &[Image], options: SheetOptions) -> ContactSheet {
+    let (columns, max_rows) = (options.columns.max(1), options.max_rows.max(1));
+    let (rows, names, titles) = if dataset.view_count() == 0 {
+        let all: Vec<Option<usize>> = (0..images.len()).map(Some).collect();
+        let rows: Vec<Vec<_>> = all.chunks(columns).take(max_rows).map(<[_]>::to_vec).collect();
+        let first = |row: usize| row * columns;
+        let name = |(i, row): (usize, &Vec<_>)| format!("images {} to {}", first(i), first(i) + row.len() - 1);
+        let names = rows.iter().enumerate().map(name).collect();
+        (rows, names, Vec::new())
     } else {
         let views = spread_views(dataset, columns);
-        (0..dataset.state_count().min(options.max_rows.max(1)))
-            .map(|state| views.iter().filter_map(|&v| dataset.frame_index(state, v)).collect())
-            .collect()
+        let states = 0..dataset.state_count().min(max_rows);
+        let row = |state| views.iter().map(|&view| dataset.frame_index(state, view)).collect();
+        let titles = views.iter().map(|&view| view_name(dataset, view)).collect();
+        (states.clone().map(row).collect(), states.map(|state| state_name(dataset, state)).collect(), titles)
     };
     let cell_w = images.iter().map(|i| i.width_px).max().unwrap_or(1) + 2 * BORDER_PX;
     let cell_h = images.iter().map(|i| i.height_px).max().unwrap_or(1) + 2 * BORDER_PX;
@@ -318,17 +343,31 @@ pub fn contact_sheet(dataset: &Dataset, images: &[Image], options: SheetOptions)
         (rows.len().max(1) as u32) * cell_h + (rows.len().max(1) as u32 - 1) * gap,
         [255; 3],
     );
+    let mut is_used = [false; FRAMES.len()];
     for (row, frames) in rows.iter().enumerate() {
-        for (at, &frame) in frames.iter().enumerate() {
-            let Some(image) = images.get(frame) else { continue };
-            let colour = LEGEND[column(dataset.frames()[frame].observability)];
+        for (at, frame) in frames.iter().enumerate() {
+            let Some((frame, image)) = frame.and_then(|f| Some((f, images.get(f)?))) else { continue };
+            let kind = column(dataset.frames()[frame].observability);
+            is_used[kind] = true;
             let (x, y) = (at as u32 * (cell_w + gap), row as u32 * (cell_h + gap));
-            let border = Image::filled(image.width_px + 2 * BORDER_PX, image.height_px + 2 * BORDER_PX, colour);
+            let border = Image::filled(image.width_px + 2 * BORDER_PX, image.height_px + 2 * BORDER_PX, FRAMES[kind].0);
             sheet.paste(&border, x, y);
             sheet.paste(image, x + BORDER_PX, y + BORDER_PX);
         }
     }
-    sheet
+    let frames = FRAMES.into_iter().zip(is_used).filter_map(|(frame, used)| used.then_some(frame)).collect();
+    ContactSheet { image: sheet, rows: names, columns: titles, pitch_px: [cell_w + gap, cell_h + gap], frames }
+}
+
+fn state_name(dataset: &Dataset, state: usize) -> String {
+    let branch =
+        |s: &ScenarioInfo| Some(format!("{}, t{}", s.branches.get(s.branch_of(state))?, s.timestamp_of(state)));
+    dataset.scenario().and_then(branch).unwrap_or_else(|| format!("state {state}"))
+}
+
+fn view_name(dataset: &Dataset, view: usize) -> String {
+    let kind = dataset.frames().iter().find(|f| f.view == Some(view)).and_then(|f| f.view_kind.as_deref());
+    format!("view {view} {}", kind.unwrap_or_default()).trim_end().to_owned()
 }
 
 /// Returns representative views: the bird's-eye view, then alternately views of each kind, evenly spaced within the

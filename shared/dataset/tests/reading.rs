@@ -537,6 +537,10 @@ fn sheet_layout() {
     let dataset = Dataset::open(&dir.path().join("set")).unwrap();
     let images = dataset.load_all_images().unwrap();
     let sheet = contact_sheet(&dataset, &images, SheetOptions { columns: 3, max_rows: 9, gap_px: 2 });
+    assert_eq!((sheet.rows.join("; "), sheet.pitch_px), ("a, t0; b, t0".to_owned(), [14, 14]));
+    assert!(sheet.columns.len() == 3 && sheet.columns[0].starts_with("view 1"), "{:?}", sheet.columns);
+    assert_eq!(sheet.frames.iter().map(|(colour, _)| *colour).collect::<Vec<_>>(), [[40, 160, 60], [205, 50, 45]]);
+    let sheet = sheet.image;
     assert_eq!((sheet.width_px, sheet.height_px), (3 * 12 + 2 * 2, 2 * 12 + 2));
     assert_eq!(sheet.pixel(5, 5), Some([0, 1, 0]));
     assert_eq!(sheet.pixel(5, 14 + 5), Some([100, 1, 0]));

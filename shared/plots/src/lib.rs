@@ -1,4 +1,4 @@
-//! Charts, filmstrips and boards as images: layout, axes and text.
+//! Charts, filmstrips, contact sheets and boards as images: layout, axes and text.
 //!
 //! The font is part of the program, so that an image looks the same on every machine.
 //!
@@ -15,10 +15,12 @@ mod board;
 mod canvas;
 mod curves;
 mod filmstrip;
+mod sheet;
 
 pub use board::{Bar, Board};
 pub use curves::{Marks, Panel, Series, curves};
 pub use filmstrip::{StripCell, StripRow, filmstrip};
+pub use sheet::labelled_sheet;
 
 /// Longest side of a drawn image, pixels.
 pub const MAX_SIDE_PX: u32 = 8192;

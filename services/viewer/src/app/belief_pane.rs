@@ -8,7 +8,7 @@ use eframe::egui::{
     Align2, Color32, FontId, Rect, ScrollArea, Sense, Stroke, TextStyle, Ui, WidgetInfo, WidgetType, vec2,
 };
 
-const BAR_HEIGHT: f32 = 21.0;
+const BAR_HEIGHT: f32 = 17.0;
 /// Width of the names of states and places.
 const NAMES: f32 = 96.0;
 /// Width of the numbers after the bars, and of the second of them.
@@ -28,10 +28,12 @@ struct Bar<'a> {
 impl Viewer {
     pub(super) fn belief_pane(&mut self, ui: &mut Ui) {
         ScrollArea::vertical().auto_shrink(false).show(ui, |ui| {
+            ui.spacing_mut().item_spacing.y = 2.0;
+            ui.spacing_mut().interact_size.y = 16.0;
             self.belief(ui);
-            ui.add_space(8.0);
+            ui.add_space(4.0);
             self.places(ui);
-            ui.add_space(8.0);
+            ui.add_space(4.0);
             self.maps(ui);
         });
     }
@@ -50,6 +52,10 @@ impl Viewer {
                 ui.weak("press Probe to read the scenes");
             }
         });
+        theme::legend(
+            ui,
+            &[(palette.hazard, "hazard state"), (palette.clear, "clear state"), (palette.accent, "shown")],
+        );
         let selection = self.session.moment().map(|m| m.selection);
         let mut chosen = None;
         for (state, name) in models.state_names.iter().enumerate() {
@@ -80,6 +86,7 @@ impl Viewer {
             ui.label(theme::heading("Places"));
             ui.weak("share of light that each box absorbs");
         });
+        theme::legend(ui, &[(palette.hazard, "actor"), (palette.ego, "ego")]);
         let found = self.session.moment().and_then(|m| m.found.as_ref());
         for (i, place) in self.session.models().probe.layout().places().iter().enumerate() {
             let share = found.and_then(|f| f.probed.occupancies.get(i).copied());

@@ -69,10 +69,10 @@ impl Command {
         (
             "Choose",
             &[
-                (Self::SceneBefore, Modifiers::NONE, Key::ArrowLeft, "Scene before"),
-                (Self::SceneAfter, Modifiers::NONE, Key::ArrowRight, "Scene after"),
-                (Self::PictureBefore, Modifiers::NONE, Key::PageUp, "Picture before"),
-                (Self::PictureAfter, Modifiers::NONE, Key::PageDown, "Picture after"),
+                (Self::SceneBefore, Modifiers::NONE, Key::ArrowLeft, "Previous scene"),
+                (Self::SceneAfter, Modifiers::NONE, Key::ArrowRight, "Next scene"),
+                (Self::PictureBefore, Modifiers::NONE, Key::PageUp, "Previous image"),
+                (Self::PictureAfter, Modifiers::NONE, Key::PageDown, "Next image"),
                 (Self::Follow, Modifiers::NONE, Key::Space, "Follow the running graph, or hold its frame"),
             ],
         ),
@@ -81,7 +81,7 @@ impl Command {
             &[
                 (Self::CameraCorner, Modifiers::NONE, Key::Num1, "Look from above a corner"),
                 (Self::CameraAbove, Modifiers::NONE, Key::Num2, "Look straight down"),
-                (Self::CameraPicture, Modifiers::NONE, Key::Num3, "Look from the pose of the image"),
+                (Self::CameraPicture, Modifiers::NONE, Key::Num3, "Look from the image's pose"),
                 (Self::Boxes, Modifiers::NONE, Key::B, "Probed boxes"),
                 (Self::Densities, Modifiers::NONE, Key::D, "Densities in the boxes"),
             ],

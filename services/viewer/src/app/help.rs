@@ -37,14 +37,33 @@ pub fn show(ctx: &Context, is_open: &mut bool) {
                     ui.add_space(24.0);
                 }
             });
-            ui.label(theme::strong("Mouse").color(palette.accent));
-            Grid::new("mouse").num_columns(2).spacing([18.0, 4.0]).show(ui, |ui| {
-                for (what, does) in MOUSE {
-                    ui.monospace(what);
-                    ui.label(does);
+            ui.horizontal_top(|ui| {
+                Grid::new("mouse").num_columns(2).spacing([18.0, 4.0]).show(ui, |ui| {
+                    ui.label(theme::strong("Mouse").color(palette.accent));
                     ui.end_row();
-                }
+                    for (what, does) in MOUSE {
+                        ui.monospace(what);
+                        ui.label(does);
+                        ui.end_row();
+                    }
+                });
+                ui.add_space(24.0);
+                ui.vertical(|ui| {
+                    ui.spacing_mut().item_spacing.y = 3.0;
+                    ui.label(theme::strong("Colours").color(palette.accent));
+                    for meaning in [
+                        (palette.hazard, "hazard state, halt, places of the actor"),
+                        (palette.clear, "clear state, advance"),
+                        (palette.ego, "ego vehicle, camera of the image"),
+                        (palette.accent, "shown scene, camera of the view"),
+                        (palette.error, "unknown state, error"),
+                    ] {
+                        theme::legend(ui, &[meaning]);
+                    }
+                });
             });
-            ui.weak("Enter does the same as N. The window only listens: it never disturbs a running graph.");
+            ui.label("In the scene, bold boxes are taken places, and dots are densities. A half-transparent object");
+            ui.label("means that the sample is between two states.");
+            ui.weak("Esc closes this help. Enter does the same as N. The window never disturbs a running graph.");
         });
 }

@@ -11,15 +11,20 @@ use eframe::egui::{
 
 /// Largest absolute latent value in the plot of a posterior.
 const LATENT_RANGE: f32 = 3.0;
+/// Largest height of the image, as a share of the pane, and the least such height: the settings below need room.
+const IMAGE_SHARE: f32 = 0.26;
+const LEAST_IMAGE: f32 = 96.0;
 
 impl Viewer {
     pub(super) fn input_pane(&mut self, ui: &mut Ui, commands: &mut Vec<Command>) {
+        let height = (ui.available_height() * IMAGE_SHARE).max(LEAST_IMAGE);
         ScrollArea::vertical().auto_shrink(false).show(ui, |ui| {
-            ui.label(theme::heading("Picture"));
-            self.picture(ui);
+            ui.label(theme::heading("Image"));
+            ui.spacing_mut().item_spacing.y = 4.0;
+            self.picture(ui, height);
             self.chooser(ui, commands);
             self.posterior(ui);
-            ui.add_space(8.0);
+            ui.add_space(4.0);
             ui.label(theme::heading("Look ahead"));
             self.settings(ui);
             if self.live.is_some() {
@@ -30,11 +35,11 @@ impl Viewer {
         });
     }
 
-    fn picture(&mut self, ui: &mut Ui) {
+    fn picture(&mut self, ui: &mut Ui, max_height: f32) {
         let palette = theme::palette(ui.ctx());
         let width = ui.available_width();
         let Some(moment) = self.session.moment() else {
-            let (rect, _) = ui.allocate_exact_size(vec2(width, width * 0.75), Sense::hover());
+            let (rect, _) = ui.allocate_exact_size(vec2(width, (width * 0.75).min(max_height)), Sense::hover());
             ui.painter().rect_filled(rect, 8.0, palette.ground);
             let hint = match &self.album {
                 Ok(_) => "Choose an image below, and press Toggle.".to_owned(),
@@ -45,9 +50,10 @@ impl Viewer {
             return;
         };
         let image = &moment.input.image;
-        let height = width * image.height_px as f32 / image.width_px.max(1) as f32;
+        let ratio = image.height_px as f32 / image.width_px.max(1) as f32;
+        let height = (width * ratio).min(max_height);
         let id = self.textures.input(ui.ctx(), image);
-        ui.add(Image::new(SizedTexture::new(id, vec2(width, height))).corner_radius(8));
+        ui.add(Image::new(SizedTexture::new(id, vec2(height / ratio.max(f32::MIN_POSITIVE), height))).corner_radius(8));
         ui.horizontal_wrapped(|ui| {
             ui.label(theme::strong(&moment.input.title));
             if let Some(truth) = moment.input.truth {
@@ -94,7 +100,7 @@ impl Viewer {
             self.command_button(ui, Command::PictureAfter, Button::new("›"), commands);
         });
         ui.horizontal(|ui| {
-            ui.weak("leaf through");
+            ui.weak("browse");
             let name = |shows: Option<Observability>| match shows {
                 None => "all views",
                 Some(Observability::Full) => "actor seen",
@@ -129,7 +135,7 @@ impl Viewer {
         };
         ui.add_space(4.0);
         ui.weak(name);
-        let (rect, response) = ui.allocate_exact_size(vec2(ui.available_width(), 46.0), Sense::hover());
+        let (rect, response) = ui.allocate_exact_size(vec2(ui.available_width(), 38.0), Sense::hover());
         let painter = ui.painter();
         painter.rect_filled(rect, 6.0, palette.ground);
         painter.hline(rect.x_range(), rect.center().y, Stroke::new(1.0, palette.line));
@@ -156,7 +162,7 @@ impl Viewer {
             ui.weak("horizon");
             ui.add(Slider::new(&mut settings.horizon, 1..=MAX_HORIZON));
             ui.end_row();
-            ui.weak("drawn");
+            ui.weak("sampling");
             let name = |sampling| match sampling {
                 Sampling::Stratified => "stratified",
                 Sampling::Independent => "independent",

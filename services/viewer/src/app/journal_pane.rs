@@ -34,9 +34,9 @@ impl Viewer {
             ui.allocate_ui_with_layout(vec2(ui.available_width(), height), Layout::top_down(Align::Min), |ui| {
                 ui.horizontal(|ui| {
                     ui.label(theme::heading("Latency"));
-                    ui.weak(if watched.is_some() { "ms by frame" } else { "ms, of this window" });
+                    ui.weak(if watched.is_some() { "of the running graph" } else { "of this window" });
                 });
-                latency(ui, journal);
+                latency(ui, journal, if watched.is_some() { "frame" } else { "call" });
             });
         });
     }
@@ -87,7 +87,7 @@ fn milliseconds(log10_ms: f64) -> String {
     }
 }
 
-fn latency(ui: &mut Ui, journal: &Journal) {
+fn latency(ui: &mut Ui, journal: &Journal, x_label: &str) {
     let palette = theme::palette(ui.ctx());
     let color = |i: usize| -> Color32 { palette.lines[i % palette.lines.len()] };
     ui.horizontal_top(|ui| {
@@ -97,6 +97,8 @@ fn latency(ui: &mut Ui, journal: &Journal) {
             .height(ui.available_height())
             .y_grid_spacer(|input| decades(input.bounds))
             .y_axis_formatter(|mark, _| milliseconds(mark.value))
+            .y_axis_label(theme::small("latency, ms"))
+            .x_axis_label(theme::small(x_label))
             .show_background(false)
             .allow_scroll(false)
             .allow_zoom(false)
@@ -113,7 +115,7 @@ fn latency(ui: &mut Ui, journal: &Journal) {
                 }
             });
         Grid::new("latency").num_columns(4).spacing([10.0, 3.0]).show(ui, |ui| {
-            for name in ["", "p50", "p99", "max"] {
+            for name in ["ms", "p50", "p99", "max"] {
                 ui.label(theme::small(name).color(palette.weak));
             }
             ui.end_row();

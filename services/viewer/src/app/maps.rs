@@ -29,6 +29,9 @@ impl Viewer {
                 });
             }
         });
+        let palette = theme::palette(ui.ctx());
+        let cameras = [(palette.ego, "camera of the image"), (palette.accent, "camera of the view")];
+        theme::legend(ui, &cameras);
         ui.horizontal(|ui| {
             ui.weak("density at");
             let slider = Slider::new(&mut self.slice_height_m, low[2] as f32..=high[2] as f32);

@@ -25,7 +25,7 @@ use crate::session::{Found, Scene, Selection, Session};
 use carff_base::geometry::PinholeCamera;
 use carff_dataset::{Image, Observability};
 use carff_field::LATENT_DIM;
-use eframe::egui::{self, CentralPanel, Context, SidePanel, ThemePreference, TopBottomPanel, ViewportCommand};
+use eframe::egui::{self, CentralPanel, Context, SidePanel, ThemePreference, TopBottomPanel, Vec2, ViewportCommand};
 use std::collections::VecDeque;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, OnceLock};
@@ -274,32 +274,36 @@ impl Viewer {
     fn lay_out(&mut self, ctx: &Context, commands: &mut Vec<Command>) {
         let palette = theme::palette(ctx);
         let frame = theme::pane(palette);
+        let Vec2 { x: width, y: height } = ctx.content_rect().size();
         TopBottomPanel::top("bar").frame(frame).show_separator_line(false).show(ctx, |ui| self.top_bar(ui, commands));
         TopBottomPanel::bottom("journal")
             .frame(frame)
             .show_separator_line(false)
             .resizable(true)
-            .default_height(176.0)
+            .default_height((height * 0.2).clamp(110.0, 176.0))
             .height_range(90.0..=420.0)
             .show(ctx, |ui| self.journal_pane(ui));
         SidePanel::left("input")
             .frame(frame)
             .show_separator_line(false)
             .resizable(true)
-            .default_width(236.0)
+            .default_width((width * 0.21).clamp(190.0, 236.0))
             .width_range(190.0..=420.0)
             .show(ctx, |ui| self.input_pane(ui, commands));
         SidePanel::right("belief")
             .frame(frame)
             .show_separator_line(false)
             .resizable(true)
-            .default_width(316.0)
+            .default_width((width * 0.26).clamp(240.0, 316.0))
             .width_range(240.0..=520.0)
             .show(ctx, |ui| self.belief_pane(ui));
         TopBottomPanel::bottom("scenes").frame(frame).show_separator_line(false).show(ctx, |ui| self.scenes_strip(ui));
         CentralPanel::default()
             .frame(egui::Frame::new().fill(palette.ground))
             .show(ctx, |ui| self.scene_pane(ui, commands));
+        if ctx.input(|input| input.key_pressed(egui::Key::Escape)) {
+            (self.shows_help, self.message) = (false, None);
+        }
         if self.shows_help {
             help::show(ctx, &mut self.shows_help);
         }

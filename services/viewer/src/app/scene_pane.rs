@@ -16,6 +16,8 @@ const SCROLL_PER_DOUBLING: f32 = 240.0;
 /// A density is drawn if this length of it absorbs a visible share of the light, metres.
 const LEAST_STOPPED: f32 = 0.04;
 const POINT_LENGTH_M: f32 = 0.25;
+/// Width of the scene below which the settings of the view are hidden, and captions are below each other.
+const NARROW: f32 = 540.0;
 /// Range of the longest side of the finest image, pixels.
 const FINEST_PX: [u32; 2] = [96, 1536];
 
@@ -130,11 +132,26 @@ impl Viewer {
         caption(&painter, rect.left_top() + vec2(12.0, 12.0), Align2::LEFT_TOP, &text, color, 13.0);
         if let Some((image, took_ms)) = &self.view {
             let text = format!("{} x {}, {took_ms:.0} ms", image.width_px, image.height_px);
-            caption(&painter, rect.right_top() + vec2(-12.0, 12.0), Align2::RIGHT_TOP, &text, Color32::WHITE, 10.5);
+            let down = if rect.width() < NARROW { 42.0 } else { 12.0 };
+            caption(&painter, rect.right_top() + vec2(-12.0, down), Align2::RIGHT_TOP, &text, Color32::WHITE, 10.5);
         }
     }
 
+    /// The field of view, and the size of the finest image.
+    fn view_settings(&mut self, ui: &mut Ui) {
+        let mut fov_deg = self.camera.fov_deg;
+        ui.spacing_mut().slider_width = 64.0;
+        let slider = Slider::new(&mut fov_deg, FOV_DEG[0]..=FOV_DEG[1]).suffix("°").fixed_decimals(0);
+        if ui.add(slider).on_hover_text("Field of view across the shorter side").changed() {
+            self.camera.set_fov(fov_deg);
+            self.moved = Some(Instant::now());
+        }
+        ui.add(DragValue::new(&mut self.finest_px).range(FINEST_PX[0]..=FINEST_PX[1]).suffix(" px").speed(4))
+            .on_hover_text("Longest side of the finest image (drag): coarser images come first");
+    }
+
     fn view_bar(&mut self, ui: &mut Ui, commands: &mut Vec<Command>) {
+        let is_narrow = ui.available_width() < NARROW;
         let palette = theme::palette(ui.ctx());
         let frame = theme::pane(palette).fill(palette.pane.gamma_multiply(0.86)).corner_radius(8);
         frame.inner_margin(eframe::egui::Margin::symmetric(8, 4)).show(ui, |ui| {
@@ -142,21 +159,15 @@ impl Viewer {
                 for (command, name) in [
                     (Command::CameraCorner, "Corner"),
                     (Command::CameraAbove, "Above"),
-                    (Command::CameraPicture, "As pictured"),
+                    (Command::CameraPicture, "Image"),
                 ] {
                     self.command_button(ui, command, Button::new(name), commands);
                 }
                 ui.separator();
-                let mut fov_deg = self.camera.fov_deg;
-                ui.spacing_mut().slider_width = 64.0;
-                let slider = Slider::new(&mut fov_deg, FOV_DEG[0]..=FOV_DEG[1]).suffix("°").fixed_decimals(0);
-                if ui.add(slider).on_hover_text("Field of view across the shorter side").changed() {
-                    self.camera.set_fov(fov_deg);
-                    self.moved = Some(Instant::now());
+                if !is_narrow {
+                    self.view_settings(ui);
+                    ui.separator();
                 }
-                ui.add(DragValue::new(&mut self.finest_px).range(FINEST_PX[0]..=FINEST_PX[1]).suffix(" px").speed(4))
-                    .on_hover_text("Longest side of the finest image (drag): coarser images come first");
-                ui.separator();
                 ui.checkbox(&mut self.overlays.boxes, "boxes");
                 ui.checkbox(&mut self.overlays.densities, "densities");
             });

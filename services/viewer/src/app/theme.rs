@@ -216,6 +216,21 @@ pub fn strong(text: impl Into<String>) -> RichText {
     RichText::new(text).font(FontId::new(12.5, bold()))
 }
 
+/// Shows the meanings of colours in one wrapped line.
+pub fn legend(ui: &mut egui::Ui, meanings: &[(Color32, &str)]) {
+    let height = ui.spacing().interact_size.y;
+    ui.spacing_mut().interact_size.y = 12.0;
+    ui.horizontal_wrapped(|ui| {
+        for (color, meaning) in meanings {
+            ui.spacing_mut().item_spacing.x = 3.0;
+            ui.label(small("●").color(*color));
+            ui.spacing_mut().item_spacing.x = 9.0;
+            ui.label(small(*meaning).color(palette(ui.ctx()).weak));
+        }
+    });
+    ui.spacing_mut().interact_size.y = height;
+}
+
 /// Formats small text.
 pub fn small(text: impl Into<String>) -> RichText {
     RichText::new(text).text_style(TextStyle::Small)

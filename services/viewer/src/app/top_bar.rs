@@ -5,8 +5,11 @@ use crate::live::LiveFeed;
 use crate::session::steps_ahead;
 use eframe::egui::{Align, Button, ComboBox, Layout, RichText, Theme, Ui, vec2};
 
-/// Number of shown entries of the history.
+/// Largest number of shown entries of the history, the width of one, and the width of everything right of them.
 const CRUMBS: usize = 7;
+const CRUMB_WIDTH: f32 = 40.0;
+const RIGHT_WIDTH: f32 = 290.0;
+const LIVE_WIDTH: f32 = 72.0;
 
 impl Viewer {
     pub(super) fn top_bar(&mut self, ui: &mut Ui, commands: &mut Vec<Command>) {
@@ -71,9 +74,11 @@ impl Viewer {
     fn crumbs(&mut self, ui: &mut Ui) {
         let history = self.session.history();
         let (place, len) = (history.place(), history.entries().len());
-        let last = (place + 3).min(len).max(len.min(CRUMBS));
+        let right = RIGHT_WIDTH + if self.live.is_some() { LIVE_WIDTH } else { 0.0 };
+        let shown = (((ui.available_width() - right) / CRUMB_WIDTH) as usize).clamp(1, CRUMBS);
+        let last = (place + 1 + (shown - 1) / 3).min(len).max(len.min(shown));
         let mut chosen = None;
-        for i in last.saturating_sub(CRUMBS)..last {
+        for i in last.saturating_sub(shown)..last {
             let moment = &history.entries()[i];
             let name = if moment.step == 0 { "now".to_owned() } else { format!("+{}", moment.step) };
             let hover = format!("{}, {}", moment.input.title, steps_ahead(moment.step));
@@ -114,7 +119,9 @@ impl Viewer {
                 Err(error) => drop(ui.colored_label(palette.error, error.to_string())),
             }
         });
-        ui.weak("source");
+        if ui.available_width() > CRUMB_WIDTH + LIVE_WIDTH {
+            ui.weak("source");
+        }
         if let Some((_, is_joined)) = live {
             let (sign, color) = match (is_joined, self.is_following) {
                 (false, _) => ("● ended", palette.error),

@@ -5,15 +5,19 @@ use crate::trials::hypotheses::{birds_eye_camera, hypotheses, state_names};
 use crate::{EvaluationError, FieldRenderer};
 use carff_checkpoint::FieldProbe;
 use carff_dataset::{Image, drives::DriveKind};
-use carff_decision::Step;
+use carff_decision::{Place, Probed, Step};
 use carff_messages::Rule;
 use carff_plots::{StripCell, StripRow};
+use std::collections::BTreeMap;
+use std::ops::RangeInclusive;
 use std::path::Path;
 
 /// Largest number of drives that are shown.
 const DRIVES: usize = 8;
 /// Largest number of hypotheses that are shown of each drive.
 const HYPOTHESES: usize = 3;
+/// Occupancies at which an object is visibly transparent.
+const FAINT: RangeInclusive<f32> = 0.1..=0.9;
 const RIGHT: [u8; 3] = [46, 155, 90];
 const WRONG: [u8; 3] = [205, 50, 45];
 const HAZARD: [u8; 3] = [236, 140, 20];
@@ -29,9 +33,11 @@ impl JudgedRun {
         let rows = rows.collect::<Result<Vec<_>, _>>()?;
         let title = format!("{}: {} drives of run {}", self.scenario.name, rows.len(), self.settings.run);
         let subtitle = format!(
-            "Camera image, with a green frame where the action was correct and a red one where it was wrong; true next \
-             state from above; and states of the {} samples of the forecast, one image for each distinct state. Orange \
-             frame: the hazard is present.",
+            "Each row is a drive. Columns: the camera image, with a green frame where the action was correct and a red \
+             one where it was wrong; the true next state from above; the states that the prober reads in the {} samples \
+             of the forecast, with one sample rendered for each. Orange frame: the state is a hazard. A half-transparent \
+             object: the sample is between two states; the caption gives the occupancy of the object's place (the share \
+             of light that it absorbs).",
             self.settings.samples
         );
         Ok(carff_plots::filmstrip(path, &title, &subtitle, &rows)?)
@@ -97,8 +103,8 @@ impl Artist<'_> {
     fn caption(&self, frame: &DecidedFrame, kind: DriveKind, right: bool) -> Vec<String> {
         let verdict = if right { "right" } else { "WRONG" };
         let truth = match kind {
-            DriveKind::Hazard => "somebody comes, hidden",
-            DriveKind::Clear => "nobody comes, in full view",
+            DriveKind::Hazard => "the actor comes, hidden",
+            DriveKind::Clear => "no actor comes, in full view",
         };
         let rule = self.run.settings.rule;
         let mut lines = vec![
@@ -148,13 +154,16 @@ impl Artist<'_> {
         let mut cells: Vec<StripCell> = Vec::new();
         for group in groups.into_iter().take(HYPOTHESES) {
             let share = 100.0 * group.count as f64 / step.samples.len() as f64;
-            let hazard = step.samples[group.sample].reading.hazard_likelihood > 0.5;
+            let sample = &step.samples[group.sample];
+            let hazard = sample.reading.hazard_likelihood > 0.5;
+            let mut caption = vec![
+                format!("{share:.0} %: {}", group.name),
+                format!("{} of {} samples, one rendered", group.count, step.samples.len()),
+            ];
+            caption.extend(faint(self.probe.layout().places(), sample));
             cells.push(StripCell {
                 image: self.renderer.image(self.probe.field(), &camera, &step.draws[group.sample].latent),
-                caption: vec![
-                    format!("{share:.0} %: {}", group.name),
-                    format!("{} of {} samples, rendered", group.count, step.samples.len()),
-                ],
+                caption,
                 emphasis: hazard.then_some(HAZARD),
             });
         }
@@ -163,6 +172,18 @@ impl Artist<'_> {
         }
         cells
     }
+}
+
+/// Names the objects that a rendered sample shows half-transparent, each with the largest occupancy of its places that
+/// are between empty and taken.
+fn faint(places: &[Place], sample: &Probed) -> Option<String> {
+    let mut found: BTreeMap<&str, f32> = BTreeMap::new();
+    for (place, &occupancy) in places.iter().zip(&sample.occupancies).filter(|(_, o)| FAINT.contains(o)) {
+        let most = found.entry(&place.name).or_default();
+        *most = most.max(occupancy);
+    }
+    let parts: Vec<String> = found.iter().map(|(name, o)| format!("{name} {:.0} %", 100.0 * o)).collect();
+    (!parts.is_empty()).then(|| format!("half-transparent: {}", parts.join(", ")))
 }
 
 #[cfg(test)]
@@ -187,5 +208,29 @@ mod tests {
         assert_eq!(shown(&run(&|i| if i < 18 { Hazard } else { Clear })), [0, 2, 3, 4, 5, 6, 18, 19]);
         assert_eq!(shown(&run(&|_| Hazard)), [0, 2, 3, 4, 5, 6, 7, 8]);
         assert!(shown(&[]).is_empty());
+    }
+
+    /// A half-transparent object is named with its occupancy in every read state; an empty or a taken
+    /// place is not.
+    #[test]
+    fn half_transparent_objects_are_named() {
+        let place = |name: &str| Place {
+            name: name.to_owned(),
+            oriented_box: carff_base::geometry::OrientedBox { center: [0.0; 3], half_size: [1.0; 3], yaw: 0.0 },
+            occupied_in: vec![true, false],
+        };
+        let places = [place("actor"), place("actor"), place("ego")];
+        let reading = carff_decision::Reading {
+            state: Some(1),
+            confidence: 0.7,
+            hazard_likelihood: 0.3,
+            state_probabilities: vec![0.3, 0.7],
+        };
+        let of = |occupancies: [f32; 3]| {
+            faint(&places, &Probed { occupancies: occupancies.to_vec(), reading: reading.clone() })
+        };
+        assert_eq!(of([0.34, 0.2, 0.99]).as_deref(), Some("half-transparent: actor 34 %"));
+        assert_eq!(of([0.02, 0.98, 0.5]).as_deref(), Some("half-transparent: ego 50 %"));
+        assert_eq!(of([0.02, 0.98, 1.0]), None);
     }
 }

@@ -299,7 +299,7 @@ fn frequency_table(subject: &Subject, open: &[Trial]) -> FrequencyTable {
         }
         by_image.into_values().collect()
     };
-    let presence = ["somebody there", "nobody there"].map(str::to_owned);
+    let presence = ["actor present", "no actor"].map(str::to_owned);
     FrequencyTable {
         by_branch: frequencies(&count(scenario.branches.len(), &|s| scenario.branch_of(s)), &scenario.branches),
         by_presence: if scenario.branches.len() > 2 {

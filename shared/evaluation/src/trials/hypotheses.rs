@@ -23,7 +23,7 @@ pub fn state_names(scenario: &ScenarioInfo, places: &[Place]) -> Vec<String> {
             .filter(|(place, taken)| *taken && coming.contains(place.name.as_str()))
             .map(|(place, _)| place.name.as_str())
             .collect();
-        let who = if there.is_empty() { "nobody".to_owned() } else { there.join(" and ") };
+        let who = if there.is_empty() { "no actor".to_owned() } else { there.join(" and ") };
         let unambiguous = (0..scenario.state_count()).all(|other| other == state || !taken(other).eq(taken(state)));
         if unambiguous { format!("{who}, t{}", scenario.timestamp_of(state)) } else { who }
     };
@@ -119,10 +119,10 @@ mod tests {
         };
         let place = |name: &str, taken: [bool; 4]| Place { name: name.into(), oriented_box, occupied_in: taken.into() };
         let truck = [place("truck", [true, false, false, false]), place("truck", [false, true, false, false])];
-        assert_eq!(state_names(&scenario, &truck), ["truck, t0", "truck, t1", "nobody", "nobody"]);
+        assert_eq!(state_names(&scenario, &truck), ["truck, t0", "truck, t1", "no actor", "no actor"]);
         let mut all = truck.to_vec();
         all.push(place("ego", [true, false, true, false]));
-        assert_eq!(state_names(&scenario, &all), ["truck, t0", "truck, t1", "nobody, t0", "nobody, t1"]);
+        assert_eq!(state_names(&scenario, &all), ["truck, t0", "truck, t1", "no actor, t0", "no actor, t1"]);
     }
 
     /// A camera too large for a filmstrip is scaled down with the same field of view; a small one is unchanged.
