@@ -2,13 +2,12 @@
 
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
-use carff_messages::ActionCode;
 use carff_observe::attach;
 use carff_tests::{
     Finished, PATIENT_AND_ENDLESS, Process, TestGraph, WATCHDOG, decisions, eventually, program, scenario_set,
     shipped_checkpoint, skipped,
 };
-use carff_transport::{OpenError, TopicId, topics};
+use carff_transport::{OpenError, TopicId};
 use foxglove::Decode as _;
 use foxglove::messages::RawImage;
 use rustix::process::Signal;
