@@ -28,7 +28,7 @@ pub fn labelled_sheet(sheet: &ContactSheet, title: &str) -> Result<Image, PlotEr
     Ok(page)
 }
 
-/// A line, or a coloured square for the next line, at its position.
+/// A line with its position, font and colour.
 type Placed = (String, u32, u32, Font, RGBColor);
 
 fn heading(sheet: &ContactSheet, title: &str, width: u32) -> Result<Image, PlotError> {
@@ -64,7 +64,9 @@ fn heading(sheet: &ContactSheet, title: &str, width: u32) -> Result<Image, PlotE
         }
     }
     let mut canvas = Canvas::new(width, lowest + 2)?;
-    swatches.iter().for_each(|(area, [r, g, b])| canvas.fill(*area, RGBColor(*r, *g, *b)));
+    for (area, [r, g, b]) in swatches {
+        canvas.fill(area, RGBColor(r, g, b));
+    }
     write(&mut canvas, &texts)?;
     Ok(canvas.finish())
 }
