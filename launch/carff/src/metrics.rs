@@ -101,7 +101,7 @@ fn answer(method: &str, target: &str, run: Option<&str>, seen: Option<(&Origin, 
 
 /// Returns the metrics while no run is alive.
 fn down(run: Option<&str>) -> String {
-    text(registry(run, 0.0))
+    text(&registry(run, 0.0))
 }
 
 /// Returns a registry with the metric that is always there.
@@ -112,10 +112,10 @@ fn registry(run: Option<&str>, up: f64) -> Registry {
     registry
 }
 
-fn text(registry: Registry) -> String {
+fn text(registry: &Registry) -> String {
     let mut text = String::new();
     // Writing into a string does not fail.
-    let _ = prometheus_text::encode(&mut text, &registry);
+    let _ = prometheus_text::encode(&mut text, registry);
     text
 }
 
@@ -180,7 +180,7 @@ fn prometheus(run: &str, origin: &Origin, vitals: &RunVitals) -> String {
                 one value for each heartbeat";
     registry.register("stage_latency_seconds", help, histograms.stages.clone());
     stages(&mut registry, vitals);
-    text(registry)
+    text(&registry)
 }
 
 /// Registers the metrics that each stage has.

@@ -67,20 +67,31 @@ impl<'a> Sessions<'a> {
         if replace(&mut self.has_joined, true) && !self.args.wait {
             return Ok(None);
         }
-        while self.args.wait {
-            if self.stop.is_stopped() || self.until_ns.is_some_and(|until_ns| monotonic_now_ns() >= until_ns) {
-                return Ok(None);
-            }
+        let join = || {
+            let session = Session::open(&self.args.session, self.name)?;
+            Ok(Some(Session { until_ns: self.until_ns, ..session }))
+        };
+        if !self.args.wait {
+            return join();
+        }
+        while !self.is_over() {
             match find(run) {
-                Ok(live) if is_started(&live) => break,
+                Ok(live) if is_started(&live) => match join() {
+                    // It has ended in between.
+                    Err(_) if !live.is_alive() => {}
+                    joined => return joined,
+                },
                 Ok(_) | Err(AttachError::NoRun | AttachError::NoSuchRun { .. }) => {}
                 Err(error) => return Err(error.into()),
             }
             idle();
             waiter.wait_until(&[], monotonic_now_ns() + ALIVE_NS)?;
         }
-        let session = Session::open(&self.args.session, self.name)?;
-        Ok(Some(Session { until_ns: self.until_ns, ..session }))
+        Ok(None)
+    }
+
+    fn is_over(&self) -> bool {
+        self.stop.is_stopped() || self.until_ns.is_some_and(|until_ns| monotonic_now_ns() >= until_ns)
     }
 }
 

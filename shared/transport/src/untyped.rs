@@ -107,6 +107,7 @@ impl<const IMAGE: bool> Payload for Unknown<IMAGE> {
         let message = if IMAGE { std::ptr::from_ref(sample.user_header()).cast() } else { bytes.as_ptr() };
         // A topic whose user header is smaller is not opened as an image's.
         let fits = IMAGE || bytes.len() >= size_of::<HeaderOnly>();
+        #[allow(clippy::cast_ptr_alignment, reason = "the next line checks the alignment")]
         let message = message.cast::<HeaderOnly>();
         if !fits || !message.is_aligned() {
             return &NO_HEADER;

@@ -43,7 +43,7 @@ struct Late {
 
 impl Late {
     fn check(&self) -> Result<(), Invalid> {
-        Ok(())
+        self.header.validate()
     }
 }
 

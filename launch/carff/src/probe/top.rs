@@ -190,7 +190,10 @@ fn lines(texts: &[String], width: usize) -> Vec<String> {
     let mut lines: Vec<String> = Vec::new();
     for text in texts {
         match lines.last_mut() {
-            Some(line) if line.chars().count() + 3 + text.chars().count() <= width => *line += &format!("   {text}"),
+            Some(line) if line.chars().count() + 3 + text.chars().count() <= width => {
+                line.push_str("   ");
+                line.push_str(text);
+            }
             _ => lines.push(text.clone()),
         }
     }

@@ -206,7 +206,7 @@ mod tests {
         use carff_messages::{FrameMeta, Header};
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("r.mcap");
-        let mut writer = carff_recording::Writer::create(&path, &Default::default(), &[]).unwrap();
+        let mut writer = carff_recording::Writer::create(&path, &carff_recording::About::default(), &[]).unwrap();
         for frame in 5..8 {
             let header = Header { publish_time_ns: frame + 1, ..Header::of_frame(frame, frame, 1) };
             let mut meta = FrameMeta { header, width_px: 2, height_px: 1, ..FrameMeta::default() };
