@@ -38,7 +38,7 @@ UNSAFE_MODULES = {
 
 
 UNFINISHED = re.compile(r"\b(?:todo|unimplemented)!|\bdbg!\(|\b(?:FIXME|TODO|XXX)\b")
-MACHINE_PATH = re.compile(r"(?<![\w.}$])/(?:home|root|work|Users|mnt|media|tmp)/")
+MACHINE_PATH = re.compile(r"(?<![\w.}$])/(?:home|root|work|Users|mnt|media|tmp)/(?!carff-)")
 UNSAFE = re.compile(r"\bunsafe\s*(?:\{|fn\b|impl\b|extern\b|trait\b)")
 TEXT = {".rs", ".toml", ".py", ".md", ".json", ".sh", ".yml"}
 # Largest distance of a SAFETY line above its `unsafe` block; macro arguments may be in between.
