@@ -21,7 +21,7 @@ pub enum BackboneCommand {
 Example: a vision transformer, as timm and Hugging Face publish them
   carff backbone import model.safetensors --out vit.safetensors
 
-Example: DINOv2, whose images are normalised with ImageNet's mean and deviation
+Example: DINOv2, whose images are normalised with `ImageNet`'s mean and deviation
   carff backbone import dinov2_vits14_reg4_pretrain.pth --imagenet-normalised --out dinov2.safetensors")]
     Import(ImportArgs),
 }
@@ -31,13 +31,13 @@ Example: DINOv2, whose images are normalised with ImageNet's mean and deviation
 pub struct ImportArgs {
     /// A Python package or another ZIP archive with one weight file, a state dict (`.pth`), safetensors, or the index of
     /// sharded files (`model.safetensors.index.json`). The weights are EfficientNet-Lite0 (also timm's
-    /// `tf_efficientnet_lite0`), or a vision transformer with the names of timm, Hugging Face or the DINOv2 authors.
+    /// `tf_efficientnet_lite0`), or a vision transformer with the names of timm, Hugging Face or the `DINOv2` authors.
     source: PathBuf,
     /// The safetensors file to write.
     #[arg(long)]
     out: PathBuf,
-    /// The vision transformer was trained on images normalised with ImageNet's mean and deviation (DINO, DINOv2, DeiT,
-    /// MAE), not on values from -1 to 1 (ViT). The weights do not contain it; the first layer is converted.
+    /// The vision transformer was trained on images normalised with `ImageNet`'s mean and deviation (DINO, `DINOv2`, `DeiT`,
+    /// MAE), not on values from -1 to 1 (`ViT`). The weights do not contain it; the first layer is converted.
     #[arg(long)]
     imagenet_normalised: bool,
     /// Replace an existing file.

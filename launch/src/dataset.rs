@@ -36,7 +36,7 @@ pub enum DatasetCommand {
   carff dataset import path/to/set --out data/mine --bounds -2,-2,0,2,2,2")]
     Import {
         /// Folder of the dataset: one `transforms.json` or three (`transforms_train.json` and so on), PNG or JPEG images,
-        /// and masks (`mask_path`). Lens distortion (OPENCV, OPENCV_FISHEYE) is undone.
+        /// and masks (`mask_path`). Lens distortion (`OPENCV`, `OPENCV_FISHEYE`) is undone.
         dir: PathBuf,
         /// Folder to write; it must be new, empty, or a dataset that this program wrote.
         #[arg(long)]
@@ -144,7 +144,7 @@ fn check(dir: &Path, sheet: Option<&Path>, columns: usize) -> anyhow::Result<()>
     sheet.map_or(Ok(()), carff_base::files::check_writable)?;
     let (dataset, faults) = Dataset::survey(dir)?;
     for fault in &faults {
-        println!("error: {fault}");
+        println!("broken: {fault}");
     }
     if let Some(dataset) = dataset {
         describe(&dataset, sheet, columns)?;

@@ -262,7 +262,7 @@ fn a_killed_recorder_leaves_its_recording() {
 fn metrics_survive_idle_connections() {
     let (graph, launcher) = running();
     let mut command = Command::new("sh");
-    command.args(["-c", "ulimit -n 200; exec \"$0\" \"$@\""]).arg(program("carff")).args(["metrics", "--run"]);
+    command.args(["-c", "ulimit -n 256; exec \"$0\" \"$@\""]).arg(program("carff")).args(["metrics", "--run"]);
     let mut metrics = Process::start(command.arg(graph.run().name()).args(["--listen", "127.0.0.1:0"]));
     metrics.wait_for("address", |text| text.contains("/status"));
     let address = metrics.text().split(['/', ' ']).nth(2).unwrap().to_owned();
@@ -272,7 +272,7 @@ fn metrics_survive_idle_connections() {
         stream.write_all(sent.as_bytes()).unwrap();
         stream
     };
-    let idle: Vec<TcpStream> = (0..250).map(|_| connect("GET /metrics HTTP/1.1\r\nX-")).collect();
+    let idle: Vec<TcpStream> = (0..400).map(|_| connect("GET /metrics HTTP/1.1\r\nX-")).collect();
     let mut text = String::new();
     connect("GET /metrics HTTP/1.1\r\n\r\n").read_to_string(&mut text).unwrap();
     assert!(text.starts_with("HTTP/1.1 200 OK") && text.contains("carff_frames_total{"), "{text}");

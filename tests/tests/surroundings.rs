@@ -109,7 +109,7 @@ fn the_folder_of_runs_is_chosen() {
     };
     let path = dir.path().to_str().unwrap();
     for key in ["XDG_RUNTIME_DIR", "TMPDIR", "RUNTIME_DIRECTORY"] {
-        assert!(examine(key, path).contains(&format!("{path}")), "{key}: {}", examine(key, path));
+        assert!(examine(key, path).contains(path), "{key}: {}", examine(key, path));
     }
     assert!(
         !examine("TMPDIR", &"/var/tmp/long".repeat(9)).contains("/var/tmp/long"),

@@ -26,9 +26,12 @@ pub struct StagesConfig {
 /// the system refuses, and continues without it.
 ///
 /// ```
-/// use carff_config::{GraphConfig, RestartPolicy}; use carff_messages::Stage; let text = "[run]\nname = \"x\"\ndataset
-/// = \"d\"\ncheckpoint = \"c\"\n[stages.encoder]\nthreads = 2\nrestart = \"never\"\n"; let graph =
-/// GraphConfig::parse(text, "x.toml".as_ref())?; assert_eq!(graph.stage(Stage::Encoder).threads, 2);
+/// use carff_config::{GraphConfig, RestartPolicy};
+/// use carff_messages::Stage;
+/// let run = "[run]\nname = \"x\"\ndataset = \"d\"\ncheckpoint = \"c\"\n";
+/// let stages = "[stages.encoder]\nthreads = 2\nrestart = \"never\"\n";
+/// let graph = GraphConfig::parse(&format!("{run}{stages}"), "x.toml".as_ref())?;
+/// assert_eq!(graph.stage(Stage::Encoder).threads, 2);
 /// assert_eq!(graph.stage(Stage::Encoder).restart, RestartPolicy::Never);
 /// # Ok::<(), carff_config::ConfigError>(())
 /// ```

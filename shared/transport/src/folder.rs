@@ -23,7 +23,7 @@ pub fn runtime_dir() -> PathBuf {
 }
 
 /// Returns all folders in which a run of this user may be, in the order of preference: `$RUNTIME_DIRECTORY`,
-/// `$XDG_RUNTIME_DIR/carff`, `/run/carff`, `$TMPDIR/carff-UID`, `/tmp/carff-UID`. A path of more than 30 bytes is left
+/// `$XDG_RUNTIME_DIR/carff`, `$TMPDIR/carff-UID`, `/run/carff`, `/tmp/carff-UID`. A path of more than 30 bytes is left
 /// out, because the paths of sockets are limited.
 pub fn runtime_dirs() -> Vec<PathBuf> {
     let folder = |name: &str| std::env::var_os(name).filter(|v| !v.is_empty()).map(PathBuf::from);
@@ -32,8 +32,8 @@ pub fn runtime_dirs() -> Vec<PathBuf> {
     let dirs = [
         service,
         folder("XDG_RUNTIME_DIR").map(|dir| dir.join("carff")),
-        Some(SERVICE_DIR.into()),
         folder("TMPDIR").map(|dir| dir.join(&of_user)),
+        Some(SERVICE_DIR.into()),
         Some(Path::new("/tmp").join(&of_user)),
     ];
     let mut found: Vec<PathBuf> = Vec::new();
