@@ -168,7 +168,9 @@ fn rewrite(from: &Path, to: &Path, kept: impl Fn(&str) -> bool) {
     messages.retain(|message| kept(&message.channel.topic));
     messages.sort_by(|a, b| a.channel.topic.cmp(&b.channel.topic));
     let mut writer = mcap::Writer::new(std::fs::File::create(to).unwrap()).unwrap();
-    messages.iter().for_each(|message| writer.write(message).unwrap());
+    for message in &messages {
+        writer.write(message).unwrap();
+    }
     writer.finish().unwrap();
 }
 
