@@ -1,5 +1,7 @@
 //! Test of a user's own stage, `examples/speed-gate`, next to the shipped programs.
 
+#![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
+
 use carff_messages::Message;
 use carff_observe::attach;
 use carff_tests::{
