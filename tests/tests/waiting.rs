@@ -1,5 +1,7 @@
 //! Test of the commands that wait for a run.
 
+#![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
+
 use carff_tests::{PATIENT_AND_ENDLESS, Process, TestGraph, eventually, program, scenario_set, shipped_checkpoint};
 use rustix::process::Signal;
 use std::io::{Read, Write};
