@@ -65,6 +65,7 @@ pub fn run(args: &AblateArgs) -> anyhow::Result<ExitCode> {
         config: &config,
         dataset: &dataset,
         random_poses: random_poses.as_deref(),
+        scenario: None,
         out: &args.out,
         device: options.device,
     };

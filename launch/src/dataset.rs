@@ -4,7 +4,10 @@ use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail, ensure};
-use carff_dataset::{Dataset, DatasetReport, ImportOptions, SheetOptions, contact_sheet, import};
+use carff_dataset::{
+    Dataset, DatasetReport, Degradation, ImportOptions, SheetOptions, contact_sheet, degrade, import,
+    sensor::SensorNoise,
+};
 use carff_scenes::{Extras, Scenario};
 use carff_training::places;
 use indicatif::{ProgressBar, ProgressStyle};
@@ -49,6 +52,31 @@ pub enum DatasetCommand {
         #[arg(long, value_parser = corners, allow_hyphen_values = true)]
         bounds: Option<[[f64; 3]; 2]>,
     },
+    /// Write a copy of a dataset as a camera gives it: noise, varying exposure and white balance, inexact poses.
+    #[command(after_help = "Example: a hard copy
+  carff dataset degrade data/approaching-intersection --read-noise 4 --out data/degraded")]
+    Degrade {
+        /// Folder of the dataset.
+        dir: PathBuf,
+        /// Folder to write; it must be new, empty, or a dataset that this program wrote.
+        #[arg(long)]
+        out: PathBuf,
+        /// Standard deviation of the read noise, of 255.
+        #[arg(long, default_value_t = 4.0)]
+        read_noise: f32,
+        /// Standard deviation of the relative exposure of each image.
+        #[arg(long, default_value_t = 0.05)]
+        gain: f32,
+        /// Standard deviation of the relative gain of each colour channel of each image.
+        #[arg(long, default_value_t = 0.03)]
+        white_balance: f32,
+        /// Standard deviation of the pose's error, as a shift of the image's centre, pixels.
+        #[arg(long, default_value_t = 1.0)]
+        pose_jitter_px: f64,
+        /// Seed of all draws.
+        #[arg(long, default_value_t = 1)]
+        seed: u64,
+    },
     /// Check a dataset, list all missing and broken images, and print the statistics of the others.
     #[command(after_help = "Example: with a contact sheet of all images
   carff dataset check data/approaching-intersection --contact-sheet reports/contact.png")]
@@ -91,6 +119,19 @@ pub fn run(command: DatasetCommand) -> anyhow::Result<()> {
             );
             let [low, high] = imported.bounds.map(|corner| corner.map(|v| (v * 1000.0).round() / 1000.0));
             println!("Bounds {low:?} to {high:?}; outside is background. Pass --bounds to change it");
+            Ok(())
+        }
+        DatasetCommand::Degrade { dir, out, read_noise, gain, white_balance, pose_jitter_px, seed } => {
+            ensure!((0.0..=32.0).contains(&pose_jitter_px), "--pose-jitter-px {pose_jitter_px}: 0 to 32 are allowed");
+            let noise = SensorNoise {
+                sigma: read_noise,
+                gain_sigma: gain,
+                channel_gain_sigma: white_balance,
+                channel_offset_sigma: 0.0,
+            };
+            noise.validate()?;
+            let images = degrade(&Dataset::open(&dir)?, &out, &Degradation { noise, pose_jitter_px, seed })?;
+            println!("{images} images in {}", out.display());
             Ok(())
         }
         DatasetCommand::Check { dir, contact_sheet, columns } => {

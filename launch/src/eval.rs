@@ -7,7 +7,7 @@ use carff_base::files::check_writable;
 use carff_checkpoint::Manifest;
 use carff_dataset::{Image, drives::DriveKind};
 use carff_evaluation::{EvalOptions, Progress, Subject, Table, evaluate};
-use carff_scenes::{Extras, Scenario};
+use carff_scenes::{Extras, FreePose, Scenario};
 use carff_training::training_curves;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -44,6 +44,10 @@ pub struct EvalArgs {
     /// Number of free drives for planning, half of them with a hazard. They need the scenario file of the dataset.
     #[arg(long, default_value_t = 400, value_parser = clap::value_parser!(u32).range(0..=100_000))]
     free_drives: u32,
+    /// Number of free poses for the trials, each with one image of each branch. They need the scenario file of the
+    /// dataset.
+    #[arg(long, default_value_t = 300, value_parser = clap::value_parser!(u32).range(0..=100_000))]
+    free_poses: u32,
     /// Folder for results.json, README.md and images; files of an earlier evaluation are overwritten.
     #[arg(long)]
     out: PathBuf,
@@ -60,6 +64,8 @@ enum TableName {
     Recall,
     /// Every decision rule, and the reliability of the hazard probability.
     Planning,
+    /// Six kinds of trial, with baselines on the same images.
+    Trials,
     /// Frequency of each outcome where several are open.
     Frequencies,
     /// t-SNE, reconstructions, curves, beliefs, density.
@@ -73,6 +79,7 @@ impl From<TableName> for Table {
             TableName::Encoder => Self::Encoder,
             TableName::Recall => Self::Recall,
             TableName::Planning => Self::Planning,
+            TableName::Trials => Self::Trials,
             TableName::Frequencies => Self::Frequencies,
             TableName::Pictures => Self::Pictures,
         }
@@ -97,10 +104,14 @@ pub fn run(args: &EvalArgs) -> anyhow::Result<ExitCode> {
     }
     let asked: Vec<Table> = args.only.iter().map(|t| Table::from(*t)).collect();
     let tables = if asked.is_empty() { Table::ALL.to_vec() } else { asked };
-    if tables.contains(&Table::Planning)
-        && let Some(scenario) = shown_scenario(&subject)
-    {
-        subject.free_drives = free_drives(&scenario, args.free_drives, args.seed, &display)?;
+    let wants = |table| tables.contains(&table);
+    if let Some(scenario) = shown_scenario(&subject).filter(|s| !s.info().hazard_branches.is_empty()) {
+        if wants(Table::Planning) {
+            subject.free_drives = free_drives(&scenario, args.free_drives, args.seed, &display)?;
+        }
+        if wants(Table::Trials) {
+            subject.free_poses = free_poses(&scenario, args.free_poses, args.seed, &display)?;
+        }
     }
     let results = evaluate(&subject, &tables, &args.out, &|p| display.show(p))?;
     display.finish();
@@ -162,9 +173,6 @@ fn free_drives(
     seed: u64,
     display: &Display,
 ) -> anyhow::Result<Vec<(Image, DriveKind)>> {
-    if scenario.info().hazard_branches.is_empty() {
-        return Ok(Vec::new());
-    }
     let total = count as usize;
     (0..total)
         .map(|done| {
@@ -172,6 +180,17 @@ fn free_drives(
             let drive = scenario.free_drive(done as u64, FRAMES_PER_TIMESTAMP, seed)?;
             let frame = scenario.free_frame(&drive, drive.decisive_frame())?;
             Ok((frame.image, drive.kind()))
+        })
+        .collect()
+}
+
+/// Free poses with their images.
+fn free_poses(scenario: &Scenario, count: u32, seed: u64, display: &Display) -> anyhow::Result<Vec<FreePose>> {
+    let total = count as usize;
+    (0..total)
+        .map(|done| {
+            display.show(&Progress { phase: "free poses", done, total, line: String::new() });
+            Ok(scenario.free_pose(done as u64, seed)?)
         })
         .collect()
 }

@@ -76,6 +76,8 @@ pub fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
     }
     refuse_another_configuration(&dir, &config, &dataset)?;
 
+    let shown = args.dataset.is_none() && config.scenario.is_some();
+    let scenario = shown.then(|| scenario(&config)).transpose()?;
     let device = carff_networks::device::parse(&args.device)?;
     let stop = stop_on_signals(&dir)?;
     let display = Display::default();
@@ -88,8 +90,8 @@ pub fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
         Some(StageName::Mdn) => Phases::Mixture,
     };
     let result = with_random_poses(rendered, &config, &dataset, &run).and_then(|random_poses| {
-        let random_poses = random_poses.as_deref();
-        Training { config: &config, dataset: &dataset, random_poses, out: &out, device }.run(phases, &run)
+        let (random_poses, scenario) = (random_poses.as_deref(), scenario.as_ref());
+        Training { config: &config, dataset: &dataset, random_poses, scenario, out: &out, device }.run(phases, &run)
     });
     display.finish();
     match result {

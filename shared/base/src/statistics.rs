@@ -33,15 +33,19 @@ pub fn psnr_of_mse(mean_squared_error: f64) -> f64 {
 
 /// Returns the 95 % Wilson score interval of a proportion, `[low, high]` in 0..=1; `[0, 1]` without trials.
 pub fn wilson_interval(successes: usize, trials: usize) -> [f64; 2] {
-    if trials == 0 {
+    wilson_interval_of_share(successes as f64 / trials.max(1) as f64, trials as f64)
+}
+
+/// Returns the 95 % Wilson score interval of a share, 0..=1, that was found in `n` independent trials or groups of
+/// trials; `[0, 1]` where `n` is 0.
+pub fn wilson_interval_of_share(share: f64, n: f64) -> [f64; 2] {
+    if n <= 0.0 {
         return [0.0, 1.0];
     }
     let z = 1.959_963_985_f64;
-    let n = trials as f64;
-    let p = successes as f64 / n;
     let scale = 1.0 + z * z / n;
-    let centre = (p + z * z / (2.0 * n)) / scale;
-    let half = z / scale * (p * (1.0 - p) / n + z * z / (4.0 * n * n)).sqrt();
+    let centre = (share + z * z / (2.0 * n)) / scale;
+    let half = z / scale * (share * (1.0 - share) / n + z * z / (4.0 * n * n)).sqrt();
     [(centre - half).max(0.0), (centre + half).min(1.0)]
 }
 

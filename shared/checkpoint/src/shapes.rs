@@ -116,11 +116,14 @@ pub struct DecoderConfig {
     /// True if the decoder gets the pose. Otherwise a latent has a single image, and the encoder must encode the pose.
     /// A residual over the pose's mean image would also reveal the pose (`vae.residual = false`).
     pub pose_condition: bool,
+    /// True if the one-hot pose is concatenated with the latent, as in the paper; false if it is multiplied with the
+    /// latent, so that each pose has its own map of the latent.
+    pub concatenated: bool,
 }
 
 impl Default for DecoderConfig {
     fn default() -> Self {
-        Self { hidden: 256, channels: 64, pose_condition: true }
+        Self { hidden: 256, channels: 64, pose_condition: true, concatenated: false }
     }
 }
 

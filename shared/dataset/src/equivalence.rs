@@ -14,9 +14,22 @@ pub struct Equivalence {
 }
 
 impl Equivalence {
+    /// Takes the truth of `alike_states` where frames have it, and compares images where they do not. Only for
+    /// evaluation: [`Self::from_images`] is what training may know.
+    pub fn from_dataset(dataset: &Dataset, images: &[Image]) -> Self {
+        Self::between(dataset, images, |a, b| {
+            let (of_a, of_b) = (&dataset.frames()[a], &dataset.frames()[b]);
+            Some(of_a.alike_states.as_ref()?.contains(&of_b.state?))
+        })
+    }
+
     /// Compares all pairs of states in each view, in the pixels that are valid in both images. `images` are those of
     /// [`Dataset::load_all_images`]. A state without an image in a view is only equivalent to itself.
-    pub fn from_dataset(dataset: &Dataset, images: &[Image]) -> Self {
+    pub fn from_images(dataset: &Dataset, images: &[Image]) -> Self {
+        Self::between(dataset, images, |_, _| None)
+    }
+
+    fn between(dataset: &Dataset, images: &[Image], known: impl Fn(usize, usize) -> Option<bool> + Sync) -> Self {
         let (views, states) = (dataset.view_count(), dataset.state_count());
         let mut frames = vec![vec![None; states]; views];
         for (i, frame) in dataset.frames().iter().enumerate().take(images.len()) {
@@ -24,7 +37,8 @@ impl Equivalence {
                 frames[view][state] = Some(i);
             }
         }
-        Self::of(states, &frames, |&a, &b| looks_same_where(&images[a], &images[b], dataset.valid_in_all(&[a, b])))
+        let compared = |a: usize, b: usize| looks_same_where(&images[a], &images[b], dataset.valid_in_all(&[a, b]));
+        Self::of(states, &frames, |&a, &b| known(a, b).unwrap_or_else(|| compared(a, b)))
     }
 
     /// Compares all pairs of states in each view; `pictures` has a row of `states` images per view.

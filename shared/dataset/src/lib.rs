@@ -17,6 +17,7 @@
 
 mod camera;
 mod dataset;
+mod degrade;
 pub mod drives;
 mod equivalence;
 mod error;
@@ -37,6 +38,7 @@ mod writer;
 
 pub use carff_messages::Observability;
 pub use dataset::Dataset;
+pub use degrade::{Degradation, degrade};
 pub use equivalence::Equivalence;
 pub use error::DatasetError;
 pub use folder::image_files;

@@ -37,6 +37,9 @@ pub struct Frame {
     pub actor_px: Option<u32>,
     /// Kind of camera, for example `orbit`, `bev` or `dash`.
     pub view_kind: Option<String>,
+    /// States that look the same from this pose, including its own, where the images cannot show it. Only evaluation
+    /// reads them.
+    pub alike_states: Option<Vec<usize>>,
 }
 
 /// A box with a name and a role.

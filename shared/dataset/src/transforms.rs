@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use carff_messages::Observability;
 use serde::de::Error;
-use serde_json::Value;
+use serde_json::{Map, Value};
 
 use crate::camera::{Keys, read_path};
 use crate::error::DatasetError;
@@ -235,6 +235,22 @@ fn read_frame(
         visible_fraction,
         actor_px: place.index(frame, "actor_px", 1 << 30)?.map(|v| v as u32),
         view_kind: place.text(frame, "view_kind")?.map(str::to_owned),
+        alike_states: alike_states(place, frame, scenario)?,
     };
     Ok((frame, rounded, fault))
+}
+
+/// Reads `alike_states`: indices of states of the scenario.
+fn alike_states(
+    place: &Place,
+    frame: &Map<String, Value>,
+    scenario: Option<&ScenarioInfo>,
+) -> Result<Option<Vec<usize>>, DatasetError> {
+    let Some(value) = present(frame, "alike_states") else { return Ok(None) };
+    let count = scenario.map_or(0, ScenarioInfo::state_count);
+    let index = |v: &Value| v.as_u64().map(|v| v as usize).filter(|v| *v < count);
+    let states: Option<Vec<usize>> = value.as_array().and_then(|all| all.iter().map(index).collect());
+    let error =
+        || place.error("alike_states", format!("must be a list of state indices from 0 to {}", count.max(1) - 1));
+    states.map(Some).ok_or_else(error)
 }

@@ -46,6 +46,8 @@ pub struct FrameRecord {
     pub mask_path: Option<String>,
     /// Path of its actor mask (8-bit grey PNG: 255 where the pixel shows the actor).
     pub mask_file_path: Option<String>,
+    /// States that look the same from this pose, including its own.
+    pub alike_states: Option<Vec<usize>>,
 }
 
 impl FrameRecord {
@@ -63,6 +65,7 @@ impl FrameRecord {
             depth_file_path: None,
             mask_path: None,
             mask_file_path: None,
+            alike_states: None,
         }
     }
 }
@@ -205,6 +208,7 @@ impl DatasetWriter {
                     depth_file_path: f.depth_file_path.as_deref(),
                     mask_path: f.mask_path.as_deref(),
                     mask_file_path: f.mask_file_path.as_deref(),
+                    alike_states: f.alike_states.as_deref(),
                     intrinsics: if shared.is_some() { None } else { Some(Intrinsics::of(&f.camera)) },
                 })
                 .collect(),
@@ -295,6 +299,8 @@ struct FrameFile<'a> {
     visible_fraction: Option<f64>,
     #[serde(skip_serializing_if = "Option::is_none")]
     actor_px: Option<u32>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    alike_states: Option<&'a [usize]>,
     #[serde(skip_serializing_if = "Option::is_none")]
     view_kind: Option<&'a str>,
     #[serde(skip_serializing_if = "Option::is_none")]

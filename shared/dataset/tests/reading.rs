@@ -579,3 +579,47 @@ fn outside_sets_if_at_hand() {
         assert_eq!(dataset.load_image(599).unwrap().width_px, 128);
     }
 }
+
+/// A degraded copy has the states and poses of the original, other bytes, and as truth which states look the same: the
+/// images no longer show it.
+#[test]
+fn degraded_copies_keep_the_truth() {
+    use carff_dataset::{Degradation, degrade, sensor::SensorNoise};
+    let folder = tempfile::tempdir().unwrap();
+    let writer = DatasetWriter::create(&folder.path().join("clean")).unwrap();
+    let camera = PinholeCamera::look_at([0.0, 0.0, 5.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], 16, 16, 60.0);
+    let mut records = Vec::new();
+    for (branch, view) in [(0, 0), (1, 0), (0, 1), (1, 1)] {
+        let path = format!("images/b{branch}_v{view}.png");
+        // From pose 0 the branches look the same.
+        let grey = if view == 1 && branch == 1 { 200 } else { 90 };
+        writer.write_image(&path, &Image::filled(16, 16, [grey; 3])).unwrap();
+        let record = FrameRecord::new(path, camera);
+        records.push(FrameRecord { branch_and_timestamp: Some((branch, 0)), view: Some(view), ..record });
+    }
+    let scenario = ScenarioInfo {
+        name: "two".into(),
+        branches: vec!["there".into(), "gone".into()],
+        timestamps: 1,
+        bounds: [[-1.0; 3], [1.0; 3]],
+        bev_view: None,
+        states: [0, 1].map(|branch| StateInfo { branch, timestamp: 0, boxes: Vec::new() }).to_vec(),
+        candidates: Vec::new(),
+        static_boxes: Vec::new(),
+        hazard_branches: vec![0],
+        hazard_action: "halt".into(),
+        clear_action: "advance".into(),
+    };
+    writer.finish(&records, Some(&scenario)).unwrap();
+    let clean = Dataset::open(&folder.path().join("clean")).unwrap();
+    let noise = SensorNoise { sigma: 8.0, ..SensorNoise::OFF };
+    let out = folder.path().join("degraded");
+    let count = degrade(&clean, &out, &Degradation { noise, pose_jitter_px: 1.0, seed: 1 }).unwrap();
+    let copy = Dataset::open(&out).unwrap();
+    let images = copy.load_all_images().unwrap();
+    assert_eq!((count, copy.frames().len()), (4, 4));
+    let [truth, seen] = [Equivalence::from_dataset(&copy, &images), Equivalence::from_images(&copy, &images)];
+    assert!(truth.same(0, 0, 1) && !truth.same(1, 0, 1));
+    assert!(!seen.same(0, 0, 1) && !seen.same(1, 0, 1));
+    assert_ne!(images[0], clean.load_image(0).unwrap());
+}

@@ -48,10 +48,12 @@ pub use tables::{
     field::{FieldPictures, NovelViews, PictureTable},
     forecast::{ForecastTable, FrequencyTable, RoleCurves},
     planning::{OneImage, PlanningResults, PlanningViews, ViewCounts},
+    trials::{Baseline, ByPart},
 };
 pub use trials::{
     Models,
     birds_eye::{BirdsEye, birds_eye},
+    looks::{ByTrialKind, TrialFigures},
     planning::{
         ByKind, BySamples, Count, NoisyEncoder, Planner, PlanningTable, SAMPLE_COUNTS, Trial, TrialOutcome, trial_frame,
     },

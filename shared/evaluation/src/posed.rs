@@ -19,8 +19,6 @@ pub struct Label {
     pub view: usize,
     /// Visibility of the actor's place; full where the dataset does not name it.
     pub observability: Observability,
-    /// Visible fraction of the actor's place, 0..=1; where unknown, 1, 0.5 or 0 by observability.
-    pub visible_fraction: f32,
     /// Role of the pose in the split; `None` for a random pose.
     pub role: Option<PoseRole>,
 }
@@ -38,8 +36,10 @@ pub struct PosedImages {
     pub labels: Vec<Label>,
     /// Split of the dataset's poses.
     pub split: PoseSplit,
-    /// Visual equivalence of states, for each view of the dataset.
+    /// Visual equivalence of states, for each view of the dataset: the truth, for evaluation.
     pub equivalence: Equivalence,
+    /// Visual equivalence as the images show it, which training may use. Noise hides it.
+    pub seen_equivalence: Equivalence,
     random_equivalence: Option<Equivalence>,
     /// Mean image of each pose over the states in which a pixel is valid, `[V, 3, 128, 128]`, 0..=1.
     pub pose_means: Tensor,
@@ -61,6 +61,7 @@ impl PosedImages {
             index[label.view * states + label.state] = Some(i);
         }
         let equivalence = Equivalence::from_dataset(&dataset, &images);
+        let seen_equivalence = Equivalence::from_images(&dataset, &images);
         let means: Vec<Tensor> = (0..dataset.view_count())
             .map(|view| {
                 let of_view: Vec<usize> = (0..states).filter_map(|state| index[view * states + state]).collect();
@@ -76,6 +77,7 @@ impl PosedImages {
             labels,
             split,
             equivalence,
+            seen_equivalence,
             random_equivalence: None,
             index,
         })
@@ -91,7 +93,7 @@ impl PosedImages {
         }
         let images = free.load_all_images()?;
         self.labels.extend(labels(&free, self.dataset.view_count(), |_| None).map_err(|what| unfit(&what))?);
-        self.random_equivalence = Some(Equivalence::from_dataset(&free, &images));
+        self.random_equivalence = Some(Equivalence::from_images(&free, &images));
         self.images.extend(images);
         Ok(())
     }
@@ -122,12 +124,17 @@ impl PosedImages {
         (0..self.labels.len()).filter(|&i| self.labels[i].role != Some(PoseRole::Unseen)).collect()
     }
 
-    /// States that look the same as `state` from a view, including `state`.
+    /// States that look the same as `state` from a view of the dataset, including `state`.
     pub fn equivalent_states(&self, view: usize, state: usize) -> Vec<usize> {
+        self.equivalence.alike(view, state).collect()
+    }
+
+    /// States whose images from a view of the dataset or of a random pose look the same, including `state`.
+    pub fn seen_alike(&self, view: usize, state: usize) -> Vec<usize> {
         let poses = self.dataset.view_count();
         match &self.random_equivalence {
             Some(free) if view >= poses => free.alike(view - poses, state).collect(),
-            _ => self.equivalence.alike(view, state).collect(),
+            _ => self.seen_equivalence.alike(view, state).collect(),
         }
     }
 
@@ -135,23 +142,6 @@ impl PosedImages {
     pub fn is_unambiguous(&self, image: usize) -> bool {
         let label = self.labels[image];
         self.equivalent_states(label.view, label.state).len() == 1
-    }
-
-    /// Per state, the unambiguous images of trained and random poses. The posterior of any other image correctly lies
-    /// between states. A state without an unambiguous image has the images that show at least half of the actor's
-    /// place.
-    pub fn unambiguous_by_state(&self) -> Vec<Vec<usize>> {
-        let mut by_state = vec![Vec::new(); self.scenario.state_count()];
-        let mut fallback = by_state.clone();
-        for i in self.trained_and_random() {
-            let label = self.labels[i];
-            if self.is_unambiguous(i) {
-                by_state[label.state].push(i);
-            } else if label.visible_fraction >= 0.5 {
-                fallback[label.state].push(i);
-            }
-        }
-        by_state.into_iter().zip(fallback).map(|(own, rest)| if own.is_empty() { rest } else { own }).collect()
     }
 
     /// Clean decoder targets `[N, 3, 128, 128]`, 0..=1.
@@ -200,13 +190,7 @@ fn labels(
             return Err(format!("frames[{i}] lacks `branch` and `timestamp`, or `view_id`"));
         };
         let observability = frame.observability.unwrap_or(Observability::Full);
-        let by_kind = match observability {
-            Observability::Full => 1.0,
-            Observability::Partial => 0.5,
-            Observability::None => 0.0,
-        };
-        let visible_fraction = frame.visible_fraction.unwrap_or(by_kind);
-        Ok(Label { state, view: first_view + view, observability, visible_fraction, role: role(view) })
+        Ok(Label { state, view: first_view + view, observability, role: role(view) })
     };
     dataset.frames().iter().enumerate().map(label).collect()
 }

@@ -19,6 +19,7 @@ use carff_networks::{
     stored::{load_decoder, load_encoder_on, load_mixture},
 };
 use carff_plots::Panel;
+use carff_scenes::FreePose;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 use tch::{Device, Tensor};
@@ -87,6 +88,8 @@ pub struct Subject {
     /// Decisive image of each free drive, without sensor noise, and the correct action. Empty until the caller renders
     /// them.
     pub free_drives: Vec<(Image, DriveKind)>,
+    /// Free poses with one image of each branch. Empty until the caller renders them.
+    pub free_poses: Vec<FreePose>,
     /// Settings of this evaluation.
     pub options: EvalOptions,
     trained: TrainedWith,
@@ -142,6 +145,7 @@ impl Subject {
             posed,
             training_curves: Vec::new(),
             free_drives: Vec::new(),
+            free_poses: Vec::new(),
             options,
             trained,
         };

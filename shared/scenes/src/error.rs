@@ -72,6 +72,17 @@ pub enum ScenarioError {
         /// Number of drawn drives.
         tries: u32,
     },
+    /// No camera pose is free of obstacles.
+    #[error(
+        "{}: none of {tries} random camera poses is free of obstacles; widen the cameras' ranges or lower `clearance_m`",
+        path.display()
+    )]
+    NoPose {
+        /// Path of the scenario file.
+        path: PathBuf,
+        /// Number of drawn poses.
+        tries: u32,
+    },
     /// The dataset cannot be written.
     #[error(transparent)]
     Dataset(#[from] DatasetError),

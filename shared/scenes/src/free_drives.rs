@@ -40,7 +40,7 @@ use crate::scenario::{Placement, Scenario};
 /// Name of the random stream.
 const STREAM: u32 = Key::named("drvf", 0, 0).step;
 /// Maximum number of drawn drives.
-const MAX_TRIES: u32 = 400;
+pub(crate) const MAX_TRIES: u32 = 400;
 /// Number of tries that only use the ego's roof.
 const ROOF_TRIES: u32 = 2;
 /// Largest deviation of the ego to the side and along its course, metres, and in heading, radians.
@@ -72,7 +72,7 @@ pub struct FreeDrive {
 
 /// Random values of a drive.
 #[derive(Clone, Debug, PartialEq)]
-struct Course {
+pub(crate) struct Course {
     aside_m: f64,
     along_m: f64,
     heading: f64,
@@ -110,6 +110,17 @@ pub struct FreeFrame {
 }
 
 impl FreeDrive {
+    /// A drive of one frame per time step without a right answer.
+    pub(crate) fn of_course(branch: usize, timestamps: usize, view_kind: String, course: Course) -> Self {
+        let kind = DriveKind::Clear;
+        Self { branch, kind, eligible_timestamp: 0, timestamps, frames_per_timestamp: 1, view_kind, course }
+    }
+
+    /// Returns the same drive through another branch.
+    pub(crate) fn through(&self, branch: usize) -> Self {
+        Self { branch, ..self.clone() }
+    }
+
     /// Returns the hidden branch.
     pub fn branch(&self) -> usize {
         self.branch
@@ -159,21 +170,8 @@ impl Scenario {
         for sample in 0..MAX_TRIES {
             let mut rng = carff_base::random::stream(Key { seed, frame: number, step: STREAM, sample });
             let Some(&branch) = branches.choose(&mut rng) else { break };
-            let roof = self.roof(branch, &mut rng).filter(|_| kind == DriveKind::Hazard || sample < ROOF_TRIES);
-            let (view_kind, camera) = match roof {
-                Some(roof) => roof,
-                None => self.drifting(&mut rng)?,
-            };
-            let scale = self.config().clearance_m / ROAD_CLEARANCE_M;
-            let mut within = |limit: f64| rng.random_range(-limit..=limit);
-            let course = Course {
-                aside_m: within(ASIDE_M) * scale,
-                along_m: within(ALONG_M) * scale,
-                heading: within(HEADING),
-                sway: [(); 4].map(|()| [within(TAU), 0.3 + (SWAYS - 0.3) * within(1.0).abs()]),
-                camera,
-                scale,
-            };
+            let roof = kind == DriveKind::Hazard || sample < ROOF_TRIES;
+            let (view_kind, course) = self.course(branch, roof, &mut rng)?;
             let timestamps = info.timestamps;
             let mut drive =
                 FreeDrive { branch, kind, eligible_timestamp: 0, timestamps, frames_per_timestamp, view_kind, course };
@@ -191,6 +189,32 @@ impl Scenario {
             }
         }
         Err(ScenarioError::NoDrive { path: self.path().to_owned(), kind, tries: MAX_TRIES })
+    }
+
+    /// Draws a course with its camera: on a roof where `roof` is set and the branch has one, else drifting. Returns the
+    /// kind of the camera's group and the course.
+    pub(crate) fn course(
+        &self,
+        branch: usize,
+        roof: bool,
+        rng: &mut impl Rng,
+    ) -> Result<(String, Course), ScenarioError> {
+        let on_roof = self.roof(branch, rng).filter(|_| roof);
+        let (view_kind, camera) = match on_roof {
+            Some(on_roof) => on_roof,
+            None => self.drifting(rng)?,
+        };
+        let scale = self.config().clearance_m / ROAD_CLEARANCE_M;
+        let mut within = |limit: f64| rng.random_range(-limit..=limit);
+        let course = Course {
+            aside_m: within(ASIDE_M) * scale,
+            along_m: within(ALONG_M) * scale,
+            heading: within(HEADING),
+            sway: [(); 4].map(|()| [within(TAU), 0.3 + (SWAYS - 0.3) * within(1.0).abs()]),
+            camera,
+            scale,
+        };
+        Ok((view_kind, course))
     }
 
     /// Renders frame `frame` of a drive, 0 to [`FreeDrive::frame_count`] - 1, with its truth.
@@ -216,7 +240,7 @@ impl Scenario {
     }
 
     /// Evaluates visibility on a smaller image, because it is a share of pixels.
-    fn free_observability(
+    pub(crate) fn free_observability(
         &self,
         placement: &Placement,
         timestamp: usize,
@@ -245,12 +269,12 @@ impl Scenario {
     }
 
     /// Returns true if the camera is free of obstacles. A roof camera is above its own vehicle.
-    fn stands_clear(&self, drive: &FreeDrive, frame: usize) -> bool {
+    pub(crate) fn stands_clear(&self, drive: &FreeDrive, frame: usize) -> bool {
         self.obstacles().clear(self.free_view(drive, frame).0.position_m())
     }
 
     /// Returns camera and placement of a frame.
-    fn free_view(&self, drive: &FreeDrive, frame: usize) -> (PinholeCamera, Placement) {
+    pub(crate) fn free_view(&self, drive: &FreeDrive, frame: usize) -> (PinholeCamera, Placement) {
         let (time, course) = (drive.time(frame), &drive.course);
         let steps = &self.placements()[drive.branch];
         let timestamp = (frame / drive.frames_per_timestamp.max(1)).min(steps.len() - 1);

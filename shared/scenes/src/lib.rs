@@ -18,6 +18,7 @@ mod cameras;
 pub mod config;
 mod error;
 mod free_drives;
+mod free_looks;
 mod materials;
 mod movers;
 mod scenario;
@@ -28,6 +29,7 @@ mod tracer;
 pub use cameras::ScenarioCamera;
 pub use error::ScenarioError;
 pub use free_drives::{FreeDrive, FreeFrame};
+pub use free_looks::{FreeLook, FreePose};
 pub use scenario::{
     ActorView, Detail, Extras, FULL_FRACTION, FULL_PIXELS, NONE_FRACTION, NONE_MEAN_DIFFERENCE, RenderOptions,
     Rendering, Scenario,

@@ -18,13 +18,17 @@ use carff_decision::{
     Calibration, CalibrationTrial, Evidence, Plan, ProbeLayout, Sampling, choose_threshold, look_ahead,
     unchosen_threshold,
 };
-use carff_evaluation::{Models, Progress, Trial, trial_frame};
+use carff_evaluation::{Models, NoisyEncoder, Progress, Trial, trial_frame};
 use carff_field::Field;
 use carff_messages::LATENT_DIM;
+use carff_scenes::Scenario;
 use std::path::Path;
 
 /// Latents of each known state on which the probing is calibrated.
 const CALIBRATION_LATENTS: usize = 64;
+
+/// Part of the seed of calibration trials, so that they share no draws with training or evaluation.
+const CALIBRATION: u64 = tag("calibrat");
 
 /// Calibrates the probing of a field on latents of the known states.
 pub fn calibrated_probing(
@@ -54,8 +58,14 @@ pub fn calibrated_probing(
     Ok((layout, calibration))
 }
 
-/// Chooses the threshold of the calibrated rule on the calibration poses, and saves it in the checkpoint.
-pub fn choose_and_save_threshold(context: Context, models: &mut Models, out: &Path) -> Result<(), TrainingError> {
+/// Chooses the threshold of the calibrated rule, and saves it in the checkpoint. The trials are free poses of
+/// `scenario`, from a seed that no evaluation uses; without a scenario they are the calibration poses of the dataset.
+pub fn choose_and_save_threshold(
+    context: Context,
+    models: &mut Models,
+    scenario: Option<&Scenario>,
+    out: &Path,
+) -> Result<(), TrainingError> {
     let Context { config, posed, run } = context;
     let (hazards, branches) = (posed.scenario.hazard_branches.len(), posed.scenario.branches.len());
     let save = |threshold| {
@@ -66,7 +76,11 @@ pub fn choose_and_save_threshold(context: Context, models: &mut Models, out: &Pa
         // Without hazard states the hazard probability is always 0: any positive threshold is never reached.
         return save(0.5);
     }
-    let trials = calibration_trials(context, models)?;
+    let trials = match scenario {
+        Some(scenario) => free_trials(context, models, scenario)?,
+        None => calibration_trials(context, models)?,
+    };
+    let trials = judged(context, models, &trials);
     let chosen = choose_threshold(&trials);
     let threshold = chosen.unwrap_or_else(|| unchosen_threshold(hazards, branches));
     if chosen.is_none() {
@@ -90,16 +104,37 @@ pub fn choose_and_save_threshold(context: Context, models: &mut Models, out: &Pa
     save(threshold)
 }
 
-/// Hazard probabilities of the calibration poses. Images are augmented as in training: a threshold from unaugmented
+/// Free poses of the scenario whose images have a right answer.
+fn free_trials(context: Context, models: &Models, scenario: &Scenario) -> Result<Vec<Trial>, TrainingError> {
+    let Context { config, run, .. } = context;
+    let settings = &config.calibration;
+    let seed = config.seed ^ CALIBRATION;
+    let encoder = NoisyEncoder { encoder: &models.encoder, noise: settings.sensor, seed };
+    let mut trials = Vec::new();
+    for number in 0..settings.free_poses {
+        if run.stopped() {
+            return Err(TrainingError::Stopped);
+        }
+        let pose = scenario.free_pose(number as u64, seed).map_err(|e| TrainingError::Unfit(e.to_string()))?;
+        for (branch, look) in pose.looks.iter().enumerate() {
+            if let Some(kind) = scenario.info().trial_kind(branch, pose.timestamp, look.observability) {
+                trials.extend(encoder.trial(&look.image, kind, trial_frame(number, branch)));
+            }
+        }
+    }
+    Ok(trials)
+}
+
+/// Images of the calibration poses. Images are augmented as in training: a threshold from unaugmented
 /// training images would be too narrow for other images.
-fn calibration_trials(context: Context, models: &mut Models) -> Result<Vec<CalibrationTrial>, TrainingError> {
+fn calibration_trials(context: Context, models: &Models) -> Result<Vec<Trial>, TrainingError> {
     let Context { config, posed, .. } = context;
     let settings = &config.calibration;
     let inputs = eligible_inputs(&posed.dataset, &posed.split.views(PoseRole::Calibration))
         .map_err(|e| TrainingError::Unfit(e.to_string()))?;
     let augmentation = Augmentation { sensor: settings.sensor, ..config.augmentation.clone() };
     // Another seed than in training, so that no image is augmented as in training.
-    let augmentation_seed = config.seed ^ tag("calibrat");
+    let augmentation_seed = config.seed ^ CALIBRATION;
     let mut trials = Vec::with_capacity(inputs.len() * settings.repeats);
     for input in &inputs {
         let state = posed.scenario.state(input.branch, input.timestamp);
@@ -111,13 +146,19 @@ fn calibration_trials(context: Context, models: &mut Models) -> Result<Vec<Calib
             trials.extend(posteriors.map(|posterior| Trial { posterior, kind, frame, seed }));
         }
     }
+    Ok(trials)
+}
+
+/// Hazard probabilities of trials.
+fn judged(context: Context, models: &mut Models, trials: &[Trial]) -> Vec<CalibrationTrial> {
+    let settings = &context.config.calibration;
     let Models { mixture, probe, .. } = models;
     let (samples, horizon, sampling) = (settings.samples, settings.horizon, Sampling::Stratified);
-    let judged = trials.iter().map(|trial| {
+    let judge = |trial: &Trial| {
         let plan = Plan { samples, sampling, horizon, seed: trial.seed, frame: trial.frame };
         let steps = look_ahead(|input, _| mixture.forecast(input), probe, &trial.posterior, plan);
         let hazard_probability = Evidence::of_steps(&steps).hazard_probability();
         CalibrationTrial { hazard_probability, halt_is_right: trial.kind == DriveKind::Hazard }
-    });
-    Ok(judged.collect())
+    };
+    trials.iter().map(judge).collect()
 }

@@ -61,11 +61,14 @@ pub struct TrainingConfig {
     pub calibration: CalibrationConfig,
 }
 
-/// Choice of the threshold of the calibrated rule, on the calibration poses only.
+/// Choice of the threshold of the calibrated rule.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct CalibrationConfig {
-    /// Trials of each image, with fresh sensor noise.
+    /// Free poses of the scenario file, each with an image of each branch; they share no pose with training or
+    /// evaluation. A dataset without a scenario file uses its calibration poses.
+    pub free_poses: usize,
+    /// Trials of each image of the calibration poses, with fresh sensor noise.
     pub repeats: usize,
     /// Sensor noise.
     pub sensor: SensorNoise,
@@ -77,7 +80,7 @@ pub struct CalibrationConfig {
 
 impl Default for CalibrationConfig {
     fn default() -> Self {
-        Self { repeats: 5, sensor: SensorNoise::default(), samples: 10, horizon: 2 }
+        Self { free_poses: 120, repeats: 5, sensor: SensorNoise::default(), samples: 10, horizon: 2 }
     }
 }
 
@@ -115,6 +118,11 @@ pub struct VaeTraining {
     /// Number of times that each pass uses the images of the dataset's own poses, which are few compared with those of
     /// random poses: once for encoder and decoder, and further times for the encoder only.
     pub own_passes: usize,
+    /// Number of other poses at which each input's state is reconstructed from its latent, as small images: the encoder
+    /// sees pose c, the decoder is asked for pose c'' (paper section 3.1, with one pose). Images of random poses are
+    /// reconstructed at poses of the dataset. With one pose, most seeds end with a latent that shows no state. 0: each
+    /// image is reconstructed at its own pose.
+    pub other_poses: usize,
     /// Further passes that train only the decoder, over the images of the dataset's own poses. While the encoder
     /// learns, the decoder follows moving latents.
     pub decoder_epochs: usize,
@@ -156,6 +164,7 @@ impl Default for VaeTraining {
         Self {
             epochs: 100,
             own_passes: 1,
+            other_poses: 0,
             decoder_epochs: 0,
             batch: 30,
             decoder_batch: 30,
@@ -265,10 +274,12 @@ impl TrainingConfig {
         let counts = [
             ("vae.epochs", self.vae.epochs, 1, 10_000),
             ("vae.own_passes", self.vae.own_passes, 1, 100),
+            ("vae.other_poses", self.vae.other_poses, 0, 64),
             ("vae.decoder_epochs", self.vae.decoder_epochs, 0, 10_000),
             ("vae.batch", self.vae.batch, 2, 4096),
             ("vae.decoder_batch", self.vae.decoder_batch, 1, 4096),
             ("nerf.rays", self.nerf.rays, 32, 1 << 20),
+            ("calibration.free_poses", self.calibration.free_poses, 1, 100_000),
             ("calibration.repeats", self.calibration.repeats, 1, 1000),
             ("calibration.samples", self.calibration.samples, 1, 64),
             ("calibration.horizon", self.calibration.horizon as usize, 1, 8),
@@ -317,6 +328,9 @@ impl TrainingConfig {
                         set `vae.residual` to false"
                     .into(),
             );
+        }
+        if self.vae.other_poses > 0 && !self.decoder.pose_condition {
+            return Err("`vae.other_poses` asks the decoder for poses: set `decoder.pose_condition` to true".into());
         }
         self.field.validate().map_err(|e| format!("[field] {e}"))?;
         self.calibration.sensor.validate().map_err(|e| format!("[calibration.sensor] {e}"))?;

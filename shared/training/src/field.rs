@@ -8,6 +8,7 @@ use crate::{
     config::TrainingConfig,
     records::{FieldRecord, names},
     run::{Context, Phase, Report, drive, part, prefixed},
+    unambiguous::unambiguous_by_state,
 };
 use carff_base::random::Key;
 use carff_dataset::PIXEL_TOLERANCE;
@@ -28,15 +29,14 @@ pub struct Clouds {
 }
 
 impl Clouds {
-    /// Posteriors of the unambiguous views of each state.
+    /// Posteriors of the views that show their state.
     pub fn new(posed: &PosedImages, posteriors: &[Gaussian]) -> Result<Self, TrainingError> {
-        let by_state: Vec<Vec<Gaussian>> = posed
-            .unambiguous_by_state()
+        let by_state: Vec<Vec<Gaussian>> = unambiguous_by_state(posed, posteriors)
             .into_iter()
             .map(|views| views.into_iter().map(|i| posteriors[i]).collect())
             .collect();
         match by_state.iter().position(Vec::is_empty) {
-            Some(state) => Err(TrainingError::Unfit(format!("no trained view of state {state} shows enough"))),
+            Some(state) => Err(TrainingError::Unfit(format!("state {state} has no view from a trained pose"))),
             None => Ok(Self { by_state }),
         }
     }

@@ -8,7 +8,7 @@
 //! let stop = AtomicBool::new(false);
 //! let run = Run { dir: "runs/toy".into(), on_progress: &|p| println!("{}", p.line), stop: &stop };
 //! let (dataset, out, device) = (config.dataset.as_path(), config.out.as_path(), tch::Device::Cpu);
-//! let training = Training { config: &config, dataset, random_poses: None, out, device };
+//! let training = Training { config: &config, dataset, random_poses: None, scenario: None, out, device };
 //! println!("{}", training.run(Phases::All, &run)?.summary());
 //! # Ok(())
 //! # }
@@ -38,6 +38,7 @@ mod places;
 mod random_poses;
 mod records;
 mod run;
+mod unambiguous;
 mod vae;
 
 pub use augmentation::Augmentation;

@@ -1,14 +1,15 @@
 //! Training phase of the mixture density network (paper section 3.4).
 //!
-//! An input is the posterior of a view. Its target is a Gaussian draw from the posterior of a random unambiguous view
-//! of the next time step. Where several states look the same from the input's view, their next steps are equally
-//! frequent targets. After the last step the scene does not change.
+//! An input is the posterior of a view. Its target is a Gaussian draw from the posterior of a random view that shows the
+//! state of the next time step. Views of several states that look the same have the same posterior, so that the network
+//! learns all their next steps. After the last step the scene does not change.
 
 use crate::{
     TrainingError,
     config::TrainingConfig,
     records::{MixtureRecord, names},
     run::{Context, Phase, Report, cosine, part, prefixed},
+    unambiguous::unambiguous_by_state,
 };
 use carff_base::random::Key;
 use carff_messages::{Gaussian, LATENT_DIM};
@@ -61,8 +62,6 @@ pub struct MixturePhase<'a> {
     inputs: Vec<usize>,
     /// Images of each state whose posteriors are targets.
     targets: Vec<Vec<usize>>,
-    /// Equivalent states of each image.
-    equivalent: Vec<Vec<usize>>,
     /// Sum of the losses since the last record.
     sum: f64,
 }
@@ -71,11 +70,9 @@ impl<'a> MixturePhase<'a> {
     /// The phase before its first step. `posteriors` are `[copy][image]`.
     pub fn new(context: Context<'a>, posteriors: &'a [Vec<Gaussian>], mdn: &'a Mdn) -> Result<Self, TrainingError> {
         let posed = context.posed;
-        let targets = posed.unambiguous_by_state();
+        let targets = unambiguous_by_state(posed, &posteriors[0]);
         if let Some(state) = targets.iter().position(Vec::is_empty) {
-            return Err(TrainingError::Unfit(format!(
-                "no trained view of state {state} shows enough of the actor's place"
-            )));
+            return Err(TrainingError::Unfit(format!("state {state} has no view from a trained pose")));
         }
         Ok(Self {
             context,
@@ -84,7 +81,6 @@ impl<'a> MixturePhase<'a> {
             adam: Adam::new(&[&mdn.store], 0.0),
             inputs: posed.trained_and_random(),
             targets,
-            equivalent: posed.labels.iter().map(|l| posed.equivalent_states(l.view, l.state)).collect(),
             sum: 0.0,
         })
     }
@@ -117,10 +113,7 @@ impl Phase for MixturePhase<'_> {
                 std::array::from_fn(|_| rng.sample::<f32, _>(StandardNormal) * settings.input_noise as f32);
             means.extend(input.at(&noise));
             log_variances.extend(input.log_variance);
-            // Equivalent states are equally probable: the network must not memorise the input.
-            let equivalent = &self.equivalent[i];
-            let state = equivalent[rng.random_range(0..equivalent.len())];
-            let views = &self.targets[posed.scenario.next_state(state)];
+            let views = &self.targets[posed.scenario.next_state(posed.labels[i].state)];
             let copy = &self.posteriors[rng.random_range(0..self.posteriors.len())];
             let next = &copy[views[rng.random_range(0..views.len())]];
             let unit: [f32; LATENT_DIM] = std::array::from_fn(|_| rng.sample(StandardNormal));

@@ -21,6 +21,7 @@ use carff_evaluation::{
 use carff_field::Field;
 use carff_messages::{Gaussian, LATENT_DIM};
 use carff_networks::stored::save_weights;
+use carff_scenes::Scenario;
 use serde_json::Value;
 use std::path::Path;
 use tch::Device;
@@ -54,6 +55,8 @@ pub struct Training<'a> {
     pub dataset: &'a Path,
     /// Folder of the dataset of random poses.
     pub random_poses: Option<&'a Path>,
+    /// Scenario of the dataset, from which calibration poses are rendered; `None` for any other dataset.
+    pub scenario: Option<&'a Scenario>,
     /// Folder of the checkpoint.
     pub out: &'a Path,
     /// Device of the VAE and the mixture density network. The field is trained on the CPU.
@@ -130,7 +133,7 @@ impl Training<'_> {
         if manifest.probing.is_some() && mixture_ready {
             save(manifest.clone(), &figures, self.out)?;
             let mut models = Models::load(self.out)?;
-            choose_and_save_threshold(context, &mut models, self.out)?;
+            choose_and_save_threshold(context, &mut models, self.scenario, self.out)?;
             figures.planning = Some(self.planning_figures(context, &models)?);
             figures.samples = Some(TrainedAndUnseen {
                 trained: sample_figures(context, &mut models, PoseRole::Rest),

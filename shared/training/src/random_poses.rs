@@ -150,7 +150,7 @@ fn codes(posed: &PosedImages, seed: u64) -> Vec<Gaussian> {
     views.dedup();
     (0..states)
         .map(|state| {
-            let same = |other: &usize| views.iter().all(|&view| posed.equivalence.same(view, state, *other));
+            let same = |other: &usize| views.iter().all(|&view| posed.seen_equivalence.same(view, state, *other));
             let first = (0..state).find(same).unwrap_or(state);
             let mean = carff_base::random::gaussians(Key::named("code", seed, first as u64));
             Gaussian { mean, log_variance: [-10.0; LATENT_DIM] }

@@ -156,8 +156,14 @@ fn a_set_without_boxes_is_refused_at_once() {
     let stop = AtomicBool::new(false);
     let run = Run { dir: place.at("run"), on_progress: &|_| {}, stop: &stop };
     let (dataset, out) = (place.at("set"), place.at("out"));
-    let training =
-        Training { config: &place.config, dataset: &dataset, random_poses: None, out: &out, device: Device::Cpu };
+    let training = Training {
+        config: &place.config,
+        dataset: &dataset,
+        random_poses: None,
+        scenario: None,
+        out: &out,
+        device: Device::Cpu,
+    };
     assert!(training.run(Phases::All, &run).unwrap_err().to_string().contains("`scenario.states[].boxes`"));
     assert!(!out.exists());
 }

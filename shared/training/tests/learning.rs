@@ -115,7 +115,8 @@ impl Place {
         std::fs::create_dir_all(&dir).unwrap();
         let run = Run { dir, on_progress: &on_progress, stop: &stop };
         let (dataset, out, device) = (self.out("set"), self.out(name), tch::Device::Cpu);
-        Training { config: &self.config, dataset: &dataset, random_poses: None, out: &out, device }.run(phases, &run)
+        Training { config: &self.config, dataset: &dataset, random_poses: None, scenario: None, out: &out, device }
+            .run(phases, &run)
     }
 }
 
@@ -137,6 +138,26 @@ fn training_learns() {
     }
     let _alone = alone();
     assert_eq!(Models::load(&place.out("learnt")).unwrap().probe.states().len(), 4);
+}
+
+/// Without any label in the loss, the latents identify the states if the decoder is asked for other poses, for every
+/// seed. Asked for the input's own pose only, they do not.
+#[test]
+fn latents_identify_states_without_labels() {
+    let mut place = Place::new();
+    place.config.vae.state_weight = 0.0;
+    place.config.vae.kl_weight = 1e-3;
+    place.config.vae.epochs = 300;
+    let mut accuracy = |other_poses, seed| {
+        place.config.vae.other_poses = other_poses;
+        place.config.seed = seed;
+        let figures = place.train_phases(&format!("unlabelled-{other_poses}-{seed}"), Phases::Vae, None).unwrap();
+        figures.vae.unwrap().trained.full.accuracy
+    };
+    let alive: Vec<f64> = (1..4).map(|seed| accuracy(8, seed)).collect();
+    assert!(alive.iter().all(|accuracy| *accuracy > 0.9), "{alive:?}");
+    let own = accuracy(0, 1);
+    assert!(own < 0.9, "{own}");
 }
 
 /// Training of the decoder only leaves the encoder unchanged and improves the decoder.

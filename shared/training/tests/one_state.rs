@@ -92,8 +92,14 @@ fn an_imported_set_trains_the_field() {
     let config = TrainingConfig::load(&path("training.toml")).unwrap();
     let (stop, on_progress) = (AtomicBool::new(false), |_: &Progress| {});
     let (dataset, out) = (path("set"), path("out"));
-    let training =
-        Training { config: &config, dataset: &dataset, random_poses: None, out: &out, device: tch::Device::Cpu };
+    let training = Training {
+        config: &config,
+        dataset: &dataset,
+        random_poses: None,
+        scenario: None,
+        out: &out,
+        device: tch::Device::Cpu,
+    };
     let train = |phases: Phases| {
         let run = Run { dir: folder.path().to_owned(), on_progress: &on_progress, stop: &stop };
         training.run(phases, &run)

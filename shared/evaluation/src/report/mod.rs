@@ -9,6 +9,7 @@ use crate::tables::{
     field::{PictureTable, picture_table},
     forecast::{self, ForecastTable, FrequencyTable},
     planning::{self, PlanningResults},
+    trials::{self, Baseline, ByPart},
 };
 use crate::{About, ByRole, EvaluationError, Progress, Reliability, Subject};
 pub use gallery::Gallery;
@@ -30,6 +31,8 @@ pub enum Table {
     Recall,
     /// Every decision rule, and the reliability of the hazard probability.
     Planning,
+    /// Six kinds of trial, with baselines on the same images.
+    Trials,
     /// Frequency of each outcome where several are open.
     Frequencies,
     /// t-SNE, reconstructions, curves, beliefs, density.
@@ -38,8 +41,8 @@ pub enum Table {
 
 impl Table {
     /// All tables.
-    pub const ALL: [Self; 6] =
-        [Self::Psnr, Self::Encoder, Self::Recall, Self::Planning, Self::Frequencies, Self::Pictures];
+    pub const ALL: [Self; 7] =
+        [Self::Psnr, Self::Encoder, Self::Recall, Self::Planning, Self::Trials, Self::Frequencies, Self::Pictures];
 
     /// Name of the table for `--only`.
     pub fn name(self) -> &'static str {
@@ -48,6 +51,7 @@ impl Table {
             Self::Encoder => "encoder",
             Self::Recall => "recall",
             Self::Planning => "planning",
+            Self::Trials => "trials",
             Self::Frequencies => "frequencies",
             Self::Pictures => "pictures",
         }
@@ -77,6 +81,12 @@ pub struct Results {
     /// Reliability of the hazard probability.
     #[serde(skip_serializing_if = "ByRole::is_empty", default)]
     pub hazard_reliability: ByRole<Reliability>,
+    /// Six kinds of trial: figures by part and kind.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty", default)]
+    pub trials: ByPart,
+    /// Baselines on the images of the trials, by name.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty", default)]
+    pub baselines: BTreeMap<String, Baseline>,
     /// Frequency of each outcome where several are open.
     #[serde(skip_serializing_if = "ByRole::is_empty", default)]
     pub frequencies: ByRole<FrequencyTable>,
@@ -122,6 +132,11 @@ pub fn evaluate(
         planning::draw(&reliability, out)?;
         results.planning = Some(table);
         results.hazard_reliability = reliability;
+    }
+    if has(Table::Trials)
+        && let Some((trials, baselines)) = results.kept(Table::Trials, trials::trials(subject, on_progress)?)
+    {
+        (results.trials, results.baselines) = (trials, baselines);
     }
     if has(Table::Pictures) {
         results.gallery = Some(gallery::gallery(subject, out, on_progress)?);

@@ -4,6 +4,7 @@ pub mod encoder;
 pub mod field;
 pub mod forecast;
 pub mod planning;
+pub mod trials;
 
 /// At most `count` entries, evenly spread.
 pub fn spread(all: &[usize], count: usize) -> Vec<usize> {

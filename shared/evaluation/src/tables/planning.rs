@@ -123,7 +123,7 @@ pub fn planning(subject: &Subject, on_progress: &dyn Fn(&Progress)) -> Result<Fo
 }
 
 /// Reason why there is nothing to plan, as an error.
-fn plannable(subject: &Subject) -> Result<(), String> {
+pub fn plannable(subject: &Subject) -> Result<(), String> {
     let scenario = &subject.posed.scenario;
     if scenario.hazard_branches.is_empty() {
         return Err("the scenario has no branch in which the hazard action is right".into());

@@ -1,7 +1,9 @@
 //! Trials: the models on images with known answers.
 
+pub mod baselines;
 pub mod birds_eye;
 pub mod hypotheses;
+pub mod looks;
 pub mod planning;
 pub mod samples;
 

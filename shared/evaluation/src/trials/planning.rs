@@ -8,7 +8,7 @@ use carff_dataset::{
     drives::{DriveKind, EligibleInput},
     sensor::{SensorNoise, apply_noise_into},
 };
-use carff_decision::{Evidence, Plan, Policy, Sampling, look_ahead};
+use carff_decision::{Evidence, Mixture, Plan, Policy, Sampling, look_ahead};
 use carff_messages::{Gaussian, Rule};
 use carff_networks::{
     encoder::{Encoder, pictures_from_bytes},
@@ -240,48 +240,37 @@ pub struct Planner<'a> {
     pub horizon: u32,
 }
 
-/// Index of a rule, number of samples, and whether the rule halted.
-type Halt = (usize, usize, bool);
-
 impl Planner<'_> {
-    /// Runs every trial with every rule and number of samples, on all threads of rayon's pool. Outcomes, in the order
-    /// of the trials, are those of 10 samples.
-    pub fn table(&self, trials: &[Trial], policies: &[Policy]) -> (PlanningTable, Vec<TrialOutcome>) {
+    /// Returns the evidence of each trial from `samples` samples, on all threads of rayon's pool.
+    pub fn evidence(&self, trials: &[Trial], samples: usize) -> Vec<Evidence> {
         let posteriors: Vec<Gaussian> = trials.iter().map(|t| t.posterior).collect();
         let first = if posteriors.is_empty() { Vec::new() } else { self.net.forecast_all(&posteriors) };
         let later = self.net.forecast_all(self.probe.states());
         let Self { sampling, horizon, .. } = *self;
-        let results: Vec<(Vec<Halt>, TrialOutcome)> = trials
-            .par_iter()
-            .zip(&first)
-            .map_init(
-                || self.probe.clone(),
-                |probe, (trial, mixture)| {
-                    let mut actions = Vec::with_capacity(SAMPLE_COUNTS.len() * policies.len());
-                    let mut outcome = TrialOutcome { hazard_probability: 0.0, kind: trial.kind };
-                    for samples in SAMPLE_COUNTS {
-                        let plan = Plan { samples, sampling, horizon, seed: trial.seed, frame: trial.frame };
-                        let forecast =
-                            |_: &Gaussian, state: Option<usize>| state.map_or(mixture, |s| &later[s]).clone();
-                        let steps = look_ahead(forecast, probe, &trial.posterior, plan);
-                        let evidence = Evidence::of_steps(&steps);
-                        let halts = policies.iter().map(|policy| policy.decide(&evidence).halt);
-                        actions.extend(halts.enumerate().map(|(policy, halt)| (policy, samples, halt)));
-                        if samples == OUTCOME_SAMPLES {
-                            outcome.hazard_probability = evidence.hazard_probability() as f32;
-                        }
-                    }
-                    (actions, outcome)
-                },
-            )
-            .collect();
-        let mut table = PlanningTable::default();
-        for (actions, outcome) in &results {
-            for &(policy, samples, halted) in actions {
-                let right = halted == (outcome.kind == DriveKind::Hazard);
-                table.add(policies[policy].rule, samples, outcome.kind, right);
+        let of_trial = |probe: &mut FieldProbe, (trial, mixture): (&Trial, &Mixture)| {
+            let plan = Plan { samples, sampling, horizon, seed: trial.seed, frame: trial.frame };
+            let forecast = |_: &Gaussian, state: Option<usize>| state.map_or(mixture, |s| &later[s]).clone();
+            Evidence::of_steps(&look_ahead(forecast, probe, &trial.posterior, plan))
+        };
+        trials.par_iter().zip(&first).map_init(|| self.probe.clone(), of_trial).collect()
+    }
+
+    /// Runs every trial with every rule and number of samples. Outcomes, in the order of the trials, are those of 10
+    /// samples.
+    pub fn table(&self, trials: &[Trial], policies: &[Policy]) -> (PlanningTable, Vec<TrialOutcome>) {
+        let (mut table, mut outcomes) = (PlanningTable::default(), Vec::new());
+        for samples in SAMPLE_COUNTS {
+            for (trial, evidence) in trials.iter().zip(self.evidence(trials, samples)) {
+                for policy in policies {
+                    let right = policy.decide(&evidence).halt == (trial.kind == DriveKind::Hazard);
+                    table.add(policy.rule, samples, trial.kind, right);
+                }
+                if samples == OUTCOME_SAMPLES {
+                    let hazard_probability = evidence.hazard_probability() as f32;
+                    outcomes.push(TrialOutcome { hazard_probability, kind: trial.kind });
+                }
             }
         }
-        (table, results.into_iter().map(|(_, outcome)| outcome).collect())
+        (table, outcomes)
     }
 }

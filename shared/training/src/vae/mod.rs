@@ -7,12 +7,14 @@
 
 mod inputs;
 pub mod losses;
+mod other_poses;
 mod train;
 
 use crate::{
     TrainingConfig, TrainingError,
     run::{Context, part, prefixed},
 };
+use carff_checkpoint::shapes::DecoderConfig;
 use carff_dataset::PoseRole;
 use carff_evaluation::{Centroids, Decoding, VaeFigures, state_accuracy};
 use carff_messages::{Gaussian, LATENT_DIM};
@@ -28,17 +30,23 @@ use std::path::Path;
 use tch::{Device, Tensor, nn, nn::VarStore};
 pub use train::VaePhase;
 
-/// Encoder, decoder, and the read-out that only training uses.
+/// Channels of the small decoder.
+const SMALL_CHANNELS: i64 = 32;
+
+/// Encoder, decoder, and what only training uses: the read-out and the small decoder of other poses.
 pub struct Vae {
     /// The encoder.
     pub encoder: Encoder,
     /// The decoder.
     pub decoder: Decoder,
     pub(super) read_out: nn::Linear,
+    /// Present when the decoder is asked for other poses than the input's.
+    pub(super) small_decoder: Option<Decoder>,
     backbone: VarStore,
     head: VarStore,
     decoder_store: VarStore,
     read_out_store: VarStore,
+    small_store: VarStore,
     frozen: bool,
 }
 
@@ -51,7 +59,7 @@ impl Vae {
         pretrained: Option<&Path>,
         device: Device,
     ) -> Result<Self, ModelError> {
-        let [mut backbone, head, decoder_store, read_out_store] = [(); 4].map(|()| VarStore::new(device));
+        let [mut backbone, head, decoder_store, read_out_store, small_store] = [(); 5].map(|()| VarStore::new(device));
         let encoder =
             Encoder::new(&config.encoder, &(backbone.root() / "backbone"), &(head.root() / "encoder"), pretrained)?;
         let decoder = Decoder::new(&(decoder_store.root() / "decoder"), &config.decoder, poses as i64);
@@ -61,11 +69,25 @@ impl Vae {
             states as i64,
             nn::LinearConfig::default(),
         );
+        let small = DecoderConfig { channels: SMALL_CHANNELS, ..config.decoder.clone() };
+        let path = small_store.root() / "small_decoder";
+        let small_decoder = (config.vae.other_poses > 0).then(|| Decoder::small(&path, &small, poses as i64));
         let frozen = config.encoder.backbone.frozen;
         if frozen {
             backbone.freeze();
         }
-        Ok(Self { encoder, decoder, read_out, backbone, head, decoder_store, read_out_store, frozen })
+        Ok(Self {
+            encoder,
+            decoder,
+            read_out,
+            small_decoder,
+            backbone,
+            head,
+            decoder_store,
+            read_out_store,
+            small_store,
+            frozen,
+        })
     }
 
     /// Weights of a checkpoint: encoder head, decoder, backbone.
@@ -79,7 +101,7 @@ impl Vae {
     }
 
     pub(super) fn stores(&self) -> Vec<&VarStore> {
-        let mut stores = vec![&self.head, &self.decoder_store, &self.read_out_store];
+        let mut stores = vec![&self.head, &self.decoder_store, &self.read_out_store, &self.small_store];
         if !self.frozen {
             stores.push(&self.backbone);
         }

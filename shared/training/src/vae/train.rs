@@ -3,6 +3,7 @@
 use super::{
     Inputs, Vae, indices,
     losses::{contrastive, cross_entropy, kl_divergence, reconstruction_error, reparameterised},
+    other_poses::OtherPoses,
 };
 use crate::{
     TrainingError,
@@ -30,6 +31,8 @@ pub struct VaePhase<'a> {
     own: Vec<usize>,
     /// For each image, the distribution over the equivalent states of its view, `[N, S]`.
     state_targets: Tensor,
+    /// Present when the decoder is asked for other poses than the input's.
+    other_poses: Option<OtherPoses>,
     means: Means,
 }
 
@@ -73,6 +76,7 @@ impl<'a> VaePhase<'a> {
             trained: posed.trained_and_random(),
             own: posed.trained(),
             state_targets: state_targets(posed).to_device(vae.device()),
+            other_poses: (context.config.vae.other_poses > 0).then(|| OtherPoses::new(posed, vae.device())),
             means: Means::default(),
         }
     }
@@ -116,19 +120,20 @@ impl<'a> VaePhase<'a> {
 
     /// Terms of one batch of images, each in its own copy. With `decoder_only` the encoder works as after training, and
     /// gets no gradient.
-    fn losses(&self, chosen: &[(usize, usize)], decoder_only: bool) -> Losses {
+    fn losses(&self, chosen: &[(usize, usize)], decoder_only: bool, rng: &mut impl Rng) -> Losses {
         let (settings, posed, vae) = (self.settings(), self.context.posed, self.vae);
         let images = || chosen.iter().map(|&(i, _)| i);
         let features = self.inputs.features(vae, chosen);
         let (mean, log_variance) = vae.encoder.posterior(&features, if decoder_only { 0.0 } else { settings.dropout });
         let latent = reparameterised(&mean, &log_variance, &Tensor::randn_like(&mean));
         let latent = if decoder_only { latent.detach() } else { latent };
-        // The decoder knows only the dataset's poses, and learns from batches of them.
-        let known = images().all(|i| posed.labels[i].role.is_some());
-        let reconstruction = known.then(|| {
-            let decoded: Vec<usize> = images().take(settings.decoder_batch).collect();
-            self.reconstruction(&latent.narrow(0, 0, decoded.len() as i64), &decoded)
-        });
+        let reconstruction = match (&self.other_poses, &vae.small_decoder) {
+            (Some(other_poses), Some(decoder)) if !decoder_only => {
+                let inputs: Vec<_> = images().map(|i| (posed.labels[i].state, posed.labels[i].view)).collect();
+                other_poses.error(decoder, &latent, &inputs, settings, rng)
+            }
+            _ => self.own_poses(&latent, &images().collect::<Vec<_>>()),
+        };
         let kl = kl_divergence(&mean, &log_variance);
         let state = (settings.state_weight > 0.0).then(|| {
             let rows = indices(images(), self.state_targets.device());
@@ -141,15 +146,20 @@ impl<'a> VaePhase<'a> {
         Losses { reconstruction, kl, state, contrastive }
     }
 
-    /// Weighted squared error of the decoder on some images of the dataset, from one latent each.
-    fn reconstruction(&self, latents: &Tensor, decoded: &[usize]) -> Tensor {
-        let (posed, device) = (self.context.posed, latents.device());
+    /// Weighted squared error of the decoder on the first images of a batch, each at its own pose. `None` for a batch
+    /// with images of random poses: the decoder knows only the dataset's poses, and learns from batches of them.
+    fn own_poses(&self, latents: &Tensor, images: &[usize]) -> Option<Tensor> {
+        let (posed, device, settings) = (self.context.posed, latents.device(), self.settings());
+        if images.iter().any(|&i| posed.labels[i].role.is_none()) {
+            return None;
+        }
+        let decoded = &images[..images.len().min(settings.decoder_batch)];
         let views = indices(decoded.iter().map(|&i| posed.labels[i].view), tch::Device::Cpu);
         let targets = posed.targets(decoded).to_device(device);
         let means = posed.pose_means.index_select(0, &views).to_device(device);
-        let made = self.vae.decoder.forward(latents, &views.to_device(device));
+        let made = self.vae.decoder.forward(&latents.narrow(0, 0, decoded.len() as i64), &views.to_device(device));
         let valid = posed.valid_targets(decoded).map(|valid| valid.to_device(device));
-        reconstruction_error(&made, &targets, &means, valid.as_ref(), self.settings())
+        Some(reconstruction_error(&made, &targets, &means, valid.as_ref(), settings))
     }
 }
 
@@ -184,7 +194,7 @@ impl Phase for VaePhase<'_> {
             let chosen: Vec<(usize, usize)> =
                 batch.iter().map(|&i| (i, rng.random_range(0..self.inputs.copies_of(i)))).collect();
             tch::manual_seed(seed as i64 ^ ((step as i64) << 20) ^ i64::from(decoder_only));
-            let losses = self.losses(&chosen, decoder_only);
+            let losses = self.losses(&chosen, decoder_only, &mut rng);
             let loss = self.loss(&losses, kl_weight, decoder_only);
             self.adam.step(&loss, settings.learning_rate * cosine(step, epochs * per_epoch), 5.0);
             let value = |t: &Tensor| t.double_value(&[]);
@@ -284,7 +294,7 @@ fn state_targets(posed: &PosedImages) -> Tensor {
     let states = posed.scenario.state_count();
     let mut rows = Vec::with_capacity(posed.labels.len() * states);
     for label in &posed.labels {
-        let equivalent = posed.equivalent_states(label.view, label.state);
+        let equivalent = posed.seen_alike(label.view, label.state);
         let share = 1.0 / equivalent.len() as f32;
         rows.extend((0..states).map(|s| if equivalent.contains(&s) { share } else { 0.0 }));
     }

@@ -1,0 +1,202 @@
+//! Looks: images with a hazard or without, from poses that give both, and their six kinds.
+
+use super::planning::{NoisyEncoder, Trial, trial_frame};
+use crate::PosedImages;
+use carff_base::statistics::wilson_interval_of_share;
+use carff_dataset::{Image, Observability, PoseRole, ScenarioInfo, drives::DriveKind};
+use carff_scenes::FreePose;
+use serde::{Deserialize, Serialize};
+use std::collections::{BTreeMap, BTreeSet};
+
+/// Names of the kinds by branch (hazard, clear) and visibility of the actor or its place.
+const KINDS: [[&str; 3]; 2] =
+    [["hazard_visible", "hazard_partial", "hazard_hidden"], ["clear_visible", "clear_partial", "clear_hidden"]];
+/// First frame number of free looks, which share no random draws with images of the dataset or free drives.
+const FIRST_FREE: u64 = 1 << 41;
+/// Probabilities are clamped to this and its complement in the log loss.
+pub const SUREST: f64 = 1e-3;
+
+/// One image of a part of the trials.
+#[derive(Clone, Debug)]
+pub struct Look<'a> {
+    /// The image, without sensor noise.
+    pub image: &'a Image,
+    /// Pose of the camera; looks from one pose are not independent.
+    pub pose: usize,
+    /// Name of the kind.
+    pub kind: &'static str,
+    /// True in a hazard branch.
+    pub hazard: bool,
+    /// Probability of a hazard, given the image, the pose and the scenario, with equally probable states.
+    pub exact: f64,
+    /// Frame number, which names the look's random draws.
+    pub frame: u64,
+}
+
+/// Answer of an observer to one look.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Answer {
+    /// Probability of a hazard, 0..=1.
+    pub hazard_probability: f64,
+    /// True to halt, false to advance.
+    pub halt: bool,
+}
+
+impl Answer {
+    /// Halts when the probability reaches the threshold.
+    pub fn at(hazard_probability: f64, threshold: f64) -> Self {
+        Self { hazard_probability, halt: hazard_probability >= threshold }
+    }
+}
+
+/// Figures of one kind of trial. Each image is one trial.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TrialFigures {
+    /// Images.
+    pub images: usize,
+    /// Poses of these images: what is independent.
+    pub poses: usize,
+    /// Trials that were answered with halt.
+    pub halts: usize,
+    /// Trials.
+    pub trials: usize,
+    /// 95 % Wilson interval of the share of halts that counts poses instead of images, `[low, high]`.
+    pub halt_interval: [f64; 2],
+    /// Mean of -ln of the probability given to what is true (hazard or none), clamped to 0.001..=0.999.
+    pub log_loss: f64,
+    /// Mean squared difference between hazard probability and truth, 0..=1.
+    pub brier: f64,
+}
+
+/// Figures by kind: `hazard_visible`, `hazard_partial`, `hazard_hidden`, `clear_visible`, `clear_partial`,
+/// `clear_hidden`. A kind without an image is absent.
+pub type ByTrialKind = BTreeMap<String, TrialFigures>;
+
+/// Names of the six kinds, in the order of tables.
+pub fn kind_names() -> impl Iterator<Item = &'static str> {
+    KINDS.into_iter().flatten()
+}
+
+fn kind_name(hazard: bool, observability: Observability) -> &'static str {
+    let visibility = match observability {
+        Observability::Full => 0,
+        Observability::Partial => 1,
+        Observability::None => 2,
+    };
+    KINDS[usize::from(!hazard)][visibility]
+}
+
+/// Share of hazard branches among the states that can be an input: those before the last time step.
+fn exact_probability(scenario: &ScenarioInfo, alike: impl Iterator<Item = usize>) -> f64 {
+    let inputs = alike.filter(|&state| scenario.timestamp_of(state) + 1 < scenario.timestamps);
+    let (mut hazards, mut all) = (0_usize, 0_usize);
+    for state in inputs {
+        all += 1;
+        hazards += usize::from(scenario.is_hazard(scenario.branch_of(state)));
+    }
+    hazards as f64 / all.max(1) as f64
+}
+
+/// Looks of the dataset's poses of one role, at all time steps but the last.
+pub fn looks_of_role(posed: &PosedImages, role: PoseRole) -> Vec<Look<'_>> {
+    let scenario = &posed.scenario;
+    let all = posed.with_roles(&[role]).into_iter();
+    all.filter(|&i| scenario.timestamp_of(posed.labels[i].state) + 1 < scenario.timestamps)
+        .map(|i| {
+            let label = posed.labels[i];
+            let hazard = scenario.is_hazard(scenario.branch_of(label.state));
+            Look {
+                image: &posed.images[i],
+                pose: label.view,
+                kind: kind_name(hazard, label.observability),
+                hazard,
+                exact: exact_probability(scenario, posed.equivalent_states(label.view, label.state).into_iter()),
+                frame: trial_frame(i, 0),
+            }
+        })
+        .collect()
+}
+
+/// Looks of free poses.
+pub fn free_looks<'a>(poses: &'a [FreePose], scenario: &ScenarioInfo) -> Vec<Look<'a>> {
+    let branches = scenario.branches.len();
+    let of_pose = |(pose, free): (usize, &'a FreePose)| {
+        free.looks.iter().enumerate().map(move |(branch, look)| {
+            let hazard = scenario.is_hazard(branch);
+            let observability = look.observability.unwrap_or(Observability::Full);
+            Look {
+                image: &look.image,
+                pose,
+                kind: kind_name(hazard, observability),
+                hazard,
+                exact: exact_probability(scenario, look.alike.iter().copied()),
+                frame: FIRST_FREE + (pose * branches + branch) as u64,
+            }
+        })
+    };
+    poses.iter().enumerate().flat_map(of_pose).collect()
+}
+
+/// Posteriors of looks behind a camera with sensor noise.
+pub fn encoded(encoder: &NoisyEncoder, looks: &[Look]) -> Vec<Trial> {
+    let kind = |hazard| if hazard { DriveKind::Hazard } else { DriveKind::Clear };
+    looks.iter().filter_map(|look| encoder.trial(look.image, kind(look.hazard), look.frame)).collect()
+}
+
+/// Figures of the answers to looks, in the same order.
+pub fn figures(looks: &[Look], answers: &[Answer]) -> ByTrialKind {
+    let mut poses: BTreeMap<&str, BTreeSet<usize>> = BTreeMap::new();
+    let mut table = ByTrialKind::new();
+    for (look, answer) in looks.iter().zip(answers) {
+        let figures = table.entry(look.kind.to_owned()).or_default();
+        poses.entry(look.kind).or_default().insert(look.pose);
+        let truth = f64::from(u8::from(look.hazard));
+        let p = answer.hazard_probability.clamp(SUREST, 1.0 - SUREST);
+        figures.images += 1;
+        figures.trials += 1;
+        figures.halts += usize::from(answer.halt);
+        figures.log_loss -= if look.hazard { p.ln() } else { (1.0 - p).ln() };
+        figures.brier += (answer.hazard_probability - truth).powi(2);
+    }
+    for (kind, figures) in &mut table {
+        let n = figures.trials as f64;
+        figures.poses = poses.get(kind.as_str()).map_or(0, BTreeSet::len);
+        figures.halt_interval = wilson_interval_of_share(figures.halts as f64 / n, figures.poses as f64);
+        figures.log_loss /= n;
+        figures.brier /= n;
+    }
+    table
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Two poses with two images each: halts are counted by image, the interval by pose; log loss and Brier score are
+    /// the closed forms.
+    #[test]
+    fn figures_of_a_known_case() {
+        let image = Image::filled(2, 2, [0; 3]);
+        let look = |pose, hazard| Look {
+            image: &image,
+            pose,
+            kind: kind_name(hazard, Observability::None),
+            hazard,
+            exact: 0.5,
+            frame: 0,
+        };
+        let looks = [look(0, true), look(0, true), look(1, true), look(1, true), look(1, false)];
+        let answers = [0.5, 0.5, 1.0, 0.0, 0.25].map(|p| Answer::at(p, 0.4));
+        let table = figures(&looks, &answers);
+        let hazard = table["hazard_hidden"];
+        assert_eq!((hazard.images, hazard.poses, hazard.halts, hazard.trials), (4, 2, 3, 4));
+        assert_eq!(hazard.halt_interval, wilson_interval_of_share(0.75, 2.0));
+        let expected = -(2.0 * 0.5_f64.ln() + 0.999_f64.ln() + 0.001_f64.ln()) / 4.0;
+        assert!((hazard.log_loss - expected).abs() < 1e-12);
+        assert!((hazard.brier - (0.25 + 0.25 + 0.0 + 1.0) / 4.0).abs() < 1e-12);
+        let clear = table["clear_hidden"];
+        assert_eq!((clear.halts, clear.poses), (0, 1));
+        assert!((clear.brier - 0.0625).abs() < 1e-12 && table.len() == 2);
+    }
+}
