@@ -1,8 +1,7 @@
 //! One line of the log of a stage or the launcher, as text or as JSON.
 
 use carff_config::LogFormat;
-use carff_recording::LogLine;
-use jiff::{Timestamp, ToSpan};
+use jiff::Timestamp;
 use serde_json::{Map, Value};
 
 /// Levels as stages write them, in text and in JSON.
@@ -23,7 +22,8 @@ pub(crate) fn formatted(format: LogFormat, time: &Timestamp, source: &str, said:
 }
 
 /// Reads a line of a log file, written before `now`. A line of another form is a warning of the launcher at `now`.
-pub(crate) fn parsed(line: &str, now: &Timestamp) -> LogLine {
+#[cfg(feature = "recording")]
+pub(crate) fn parsed(line: &str, now: &Timestamp) -> carff_recording::LogLine {
     let text = |time: Timestamp, source: &str, said: &str| {
         let mut fields = fields(said);
         let mut take = |key| fields.remove(key).and_then(|v| v.as_str().map(str::to_owned));
@@ -32,14 +32,14 @@ pub(crate) fn parsed(line: &str, now: &Timestamp) -> LogLine {
         let message = take("message").unwrap_or_default();
         let rest = fields.iter().map(|(key, value)| format!(" {key}={value}"));
         let message = std::iter::once(message).chain(rest).collect();
-        LogLine { wall_ns: u64::try_from(time.as_nanosecond()).unwrap_or(0), source, level, message }
+        carff_recording::LogLine { wall_ns: u64::try_from(time.as_nanosecond()).unwrap_or(0), source, level, message }
     };
     let (clock, rest) = line.split_once(" [").unwrap_or_default();
     let date = now.strftime("%Y-%m-%d");
     match (format!("{date}T{clock}").parse::<Timestamp>(), rest.split_once("] ")) {
         // The time of day is in the past: after midnight it is that of the day before.
         (Ok(time), Some((source, said))) if time > *now => {
-            text(time.saturating_sub(24.hours()).unwrap_or(time), source, said)
+            text(time.saturating_sub(jiff::SignedDuration::from_hours(24)).unwrap_or(time), source, said)
         }
         (Ok(time), Some((source, said))) => text(time, source, said),
         _ => text(*now, "launcher", line),
@@ -115,6 +115,7 @@ mod tests {
 
     /// A line of a log file is read back with its time, also one from before midnight, source, level and text.
     #[test]
+    #[cfg(feature = "recording")]
     fn lines_are_read_back() {
         let now: Timestamp = "2026-01-02T00:00:01Z".parse().unwrap();
         for format in [LogFormat::Text, LogFormat::Json] {
@@ -127,7 +128,7 @@ mod tests {
                 let line = parsed(&formatted(format, &time, "encoder", said), &now);
                 let wall_ns = time.as_nanosecond() as u64;
                 let (source, level, message) = ("encoder".to_owned(), level.to_owned(), message.to_owned());
-                assert_eq!(line, LogLine { wall_ns, source, level, message });
+                assert_eq!(line, carff_recording::LogLine { wall_ns, source, level, message });
             }
         }
         let said = r#"{"level":"WARN","message":"late","frame":7}"#;
