@@ -143,20 +143,27 @@ class Receiver:
     def next(self) -> Optional[Received]:
         """Returns the oldest waiting valid message, or None."""
         for _ in range(_MAX_DROPS):
-            sample = self._port.receive()
+            try:
+                sample = self._port.receive()
+            except iox2.ReceiveError as error:
+                most = self.topic.limits.borrowed
+                raise RunError(f"topic `{self.topic.name}`: {error}: at most {most} messages can be held; copy arrays") from error
             if sample is None:
                 return None
             received = self._read(sample)
             if received is not None:
                 return received
             self.invalid += 1
+            # Its memory is given back before the next one is taken.
+            del sample
         return None
 
     def newest(self) -> Optional[Received]:
-        """Returns the newest waiting valid message, or None."""
-        newest = None
-        while (received := self.next()) is not None:
-            newest = received
+        """Returns the newest waiting message, or None if there is none or it is not valid. Older ones are dropped."""
+        newest = self.next()
+        while newest is not None and self._port.has_samples():
+            del newest
+            newest = self.next()
         return newest
 
     def wait(self, timeout_s: float) -> bool:
@@ -166,7 +173,7 @@ class Receiver:
             left = min(end - time.monotonic(), 0.2)
             if left <= 0 or not self._node.run.is_alive():
                 return False
-            self._listener.timed_wait(lambda _: None, iox2.Duration.from_secs_f64(left))
+            self._listener.timed_wait(iox2.Duration.from_secs_f64(left))
         return True
 
     def __iter__(self) -> Iterator[Received]:

@@ -121,6 +121,14 @@ def own(node: carff.Node) -> None:
     for version, run_id in ((carff.SCHEMA_VERSION + 1, node.run.run_id), (carff.SCHEMA_VERSION, 1)):
         publisher._port.send_copy(Note(carff.Header(schema_version=version, run_id=run_id), 3.5))
     assert receiver.next() is None and receiver.invalid == 2
+    # A receiver holds as many messages as the topic allows, and one more after one is given back.
+    held = [first, second]
+    for value in range(4):
+        publisher.send(Note(carff.Header(), value))
+    held.append(receiver.next())
+    raises(carff.RunError, "at most 3 messages can be held", receiver.next)
+    del first, held[0]
+    assert receiver.newest().message.value == 3
     raises(TypeError, "takes Note", lambda: publisher.send(carff.Posterior()))
     raises(TypeError, "use `send`", lambda: publisher.loan(2, 2))
 

@@ -74,8 +74,14 @@ fn a_camera_in_python_is_encoded() {
     let graph = TestGraph::new(&scenario_set(), &shipped_checkpoint(), PATIENT);
     let run = graph.run();
     let file = || graph.file().display().to_string();
-    let record =
-        RunRecord { pid: std::process::id(), run_id: run.id(), graph: file(), dataset: file(), checkpoint: file(), started_unix_s: 0 };
+    let record = RunRecord {
+        pid: std::process::id(),
+        run_id: run.id(),
+        graph: file(),
+        dataset: file(),
+        checkpoint: file(),
+        started_unix_s: 0,
+    };
     let lock = RunLock::take(&runtime_dir(), run.name(), &record, "--run").unwrap();
     {
         let node = Node::open(run, "test").unwrap();
