@@ -153,17 +153,29 @@ fn corners(text: &str) -> Result<[[f64; 3]; 2], String> {
     }
 }
 
-/// Returns the path of a scenario file, or of the scenario of that name in configs/scenarios.
+/// Returns the path of a scenario file, or of the scenario of that name: in configs/scenarios of this folder, of a
+/// folder above it, or of the folder in which this program was built or installed.
 fn find_scenario(scenario: &Path) -> anyhow::Result<PathBuf> {
     if scenario.is_file() {
         return Ok(scenario.to_owned());
     }
-    let named = Path::new("configs/scenarios").join(scenario).with_extension("toml");
-    if named.is_file() {
-        return Ok(named);
+    let named = |folder: &PathBuf| {
+        let mut name = folder.join("configs/scenarios").join(scenario).into_os_string();
+        name.push(".toml");
+        PathBuf::from(name)
+    };
+    let (here, program) = (std::env::current_dir().unwrap_or_default(), std::env::current_exe().unwrap_or_default());
+    let installed = program.ancestors().map(|folder| folder.join("share/carff"));
+    let folders: Vec<PathBuf> =
+        here.ancestors().chain(program.ancestors()).map(Path::to_owned).chain(installed).collect();
+    if let Some(found) = folders.iter().map(named).find(|path| path.is_file()) {
+        return Ok(found);
     }
+    // The scenarios that exist, for the suggestion.
+    let shipped = folders.iter().find(|folder| folder.join("configs/scenarios").is_dir()).unwrap_or(&here);
+    let (scenario, named) = (scenario.display(), named(shipped));
     let hint = carff_base::names::beside(&named);
-    bail!("no scenario {}: neither this file nor {} exists{hint}", scenario.display(), named.display());
+    bail!("no scenario {scenario}: neither this file nor {} exists{hint}", named.display());
 }
 
 /// Renders a dataset, with a progress bar. Returns the number of images.

@@ -128,9 +128,10 @@ Exit code: 1 when --verify finds a difference.")]
 
 Exit code: 1 if a finding is an error, else 0.")]
     Doctor(DoctorArgs),
-    /// Print the JSON Schema of a kind of file, for editors.
-    #[command(after_help = "Example: write a file of configs/schemas
+    /// Print the JSON Schema of a kind of file, for editors, or the layouts of the messages, for other languages.
+    #[command(after_help = "Example: write a file of configs/schemas; the layouts of the Python package
   carff schema graph > graph.schema.json
+  carff schema --python > layouts.py
 
 A TOML file names its schema in its first line, for editors that know taplo: #:schema ../schemas/graph.schema.json")]
     Schema(SchemaArgs),

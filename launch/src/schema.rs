@@ -1,5 +1,6 @@
 //! `carff schema`: the JSON Schema of each kind of file, generated from the structures that read the file. Editors use
-//! it for completion and checks. `configs/schemas` contains the generated files.
+//! it for completion and checks. `configs/schemas` contains the generated files. With `--python` or `--c`, the layouts of
+//! the messages in shared memory.
 
 use carff_config::{GraphConfig, SoakConfig};
 use carff_scenes::config::ScenarioConfig;
@@ -7,11 +8,18 @@ use carff_training::TrainingConfig;
 use schemars::generate::SchemaSettings;
 use serde_json::Value;
 
-/// Print the schema of a kind of file.
+/// Print the schema of a kind of file, or the layouts of the messages.
 #[derive(Clone, Debug, clap::Args)]
+#[group(required = true, multiple = false)]
 pub struct SchemaArgs {
     /// Kind of file.
-    pub kind: FileKind,
+    pub kind: Option<FileKind>,
+    /// Print the layouts of all messages as a Python module (python/carff/layouts.py).
+    #[arg(long)]
+    pub python: bool,
+    /// Print the layouts of all messages as a header for C and C++ (examples/cpp/carff.h).
+    #[arg(long)]
+    pub c: bool,
 }
 
 /// A kind of file that a user writes.
@@ -76,9 +84,13 @@ pub fn schema(kind: FileKind) -> Value {
     schema
 }
 
-/// Prints the schema.
+/// Prints the schema or the layouts.
 pub fn run(args: &SchemaArgs) -> anyhow::Result<()> {
-    let text = serde_json::to_string_pretty(&schema(args.kind))? + "\n";
+    let text = match args.kind {
+        Some(kind) => serde_json::to_string_pretty(&schema(kind))? + "\n",
+        None if args.python => carff::layout::python(),
+        None => carff::layout::c(),
+    };
     print!("{text}");
     Ok(())
 }

@@ -1,16 +1,17 @@
 //! `carff bridge`: serves the run's topics over the Foxglove WebSocket protocol, read-only, for headless vehicles.
 
 use crate::complete;
-use crate::record::wall_offset_ns;
+use crate::record::{RunLog, wall_offset_ns};
 use crate::session::{Session, Sessions, WaitArgs};
 use anyhow::Context;
 use carff_checkpoint::Manifest;
 use carff_observe::find;
-use carff_recording::{Encoder, Format};
+use carff_recording::{Encoded, Encoder, Format};
 use carff_transport::TopicId;
 use clap::Args;
 use clap_complete::engine::ArgValueCandidates;
 use foxglove::{ChannelBuilder, PartialMetadata, RawChannel, WebSocketServer, WebSocketServerHandle};
+use std::cell::RefCell;
 use std::collections::BTreeMap;
 use std::collections::btree_map::Entry;
 use std::net::SocketAddr;
@@ -30,7 +31,7 @@ pub struct BridgeArgs {
     /// Allow an address that other machines can reach. Every host that reaches it can see the camera's images.
     #[arg(long)]
     pub remote: bool,
-    /// Topics to serve; all by default.
+    /// Topics to serve; all by default, with the run's log.
     #[arg(add = ArgValueCandidates::new(complete::graph_topics))]
     pub topics: Vec<TopicId>,
     /// The run, the time limit, and the runs after it.
@@ -58,7 +59,8 @@ pub fn run(args: &BridgeArgs) -> anyhow::Result<ExitCode> {
         open.insert(topic.name().to_owned(), channel(topic.name(), Format::Form(topic))?);
     }
     while let Some(session) = sessions.next(|| {})? {
-        serve(session, &topics, &server, &mut open)?;
+        let log = RunLog::of(&session.attached.live, args.topics.is_empty());
+        serve(session, log, &topics, &server, &mut open)?;
     }
     // The server waits for its clients, and a client that does not read would block it indefinitely.
     let stopping = server.stop();
@@ -75,6 +77,7 @@ pub fn run(args: &BridgeArgs) -> anyhow::Result<ExitCode> {
 /// Serves one run to the clients of the server.
 fn serve(
     mut session: Session,
+    mut log: RunLog,
     topics: &[TopicId],
     server: &WebSocketServerHandle,
     open: &mut BTreeMap<String, Arc<RawChannel>>,
@@ -82,6 +85,7 @@ fn serve(
     session.listen(topics.iter().copied())?;
     let places = Manifest::load(&session.attached.live.checkpoint).map(|m| m.places).unwrap_or_default();
     let mut encoder = Encoder::new(places, wall_offset_ns());
+    let open = RefCell::new(open);
     let going = session.follow(
         |topic, message| {
             // Nothing is encoded without a client.
@@ -89,22 +93,27 @@ fn serve(
                 return Ok(true);
             }
             let message = message.message();
-            let log_time = Some(encoder.wall_ns(message.header().publish_time_ns));
-            for message in encoder.encode(topic, message)? {
-                let channel = match open.entry(message.channel) {
-                    Entry::Occupied(known) => known.into_mut(),
-                    Entry::Vacant(new) => {
-                        let opened = channel(new.key(), message.format)?;
-                        new.insert(opened)
-                    }
-                };
-                channel.log_with_meta(&message.data, PartialMetadata { log_time });
-            }
+            let wall_ns = encoder.wall_ns(message.header().publish_time_ns);
+            let encoded = encoder.encode(topic, message)?;
+            encoded.into_iter().try_for_each(|message| send(&mut open.borrow_mut(), message, wall_ns))?;
             Ok(true)
         },
-        || Ok(()),
+        || log.lines().iter().try_for_each(|line| send(&mut open.borrow_mut(), line.encode(), line.wall_ns)),
     )?;
     session.say_end(going);
+    Ok(())
+}
+
+/// Sends a message on its channel, which is opened for its first message.
+fn send(open: &mut BTreeMap<String, Arc<RawChannel>>, message: Encoded, wall_ns: u64) -> anyhow::Result<()> {
+    let channel = match open.entry(message.channel) {
+        Entry::Occupied(known) => known.into_mut(),
+        Entry::Vacant(new) => {
+            let opened = channel(new.key(), message.format)?;
+            new.insert(opened)
+        }
+    };
+    channel.log_with_meta(&message.data, PartialMetadata { log_time: Some(wall_ns) });
     Ok(())
 }
 

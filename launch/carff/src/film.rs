@@ -323,7 +323,8 @@ impl Scene {
         let above = self.view_px.map(|size_px| match &self.view {
             Some((view, image)) => {
                 let state = self.state_name(view.state);
-                let caption = format!("frame {}: {state}, {:.0} %", view.header.frame_id, 100.0 * view.probability);
+                let (of, share) = (view.header.frame_id, 100.0 * view.probability);
+                let caption = format!("a hypothesis of frame {of} ({share:.0} %): {state}");
                 (caption, resized(image, size_px))
             }
             None => ("no rendered hypothesis yet".to_owned(), Image::filled(size_px[0], size_px[1], [228, 230, 234])),

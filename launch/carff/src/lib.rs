@@ -11,6 +11,7 @@ pub mod export;
 #[cfg(feature = "film")]
 mod film;
 mod http;
+pub mod layout;
 mod log_file;
 pub mod log_line;
 pub mod metrics;

@@ -1,8 +1,8 @@
-//! A log file of limited size: one earlier file is kept.
+//! The log file of a run: writing it with a limited size, where one earlier file is kept, and reading it as it grows.
 
 use std::fs::{File, OpenOptions};
-use std::io::{Result, Write};
-use std::os::unix::fs::OpenOptionsExt;
+use std::io::{Read, Result, Seek, SeekFrom, Write};
+use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 
 /// Size at which a new file begins, bytes.
@@ -34,6 +34,44 @@ impl LogFile {
     }
 }
 
+/// Reads the log file of a run as it grows, also across the start of the next file.
+#[derive(Debug)]
+pub(crate) struct LogTail {
+    path: PathBuf,
+    file: File,
+    /// Start of a line whose end is not written yet.
+    begun: Vec<u8>,
+}
+
+impl LogTail {
+    /// Opens the file, to read it from its start.
+    pub(crate) fn open(path: &Path) -> Result<Self> {
+        Ok(Self { path: path.to_owned(), file: File::open(path)?, begun: Vec::new() })
+    }
+
+    /// Opens the file, to read what is written from now on.
+    pub(crate) fn open_at_end(path: &Path) -> Result<Self> {
+        let mut tail = Self::open(path)?;
+        tail.file.seek(SeekFrom::End(0))?;
+        Ok(tail)
+    }
+
+    /// Returns the lines written since the last call, with their ends.
+    pub(crate) fn read(&mut self) -> Result<String> {
+        let mut text = std::mem::take(&mut self.begun);
+        // Looked up before the last lines are read: nothing is written to a file that has another name.
+        let current = std::fs::metadata(&self.path).map(|m| m.ino());
+        self.file.read_to_end(&mut text)?;
+        if current.is_ok_and(|inode| self.file.metadata().is_ok_and(|m| m.ino() != inode)) {
+            self.file = File::open(&self.path)?;
+            self.file.read_to_end(&mut text)?;
+        }
+        let end = text.iter().rposition(|&byte| byte == b'\n').map_or(0, |at| at + 1);
+        self.begun = text.split_off(end);
+        Ok(String::from_utf8_lossy(&text).into_owned())
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -49,5 +87,25 @@ mod tests {
         let size = |path: &Path| path.metadata().unwrap().len();
         assert!(size(&path) <= LIMIT_BYTES + (1 << 21) && size(&path.with_extension("log.1")) >= LIMIT_BYTES);
         assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 2);
+    }
+
+    /// A reader gets every line once and whole, also across the start of the next file.
+    #[test]
+    fn a_log_is_read_as_it_grows() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("run.log");
+        let mut log = LogFile::create(&path).unwrap();
+        log.line("before").unwrap();
+        let (mut all, mut new) = (LogTail::open(&path).unwrap(), LogTail::open_at_end(&path).unwrap());
+        assert_eq!((all.read().unwrap().as_str(), new.read().unwrap().as_str()), ("before\n", ""));
+        write!(log.file, "half").unwrap();
+        assert_eq!(new.read().unwrap(), "");
+        log.line(" a line").unwrap();
+        log.line(&"x".repeat(LIMIT_BYTES as usize)).unwrap();
+        log.line("in the next file").unwrap();
+        let read = new.read().unwrap();
+        assert!(read.starts_with("half a line\nx") && read.ends_with("x\nin the next file\n"), "{}", read.len());
+        assert_eq!(all.read().unwrap(), read);
+        assert_eq!(new.read().unwrap(), "");
     }
 }

@@ -1,12 +1,15 @@
 //! `carff record`: writes the messages of a running graph into an MCAP file.
 
+use crate::log_file::LogTail;
+use crate::log_line;
+use crate::runs::log_path;
 use crate::session::{Session, Sessions, WaitArgs};
 use crate::terminal::Terminal;
 use crate::{complete, provenance};
 use anyhow::Context;
 use carff_checkpoint::Manifest;
 use carff_observe::LiveRun;
-use carff_recording::{About, Limits, RecordingQueue, RotatingWriter};
+use carff_recording::{About, Limits, LogLine, RecordingQueue, RotatingWriter};
 use carff_transport::TopicId;
 use carff_transport::monotonic_now_ns;
 use clap::Args;
@@ -21,7 +24,7 @@ const STATUS_NS: u64 = 1_000_000_000;
 /// Record a run.
 #[derive(Clone, Debug, Args)]
 pub struct RecordArgs {
-    /// Topics to record; all by default.
+    /// Topics to record; all by default, with the run's log.
     #[arg(add = ArgValueCandidates::new(complete::graph_topics))]
     pub topics: Vec<TopicId>,
     /// File to write; it must not exist. With --wait, the names of the files also have the run and the start (UTC).
@@ -81,6 +84,7 @@ fn record(args: &RecordArgs, mut session: Session, out: &Path) -> anyhow::Result
     };
     let writer = RotatingWriter::create(out, about(live, states)?, places, limits)?;
     let queue = RecordingQueue::start(writer, args.queue_mb * 1_000_000).context("cannot start the writer")?;
+    let mut log = RunLog::of(live, args.topics.is_empty());
     let terminal = Terminal::new();
     let name = live.name.clone();
     let (mut status_ns, mut told) = (0, 0);
@@ -88,6 +92,7 @@ fn record(args: &RecordArgs, mut session: Session, out: &Path) -> anyhow::Result
         // A failed writer ends the recording; its error is reported below.
         |topic, message| Ok(queue.push(topic, message.message().to_owned())),
         || {
+            log.lines().into_iter().for_each(|line| _ = queue.push_log(line));
             let now_ns = monotonic_now_ns();
             if now_ns >= status_ns {
                 status_ns = now_ns + STATUS_NS;
@@ -111,6 +116,24 @@ fn record(args: &RecordArgs, mut session: Session, out: &Path) -> anyhow::Result
     let counts = queue.finish().context("the recording ended early; its file is readable")?;
     println!("{}: {} messages of run {name}, {} dropped", out.display(), counts.written, counts.dropped);
     Ok(())
+}
+
+/// The log of a run from now on.
+#[derive(Debug)]
+pub(crate) struct RunLog(Option<LogTail>);
+
+impl RunLog {
+    /// Opens the log of a run if it is `wanted`. A run that another program started has none.
+    pub(crate) fn of(live: &LiveRun, wanted: bool) -> Self {
+        Self(wanted.then(|| LogTail::open_at_end(&log_path(&live.dir, &live.name)).ok()).flatten())
+    }
+
+    /// Returns the lines since the last call. An unreadable log has none: messages matter more.
+    pub(crate) fn lines(&mut self) -> Vec<LogLine> {
+        let text = self.0.as_mut().and_then(|log| log.read().ok()).unwrap_or_default();
+        let now = jiff::Timestamp::now();
+        text.lines().map(|line| log_line::parsed(line, &now)).collect()
+    }
 }
 
 /// Returns the difference of wall-clock time (nanoseconds since 1970) and monotonic time.

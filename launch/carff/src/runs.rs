@@ -1,14 +1,14 @@
 //! `carff ps`, `stop` and `logs`: the living runs of this user, their end, and their log.
 
 use crate::complete;
+use crate::log_file::LogTail;
 use anyhow::{Context, bail, ensure};
 use carff_observe::{LiveRun, runs};
 use carff_transport::{Run, Stop, Waiter, Woken, monotonic_now_ns, runtime_dirs};
 use clap_complete::engine::ArgValueCandidates;
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::json;
-use std::fs::File;
-use std::io::{Read, Write, stdout};
+use std::io::{Write, stdout};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::{Duration, SystemTime};
@@ -103,14 +103,12 @@ pub fn logs(args: &LogsArgs) -> anyhow::Result<ExitCode> {
         (Some(name), Err(_)) if Run::new(name, 0).is_ok() => (None, ended_log(name)?),
         (_, Err(error)) => return Err(error.into()),
     };
-    let mut file = File::open(&path).with_context(|| format!("cannot read {}", path.display()))?;
+    let mut log = LogTail::open(&path).with_context(|| format!("cannot read {}", path.display()))?;
     let waiter = Waiter::new(Stop::on_signals()?);
     loop {
         // In this order, so that the last lines of a run are read after its end.
         let lives = args.follow && live.as_ref().is_some_and(LiveRun::is_alive);
-        let mut text = Vec::new();
-        file.read_to_end(&mut text)?;
-        stdout().write_all(&text)?;
+        stdout().write_all(log.read()?.as_bytes())?;
         stdout().flush()?;
         if !lives || waiter.wait_until(&[], monotonic_now_ns() + LOOK_NS)? == Woken::Stopped {
             return Ok(ExitCode::SUCCESS);

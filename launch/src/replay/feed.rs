@@ -1,14 +1,14 @@
 //! Sends recorded messages in place of their stages.
 
 use super::compare::{COMPARED, Replayed};
-use anyhow::Context;
+use anyhow::{Context, ensure};
 use carff::terminal::Terminal;
 use carff_messages::forms::{AnyMessage, OwnedMessage};
 use carff_messages::{Action, Header, MAX_IMAGE_BYTES};
 use carff_recording::{Entry, Reader};
 use carff_transport::{AnyPublisher, AnyReceiver, Node, Run, Stop, TopicId, Waiter, Woken, monotonic_now_ns};
 use std::collections::{BTreeMap, BTreeSet};
-use std::io::BufRead;
+use std::io::{BufRead, IsTerminal, stdin};
 use std::path::PathBuf;
 use std::sync::mpsc::{Receiver, TryRecvError, channel};
 use std::sync::{Arc, Mutex};
@@ -198,8 +198,16 @@ impl Player {
         loop {
             match keys.try_recv() {
                 Ok(()) => return Ok(true),
-                // The end of the input ends the replay.
-                Err(TryRecvError::Disconnected) => return Ok(false),
+                Err(TryRecvError::Disconnected) => {
+                    // The last frame's results are still in progress.
+                    self.look_until(waiter, back, monotonic_now_ns() + LINGER_NS, |_| false)?;
+                    ensure!(
+                        stdin().is_terminal(),
+                        "standard input ended before the recording: `--step` sends one frame for each line; start it \
+                         in a terminal, or use `--rate` or `--verify`"
+                    );
+                    return Ok(false);
+                }
                 Err(TryRecvError::Empty) => {}
             }
             if !self.look_until(waiter, back, monotonic_now_ns() + 10 * LOOK_NS, |_| false)? {
@@ -227,7 +235,7 @@ impl Player {
 fn keys() -> Receiver<()> {
     let (sender, receiver) = channel();
     std::thread::spawn(move || {
-        for line in std::io::stdin().lock().lines() {
+        for line in stdin().lock().lines() {
             if line.is_err() || sender.send(()).is_err() {
                 return;
             }

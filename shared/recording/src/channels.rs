@@ -59,6 +59,26 @@ impl Encoded {
     }
 }
 
+/// A line of a run's log, from a stage or the launcher.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct LogLine {
+    /// Time of the line, nanoseconds since 1970.
+    pub wall_ns: u64,
+    /// Stage that wrote it, or `launcher`.
+    pub source: String,
+    /// Level: `ERROR`, `WARN`, `INFO`, `DEBUG` or `TRACE`.
+    pub level: String,
+    /// The text.
+    pub message: String,
+}
+
+impl LogLine {
+    /// Encodes the line for the channel `log`.
+    pub fn encode(&self) -> Encoded {
+        Encoded::protobuf("log", &standard::log_line(self))
+    }
+}
+
 /// Encodes a run's messages for their channels.
 ///
 /// No channel mixes sources: each camera, horizon step and hypothesis has its own.

@@ -10,7 +10,7 @@
 //! | `camera/calibration`, `renderer/CAMERA/calibration` | `foxglove.CameraCalibration` | intrinsics |
 //! | `camera/pose`, `renderer/CAMERA/pose` | `foxglove.FrameTransform` | world space from camera space |
 //! | `prober/boxes/stepN` | `foxglove.SceneUpdate` | the probed places, with their probability |
-//! | `log` | `foxglove.Log` | changes of a stage's health and of the action |
+//! | `log` | `foxglove.Log` | changes of a stage's health and of the action, and the lines of the run's log |
 //!
 //! Log times are the wall-clock times of publication. Stamps in protobuf messages are the wall-clock times of capture;
 //! of a log entry, that of publication. The forms' headers contain the monotonic times. The metadata record `carff`
@@ -25,7 +25,7 @@ mod standard;
 mod writer;
 
 pub use about::About;
-pub use channels::{Encoded, Encoder, Format};
+pub use channels::{Encoded, Encoder, Format, LogLine};
 pub use queue::{QueueCounts, RecordingQueue};
 pub use reader::{Entry, Reader};
 pub use rotation::{Limits, RotatingWriter};

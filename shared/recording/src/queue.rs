@@ -1,6 +1,6 @@
 //! A queue before the disk, so that subscribers of the graph never wait for the disk.
 
-use crate::{RecordingError, RotatingWriter};
+use crate::{LogLine, RecordingError, RotatingWriter};
 use carff_messages::forms::OwnedMessage;
 use carff_transport::TopicId;
 use crossbeam::channel::{Receiver, RecvTimeoutError, Sender, TrySendError, bounded};
@@ -30,6 +30,22 @@ struct Shared {
     dropped: AtomicU64,
 }
 
+/// An item of the queue.
+#[derive(Debug)]
+enum Item {
+    Message(TopicId, OwnedMessage),
+    Log(LogLine),
+}
+
+impl Item {
+    fn size_bytes(&self) -> u64 {
+        match self {
+            Self::Message(_, message) => message.as_message().size_bytes() as u64,
+            Self::Log(line) => (size_of::<LogLine>() + line.message.len()) as u64,
+        }
+    }
+}
+
 /// Writes a recording on a separate thread from a bounded queue.
 ///
 /// ```
@@ -50,7 +66,7 @@ struct Shared {
 /// ```
 #[derive(Debug)]
 pub struct RecordingQueue {
-    sender: Option<Sender<(TopicId, OwnedMessage)>>,
+    sender: Option<Sender<Item>>,
     shared: Arc<Shared>,
     limit_bytes: u64,
     thread: Option<JoinHandle<Result<(), RecordingError>>>,
@@ -70,14 +86,23 @@ impl RecordingQueue {
     /// Queues a message, or drops and counts it if the queue is full. Returns false if the writer has failed: then
     /// [`RecordingQueue::finish`] returns the error.
     pub fn push(&self, topic: TopicId, message: OwnedMessage) -> bool {
+        self.queue(Item::Message(topic, message))
+    }
+
+    /// Queues a line of the run's log like a message.
+    pub fn push_log(&self, line: LogLine) -> bool {
+        self.queue(Item::Log(line))
+    }
+
+    fn queue(&self, item: Item) -> bool {
         let Some(sender) = &self.sender else { return false };
-        let bytes = message.as_message().size_bytes() as u64;
+        let bytes = item.size_bytes();
         if self.shared.waiting_bytes.load(Ordering::Relaxed) + bytes > self.limit_bytes {
             self.shared.dropped.fetch_add(1, Ordering::Relaxed);
             return true;
         }
         self.shared.waiting_bytes.fetch_add(bytes, Ordering::Relaxed);
-        match sender.try_send((topic, message)) {
+        match sender.try_send(item) {
             Ok(()) => true,
             Err(TrySendError::Full(_)) => {
                 self.shared.waiting_bytes.fetch_sub(bytes, Ordering::Relaxed);
@@ -119,17 +144,16 @@ impl Drop for RecordingQueue {
     }
 }
 
-fn drain(
-    mut writer: RotatingWriter,
-    receiver: &Receiver<(TopicId, OwnedMessage)>,
-    shared: &Shared,
-) -> Result<(), RecordingError> {
+fn drain(mut writer: RotatingWriter, receiver: &Receiver<Item>, shared: &Shared) -> Result<(), RecordingError> {
     let mut flushed = Instant::now();
     loop {
         match receiver.recv_timeout(FLUSH_EVERY) {
-            Ok((topic, message)) => {
-                writer.write(topic, message.as_message())?;
-                shared.waiting_bytes.fetch_sub(message.as_message().size_bytes() as u64, Ordering::Relaxed);
+            Ok(item) => {
+                match &item {
+                    Item::Message(topic, message) => writer.write(*topic, message.as_message())?,
+                    Item::Log(line) => writer.write_log(line)?,
+                }
+                shared.waiting_bytes.fetch_sub(item.size_bytes(), Ordering::Relaxed);
                 shared.written.fetch_add(1, Ordering::Relaxed);
             }
             Err(RecvTimeoutError::Timeout) => {}

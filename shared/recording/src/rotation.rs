@@ -1,6 +1,6 @@
 //! A recording as a sequence of files with limits.
 
-use crate::{About, RecordingError, Writer};
+use crate::{About, LogLine, RecordingError, Writer};
 use carff_decision::Place;
 use carff_messages::forms::AnyMessage;
 use carff_transport::TopicId;
@@ -59,6 +59,11 @@ impl RotatingWriter {
             self.begun_ns = Some(now_ns);
         }
         self.writer.write(topic, message)
+    }
+
+    /// Writes a line of the run's log into the current file.
+    pub fn write_log(&mut self, line: &LogLine) -> Result<(), RecordingError> {
+        self.writer.write_log(line)
     }
 
     /// Makes the written messages safe, and starts the next file if this one is too large.

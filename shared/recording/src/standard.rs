@@ -1,5 +1,6 @@
 //! Messages in the standard robotics schemas: images, calibrations, poses, boxes, logs.
 
+use crate::LogLine;
 use carff_decision::Place;
 use carff_messages::forms::AnyMessage;
 use carff_messages::{Action, ActionCode, Belief, Health, HealthState, Intrinsics, Reason, Stage};
@@ -147,6 +148,24 @@ fn label(place: &Place, text: String) -> TextPrimitive {
         scale_invariant: true,
         color: Some(Color { r: 1.0, g: 1.0, b: 1.0, a: 1.0 }),
         text,
+    }
+}
+
+/// Returns a line of a run's log.
+pub(crate) fn log_line(line: &LogLine) -> Log {
+    let level = match line.level.as_str() {
+        "TRACE" | "DEBUG" => Level::Debug,
+        "INFO" => Level::Info,
+        "ERROR" => Level::Error,
+        _ => Level::Warning,
+    };
+    Log {
+        timestamp: Some(timestamp(line.wall_ns)),
+        level: level.into(),
+        message: line.message.clone(),
+        name: line.source.clone(),
+        file: String::new(),
+        line: 0,
     }
 }
 

@@ -1,7 +1,7 @@
 //! Writes one file of a recording.
 
 use crate::about::METADATA;
-use crate::{About, Encoded, Encoder, RecordingError};
+use crate::{About, Encoded, Encoder, LogLine, RecordingError};
 use carff_decision::Place;
 use carff_messages::forms::AnyMessage;
 use carff_transport::TopicId;
@@ -100,18 +100,18 @@ impl Writer {
             sequence,
             cause: e.to_string(),
         })?;
-        for message in encoded {
-            let header = MessageHeader {
-                channel_id: self.channel(&message).map_err(|e| RecordingError::mcap(&self.path, e))?,
-                sequence,
-                log_time: wall_ns,
-                publish_time: wall_ns,
-            };
-            self.inner
-                .write_to_known_channel(&header, &message.data)
-                .map_err(|e| RecordingError::mcap(&self.path, e))?;
-        }
-        Ok(())
+        encoded.iter().try_for_each(|message| self.append(message, sequence, wall_ns))
+    }
+
+    /// Writes a line of the run's log.
+    pub fn write_log(&mut self, line: &LogLine) -> Result<(), RecordingError> {
+        self.append(&line.encode(), 0, line.wall_ns)
+    }
+
+    fn append(&mut self, message: &Encoded, sequence: u32, wall_ns: u64) -> Result<(), RecordingError> {
+        let channel_id = self.channel(message).map_err(|e| RecordingError::mcap(&self.path, e))?;
+        let header = MessageHeader { channel_id, sequence, log_time: wall_ns, publish_time: wall_ns };
+        self.inner.write_to_known_channel(&header, &message.data).map_err(|e| RecordingError::mcap(&self.path, e))
     }
 
     /// Returns the id of a message's channel, which is created for its first message.

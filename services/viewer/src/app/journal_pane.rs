@@ -9,6 +9,8 @@ use egui_plot::{GridMark, Line, Plot, PlotPoints};
 const DECISIONS: f32 = 0.5;
 /// Shorter durations are drawn as this one, because the axis is logarithmic.
 const LEAST_MS: f64 = 0.01;
+/// Least distance between two labels of the axis, points; labels that are closer are faint or missing.
+const LABEL_HEIGHT: f64 = 26.0;
 
 impl Viewer {
     pub(super) fn journal_pane(&mut self, ui: &mut Ui) {
@@ -70,11 +72,13 @@ fn decisions(ui: &mut Ui, journal: &Journal) {
     });
 }
 
-/// Returns the powers of ten on the axis.
-fn decades((low, high): (f64, f64)) -> Vec<GridMark> {
-    let shown = low..=high;
-    let all = (-2..=6).map(|decade| GridMark { value: f64::from(decade), step_size: 1.0 });
-    all.filter(|mark| shown.contains(&mark.value)).collect()
+/// Returns the powers of ten on an axis of this height, in steps that leave room for their labels.
+fn decades((low, high): (f64, f64), height: f32) -> Vec<GridMark> {
+    let decade_height = f64::from(height) / (high - low);
+    let step = (1..=4).find(|step| f64::from(*step) * decade_height >= LABEL_HEIGHT).unwrap_or(4);
+    let all = (-2..=6).filter(|decade| decade % step == 0);
+    let marks = all.map(|decade| GridMark { value: f64::from(decade), step_size: f64::from(step) });
+    marks.filter(|mark| (low..=high).contains(&mark.value)).collect()
 }
 
 /// Returns the label of a value on the logarithmic axis.
@@ -92,10 +96,11 @@ fn latency(ui: &mut Ui, journal: &Journal, x_label: &str) {
     let color = |i: usize| -> Color32 { palette.lines[i % palette.lines.len()] };
     ui.horizontal_top(|ui| {
         let plot_width = (ui.available_width() - 236.0).max(120.0);
+        let height = ui.available_height() - LABEL_HEIGHT as f32;
         Plot::new("latency")
             .width(plot_width)
             .height(ui.available_height())
-            .y_grid_spacer(|input| decades(input.bounds))
+            .y_grid_spacer(move |input| decades(input.bounds, height))
             .y_axis_formatter(|mark, _| milliseconds(mark.value))
             .y_axis_label(theme::small("latency, ms"))
             .x_axis_label(theme::small(x_label))
@@ -129,4 +134,23 @@ fn latency(ui: &mut Ui, journal: &Journal, x_label: &str) {
             }
         });
     });
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Some powers of ten are on the axis at any height and range, never closer than their labels are high.
+    #[test]
+    fn the_axis_has_labels() {
+        for height in [60.0, 90.0, 130.0, 400.0] {
+            for bounds in [(-0.2, 0.9), (-2.3, 5.1), (1.5, 4.2), (-1.0, 6.0)] {
+                let marks = decades(bounds, height);
+                assert!(!marks.is_empty(), "{height} {bounds:?}");
+                let distance = marks[0].step_size * f64::from(height) / (bounds.1 - bounds.0);
+                assert!(distance >= LABEL_HEIGHT, "{height} {bounds:?}");
+                assert!(marks.windows(2).all(|pair| pair[1].value - pair[0].value == pair[0].step_size));
+            }
+        }
+    }
 }

@@ -17,7 +17,7 @@ const DRIVES: usize = 8;
 /// Largest number of hypotheses that are shown of each drive.
 const HYPOTHESES: usize = 3;
 /// Occupancies at which an object is visibly transparent.
-const FAINT: RangeInclusive<f32> = 0.1..=0.9;
+const FAINT: RangeInclusive<f32> = 0.2..=0.8;
 const RIGHT: [u8; 3] = [46, 155, 90];
 const WRONG: [u8; 3] = [205, 50, 45];
 const HAZARD: [u8; 3] = [236, 140, 20];
@@ -101,7 +101,7 @@ impl Artist<'_> {
     }
 
     fn caption(&self, frame: &DecidedFrame, kind: DriveKind, right: bool) -> Vec<String> {
-        let verdict = if right { "right" } else { "WRONG" };
+        let verdict = if right { "correct" } else { "WRONG" };
         let truth = match kind {
             DriveKind::Hazard => "the actor comes, hidden",
             DriveKind::Clear => "no actor comes, in full view",
@@ -168,7 +168,8 @@ impl Artist<'_> {
             });
         }
         if let Some(last) = cells.last_mut().filter(|_| hidden > 0) {
-            last.caption.push(format!("not shown: {hidden} samples of other states"));
+            let plural = if hidden == 1 { "" } else { "s" };
+            last.caption.push(format!("not shown: {hidden} sample{plural} of other states"));
         }
         cells
     }
@@ -229,8 +230,9 @@ mod tests {
         let of = |occupancies: [f32; 3]| {
             faint(&places, &Probed { occupancies: occupancies.to_vec(), reading: reading.clone() })
         };
-        assert_eq!(of([0.34, 0.2, 0.99]).as_deref(), Some("half-transparent: actor 34 %"));
+        assert_eq!(of([0.34, 0.25, 0.99]).as_deref(), Some("half-transparent: actor 34 %"));
         assert_eq!(of([0.02, 0.98, 0.5]).as_deref(), Some("half-transparent: ego 50 %"));
-        assert_eq!(of([0.02, 0.98, 1.0]), None);
+        // A faint trace next to an opaque object is not a half-transparent object.
+        assert_eq!(of([0.13, 0.98, 0.86]), None);
     }
 }
