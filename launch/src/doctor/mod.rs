@@ -81,7 +81,7 @@ pub fn examine(args: &DoctorArgs) -> anyhow::Result<Vec<Finding>> {
     let (library, version) = gather::libtorch();
     findings.push(checks::libtorch(library.as_deref(), version.as_deref()));
     let folder = std::env::current_exe()?.parent().context("this program has no folder")?.to_owned();
-    findings.push(checks::programs(&folder, &gather::missing_programs(&folder)));
+    findings.push(checks::programs(&folder, &gather::missing_programs(&folder, &stages)));
 
     match (&args.graph, graph) {
         (Some(path), Some(Ok(config))) => {
