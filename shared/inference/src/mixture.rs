@@ -32,13 +32,14 @@ impl MixtureNet {
         }
         let wrong = |e: InferenceError| CheckpointError::Weights { path: dir.into(), what: e.to_string() };
         let config = &manifest.mixture;
-        if !(1..=4).contains(&config.components) {
-            let allowed = "1 to 4";
-            return Err(wrong(InferenceError::Setting {
-                key: "mixture.components",
-                value: config.components,
-                allowed,
-            }));
+        for (key, value, range, allowed) in [
+            ("mixture.components", config.components, 1..=4, "1 to 4"),
+            ("mixture.hidden", config.hidden, 1..=i64::MAX, "at least 1"),
+            ("mixture.weight_hidden", config.weight_hidden, 1..=i64::MAX, "at least 1"),
+        ] {
+            if !range.contains(&value) {
+                return Err(wrong(InferenceError::Setting { key, value, allowed }));
+            }
         }
         let mut weights = Weights::read(&path).map_err(wrong)?;
         let (d, k, h, w) = (LATENT_DIM as i64, config.components, config.hidden, config.weight_hidden);
