@@ -12,11 +12,11 @@ ifneq ($(LIBTORCH),)
 export LIBTORCH
 export LD_LIBRARY_PATH := $(LIBTORCH)/lib$(if $(LD_LIBRARY_PATH),:$(LD_LIBRARY_PATH))
 else ifneq ($(CARGO_TARGET_DIR),)
-# Programs look for libtorch next to ./target. With another target folder they need LD_LIBRARY_PATH.
-export LD_LIBRARY_PATH := $(CURDIR)/.libtorch/lib$(if $(LD_LIBRARY_PATH),:$(LD_LIBRARY_PATH))
+# Programs look for libtorch and ONNX Runtime next to ./target. With another target folder they need LD_LIBRARY_PATH.
+export LD_LIBRARY_PATH := $(CURDIR)/.libtorch/lib:$(CURDIR)/.onnxruntime/lib$(if $(LD_LIBRARY_PATH),:$(LD_LIBRARY_PATH))
 endif
 
-.PHONY: help run build deb check-deb link check-link test soak fuzz bench-peer lint sanitize miri sbom fmt libtorch
+.PHONY: help run build deb check-deb link check-link test soak fuzz bench-peer lint sanitize miri sbom fmt libtorch onnxruntime
 
 help: ## List the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -24,11 +24,11 @@ help: ## List the targets
 # The programs of a run. `make run` leaves out the window, the benchmarks, films and the bridge.
 RUNNING := carff carff-launch carff-camera carff-encoder carff-forecaster carff-prober carff-renderer carff-controller
 
-run: libtorch ## Drive the shipped model through the intersection; show decisions, then write report, JSON and filmstrip
+run: libtorch onnxruntime ## Drive the shipped model through the intersection; show decisions, then write report, JSON and filmstrip
 	cargo build --release --locked --bins --no-default-features $(addprefix -p ,$(RUNNING))
 	$(TARGET)/release/carff launch $(GRAPH) --report $(REPORT)
 
-build: libtorch ## Build all programs
+build: libtorch onnxruntime ## Build all programs
 	cargo build --release --locked --workspace --bins
 
 test: build ## Run all tests, including whole graphs of processes
@@ -98,4 +98,7 @@ fmt: ## Format all Rust sources
 	cargo fmt --all
 
 libtorch: ## Fetch libtorch once (your own LIBTORCH wins)
-	@$(PYTHON) launch/packaging/fetch_libtorch.py
+	@$(PYTHON) launch/packaging/fetch_libraries.py libtorch
+
+onnxruntime: ## Fetch ONNX Runtime once (your own ORT_DYLIB_PATH wins)
+	@$(PYTHON) launch/packaging/fetch_libraries.py onnxruntime

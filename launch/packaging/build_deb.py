@@ -5,7 +5,7 @@ Usage: python3 launch/packaging/build_deb.py [TARGET] [OUT]     (default: target
 
 | content | path |
 |---|---|
-| programs (carff-link only if it was built), libtorch | /usr/lib/carff/bin, /usr/lib/carff/lib |
+| programs (carff-link only if it was built), libtorch, ONNX Runtime | /usr/lib/carff/bin, /usr/lib/carff/lib |
 | checkpoints, graphs, scenarios, schemas | /usr/share/carff/configs |
 | graph file of the service | /etc/carff/vehicle.toml |
 | units | /lib/systemd/system |
@@ -27,8 +27,8 @@ from pathlib import Path
 import build_sbom
 
 ROOT = Path(__file__).resolve().parents[2]
-PROGRAMS = ["carff", "carff-launch", "carff-camera", "carff-encoder", "carff-forecaster", "carff-prober", "carff-renderer",
-            "carff-controller", "carff-viewer"]
+PROGRAMS = ["carff", "carff-launch", "carff-camera", "carff-encoder", "carff-encoder-tch", "carff-forecaster", "carff-prober",
+            "carff-renderer", "carff-controller", "carff-viewer"]
 # Included if it was built with `make link`.
 OPTIONAL = ["carff-link"]
 # The run path of a program built in the project, and its replacement in the package.
@@ -82,6 +82,7 @@ def fill(tree: Path, target: Path) -> None:
         put(library, home / "lib" / library.name)
     if (libtorch / "build-version").is_file():
         put(libtorch / "build-version", home / "build-version")
+    put(Path(os.environ.get("ORT_DYLIB_PATH") or ROOT / ".onnxruntime/lib/libonnxruntime.so.1"), home / "lib/libonnxruntime.so.1")
     (tree / "usr/bin").mkdir(parents=True)
     (tree / "usr/bin/carff").symlink_to("../lib/carff/bin/carff")
     for part in ["checkpoints", "graphs", "scenarios", "schemas", "soak", "training"]:

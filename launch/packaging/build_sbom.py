@@ -4,11 +4,10 @@
 Usage: python3 launch/packaging/build_sbom.py [OUT]     (default: target/carff.cdx.json; needs cargo-cyclonedx)
 
 cargo-cyclonedx writes one file per crate into the source folders, so this program runs it on a copy. It merges the files
-of the programs into one document with each crate once, and adds libtorch, which is in no lock file. Equal sources give
-equal bytes: the time is that of the last commit.
+of the programs into one document with each crate once, and adds libtorch and ONNX Runtime, which are in no lock file. Equal
+sources give equal bytes: the time is that of the last commit.
 """
 
-import importlib.util
 import json
 import os
 import re
@@ -19,13 +18,15 @@ import tempfile
 import uuid
 from pathlib import Path
 
+from fetch_libraries import LIBRARIES
+
 ROOT = Path(__file__).resolve().parents[2]
 TARGET = "x86_64-unknown-linux-gnu"
 PROGRAMS = ["launch", "launch/carff", "services/camera", "services/encoder", "services/forecaster", "services/prober",
             "services/renderer", "services/controller", "services/viewer"]
 TOOL = ["cargo", "cyclonedx"]
-# The crate that links with libtorch.
-LINKED = "torch-sys"
+# The crate that uses each library.
+USERS = {"libtorch": "torch-sys", "onnxruntime": "ort-sys"}
 
 
 def run(*command: str, **kwargs) -> str:
@@ -58,25 +59,22 @@ def describe() -> list[dict]:
     return [json.loads(text.replace(str(copy), "")) for text in texts]
 
 
-def libtorch() -> list[dict]:
-    """Returns the parts of libtorch that launch/packaging/fetch_libtorch.py fetches, or the user's libtorch."""
-    if own := os.environ.get("LIBTORCH"):
+def library(name: str) -> list[dict]:
+    """Returns the packages of a library that launch/packaging/fetch_libraries.py fetches, or the user's libtorch."""
+    if name == "libtorch" and (own := os.environ.get("LIBTORCH")):
         version = (Path(own) / "build-version").read_text(encoding="utf-8").strip()
         return [{"type": "library", "bom-ref": "libtorch", "name": "libtorch", "version": version}]
-    spec = importlib.util.spec_from_file_location("fetch_libtorch", ROOT / "launch/packaging/fetch_libtorch.py")
-    module = importlib.util.module_from_spec(spec)
-    sys.dont_write_bytecode = True
-    spec.loader.exec_module(module)
+    machine = TARGET.partition("-")[0]
     return [
         {
             "type": "library",
-            "bom-ref": f"pkg:pypi/{name}@{version}",
-            "name": name,
-            "version": version,
-            "purl": f"pkg:pypi/{name}@{version}",
-            "hashes": [{"alg": "SHA-256", "content": sha256}],
+            "bom-ref": f"pkg:pypi/{wheel.name}@{wheel.version}",
+            "name": wheel.name,
+            "version": wheel.version,
+            "purl": f"pkg:pypi/{wheel.name}@{wheel.version}",
+            "hashes": [{"alg": "SHA-256", "content": wheel.sha256[machine]}],
         }
-        for name, version, sha256, _ in module.WHEELS
+        for wheel in LIBRARIES[name].wheels
     ]
 
 
@@ -94,12 +92,11 @@ def merge(bills: list[dict]) -> dict:
                 components[component["bom-ref"]] = component
         for entry in bill.get("dependencies", []):
             uses.setdefault(entry["ref"], set()).update(entry.get("dependsOn", []))
-    torch = libtorch()
-    for part in torch:
-        components[part["bom-ref"]] = part
-    for ref, component in components.items():
-        if component["name"] == LINKED:
-            uses.setdefault(ref, set()).update(part["bom-ref"] for part in torch)
+    for name, user in USERS.items():
+        parts = {part["bom-ref"]: part for part in library(name)}
+        for ref in [ref for ref, component in components.items() if component["name"] == user]:
+            uses.setdefault(ref, set()).update(parts)
+        components.update(parts)
     version = re.search(r'^version = "(.+)"$', (ROOT / "Cargo.toml").read_text(encoding="utf-8"), re.M).group(1)
     metadata = {key: value for key, value in bills[0]["metadata"].items() if key in {"timestamp", "tools"}}
     metadata["component"] = {"type": "application", "bom-ref": "carff", "name": "carff", "version": version}

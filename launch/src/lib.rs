@@ -4,6 +4,7 @@
 pub mod ablate;
 #[cfg(feature = "import")]
 pub mod backbone;
+pub mod checkpoint;
 pub mod dataset;
 mod decisions;
 pub mod doctor;

@@ -6,6 +6,7 @@ use carff_bench::BenchCommand;
 use carff_launch::ablate::AblateArgs;
 #[cfg(feature = "import")]
 use carff_launch::backbone::BackboneCommand;
+use carff_launch::checkpoint::CheckpointCommand;
 use carff_launch::dataset::DatasetCommand;
 use carff_launch::doctor::DoctorArgs;
 use carff_launch::eval::EvalArgs;
@@ -96,6 +97,13 @@ Exit code: 1 when --verify finds a difference.")]
     #[cfg(not(feature = "import"))]
     #[command(hide = true)]
     Backbone(carff::NotBuilt),
+    /// Export trained models for other programs.
+    #[command(
+        subcommand,
+        after_help = "Example: the encoder as an ONNX file
+  carff checkpoint onnx configs/checkpoints/approaching-intersection --out encoder.onnx"
+    )]
+    Checkpoint(CheckpointCommand),
     /// Measure the program's parts and the whole loop on this machine.
     #[command(
         subcommand,
@@ -175,6 +183,7 @@ fn run() -> anyhow::Result<ExitCode> {
         Command::Soak(args) => args.run("carff soak"),
         #[cfg(feature = "recording")]
         Command::SoakInject(args) => carff_launch::soak::inject(&args).map(|()| ExitCode::SUCCESS),
+        Command::Checkpoint(command) => carff_launch::checkpoint::run(&command),
         Command::Doctor(args) => carff_launch::doctor::run(&args),
         Command::Schema(args) => carff_launch::schema::run(&args).map(|()| ExitCode::SUCCESS),
         Command::Completions(args) => carff_launch::shell::completions(&args).map(|()| ExitCode::SUCCESS),

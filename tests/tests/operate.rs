@@ -2,6 +2,7 @@
 
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
+use carff_messages::Stage;
 use carff_observe::attach;
 use carff_tests::{
     Finished, PATIENT_AND_ENDLESS, Process, TestGraph, WATCHDOG, decisions, eventually, program, scenario_set,
@@ -58,8 +59,9 @@ fn what_needs_no_tensors_is_not_linked_with_libtorch() {
         assert!(text.contains("libc.so"), "{name}: {text}");
         text.contains("libtorch")
     };
-    assert!(loads("carff-launch") && loads("carff-encoder"));
-    for name in ["carff", "carff-camera", "carff-prober", "carff-renderer", "carff-controller"] {
+    assert!(loads("carff-launch") && loads("carff-encoder-tch"));
+    let stages = Stage::ALL.map(|stage| format!("carff-{stage}"));
+    for name in stages.iter().map(String::as_str).chain(["carff"]) {
         assert!(!loads(name), "{name} is linked with libtorch");
     }
 }

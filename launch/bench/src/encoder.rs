@@ -8,7 +8,7 @@ use carff_checkpoint::{
     Manifest,
     shapes::{BackboneConfig, BackboneKind, EncoderConfig},
 };
-use carff_decision::Sampling;
+use carff_decision::{Mixture, Sampling};
 use carff_messages::Gaussian;
 use carff_networks::{
     borrow,
@@ -57,21 +57,27 @@ pub(crate) fn run(args: &EncoderArgs) -> anyhow::Result<Report> {
         report.set(&format!("{key}p99_ms"), p99);
     };
 
-    let with_threads = |threads: i32| -> Contender<'_> {
-        let (encoder, rgb) = (&encoder, &rgb);
-        let mut clock = timed(move || {
-            std::hint::black_box(encode(encoder, rgb));
-        });
-        // The change of threads is not part of the frame.
-        Box::new(move || {
-            tch::set_num_threads(threads);
-            clock()
-        })
-    };
-    let seconds = alternate(if args.quick { 20 } else { 300 }, &mut [with_threads(1), with_threads(2)]);
+    let load = |threads| carff_inference::Encoder::load(&args.checkpoint, &manifest, threads);
+    let (mut one, mut two) = (load(1)?, load(2)?);
+    let seconds = alternate(
+        if args.quick { 20 } else { 300 },
+        &mut [
+            in_onnx(&mut one, &rgb),
+            in_tch(&encoder, &rgb, 1),
+            in_onnx(&mut two, &rgb),
+            in_tch(&encoder, &rgb, 2),
+        ],
+    );
     let backbone = format!("{:?}", manifest.encoder.backbone.kind);
-    note(&format!("encoder, {backbone}, 1 thread"), "encoder.", &seconds[0]);
-    note(&format!("encoder, {backbone}, 2 threads"), "encoder.two_threads.", &seconds[1]);
+    for (seconds, (library, threads, key)) in seconds.iter().zip([
+        ("ONNX Runtime", "1 thread", "encoder."),
+        ("libtorch", "1 thread", "encoder.tch."),
+        ("ONNX Runtime", "2 threads", "encoder.two_threads."),
+        ("libtorch", "2 threads", "encoder.tch.two_threads."),
+    ]) {
+        note(&format!("encoder, {backbone}, {library}, {threads}"), key, seconds);
+    }
+    let gains = [Ratio::new(&seconds[1], &seconds[0]), Ratio::new(&seconds[3], &seconds[2])];
 
     let halved = in_bf16(args, &manifest, &encoder, &rgb)?;
     if let Some(halved) = &halved {
@@ -79,12 +85,15 @@ pub(crate) fn run(args: &EncoderArgs) -> anyhow::Result<Report> {
     }
 
     tch::set_num_threads(1);
-    let forecast = timed(|| {
-        let mixture = net.forecast(&posterior);
-        std::hint::black_box(mixture.draw(SAMPLES, Sampling::Stratified, 1, 2, 1));
-    });
-    let seconds = alternate(if args.quick { 200 } else { 3000 }, &mut [forecast]);
-    note(&format!("forecaster, n = {SAMPLES}, 1 thread"), "forecaster.", &seconds[0]);
+    let native = carff_inference::MixtureNet::load(&args.checkpoint, &manifest)?;
+    let draw = |mixture: Mixture| std::hint::black_box(mixture.draw(SAMPLES, Sampling::Stratified, 1, 2, 1));
+    let seconds = alternate(
+        if args.quick { 200 } else { 3000 },
+        &mut [timed(|| drop(draw(native.forecast(&posterior)))), timed(|| drop(draw(net.forecast(&posterior))))],
+    );
+    note(&format!("forecaster, n = {SAMPLES}"), "forecaster.", &seconds[0]);
+    note(&format!("forecaster, n = {SAMPLES}, libtorch, 1 thread"), "forecaster.tch.", &seconds[1]);
+    let forecaster_gain = Ratio::new(&seconds[1], &seconds[0]);
 
     if !args.no_vit {
         let config = EncoderConfig {
@@ -93,21 +102,19 @@ pub(crate) fn run(args: &EncoderArgs) -> anyhow::Result<Report> {
         };
         let store = VarStore::new(Device::Cpu);
         let vit = Encoder::new(&config, &(store.root() / "backbone"), &(store.root() / "head"), None)?;
-        let with_threads = |threads: i32| -> Contender<'_> {
-            let (vit, rgb) = (&vit, &rgb);
-            let mut clock = timed(move || {
-                std::hint::black_box(encode(vit, rgb));
-            });
-            Box::new(move || {
-                tch::set_num_threads(threads);
-                clock()
-            })
-        };
-        let seconds = alternate(if args.quick { 2 } else { 10 }, &mut [with_threads(1), with_threads(2)]);
-        note("encoder, ViT-L/16 of random weights, 1 thread", "encoder.vit_l16.", &seconds[0]);
-        note("encoder, ViT-L/16 of random weights, 2 threads", "encoder.vit_l16.two_threads.", &seconds[1]);
+        let seconds =
+            alternate(if args.quick { 2 } else { 10 }, &mut [in_tch(&vit, &rgb, 1), in_tch(&vit, &rgb, 2)]);
+        note("encoder, ViT-L/16 of random weights, libtorch, 1 thread", "encoder.vit_l16.", &seconds[0]);
+        note("encoder, ViT-L/16 of random weights, libtorch, 2 threads", "encoder.vit_l16.two_threads.", &seconds[1]);
     }
     print!("{}", table(&rows));
+    println!(
+        "libtorch takes {} the time of ONNX Runtime on one thread and {} on two; {} that of the native forecaster",
+        gains[0], gains[1], forecaster_gain
+    );
+    report.set("encoder.tch_vs_onnx", gains[0].of_medians);
+    report.set("encoder.tch_vs_onnx.two_threads", gains[1].of_medians);
+    report.set("forecaster.tch_vs_native", forecaster_gain.of_medians);
     if let Some(halved) = &halved {
         println!(
             "with the backbone in bf16 a frame is encoded {} as fast as in f32; this one's mean moves by {} of its \
@@ -170,7 +177,21 @@ fn in_bf16(args: &EncoderArgs, manifest: &Manifest, encoder: &Encoder, rgb: &[u8
     Ok(seconds.into_iter().nth(1).map(|seconds| Halved { seconds, ratio, moved }))
 }
 
-/// Computes the posterior of an image's bytes, as the encoder stage does.
+/// Times the encoder as the stage runs it by default.
+fn in_onnx<'a>(encoder: &'a mut carff_inference::Encoder, rgb: &'a [u8]) -> Contender<'a> {
+    timed(move || drop(std::hint::black_box(image(rgb).map(|image| encoder.encode(image)))))
+}
+
+/// Times the encoder in libtorch. The change of threads is not part of the frame.
+fn in_tch<'a>(encoder: &'a Encoder, rgb: &'a [u8], threads: i32) -> Contender<'a> {
+    let mut clock = timed(move || drop(std::hint::black_box(encode(encoder, rgb))));
+    Box::new(move || {
+        tch::set_num_threads(threads);
+        clock()
+    })
+}
+
+/// Computes the posterior of an image's bytes in libtorch.
 fn encode(encoder: &Encoder, rgb: &[u8]) -> Option<Gaussian> {
     borrow::with_image(image(rgb)?, |picture| encoder.encode_bytes(picture)).flatten()
 }

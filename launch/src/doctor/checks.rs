@@ -538,6 +538,26 @@ pub fn libtorch(library: Option<&Path>, version: Option<&str>) -> Finding {
     }
 }
 
+/// Checks the version of ONNX Runtime, or the reason why it cannot be loaded; `needed` if the encoder computes with it.
+pub fn onnx_runtime(library: &Path, version: Result<&str, &str>, needed: bool) -> Finding {
+    let (area, subject, wanted) = (Area::Programs, "ONNX Runtime", carff_inference::library::VERSION);
+    let advice = format!("make onnxruntime, or name a libonnxruntime.so of {wanted} in ORT_DYLIB_PATH");
+    match version {
+        Ok(version) if version == wanted => Finding::ok(area, subject, format!("{version} ({})", library.display())),
+        Ok(version) => Finding::warning(
+            area,
+            subject,
+            format!("{version} ({}); {wanted} was tried", library.display()),
+            "the encoder's last bits may differ",
+            advice,
+        ),
+        Err(error) => {
+            let finding = if needed { Finding::error } else { Finding::warning };
+            finding(area, subject, error, "the encoder stage cannot start with `backend = \"onnx\"`", advice.as_str())
+        }
+    }
+}
+
 /// Checks that a folder contains the stages' programs.
 pub fn programs(folder: &Path, missing: &[String]) -> Finding {
     if missing.is_empty() {
@@ -770,6 +790,16 @@ mod tests {
         assert_level(&libtorch(library, Some("2.13.0")), Level::Error);
         assert_level(&libtorch(library, None), Level::Warning);
         assert_level(&libtorch(None, None), Level::Error);
+    }
+
+    /// A missing library is an error where the encoder needs it; another version is a warning.
+    #[test]
+    fn versions_of_onnx_runtime() {
+        let library = Path::new("lib/libonnxruntime.so.1");
+        assert_level(&onnx_runtime(library, Ok(carff_inference::library::VERSION), true), Level::Ok);
+        assert_level(&onnx_runtime(library, Ok("1.24.1"), true), Level::Warning);
+        assert_level(&onnx_runtime(library, Err("not found"), true), Level::Error);
+        assert_level(&onnx_runtime(library, Err("not found"), false), Level::Warning);
     }
 
     /// Missing programs are reported by name.

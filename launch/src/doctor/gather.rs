@@ -1,6 +1,7 @@
 //! Collects facts about the machine, without judging them.
 
 use super::checks::{Allowed, Clock, Logind, RunFiles, SharedMemory, Strays};
+use carff_config::StagesConfig;
 use carff_messages::Stage;
 use carff_transport::{
     Run, SHARED_MEMORY_DIR, living_processes, mapping_processes, monotonic_now_ns, runtime_dir, runtime_dirs,
@@ -229,9 +230,9 @@ pub fn libtorch() -> (Option<PathBuf>, Option<String>) {
 }
 
 /// Returns the stages' programs that are missing in a folder or cannot be started.
-pub fn missing_programs(folder: &Path) -> Vec<String> {
+pub fn missing_programs(folder: &Path, stages: &StagesConfig) -> Vec<String> {
     let is_program = |path: &Path| path.metadata().is_ok_and(|m| m.is_file() && m.permissions().mode() & 0o111 != 0);
-    Stage::ALL.iter().map(|stage| format!("carff-{stage}")).filter(|name| !is_program(&folder.join(name))).collect()
+    Stage::ALL.iter().map(|&stage| stages.program(stage)).filter(|name| !is_program(&folder.join(name))).collect()
 }
 
 #[cfg(test)]

@@ -146,8 +146,8 @@ fn models(checkpoint: &Path, shown: Option<&ScenarioIdentity>, findings: &mut Ve
         }
     };
     let parts = [
-        carff_networks::stored::load_encoder(checkpoint, &manifest).map(drop).map_err(|e| e.to_string()),
-        carff_networks::stored::load_mixture(checkpoint, &manifest).map(drop).map_err(|e| e.to_string()),
+        carff_inference::encoder_onnx(checkpoint, &manifest).map(drop).map_err(|e| e.to_string()),
+        carff_inference::MixtureNet::load(checkpoint, &manifest).map(drop).map_err(|e| e.to_string()),
         carff_checkpoint::load_field(checkpoint, &manifest).map(drop).map_err(|e| e.to_string()),
         carff_checkpoint::load_probing(checkpoint, &manifest).map(drop).map_err(|e| e.to_string()),
         CheckpointPlanning::load(checkpoint).map(drop).map_err(|e| e.to_string()),

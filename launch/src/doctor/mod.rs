@@ -10,7 +10,7 @@ pub use finding::{Area, Finding, Level};
 
 use anyhow::Context;
 use carff::provenance;
-use carff_config::{GraphConfig, RendererConfig, StagesConfig};
+use carff_config::{Backend, GraphConfig, RendererConfig, StagesConfig};
 use carff_transport::graph_bytes;
 use std::io::IsTerminal;
 use std::path::PathBuf;
@@ -80,8 +80,12 @@ pub fn examine(args: &DoctorArgs) -> anyhow::Result<Vec<Finding>> {
 
     let (library, version) = gather::libtorch();
     findings.push(checks::libtorch(library.as_deref(), version.as_deref()));
+    let onnx = carff_inference::library::version().map_err(|e| e.to_string());
+    let needed = stages.encoder_backend() == Backend::Onnx;
+    let onnx = onnx.as_deref().map_err(String::as_str);
+    findings.push(checks::onnx_runtime(&carff_inference::library::path(), onnx, needed));
     let folder = std::env::current_exe()?.parent().context("this program has no folder")?.to_owned();
-    findings.push(checks::programs(&folder, &gather::missing_programs(&folder)));
+    findings.push(checks::programs(&folder, &gather::missing_programs(&folder, &stages)));
 
     match (&args.graph, graph) {
         (Some(path), Some(Ok(config))) => {

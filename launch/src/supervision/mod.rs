@@ -201,7 +201,8 @@ impl<'a> Supervisor<'a> {
         // A restarted camera continues after its last frame.
         let first_frame = if stage == Stage::Camera { self.monitor.records.frame_count() } else { 0 };
         let args = StageArgs { first_frame, ..self.stage_args.clone() };
-        let process = StageProcess::start(stage, &self.folder, &args, &self.terminal)?;
+        let program = self.folder.join(self.graph.stages.program(stage));
+        let process = StageProcess::start(stage, &program, &args, &self.terminal)?;
         let (pid, now_ns) = (process.pid(), monotonic_now_ns());
         match self.stages.iter_mut().find(|w| w.stage == stage) {
             Some(watched) => {

@@ -29,12 +29,11 @@ impl StageProcess {
     /// Starts the process. Call this from the main thread: the child ends with the thread that started it.
     pub(crate) fn start(
         stage: Stage,
-        folder: &Path,
+        program: &Path,
         args: &StageArgs,
         terminal: &Arc<Terminal>,
     ) -> anyhow::Result<Self> {
-        let program = folder.join(format!("carff-{stage}"));
-        let mut child = Command::new(&program)
+        let mut child = Command::new(program)
             .args(args.to_command_line())
             .stdin(Stdio::null())
             .stdout(Stdio::null())

@@ -2,8 +2,8 @@
 
 use carff_checkpoint::Manifest;
 use carff_decision::{Sampling, path_probability, set_mixture_and_draws};
+use carff_inference::MixtureNet;
 use carff_messages::{Belief, Forecast, ForecastSource, Gaussian, Header, Posterior};
-use carff_networks::mixture::MixtureNet;
 use std::path::Path;
 
 /// The forecaster's model and settings.
@@ -16,22 +16,10 @@ pub struct Forecaster {
 }
 
 impl Forecaster {
-    /// Loads the mixture density network and runs it a few times, so that the first frame is as fast as later ones.
-    pub fn load(
-        checkpoint: &Path,
-        threads: usize,
-        samples: usize,
-        sampling: Sampling,
-        horizon: u32,
-    ) -> anyhow::Result<Self> {
-        carff_networks::allocator::keep_large_blocks();
-        carff_networks::device::set_threads(threads);
+    /// Loads the mixture density network.
+    pub fn load(checkpoint: &Path, samples: usize, sampling: Sampling, horizon: u32) -> anyhow::Result<Self> {
         let manifest = Manifest::load(checkpoint)?;
-        let net = carff_networks::stored::load_mixture(checkpoint, &manifest)?;
-        for _ in 0..3 {
-            net.forecast(&Gaussian::standard());
-        }
-        Ok(Self { net, samples, sampling, horizon })
+        Ok(Self { net: MixtureNet::load(checkpoint, &manifest)?, samples, sampling, horizon })
     }
 
     /// Sets the number of samples from now on, and the horizon of frames that start from now on.

@@ -15,13 +15,8 @@ fn run(stage: &mut StageContext) -> anyhow::Result<()> {
     let mut forecasts = stage.output(&topics::FORECAST)?;
     let settings = &stage.graph.run;
     let mut overload = Overload::new(&stage.graph);
-    let mut forecaster = Forecaster::load(
-        &stage.checkpoint,
-        stage.threads,
-        settings.samples as usize,
-        settings.sampling,
-        settings.horizon,
-    )?;
+    let mut forecaster =
+        Forecaster::load(&stage.checkpoint, settings.samples as usize, settings.sampling, settings.horizon)?;
     let mut newest_frame = 0;
     stage.ready();
     while stage.wait(&[&posteriors, &beliefs])? {

@@ -1,12 +1,9 @@
 //! The field's weights: safetensors in half precision, read without a tensor library.
 
-use crate::{CheckpointError, Manifest, files};
+use crate::{CheckpointError, Manifest, files, tensors::read_tensors};
 use carff_field::{Field, FieldConfig};
 use half::f16;
-use safetensors::{
-    SafeTensors,
-    tensor::{Dtype, TensorView, serialize},
-};
+use safetensors::tensor::{Dtype, TensorView, serialize};
 use std::path::Path;
 
 /// Reads the field of a checkpoint.
@@ -23,31 +20,8 @@ pub fn load_field(dir: &Path, manifest: &Manifest) -> Result<Field, CheckpointEr
 fn read(dir: &Path, path: &Path, config: FieldConfig) -> Result<Field, CheckpointError> {
     let wrong =
         |what: String| CheckpointError::Weights { path: dir.into(), what: format!("{}: {what}", path.display()) };
-    let bytes = std::fs::read(path).map_err(|e| wrong(e.to_string()))?;
-    let tensors = SafeTensors::deserialize(&bytes)
-        .map_err(|e| wrong(format!("not a readable safetensors file ({e}); fetch or train the checkpoint again")))?;
-    let rows = tensors
-        .tensors()
-        .into_iter()
-        .map(|(name, tensor)| match values(&tensor) {
-            Some(values) => Ok((name, tensor.shape().to_vec(), values)),
-            None => Err(wrong(format!("`{name}` is of type {:?}; known are F16, BF16, F32 and U8", tensor.dtype()))),
-        })
-        .collect::<Result<Vec<_>, _>>()?;
+    let rows = read_tensors(path, |_| true).map_err(wrong)?;
     Field::from_tensors(config, rows).map_err(|source| CheckpointError::Field { path: dir.into(), source })
-}
-
-/// Returns a tensor's values as `f32`; `None` for an unknown type.
-fn values(tensor: &TensorView<'_>) -> Option<Vec<f32>> {
-    let data = tensor.data();
-    let pairs = || data.as_chunks::<2>().0.iter();
-    Some(match tensor.dtype() {
-        Dtype::U8 => data.iter().map(|&b| f32::from(b)).collect(),
-        Dtype::F16 => pairs().map(|&b| f16::from_le_bytes(b).to_f32()).collect(),
-        Dtype::BF16 => pairs().map(|&b| half::bf16::from_le_bytes(b).to_f32()).collect(),
-        Dtype::F32 => data.as_chunks::<4>().0.iter().map(|&b| f32::from_le_bytes(b)).collect(),
-        _ => return None,
-    })
 }
 
 /// Writes the field atomically: weights in half precision, bit fields as bytes.

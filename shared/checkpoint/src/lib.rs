@@ -5,14 +5,17 @@
 //! This crate reads the field's weights. `carff_networks` reads the weights of the tch networks, so that programs
 //! without them do not link libtorch.
 
+pub mod backbones;
 mod field;
 mod planning;
 mod probe;
 pub mod shapes;
+mod tensors;
 
 pub use field::{load_field, save_field};
 pub use planning::{CheckpointPlanning, CheckpointPlanningError, load_policy};
 pub use probe::{FieldProbe, PreparedField, load_field_probe, load_probing};
+pub use tensors::{Row, read_tensors};
 
 use carff_dataset::ScenarioInfo;
 use carff_decision::{Calibration, Place, ProbingError};

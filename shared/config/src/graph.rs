@@ -466,10 +466,7 @@ impl GraphConfig {
             let allowed = "`free-drives` with a `run.scenario` to render".to_owned();
             return Err(source.range("camera.source", "\"free-drives\"".to_owned(), allowed));
         }
-        if self.stages.controller.threads != 1 {
-            let found = self.stages.controller.threads.to_string();
-            return Err(source.range("stages.controller.threads", found, "1".to_owned()));
-        }
+        self.stages.check(source)?;
         let order = &self.overload.order;
         if (1..order.len()).any(|i| order[..i].contains(&order[i])) {
             let allowed = "`resolution`, `samples`, `horizon`, each at most once".to_owned();

@@ -34,4 +34,4 @@ pub use graph::{
     RendererConfig, RunConfig, ViewChoice, WhenLost,
 };
 pub use soak::{Contract, Kind, Pace, SoakConfig, Weights};
-pub use stages::{LogFormat, LogLevel, RestartPolicy, StageConfig, StagesConfig};
+pub use stages::{Backend, LogFormat, LogLevel, RestartPolicy, StageConfig, StagesConfig};

@@ -1,5 +1,7 @@
 //! The table that each stage has: how its process runs.
 
+use crate::ConfigError;
+use crate::error::Source;
 use carff_messages::Stage;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -41,6 +43,9 @@ pub struct StageConfig {
     /// Threads that compute, 1 to 256. The controller only uses one. Default 1.
     #[schemars(range(min = 1, max = 256))]
     pub threads: u32,
+    /// Library that computes the encoder's network: `onnx` (ONNX Runtime) or `tch` (libtorch; the program
+    /// `carff-encoder-tch`). Only the encoder has it. Default `onnx`.
+    pub backend: Option<Backend>,
     /// Time for one output above which the stage reports that it is slow, milliseconds, 1 to 60000. Default: encoder
     /// 60, forecaster 20, prober 30, renderer 2000; camera one period of `run.frame_rate_hz`, controller
     /// `controller.deadline_ms`.
@@ -72,6 +77,7 @@ impl Default for StageConfig {
     fn default() -> Self {
         Self {
             threads: 1,
+            backend: None,
             deadline_ms: None,
             log: LogLevel::Info,
             restart: RestartPolicy::OnFailure { backoff_ms: 100, max_restarts: 5, within_s: 60 },
@@ -97,6 +103,31 @@ impl StagesConfig {
         }
     }
 
+    /// The library that computes the encoder's network.
+    pub fn encoder_backend(&self) -> Backend {
+        self.encoder.backend.unwrap_or_default()
+    }
+
+    /// The name of a stage's program.
+    pub fn program(&self, stage: Stage) -> String {
+        match (stage, self.encoder_backend()) {
+            (Stage::Encoder, Backend::Tch) => "carff-encoder-tch".to_owned(),
+            _ => format!("carff-{stage}"),
+        }
+    }
+
+    /// Checks the settings that not every stage has.
+    pub(crate) fn check(&self, source: &Source<'_>) -> Result<(), ConfigError> {
+        if self.controller.threads != 1 {
+            return Err(source.range("stages.controller.threads", self.controller.threads.to_string(), "1".to_owned()));
+        }
+        let other = Stage::ALL.into_iter().find(|&s| s != Stage::Encoder && self.of(s).backend.is_some());
+        other.map_or(Ok(()), |stage| {
+            let found = format!("{:?}", self.of(stage).backend.unwrap_or_default()).to_lowercase();
+            Err(source.range(&format!("stages.{stage}.backend"), found, "only `stages.encoder` has a backend".to_owned()))
+        })
+    }
+
     /// The table of a stage, to be changed.
     pub fn of_mut(&mut self, stage: Stage) -> &mut StageConfig {
         match stage {
@@ -108,6 +139,17 @@ impl StagesConfig {
             Stage::Controller => &mut self.controller,
         }
     }
+}
+
+/// A library that computes networks.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+pub enum Backend {
+    /// ONNX Runtime.
+    #[default]
+    Onnx,
+    /// libtorch.
+    Tch,
 }
 
 /// The launcher's answer to a stage that dies.

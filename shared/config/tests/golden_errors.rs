@@ -53,6 +53,14 @@ fn wrong_files_have_golden_messages() {
             "graph.toml:6: `stages.prober.fifo_priority` is 100; allowed: 1 to 99",
         ),
         (
+            format!("{HEAD}[stages.forecaster]\nbackend = \"tch\"\n"),
+            "graph.toml:6: `stages.forecaster.backend` is tch; allowed: only `stages.encoder` has a backend",
+        ),
+        (
+            format!("{HEAD}[stages.encoder]\nbackend = \"tensorrt\"\n"),
+            "graph.toml:6: `stages.encoder.backend`: unknown variant `tensorrt`, expected `onnx` or `tch`",
+        ),
+        (
             "[run]\nname = \"two words\"\ndataset = \"d\"\ncheckpoint = \"c\"\n".to_owned(),
             "graph.toml:2: `run.name` is \"two words\"; allowed: 1 to 24 characters out of a-z, A-Z, 0-9, `-` and `_`",
         ),

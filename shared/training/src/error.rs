@@ -21,6 +21,9 @@ pub enum TrainingError {
     /// The models cannot be evaluated.
     #[error(transparent)]
     Evaluation(#[from] carff_evaluation::EvaluationError),
+    /// The encoder cannot be exported.
+    #[error(transparent)]
+    Inference(#[from] carff_inference::InferenceError),
     /// The curves cannot be drawn.
     #[error(transparent)]
     Plot(#[from] carff_plots::PlotError),

@@ -81,7 +81,10 @@ impl Training<'_> {
         } else {
             self.train_states(context, phases)?
         };
-        save(manifest, &figures, self.out)?;
+        save(manifest.clone(), &figures, self.out)?;
+        if self.out.join(files::ENCODER).is_file() {
+            carff_inference::save_encoder_onnx(self.out, &manifest, &self.out.join(carff_inference::FILE))?;
+        }
         run.record(names::DONE, &DoneRecord { metrics: &figures })?;
         Ok(figures)
     }

@@ -11,6 +11,7 @@ use carff_dataset::{
     sensor::SensorNoise,
 };
 use carff_decision::{Evidence, Plan, Policy, Sampling, Step, look_ahead};
+use carff_inference::MixtureNet;
 use carff_messages::{Gaussian, Rule};
 use carff_scenes::Scenario;
 use serde::{Deserialize, Serialize};
@@ -209,6 +210,8 @@ pub struct JudgedRun {
     dataset: Dataset,
     scenario: ScenarioInfo,
     models: Models,
+    /// The forecaster as the graph computes it: the same bits.
+    forecaster: MixtureNet,
 }
 
 impl JudgedRun {
@@ -218,7 +221,8 @@ impl JudgedRun {
         let scenario =
             dataset.scenario().cloned().ok_or_else(|| EvaluationError::Unfit("it has no scenario".into()))?;
         let models = Models::load(&settings.checkpoint)?;
-        Ok(Self { settings, dataset, scenario, models })
+        let forecaster = MixtureNet::load(&settings.checkpoint, &models.manifest)?;
+        Ok(Self { settings, dataset, scenario, models, forecaster })
     }
 
     /// Scenario of the run.
@@ -264,7 +268,7 @@ impl JudgedRun {
     fn look_ahead(&self, probe: &mut FieldProbe, frame: &DecidedFrame, samples: usize) -> Option<Vec<Step>> {
         let RunSettings { sampling, horizon, seed, .. } = self.settings;
         let plan = Plan { samples, sampling, horizon, seed, frame: frame.frame };
-        let forecast = |input: &Gaussian, _| self.models.mixture.forecast(input);
+        let forecast = |input: &Gaussian, _| self.forecaster.forecast(input);
         Some(look_ahead(forecast, probe, &frame.posterior?, plan))
     }
 

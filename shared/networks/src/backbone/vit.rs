@@ -5,7 +5,10 @@ use crate::{
     ModelError,
     weights::{Tensors, select},
 };
-use carff_checkpoint::shapes::VitConfig;
+use carff_checkpoint::{
+    backbones::vit::{self, is_beyond_the_features},
+    shapes::VitConfig,
+};
 use tch::{Kind, Tensor, nn, nn::Module};
 
 /// The network without its classifier.
@@ -188,41 +191,11 @@ fn named<'a>(
         .flatten()
 }
 
-/// Returns true for tensors that the feature map does not depend on: classifiers, decoders and the mask token.
-fn is_beyond_the_features(name: &str) -> bool {
-    let first = name.split('.').next().unwrap_or_default();
-    ["head", "head_dist", "fc_norm", "pre_logits", "classifier", "pooler", "lm_head", "mask_token"].contains(&first)
-        || first.starts_with("decoder")
-}
-
-/// Parts of Hugging Face names and of the `DINOv2` authors' names, with timm's; earlier entries have precedence.
-const TIMM_PARTS: [(&str, &str); 15] = [
-    ("embeddings.cls_token", "cls_token"),
-    ("embeddings.mask_token", "mask_token"),
-    ("embeddings.position_embeddings", "pos_embed"),
-    ("embeddings.patch_embeddings.projection.", "patch_embed.proj."),
-    ("embeddings.register_tokens", "reg_token"),
-    ("register_tokens", "reg_token"),
-    ("encoder.layer.", "blocks."),
-    (".layernorm_before.", ".norm1."),
-    (".layernorm_after.", ".norm2."),
-    (".attention.output.dense.", ".attn.proj."),
-    (".intermediate.dense.", ".mlp.fc1."),
-    (".output.dense.", ".mlp.fc2."),
-    (".layer_scale1.lambda1", ".ls1.gamma"),
-    (".layer_scale2.lambda1", ".ls2.gamma"),
-    ("layernorm.", "norm."),
-];
-
 /// Converts the tensors to timm's names and form: queries, keys and values are concatenated, `LayerScale` is folded,
 /// and the class token has a position. Tensors that cannot be converted keep their names, and are reported as unknown.
 fn timm_form(tensors: &Tensors) -> Tensors {
-    let root = tensors.keys().find_map(|k| k.strip_suffix("embeddings.cls_token")).unwrap_or_default();
-    let renamed = |name: &str| {
-        let name = name.strip_prefix(root).unwrap_or(name);
-        TIMM_PARTS.iter().fold(name.to_owned(), |name, (from, to)| name.replace(from, to))
-    };
-    let mut own: Tensors = tensors.iter().map(|(name, t)| (renamed(name), t.shallow_clone())).collect();
+    let root = vit::root(tensors.keys().map(String::as_str));
+    let mut own: Tensors = tensors.iter().map(|(name, t)| (vit::timm_name(name, root), t.shallow_clone())).collect();
     for i in 0..depth(&own, "blocks", "norm1.weight") {
         for part in ["weight", "bias"] {
             join_queries(&mut own, i, part);

@@ -1,0 +1,61 @@
+//! The shared library of ONNX Runtime.
+//!
+//! The first of these that exists is loaded:
+//!
+//! 1. the file that the environment variable `ORT_DYLIB_PATH` names;
+//! 2. `libonnxruntime.so.1` in `../lib` of the program's folder, where the Debian package puts it;
+//! 3. the one that `make onnxruntime` stores in `.onnxruntime/lib` of the project, for a program in `target/release`;
+//! 4. the one that the system's loader finds, for example by `LD_LIBRARY_PATH`.
+
+use crate::InferenceError;
+use ort::environment::Environment;
+use std::path::{Path, PathBuf};
+use std::sync::OnceLock;
+
+/// Version that the fetch script stores.
+pub const VERSION: &str = "1.32.0";
+/// Name of the library.
+pub const NAME: &str = "libonnxruntime.so.1";
+/// Variable that names another file.
+const VARIABLE: &str = "ORT_DYLIB_PATH";
+/// Folders of the library, relative to the folder of the program. Tests are one folder deeper.
+const FOLDERS: [&str; 3] = ["../lib", "../../.onnxruntime/lib", "../../../.onnxruntime/lib"];
+
+/// Returns the path of the library; a bare name if only the system's loader can find it.
+pub fn path() -> PathBuf {
+    if let Some(named) = std::env::var_os(VARIABLE).filter(|v| !v.is_empty()) {
+        return named.into();
+    }
+    let program = std::env::current_exe().ok();
+    let folder = program.as_deref().and_then(Path::parent);
+    let stored = folder.into_iter().flat_map(|folder| FOLDERS.map(|f| folder.join(f).join(NAME)));
+    stored.into_iter().find(|file| file.exists()).unwrap_or_else(|| NAME.into())
+}
+
+/// Loads the library, once in a process.
+///
+/// # Errors
+///
+/// [`InferenceError::Library`] if it is missing, is another library, or is too old.
+pub fn load() -> Result<Environment, InferenceError> {
+    static LOADED: OnceLock<Result<Environment, String>> = OnceLock::new();
+    LOADED.get_or_init(|| open(&path())).clone().map_err(|what| InferenceError::Library { what })
+}
+
+fn open(path: &Path) -> Result<Environment, String> {
+    let builder = ort::init_from(path).map_err(|e| format!("{e} ({NAME} {VERSION} is wanted)"))?;
+    builder.with_name("carff").with_telemetry(false).build().map_err(|e| format!("{}: {e}", path.display()))
+}
+
+/// Loads the library, and returns the version that it states.
+///
+/// # Errors
+///
+/// As [`load`].
+pub fn version() -> Result<String, InferenceError> {
+    load()?;
+    // "ORT Build Info: git-branch=rel-1.32.0, git-commit-id=.."
+    let info = ort::info();
+    let version = info.split("git-branch=").nth(1).and_then(|rest| rest.split([',', ' ']).next());
+    Ok(version.map_or(info, |v| v.trim_start_matches("rel-")).to_owned())
+}
