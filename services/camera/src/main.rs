@@ -1,8 +1,8 @@
-//! The camera stage: takes images from a [`source::Source`] at a fixed rate and publishes them.
+//! The camera stage: takes images from a [`source::Source`] at a fixed rate, or from a recording, and publishes them.
 //! The encoder interprets the images.
 
-use anyhow::Context;
-use carff_camera::{DriveSource, FolderSource, FreeDriveSource, Source};
+use anyhow::{Context, bail};
+use carff_camera::{DriveSource, FolderSource, FreeDriveSource, McapSource, Source, VideoSource, recorded};
 use carff_config::CameraSource;
 use carff_messages::{Header, ImageMeta, Stage};
 use carff_runtime::{StageContext, frame_span};
@@ -13,6 +13,18 @@ fn main() -> std::process::ExitCode {
 }
 
 fn run(stage: &mut StageContext) -> anyhow::Result<()> {
+    let file = stage.graph.camera.file.as_ref().map(|file| stage.graph.resolve(file)).unwrap_or_default();
+    match stage.graph.camera.source {
+        CameraSource::Mcap => {
+            let mut source = McapSource::open(&file, &stage.graph)?;
+            recorded::run(stage, &mut source)
+        }
+        CameraSource::Video => recorded::run(stage, &mut VideoSource::open(&file)?),
+        _ => run_drives(stage),
+    }
+}
+
+fn run_drives(stage: &mut StageContext) -> anyhow::Result<()> {
     let mut source = open_source(stage)?;
     let mut frames = stage.image_output(&topics::FRAME, source.max_image_bytes())?;
     let period_ns = (1e9 / stage.graph.run.frame_rate_hz) as u64;
@@ -64,7 +76,11 @@ fn open_source(stage: &mut StageContext) -> anyhow::Result<Box<dyn Source>> {
             for error in &unreadable {
                 stage.error(error);
             }
-            Ok(Box::new(source))
+            Ok(match carff_runtime::rectifier(stage, None)? {
+                Some(rectifier) => Box::new(source.rectified(&rectifier)?),
+                None => Box::new(source),
+            })
         }
+        other => bail!("the program carff-camera has no source {other:?}: start the graph with `carff launch`"),
     }
 }

@@ -33,11 +33,13 @@
 //! 2 for wrong arguments.
 
 mod args;
+mod camera;
 mod context;
 mod health;
 mod overload;
 mod realtime;
 
 pub use args::StageArgs;
+pub use camera::{FrameOutput, rectifier};
 pub use context::{StageContext, frame_span, main, run_with};
 pub use overload::{Overload, Quality};
