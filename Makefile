@@ -16,7 +16,7 @@ else ifneq ($(CARGO_TARGET_DIR),)
 export LD_LIBRARY_PATH := $(CURDIR)/.libtorch/lib$(if $(LD_LIBRARY_PATH),:$(LD_LIBRARY_PATH))
 endif
 
-.PHONY: help run build deb check-deb link check-link test soak fuzz bench-peer lint sanitize miri sbom fmt libtorch
+.PHONY: help run build deb check-deb link check-link camera-rtsp camera-gst check-cameras test soak fuzz bench-peer lint sanitize miri sbom fmt libtorch
 
 help: ## List the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -49,6 +49,22 @@ check-link: build link ## Test carff-link; then drive here, observe from another
 	cargo fmt --manifest-path services/link/Cargo.toml --check
 	cargo test --release --locked --manifest-path services/link/Cargo.toml --target-dir $(TARGET)/link
 	$(PYTHON) tests/scripts/check_link.py $(TARGET)/release
+
+camera-rtsp: ## Build carff-camera-rtsp, the camera of RTSP network cameras (optional; adds 90 crates)
+	cargo build --release --locked --manifest-path services/camera-rtsp/Cargo.toml --target-dir $(TARGET)/cameras
+	mkdir -p $(TARGET)/release
+	cp $(TARGET)/cameras/release/carff-camera-rtsp $(TARGET)/release/
+
+camera-gst: ## Build carff-camera-gst, the camera of GStreamer pipelines (optional; needs GStreamer's development packages)
+	cargo build --release --locked --manifest-path services/camera-gst/Cargo.toml --target-dir $(TARGET)/cameras
+	mkdir -p $(TARGET)/release
+	cp $(TARGET)/cameras/release/carff-camera-gst $(TARGET)/release/
+
+check-cameras: build camera-rtsp camera-gst ## Test both optional cameras on pipelines and on an RTSP server of this machine
+	cargo fmt --manifest-path services/camera-rtsp/Cargo.toml --check
+	cargo fmt --manifest-path services/camera-gst/Cargo.toml --check
+	cargo test --release --locked --manifest-path services/camera-rtsp/Cargo.toml --target-dir $(TARGET)/cameras
+	$(PYTHON) tests/scripts/check_cameras.py $(TARGET)/release
 
 bench-peer: ## Build the peer with which `carff bench ipc` also measures zenoh (optional; adds 300 crates)
 	cargo build --release --locked --manifest-path tests/zenoh-peer/Cargo.toml --target-dir $(TARGET)/zenoh-peer

@@ -36,7 +36,7 @@ fn info(graph: &TestGraph) -> Value {
     serde_json::from_str(&finished.text).unwrap()
 }
 
-/// A graph without a camera of its own says who is expected. A camera joins by the run's name, its frames are decided
+/// A graph without a camera of its own names who is expected. A camera joins by the run's name, its frames are decided
 /// on; it is killed, the safe action follows, and its successor continues the numbers of its frames. Nothing is left.
 #[test]
 fn another_process_is_the_camera() {

@@ -143,7 +143,9 @@ impl Watched {
     fn watch(&mut self, waiter: &Waiter, span_ns: u64, source: CameraSource) -> anyhow::Result<Seen> {
         if let (CameraSource::External, Some(own)) = (source, &self.own) {
             let name = own.run.name();
-            println!("waiting for another process to publish camera/frame; `carff run info {name} --json` says how");
+            println!(
+                "waiting for another process to publish camera/frame; `carff run info {name} --json` prints how it joins"
+            );
         }
         let begun_ns = monotonic_now_ns();
         let mut seen: Option<Seen> = None;

@@ -4,8 +4,10 @@ use crate::complete;
 use carff_config::GraphConfig;
 use carff_dataset::Dataset;
 use carff_messages::SCHEMA_VERSION;
+use carff_messages::layout::{Described, Layout};
 use carff_observe::LiveRun;
-use carff_transport::{Run, TRANSPORT_VERSION, TopicId};
+use carff_runtime::{EGO_POSE, EgoPose};
+use carff_transport::{Limits, Run, TRANSPORT_VERSION, TopicId};
 use clap_complete::engine::ArgValueCandidates;
 use serde_json::{Value, json};
 use std::process::ExitCode;
@@ -46,6 +48,10 @@ pub fn run(command: &RunCommand) -> anyhow::Result<ExitCode> {
 /// Describes a run.
 pub fn info(live: &LiveRun) -> anyhow::Result<Value> {
     let run = Run::within(&live.dir, &live.name, live.run_id)?;
+    let graph = TopicId::all().map(|id| topic(id.name(), id.is_image(), &id.layout(), id.limits()));
+    // A camera on a vehicle receives it.
+    let ego = topic(EGO_POSE.name, false, &EgoPose::layout(), EGO_POSE.limits);
+    let topics: Vec<Value> = graph.chain([ego]).collect();
     Ok(json!({
         "run": live.name,
         "run_id": format!("{:016x}", live.run_id),
@@ -61,7 +67,7 @@ pub fn info(live: &LiveRun) -> anyhow::Result<Value> {
         "dataset": live.dataset,
         "checkpoint": live.checkpoint,
         "camera": camera(live),
-        "topics": TopicId::all().map(topic).collect::<Vec<_>>(),
+        "topics": topics,
     }))
 }
 
@@ -83,15 +89,14 @@ fn camera(live: &LiveRun) -> Value {
 }
 
 /// Describes a topic. It is two services of its name: publish-subscribe, and an event for wake-ups.
-fn topic(id: TopicId) -> Value {
-    let (layout, limits) = (id.layout(), id.limits());
-    let (payload, header) = if id.is_image() {
+fn topic(name: &str, is_image: bool, layout: &Layout, limits: Limits) -> Value {
+    let (payload, header) = if is_image {
         (json!({ "type_name": "u8", "variant": "slice", "content": "RGB, 8 bit, rows from the top" }), json!(layout))
     } else {
         (json!(layout), Value::Null)
     };
     json!({
-        "name": id.name(),
+        "name": name,
         "payload": payload,
         "user_header": header,
         "limits": {

@@ -64,7 +64,7 @@ fn scenario(graph: &GraphConfig, renders: bool, findings: &mut Vec<Finding>) -> 
     }
 }
 
-/// Checks a source of images that is no dataset: the folder or the file that it names exists.
+/// Checks a source of images other than a dataset: the folder or the file that it names exists.
 fn real_source(graph: &GraphConfig, dataset: &Path) -> Finding {
     let camera = &graph.camera;
     let (key, path) = match (camera.source, &camera.folder, &camera.file) {

@@ -133,7 +133,7 @@ impl ForeignCamera {
         })
     }
 
-    /// Returns the log line that tells who is expected.
+    /// Returns the log line that names who is expected.
     pub(crate) fn invitation(&self, run: &Run) -> String {
         let (topic, name) = (topics::FRAME.name, run.name());
         format!(

@@ -204,7 +204,7 @@ impl<'a> Supervisor<'a> {
         }
     }
 
-    /// Waits for the camera of another process, and says how it joins.
+    /// Waits for the camera of another process, and reports how it joins.
     fn expect_camera(&mut self) -> anyhow::Result<()> {
         let camera = ForeignCamera::expect(self.node, self.graph, self.limits(Stage::Camera).quiet_ns)?;
         self.terminal.log(LAUNCHER, &camera.invitation(self.node.run()));

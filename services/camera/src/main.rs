@@ -2,7 +2,7 @@
 //! The encoder interprets the images.
 
 use anyhow::{Context, bail};
-use carff_camera::{DriveSource, FolderSource, FreeDriveSource, McapSource, Source, VideoSource, recorded};
+use carff_camera::{DriveSource, FolderSource, FreeDriveSource, Source};
 use carff_config::CameraSource;
 use carff_messages::{Header, ImageMeta, Stage};
 use carff_runtime::{StageContext, frame_span};
@@ -13,15 +13,25 @@ fn main() -> std::process::ExitCode {
 }
 
 fn run(stage: &mut StageContext) -> anyhow::Result<()> {
-    let file = stage.graph.camera.file.as_ref().map(|file| stage.graph.resolve(file)).unwrap_or_default();
     match stage.graph.camera.source {
+        #[cfg(feature = "recordings")]
         CameraSource::Mcap => {
-            let mut source = McapSource::open(&file, &stage.graph)?;
-            recorded::run(stage, &mut source)
+            let mut source = carff_camera::McapSource::open(&file(stage)?, &stage.graph)?;
+            carff_camera::recorded::run(stage, &mut source)
         }
-        CameraSource::Video => recorded::run(stage, &mut VideoSource::open(&file)?),
+        #[cfg(feature = "video")]
+        CameraSource::Video => {
+            let mut source = carff_camera::VideoSource::open(&file(stage)?)?;
+            carff_camera::recorded::run(stage, &mut source)
+        }
         _ => run_drives(stage),
     }
+}
+
+#[cfg(any(feature = "recordings", feature = "video"))]
+fn file(stage: &StageContext) -> anyhow::Result<std::path::PathBuf> {
+    let file = stage.graph.camera.file.as_ref().context("`camera.file` is missing in the graph file")?;
+    Ok(stage.graph.resolve(file))
 }
 
 fn run_drives(stage: &mut StageContext) -> anyhow::Result<()> {
@@ -81,6 +91,9 @@ fn open_source(stage: &mut StageContext) -> anyhow::Result<Box<dyn Source>> {
                 None => Box::new(source),
             })
         }
-        other => bail!("the program carff-camera has no source {other:?}: start the graph with `carff launch`"),
+        source @ (CameraSource::Mcap | CameraSource::Video) => {
+            bail!("this build of carff-camera has no source {source:?}: build it with `make build`")
+        }
+        source => bail!("carff-camera has no source {source:?}: `carff launch` starts its program"),
     }
 }

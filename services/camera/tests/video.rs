@@ -53,7 +53,7 @@ fn all_images_are_shown_in_order() {
     assert_eq!(show(), (times, centres));
 }
 
-/// Files that are no video, of another codec, or cut off are errors with the remedy.
+/// Files without video, of another codec, or cut off are errors with the remedy.
 #[test]
 fn unusable_files_are_refused() {
     let cut = refused(|bytes| bytes.truncate(5000));

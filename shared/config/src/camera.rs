@@ -137,7 +137,8 @@ pub struct CameraConfig {
     pub calibration: Option<CalibrationChoice>,
     /// Pose of a fixed camera in the world. Default: the origin.
     pub world_from_camera: Option<Pose>,
-    /// Pose of the camera on the vehicle; the vehicle's pose comes from the topic `ego/pose`. Default: none.
+    /// Pose of the camera on the vehicle; the vehicle's pose comes from the topic `ego/pose`, and is the origin until the
+    /// first one. Default: none.
     pub vehicle_from_camera: Option<Pose>,
     /// Drives, half of them with the hazard, 1 to 100000. Default 60.
     #[schemars(range(min = 1, max = 100_000))]

@@ -1,12 +1,13 @@
 //! The output of a real camera's stage: images are rectified straight into the memory that the encoder reads.
 
+use crate::ego::{EGO_POSE, EgoPose};
 use crate::{StageContext, frame_span};
 use anyhow::{Context, ensure};
 use carff_base::geometry::PinholeCamera;
 use carff_config::Pose;
 use carff_dataset::{Calibration, Dataset, RawImage, Rectifier};
 use carff_messages::{DatasetView, FrameMeta, Header, ImageMeta, MAX_IMAGE_BYTES, rgb_bytes};
-use carff_transport::{Image, Publisher, monotonic_now_ns, topics};
+use carff_transport::{Image, Publisher, Receiver, monotonic_now_ns, topics};
 
 /// Assumed horizontal field of view of a camera without a calibration, degrees.
 const FIELD_OF_VIEW_DEG: f64 = 60.0;
@@ -24,6 +25,8 @@ pub struct FrameOutput {
     raw: Option<Publisher<Image<FrameMeta>>>,
     rectifier: Option<Rectifier>,
     world_from_camera: Pose,
+    /// The camera's pose on the vehicle, and the vehicle's poses.
+    ego: Option<(Pose, Receiver<EgoPose>)>,
     frame_id: u64,
     limit: u64,
 }
@@ -43,11 +46,16 @@ impl FrameOutput {
                  the training"
             );
         }
+        let ego = match camera.vehicle_from_camera {
+            Some(pose) => Some((pose, stage.input(&EGO_POSE)?.polled())),
+            None => None,
+        };
         Ok(Self {
             publisher: None,
             raw: stage.args.raw.then(|| stage.image_output(&topics::RAW, RAW_BYTES)).transpose()?,
             rectifier,
             world_from_camera: camera.world_from_camera.or(camera.vehicle_from_camera).unwrap_or(IDENTITY),
+            ego,
             frame_id: stage.args.first_frame,
             limit: stage.args.frames.unwrap_or(u64::MAX),
         })
@@ -93,6 +101,12 @@ impl FrameOutput {
         if let Err(error) = self.check(raw) {
             stage.refuse(&error);
             return Ok(());
+        }
+        // Without a new pose the vehicle is where it was; at first it is at the origin.
+        if let Some((vehicle_from_camera, poses)) = &mut self.ego
+            && let Some(ego) = poses.newest()?
+        {
+            self.world_from_camera = ego.world_from_camera(vehicle_from_camera);
         }
         let mut meta = FrameMeta::of_camera(&self.camera(raw), DatasetView::UNKNOWN);
         meta.header = Header::of_frame(self.frame_id, capture_time_ns, stage.seed());
