@@ -31,19 +31,21 @@ struct Schedule {
     /// Period of a given rate; `None` for the recorded one.
     period_ns: Option<u64>,
     recorded_ns: Option<u64>,
+    /// The last gap, which also separates the last image from the first one of a repetition.
+    gap_ns: u64,
     due_ns: u64,
 }
 
 impl Schedule {
     /// Returns the time of the frame that was recorded at a time.
     fn due(&mut self, recorded_ns: u64, now_ns: u64) -> u64 {
-        let last_ns = self.recorded_ns.replace(recorded_ns);
-        // A clock that was set back while recording makes no gap.
-        let recorded = || last_ns.map_or(0, |last_ns| recorded_ns.saturating_sub(last_ns).min(MAX_GAP_NS));
-        let first = last_ns.is_none();
-        let gap_ns = self.period_ns.filter(|_| !first).unwrap_or_else(recorded);
+        if let Some(last_ns) = self.recorded_ns.replace(recorded_ns) {
+            // A clock that was set back while recording makes no gap.
+            let recorded_ns = recorded_ns.saturating_sub(last_ns).min(MAX_GAP_NS);
+            self.gap_ns = self.period_ns.unwrap_or(recorded_ns);
+        }
         // A late frame delays later ones; the camera does not catch up with a burst.
-        self.due_ns = (self.due_ns + gap_ns).max(now_ns);
+        self.due_ns = (self.due_ns + self.gap_ns).max(now_ns);
         self.due_ns
     }
 }
@@ -65,7 +67,7 @@ pub fn run(stage: &mut StageContext, source: &mut dyn Recorded) -> anyhow::Resul
 
     let period_ns =
         (stage.graph.camera.pace == FramePace::FrameRate).then(|| (1e9 / stage.graph.run.frame_rate_hz) as u64);
-    let mut schedule = Schedule { period_ns, recorded_ns: None, due_ns: monotonic_now_ns() };
+    let mut schedule = Schedule { period_ns, recorded_ns: None, gap_ns: 0, due_ns: monotonic_now_ns() };
     let mut is_empty = false;
     while !output.is_complete() {
         let recorded_ns = match source.next() {
@@ -114,19 +116,22 @@ mod tests {
     /// Frames follow the recorded times; a clock that jumps back makes no gap, one that jumps forward a bounded one.
     #[test]
     fn frames_follow_the_recorded_times() {
-        let mut schedule = Schedule { period_ns: None, recorded_ns: None, due_ns: 1000 * MS };
+        let mut schedule = Schedule { period_ns: None, recorded_ns: None, gap_ns: 0, due_ns: 1000 * MS };
         let recorded = [50_000, 50_100, 50_250, 10, 110, 9_000_000];
         let due: Vec<u64> = recorded.map(|ms: u64| schedule.due(ms * MS, 0) / MS).to_vec();
         assert_eq!(due, [1000, 1100, 1250, 1250, 1350, 6350]);
         // A late frame delays the next ones.
         assert_eq!(schedule.due(9_000_100 * MS, 8000 * MS), 8000 * MS);
         assert_eq!(schedule.due(9_000_200 * MS, 8001 * MS), 8100 * MS);
+        // A repetition begins after the same gap as before.
+        schedule.recorded_ns = None;
+        assert_eq!(schedule.due(50_000 * MS, 8101 * MS), 8200 * MS);
     }
 
     /// A given rate does not depend on the recorded times.
     #[test]
     fn frames_follow_a_given_rate() {
-        let mut schedule = Schedule { period_ns: Some(20 * MS), recorded_ns: None, due_ns: 0 };
+        let mut schedule = Schedule { period_ns: Some(20 * MS), recorded_ns: None, gap_ns: 0, due_ns: 0 };
         let due: Vec<u64> = [7, 900, 3].map(|ms: u64| schedule.due(ms * MS, 0) / MS).to_vec();
         assert_eq!(due, [0, 20, 40]);
     }

@@ -3,11 +3,12 @@
 use crate::recorded::Recorded;
 use anyhow::{Context, anyhow, bail, ensure};
 use carff_dataset::{Calibration, RawImage};
-use openh264::decoder::Decoder;
+use openh264::decoder::{DecodeOptions, DecodedYUV, Decoder, Flush};
 use openh264::formats::YUVSource;
 use shiguredo_mp4::TrackKind;
 use shiguredo_mp4::boxes::SampleEntry;
 use shiguredo_mp4::demux::{Input, Mp4FileDemuxer};
+use std::collections::VecDeque;
 use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
@@ -39,8 +40,26 @@ pub struct VideoSource {
     times_ns: Vec<u64>,
     shown: usize,
     decoder: Decoder,
-    image: Vec<u8>,
+    /// The current image.
+    image: Rgb,
+    /// The last images, which the decoder holds back until the end.
+    last: Option<VecDeque<Rgb>>,
+}
+
+/// A decoded image.
+#[derive(Clone, Debug, Default)]
+struct Rgb {
     size_px: [u32; 2],
+    bytes: Vec<u8>,
+}
+
+impl Rgb {
+    fn take(&mut self, yuv: &DecodedYUV<'_>) {
+        let (width, height) = yuv.dimensions();
+        self.bytes.resize(width * height * 3, 0);
+        yuv.write_rgb8(&mut self.bytes);
+        self.size_px = [width as u32, height as u32];
+    }
 }
 
 impl std::fmt::Debug for VideoSource {
@@ -56,9 +75,9 @@ impl VideoSource {
         let coded = table(&mut file).with_context(|| format!("{} cannot be shown", path.display()))?;
         let mut times_ns: Vec<u64> = coded.iter().map(|coded| coded.time_ns).collect();
         times_ns.sort_unstable();
-        let (decoder, image) = (Decoder::new()?, Vec::new());
+        let (decoder, image) = (Decoder::new()?, Rgb::default());
         let path = path.to_owned();
-        Ok(Self { path, file, coded, next: 0, times_ns, shown: 0, decoder, image, size_px: [0; 2] })
+        Ok(Self { path, file, coded, next: 0, times_ns, shown: 0, decoder, image, last: None })
     }
 
     /// Decodes up to the next image that can be shown.
@@ -68,16 +87,27 @@ impl VideoSource {
             let data = read(&mut self.file, coded.at, coded.bytes as u64)?;
             let mut stream = coded.parameters.clone();
             append_units(&mut stream, &data, coded.length_bytes);
-            let image = self.decoder.decode(&stream).map_err(|e| anyhow!("image {} is damaged: {e}", self.next))?;
-            if let Some(yuv) = image {
-                let (width, height) = yuv.dimensions();
-                self.image.resize(width * height * 3, 0);
-                yuv.write_rgb8(&mut self.image);
-                self.size_px = [width as u32, height as u32];
+            // Images come out in the order in which they are shown; the decoder holds some back.
+            let options = DecodeOptions::new().flush_after_decode(Flush::NoFlush);
+            let image = self.decoder.decode_with_options(&stream, options);
+            if let Some(yuv) = image.map_err(|e| anyhow!("image {} is damaged: {}", self.next, reason(&e)))? {
+                self.image.take(&yuv);
                 return Ok(true);
             }
         }
-        Ok(false)
+        if self.last.is_none() {
+            // An error at the end happens once.
+            self.last = Some(VecDeque::new());
+            let rest = self.decoder.flush_remaining().map_err(|e| anyhow!("the end is damaged: {}", reason(&e)));
+            let images = rest?.iter().map(|yuv| {
+                let mut image = Rgb::default();
+                image.take(yuv);
+                image
+            });
+            self.last = Some(images.collect());
+        }
+        let next = self.last.as_mut().and_then(VecDeque::pop_front);
+        Ok(next.map(|image| self.image = image).is_some())
     }
 }
 
@@ -88,34 +118,38 @@ impl Recorded for VideoSource {
 
     fn next(&mut self) -> anyhow::Result<Option<u64>> {
         // A damaged image is left out; those that depend on it follow when they can be decoded again.
-        let mut errors = 0;
-        loop {
-            match self.decode() {
-                Ok(false) => return Ok(None),
-                Ok(true) => break,
-                Err(error) if self.next >= self.coded.len() => return Err(error),
-                Err(error) => {
-                    errors += 1;
-                    if errors == 1 {
-                        tracing::warn!("{}: {error}", self.path.display());
-                    }
+        let (mut errors, mut first) = (0, None);
+        while !match self.decode() {
+            Ok(true) => true,
+            Ok(false) => return first.filter(|_| self.shown == 0).map_or(Ok(None), Err),
+            Err(error) => {
+                errors += 1;
+                if first.is_none() {
+                    tracing::warn!("{}: {error}", self.path.display());
+                    first = Some(error);
                 }
+                false
             }
-        }
+        } {}
         let time_ns = self.times_ns.get(self.shown).or(self.times_ns.last()).copied();
         self.shown += 1 + errors;
         Ok(time_ns)
     }
 
     fn with_image(&mut self, each: &mut dyn FnMut(&RawImage<'_>) -> anyhow::Result<()>) -> anyhow::Result<()> {
-        each(&RawImage::rgb(self.size_px, &self.image)?)
+        each(&RawImage::rgb(self.image.size_px, &self.image.bytes)?)
     }
 
     fn rewind(&mut self) -> anyhow::Result<()> {
-        (self.next, self.shown) = (0, 0);
+        (self.next, self.shown, self.last) = (0, 0, None);
         self.decoder = Decoder::new()?;
         Ok(())
     }
+}
+
+/// Returns the first line of a decoder's error.
+fn reason(error: &openh264::Error) -> String {
+    error.to_string().lines().next().unwrap_or_default().to_owned()
 }
 
 /// Returns the coded images of the first video track.
