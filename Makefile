@@ -88,7 +88,7 @@ miri: ## Run the kernels of the field (portable path) and the messages' tests un
 FUZZ_FLAGS := --cfg fuzzing -Ccodegen-units=1 -Cpasses=sancov-module -Cllvm-args=-sanitizer-coverage-level=4 \
 	-Cllvm-args=-sanitizer-coverage-inline-8bit-counters -Cllvm-args=-sanitizer-coverage-pc-table \
 	-Cllvm-args=-sanitizer-coverage-trace-compares
-READERS := messages graph scenario soak training dataset import png planning manifest weights recording run-record
+READERS := messages graph scenario soak training dataset import png planning manifest weights recording bag calibration run-record
 FUZZ := $(TARGET)/fuzz
 
 fuzz: libtorch ## Feed each of READERS (default: all) with RUNS inputs (default 1000000), guided by coverage (nightly)

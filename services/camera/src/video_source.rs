@@ -98,8 +98,8 @@ impl VideoSource {
         if self.last.is_none() {
             // An error at the end happens once.
             self.last = Some(VecDeque::new());
-            let rest = self.decoder.flush_remaining().map_err(|e| anyhow!("the end is damaged: {}", reason(&e)));
-            let images = rest?.iter().map(|yuv| {
+            let rest = self.decoder.flush_remaining().map_err(|e| anyhow!("the end is damaged: {}", reason(&e)))?;
+            let images = rest.iter().map(|yuv| {
                 let mut image = Rgb::default();
                 image.take(yuv);
                 image
