@@ -16,7 +16,7 @@ else ifneq ($(CARGO_TARGET_DIR),)
 export LD_LIBRARY_PATH := $(CURDIR)/.libtorch/lib:$(CURDIR)/.onnxruntime/lib$(if $(LD_LIBRARY_PATH),:$(LD_LIBRARY_PATH))
 endif
 
-.PHONY: help run build deb check-deb link check-link test soak fuzz bench-peer lint sanitize miri sbom fmt libtorch onnxruntime
+.PHONY: help run build deb check-deb link check-link camera-rtsp camera-gst check-cameras test soak fuzz bench-peer lint sanitize miri sbom fmt libtorch onnxruntime
 
 help: ## List the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -50,6 +50,22 @@ check-link: build link ## Test carff-link; then drive here, observe from another
 	cargo test --release --locked --manifest-path services/link/Cargo.toml --target-dir $(TARGET)/link
 	$(PYTHON) tests/scripts/check_link.py $(TARGET)/release
 
+camera-rtsp: ## Build carff-camera-rtsp, the camera of RTSP network cameras (optional; adds 90 crates)
+	cargo build --release --locked --manifest-path services/camera-rtsp/Cargo.toml --target-dir $(TARGET)/cameras
+	mkdir -p $(TARGET)/release
+	cp $(TARGET)/cameras/release/carff-camera-rtsp $(TARGET)/release/
+
+camera-gst: ## Build carff-camera-gst, the camera of GStreamer pipelines (optional; needs GStreamer's development packages)
+	cargo build --release --locked --manifest-path services/camera-gst/Cargo.toml --target-dir $(TARGET)/cameras
+	mkdir -p $(TARGET)/release
+	cp $(TARGET)/cameras/release/carff-camera-gst $(TARGET)/release/
+
+check-cameras: build camera-rtsp camera-gst ## Test both optional cameras on pipelines and on an RTSP server of this machine
+	cargo fmt --manifest-path services/camera-rtsp/Cargo.toml --check
+	cargo fmt --manifest-path services/camera-gst/Cargo.toml --check
+	cargo test --release --locked --manifest-path services/camera-rtsp/Cargo.toml --target-dir $(TARGET)/cameras
+	$(PYTHON) tests/scripts/check_cameras.py $(TARGET)/release
+
 bench-peer: ## Build the peer with which `carff bench ipc` also measures zenoh (optional; adds 300 crates)
 	cargo build --release --locked --manifest-path tests/zenoh-peer/Cargo.toml --target-dir $(TARGET)/zenoh-peer
 	mkdir -p $(TARGET)/release
@@ -72,7 +88,7 @@ miri: ## Run the kernels of the field (portable path) and the messages' tests un
 FUZZ_FLAGS := --cfg fuzzing -Ccodegen-units=1 -Cpasses=sancov-module -Cllvm-args=-sanitizer-coverage-level=4 \
 	-Cllvm-args=-sanitizer-coverage-inline-8bit-counters -Cllvm-args=-sanitizer-coverage-pc-table \
 	-Cllvm-args=-sanitizer-coverage-trace-compares
-READERS := messages graph scenario soak training dataset import png planning manifest weights recording run-record
+READERS := messages graph scenario soak training dataset import png planning manifest weights recording bag calibration run-record
 FUZZ := $(TARGET)/fuzz
 
 fuzz: libtorch ## Feed each of READERS (default: all) with RUNS inputs (default 1000000), guided by coverage (nightly)

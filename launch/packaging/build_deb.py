@@ -5,7 +5,7 @@ Usage: python3 launch/packaging/build_deb.py [TARGET] [OUT]     (default: target
 
 | content | path |
 |---|---|
-| programs (carff-link only if it was built), libtorch, ONNX Runtime | /usr/lib/carff/bin, /usr/lib/carff/lib |
+| programs (the link and optional cameras only if they were built), libtorch, ONNX Runtime | /usr/lib/carff/bin, /usr/lib/carff/lib |
 | checkpoints, graphs, scenarios, schemas | /usr/share/carff/configs |
 | graph file of the service | /etc/carff/vehicle.toml |
 | units | /lib/systemd/system |
@@ -29,8 +29,8 @@ import build_sbom
 ROOT = Path(__file__).resolve().parents[2]
 PROGRAMS = ["carff", "carff-launch", "carff-camera", "carff-encoder", "carff-encoder-tch", "carff-forecaster", "carff-prober",
             "carff-renderer", "carff-controller", "carff-viewer"]
-# Included if it was built with `make link`.
-OPTIONAL = ["carff-link"]
+# Included if they were built with `make link`, `make camera-rtsp` and `make camera-gst`.
+OPTIONAL = ["carff-link", "carff-camera-rtsp", "carff-camera-gst"]
 # The run path of a program built in the project, and its replacement in the package.
 BUILT_RUNPATH = b"$ORIGIN/../../.libtorch/lib:$ORIGIN/../../../.libtorch/lib"
 INSTALLED_RUNPATH = b"$ORIGIN/../lib"
@@ -99,6 +99,8 @@ def fill(tree: Path, target: Path) -> None:
     put(debian / "vehicle.toml", tree / "etc/carff/vehicle.toml")
     for unit in ["carff.service", "carff-metrics.service", "carff-record.service", "carff.target"]:
         put(debian / unit, tree / "lib/systemd/system" / unit)
+    for drop_in in ["camera-device.conf", "camera-network.conf"]:
+        put(debian / drop_in, doc / "examples" / drop_in)
     put(debian / "carff.tmpfiles", tree / "usr/lib/tmpfiles.d/carff.conf")
 
     carff = str(target / "release/carff")

@@ -225,7 +225,10 @@ fn write_copy(graph: &GraphConfig, path: &Path) -> anyhow::Result<tempfile::Temp
 fn provide_dataset(graph: &GraphConfig, args: &LaunchArgs, dataset: &Path, terminal: &Terminal) -> anyhow::Result<()> {
     let complete = std::fs::read_dir(dataset)
         .is_ok_and(|entries| entries.flatten().any(|e| e.file_name().to_string_lossy().starts_with("transforms")));
-    if complete || graph.camera.source == CameraSource::Folder {
+    let camera = &graph.camera;
+    let is_needed = camera.source.has_truth() || camera.calibration.is_some();
+    let is_foreign = matches!(camera.source, CameraSource::Folder | CameraSource::External);
+    if complete || !is_needed && (is_foreign || graph.scenario_path().is_none()) {
         return Ok(());
     }
     ensure!(
@@ -250,7 +253,8 @@ fn provide_dataset(graph: &GraphConfig, args: &LaunchArgs, dataset: &Path, termi
 /// Returns the scenario of the dataset. Refuses a checkpoint of another scenario, whose decisions would be confident and
 /// wrong. The stage that needs a missing checkpoint reports it.
 fn scenario_of(graph: &GraphConfig, dataset: &Path, checkpoint: &Path) -> anyhow::Result<Option<ScenarioInfo>> {
-    if graph.camera.source == CameraSource::Folder {
+    let has_truth = graph.camera.source.has_truth();
+    if !has_truth && graph.camera.calibration.is_none() {
         return Ok(None);
     }
     let dataset = Dataset::open(dataset)?;
@@ -261,5 +265,5 @@ fn scenario_of(graph: &GraphConfig, dataset: &Path, checkpoint: &Path) -> anyhow
         let identity = ScenarioIdentity::of(scenario, dataset.view_count());
         Manifest::load(checkpoint)?.check_scenario(checkpoint, &identity)?;
     }
-    Ok(scenario.cloned())
+    Ok(scenario.filter(|_| has_truth).cloned())
 }

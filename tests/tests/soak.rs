@@ -32,6 +32,25 @@ fn the_graph_survives() {
     assert!(result["faults"].is_object() && result.get("rss_growth_percent_per_hour").is_some(), "{result:#}");
 }
 
+/// The contract holds under the faults of cameras: a lost device, stalls, other sizes, corrupt images, clock steps.
+#[test]
+fn the_graph_survives_its_camera() {
+    let folder = tempfile::tempdir().unwrap();
+    let json = folder.path().join("soak.json");
+    let mut command = Command::new(program("carff"));
+    command.arg("soak").arg(project_root().join("configs/soak/camera.toml"));
+    command.args(["--faults", &FAULTS.to_string(), "--minutes", "60", "--seed", "2", "--json"]).arg(&json);
+    command.arg("--dataset").arg(scenario_set()).arg("--checkpoint").arg(shipped_checkpoint());
+    let finished = Process::start(command.current_dir(project_root())).end();
+    let evidence = std::fs::read_to_string(folder.path().join("soak.evidence/launcher.log")).unwrap_or_default();
+    assert!(finished.status.success(), "{}:\n{}\n{evidence}", finished.status, finished.text);
+    let result: Value = serde_json::from_str(&std::fs::read_to_string(&json).unwrap()).unwrap();
+    assert_eq!((&result["violations"], &result["leaked_files"]), (&0.into(), &0.into()), "{result:#}");
+    for kind in ["device_loss", "stall", "resolution", "corrupt"] {
+        assert!(result["faults"][kind].as_u64() > Some(0), "{kind}: {result:#}");
+    }
+}
+
 /// A wrong soak file causes one error that names the file and the key.
 #[test]
 fn a_wrong_soak_file_is_named() {

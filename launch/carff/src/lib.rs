@@ -5,12 +5,14 @@
 
 #[cfg(feature = "bridge")]
 pub mod bridge;
+pub mod camera;
 mod complete;
 #[cfg(feature = "recording")]
 pub mod export;
 #[cfg(feature = "film")]
 mod film;
 mod http;
+pub mod info;
 pub mod layout;
 mod log_file;
 pub mod log_line;
@@ -55,6 +57,20 @@ pub enum Attach {
   carff ps
   carff ps --json")]
     Ps(runs::PsArgs),
+    /// Check a camera before the first drive.
+    #[command(
+        subcommand,
+        after_help = "Example: what arrives, and what the model sees, as an image file
+  carff camera check configs/graphs/approaching-intersection.toml --image check.png"
+    )]
+    Camera(camera::CameraCommand),
+    /// Describe a run to other programs.
+    #[command(
+        subcommand,
+        after_help = "Example: what a program in another language needs to join the only run
+  carff run info --json"
+    )]
+    Run(info::RunCommand),
     /// Stop a run, as Ctrl-C in its terminal does, and wait for its end.
     #[command(after_help = "Example: the only run; the run of a name
   carff stop
@@ -119,6 +135,8 @@ impl Attach {
         match self {
             Self::Probe(command) => probe::run(command),
             Self::Ps(args) => runs::ps(args),
+            Self::Camera(command) => camera::run(command),
+            Self::Run(command) => info::run(command),
             Self::Stop(args) => runs::stop(args),
             Self::Logs(args) => runs::logs(args),
             Self::View(_) => view::run(),

@@ -64,6 +64,52 @@ fn scenario(graph: &GraphConfig, renders: bool, findings: &mut Vec<Finding>) -> 
     }
 }
 
+/// Checks a source of images other than a dataset: the folder or the file that it names exists.
+fn real_source(graph: &GraphConfig, dataset: &Path) -> Finding {
+    let camera = &graph.camera;
+    let (key, path) = match (camera.source, &camera.folder, &camera.file) {
+        (CameraSource::Folder, Some(folder), _) => ("camera.folder", graph.resolve(folder)),
+        (CameraSource::Folder, None, _) => ("camera.folder", dataset.join("images")),
+        (CameraSource::Mcap | CameraSource::Video, _, Some(file)) => ("camera.file", graph.resolve(file)),
+        (CameraSource::External, ..) => {
+            return Finding::ok(Area::Graph, "images", "another process publishes `camera/frame`".to_owned());
+        }
+        _ => {
+            let program = camera.source.program().unwrap_or_default();
+            return Finding::ok(Area::Graph, "images", format!("from {program}; `carff camera check` shows them"));
+        }
+    };
+    let there = if camera.source == CameraSource::Folder { path.is_dir() } else { path.exists() };
+    if there {
+        return Finding::ok(Area::Graph, "images", path.display().to_string());
+    }
+    let kind = if camera.source == CameraSource::Folder { "is not a folder" } else { "does not exist" };
+    Finding::error(
+        Area::Graph,
+        "images",
+        format!("{} {kind}{}", path.display(), carff_base::names::beside(&path)),
+        "the camera has no images",
+        format!("correct `{key}` in the graph file"),
+    )
+}
+
+/// Checks that the calibration can be read.
+fn calibration(graph: &GraphConfig) -> Option<Finding> {
+    Some(match graph.calibration() {
+        Ok(found) => {
+            let [width, height] = found?.size_px();
+            Finding::ok(Area::Graph, "calibration", format!("for images of {width}x{height} pixels"))
+        }
+        Err(error) => Finding::error(
+            Area::Graph,
+            "calibration",
+            error.to_string(),
+            "the camera's images cannot be rectified",
+            "correct `camera.calibration` in the graph file",
+        ),
+    })
+}
+
 /// Checks the source of images. Returns the scenario of the images.
 fn pictures(
     graph: &GraphConfig,
@@ -72,20 +118,13 @@ fn pictures(
     findings: &mut Vec<Finding>,
 ) -> Option<ScenarioIdentity> {
     let subject = "dataset";
-    if graph.camera.source == CameraSource::Folder {
-        let folder = graph.camera.folder.as_ref().map_or_else(|| dataset.join("images"), |f| graph.resolve(f));
-        findings.push(if folder.is_dir() {
-            Finding::ok(Area::Graph, "images", folder.display().to_string())
-        } else {
-            Finding::error(
-                Area::Graph,
-                "images",
-                format!("{} is not a folder{}", folder.display(), carff_base::names::beside(&folder)),
-                "the camera has no images",
-                "correct `camera.folder` in the graph file",
-            )
-        });
-        return None;
+    let camera = &graph.camera;
+    if !camera.source.has_truth() {
+        findings.push(real_source(graph, dataset));
+        if camera.calibration.is_none() {
+            return None;
+        }
+        findings.extend(calibration(graph));
     }
     let rendered = scenario.map(|s| ScenarioIdentity::of(s.info(), s.cameras().len()));
     if !dataset.exists() {

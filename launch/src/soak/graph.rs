@@ -69,7 +69,10 @@ impl Graph {
         let name = format!("soak-{}", std::process::id());
         config.run.name.clone_from(&name);
         (config.run.seed, config.run.scenario) = (seed, None);
-        (config.run.dataset, config.run.checkpoint) = (std::path::absolute(dataset)?, checkpoint.clone());
+        // A link, so that the camera can lose its images without harm to them.
+        let images = folder.path().join("dataset");
+        std::os::unix::fs::symlink(std::path::absolute(dataset)?, &images)?;
+        (config.run.dataset, config.run.checkpoint) = (images, checkpoint.clone());
         config.camera.repeat = true;
         config.launcher.keep_frames = KEEP_FRAMES;
         // A soak kills more often than any policy for the road allows.
@@ -81,6 +84,13 @@ impl Graph {
         let graph = Self { folder, config, checkpoint, name, launcher: None };
         std::fs::write(graph.file(), toml::to_string(&graph.config)?)?;
         Ok(graph)
+    }
+
+    /// Takes the images from the camera, or gives them back.
+    pub(super) fn unplug(&self, unplugged: bool) -> anyhow::Result<()> {
+        let (plugged, aside) = (self.folder.path().join("dataset"), self.folder.path().join("unplugged"));
+        let (from, to) = if unplugged { (&plugged, &aside) } else { (&aside, &plugged) };
+        std::fs::rename(from, to).context("cannot move the link to the dataset")
     }
 
     fn file(&self) -> PathBuf {

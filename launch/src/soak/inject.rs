@@ -140,7 +140,8 @@ fn frames(node: &Node, args: &InjectArgs) -> anyhow::Result<()> {
         }
     }
     ensure!(!seen.is_empty(), "no frames to send again");
-    let most = seen.iter().map(|(_, bytes)| bytes.len()).max().unwrap_or(0);
+    // Frames of other sizes are up to twice as large along each side.
+    let most = 4 * seen.iter().map(|(_, bytes)| bytes.len()).max().unwrap_or(0);
     let mut output = node.image_publisher(&topics::FRAME, most)?;
     let newest = seen.len() - 1;
     match args.what.as_str() {
@@ -157,10 +158,42 @@ fn frames(node: &Node, args: &InjectArgs) -> anyhow::Result<()> {
             let jump_ns = if args.seed & (1 << 60) == 0 { jump_ns } else { -jump_ns };
             (0..args.count).try_for_each(|_| send(&mut output, &seen[newest], jump_ns))?;
         }
+        "resolution" => {
+            let sizes = [[4, 4], [1, 2], [3, 1], [1, 1]];
+            (0..args.count as usize).try_for_each(|i| send(&mut output, &rescaled(&seen[newest], sizes[i % 4]), 0))?;
+        }
+        "corrupt" => {
+            let mut random = stream(Key { seed: args.seed, frame: 0, step: 1, sample: 0 });
+            for i in 0..args.count {
+                let (mut meta, mut bytes) = seen[newest].clone();
+                meta.header.capture_time_ns = monotonic_now_ns();
+                match i % 3 {
+                    0 => random.fill(&mut bytes[..]),
+                    1 => bytes.truncate(bytes.len() / 2),
+                    _ => (meta.width_px, bytes) = (0, vec![0]),
+                }
+                send(&mut output, &(meta, bytes), 0)?;
+            }
+        }
         other => anyhow::bail!("`{other}` is not a fault that can be injected"),
     }
     std::thread::sleep(Duration::from_millis(300));
     Ok(())
+}
+
+/// Returns a frame captured now, with its sides multiplied by halves of `halves`.
+fn rescaled((meta, bytes): &(FrameMeta, Vec<u8>), halves: [u32; 2]) -> (FrameMeta, Vec<u8>) {
+    let mut meta = *meta;
+    let (width, from) = (meta.width_px, [meta.width_px, meta.height_px]);
+    (meta.width_px, meta.height_px) = ((from[0] * halves[0]).div_ceil(2), (from[1] * halves[1]).div_ceil(2));
+    meta.header.capture_time_ns = monotonic_now_ns();
+    let pixels = (0..meta.height_px).flat_map(|y| (0..meta.width_px).map(move |x| (x, y)));
+    let source = |(x, y): (u32, u32)| {
+        let at = [(x * 2 / halves[0]).min(from[0] - 1), (y * 2 / halves[1]).min(from[1] - 1)];
+        (at[1] * width + at[0]) as usize * 3
+    };
+    let scaled = pixels.flat_map(|pixel| bytes[source(pixel)..][..3].to_vec()).collect();
+    (meta, scaled)
 }
 
 fn send(output: &mut Publisher<Image<FrameMeta>>, frame: &(FrameMeta, Vec<u8>), jump_ns: i64) -> anyhow::Result<()> {

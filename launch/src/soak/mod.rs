@@ -20,7 +20,7 @@ pub use schedule::{Fault, fault};
 
 use anyhow::{Context, ensure};
 use carff_base::files::check_writable;
-use carff_config::{Kind, SoakConfig};
+use carff_config::{CameraSource, Kind, SoakConfig};
 use carff_messages::Stage;
 use carff_transport::{Node, Run, SHARED_MEMORY_DIR, Stop, Waiter, monotonic_now_ns};
 use graph::{Graph, Holdings, Victim, resident_bytes};
@@ -348,7 +348,27 @@ impl Soak<'_> {
                 self.recover(None)?;
             }
             Kind::Nan | Kind::Garbage | Kind::Schema | Kind::ForeignRun => self.lie(fault)?,
-            Kind::Burst | Kind::Late | Kind::Duplicate | Kind::Reorder | Kind::ClockJump => {
+            Kind::Stall => {
+                let camera = Fault { target: Some(Stage::Camera), ..*fault };
+                let victim = Victim::new(self.pid_of(&camera, &pids)?)?;
+                victim.signal(Signal::STOP);
+                self.look_for(fault.hold_ms)?;
+                victim.signal(Signal::CONT);
+                self.recover(None)?;
+            }
+            Kind::DeviceLoss => {
+                if self.graph.config.camera.source != CameraSource::Drives {
+                    return Ok(false);
+                }
+                self.lose_device(fault, &pids)?;
+            }
+            Kind::Burst
+            | Kind::Late
+            | Kind::Duplicate
+            | Kind::Reorder
+            | Kind::ClockJump
+            | Kind::Resolution
+            | Kind::Corrupt => {
                 self.injector(fault.kind.name(), fault)?;
                 self.recover(None)?;
             }
@@ -551,6 +571,16 @@ impl Soak<'_> {
         self.kill(Some(stage), pid);
         self.look_for(fault.hold_ms)?;
         write_whole(&path, &good)?;
+        self.recover(Some(pid))
+    }
+
+    /// Kills the camera and takes its images: it cannot return until they are back.
+    fn lose_device(&mut self, fault: &Fault, pids: &BTreeMap<Stage, u32>) -> anyhow::Result<()> {
+        let pid = pids.get(&Stage::Camera).copied().context("the camera never sent a heartbeat")?;
+        self.graph.unplug(true)?;
+        self.kill(Some(Stage::Camera), pid);
+        self.look_for(fault.hold_ms)?;
+        self.graph.unplug(false)?;
         self.recover(Some(pid))
     }
 

@@ -3,11 +3,13 @@
 //! | module | content |
 //! |---|---|
 //! | `process` | the process of a stage, and its log |
+//! | [`external`] | the camera of another process |
 //! | [`health`] | the state of a stage, from its heartbeats and its topic: a state machine without a clock |
 //! | [`restart`] | the restarts that a policy allows |
 //! | [`monitor`] | the records of frames and stages that a report is made of |
 //! | `service_manager` | notifications for systemd |
 
+pub mod external;
 pub mod health;
 pub mod monitor;
 mod process;
@@ -16,10 +18,11 @@ mod service_manager;
 
 use anyhow::{Context, anyhow, bail, ensure};
 use carff::terminal::Terminal;
-use carff_config::{GraphConfig, WhenLost};
+use carff_config::{CameraSource, GraphConfig, WhenLost};
 use carff_messages::{HealthState, Stage};
 use carff_runtime::StageArgs;
 use carff_transport::{Node, Run, Stop, Waiter, Woken, monotonic_now_ns, topics};
+use external::ForeignCamera;
 use health::{Ailment, Limits, StageHealth};
 use monitor::{FrameRecord, Monitor, Records};
 use process::StageProcess;
@@ -94,6 +97,8 @@ pub(crate) struct Supervisor<'a> {
     watchdog: Watchdog,
     /// Thread of the feed, once it has started.
     feed: Option<JoinHandle<anyhow::Result<()>>>,
+    /// The camera, if another process has it.
+    foreign: Option<ForeignCamera>,
     /// Time of the last check of the stages.
     watched_ns: u64,
     /// Time of the next search for leftovers.
@@ -129,6 +134,7 @@ impl<'a> Supervisor<'a> {
             terminal: terminal.clone(),
             watchdog: Watchdog::from_environment(),
             feed: None,
+            foreign: None,
             watched_ns: monotonic_now_ns(),
             cleanup_ns: monotonic_now_ns(),
             refresh_ns: monotonic_now_ns() + REFRESH_NS,
@@ -159,6 +165,7 @@ impl<'a> Supervisor<'a> {
             return Ok(Ended::Interrupted);
         }
         match feed {
+            None if self.graph.camera.source == CameraSource::External => self.expect_camera()?,
             None => self.start(*camera)?,
             Some(feed) => {
                 let (run, stop) = (run.clone(), stop.clone());
@@ -174,7 +181,7 @@ impl<'a> Supervisor<'a> {
                     None => Ok(Ended::Interrupted),
                 };
             }
-            if self.watch()? || self.is_fed()? {
+            if self.watch()? || self.is_fed()? || self.watch_camera()? {
                 self.collect()?;
                 return Ok(Ended::Done);
             }
@@ -197,12 +204,32 @@ impl<'a> Supervisor<'a> {
         }
     }
 
+    /// Waits for the camera of another process, and reports how it joins.
+    fn expect_camera(&mut self) -> anyhow::Result<()> {
+        let camera = ForeignCamera::expect(self.node, self.graph, self.limits(Stage::Camera).quiet_ns)?;
+        self.terminal.log(LAUNCHER, &camera.invitation(self.node.run()));
+        self.foreign = Some(camera);
+        Ok(())
+    }
+
+    /// Watches the camera of another process. Returns true when the run has all the frames that it was to have.
+    fn watch_camera(&mut self) -> anyhow::Result<bool> {
+        let Some(camera) = &mut self.foreign else { return Ok(false) };
+        if let Some(line) = camera.watch(self.node, &self.monitor.records)? {
+            self.terminal.log(LAUNCHER, &line);
+        }
+        Ok(camera.is_complete(self.stage_args.frames))
+    }
+
     fn start(&mut self, stage: Stage) -> anyhow::Result<()> {
         // A restarted camera continues after its last frame.
         let first_frame = if stage == Stage::Camera { self.monitor.records.frame_count() } else { 0 };
         let args = StageArgs { first_frame, ..self.stage_args.clone() };
-        let program = self.folder.join(self.graph.stages.program(stage));
-        let process = StageProcess::start(stage, &program, &args, &self.terminal)?;
+        let program = match stage {
+            Stage::Camera => self.graph.camera.source.program().unwrap_or_default().to_owned(),
+            other => self.graph.stages.program(other),
+        };
+        let process = StageProcess::start(stage, &self.folder.join(program), &args, &self.terminal)?;
         let (pid, now_ns) = (process.pid(), monotonic_now_ns());
         match self.stages.iter_mut().find(|w| w.stage == stage) {
             Some(watched) => {
@@ -283,6 +310,7 @@ impl<'a> Supervisor<'a> {
         let pause_ns = now_ns.saturating_sub(std::mem::replace(&mut self.watched_ns, now_ns));
         if pause_ns > OWN_PAUSE_NS {
             self.stages.iter_mut().for_each(|w| w.health.forgive(pause_ns));
+            self.foreign.iter_mut().for_each(|camera| camera.forgive(pause_ns));
         }
         let mut ended = BTreeMap::new();
         for watched in &mut self.stages {
@@ -396,7 +424,8 @@ impl<'a> Supervisor<'a> {
     fn show_status(&self) {
         let (records, now_ns) = (&self.monitor.records, monotonic_now_ns());
         let restarts: u32 = self.stages.iter().map(|s| s.budget.restarts()).sum();
-        let other = self.stages.iter().map(|w| (w.stage, w.health.state(now_ns)));
+        let foreign = self.foreign.iter().map(|camera| (Stage::Camera, camera.state()));
+        let other = self.stages.iter().map(|w| (w.stage, w.health.state(now_ns))).chain(foreign);
         let other: Vec<_> =
             other.filter(|(_, state)| *state != HealthState::Ok).map(|(s, state)| format!("{s} {state}")).collect();
         let latest = records.frames.values().rev().find_map(|f| Some((f.action?, f.hazard_probability)));

@@ -108,6 +108,8 @@ pub struct Records {
     wanted: Wanted,
     /// Frames by number.
     pub frames: BTreeMap<u64, FrameRecord>,
+    /// Number of valid camera frames that the launcher has read.
+    pub frames_seen: u64,
     /// Number of published actions, both decisions and repeats.
     pub actions: u64,
     /// Number of published actions that the launcher did not read in time, because it was stopped or slow.
@@ -175,6 +177,7 @@ impl Records {
 
     fn take_frame(&mut self, meta: &FrameMeta) {
         self.spoke_ns.insert(Stage::Camera, meta.header.publish_time_ns);
+        self.frames_seen += 1;
         self.record(FrameRecord::of(&meta.header, &meta.dataset_view));
     }
 

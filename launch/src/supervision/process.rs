@@ -33,6 +33,10 @@ impl StageProcess {
         args: &StageArgs,
         terminal: &Arc<Terminal>,
     ) -> anyhow::Result<Self> {
+        let build = match program.file_name().and_then(|name| name.to_str()) {
+            Some(name @ ("carff-camera-rtsp" | "carff-camera-gst")) => format!("make {}", &name["carff-".len()..]),
+            _ => "cargo build --release".to_owned(),
+        };
         let mut child = Command::new(program)
             .args(args.to_command_line())
             .stdin(Stdio::null())
@@ -41,7 +45,7 @@ impl StageProcess {
             // Only the launcher receives Ctrl-C; it ends the stages in order.
             .process_group(0)
             .spawn()
-            .with_context(|| format!("cannot start {}; build it with `cargo build --release`", program.display()))?;
+            .with_context(|| format!("cannot start {}; build it with `{build}`", program.display()))?;
         let last_error = Arc::new(Mutex::new(None));
         let stderr = child.stderr.take().context("the child's standard error is missing")?;
         let (terminal, noted) = (terminal.clone(), last_error.clone());

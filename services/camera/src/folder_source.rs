@@ -6,7 +6,7 @@ use carff_base::geometry::PinholeCamera;
 use carff_base::random::Key;
 use carff_config::GraphConfig;
 use carff_dataset::sensor::{SensorNoise, apply_noise_into};
-use carff_dataset::{Image, image_files};
+use carff_dataset::{Image, RawImage, Rectifier, image_files};
 use carff_messages::{DatasetView, FrameMeta};
 use std::path::Path;
 
@@ -24,6 +24,8 @@ pub struct FolderSource {
     frames_per_picture: usize,
     shown: usize,
     current: usize,
+    /// The camera of rectified images.
+    camera: Option<PinholeCamera>,
 }
 
 impl FolderSource {
@@ -66,8 +68,21 @@ impl FolderSource {
             frames_per_picture: graph.camera.frames_per_timestamp as usize,
             shown: 0,
             current: 0,
+            camera: None,
         };
         Ok((source, errors))
+    }
+
+    /// Rectifies all images.
+    pub fn rectified(mut self, rectifier: &Rectifier) -> anyhow::Result<Self> {
+        let camera = *rectifier.camera();
+        for (_, image) in &mut self.images {
+            let mut rectified = Image::filled(camera.width_px, camera.height_px, [0; 3]);
+            rectifier.write(&RawImage::rgb([image.width_px, image.height_px], &image.rgb)?, &mut rectified.rgb)?;
+            *image = rectified;
+        }
+        self.camera = Some(camera);
+        Ok(self)
     }
 }
 
@@ -84,14 +99,9 @@ impl Source for FolderSource {
         self.current = self.shown % total / self.frames_per_picture;
         self.shown += 1;
         let (view, image) = &self.images[self.current];
-        let camera = PinholeCamera::look_at(
-            [0.0; 3],
-            [0.0, 1.0, 0.0],
-            [0.0, 0.0, 1.0],
-            image.width_px,
-            image.height_px,
-            FIELD_OF_VIEW_DEG,
-        );
+        let [eye, ahead, up] = [[0.0; 3], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
+        let assumed = PinholeCamera::look_at(eye, ahead, up, image.width_px, image.height_px, FIELD_OF_VIEW_DEG);
+        let camera = self.camera.unwrap_or(assumed);
         Ok(Some(FrameMeta::of_camera(&camera, DatasetView { view: *view, ..DatasetView::UNKNOWN })))
     }
 

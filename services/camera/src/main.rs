@@ -1,7 +1,7 @@
-//! The camera stage: takes images from a [`source::Source`] at a fixed rate and publishes them.
+//! The camera stage: takes images from a [`source::Source`] at a fixed rate, or from a recording, and publishes them.
 //! The encoder interprets the images.
 
-use anyhow::Context;
+use anyhow::{Context, bail};
 use carff_camera::{DriveSource, FolderSource, FreeDriveSource, Source};
 use carff_config::CameraSource;
 use carff_messages::{Header, ImageMeta, Stage};
@@ -13,6 +13,28 @@ fn main() -> std::process::ExitCode {
 }
 
 fn run(stage: &mut StageContext) -> anyhow::Result<()> {
+    match stage.graph.camera.source {
+        #[cfg(feature = "recordings")]
+        CameraSource::Mcap => {
+            let mut source = carff_camera::McapSource::open(&file(stage)?, &stage.graph)?;
+            carff_camera::recorded::run(stage, &mut source)
+        }
+        #[cfg(feature = "video")]
+        CameraSource::Video => {
+            let mut source = carff_camera::VideoSource::open(&file(stage)?)?;
+            carff_camera::recorded::run(stage, &mut source)
+        }
+        _ => run_drives(stage),
+    }
+}
+
+#[cfg(any(feature = "recordings", feature = "video"))]
+fn file(stage: &StageContext) -> anyhow::Result<std::path::PathBuf> {
+    let file = stage.graph.camera.file.as_ref().context("`camera.file` is missing in the graph file")?;
+    Ok(stage.graph.resolve(file))
+}
+
+fn run_drives(stage: &mut StageContext) -> anyhow::Result<()> {
     let mut source = open_source(stage)?;
     let mut frames = stage.image_output(&topics::FRAME, source.max_image_bytes())?;
     let period_ns = (1e9 / stage.graph.run.frame_rate_hz) as u64;
@@ -64,7 +86,14 @@ fn open_source(stage: &mut StageContext) -> anyhow::Result<Box<dyn Source>> {
             for error in &unreadable {
                 stage.error(error);
             }
-            Ok(Box::new(source))
+            Ok(match carff_runtime::rectifier(stage, None)? {
+                Some(rectifier) => Box::new(source.rectified(&rectifier)?),
+                None => Box::new(source),
+            })
         }
+        source @ (CameraSource::Mcap | CameraSource::Video) => {
+            bail!("this build of carff-camera has no source {source:?}: build it with `make build`")
+        }
+        source => bail!("carff-camera has no source {source:?}: `carff launch` starts its program"),
     }
 }

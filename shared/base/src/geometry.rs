@@ -142,6 +142,14 @@ impl PinholeCamera {
             .then(|| ([self.cx_px + self.fl_x_px * c[0] / depth, self.cy_px - self.fl_y_px * c[1] / depth], depth))
     }
 
+    /// Returns the horizontal and vertical field of view, degrees.
+    pub fn field_of_view_deg(&self) -> [f64; 2] {
+        let angle = |centre: f64, side: u32, focal: f64| {
+            ((centre / focal).atan() + ((f64::from(side) - centre) / focal).atan()).to_degrees()
+        };
+        [angle(self.cx_px, self.width_px, self.fl_x_px), angle(self.cy_px, self.height_px, self.fl_y_px)]
+    }
+
     /// Returns the same camera with another image size.
     #[must_use]
     pub fn resized(&self, width_px: u32, height_px: u32) -> Self {
@@ -179,22 +187,23 @@ impl PinholeCamera {
         if self.height_px == 0 {
             return Err(CameraError::NotPositive("h"));
         }
-        let m = &self.world_from_camera;
-        if m.iter().flatten().any(|v| !v.is_finite()) {
+        if self.world_from_camera.iter().flatten().any(|v| !v.is_finite()) {
             return Err(CameraError::NotFinite("transform_matrix"));
         }
-        let column = |j: usize| [m[0][j], m[1][j], m[2][j]];
-        let (x, y, z) = (column(0), column(1), column(2));
-        let unit = |v: [f64; 3]| (dot(v, v) - 1.0).abs() < 1e-3;
-        let right_handed = dot(cross(x, y), z) > 0.0;
-        let orthogonal = dot(x, y).abs() < 1e-3 && dot(y, z).abs() < 1e-3 && dot(x, z).abs() < 1e-3;
-        let last_row = m[3] == [0.0, 0.0, 0.0, 1.0];
-        if unit(x) && unit(y) && unit(z) && orthogonal && right_handed && last_row {
-            Ok(())
-        } else {
-            Err(CameraError::NotARotation)
-        }
+        if is_rigid(&self.world_from_camera) { Ok(()) } else { Err(CameraError::NotARotation) }
     }
+}
+
+/// Returns true if a matrix is a rotation and a translation over the row 0 0 0 1.
+pub fn is_rigid(m: &[[f64; 4]; 4]) -> bool {
+    let column = |j: usize| [m[0][j], m[1][j], m[2][j]];
+    let (x, y, z) = (column(0), column(1), column(2));
+    let unit = |v: [f64; 3]| (dot(v, v) - 1.0).abs() < 1e-3;
+    let right_handed = dot(cross(x, y), z) > 0.0;
+    let orthogonal = dot(x, y).abs() < 1e-3 && dot(y, z).abs() < 1e-3 && dot(x, z).abs() < 1e-3;
+    let finite = m.iter().flatten().all(|v| v.is_finite());
+    let last_row = m[3] == [0.0, 0.0, 0.0, 1.0];
+    finite && unit(x) && unit(y) && unit(z) && orthogonal && right_handed && last_row
 }
 
 /// A box that is rotated about the vertical axis.

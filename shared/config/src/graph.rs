@@ -4,10 +4,11 @@
 //! it, and reading a file checks it.
 
 use crate::ConfigError;
+use crate::camera::{CalibrationChoice, CameraConfig, CameraSource};
 use crate::error::{Source, read};
 use crate::ranges;
 use crate::stages::{LogFormat, StageConfig, StagesConfig};
-use carff_dataset::sensor::SensorNoise;
+use carff_dataset::{Calibration, CalibrationError};
 use carff_decision::Sampling;
 use carff_messages::{Rule, Stage};
 use schemars::JsonSchema;
@@ -78,75 +79,6 @@ pub struct RunConfig {
     /// Waits by spinning instead of sleeping: 20 to 60 us faster, at one full core per stage. Default false.
     #[serde(default)]
     pub busy_polling: bool,
-}
-
-/// The source of camera images.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
-#[serde(rename_all = "kebab-case")]
-pub enum CameraSource {
-    /// Drives through a dataset.
-    #[default]
-    Drives,
-    /// Drives through the scenario itself (`run.scenario`), rendered during the run. The ego moves, and no pose is a
-    /// pose of the dataset.
-    FreeDrives,
-    /// The images of a folder, in the order of their names.
-    Folder,
-}
-
-/// The poses that drives are taken from.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
-#[serde(rename_all = "kebab-case")]
-pub enum PoseChoice {
-    /// Training poses, without the calibration poses.
-    #[default]
-    Trained,
-    /// Held-out poses, which training never saw.
-    Unseen,
-}
-
-/// The images that the camera stage publishes.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields, default)]
-pub struct CameraConfig {
-    /// `drives` through the dataset, `free-drives` through the scenario, or the images of a `folder`. Default `drives`.
-    pub source: CameraSource,
-    /// The folder, when `source` is `folder`. Default: `images` in the dataset.
-    pub folder: Option<PathBuf>,
-    /// Drives, half of them with the hazard, 1 to 100000. Default 60.
-    #[schemars(range(min = 1, max = 100_000))]
-    pub drives: u32,
-    /// Frames per time step of a drive, 1 to 1000. Default 6.
-    #[schemars(range(min = 1, max = 1000))]
-    pub frames_per_timestamp: u32,
-    /// Sensor noise, drawn anew for each frame.
-    pub noise: SensorNoise,
-    /// The poses that `drives` are taken from: `trained` (the paper's setting) or `unseen`. Default `trained`.
-    pub poses: PoseChoice,
-    /// Seed of the split into trained and held-out poses. Default: the seed that the checkpoint records.
-    pub split_seed: Option<u64>,
-    /// Starts again at the end until the run is stopped. Free drives continue with new drives instead. Default false.
-    pub repeat: bool,
-    /// Time that the stage waits after the last frame, so that the other stages can finish it, milliseconds, 0 to
-    /// 60000. Default 500.
-    #[schemars(range(min = 0, max = 60_000))]
-    pub linger_ms: u64,
-}
-
-impl Default for CameraConfig {
-    fn default() -> Self {
-        Self {
-            source: CameraSource::Drives,
-            folder: None,
-            drives: 60,
-            frames_per_timestamp: 6,
-            noise: SensorNoise::default(),
-            poses: PoseChoice::Trained,
-            split_seed: None,
-            repeat: false,
-            linger_ms: 500,
-        }
-    }
 }
 
 /// A camera that the renderer looks through.
@@ -374,8 +306,8 @@ impl GraphConfig {
         graph.run.dataset = self.resolve(&self.run.dataset);
         graph.run.checkpoint = self.resolve(&self.run.checkpoint);
         graph.run.scenario = self.scenario_path().map(|path| path.with_extension("").display().to_string());
-        graph.camera.folder = self.camera.folder.as_ref().map(|folder| self.resolve(folder));
-        for path in [&mut graph.run.dataset, &mut graph.run.checkpoint].into_iter().chain(&mut graph.camera.folder) {
+        graph.camera.paths_mut().for_each(|path| *path = self.resolve(path));
+        for path in [&mut graph.run.dataset, &mut graph.run.checkpoint].into_iter().chain(graph.camera.paths_mut()) {
             *path = std::path::absolute(&*path).unwrap_or_else(|_| path.clone());
         }
         toml::to_string(&graph)
@@ -402,6 +334,22 @@ impl GraphConfig {
     /// if it exists there, else from the root of the project.
     pub fn resolve(&self, path: &Path) -> PathBuf {
         if path.is_absolute() || path.exists() { path.to_owned() } else { self.project_root.join(path) }
+    }
+
+    /// The calibration of a real camera, where there is one.
+    ///
+    /// # Errors
+    ///
+    /// If its file cannot be read.
+    pub fn calibration(&self) -> Result<Option<Calibration>, CalibrationError> {
+        self.camera
+            .calibration
+            .as_ref()
+            .map(|choice| match choice {
+                CalibrationChoice::File(path) => Calibration::load(&self.resolve(path)),
+                CalibrationChoice::Table(table) => Ok(table.clone()),
+            })
+            .transpose()
     }
 
     /// The scenario file that the dataset is rendered from, where one is named.
@@ -466,6 +414,7 @@ impl GraphConfig {
             let allowed = "`free-drives` with a `run.scenario` to render".to_owned();
             return Err(source.range("camera.source", "\"free-drives\"".to_owned(), allowed));
         }
+        self.camera.check(source)?;
         self.stages.check(source)?;
         let order = &self.overload.order;
         if (1..order.len()).any(|i| order[..i].contains(&order[i])) {

@@ -22,16 +22,18 @@
 //! A relative path in a graph file is resolved in the current directory. Where it does not exist there, it is taken
 //! from the root of the project: the first folder above the graph file that holds a `configs` folder.
 
+mod camera;
 mod error;
 mod graph;
 mod ranges;
 mod soak;
 mod stages;
 
+pub use camera::{CalibrationChoice, CameraConfig, CameraSource, FramePace, Pose, PoseChoice};
 pub use error::ConfigError;
 pub use graph::{
-    CameraConfig, CameraSource, ControllerConfig, GraphConfig, LauncherConfig, OverloadConfig, PoseChoice, Quality,
-    RendererConfig, RunConfig, ViewChoice, WhenLost,
+    ControllerConfig, GraphConfig, LauncherConfig, OverloadConfig, Quality, RendererConfig, RunConfig, ViewChoice,
+    WhenLost,
 };
 pub use soak::{Contract, Kind, Pace, SoakConfig, Weights};
 pub use stages::{Backend, LogFormat, LogLevel, RestartPolicy, StageConfig, StagesConfig};

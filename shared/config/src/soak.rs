@@ -70,6 +70,14 @@ weights! {
     reorder => Reorder,
     /// Frames that never come: the camera stands still for some.
     drop => Drop,
+    /// The camera's device is gone for a while: its process is killed, and cannot start until its images are back.
+    device_loss => DeviceLoss,
+    /// The camera delivers nothing for a while: SIGSTOP, SIGCONT later.
+    stall => Stall,
+    /// Frames of other sizes in mid-stream.
+    resolution => Resolution,
+    /// Frames of random pixels, of the wrong length, and without pixels.
+    corrupt => Corrupt,
     /// Messages with a NaN.
     nan => Nan,
     /// Messages of random bits.

@@ -25,6 +25,37 @@ fn wrong_files_have_golden_messages() {
             format!("{HEAD}[camera]\nsource = \"free-drives\"\n"),
             "graph.toml:6: `camera.source` is \"free-drives\"; allowed: `free-drives` with a `run.scenario` to render",
         ),
+        (
+            format!("{HEAD}[camera]\nsource = \"mcap\"\n"),
+            "graph.toml:6: `camera.source` is \"mcap\"; allowed: `mcap` with `camera.file`, the recording",
+        ),
+        (
+            format!("{HEAD}[camera]\nsource = \"rtsp\"\n"),
+            "graph.toml:6: `camera.source` is \"rtsp\"; allowed: `rtsp` with `camera.url`, the camera's address",
+        ),
+        (
+            format!("{HEAD}[camera]\nsource = \"external\"\ncalibration = \"c.yaml\"\n"),
+            "graph.toml:7: `camera.calibration` is set; allowed: no calibration for `drives` and `free-drives`, which \
+             need none, and `external`, whose process rectifies its images itself",
+        ),
+        (
+            format!(
+                "{HEAD}[camera]\nsource = \"folder\"\n[camera.calibration]\nwidth_px = 10\nheight_px = 10\n\
+                     fl_x_px = 0.0\nfl_y_px = 5.0\ncx_px = 5.0\ncy_px = 5.0\n"
+            ),
+            "graph.toml:10: `camera.calibration.fl_x_px` is 0; allowed: a focal length is finite and above 0",
+        ),
+        (
+            format!("{HEAD}[camera]\nsource = \"folder\"\n[camera.calibration]\nwidth = 10\n"),
+            "graph.toml:8: `camera.calibration.width`: unknown field `width`, expected one of `width_px`, `height_px`, \
+             `fl_x_px`, `fl_y_px`, `cx_px`, `cy_px`, `model`, `distortion`; did you mean `width_px`?",
+        ),
+        (
+            format!("{HEAD}[camera]\nworld_from_camera = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 2]]\n"),
+            "graph.toml:6: `camera.world_from_camera` is [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, \
+             0.0], [0.0, 0.0, 0.0, 2.0]]; allowed: four rows of four numbers: a rotation and a translation over the \
+             row 0 0 0 1",
+        ),
         (format!("{HEAD}horizon = 9\n"), "graph.toml:5: `run.horizon` is 9; allowed: 1 to 8"),
         (
             format!("{HEAD}horizon = \"two\"\n"),

@@ -115,6 +115,21 @@ impl Dataset {
         }
     }
 
+    /// Returns the camera that most frames were taken with, at the first one's pose: the size and the field of view that
+    /// models are trained for.
+    pub fn usual_camera(&self) -> Option<PinholeCamera> {
+        let key = |c: &PinholeCamera| {
+            let numbers = [c.fl_x_px, c.fl_y_px, c.cx_px, c.cy_px].map(f64::to_bits);
+            (c.width_px, c.height_px, numbers)
+        };
+        let mut counts: HashMap<_, (usize, usize)> = HashMap::new();
+        for (i, frame) in self.frames.iter().enumerate() {
+            counts.entry(key(&frame.camera)).or_insert((0, i)).0 += 1;
+        }
+        let (_, first) = counts.into_values().max_by_key(|(count, first)| (*count, std::cmp::Reverse(*first)))?;
+        Some(self.frames[first].camera)
+    }
+
     /// Returns the index of the frame of a state from a view.
     pub fn frame_index(&self, state: usize, view: usize) -> Option<usize> {
         self.frames.iter().position(|f| f.state == Some(state) && f.view == Some(view))

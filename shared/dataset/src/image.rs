@@ -101,6 +101,13 @@ impl Image {
         Ok(Self { width_px, height_px, rgb: decoded.into_rgb8().into_raw() })
     }
 
+    /// Decodes a PNG or JPEG image of any pixel type from memory; errors name `source`. Transparency is ignored.
+    pub fn decode(bytes: &[u8], source: &Path) -> Result<Self, DatasetError> {
+        let decoded = decode_bytes(source, bytes)?;
+        let (width_px, height_px) = (decoded.width(), decoded.height());
+        Ok(Self { width_px, height_px, rgb: decoded.into_rgb8().into_raw() })
+    }
+
     /// Writes the image as an 8-bit RGB PNG file.
     pub fn save_png(&self, path: &Path) -> Result<(), DatasetError> {
         write_png(path, &self.rgb, self.width_px, self.height_px, ExtendedColorType::Rgb8)
@@ -154,14 +161,19 @@ pub(crate) fn load_mask(path: &Path, (width_px, height_px): (u32, u32)) -> Resul
 /// Decodes a PNG or JPEG file by its content.
 fn decode(path: &Path) -> Result<DynamicImage, DatasetError> {
     let bytes = std::fs::read(path).map_err(|source| DatasetError::Io { path: path.to_owned(), source })?;
-    let format = match image::guess_format(&bytes) {
+    decode_bytes(path, &bytes)
+}
+
+/// Decodes PNG or JPEG bytes; errors name `path`.
+fn decode_bytes(path: &Path, bytes: &[u8]) -> Result<DynamicImage, DatasetError> {
+    let format = match image::guess_format(bytes) {
         Ok(format @ (ImageFormat::Png | ImageFormat::Jpeg)) => format,
         Ok(other) => return Err(unreadable(path, &format!("a {other:?} file"))),
         Err(_) => {
-            return Err(unreadable(path, carff_base::errors::stand_in(&bytes).unwrap_or("it starts like neither")));
+            return Err(unreadable(path, carff_base::errors::stand_in(bytes).unwrap_or("it starts like neither")));
         }
     };
-    if format == ImageFormat::Jpeg && !has_end_marker(&bytes) {
+    if format == ImageFormat::Jpeg && !has_end_marker(bytes) {
         return Err(unreadable(path, "the file is cut off: it has no end marker; copy or export it again"));
     }
     let mut limits = Limits::default();

@@ -128,19 +128,51 @@ impl Lens {
         }
     }
 
-    /// Returns, for each pixel of a pinhole camera of these intrinsics, its position in the lens's image in pixels;
-    /// `None` where the lens shows nothing.
-    fn positions<'a>(&'a self, camera: &'a PinholeCamera) -> impl Iterator<Item = Option<[f64; 2]>> + 'a {
+    /// Returns the function from a position in a pinhole camera's image (pixels; a pixel's centre is at +0.5) to the
+    /// position in the lens's image on `sensor` (pixels; a pixel's centre is at 0); `None` where the lens shows nothing.
+    pub fn mapping<'a>(
+        &'a self,
+        camera: &'a PinholeCamera,
+        sensor: &'a PinholeCamera,
+    ) -> impl Fn(f64, f64) -> Option<[f64; 2]> + 'a {
         let (w, h) = (f64::from(camera.width_px), f64::from(camera.height_px));
         let at = |u: f64, v: f64| [(u - camera.cx_px) / camera.fl_x_px, (v - camera.cy_px) / camera.fl_y_px];
         let corners = [at(0.0, 0.0), at(w, 0.0), at(0.0, h), at(w, h)];
         let reach = self.reach(corners.iter().map(|[x, y]| self.argument(x.hypot(*y))).fold(0.0, f64::max));
-        (0..camera.height_px).flat_map(move |v| (0..camera.width_px).map(move |u| (u, v))).map(move |(u, v)| {
-            let [x, y] = at(f64::from(u) + 0.5, f64::from(v) + 0.5);
+        move |u, v| {
+            let [x, y] = at(u, v);
             let [x, y] = Some([x, y]).filter(|_| self.argument(x.hypot(y)) <= reach).map(|[x, y]| self.bent(x, y))?;
-            let (u, v) = (x * camera.fl_x_px + camera.cx_px - 0.5, y * camera.fl_y_px + camera.cy_px - 0.5);
+            let (u, v) = (x * sensor.fl_x_px + sensor.cx_px - 0.5, y * sensor.fl_y_px + sensor.cy_px - 0.5);
             (u.is_finite() && v.is_finite()).then_some([u, v])
-        })
+        }
+    }
+
+    /// Returns, for each pixel of a pinhole camera of these intrinsics, its position in the lens's image in pixels;
+    /// `None` where the lens shows nothing.
+    fn positions<'a>(&'a self, camera: &'a PinholeCamera) -> impl Iterator<Item = Option<[f64; 2]>> + 'a {
+        let position = self.mapping(camera, camera);
+        let pixels = (0..camera.height_px).flat_map(move |v| (0..camera.width_px).map(move |u| (u, v)));
+        pixels.map(move |(u, v)| position(f64::from(u) + 0.5, f64::from(v) + 0.5))
+    }
+
+    /// Returns the field of view of the lens on a sensor, from edge to edge through the principal point: horizontal and
+    /// vertical, degrees.
+    pub fn field_of_view_deg(&self, sensor: &PinholeCamera) -> [f64; 2] {
+        /// Steps of half a degree up to the angle that a pinhole camera can show.
+        const STEPS: u32 = 179;
+        let angle = |step: u32| (f64::from(step) / 2.0).to_radians();
+        let reach = self.reach(self.argument(angle(STEPS).tan()));
+        let (w, h) = (f64::from(sensor.width_px), f64::from(sensor.height_px));
+        let shown = |direction: [f64; 2], step: u32| {
+            let radius = angle(step).tan();
+            let [x, y] = self.bent(direction[0] * radius, direction[1] * radius);
+            let (u, v) = (x * sensor.fl_x_px + sensor.cx_px, y * sensor.fl_y_px + sensor.cy_px);
+            self.argument(radius) <= reach && u >= -0.5 && v >= -0.5 && u <= w + 0.5 && v <= h + 0.5
+        };
+        let side = |direction: [f64; 2]| {
+            (0..=STEPS).take_while(|&step| shown(direction, step)).last().map_or(0.0, |step| f64::from(step) / 2.0)
+        };
+        [side([-1.0, 0.0]) + side([1.0, 0.0]), side([0.0, -1.0]) + side([0.0, 1.0])]
     }
 
     /// Returns the pixels of the undistorted image that the lens's image shows, and that `mask` (of the lens's image)
@@ -178,7 +210,7 @@ impl Lens {
 }
 
 /// Returns the four pixels around a position, and the position between them, 0..1.
-fn neighbours(u: f64, v: f64, w: usize, h: usize) -> ([usize; 4], [f64; 2]) {
+pub(crate) fn neighbours(u: f64, v: f64, w: usize, h: usize) -> ([usize; 4], [f64; 2]) {
     let (u, v) = (u.clamp(0.0, (w - 1) as f64), v.clamp(0.0, (h - 1) as f64));
     let (left, top) = (u.floor() as usize, v.floor() as usize);
     let (right, bottom) = ((left + 1).min(w - 1), (top + 1).min(h - 1));

@@ -15,6 +15,7 @@
 //! # }
 //! ```
 
+mod calibration;
 mod camera;
 mod dataset;
 mod degrade;
@@ -26,6 +27,8 @@ mod image;
 mod import;
 mod lens;
 mod place;
+mod raw;
+mod rectify;
 mod report;
 mod scenario;
 mod scenario_keys;
@@ -36,6 +39,7 @@ mod transforms;
 mod views;
 mod writer;
 
+pub use calibration::{Calibration, CalibrationError, DistortionModel};
 pub use carff_messages::Observability;
 pub use dataset::Dataset;
 pub use degrade::{Degradation, degrade};
@@ -44,6 +48,8 @@ pub use error::DatasetError;
 pub use folder::image_files;
 pub use image::{Image, MAX_DIFFERENT_PIXELS, MAX_IMAGE_SIDE_PX, PIXEL_TOLERANCE, looks_same};
 pub use import::{ImportOptions, Imported, import};
+pub use raw::{PixelFormat, RawError, RawImage};
+pub use rectify::Rectifier;
 pub use report::{ContactSheet, DatasetReport, HiddenPair, SheetOptions, contact_sheet};
 pub use scenario::{Candidate, Frame, MAX_FRAMES, NamedBox, ScenarioInfo, StateInfo};
 pub use split::{PoseRole, PoseSplit};

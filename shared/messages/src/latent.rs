@@ -252,7 +252,7 @@ pub struct Belief {
     /// The most probable state, fed back as the next step's input; -1 for none of the known ones.
     pub resolved_state: i32,
     /// Unused; 0. Without it, `resolved` would move in the layout.
-    reserved: u32,
+    pub(crate) reserved: u32,
     /// That state's stored posterior.
     pub resolved: Gaussian,
     /// Duration of the encoding of this frame, nanoseconds.

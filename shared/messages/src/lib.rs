@@ -24,6 +24,7 @@ pub mod forms;
 mod frame;
 mod health;
 mod latent;
+pub mod layout;
 
 pub use check::Invalid;
 pub use codes::{ActionCode, ForecastSource, HealthState, Observability, Reason, Rule, Stage, ViewKind};

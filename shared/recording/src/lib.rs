@@ -17,15 +17,19 @@
 //! contains the run, its graph file, its folders and its origin.
 
 mod about;
+mod cdr;
 mod channels;
+mod images;
 mod queue;
 mod reader;
 mod rotation;
 mod standard;
+mod summary;
 mod writer;
 
 pub use about::About;
 pub use channels::{Encoded, Encoder, Format, LogLine};
+pub use images::{ImageError, ImageReader};
 pub use queue::{QueueCounts, RecordingQueue};
 pub use reader::{Entry, Reader};
 pub use rotation::{Limits, RotatingWriter};
@@ -79,6 +83,43 @@ pub enum RecordingError {
         /// Topics of the file.
         present: String,
     },
+    /// No channel contains images.
+    #[error(
+        "{path} contains no images that this program reads; {channels}. It reads sensor_msgs/msg/Image and \
+         CompressedImage of ROS 2 in CDR, and foxglove.RawImage and CompressedImage in protobuf"
+    )]
+    NoImages {
+        /// Path of the file or folder.
+        path: PathBuf,
+        /// Channels of the file.
+        channels: String,
+    },
+    /// Several channels contain images.
+    #[error("{path} has images on several channels: name one with `camera.topic`: `{channels}`")]
+    SeveralImages {
+        /// Path of the file or folder.
+        path: PathBuf,
+        /// Names of these channels.
+        channels: String,
+    },
+    /// The named channel contains no images.
+    #[error("{path} has no images on `{topic}`; its channels with images: `{channels}`")]
+    NoSuchImages {
+        /// Path of the file or folder.
+        path: PathBuf,
+        /// Name of the channel.
+        topic: String,
+        /// Names of the channels with images.
+        channels: String,
+    },
+    /// The calibration in the recording cannot be used.
+    #[error("{path}: its calibration cannot be used: {cause}; set `camera.calibration`")]
+    Calibration {
+        /// Path of the file.
+        path: PathBuf,
+        /// Description of the error.
+        cause: String,
+    },
     /// A message of the file cannot be read.
     #[error("{path}, channel `{channel}`, message {sequence}: {cause}")]
     Message {
@@ -105,6 +146,12 @@ impl RecordingError {
             mcap::McapError::Io(source) => Self::Io { path: path.to_owned(), source },
             error => Self::Mcap { path: path.to_owned(), cause: error.to_string() },
         }
+    }
+}
+
+impl From<carff_dataset::RawError> for MessageError {
+    fn from(error: carff_dataset::RawError) -> Self {
+        Self(error.to_string())
     }
 }
 

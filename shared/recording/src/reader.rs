@@ -311,7 +311,11 @@ impl Reader {
 }
 
 /// Reads the records in a range of the file; those of a chunk are decompressed.
-fn records(file: &mut (impl Read + Seek), range: Range<u64>, mut each: impl FnMut(Record<'_>)) -> McapResult<()> {
+pub(crate) fn records(
+    file: &mut (impl Read + Seek),
+    range: Range<u64>,
+    mut each: impl FnMut(Record<'_>),
+) -> McapResult<()> {
     let options = LinearReaderOptions::default()
         .with_record_length_limit(MAX_RECORD_BYTES)
         .with_validate_chunk_crcs(true)

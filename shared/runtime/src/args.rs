@@ -33,6 +33,9 @@ pub struct StageArgs {
     /// Camera: number of the first frame; the camera continues as if it had shown earlier frames.
     #[arg(long, default_value_t = 0)]
     pub first_frame: u64,
+    /// Camera: also publish each image before its rectification.
+    #[arg(long, hide = true)]
+    pub raw: bool,
     /// End when this process, the parent, ends.
     #[arg(long)]
     pub parent_pid: Option<u32>,
@@ -50,6 +53,7 @@ impl StageArgs {
             drives: None,
             frames: None,
             first_frame: 0,
+            raw: false,
             parent_pid: None,
         }
     }
@@ -70,6 +74,7 @@ impl StageArgs {
         add("--frames", self.frames.map(|n| n.to_string().into()));
         add("--first-frame", (self.first_frame > 0).then(|| self.first_frame.to_string().into()));
         add("--parent-pid", self.parent_pid.map(|n| n.to_string().into()));
+        line.extend(self.raw.then(|| OsString::from("--raw")));
         line
     }
 }
@@ -88,7 +93,7 @@ mod tests {
             args.dataset = Some("data".into());
             args.checkpoint = Some("checkpoint".into());
             (args.drives, args.frames, args.parent_pid) = (Some(2), Some(30), Some(1));
-            args.first_frame = 17;
+            (args.first_frame, args.raw) = (17, true);
         }
     }
 }

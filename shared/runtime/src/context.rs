@@ -65,6 +65,10 @@ pub struct StageContext {
     waiter: Waiter,
     vitals: Arc<Vitals>,
     begun: bool,
+    /// The latest refusal and its number of repetitions.
+    refused: (String, u64),
+    /// Reason why the source of a camera delivers nothing.
+    stalled: Option<String>,
     // Fields are dropped in this order: the last heartbeat is sent before the node closes.
     heartbeat: Option<Heartbeat>,
     node: Node,
@@ -92,6 +96,8 @@ impl StageContext {
             waiter: Waiter::new(stop),
             vitals,
             begun: false,
+            refused: (String::new(), 0),
+            stalled: None,
             heartbeat: Some(heartbeat),
             node,
             graph,
@@ -180,6 +186,9 @@ impl StageContext {
     pub fn worked(&mut self, header: &Header, started_ns: u64) -> u64 {
         let latency_ns = monotonic_now_ns().saturating_sub(started_ns);
         self.begun = true;
+        if self.stalled.take().is_some() {
+            tracing::info!(frame = header.frame_id, "delivers again");
+        }
         self.vitals.worked(header, latency_ns);
         self.vitals.set_state(if latency_ns > self.deadline_ns { HealthState::Slow } else { HealthState::Ok });
         tracing::trace!(frame = header.frame_id, step = header.step, latency_us = latency_ns / 1000, "worked");
@@ -195,6 +204,31 @@ impl StageContext {
     pub fn error(&mut self, error: &anyhow::Error) {
         self.vitals.count_error();
         tracing::error!("{}", sentence(&**error));
+    }
+
+    /// Counts an input that cannot be used, and reports the stage as faulty until its next output. A repeated reason is
+    /// logged less and less often.
+    pub fn refuse(&mut self, error: &anyhow::Error) {
+        self.vitals.count_error();
+        self.vitals.set_state(HealthState::Faulty);
+        self.vitals.progress();
+        let reason = sentence(&**error);
+        let (last, count) = &mut self.refused;
+        *count = if *last == reason { *count + 1 } else { 1 };
+        if count.is_power_of_two() {
+            tracing::error!(count, "{reason}");
+        }
+        *last = reason;
+    }
+
+    /// Reports that the source of the stage's outputs delivers nothing, with the reason, until its next output.
+    pub fn stalled(&mut self, reason: &str) {
+        self.vitals.set_state(HealthState::Stale);
+        self.vitals.progress();
+        if self.stalled.as_deref() != Some(reason) {
+            tracing::warn!("{reason}");
+            self.stalled = Some(reason.to_owned());
+        }
     }
 
     fn finish(&mut self, run: impl FnOnce(&mut Self) -> anyhow::Result<()>) -> anyhow::Result<()> {

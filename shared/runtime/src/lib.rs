@@ -33,11 +33,15 @@
 //! 2 for wrong arguments.
 
 mod args;
+mod camera;
 mod context;
+mod ego;
 mod health;
 mod overload;
 mod realtime;
 
 pub use args::StageArgs;
+pub use camera::{FrameOutput, rectifier};
 pub use context::{StageContext, frame_span, main, run_with};
+pub use ego::{EGO_POSE, EgoPose};
 pub use overload::{Overload, Quality};

@@ -66,6 +66,9 @@ pub use topic::{Limits, Topic};
 pub use untyped::HeaderOnly;
 pub use wait::{Input, Waiter, Woken};
 
+/// Version of iceoryx2, which all processes of a run must use.
+pub const TRANSPORT_VERSION: &str = "0.10.0";
+
 /// Returns the present time of the clock that all headers use: `CLOCK_MONOTONIC`, nanoseconds, the same in all
 /// processes of a machine.
 pub fn monotonic_now_ns() -> u64 {

@@ -1,9 +1,12 @@
 //! Topics with a payload type that is only known at run time: for probes, recordings and links.
 
 use crate::payload::Payload;
-use crate::{Input, Node, OpenError, Ports, Publisher, ReceiveError, Receiver, Sample, SendError, Topic, topics};
+use crate::{
+    Input, Limits, Node, OpenError, Ports, Publisher, ReceiveError, Receiver, Sample, SendError, Topic, topics,
+};
 use carff_messages::Stage;
 use carff_messages::forms::{AnyMessage, FormError, OwnedMessage, Readable, read, schema};
+use carff_messages::layout::{Described, Layout};
 use serde_json::Value;
 use std::cmp::Ordering;
 use std::fmt;
@@ -21,6 +24,13 @@ pub trait AnyTopic: fmt::Debug + Sync {
 
     /// Returns name and JSON Schema of its message's form.
     fn schema(&self) -> (&'static str, Value);
+
+    /// Returns the limits that all its users share.
+    fn limits(&self) -> Limits;
+
+    /// Returns the layout of its message; of an image, the message that describes it. A message of a type that this
+    /// program does not know has no fields.
+    fn layout(&self) -> Layout;
 
     /// Reads a message from the JSON of its form, and takes the bytes of its image, which must have the described size.
     fn read(&self, json: &[u8], bytes: Vec<u8>) -> Result<OwnedMessage, FormError>;
@@ -83,6 +93,14 @@ where
 
     fn schema(&self) -> (&'static str, Value) {
         (P::Message::SCHEMA, schema::<<P::Message as Readable>::Form>())
+    }
+
+    fn limits(&self) -> Limits {
+        self.limits
+    }
+
+    fn layout(&self) -> Layout {
+        P::Message::layout()
     }
 
     fn read(&self, json: &[u8], bytes: Vec<u8>) -> Result<OwnedMessage, FormError> {

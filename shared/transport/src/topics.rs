@@ -25,8 +25,14 @@ pub const IMAGES: Limits =
 /// Limits of status messages: a late receiver gets the latest one.
 pub const STATUS: Limits = Limits { history: 1, ..MESSAGES };
 
+/// Limits of images for one observer: large ones need little memory.
+const ONE_IMAGE: Limits =
+    Limits { max_subscribers: 1, max_publishers: 2, max_nodes: 4, history: 0, buffer: 1, borrowed: 1, loaned: 1 };
+
 /// Images from camera to encoder.
 pub const FRAME: Topic<Image<FrameMeta>> = Topic::new("camera/frame", IMAGES, 500);
+/// Images of a real camera before rectification, for `carff camera check`; published only for it.
+pub const RAW: Topic<Image<FrameMeta>> = Topic::new("camera/raw", ONE_IMAGE, 500);
 /// Posteriors from encoder to forecaster.
 pub const POSTERIOR: Topic<Posterior> = Topic::new("encoder/posterior", MESSAGES, 500);
 /// Forecasts from forecaster to prober and renderer.

@@ -7,8 +7,9 @@ use crate::node::failed;
 use crate::payload::{Image, Loaned, Opened, Payload, Port, PublisherFactory, Received, Unopened};
 use crate::{AnyPublisher, AnyReceiver, AnyTopic, Limits, Node, OpenError, Ports, Receiver, Service, Topic, TopicId};
 use carff_messages::forms::{FormError, OwnedMessage, Readable};
+use carff_messages::layout::Layout;
 use carff_messages::{
-    Action, Belief, Forecast, FrameMeta, Header, Health, Invalid, Posterior, ViewMeta, ZeroCopySend, message,
+    Action, Belief, Forecast, FrameMeta, Header, Health, Invalid, Posterior, ViewMeta, ZeroCopySend, described, message,
 };
 use iceoryx2::port::LoanError;
 use iceoryx2::port::subscriber::Subscriber;
@@ -37,6 +38,7 @@ impl HeaderOnly {
 }
 
 message!(HeaderOnly);
+described!(HeaderOnly { header });
 
 impl Readable for HeaderOnly {
     type Form = Header;
@@ -165,6 +167,16 @@ impl<const IMAGE: bool> AnyTopic for Untyped<IMAGE> {
 
     fn schema(&self) -> (&'static str, Value) {
         (self.message, Value::Bool(true))
+    }
+
+    fn limits(&self) -> Limits {
+        self.topic.limits
+    }
+
+    fn layout(&self) -> Layout {
+        let types = if IMAGE { self.types.user_header } else { self.types.payload };
+        let (size_bytes, alignment_bytes) = (types.size(), types.alignment());
+        Layout { type_name: self.message.to_owned(), size_bytes, alignment_bytes, fields: Vec::new() }
     }
 
     fn read(&self, json: &[u8], bytes: Vec<u8>) -> Result<OwnedMessage, FormError> {

@@ -5,17 +5,18 @@
 mod raw;
 mod valid;
 
+use carff_base::geometry::PinholeCamera;
 use carff_checkpoint::CheckpointPlanning;
 use carff_checkpoint::Manifest;
 use carff_config::{GraphConfig, Kind, SoakConfig};
-use carff_dataset::{Dataset, Image, ImportOptions, import};
+use carff_dataset::{Calibration, Dataset, Image, ImportOptions, RawImage, Rectifier, import};
 use carff_field::FieldConfig;
 use carff_messages::forms::AnyMessage;
 use carff_messages::{
     Action, Belief, Forecast, FrameMeta, Health, ImageMeta, MAX_IMAGE_BYTES, Message, Posterior, ViewMeta,
 };
 use carff_observe::RunRecord;
-use carff_recording::{About, Reader as RecordingReader, Writer};
+use carff_recording::{About, ImageReader, Reader as RecordingReader, RecordingError, Writer};
 use carff_scenes::Scenario;
 use carff_training::TrainingConfig;
 use carff_transport::TopicId;
@@ -36,7 +37,7 @@ pub struct Reader {
 }
 
 /// All readers.
-pub const READERS: [Reader; 13] = [
+pub const READERS: [Reader; 15] = [
     Reader { name: "messages", read: messages, examples: |_| (0..7).map(|kind| vec![kind]).collect() },
     Reader { name: "graph", read: graph, examples: |_| shipped("configs/graphs", "toml") },
     Reader { name: "scenario", read: scenario, examples: |_| shipped("configs/scenarios", "toml") },
@@ -49,6 +50,8 @@ pub const READERS: [Reader; 13] = [
     Reader { name: "manifest", read: manifest, examples: |_| vec![shipped_file(MANIFEST)] },
     Reader { name: "weights", read: weights, examples: small_weights },
     Reader { name: "recording", read: recording, examples: small_recording },
+    Reader { name: "bag", read: bag, examples: |_| shipped("shared/recording/testdata", "mcap") },
+    Reader { name: "calibration", read: calibration, examples: |_| vec![CAMERA_INFO.into()] },
     Reader { name: "run-record", read: run_record, examples: |_| vec![small_record()] },
 ];
 
@@ -109,6 +112,11 @@ const PLAIN_SET: &str = r#"{
     {"file_path": "a.png", "transform_matrix": [[0, 0, 1, 5], [1, 0, 0, 0], [0, 1, 0, 1], [0, 0, 0, 1]]}
   ]
 }"#;
+
+/// A calibration as ROS's calibrators write it.
+const CAMERA_INFO: &str = "image_width: 640\nimage_height: 480\ndistortion_model: plumb_bob\ncamera_matrix:\n  rows: 3\n  \
+    cols: 3\n  data: [438.7, 0.0, 305.5, 0.0, 437.3, 243.7, 0.0, 0.0, 1.0]\ndistortion_coefficients:\n  \
+    data: [-0.36, 0.11, 0.001, 0.0005, 0.0]\n";
 
 fn project() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../..")
@@ -237,6 +245,32 @@ fn small_picture(folder: &Path) {
     if !path.is_file() {
         Image::filled(2, 2, [9; 3]).save_png(&path).unwrap_or_else(|e| panic!("{e}"));
     }
+}
+
+/// Camera images of another tool. A bag without images is accepted as an example of a readable file.
+fn bag(bytes: &[u8], folder: &Path) -> Verdict {
+    let path = folder.join("bag.mcap");
+    fs::write(&path, bytes).map_err(|e| e.to_string())?;
+    let mut reader = match ImageReader::open(&path, None) {
+        Err(RecordingError::NoImages { .. } | RecordingError::SeveralImages { .. }) => return Ok(()),
+        opened => opened.map_err(|e| e.to_string())?,
+    };
+    reader.calibration().map_err(|e| e.to_string())?;
+    while reader.next().map_err(|e| e.to_string())?.is_some() {
+        let [w, h] = reader.with_image(RawImage::size_px).map_err(|e| e.to_string())?;
+        let last = reader.with_image(|raw| raw.pixel(w as usize - 1, h as usize - 1));
+        assert!(w > 0 && h > 0 && last.is_ok());
+    }
+    Ok(())
+}
+
+/// Accepted calibrations give a map, or an error, for a small trained camera.
+fn calibration(bytes: &[u8], folder: &Path) -> Verdict {
+    let path = folder.join("camera.yaml");
+    fs::write(&path, bytes).map_err(|e| e.to_string())?;
+    let calibration = Calibration::load(&path).map_err(|e| e.to_string())?;
+    let trained = PinholeCamera::look_at([0.0; 3], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], 8, 8, 30.0);
+    Rectifier::new(&calibration, &trained).map(drop).map_err(|e| e.to_string())
 }
 
 fn png(bytes: &[u8], folder: &Path) -> Verdict {

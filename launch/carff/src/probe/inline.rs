@@ -47,7 +47,7 @@ pub enum Inline {
 
 impl Inline {
     /// Resolves `Auto` by asking the terminal. Call this before anything else reads from the terminal.
-    pub(super) fn resolved(self) -> Self {
+    pub(crate) fn resolved(self) -> Self {
         match self {
             Self::Auto => {
                 let said = from_environment(|name| std::env::var(name).ok());
@@ -59,7 +59,7 @@ impl Inline {
 
     /// Encodes an image, RGB bytes row by row, for a terminal with this number of columns. The text ends at the start
     /// of the next line.
-    pub(super) fn encode(self, rgb: &[u8], [width_px, height_px]: [u32; 2], columns: u32) -> anyhow::Result<String> {
+    pub(crate) fn encode(self, rgb: &[u8], [width_px, height_px]: [u32; 2], columns: u32) -> anyhow::Result<String> {
         let drawn_columns = columns.min((width_px * MAX_SCALE).div_ceil(COLUMN_PX)).max(1);
         Ok(match self {
             Self::Kitty => in_kitty(&png(rgb, [width_px, height_px])?, drawn_columns),
@@ -76,7 +76,7 @@ impl Inline {
 }
 
 /// Returns the space for an image, columns.
-pub(super) fn columns() -> u32 {
+pub(crate) fn columns() -> u32 {
     let wide = if std::io::stdout().is_terminal() { terminal::size().ok() } else { None };
     // Some terminals report 0 for an unknown width.
     wide.map(|(columns, _)| columns.into())

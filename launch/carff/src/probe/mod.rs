@@ -10,6 +10,8 @@ mod structure;
 mod top;
 mod trace;
 
+pub(crate) use inline::{Inline, columns};
+
 use crate::complete;
 use crate::session::SessionArgs;
 use clap::{Args, Subcommand};

@@ -1,6 +1,7 @@
 //! Messages with a type that is only known at run time.
 
 use super::{ActionForm, BeliefForm, ForecastForm, FormError, FrameForm, ViewForm};
+use crate::layout::Described;
 use crate::{Action, Belief, Forecast, FrameMeta, Header, Health, Message, Posterior, ViewMeta};
 use schemars::JsonSchema;
 use serde::Serialize;
@@ -10,7 +11,7 @@ use std::any::Any;
 use std::fmt::Debug;
 
 /// A message that has a JSON form: probes, recordings and links handle it without knowing its type.
-pub trait Readable: Message {
+pub trait Readable: Message + Described {
     /// The JSON form of the message.
     type Form: Serialize + DeserializeOwned + JsonSchema;
     /// Name of the form's schema, for example `carff.Belief`.
