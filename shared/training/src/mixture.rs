@@ -1,15 +1,16 @@
 //! Training phase of the mixture density network (paper section 3.4).
 //!
 //! An input is the posterior of a view. Its target is a Gaussian draw from the posterior of a random view that shows the
-//! state of the next time step. Views of several states that look the same have the same posterior, so that the network
-//! learns all their next steps. After the last step the scene does not change.
+//! state of the next time step. Views that look the same have the same posterior: the targets follow the states of the
+//! input's nearest posteriors, so that the network cannot memorise which of them the input was. After the last step the
+//! scene does not change.
 
 use crate::{
     TrainingError,
     config::TrainingConfig,
     records::{MixtureRecord, names},
     run::{Context, Phase, Report, cosine, part, prefixed},
-    unambiguous::unambiguous_by_state,
+    unambiguous::{possible_states, unambiguous_by_state},
 };
 use carff_base::random::Key;
 use carff_messages::{Gaussian, LATENT_DIM};
@@ -60,6 +61,8 @@ pub struct MixturePhase<'a> {
     mdn: &'a Mdn,
     adam: Adam,
     inputs: Vec<usize>,
+    /// States that the view of each input may show.
+    possible: Vec<Vec<usize>>,
     /// Images of each state whose posteriors are targets.
     targets: Vec<Vec<usize>>,
     /// Sum of the losses since the last record.
@@ -80,6 +83,7 @@ impl<'a> MixturePhase<'a> {
             mdn,
             adam: Adam::new(&[&mdn.store], 0.0),
             inputs: posed.trained_and_random(),
+            possible: possible_states(posed, &posteriors[0]),
             targets,
             sum: 0.0,
         })
@@ -107,13 +111,16 @@ impl Phase for MixturePhase<'_> {
         let mut rng = carff_base::random::stream(Key::named(names::MIXTURE, config.seed, step as u64));
         let [mut means, mut log_variances, mut targets] = [(); 3].map(|()| Vec::<f32>::new());
         for _ in 0..settings.batch {
-            let i = self.inputs[rng.random_range(0..self.inputs.len())];
+            let k = rng.random_range(0..self.inputs.len());
+            let i = self.inputs[k];
             let input = &self.posteriors[rng.random_range(0..self.posteriors.len())][i];
             let noise: [f32; LATENT_DIM] =
                 std::array::from_fn(|_| rng.sample::<f32, _>(StandardNormal) * settings.input_noise as f32);
             means.extend(input.at(&noise));
             log_variances.extend(input.log_variance);
-            let views = &self.targets[posed.scenario.next_state(posed.labels[i].state)];
+            let possible = &self.possible[k];
+            let state = possible[rng.random_range(0..possible.len())];
+            let views = &self.targets[posed.scenario.next_state(state)];
             let copy = &self.posteriors[rng.random_range(0..self.posteriors.len())];
             let next = &copy[views[rng.random_range(0..views.len())]];
             let unit: [f32; LATENT_DIM] = std::array::from_fn(|_| rng.sample(StandardNormal));

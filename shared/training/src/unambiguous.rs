@@ -21,18 +21,33 @@ type Latent = [f32; LATENT_DIM];
 /// Per state, the unambiguous images of trained and random poses. Every state that has an image gets one.
 pub fn unambiguous_by_state(posed: &PosedImages, posteriors: &[Gaussian]) -> Vec<Vec<usize>> {
     let images = posed.trained_and_random();
-    let states: Vec<usize> = images.iter().map(|&i| posed.labels[i].state).collect();
-    let means: Vec<Latent> = images.iter().map(|&i| posteriors[i].mean).collect();
-    let chosen = unambiguous(&means, &states, posed.scenario.state_count());
+    let (means, states) = means_and_states(posed, posteriors, &images);
+    let chosen = unambiguous(&neighbours(&means), &states, posed.scenario.state_count());
     chosen.into_iter().map(|of_state| of_state.into_iter().map(|k| images[k]).collect()).collect()
 }
 
-/// Per state, the indices of the means with a large own share.
-fn unambiguous(means: &[Latent], states: &[usize], count: usize) -> Vec<Vec<usize>> {
-    let shares = own_shares(means, states);
+/// For each image of trained and random poses, its state and those of the views with the nearest posteriors: what its
+/// view may show, each as often as it is likely.
+pub fn possible_states(posed: &PosedImages, posteriors: &[Gaussian]) -> Vec<Vec<usize>> {
+    let images = posed.trained_and_random();
+    let (means, states) = means_and_states(posed, posteriors, &images);
+    let with_own = |(k, near): (usize, Vec<usize>)| near.into_iter().chain([k]).map(|other| states[other]).collect();
+    neighbours(&means).into_iter().enumerate().map(with_own).collect()
+}
+
+fn means_and_states(posed: &PosedImages, posteriors: &[Gaussian], images: &[usize]) -> (Vec<Latent>, Vec<usize>) {
+    images.iter().map(|&i| (posteriors[i].mean, posed.labels[i].state)).unzip()
+}
+
+/// Per state, the indices of the views most of whose neighbours have that state.
+fn unambiguous(neighbours: &[Vec<usize>], states: &[usize], count: usize) -> Vec<Vec<usize>> {
+    let own = |(near, state): (&Vec<usize>, &usize)| {
+        near.iter().filter(|&&other| states[other] == *state).count() as f64 / near.len().max(1) as f64
+    };
+    let shares: Vec<f64> = neighbours.iter().zip(states).map(own).collect();
     (0..count)
         .map(|state| {
-            let of_state: Vec<usize> = (0..means.len()).filter(|&k| states[k] == state).collect();
+            let of_state: Vec<usize> = (0..states.len()).filter(|&k| states[k] == state).collect();
             let mut sorted: Vec<f64> = of_state.iter().map(|&k| shares[k]).collect();
             sorted.sort_by(f64::total_cmp);
             let best = carff_base::statistics::percentile_of_sorted(&sorted, BEST).unwrap_or_default();
@@ -41,8 +56,8 @@ fn unambiguous(means: &[Latent], states: &[usize], count: usize) -> Vec<Vec<usiz
         .collect()
 }
 
-/// Share of each mean's neighbours that have its state, 0..=1. Distances are in deviations of each dimension.
-fn own_shares(means: &[Latent], states: &[usize]) -> Vec<f64> {
+/// Indices of the nearest other means of each mean. Distances are in deviations of each dimension.
+fn neighbours(means: &[Latent]) -> Vec<Vec<usize>> {
     let n = means.len().max(1) as f32;
     let scale: Latent = std::array::from_fn(|d| {
         let mean = means.iter().map(|m| m[d]).sum::<f32>() / n;
@@ -50,18 +65,21 @@ fn own_shares(means: &[Latent], states: &[usize]) -> Vec<f64> {
         1.0 / variance.sqrt().max(1e-6)
     });
     let scaled: Vec<Latent> = means.iter().map(|m| std::array::from_fn(|d| m[d] * scale[d])).collect();
-    let share = |k: usize| {
+    let nearest = |k: usize| {
         let distance =
             |other: usize| -> f32 { (0..LATENT_DIM).map(|d| (scaled[k][d] - scaled[other][d]).powi(2)).sum() };
         let mut others: Vec<(f32, usize)> =
-            (0..scaled.len()).filter(|&other| other != k).map(|other| (distance(other), states[other])).collect();
+            (0..scaled.len()).filter(|&other| other != k).map(|other| (distance(other), other)).collect();
         let taken = NEIGHBOURS.min(others.len());
         if taken > 0 {
-            others.select_nth_unstable_by(taken - 1, |a, b| a.0.total_cmp(&b.0));
+            // Equal distances in the order of the views, so that the choice does not depend on the sort.
+            others.select_nth_unstable_by(taken - 1, |a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
         }
-        others[..taken].iter().filter(|(_, state)| *state == states[k]).count() as f64 / taken.max(1) as f64
+        let mut near: Vec<usize> = others[..taken].iter().map(|(_, other)| *other).collect();
+        near.sort_unstable();
+        near
     };
-    (0..means.len()).into_par_iter().map(share).collect()
+    (0..means.len()).into_par_iter().map(nearest).collect()
 }
 
 #[cfg(test)]
@@ -84,7 +102,7 @@ mod tests {
                 hidden.push(view % 3 == 0);
             }
         }
-        let found = unambiguous(&means, &states, 4);
+        let found = unambiguous(&neighbours(&means), &states, 4);
         for state in 0..2 {
             let expected: Vec<usize> = (0..480).filter(|&k| states[k] == state && !hidden[k]).collect();
             assert_eq!(found[state], expected, "state {state}");
