@@ -157,6 +157,7 @@ fn decode(path: &Path) -> Result<DynamicImage, DatasetError> {
     let format = match image::guess_format(&bytes) {
         Ok(format @ (ImageFormat::Png | ImageFormat::Jpeg)) => format,
         Ok(other) => return Err(unreadable(path, &format!("a {other:?} file"))),
+        Err(_) if bytes.is_empty() => return Err(unreadable(path, "the file is empty; copy or export it again")),
         Err(_) => {
             return Err(unreadable(path, carff_base::errors::stand_in(&bytes).unwrap_or("it starts like neither")));
         }
