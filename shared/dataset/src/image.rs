@@ -169,6 +169,7 @@ fn decode_bytes(path: &Path, bytes: &[u8]) -> Result<DynamicImage, DatasetError>
     let format = match image::guess_format(bytes) {
         Ok(format @ (ImageFormat::Png | ImageFormat::Jpeg)) => format,
         Ok(other) => return Err(unreadable(path, &format!("a {other:?} file"))),
+        Err(_) if bytes.is_empty() => return Err(unreadable(path, "the file is empty; copy or export it again")),
         Err(_) => {
             return Err(unreadable(path, carff_base::errors::stand_in(bytes).unwrap_or("it starts like neither")));
         }

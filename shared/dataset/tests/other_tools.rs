@@ -281,4 +281,6 @@ fn cut_off_images() {
         std::fs::write(&path, [&bytes[..], b"more after the end"].concat()).unwrap();
         assert_eq!(Image::load(&path).unwrap(), whole);
     }
+    std::fs::write(&path, b"").unwrap();
+    assert!(refused(dir.path()).contains("images/0.png: not a readable PNG or JPEG image: the file is empty"));
 }
