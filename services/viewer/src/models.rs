@@ -1,4 +1,4 @@
-//! A checkpoint's models, loaded once, in the same way as the stages load them.
+//! A checkpoint's models, loaded once, with encoder and forecaster in libtorch.
 
 use carff_checkpoint::{CheckpointError, FieldProbe, Manifest, load_field_probe, load_policy};
 use carff_dataset::Image;
@@ -59,7 +59,7 @@ impl Models {
         Ok(models)
     }
 
-    /// Returns the posterior of an image as the encoder stage computes it; `None` for an image of the wrong size.
+    /// Returns the posterior of an image, computed in libtorch; `None` for an image of the wrong size.
     pub fn encode(&self, image: &Image) -> Option<Gaussian> {
         borrow::with_image(image.view()?, |image| self.encoder.encode_bytes(image)).flatten()
     }
