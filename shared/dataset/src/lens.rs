@@ -170,9 +170,8 @@ impl Lens {
             let (u, v) = (x * sensor.fl_x_px + sensor.cx_px, y * sensor.fl_y_px + sensor.cy_px);
             self.argument(radius) <= reach && u >= 0.0 && v >= 0.0 && u <= w && v <= h
         };
-        let side = |direction: [f64; 2]| {
-            (0..=STEPS).take_while(|&step| shown(direction, step)).last().map_or(0.0, degrees)
-        };
+        let side =
+            |direction: [f64; 2]| (0..=STEPS).take_while(|&step| shown(direction, step)).last().map_or(0.0, degrees);
         [side([-1.0, 0.0]) + side([1.0, 0.0]), side([0.0, -1.0]) + side([0.0, 1.0])]
     }
 
