@@ -243,7 +243,7 @@ fn unusable_sources_are_one_error() {
         mcap(&bag("ros2-raw.mcap"), &format!("calibration = \"{}\"", path.display()))
     };
     one_error(&with("size.yaml", &yaml(64, 50.0)), &["32x32", "64x64", "calibrate at the size"]);
-    one_error(&with("narrow.yaml", &yaml(32, 40.0)), &["43.0 x 43.0", "59.5 x 59.5", "wider lens"]);
+    one_error(&with("narrow.yaml", &yaml(32, 40.0)), &["43.6 x 43.6", "59.5 x 59.5", "wider lens"]);
     one_error(&with("broken.yaml", "image_width: [\n"), &["broken.yaml", "camera_info"]);
     let missing = mcap(&bag("ros2-raw.mcap"), "calibration = \"no/such.yaml\"");
     one_error(&missing, &["no/such.yaml"]);

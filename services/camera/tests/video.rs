@@ -48,7 +48,7 @@ fn all_images_are_shown_in_order() {
     assert!(times.windows(2).all(|pair| (90_000_000..=110_000_000).contains(&(pair[1] - pair[0]))), "{times:?}");
     for pair in centres.windows(2) {
         let step = (pair[1][0] - pair[0][0]).hypot(pair[1][1] - pair[0][1]);
-        assert!((0.5..12.0).contains(&step), "{centres:?}");
+        assert!((0.3..2.0).contains(&step) && pair[1][0] > pair[0][0], "{centres:?}");
     }
     assert_eq!(show(), (times, centres));
 }
@@ -85,7 +85,10 @@ fn damaged_images_are_left_out() {
         let Ok(mut source) = VideoSource::open(&path) else { continue };
         let mut shown = 0;
         while let Ok(Some(_)) = source.next() {
-            let _ = source.with_image(&mut |raw| Ok(drop(raw.pixel(0, 0))));
+            let _ = source.with_image(&mut |raw| {
+                let _ = raw.pixel(0, 0);
+                Ok(())
+            });
             shown += 1;
             assert!(shown <= 100);
         }

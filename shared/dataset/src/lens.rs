@@ -158,20 +158,20 @@ impl Lens {
     /// Returns the field of view of the lens on a sensor, from edge to edge through the principal point: horizontal and
     /// vertical, degrees.
     pub fn field_of_view_deg(&self, sensor: &PinholeCamera) -> [f64; 2] {
-        /// Steps of half a degree up to the angle that a pinhole camera can show.
-        const STEPS: u32 = 179;
-        let angle = |step: u32| (f64::from(step) / 2.0).to_radians();
+        /// Steps of a twentieth of a degree up to the angle that a pinhole camera can show.
+        const STEPS: u32 = 1790;
+        let degrees = |step: u32| f64::from(step) / 20.0;
+        let angle = |step: u32| degrees(step).to_radians();
         let reach = self.reach(self.argument(angle(STEPS).tan()));
         let (w, h) = (f64::from(sensor.width_px), f64::from(sensor.height_px));
         let shown = |direction: [f64; 2], step: u32| {
             let radius = angle(step).tan();
             let [x, y] = self.bent(direction[0] * radius, direction[1] * radius);
             let (u, v) = (x * sensor.fl_x_px + sensor.cx_px, y * sensor.fl_y_px + sensor.cy_px);
-            self.argument(radius) <= reach && u >= -0.5 && v >= -0.5 && u <= w + 0.5 && v <= h + 0.5
+            self.argument(radius) <= reach && u >= 0.0 && v >= 0.0 && u <= w && v <= h
         };
-        let side = |direction: [f64; 2]| {
-            (0..=STEPS).take_while(|&step| shown(direction, step)).last().map_or(0.0, |step| f64::from(step) / 2.0)
-        };
+        let side =
+            |direction: [f64; 2]| (0..=STEPS).take_while(|&step| shown(direction, step)).last().map_or(0.0, degrees);
         [side([-1.0, 0.0]) + side([1.0, 0.0]), side([0.0, -1.0]) + side([0.0, 1.0])]
     }
 

@@ -221,7 +221,7 @@ mod tests {
         // 2 atan(50 / 100) is 53 degrees.
         let narrow = calibration(100, 100.0, DistortionModel::Pinhole, &[]);
         let error = Rectifier::new(&narrow, &camera).unwrap_err().to_string();
-        assert!(error.contains("53.0 x 53.0") && error.contains("60.0 x 60.0"), "{error}");
+        assert!(error.contains("53.1 x 53.1") && error.contains("60.0 x 60.0"), "{error}");
         // A barrel lens whose polynomial turns back before the trained corner.
         let turning = calibration(400, 200.0, DistortionModel::PlumbBob, &[-1.5]);
         assert!(Rectifier::new(&turning, &camera).is_err());
