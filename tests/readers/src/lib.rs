@@ -9,7 +9,7 @@ use carff_base::geometry::PinholeCamera;
 use carff_checkpoint::CheckpointPlanning;
 use carff_checkpoint::Manifest;
 use carff_config::{GraphConfig, Kind, SoakConfig};
-use carff_dataset::{Calibration, Dataset, Image, ImportOptions, RawImage, Rectifier, import};
+use carff_dataset::{Calibration, Dataset, Image, ImportOptions, Rectifier, import};
 use carff_field::FieldConfig;
 use carff_messages::forms::AnyMessage;
 use carff_messages::{

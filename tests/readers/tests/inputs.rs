@@ -105,5 +105,7 @@ readers!(
     manifests "manifest",
     field_weights "weights",
     recordings "recording",
+    bags "bag",
+    calibrations "calibration",
     run_records "run-record"
 );
