@@ -23,7 +23,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 /// Time limit that only a hanging process exceeds, even on a busy machine. It does not assert a speed.
-pub const WATCHDOG: Duration = Duration::from_secs(600);
+pub const WATCHDOG: Duration = Duration::from_mins(10);
 
 /// Returns the project's root.
 pub fn project_root() -> PathBuf {

@@ -102,12 +102,12 @@ fn another_process_is_the_camera() {
 /// still waits for its camera. A limit of frames ends the run.
 #[test]
 fn foreign_frames_are_validated() {
+    static OTHER: Topic<ImageTopic<ViewMeta>> = Topic::new("camera/frame", topics::IMAGES, 500);
     let graph = TestGraph::new(&scenario_set(), &shipped_checkpoint(), &external());
     let mut launcher = Process::start(&mut graph.launch(&graph.file(), &["--frames", "3"]));
     launcher.wait_for("invitation", |text| text.contains("waiting for another process"));
     {
         let seen = attach(Some(graph.run().name()), "foreign").unwrap();
-        static OTHER: Topic<ImageTopic<ViewMeta>> = Topic::new("camera/frame", topics::IMAGES, 500);
         let refused = seen.node.image_publisher(&OTHER, 12).unwrap_err().to_string();
         assert!(refused.contains("another layout"), "{refused}");
         let mut frames = seen.node.image_publisher(&topics::FRAME, 4 * 4 * 3).unwrap();
@@ -162,8 +162,11 @@ fn bag(name: &str) -> String {
     project_root().join("shared/recording/testdata").join(name).display().to_string()
 }
 
-/// Returns the frames that a camera's process publishes: their size and the colours of two pixels.
-fn frames(graph: &TestGraph) -> (Vec<([u32; 2], [u8; 3], [u8; 3])>, String) {
+/// Size of a frame, and the colours of its first and last pixels.
+type Seen = ([u32; 2], [u8; 3], [u8; 3]);
+
+/// Returns the frames that a camera's process publishes, and its output.
+fn frames(graph: &TestGraph) -> (Vec<Seen>, String) {
     let node = Node::open(graph.run(), "test").unwrap();
     let mut frames = node.receiver(&topics::FRAME).unwrap();
     let mut healths = node.receiver(topics::health(Stage::Camera)).unwrap();

@@ -25,10 +25,10 @@ fn main() -> anyhow::Result<()> {
     // Frame numbers never repeat in a run: a restarted camera continues after the last frame, which the launcher's
     // heartbeat for this camera names. At the first start nothing has been published.
     let last = node.receiver(topics::health(Stage::Camera))?.newest()?.filter(|h| h.published > 0);
-    let mut frame_id = last.map_or(0, |health| health.header.frame_id + 1);
+    let first_id = last.map_or(0, |health| health.header.frame_id + 1);
     println!("joined run `{}`", live.name);
     let mut next_ns = monotonic_now_ns();
-    for image in images.iter().cycle() {
+    for (frame_id, image) in (first_id..).zip(images.iter().cycle()) {
         if waiter.wait_until(&[], next_ns)? == Woken::Stopped || !live.is_alive() {
             break;
         }
@@ -41,7 +41,6 @@ fn main() -> anyhow::Result<()> {
         let mut loan = frames.loan(meta.image_bytes())?;
         loan.bytes_mut().copy_from_slice(&image.rgb);
         frames.send_image(loan, meta)?;
-        frame_id += 1;
     }
     println!("left run `{}`", live.name);
     Ok(())

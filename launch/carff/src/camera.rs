@@ -79,7 +79,9 @@ pub fn run(command: &CameraCommand) -> anyhow::Result<ExitCode> {
     let seen = watched.watch(&Waiter::new(stop), (args.seconds * 1e9) as u64, graph.camera.source)?;
     drop(watched);
     let lines = seen.lines(&graph);
-    lines.iter().for_each(|line| println!("{line}"));
+    for line in &lines {
+        println!("{line}");
+    }
     let board = Board { images: seen.images(&graph, &dataset)?, decision: "camera".into(), lines, ..Board::default() };
     if let Some(path) = &args.image {
         board.draw()?.save_png(path)?;

@@ -10,6 +10,7 @@ use carff_runtime::{EGO_POSE, EgoPose};
 use carff_transport::{Limits, Run, TRANSPORT_VERSION, TopicId};
 use clap_complete::engine::ArgValueCandidates;
 use serde_json::{Value, json};
+use std::fmt::Write;
 use std::process::ExitCode;
 
 /// The commands of `carff run`.
@@ -112,6 +113,7 @@ fn topic(name: &str, is_image: bool, layout: &Layout, limits: Limits) -> Value {
     })
 }
 
+/// Writing into a `String` cannot fail, so results of `writeln!` are dropped.
 fn text(info: &Value) -> String {
     let word = |value: &Value| value.as_str().map_or_else(|| value.to_string(), str::to_owned);
     let transport = &info["transport"];
@@ -126,14 +128,15 @@ fn text(info: &Value) -> String {
         ("camera", &info["camera"]["source"]),
         ("frames a second", &info["camera"]["frame_rate_hz"]),
     ] {
-        text += &format!("{name:<16} {}\n", word(value));
+        let _ = writeln!(text, "{name:<16} {}", word(value));
     }
-    text += &format!("\n{:<22} {:<24} {:>6}  ALIGNMENT\n", "TOPIC", "MESSAGE", "BYTES");
+    let _ = writeln!(text, "\n{:<22} {:<24} {:>6}  ALIGNMENT", "TOPIC", "MESSAGE", "BYTES");
     for topic in info["topics"].as_array().into_iter().flatten() {
         let message = if topic["user_header"].is_null() { &topic["payload"] } else { &topic["user_header"] };
         let image = if topic["user_header"].is_null() { "" } else { " + RGB image" };
-        text += &format!(
-            "{:<22} {:<24} {:>6}  {}{image}\n",
+        let _ = writeln!(
+            text,
+            "{:<22} {:<24} {:>6}  {}{image}",
             word(&topic["name"]),
             word(&message["type_name"]),
             message["size_bytes"],

@@ -27,6 +27,7 @@ pub trait Recorded {
 }
 
 /// The schedule of the frames.
+#[allow(clippy::struct_field_names, reason = "the unit is part of each name")]
 struct Schedule {
     /// Period of a given rate; `None` for the recorded one.
     period_ns: Option<u64>,

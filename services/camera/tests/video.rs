@@ -1,5 +1,7 @@
 //! Tests of the video source on a file of another encoder.
 
+#![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
+
 use carff_camera::VideoSource;
 use carff_camera::recorded::Recorded;
 use std::path::{Path, PathBuf};
@@ -15,7 +17,7 @@ fn refused(change: impl FnOnce(&mut Vec<u8>)) -> String {
     let mut bytes = std::fs::read(ball()).unwrap();
     change(&mut bytes);
     std::fs::write(&path, bytes).unwrap();
-    VideoSource::open(&path).map(|_| String::new()).unwrap_or_else(|e| format!("{e:#}"))
+    VideoSource::open(&path).map_or_else(|e| format!("{e:#}"), |_| String::new())
 }
 
 /// Every image is shown, in the order of its time: the ball is bright, moves in small steps, and the times are a tenth

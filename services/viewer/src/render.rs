@@ -447,7 +447,7 @@ mod tests {
     use std::time::Duration;
 
     /// Longest wait for an image. It only bounds a test that hangs.
-    const PATIENCE: Duration = Duration::from_secs(120);
+    const PATIENCE: Duration = Duration::from_mins(2);
 
     fn field() -> Field {
         let config = FieldConfig { log2_table_size: 8, occupancy_resolution: 8, ..FieldConfig::default() };

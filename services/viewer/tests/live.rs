@@ -10,7 +10,7 @@ use carff_viewer::live::LiveFeed;
 use std::time::{Duration, Instant};
 
 /// Longest wait. It only bounds a test that hangs.
-const PATIENCE: Duration = Duration::from_secs(60);
+const PATIENCE: Duration = Duration::from_mins(1);
 
 fn wait_for<T>(mut look: impl FnMut() -> Option<T>) -> T {
     let since = Instant::now();

@@ -14,7 +14,7 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 /// Longest wait for an image. It only bounds a test that hangs.
-const PATIENCE: Duration = Duration::from_secs(300);
+const PATIENCE: Duration = Duration::from_mins(5);
 
 /// Creates a window with small images; `None`: no image yet.
 fn window(view: Option<usize>, folder: &Path) -> Harness<'static, Viewer> {

@@ -31,7 +31,7 @@ pub enum CameraSource {
     Video,
     /// A network camera (`camera.url`). Its program is built by `make camera-rtsp`.
     Rtsp,
-    /// A GStreamer pipeline (`camera.pipeline`). Its program is built by `make camera-gst`.
+    /// A `GStreamer` pipeline (`camera.pipeline`). Its program is built by `make camera-gst`.
     Pipeline,
 }
 
@@ -116,7 +116,7 @@ impl<'de> Deserialize<'de> for CalibrationChoice {
 #[serde(deny_unknown_fields, default)]
 pub struct CameraConfig {
     /// `drives` through the dataset, `free-drives` through the scenario, the images of a `folder`, another process
-    /// (`external`), a recording (`mcap`), a film (`video`), a network camera (`rtsp`), or a GStreamer `pipeline`.
+    /// (`external`), a recording (`mcap`), a film (`video`), a network camera (`rtsp`), or a `GStreamer` pipeline.
     /// Default `drives`.
     pub source: CameraSource,
     /// The folder, when `source` is `folder`. Default: `images` in the dataset.
@@ -127,7 +127,7 @@ pub struct CameraConfig {
     pub topic: Option<String>,
     /// Address of the network camera, when `source` is `rtsp`, for example `rtsp://user:password@10.0.0.7/stream`.
     pub url: Option<String>,
-    /// GStreamer pipeline, when `source` is `pipeline`. It ends in an `appsink`, which the stage configures.
+    /// `GStreamer` pipeline, when `source` is `pipeline`. It ends in an `appsink`, which the stage configures.
     pub pipeline: Option<String>,
     /// Times of the frames, when `source` is `mcap` or `video`: as `recorded`, or at the `frame-rate` of the run.
     /// Default `recorded`.

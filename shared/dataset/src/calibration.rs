@@ -22,7 +22,7 @@ pub enum DistortionModel {
     Fisheye,
 }
 
-/// Calibration of a camera, with the numbers that ROS and OpenCV print: the centre of the top left pixel is at 0.
+/// Calibration of a camera, with the numbers that ROS and `OpenCV` print: the centre of the top left pixel is at 0.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Calibration {

@@ -94,7 +94,9 @@ impl Linear {
 
     fn relu(&self, x: &[f32]) -> Vec<f32> {
         let mut out = self.forward(x);
-        out.iter_mut().for_each(|v| *v = v.max(0.0));
+        for v in &mut out {
+            *v = v.max(0.0);
+        }
         out
     }
 }

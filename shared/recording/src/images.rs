@@ -120,6 +120,7 @@ impl ImageReader {
     /// # Errors
     ///
     /// If the file is damaged. What follows in it cannot be read.
+    #[allow(clippy::should_implement_trait, reason = "errors do not end it: the next image may be valid")]
     pub fn next(&mut self) -> Result<Option<u64>, RecordingError> {
         let topic = self.topic.clone();
         self.next_of(|channel| channel.topic == topic)

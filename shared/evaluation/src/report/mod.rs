@@ -134,7 +134,7 @@ pub fn evaluate(
         results.hazard_reliability = reliability;
     }
     if has(Table::Trials)
-        && let Some((trials, baselines)) = results.kept(Table::Trials, trials::trials(subject, on_progress)?)
+        && let Some((trials, baselines)) = results.kept(Table::Trials, trials::trials(subject, on_progress))
     {
         (results.trials, results.baselines) = (trials, baselines);
     }

@@ -448,7 +448,7 @@ fn trials(page: &mut String, results: &Results) {
         };
         let probabilities = |f: &TrialFigures| format!("{:.3} / {:.3}", f.log_loss, f.brier);
         trial_rows(page, results, part, &kinds, with_interval);
-        cells[0] = "log loss / Brier score".to_owned();
+        "log loss / Brier score".clone_into(&mut cells[0]);
         page.push('\n');
         head(page, &cells.iter().map(String::as_str).collect::<Vec<_>>());
         trial_rows(page, results, part, &kinds, probabilities);

@@ -5,7 +5,7 @@ use crate::trials::{
     looks::{Answer, ByTrialKind, Look, encoded, figures, free_looks, looks_of_role},
     planning::Trial,
 };
-use crate::{EvaluationError, Progress, Subject};
+use crate::{Progress, Subject};
 use carff_dataset::PoseRole;
 use carff_decision::{CalibrationTrial, Evidence, Policy, Sampling, choose_threshold};
 use carff_messages::Rule;
@@ -42,14 +42,10 @@ const BASELINES: [(&str, &str); 6] = [
 ];
 
 /// Computes the trials of a scenario with hazards, or returns the reason why there are none.
-pub fn trials(
-    subject: &Subject,
-    on_progress: &dyn Fn(&Progress),
-) -> Result<Result<TrialsAndBaselines, String>, EvaluationError> {
-    if let Err(why) = super::planning::plannable(subject) {
-        return Ok(Err(why));
-    }
-    let Some(threshold) = subject.threshold else { return Ok(Err("the checkpoint has no threshold".into())) };
+pub fn trials(subject: &Subject, on_progress: &dyn Fn(&Progress)) -> Result<TrialsAndBaselines, String> {
+    super::planning::plannable(subject)?;
+    let threshold = subject.threshold.ok_or("the checkpoint has no threshold")?;
+    let planner = subject.planner(Sampling::Stratified)?;
     let posed = &subject.posed;
     let mut parts: Vec<(&str, Vec<Look>)> =
         PARTS.into_iter().map(|(name, role)| (name, looks_of_role(posed, role))).collect();
@@ -62,10 +58,7 @@ pub fn trials(
     for (done, (part, looks)) in parts.into_iter().enumerate() {
         on_progress(&Progress { phase: "trials", done, total, line: part.to_owned() });
         let taken = encoded(&subject.noisy_encoder(), &looks);
-        let evidence = match subject.planner(Sampling::Stratified) {
-            Ok(planner) => planner.evidence(&taken, SAMPLES),
-            Err(why) => return Ok(Err(why)),
-        };
+        let evidence = planner.evidence(&taken, SAMPLES);
         let by_rule = |rule| by_rule(&evidence, Policy { rule, threshold });
         own.insert(part.to_owned(), figures(&looks, &by_rule(Rule::Calibrated)));
         let constant = |p: f64| looks.iter().map(|_| Answer::at(p, 0.5)).collect::<Vec<_>>();
@@ -82,11 +75,11 @@ pub fn trials(
         ];
         for ((name, about), answers) in BASELINES.into_iter().zip(answers) {
             let baseline = baselines.entry(name.to_owned()).or_default();
-            baseline.about = about.to_owned();
+            about.clone_into(&mut baseline.about);
             baseline.trials.insert(part.to_owned(), figures(&looks, &answers));
         }
     }
-    Ok(Ok((own, baselines)))
+    Ok((own, baselines))
 }
 
 fn by_rule(evidence: &[Evidence], policy: Policy) -> Vec<Answer> {

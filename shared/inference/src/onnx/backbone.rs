@@ -252,7 +252,8 @@ impl Layers<'_> {
 fn timm_form(tensors: Tensors) -> Tensors {
     let root = vit::root(tensors.keys().map(String::as_str)).to_owned();
     let mut own: Tensors = tensors.into_iter().map(|(name, t)| (vit::timm_name(&name, &root), t)).collect();
-    for block in (0..).take_while(|i| own.contains_key(&format!("blocks.{i}.norm1.weight"))).collect::<Vec<i64>>() {
+    let there = |i: &i64| own.contains_key(&format!("blocks.{i}.norm1.weight"));
+    for block in (0..i64::MAX).take_while(there).collect::<Vec<i64>>() {
         for part in ["weight", "bias"] {
             join_queries(&mut own, block, part);
         }
