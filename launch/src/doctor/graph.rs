@@ -121,9 +121,7 @@ fn pictures(
     let camera = &graph.camera;
     if !camera.source.has_truth() {
         findings.push(real_source(graph, dataset));
-        if camera.calibration.is_none() {
-            return None;
-        }
+        camera.calibration.as_ref()?;
         findings.extend(calibration(graph));
     }
     let rendered = scenario.map(|s| ScenarioIdentity::of(s.info(), s.cameras().len()));

@@ -134,7 +134,7 @@ impl ForeignCamera {
     }
 
     /// Returns the log line that names who is expected.
-    pub(crate) fn invitation(&self, run: &Run) -> String {
+    pub(crate) fn invitation(run: &Run) -> String {
         let (topic, name) = (topics::FRAME.name, run.name());
         format!(
             "INFO camera: waiting for another process to publish `{topic}` of run `{name}`; `carff run info {name} \

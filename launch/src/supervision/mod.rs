@@ -207,7 +207,7 @@ impl<'a> Supervisor<'a> {
     /// Waits for the camera of another process, and reports how it joins.
     fn expect_camera(&mut self) -> anyhow::Result<()> {
         let camera = ForeignCamera::expect(self.node, self.graph, self.limits(Stage::Camera).quiet_ns)?;
-        self.terminal.log(LAUNCHER, &camera.invitation(self.node.run()));
+        self.terminal.log(LAUNCHER, &ForeignCamera::invitation(self.node.run()));
         self.foreign = Some(camera);
         Ok(())
     }

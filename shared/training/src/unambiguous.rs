@@ -103,9 +103,9 @@ mod tests {
             }
         }
         let found = unambiguous(&neighbours(&means), &states, 4);
-        for state in 0..2 {
+        for (state, of_state) in found.iter().enumerate().take(2) {
             let expected: Vec<usize> = (0..480).filter(|&k| states[k] == state && !hidden[k]).collect();
-            assert_eq!(found[state], expected, "state {state}");
+            assert_eq!(*of_state, expected, "state {state}");
         }
         // Two states that no view distinguishes: by chance some views have fewer neighbours of their own state.
         for of_state in &found[2..] {

@@ -257,6 +257,7 @@ fn bag(bytes: &[u8], folder: &Path) -> Verdict {
     };
     reader.calibration().map_err(|e| e.to_string())?;
     while reader.next().map_err(|e| e.to_string())?.is_some() {
+        #[allow(clippy::redundant_closure_for_method_calls, reason = "the method is of one lifetime")]
         let [w, h] = reader.with_image(|image| image.size_px()).map_err(|e| e.to_string())?;
         let last = reader.with_image(|raw| raw.pixel(w as usize - 1, h as usize - 1));
         assert!(w > 0 && h > 0 && last.is_ok());
