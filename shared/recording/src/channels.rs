@@ -75,7 +75,8 @@ pub struct LogLine {
 impl LogLine {
     /// Encodes the line for the channel `log`.
     pub fn encode(&self) -> Encoded {
-        Encoded::protobuf("log", &standard::log_line(self))
+        let Self { wall_ns, source, level, message } = self;
+        Encoded::protobuf("log", &standard::log_line(*wall_ns, source, level, message))
     }
 }
 

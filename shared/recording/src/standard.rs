@@ -1,6 +1,5 @@
 //! Messages in the standard robotics schemas: images, calibrations, poses, boxes, logs.
 
-use crate::LogLine;
 use carff_decision::Place;
 use carff_messages::forms::AnyMessage;
 use carff_messages::{Action, ActionCode, Belief, Health, HealthState, Intrinsics, Reason, Stage};
@@ -152,18 +151,18 @@ fn label(place: &Place, text: String) -> TextPrimitive {
 }
 
 /// Returns a line of a run's log.
-pub(crate) fn log_line(line: &LogLine) -> Log {
-    let level = match line.level.as_str() {
+pub(crate) fn log_line(wall_ns: u64, source: &str, level: &str, message: &str) -> Log {
+    let level = match level {
         "TRACE" | "DEBUG" => Level::Debug,
         "INFO" => Level::Info,
         "ERROR" => Level::Error,
         _ => Level::Warning,
     };
     Log {
-        timestamp: Some(timestamp(line.wall_ns)),
+        timestamp: Some(timestamp(wall_ns)),
         level: level.into(),
-        message: line.message.clone(),
-        name: line.source.clone(),
+        message: message.to_owned(),
+        name: source.to_owned(),
         file: String::new(),
         line: 0,
     }
