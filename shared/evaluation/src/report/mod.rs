@@ -1,8 +1,10 @@
 //! The results of a checkpoint on a dataset: `results.json`, the images, and one page.
 
 mod gallery;
+mod markdown;
 mod page;
 mod targets;
+mod trials_page;
 
 use crate::tables::{
     encoder::{EncoderTable, encoder_table},
