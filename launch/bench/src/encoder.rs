@@ -61,12 +61,7 @@ pub(crate) fn run(args: &EncoderArgs) -> anyhow::Result<Report> {
     let (mut one, mut two) = (load(1)?, load(2)?);
     let seconds = alternate(
         if args.quick { 20 } else { 300 },
-        &mut [
-            in_onnx(&mut one, &rgb),
-            in_tch(&encoder, &rgb, 1),
-            in_onnx(&mut two, &rgb),
-            in_tch(&encoder, &rgb, 2),
-        ],
+        &mut [in_onnx(&mut one, &rgb), in_tch(&encoder, &rgb, 1), in_onnx(&mut two, &rgb), in_tch(&encoder, &rgb, 2)],
     );
     let backbone = format!("{:?}", manifest.encoder.backbone.kind);
     for (seconds, (library, threads, key)) in seconds.iter().zip([
@@ -102,8 +97,7 @@ pub(crate) fn run(args: &EncoderArgs) -> anyhow::Result<Report> {
         };
         let store = VarStore::new(Device::Cpu);
         let vit = Encoder::new(&config, &(store.root() / "backbone"), &(store.root() / "head"), None)?;
-        let seconds =
-            alternate(if args.quick { 2 } else { 10 }, &mut [in_tch(&vit, &rgb, 1), in_tch(&vit, &rgb, 2)]);
+        let seconds = alternate(if args.quick { 2 } else { 10 }, &mut [in_tch(&vit, &rgb, 1), in_tch(&vit, &rgb, 2)]);
         note("encoder, ViT-L/16 of random weights, libtorch, 1 thread", "encoder.vit_l16.", &seconds[0]);
         note("encoder, ViT-L/16 of random weights, libtorch, 2 threads", "encoder.vit_l16.two_threads.", &seconds[1]);
     }
@@ -179,12 +173,16 @@ fn in_bf16(args: &EncoderArgs, manifest: &Manifest, encoder: &Encoder, rgb: &[u8
 
 /// Times the encoder as the stage runs it by default.
 fn in_onnx<'a>(encoder: &'a mut carff_inference::Encoder, rgb: &'a [u8]) -> Contender<'a> {
-    timed(move || drop(std::hint::black_box(image(rgb).map(|image| encoder.encode(image)))))
+    timed(move || {
+        let _ = std::hint::black_box(image(rgb).map(|image| encoder.encode(image)));
+    })
 }
 
 /// Times the encoder in libtorch. The change of threads is not part of the frame.
 fn in_tch<'a>(encoder: &'a Encoder, rgb: &'a [u8], threads: i32) -> Contender<'a> {
-    let mut clock = timed(move || drop(std::hint::black_box(encode(encoder, rgb))));
+    let mut clock = timed(move || {
+        std::hint::black_box(encode(encoder, rgb));
+    });
     Box::new(move || {
         tch::set_num_threads(threads);
         clock()

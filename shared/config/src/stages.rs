@@ -124,7 +124,11 @@ impl StagesConfig {
         let other = Stage::ALL.into_iter().find(|&s| s != Stage::Encoder && self.of(s).backend.is_some());
         other.map_or(Ok(()), |stage| {
             let found = format!("{:?}", self.of(stage).backend.unwrap_or_default()).to_lowercase();
-            Err(source.range(&format!("stages.{stage}.backend"), found, "only `stages.encoder` has a backend".to_owned()))
+            Err(source.range(
+                &format!("stages.{stage}.backend"),
+                found,
+                "only `stages.encoder` has a backend".to_owned(),
+            ))
         })
     }
 
