@@ -173,7 +173,9 @@ fn in_bf16(args: &EncoderArgs, manifest: &Manifest, encoder: &Encoder, rgb: &[u8
 
 /// Times the encoder as the stage runs it by default.
 fn in_onnx<'a>(encoder: &'a mut carff_inference::Encoder, rgb: &'a [u8]) -> Contender<'a> {
-    timed(move || drop(std::hint::black_box(image(rgb).map(|image| encoder.encode(image)))))
+    timed(move || {
+        let _ = std::hint::black_box(image(rgb).map(|image| encoder.encode(image)));
+    })
 }
 
 /// Times the encoder in libtorch. The change of threads is not part of the frame.

@@ -14,6 +14,8 @@ use std::sync::OnceLock;
 
 /// Version that the fetch script stores.
 pub const VERSION: &str = "1.32.0";
+/// Part of that version's description of its build.
+pub const BUILD: &str = "git-commit-id=fab30a4";
 /// Name of the library.
 pub const NAME: &str = "libonnxruntime.so.1";
 /// Variable that names another file.
@@ -43,19 +45,19 @@ pub fn load() -> Result<Environment, InferenceError> {
 }
 
 fn open(path: &Path) -> Result<Environment, String> {
+    if path.parent().is_some_and(|folder| folder != Path::new("")) && !path.exists() {
+        return Err(format!("{} does not exist", path.display()));
+    }
     let builder = ort::init_from(path).map_err(|e| format!("{e} ({NAME} {VERSION} is wanted)"))?;
     builder.with_name("carff").with_telemetry(false).build().map_err(|e| format!("{}: {e}", path.display()))
 }
 
-/// Loads the library, and returns the version that it states.
+/// Loads the library, and returns its description of the build.
 ///
 /// # Errors
 ///
 /// As [`load`].
-pub fn version() -> Result<String, InferenceError> {
+pub fn build() -> Result<&'static str, InferenceError> {
     load()?;
-    // "ORT Build Info: git-branch=rel-1.32.0, git-commit-id=.."
-    let info = ort::info();
-    let version = info.split("git-branch=").nth(1).and_then(|rest| rest.split([',', ' ']).next());
-    Ok(version.map_or(info, |v| v.trim_start_matches("rel-")).to_owned())
+    Ok(ort::info())
 }
