@@ -77,9 +77,10 @@ impl Pipeline {
         let pipeline =
             built.downcast::<gst::Pipeline>().map_err(|_| anyhow!("`camera.pipeline` has only one element"))?;
         let sinks = pipeline.iterate_sinks().into_iter().filter_map(Result::ok);
-        let sink = sinks.filter_map(|sink| sink.downcast::<AppSink>().ok()).next().context(
-            "`camera.pipeline` has no appsink: end it with `! videoconvert ! appsink`",
-        )?;
+        let sink = sinks
+            .filter_map(|sink| sink.downcast::<AppSink>().ok())
+            .next()
+            .context("`camera.pipeline` has no appsink: end it with `! videoconvert ! appsink`")?;
         sink.set_caps(Some(&VideoCapsBuilder::new().format(VideoFormat::Rgb).build()));
         sink.set_max_buffers(1);
         sink.set_drop(true);

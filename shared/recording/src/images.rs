@@ -417,7 +417,3 @@ fn calibration_of(
     }
     Ok(Calibration::of_ros(size_px, &model, &k, &d))
 }
-
-#[cfg(test)]
-#[path = "images_tests.rs"]
-mod tests;

@@ -1,7 +1,13 @@
-use super::*;
+//! Tests of reading camera images in MCAP files of other tools.
+
+#![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
+
 use carff_dataset::DistortionModel;
-use foxglove::Encode;
+use carff_recording::ImageReader;
+use foxglove::{Encode, messages};
 use mcap::records::MessageHeader;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
 
 fn bag(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("testdata").join(name)
