@@ -1,4 +1,4 @@
-//! Tests of the Python package next to the shipped programs. They need a Python with iceoryx2 and NumPy.
+//! Tests of the Python package next to the shipped programs. They need a Python with iceoryx2 and `NumPy`.
 
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
