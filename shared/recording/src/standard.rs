@@ -1,6 +1,5 @@
 //! Messages in the standard robotics schemas: images, calibrations, poses, boxes, logs.
 
-use crate::LogLine;
 use carff_decision::Place;
 use carff_messages::forms::AnyMessage;
 use carff_messages::{Action, ActionCode, Belief, Health, HealthState, Intrinsics, Reason, Stage};
@@ -149,6 +148,19 @@ fn label(place: &Place, text: String) -> TextPrimitive {
         color: Some(Color { r: 1.0, g: 1.0, b: 1.0, a: 1.0 }),
         text,
     }
+}
+
+/// A line of a run's log, from a stage or the launcher.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct LogLine {
+    /// Time of the line, nanoseconds since 1970.
+    pub wall_ns: u64,
+    /// Stage that wrote it, or `launcher`.
+    pub source: String,
+    /// Level: `ERROR`, `WARN`, `INFO`, `DEBUG` or `TRACE`.
+    pub level: String,
+    /// The text.
+    pub message: String,
 }
 
 /// Returns a line of a run's log.
