@@ -7,6 +7,7 @@ use carff_messages::forms::{AnyMessage, OwnedMessage};
 use carff_messages::{Action, Header, MAX_IMAGE_BYTES};
 use carff_recording::{Entry, Reader};
 use carff_transport::{AnyPublisher, AnyReceiver, Node, Run, Stop, TopicId, Waiter, Woken, monotonic_now_ns};
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::{BufRead, IsTerminal, stdin};
 use std::path::PathBuf;
@@ -21,6 +22,10 @@ const PATIENCE_NS: u64 = 3_000_000_000;
 const LINGER_NS: u64 = 500_000_000;
 /// Interval between two checks for answers, nanoseconds.
 const LOOK_NS: u64 = 2_000_000;
+
+/// Error of a replay by single steps without the input for a step.
+pub(super) const NO_INPUT: &str = "standard input ended before the recording: `--step` sends one frame for each line; \
+                                   start it in a terminal, or use `--rate` or `--verify`";
 
 /// Timing of the next message.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -201,11 +206,7 @@ impl Player {
                 Err(TryRecvError::Disconnected) => {
                     // The last frame's results are still in progress.
                     self.look_until(waiter, back, monotonic_now_ns() + LINGER_NS, |_| false)?;
-                    ensure!(
-                        stdin().is_terminal(),
-                        "standard input ended before the recording: `--step` sends one frame for each line; start it \
-                         in a terminal, or use `--rate` or `--verify`"
-                    );
+                    ensure!(stdin().is_terminal(), NO_INPUT);
                     return Ok(false);
                 }
                 Err(TryRecvError::Empty) => {}
@@ -228,6 +229,12 @@ impl Player {
         }
         Ok(largest)
     }
+}
+
+/// Returns true unless standard input has ended. It does not wait for input.
+pub(super) fn has_input() -> bool {
+    let waiting = poll(&mut [PollFd::new(&stdin(), PollFlags::IN)], Some(&Timespec::default())).is_ok_and(|n| n > 0);
+    stdin().is_terminal() || !waiting || stdin().lock().fill_buf().is_ok_and(|bytes| !bytes.is_empty())
 }
 
 /// Returns a channel with a message for each line of standard input; a thread reads it, because a read cannot be

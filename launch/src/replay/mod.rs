@@ -12,7 +12,7 @@ use carff_recording::{About, Reader};
 use carff_transport::TopicId;
 use clap::Args;
 use compare::{COMPARED, Replayed};
-use feed::{Pace, Player};
+use feed::{NO_INPUT, Pace, Player, has_input};
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -100,6 +100,7 @@ fn replaced(topics: &BTreeSet<TopicId>) -> BTreeSet<Stage> {
 pub fn run(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
     let topics = args.only.clone().map_or_else(|| [TopicId::FRAME].into(), |only| only.0);
     ensure!(!topics.is_empty(), "name at least one topic with --only");
+    ensure!(!args.step || has_input(), NO_INPUT);
     let (about, sent) = check(args, &topics)?;
     let folder = tempfile::tempdir().context("cannot create a temporary folder")?;
     // The recorded configuration, or the original file if it is unchanged: error messages then name that file.

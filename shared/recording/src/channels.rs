@@ -1,7 +1,7 @@
 //! Channels of recordings and of the live bridge: names, schemas, and encoded messages.
 
 use crate::standard;
-use crate::standard::Events;
+use crate::standard::{Events, LogLine};
 use carff_decision::Place;
 use carff_messages::forms::AnyMessage;
 use carff_messages::{Belief, FrameMeta, ImageMeta, ViewKind, ViewMeta};
@@ -57,19 +57,6 @@ impl Encoded {
         let _ = message.encode(&mut data);
         Self { channel: channel.into(), format: Format::Protobuf(M::get_schema), data }
     }
-}
-
-/// A line of a run's log, from a stage or the launcher.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct LogLine {
-    /// Time of the line, nanoseconds since 1970.
-    pub wall_ns: u64,
-    /// Stage that wrote it, or `launcher`.
-    pub source: String,
-    /// Level: `ERROR`, `WARN`, `INFO`, `DEBUG` or `TRACE`.
-    pub level: String,
-    /// The text.
-    pub message: String,
 }
 
 impl LogLine {

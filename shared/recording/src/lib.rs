@@ -28,11 +28,12 @@ mod summary;
 mod writer;
 
 pub use about::About;
-pub use channels::{Encoded, Encoder, Format, LogLine};
+pub use channels::{Encoded, Encoder, Format};
 pub use images::{ImageError, ImageReader};
 pub use queue::{QueueCounts, RecordingQueue};
 pub use reader::{Entry, Reader};
 pub use rotation::{Limits, RotatingWriter};
+pub use standard::LogLine;
 pub use writer::Writer;
 
 use carff_messages::forms::FormError;

@@ -150,6 +150,19 @@ fn label(place: &Place, text: String) -> TextPrimitive {
     }
 }
 
+/// A line of a run's log, from a stage or the launcher.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct LogLine {
+    /// Time of the line, nanoseconds since 1970.
+    pub wall_ns: u64,
+    /// Stage that wrote it, or `launcher`.
+    pub source: String,
+    /// Level: `ERROR`, `WARN`, `INFO`, `DEBUG` or `TRACE`.
+    pub level: String,
+    /// The text.
+    pub message: String,
+}
+
 /// Returns a line of a run's log.
 pub(crate) fn log_line(wall_ns: u64, source: &str, level: &str, message: &str) -> Log {
     let level = match level {
