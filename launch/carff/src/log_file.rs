@@ -50,6 +50,7 @@ impl LogTail {
     }
 
     /// Opens the file, to read what is written from now on.
+    #[cfg_attr(not(feature = "recording"), allow(dead_code, reason = "recorder and bridge use it"))]
     pub(crate) fn open_at_end(path: &Path) -> Result<Self> {
         let mut tail = Self::open(path)?;
         tail.file.seek(SeekFrom::End(0))?;
