@@ -82,7 +82,7 @@ pub fn examine(args: &DoctorArgs) -> anyhow::Result<Vec<Finding>> {
     findings.push(checks::libtorch(library.as_deref(), version.as_deref()));
     let onnx = carff_inference::library::build().map_err(|e| e.to_string());
     let needed = stages.encoder_backend() == Backend::Onnx;
-    let onnx = onnx.as_ref().map(|build| *build).map_err(String::as_str);
+    let onnx = onnx.as_ref().copied().map_err(String::as_str);
     findings.push(checks::onnx_runtime(&carff_inference::library::path(), onnx, needed));
     let folder = std::env::current_exe()?.parent().context("this program has no folder")?.to_owned();
     findings.push(checks::programs(&folder, &gather::missing_programs(&folder, &stages)));

@@ -59,6 +59,7 @@ pub fn save_field(dir: &Path, field: &Field) -> Result<(), CheckpointError> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::tensors::values;
 
     fn config() -> FieldConfig {
         FieldConfig {

@@ -93,11 +93,7 @@ impl Linear {
     }
 
     fn relu(&self, x: &[f32]) -> Vec<f32> {
-        let mut out = self.forward(x);
-        for v in &mut out {
-            *v = v.max(0.0);
-        }
-        out
+        self.forward(x).into_iter().map(|v| v.max(0.0)).collect()
     }
 }
 

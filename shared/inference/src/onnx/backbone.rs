@@ -252,21 +252,22 @@ impl Layers<'_> {
 fn timm_form(tensors: Tensors) -> Tensors {
     let root = vit::root(tensors.keys().map(String::as_str)).to_owned();
     let mut own: Tensors = tensors.into_iter().map(|(name, t)| (vit::timm_name(&name, &root), t)).collect();
-    let there = |i: &i64| own.contains_key(&format!("blocks.{i}.norm1.weight"));
-    for block in (0..i64::MAX).take_while(there).collect::<Vec<i64>>() {
+    let mut block = 0;
+    while own.contains_key(&format!("blocks.{block}.norm1.weight")) {
         for part in ["weight", "bias"] {
             join_queries(&mut own, block, part);
         }
         for (factor, layer) in [("ls1.gamma", "attn.proj"), ("ls2.gamma", "mlp.fc2")] {
             fold_scale(&mut own, &format!("blocks.{block}.{factor}"), &format!("blocks.{block}.{layer}"));
         }
+        block += 1;
     }
     add_class_position(&mut own);
     own
 }
 
 /// Concatenates a block's queries, keys and values.
-fn join_queries(tensors: &mut Tensors, block: i64, part: &str) {
+fn join_queries(tensors: &mut Tensors, block: usize, part: &str) {
     let names = ["query", "key", "value"].map(|q| format!("blocks.{block}.attention.attention.{q}.{part}"));
     let parts: Vec<_> = names.iter().filter_map(|name| Some(tensors.get(name)?.view())).collect();
     if parts.len() == 3

@@ -93,8 +93,7 @@ impl Builder {
     /// Ends the graph, and returns the bytes of the ONNX file.
     pub fn finish(mut self, name: &str, doc: &str, input: Value, outputs: &[(&str, &str, i64)]) -> Vec<u8> {
         for &(value, output, width) in outputs {
-            let last = self.graph.node.iter_mut().flat_map(|node| &mut node.output).find(|o| *o == value);
-            if let Some(last) = last {
+            if let Some(last) = self.graph.node.iter_mut().flat_map(|node| &mut node.output).find(|o| *o == value) {
                 output.clone_into(last);
             }
             self.graph.output.push(described(output, DataType::Float, vec![Extent::Fixed(1), Extent::Fixed(width)]));
