@@ -32,6 +32,9 @@ fn run(stage: &mut StageContext) -> anyhow::Result<()> {
     let url = stage.graph.camera.url.as_deref().context("`camera.url` is missing in the graph file")?;
     let (url, credentials) = address(url)?;
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+    // A connection that is dropped takes leave of the camera in the background.
+    let handle = runtime.handle().clone();
+    let _context = handle.enter();
     let mut camera = Camera { runtime, url, credentials, output: FrameOutput::open(stage, None)?, is_ready: false };
     loop {
         match camera.watch(stage) {
