@@ -93,7 +93,7 @@ mod tests {
     #[test]
     fn types_of_numbers() {
         let numbers = [0.5_f32, -2.0, 96.0];
-        let of = |kind, data: Vec<u8>| crate::tensors::values(&TensorView::new(kind, vec![3], &data).unwrap());
+        let of = |kind, data: Vec<u8>| values(&TensorView::new(kind, vec![3], &data).unwrap());
         assert_eq!(of(Dtype::F32, numbers.iter().flat_map(|v| v.to_le_bytes()).collect()).unwrap(), numbers);
         let halves = numbers.iter().flat_map(|&v| f16::from_f32(v).to_le_bytes()).collect();
         assert_eq!(of(Dtype::F16, halves).unwrap(), numbers);
