@@ -97,33 +97,38 @@ def network(programs: Path, folder: Path) -> None:
     gst = f"rtspsrc location={address}/test latency=0 ! decodebin ! videoconvert ! appsink"
     good(programs, graph(folder, f'source = "pipeline"\npipeline = "{gst}"'), "RTSP by GStreamer", 10)
 
-    # The camera is lost and comes back during one check.
+    lost_and_back(programs, folder, address, server, serve)
+
+
+def lost_and_back(programs: Path, folder: Path, address: str, server: subprocess.Popen, serve) -> None:
+    """The camera of a running stage is lost and comes back."""
     file = graph(folder, f'source = "rtsp"\nurl = "{address}/test"')
     command = [programs / "carff-camera-rtsp", "--graph", file, "--run", "check-cameras-2", "--run-id", "7"]
-    camera = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-    lines = iter(camera.stderr.readline, "")
-    wait(lines, "ready")
-    server.kill()
-    server.wait()
-    wait(lines, "connecting again")
-    server = serve()
-    wait(lines, "delivers again")
-    print("RTSP: lost and back")
-    camera.terminate()
-    if camera.wait(20) != 0:
-        sys.exit(f"the camera ended with {camera.returncode}")
-    server.kill()
-    server.wait()
+    log = folder / "camera.log"
+    with log.open("w") as output:
+        camera = subprocess.Popen(command, stderr=output)
+    try:
+        wait(log, "ready")
+        server.kill()
+        server.wait()
+        wait(log, "connecting again")
+        server = serve()
+        wait(log, "delivers again")
+        print("RTSP: lost and back")
+        camera.terminate()
+        if camera.wait(20) != 0:
+            sys.exit(f"the camera ended with {camera.returncode}")
+    finally:
+        camera.kill()
+        server.kill()
 
 
-def wait(lines, word: str) -> None:
+def wait(log: Path, word: str) -> None:
     begun = time.monotonic()
-    for line in lines:
-        if word in line:
-            return
+    while word not in log.read_text():
         if time.monotonic() - begun > 120:
-            break
-    sys.exit(f"the camera did not log `{word}`")
+            sys.exit(f"the camera did not log `{word}`:\n{log.read_text()}")
+        time.sleep(0.1)
 
 
 def main() -> None:

@@ -75,7 +75,8 @@ impl Camera {
         let Some(mut session) = connected else { return Ok(()) };
         let mut decoder = Decoder::new()?;
         let mut image = Vec::new();
-        while !self.output.is_complete() {
+        // Images may come faster than the stage looks at requests to stop.
+        while !self.output.is_complete() && stage.wait_until(&[], 0)? != Woken::Stopped {
             let Some(item) = self.drive(stage, async { Ok(session.next().await) })? else { return Ok(()) };
             let item = item.context("the camera has closed the connection")??;
             let CodecItem::VideoFrame(frame) = item else { continue };
