@@ -37,6 +37,11 @@ impl ExternalCamera {
     /// Takes the number of valid frames so far. Returns the number of new ones.
     pub fn saw(&mut self, frames: u64, now_ns: u64) -> u64 {
         let new = frames.saturating_sub(std::mem::replace(&mut self.seen, frames));
+        let quiet = |last_ns: &u64| now_ns.saturating_sub(*last_ns) > self.quiet_ns;
+        if new > 0 && self.recent_ns.back().is_some_and(quiet) {
+            // Older frames say nothing about the rate after the gap.
+            self.recent_ns.clear();
+        }
         for _ in 0..new.min(RECENT as u64) {
             self.recent_ns.push_back(now_ns);
         }
@@ -80,10 +85,6 @@ impl ExternalCamera {
         let who = publisher.unwrap_or("a process that has ended");
         Some(match state {
             HealthState::Stale => {
-                // Older frames say nothing about the rate after the gap.
-                let last_ns = self.recent_ns.back().copied();
-                self.recent_ns.clear();
-                self.recent_ns.extend(last_ns);
                 let whose = publisher.map_or("its process has ended", |_| "its process lives");
                 format!(
                     "WARN camera: no frame for {} ms ({whose}): the safe action applies until frames come",
