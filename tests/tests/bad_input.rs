@@ -13,7 +13,11 @@ fn wrong_graph_files() {
     let cases = [
         ("horizn = 2", "wrong.toml:5: `run.horizn`: unknown field `horizn`, expected one of"),
         ("samples = 65", "wrong.toml:5: `run.samples` is 65; allowed: 1 to 64"),
-        ("[camera]\nsource = \"video\"", "wrong.toml:6: `camera.source`: unknown variant `video`, expected"),
+        ("[camera]\nsource = \"webcam\"", "wrong.toml:6: `camera.source`: unknown variant `webcam`, expected"),
+        (
+            "[camera]\nsource = \"video\"",
+            "wrong.toml:6: `camera.source` is \"video\"; allowed: `video` with `camera.file`",
+        ),
         ("[controller]\nthreshold = nan", "wrong.toml:6: `controller.threshold` is NaN; allowed: 0 to 1"),
         ("[renderer]\nwidth_px = \"wide\"", "wrong.toml:6: `renderer.width_px`: invalid type"),
         ("seed = ", "wrong.toml:5: "),
