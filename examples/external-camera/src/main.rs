@@ -24,8 +24,16 @@ fn main() -> anyhow::Result<()> {
     let waiter = Waiter::new(Stop::on_signals()?);
     // Frame numbers never repeat in a run: a restarted camera continues after the last frame, which the launcher's
     // heartbeat for this camera names. At the first start nothing has been published.
-    let last = node.receiver(topics::health(Stage::Camera))?.newest()?.filter(|h| h.published > 0);
-    let first_id = last.map_or(0, |health| health.header.frame_id + 1);
+    let mut healths = node.receiver(topics::health(Stage::Camera))?;
+    let until_ns = monotonic_now_ns() + 1_000_000_000;
+    let first_id = loop {
+        if let Some(health) = healths.newest()? {
+            break if health.published > 0 { health.header.frame_id + 1 } else { 0 };
+        }
+        if matches!(waiter.wait_until(&[&healths], until_ns)?, Woken::Timeout | Woken::Stopped) {
+            break 0;
+        }
+    };
     println!("joined run `{}`", live.name);
     let mut next_ns = monotonic_now_ns();
     for (frame_id, image) in (first_id..).zip(images.iter().cycle()) {
