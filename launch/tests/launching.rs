@@ -230,8 +230,11 @@ fn text(output: &Output) -> String {
 }
 
 /// Returns a launcher that has printed its first decision.
+/// Starts a run that takes every signal, also where the tests themselves run under `nohup`.
 fn deciding(graph: &Graph) -> Child {
-    deciding_as(&mut graph.command(100_000))
+    let inner = graph.command(100_000);
+    let mut command = Command::new("env");
+    deciding_as(command.arg("--default-signal=HUP").arg(inner.get_program()).args(inner.get_args()))
 }
 
 fn deciding_as(command: &mut Command) -> Child {

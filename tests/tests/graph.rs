@@ -101,9 +101,10 @@ fn a_signal_ends_every_command() {
     ];
     for command in commands {
         for signal in [Signal::INT, Signal::TERM, Signal::HUP] {
-            let process = Process::start(
-                std::process::Command::new(program("carff-launch")).args(command).current_dir(project_root()),
-            );
+            // Also where the tests themselves run under `nohup`.
+            let mut started = std::process::Command::new("env");
+            started.arg("--default-signal=HUP").arg(program("carff-launch")).args(command);
+            let process = Process::start(started.current_dir(project_root()));
             assert!(eventually(|| process.catches(signal)), "{command:?} takes no {signal:?}");
             process.signal(signal);
             let finished = process.end();

@@ -34,8 +34,8 @@ impl ExternalCamera {
         Self { expected_hz, quiet_ns, recent_ns: VecDeque::new(), seen: 0, state: HealthState::Starting }
     }
 
-    /// Takes the number of valid frames so far. Returns the number of new ones.
-    pub fn saw(&mut self, frames: u64, now_ns: u64) -> u64 {
+    /// Takes the number of valid frames so far.
+    pub fn saw(&mut self, frames: u64, now_ns: u64) {
         let new = frames.saturating_sub(std::mem::replace(&mut self.seen, frames));
         let quiet = |last_ns: &u64| now_ns.saturating_sub(*last_ns) > self.quiet_ns;
         if new > 0 && self.recent_ns.back().is_some_and(quiet) {
@@ -48,7 +48,6 @@ impl ExternalCamera {
         while self.recent_ns.len() > RECENT {
             self.recent_ns.pop_front();
         }
-        new
     }
 
     /// Excludes a gap in which the launcher itself was not running.
@@ -114,8 +113,8 @@ pub(crate) struct ForeignCamera {
     frame_id: u64,
     pid: u32,
     beat_ns: u64,
-    /// Arrival of the latest frame.
-    arrived_ns: u64,
+    /// Time at which the wanted number of frames had arrived.
+    complete_ns: Option<u64>,
 }
 
 impl ForeignCamera {
@@ -130,7 +129,7 @@ impl ForeignCamera {
             frame_id: 0,
             pid: 0,
             beat_ns: 0,
-            arrived_ns: 0,
+            complete_ns: None,
         })
     }
 
@@ -147,9 +146,7 @@ impl ForeignCamera {
     /// changed.
     pub(crate) fn watch(&mut self, node: &Node, records: &Records) -> anyhow::Result<Option<String>> {
         let now_ns = monotonic_now_ns();
-        if self.frames.saw(records.frames_seen, now_ns) > 0 {
-            self.arrived_ns = now_ns;
-        }
+        self.frames.saw(records.frames_seen, now_ns);
         if now_ns < self.beat_ns {
             return Ok(None);
         }
@@ -166,10 +163,14 @@ impl ForeignCamera {
         Ok(line)
     }
 
-    /// Returns true once the wanted number of frames has arrived, and time to work on them has passed.
-    pub(crate) fn is_complete(&self, wanted: Option<u64>) -> bool {
-        wanted.is_some_and(|wanted| self.published >= wanted)
-            && monotonic_now_ns().saturating_sub(self.arrived_ns) >= self.linger_ns
+    /// Returns true once the wanted number of frames has arrived, and time to work on them has passed. The camera may
+    /// go on meanwhile: it does not know the number.
+    pub(crate) fn is_complete(&mut self, wanted: Option<u64>) -> bool {
+        if wanted.is_none_or(|wanted| self.published < wanted) {
+            return false;
+        }
+        let now_ns = monotonic_now_ns();
+        now_ns - *self.complete_ns.get_or_insert(now_ns) >= self.linger_ns
     }
 
     /// Excludes a gap in which the launcher itself was not running.
@@ -219,7 +220,7 @@ mod tests {
                 .filter_map(|_| {
                     *at += period_ms * MS;
                     frames += 1;
-                    assert_eq!(camera.saw(frames, *at), 1);
+                    camera.saw(frames, *at);
                     camera.look(*at, Some("cam (process 7)"))
                 })
                 .collect::<Vec<_>>()
