@@ -164,7 +164,7 @@ impl ForeignCamera {
     }
 
     /// Returns true once the wanted number of frames has arrived, and time to work on them has passed. The camera may
-    /// go on meanwhile: it does not know the number.
+    /// continue meanwhile: it does not know the number.
     pub(crate) fn is_complete(&mut self, wanted: Option<u64>) -> bool {
         if wanted.is_none_or(|wanted| self.published < wanted) {
             return false;
