@@ -150,34 +150,6 @@ static_assert(offsetof(CarffFrameMeta, intrinsics) == 64, "CarffFrameMeta.intrin
 static_assert(offsetof(CarffFrameMeta, world_from_camera) == 96, "CarffFrameMeta.world_from_camera");
 static_assert(offsetof(CarffFrameMeta, dataset_view) == 224, "CarffFrameMeta.dataset_view");
 
-#define CARFF_VIEW_META_TYPE_NAME "carff.ViewMeta.v1"
-typedef struct CarffViewMeta {
-    CarffHeader header;
-    uint32_t hypothesis;
-    uint32_t kind;
-    int32_t state;
-    uint32_t width_px;
-    uint32_t height_px;
-    float probability;
-    float latent[8];
-    CarffIntrinsics intrinsics;
-    double world_from_camera[16];
-    uint64_t stage_latency_ns;
-} CarffViewMeta;
-
-static_assert(sizeof(CarffViewMeta) == 280, "CarffViewMeta");
-static_assert(offsetof(CarffViewMeta, header) == 0, "CarffViewMeta.header");
-static_assert(offsetof(CarffViewMeta, hypothesis) == 56, "CarffViewMeta.hypothesis");
-static_assert(offsetof(CarffViewMeta, kind) == 60, "CarffViewMeta.kind");
-static_assert(offsetof(CarffViewMeta, state) == 64, "CarffViewMeta.state");
-static_assert(offsetof(CarffViewMeta, width_px) == 68, "CarffViewMeta.width_px");
-static_assert(offsetof(CarffViewMeta, height_px) == 72, "CarffViewMeta.height_px");
-static_assert(offsetof(CarffViewMeta, probability) == 76, "CarffViewMeta.probability");
-static_assert(offsetof(CarffViewMeta, latent) == 80, "CarffViewMeta.latent");
-static_assert(offsetof(CarffViewMeta, intrinsics) == 112, "CarffViewMeta.intrinsics");
-static_assert(offsetof(CarffViewMeta, world_from_camera) == 144, "CarffViewMeta.world_from_camera");
-static_assert(offsetof(CarffViewMeta, stage_latency_ns) == 272, "CarffViewMeta.stage_latency_ns");
-
 #define CARFF_GAUSSIAN_TYPE_NAME "carff.Gaussian.v1"
 typedef struct CarffGaussian {
     float mean[8];
@@ -291,6 +263,34 @@ static_assert(offsetof(CarffBelief, resolved) == 14304, "CarffBelief.resolved");
 static_assert(offsetof(CarffBelief, encoder_ns) == 14368, "CarffBelief.encoder_ns");
 static_assert(offsetof(CarffBelief, forecaster_ns) == 14376, "CarffBelief.forecaster_ns");
 static_assert(offsetof(CarffBelief, stage_latency_ns) == 14384, "CarffBelief.stage_latency_ns");
+
+#define CARFF_VIEW_META_TYPE_NAME "carff.ViewMeta.v1"
+typedef struct CarffViewMeta {
+    CarffHeader header;
+    uint32_t hypothesis;
+    uint32_t kind;
+    int32_t state;
+    uint32_t width_px;
+    uint32_t height_px;
+    float probability;
+    float latent[8];
+    CarffIntrinsics intrinsics;
+    double world_from_camera[16];
+    uint64_t stage_latency_ns;
+} CarffViewMeta;
+
+static_assert(sizeof(CarffViewMeta) == 280, "CarffViewMeta");
+static_assert(offsetof(CarffViewMeta, header) == 0, "CarffViewMeta.header");
+static_assert(offsetof(CarffViewMeta, hypothesis) == 56, "CarffViewMeta.hypothesis");
+static_assert(offsetof(CarffViewMeta, kind) == 60, "CarffViewMeta.kind");
+static_assert(offsetof(CarffViewMeta, state) == 64, "CarffViewMeta.state");
+static_assert(offsetof(CarffViewMeta, width_px) == 68, "CarffViewMeta.width_px");
+static_assert(offsetof(CarffViewMeta, height_px) == 72, "CarffViewMeta.height_px");
+static_assert(offsetof(CarffViewMeta, probability) == 76, "CarffViewMeta.probability");
+static_assert(offsetof(CarffViewMeta, latent) == 80, "CarffViewMeta.latent");
+static_assert(offsetof(CarffViewMeta, intrinsics) == 112, "CarffViewMeta.intrinsics");
+static_assert(offsetof(CarffViewMeta, world_from_camera) == 144, "CarffViewMeta.world_from_camera");
+static_assert(offsetof(CarffViewMeta, stage_latency_ns) == 272, "CarffViewMeta.stage_latency_ns");
 
 #define CARFF_ACTION_TYPE_NAME "carff.Action.v1"
 typedef struct CarffAction {

@@ -135,26 +135,6 @@ class FrameMeta(ctypes.Structure):
         return "carff.FrameMeta.v1"
 
 
-class ViewMeta(ctypes.Structure):
-    _fields_ = [
-        ("header", Header),
-        ("hypothesis", ctypes.c_uint32),
-        ("kind", ctypes.c_uint32),
-        ("state", ctypes.c_int32),
-        ("width_px", ctypes.c_uint32),
-        ("height_px", ctypes.c_uint32),
-        ("probability", ctypes.c_float),
-        ("latent", (ctypes.c_float * 8)),
-        ("intrinsics", Intrinsics),
-        ("world_from_camera", (ctypes.c_double * 16)),
-        ("stage_latency_ns", ctypes.c_uint64),
-    ]
-
-    @staticmethod
-    def type_name() -> str:
-        return "carff.ViewMeta.v1"
-
-
 class Gaussian(ctypes.Structure):
     _fields_ = [
         ("mean", (ctypes.c_float * 8)),
@@ -242,6 +222,26 @@ class Belief(ctypes.Structure):
         return "carff.Belief.v2"
 
 
+class ViewMeta(ctypes.Structure):
+    _fields_ = [
+        ("header", Header),
+        ("hypothesis", ctypes.c_uint32),
+        ("kind", ctypes.c_uint32),
+        ("state", ctypes.c_int32),
+        ("width_px", ctypes.c_uint32),
+        ("height_px", ctypes.c_uint32),
+        ("probability", ctypes.c_float),
+        ("latent", (ctypes.c_float * 8)),
+        ("intrinsics", Intrinsics),
+        ("world_from_camera", (ctypes.c_double * 16)),
+        ("stage_latency_ns", ctypes.c_uint64),
+    ]
+
+    @staticmethod
+    def type_name() -> str:
+        return "carff.ViewMeta.v1"
+
+
 class Action(ctypes.Structure):
     _fields_ = [
         ("header", Header),
@@ -290,12 +290,12 @@ LAYOUTS = {
     Intrinsics: (32, 8, {"fl_x_px": 0, "fl_y_px": 8, "cx_px": 16, "cy_px": 24}),
     DatasetView: (32, 4, {"known": 0, "view": 4, "branch": 8, "timestamp": 12, "drive": 16, "frame_in_drive": 20, "observability": 24, "last_of_timestamp": 28}),
     FrameMeta: (256, 8, {"header": 0, "width_px": 56, "height_px": 60, "intrinsics": 64, "world_from_camera": 96, "dataset_view": 224}),
-    ViewMeta: (280, 8, {"header": 0, "hypothesis": 56, "kind": 60, "state": 64, "width_px": 68, "height_px": 72, "probability": 76, "latent": 80, "intrinsics": 112, "world_from_camera": 144, "stage_latency_ns": 272}),
     Gaussian: (64, 4, {"mean": 0, "log_variance": 32}),
     Posterior: (128, 8, {"header": 0, "gaussian": 56, "stage_latency_ns": 120}),
     Forecast: (2480, 8, {"header": 0, "source": 56, "component_count": 60, "sample_count": 64, "horizon": 68, "resolved_state": 72, "path_probability": 76, "weights": 80, "components": 96, "samples": 352, "sample_component": 2400, "encoder_ns": 2464, "stage_latency_ns": 2472}),
     ProbeResult: (204, 4, {"state": 0, "confidence": 4, "hazard_likelihood": 8, "occupancies": 12}),
     Belief: (14392, 8, {"header": 0, "horizon": 56, "state_count": 60, "place_count": 64, "component_count": 68, "sample_count": 72, "is_final": 76, "state_probability": 80, "hazard_probability": 336, "path_probability": 340, "component_weights": 344, "components": 360, "samples": 1176, "sample_component": 14232, "resolved_state": 14296, "reserved": 14300, "resolved": 14304, "encoder_ns": 14368, "forecaster_ns": 14376, "stage_latency_ns": 14384}),
+    ViewMeta: (280, 8, {"header": 0, "hypothesis": 56, "kind": 60, "state": 64, "width_px": 68, "height_px": 72, "probability": 76, "latent": 80, "intrinsics": 112, "world_from_camera": 144, "stage_latency_ns": 272}),
     Action: (112, 8, {"header": 0, "action": 56, "reason": 60, "rule": 64, "sample_count": 68, "confidence": 72, "hazard_probability": 76, "is_decision": 80, "valid_until_ns": 88, "based_on_frame": 96, "latency_ns": 104}),
     Health: (144, 8, {"header": 0, "stage": 56, "state": 60, "pid": 64, "received": 72, "published": 80, "skipped": 88, "invalid": 96, "errors": 104, "last_latency_ns": 112, "max_latency_ns": 120, "last_progress_ns": 128, "rss_bytes": 136}),
 }

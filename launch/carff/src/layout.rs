@@ -3,128 +3,60 @@
 //! [`python`] and [`c`] write them as source text. Both texts contain sizes and offsets as this compiler lays them out,
 //! and check them: Python when the module is imported, C and C++ when the header is compiled.
 
+use carff_messages::layout::{Field, Layout};
 use carff_messages::{
-    Action, ActionCode, Belief, DatasetView, Forecast, ForecastSource, FrameMeta, Gaussian, Header, Health,
-    HealthState, Intrinsics, LATENT_DIM, MAX_COMPONENTS, MAX_HORIZON, MAX_IMAGE_BYTES, MAX_PLACES, MAX_SAMPLES,
-    MAX_SIDE_PX, MAX_STATES, Observability, Posterior, ProbeResult, Reason, Rule, SCHEMA_VERSION, Stage, ViewKind,
-    ViewMeta,
+    ActionCode, ForecastSource, HealthState, LATENT_DIM, MAX_COMPONENTS, MAX_HORIZON, MAX_IMAGE_BYTES, MAX_PLACES,
+    MAX_SAMPLES, MAX_SIDE_PX, MAX_STATES, Observability, Reason, Rule, SCHEMA_VERSION, Stage, ViewKind,
 };
-use carff_transport::{Limits, Payload, Topic, topics};
-use iceoryx2::service::static_config::message_type_details::{TypeDetail, TypeVariant};
+use carff_transport::TopicId;
 use std::fmt::Write as _;
-use std::mem::offset_of;
 
-/// Type of a field.
-#[derive(Clone, Debug)]
-enum Kind {
-    /// A number, by its names in Python's ctypes and in C.
-    Number([&'static str; 2]),
-    /// An array with its length.
-    Array(Box<Kind>, usize),
-    /// Another structure.
-    Struct(&'static str),
-}
-
-/// A type that a field can have.
-trait Laid {
-    fn kind() -> Kind;
-}
-
-macro_rules! numbers {
-    ($($type:ty: $ctypes:literal $c:literal),+) => {
-        $(impl Laid for $type { fn kind() -> Kind { Kind::Number([$ctypes, $c]) } })+
-    };
-}
-
-numbers!(u8: "c_uint8" "uint8_t", u32: "c_uint32" "uint32_t", i32: "c_int32" "int32_t", u64: "c_uint64" "uint64_t",
-    f32: "c_float" "float", f64: "c_double" "double");
-
-impl<T: Laid, const N: usize> Laid for [T; N] {
-    fn kind() -> Kind {
-        Kind::Array(Box::new(T::kind()), N)
-    }
-}
-
-#[derive(Clone, Debug)]
-struct Field {
-    name: &'static str,
-    kind: Kind,
-    offset: usize,
-    size: usize,
-    alignment: usize,
-}
-
-#[derive(Clone, Debug)]
-struct Struct {
-    name: &'static str,
-    detail: TypeDetail,
-    fields: Vec<Field>,
-}
-
-/// Describes a field; its type is that of the function that borrows it.
-fn field<S, F: Laid>(name: &'static str, offset: usize, _: fn(&S) -> &F) -> Field {
-    Field { name, kind: F::kind(), offset, size: size_of::<F>(), alignment: align_of::<F>() }
-}
-
-/// Adds a field to the fields before it, and before it the private field that fills a gap of four bytes.
-fn append(mut fields: Vec<Field>, next: Field) -> Vec<Field> {
-    let end = fields.last().map_or(0, |last| last.offset + last.size);
-    if next.offset == end.next_multiple_of(next.alignment) + 4 {
-        fields.push(Field { name: RESERVED, kind: u32::kind(), offset: end, size: 4, alignment: 4 });
-    }
-    fields.push(next);
-    fields
-}
-
-/// Name of private fields, which are 0.
-const RESERVED: &str = "reserved";
-
-macro_rules! structs {
-    ($($type:ident { $($field:ident),+ })+) => {
-        $(impl Laid for $type { fn kind() -> Kind { Kind::Struct(stringify!($type)) } })+
-
-        /// Returns all structures, each after those that it contains.
-        fn structs() -> Vec<Struct> {
-            vec![$(Struct {
-                name: stringify!($type),
-                detail: TypeDetail::new::<$type>(TypeVariant::FixedSize),
-                fields: [
-                    $(field(stringify!($field), offset_of!($type, $field), |all: &$type| &all.$field)),+
-                ].into_iter().fold(Vec::new(), append),
-            }),+]
+/// Returns the structures of all messages, each after those that it contains.
+fn structs() -> Vec<Layout> {
+    fn add(layout: Layout, all: &mut Vec<Layout>) {
+        if layout.fields.is_empty() || all.contains(&layout) {
+            return;
         }
-    };
+        layout.fields.iter().for_each(|field| add(field.kind.clone(), all));
+        all.push(layout);
+    }
+    let mut all = Vec::new();
+    TopicId::all().for_each(|topic| add(topic.layout(), &mut all));
+    all
 }
 
-structs! {
-    Header { schema_version, step, run_id, frame_id, sequence, capture_time_ns, publish_time_ns, seed }
-    Intrinsics { fl_x_px, fl_y_px, cx_px, cy_px }
-    DatasetView { known, view, branch, timestamp, drive, frame_in_drive, observability, last_of_timestamp }
-    FrameMeta { header, width_px, height_px, intrinsics, world_from_camera, dataset_view }
-    ViewMeta {
-        header, hypothesis, kind, state, width_px, height_px, probability, latent, intrinsics, world_from_camera,
-        stage_latency_ns
-    }
-    Gaussian { mean, log_variance }
-    Posterior { header, gaussian, stage_latency_ns }
-    Forecast {
-        header, source, component_count, sample_count, horizon, resolved_state, path_probability, weights, components,
-        samples, sample_component, encoder_ns, stage_latency_ns
-    }
-    ProbeResult { state, confidence, hazard_likelihood, occupancies }
-    Belief {
-        header, horizon, state_count, place_count, component_count, sample_count, is_final, state_probability,
-        hazard_probability, path_probability, component_weights, components, samples, sample_component, resolved_state,
-        resolved, encoder_ns, forecaster_ns, stage_latency_ns
-    }
-    Action {
-        header, action, reason, rule, sample_count, confidence, hazard_probability, is_decision, valid_until_ns,
-        based_on_frame, latency_ns
-    }
-    Health {
-        header, stage, state, pid, received, published, skipped, invalid, errors, last_latency_ns, max_latency_ns,
-        last_progress_ns, rss_bytes
-    }
+/// Returns the name of a structure without the parts of its type name that other programs compare: `FrameMeta` of
+/// `carff.FrameMeta.v1`.
+fn short(layout: &Layout) -> &str {
+    layout.type_name.split('.').nth(1).unwrap_or(&layout.type_name)
+}
+
+/// Returns the type of a field's elements in Python.
+fn python_type(field: &Field) -> String {
+    let element = match field.kind.type_name.as_str() {
+        "u8" => "ctypes.c_uint8",
+        "u32" => "ctypes.c_uint32",
+        "i32" => "ctypes.c_int32",
+        "u64" => "ctypes.c_uint64",
+        "f32" => "ctypes.c_float",
+        "f64" => "ctypes.c_double",
+        _ => short(&field.kind),
+    };
+    field.shape.iter().rev().fold(element.to_owned(), |of, length| format!("({of} * {length})"))
+}
+
+/// Returns the declaration of a field in C.
+fn c_field(field: &Field) -> String {
+    let element = match field.kind.type_name.as_str() {
+        "u8" => "uint8_t".to_owned(),
+        "u32" => "uint32_t".to_owned(),
+        "i32" => "int32_t".to_owned(),
+        "u64" => "uint64_t".to_owned(),
+        "f32" => "float".to_owned(),
+        "f64" => "double".to_owned(),
+        _ => format!("Carff{}", short(&field.kind)),
+    };
+    field.shape.iter().fold(format!("{element} {}", field.name), |text, length| format!("{text}[{length}]"))
 }
 
 /// Returns the limits and versions of the messages.
@@ -159,54 +91,6 @@ fn upper(name: &str) -> String {
     name.chars().map(|c| if c.is_ascii_alphanumeric() { c.to_ascii_uppercase() } else { '_' }).collect()
 }
 
-/// Name, message type, payload form and limits of a topic.
-struct OneTopic {
-    name: &'static str,
-    message: &'static str,
-    is_image: bool,
-    limits: Limits,
-}
-
-fn topic<P: Payload>(topic: &Topic<P>) -> OneTopic {
-    let message = std::any::type_name::<P::Message>().rsplit("::").next().unwrap_or_default();
-    OneTopic { name: topic.name, message, is_image: P::IS_IMAGE, limits: topic.limits }
-}
-
-fn all_topics() -> Vec<OneTopic> {
-    let mut all = vec![
-        topic(&topics::FRAME),
-        topic(&topics::POSTERIOR),
-        topic(&topics::FORECAST),
-        topic(&topics::BELIEF),
-        topic(&topics::VIEW),
-        topic(&topics::ACTION),
-    ];
-    all.extend(Stage::ALL.map(|stage| topic(topics::health(stage))));
-    all
-}
-
-impl Kind {
-    fn python(&self) -> String {
-        match self {
-            Self::Number([ctypes, _]) => format!("ctypes.{ctypes}"),
-            Self::Array(of, length) => format!("({} * {length})", of.python()),
-            Self::Struct(name) => (*name).to_owned(),
-        }
-    }
-
-    /// Returns the element type, and the lengths as they follow a name.
-    fn c(&self) -> (String, String) {
-        match self {
-            Self::Number([_, c]) => ((*c).to_owned(), String::new()),
-            Self::Array(of, length) => {
-                let (element, inner) = of.c();
-                (element, format!("[{length}]{inner}"))
-            }
-            Self::Struct(name) => (format!("Carff{name}"), String::new()),
-        }
-    }
-}
-
 /// Returns the source text of a Python module with all layouts, as ctypes structures.
 pub fn python() -> String {
     let mut text = "\"\"\"Messages, codes and topics of a run. Generated by `carff schema --python`.\"\"\"\n\n\
@@ -221,21 +105,23 @@ pub fn python() -> String {
             let _ = writeln!(text, "    {value} = {code}");
         }
     }
-    for Struct { name, detail, fields } in structs() {
-        let _ = write!(text, "\n\nclass {name}(ctypes.Structure):\n    _fields_ = [\n");
-        for Field { name, kind, .. } in fields {
-            let _ = writeln!(text, "        (\"{name}\", {}),", kind.python());
+    for layout in structs() {
+        let _ = write!(text, "\n\nclass {}(ctypes.Structure):\n    _fields_ = [\n", short(&layout));
+        for field in &layout.fields {
+            let _ = writeln!(text, "        (\"{}\", {}),", field.name, python_type(field));
         }
         let _ = write!(
             text,
             "    ]\n\n    @staticmethod\n    def type_name() -> str:\n        return \"{}\"\n",
-            detail.type_name()
+            layout.type_name
         );
     }
     text += "\n\n# Size, alignment and offsets of the fields in the programs, bytes.\nLAYOUTS = {\n";
-    for Struct { name, detail, fields } in structs() {
-        let offsets: Vec<String> = fields.iter().map(|f| format!("\"{}\": {}", f.name, f.offset)).collect();
-        let _ = writeln!(text, "    {name}: ({}, {}, {{{}}}),", detail.size(), detail.alignment(), offsets.join(", "));
+    for layout in structs() {
+        let offsets: Vec<String> =
+            layout.fields.iter().map(|f| format!("\"{}\": {}", f.name, f.offset_bytes)).collect();
+        let (size, alignment) = (layout.size_bytes, layout.alignment_bytes);
+        let _ = writeln!(text, "    {}: ({size}, {alignment}, {{{}}}),", short(&layout), offsets.join(", "));
     }
     text += "}\n\n\nclass Limits(NamedTuple):\n    \"\"\"Limits of a topic, equal for all its users.\"\"\"\n\n";
     for field in ["max_subscribers", "max_publishers", "max_nodes", "history", "buffer", "borrowed", "loaned"] {
@@ -243,11 +129,13 @@ pub fn python() -> String {
     }
     text += "\n\nclass Topic(NamedTuple):\n    \"\"\"A topic: its name, its message, and its limits.\"\"\"\n\n    \
              name: str\n    message: type\n    is_image: bool\n    limits: Limits\n\n\nTOPICS = [\n";
-    for OneTopic { name, message, is_image, limits: l } in all_topics() {
+    for topic in TopicId::all() {
+        let l = topic.limits();
         let limits = [l.max_subscribers, l.max_publishers, l.max_nodes, l.history, l.buffer, l.borrowed, l.loaned];
         let limits = limits.map(|n| n.to_string()).join(", ");
-        let is_image = if is_image { "True" } else { "False" };
-        let _ = writeln!(text, "    Topic(\"{name}\", {message}, {is_image}, Limits({limits})),");
+        let is_image = if topic.is_image() { "True" } else { "False" };
+        let (name, layout) = (topic.name(), topic.layout());
+        let _ = writeln!(text, "    Topic(\"{name}\", {}, {is_image}, Limits({limits})),", short(&layout));
     }
     text + "]\n"
 }
@@ -266,23 +154,26 @@ pub fn c() -> String {
         let values = values.iter().map(|(value, code)| format!("    CARFF_{name}_{value} = {code},\n"));
         let _ = write!(text, "\nenum {{\n{}}};\n", values.collect::<String>());
     }
-    for Struct { name, detail, fields } in structs() {
-        let (type_name, size, upper) = (detail.type_name(), detail.size(), upper_words(name));
+    for layout in structs() {
+        let (name, size) = (short(&layout), layout.size_bytes);
+        let (type_name, upper) = (&layout.type_name, upper_words(name));
         let _ = write!(text, "\n#define CARFF_{upper}_TYPE_NAME \"{type_name}\"\ntypedef struct Carff{name} {{\n");
-        for field in &fields {
-            let (element, lengths) = field.kind.c();
-            let _ = writeln!(text, "    {element} {}{lengths};", field.name);
+        for field in &layout.fields {
+            let _ = writeln!(text, "    {};", c_field(field));
         }
         let _ = write!(text, "}} Carff{name};\n\nstatic_assert(sizeof(Carff{name}) == {size}, \"Carff{name}\");\n");
-        for Field { name: field, offset, .. } in fields {
-            let _ =
-                writeln!(text, "static_assert(offsetof(Carff{name}, {field}) == {offset}, \"Carff{name}.{field}\");");
+        for Field { name: field, offset_bytes, .. } in &layout.fields {
+            let _ = writeln!(
+                text,
+                "static_assert(offsetof(Carff{name}, {field}) == {offset_bytes}, \"Carff{name}.{field}\");"
+            );
         }
     }
     text += "\n/* Names of the topics, and of the types of their messages. */\n";
-    for OneTopic { name, message, is_image, .. } in all_topics() {
-        let note = if is_image { " (user header of a slice of bytes)" } else { "" };
-        let _ = writeln!(text, "#define CARFF_TOPIC_{} \"{name}\" /* Carff{message}{note} */", upper(name));
+    for topic in TopicId::all() {
+        let note = if topic.is_image() { " (user header of a slice of bytes)" } else { "" };
+        let (name, layout) = (topic.name(), topic.layout());
+        let _ = writeln!(text, "#define CARFF_TOPIC_{} \"{name}\" /* Carff{}{note} */", upper(name), short(&layout));
     }
     text + "\n#endif\n"
 }
@@ -318,23 +209,6 @@ mod tests {
             let found = std::fs::read_to_string(project(path)).unwrap_or_default();
             assert!(found == text, "run `carff schema --{option} > {path}`");
         }
-    }
-
-    /// No field is missing: each begins at the first aligned byte after the one before it, and only the belief has a
-    /// private field.
-    #[test]
-    fn fields_are_complete_and_ordered() {
-        let mut reserved = Vec::new();
-        for Struct { name, detail, fields } in structs() {
-            let end = fields.iter().fold(0, |end: usize, field| {
-                assert_eq!(field.offset, end.next_multiple_of(field.alignment), "{name}.{}", field.name);
-                field.offset + field.size
-            });
-            assert_eq!(end.next_multiple_of(detail.alignment()), detail.size(), "{name}");
-            assert!(detail.type_name().to_string().starts_with(&format!("carff.{name}.v")), "{name}");
-            reserved.extend(fields.iter().filter(|field| field.name == RESERVED).map(|_| name));
-        }
-        assert_eq!(reserved, ["Belief"]);
     }
 
     /// The header compiles as C and as C++ with its assertions on sizes and offsets, and a wrong one does not.
