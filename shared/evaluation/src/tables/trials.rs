@@ -1,7 +1,7 @@
 //! Trials of six kinds from poses that give hazard and clear images alike, and baselines on the same images.
 
 use crate::trials::{
-    baselines::{PARTS, ReadOut, nearest_neighbour},
+    baselines::{ReadOut, nearest_neighbour},
     looks::{Answer, ByTrialKind, Look, encoded, figures, free_looks, looks_of_role},
     planning::Trial,
 };
@@ -30,6 +30,9 @@ pub struct Baseline {
 
 /// Trials and baselines by name.
 pub type TrialsAndBaselines = (ByPart, BTreeMap<String, Baseline>);
+
+/// Parts of the dataset's poses, with their roles.
+const PARTS: [(&str, PoseRole); 2] = [("rest", PoseRole::Rest), ("unseen", PoseRole::Unseen)];
 
 /// Names of the baselines and what they are, in the order of the page.
 const BASELINES: [(&str, &str); 6] = [

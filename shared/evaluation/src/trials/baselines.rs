@@ -2,7 +2,7 @@
 
 use super::looks::Look;
 use crate::PosedImages;
-use carff_dataset::{Image, PoseRole};
+use carff_dataset::Image;
 use carff_messages::{Gaussian, LATENT_DIM};
 
 /// Side of the thumbnails of the nearest neighbour.
@@ -124,9 +124,6 @@ impl ReadOut {
         probabilities.zip(&self.hazard_states).filter(|(_, hazard)| **hazard).map(|(p, _)| p).sum()
     }
 }
-
-/// Roles of the dataset's poses that are parts of the trials, with their names.
-pub const PARTS: [(&str, PoseRole); 2] = [("rest", PoseRole::Rest), ("unseen", PoseRole::Unseen)];
 
 #[cfg(test)]
 mod tests {
