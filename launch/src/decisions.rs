@@ -172,6 +172,7 @@ fn record(frame: &FrameRecord, images: &[PathBuf]) -> serde_json::Value {
         "source": source,
         "capture_time_ns": frame.capture_time_ns,
         "hazard": frame.hazard_probability,
+        "unknown": frame.unknown_probability,
         "action": frame.action.map(ActionCode::name),
         "reason": frame.reason.map(Reason::name),
         "latency_ms": latency_ms(frame),

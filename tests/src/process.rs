@@ -84,9 +84,10 @@ impl Process {
             self.child.kill().unwrap();
         }
         let status = self.child.wait().unwrap();
+        // Its own children may still hold its output.
+        assert!(ended, "it did not end within {WATCHDOG:?}:\n{}", self.text());
         self.readers.drain(..).for_each(|reader| reader.join().unwrap());
         let text = self.text();
-        assert!(ended, "it did not end within {WATCHDOG:?}:\n{text}");
         Finished { status, text }
     }
 }

@@ -18,6 +18,7 @@ use std::io::{Read as _, Write as _};
 use std::net::{Ipv4Addr, TcpStream};
 use std::path::Path;
 use std::process::Command;
+use std::time::Instant;
 use tungstenite::client::IntoClientRequest as _;
 use tungstenite::{Message, WebSocket};
 
@@ -381,8 +382,8 @@ fn a_slow_disk_costs_messages_alone() {
     stop(&graph, launcher);
 }
 
-/// A client of the Foxglove WebSocket protocol, version 1.
-struct Client(WebSocket<TcpStream>);
+/// A client of the Foxglove WebSocket protocol, version 1, with its subscriptions.
+struct Client(WebSocket<TcpStream>, Value);
 
 impl Client {
     fn connect(port: u16, protocol: Option<&'static str>) -> Result<Self, String> {
@@ -392,35 +393,56 @@ impl Client {
         if let Some(protocol) = protocol {
             request.headers_mut().insert("Sec-WebSocket-Protocol", protocol.parse().unwrap());
         }
-        tungstenite::client(request, stream).map(|(socket, _)| Self(socket)).map_err(|error| error.to_string())
+        tungstenite::client(request, stream)
+            .map(|(socket, _)| Self(socket, Value::Null))
+            .map_err(|error| error.to_string())
     }
 
     fn say(&mut self, what: &Value) {
         self.0.send(Message::text(what.to_string())).unwrap();
     }
 
+    /// Returns what `select` takes from the next messages; fails at the watchdog's limit, with other messages too.
+    fn next<T>(&mut self, what: &str, select: impl Fn(Message) -> Option<T>) -> T {
+        let deadline = Instant::now() + WATCHDOG;
+        let mut others = 0;
+        loop {
+            match select(self.0.read().unwrap()) {
+                Some(found) => return found,
+                None => others += 1,
+            }
+            assert!(Instant::now() < deadline, "no {what} within {WATCHDOG:?}, but {others} other messages");
+        }
+    }
+
     /// Returns the next text message of a kind.
     fn hear(&mut self, op: &str) -> Value {
-        loop {
-            if let Message::Text(text) = self.0.read().unwrap() {
-                let said: Value = serde_json::from_str(&text).unwrap();
-                if said["op"] == op {
-                    return said;
-                }
-            }
-        }
+        self.next(op, |message| {
+            let Message::Text(text) = message else { return None };
+            let said: Value = serde_json::from_str(&text).unwrap();
+            // Warnings, such as one of a repeated subscription, are no answers.
+            (said["op"] == op && said["level"].as_u64().is_none_or(|level| level == 2)).then_some(said)
+        })
     }
 
     /// Returns the next data of a subscription, and its time, nanoseconds since 1970.
     fn receive(&mut self, subscription: u32) -> (u64, Vec<u8>) {
         loop {
-            if let Message::Binary(bytes) = self.0.read().unwrap() {
-                let (kind, rest) = bytes.split_first().unwrap();
-                let (id, rest) = rest.split_first_chunk().unwrap();
-                let (time_ns, data) = rest.split_first_chunk().unwrap();
-                if *kind == 1 && u32::from_le_bytes(*id) == subscription {
-                    return (u64::from_le_bytes(*time_ns), data.to_vec());
+            let received = self.next("data", |message| match message {
+                // The server advertises a channel a moment before it accepts subscriptions to it.
+                Message::Text(text) => text.contains("Unknown channel ID").then_some(None),
+                Message::Binary(bytes) => {
+                    let (kind, rest) = bytes.split_first().unwrap();
+                    let (id, rest) = rest.split_first_chunk().unwrap();
+                    let (time_ns, data) = rest.split_first_chunk().unwrap();
+                    let wanted = *kind == 1 && u32::from_le_bytes(*id) == subscription;
+                    wanted.then(|| Some((u64::from_le_bytes(*time_ns), data.to_vec())))
                 }
+                _ => None,
+            });
+            match received {
+                Some(received) => return received,
+                None => self.say(&self.1.clone()),
             }
         }
     }
@@ -456,9 +478,10 @@ fn a_bridge_serves_clients_that_only_look() {
     assert!(schema["properties"]["hazard_probability"].is_object(), "{schema}");
     assert_eq!((&image["encoding"], &image["schemaName"]), (&json!("protobuf"), &json!("foxglove.RawImage")));
 
-    client.say(&json!({ "op": "subscribe", "subscriptions": [
+    client.1 = json!({ "op": "subscribe", "subscriptions": [
         { "id": 7, "channelId": belief["id"] }, { "id": 8, "channelId": image["id"] },
-    ] }));
+    ] });
+    client.say(&client.1.clone());
     let run_id = format!("{:016x}", attach(Some(graph.run().name()), "test").unwrap().live.run_id);
     let belief_of = |(_, data): (u64, Vec<u8>)| serde_json::from_slice::<Value>(&data).unwrap();
     let (first_ns, data) = client.receive(7);

@@ -57,6 +57,7 @@ mod tests {
             confidence: 1.0,
             hazard_probability: 0.0,
             is_decision: 1,
+            unknown_probability: 0.0,
             valid_until_ns: 0,
             based_on_frame: 7,
             latency_ns: 0,

@@ -383,7 +383,7 @@ impl Bench {
             self.rounds * 20,
             &mut [
                 timed(|| {
-                    std::hint::black_box(probe.step(mixture.clone(), drawn(), 1.0));
+                    std::hint::black_box(probe.step(mixture.clone(), drawn(), 1.0, None));
                 }),
                 timed(|| field.density_prepared(&points, &draws, &mut densities)),
             ],

@@ -58,11 +58,18 @@ pub fn run(args: &RecordArgs) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-/// Returns the file of one run of several.
+/// Returns the file of one run of several. Runs that start within one second have numbers.
 fn out_of(out: &Path, run: &str) -> PathBuf {
     let stem = out.file_stem().unwrap_or_default().to_string_lossy();
     let extension = out.extension().map_or("mcap".into(), |extension| extension.to_string_lossy());
-    out.with_file_name(format!("{stem}-{run}-{}.{extension}", jiff::Timestamp::now().strftime("%Y%m%dT%H%M%SZ")))
+    let time = jiff::Timestamp::now().strftime("%Y%m%dT%H%M%SZ");
+    let named = |number: String| out.with_file_name(format!("{stem}-{run}-{time}{number}.{extension}"));
+    let first = named(String::new());
+    if first.exists() {
+        (2_u32..).map(|n| named(format!("-{n}"))).find(|path| !path.exists()).unwrap_or(first)
+    } else {
+        first
+    }
 }
 
 /// Records one run.
@@ -157,4 +164,24 @@ fn about(live: &LiveRun, states: Vec<String>) -> anyhow::Result<About> {
         states,
         origin,
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Runs that start within one second have recordings of their own.
+    #[test]
+    fn each_run_has_its_own_file() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut files = Vec::new();
+        for _ in 0..3 {
+            let file = out_of(&folder.path().join("drive.mcap"), "x");
+            assert!(!file.exists() && file.extension().is_some_and(|e| e == "mcap"));
+            std::fs::write(&file, "").unwrap();
+            files.push(file);
+        }
+        files.dedup();
+        assert_eq!(files.len(), 3);
+    }
 }

@@ -355,6 +355,7 @@ mod tests {
             confidence: 1.0,
             hazard_probability: 0.0,
             is_decision: 1,
+            unknown_probability: 0.0,
             valid_until_ns: (at_ms + 150) * MS,
             based_on_frame: frame_id,
             latency_ns: (at_ms - frame_id * 100) * MS,

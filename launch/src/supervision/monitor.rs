@@ -1,9 +1,10 @@
 //! Subscribes to all topics of a run and records every frame.
 
 use carff_config::GraphConfig;
+use carff_decision::ImageEvidence;
 use carff_messages::{
-    Action, ActionCode, Belief, DatasetView, FrameMeta, Gaussian, Header, Health, HealthState, Observability,
-    Posterior, Reason, Stage, ViewMeta,
+    Action, ActionCode, Belief, DatasetView, FrameMeta, Gaussian, Header, Health, HealthState, ImageCheck,
+    ImageCondition, Observability, Posterior, Reason, Stage, Unknowns, ViewMeta,
 };
 use carff_transport::{Image, Node, OpenError, ReceiveError, Receiver, topics};
 use std::collections::{BTreeMap, VecDeque};
@@ -31,12 +32,16 @@ pub struct FrameRecord {
     pub capture_time_ns: u64,
     /// Posterior from the encoder.
     pub posterior: Option<Gaussian>,
+    /// Evidence of the image, if it was compared with the known states.
+    pub image: Option<ImageEvidence>,
     /// Decision based on the frame.
     pub action: Option<ActionCode>,
     /// Reason of the decision; also set if a belief about the frame was refused.
     pub reason: Option<Reason>,
     /// Hazard probability of the decision.
     pub hazard_probability: f32,
+    /// Probability of something unknown in the decision.
+    pub unknown_probability: f32,
     /// Confidence of the decision.
     pub confidence: f32,
     /// Time from capture to the publication of the decision, nanoseconds; 0 without a decision.
@@ -57,9 +62,11 @@ impl FrameRecord {
             observability: Observability::of_code(view.observability).ok().flatten(),
             capture_time_ns: header.capture_time_ns,
             posterior: None,
+            image: None,
             action: None,
             reason: None,
             hazard_probability: 0.0,
+            unknown_probability: 0.0,
             confidence: 0.0,
             latency_ns: 0,
         }
@@ -118,6 +125,12 @@ pub struct Records {
     next_action: u64,
     /// Safe actions by reason.
     pub safe_actions: BTreeMap<&'static str, u64>,
+    /// Images that no decision could rest on, by condition.
+    pub unusable_images: BTreeMap<&'static str, u64>,
+    /// Number of images that were compared with the known states.
+    pub compared: u64,
+    /// Duration of each comparison, nanoseconds.
+    pub compare_ns: VecDeque<u64>,
     /// Reductions under overload: beliefs with fewer samples, frames with fewer steps, and views with fewer pixels than
     /// the graph file requests.
     pub given_up: BTreeMap<&'static str, u64>,
@@ -196,6 +209,24 @@ impl Records {
         }
     }
 
+    fn take_check(&mut self, check: &ImageCheck) {
+        self.spoke_ns.insert(Stage::Encoder, check.header.publish_time_ns);
+        if let Ok(condition) = check.condition()
+            && condition != ImageCondition::Usable
+        {
+            *self.unusable_images.entry(condition.name()).or_default() += 1;
+        }
+    }
+
+    fn take_unknowns(&mut self, unknowns: &Unknowns) {
+        self.compared += 1;
+        Self::note_time(&mut self.compare_ns, unknowns.stage_latency_ns, self.wanted.keep);
+        if let Some(frame) = self.frames.get_mut(&unknowns.header.frame_id) {
+            let ratios: Vec<f64> = unknowns.ratios().iter().map(|&ratio| f64::from(ratio)).collect();
+            frame.image = Some(ImageEvidence::new(&ratios));
+        }
+    }
+
     fn take_belief(&mut self, belief: &Belief) {
         // A belief depends on a forecast: both stages have published.
         for stage in [Stage::Forecaster, Stage::Prober] {
@@ -236,6 +267,7 @@ impl Records {
         frame.action = action.code().ok();
         frame.reason = Some(reason);
         frame.hazard_probability = action.hazard_probability;
+        frame.unknown_probability = action.unknown_probability;
         frame.confidence = action.confidence;
         frame.latency_ns = action.header.publish_time_ns.saturating_sub(action.header.capture_time_ns);
         Some(frame.frame_id)
@@ -247,6 +279,8 @@ impl Records {
 pub struct Monitor {
     frames: Receiver<Image<FrameMeta>>,
     posteriors: Receiver<Posterior>,
+    checks: Receiver<ImageCheck>,
+    unknowns: Receiver<Unknowns>,
     beliefs: Receiver<Belief>,
     actions: Receiver<Action>,
     views: Receiver<Image<ViewMeta>>,
@@ -268,6 +302,8 @@ impl Monitor {
         Ok(Self {
             frames: node.receiver(&topics::FRAME)?.polled(),
             posteriors: node.receiver(&topics::POSTERIOR)?.polled(),
+            checks: node.receiver(&topics::CHECK)?.polled(),
+            unknowns: node.receiver(&topics::UNKNOWN)?.polled(),
             beliefs: node.receiver(&topics::BELIEF)?.polled(),
             actions: node.receiver(&topics::ACTION)?.polled(),
             views: node.receiver(&topics::VIEW)?.polled(),
@@ -284,6 +320,12 @@ impl Monitor {
         }
         while let Some(posterior) = self.posteriors.next()? {
             self.records.take_posterior(&posterior);
+        }
+        while let Some(check) = self.checks.next()? {
+            self.records.take_check(&check);
+        }
+        while let Some(unknowns) = self.unknowns.next()? {
+            self.records.take_unknowns(&unknowns);
         }
         while let Some(belief) = self.beliefs.next()? {
             self.records.take_belief(&belief);

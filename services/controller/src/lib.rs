@@ -4,7 +4,7 @@
 //! in between.
 
 use carff_decision::{Decision, Evidence, Policy};
-use carff_messages::{Action, ActionCode, Belief, Header, MAX_HORIZON, Message, Reason};
+use carff_messages::{Action, ActionCode, Belief, Header, ImageCheck, MAX_HORIZON, Message, Reason};
 
 /// Settings of a controller.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -23,6 +23,7 @@ pub struct Settings {
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Step {
     hazard_probability: f32,
+    unknown_probability: f32,
     path_probability: f32,
     sample_count: u32,
     resolved_state: i32,
@@ -33,6 +34,7 @@ impl Step {
     fn of(belief: &Belief) -> Self {
         Self {
             hazard_probability: belief.hazard_probability,
+            unknown_probability: belief.unknown_probability,
             path_probability: belief.path_probability,
             sample_count: belief.sample_count,
             resolved_state: belief.resolved_state,
@@ -70,12 +72,16 @@ pub struct Controller {
     settled: Option<(u64, u64)>,
     /// Reason why the last belief was refused, until a belief is accepted.
     refused: Option<Reason>,
+    /// Capture time of the newest checked image.
+    checked_ns: u64,
+    /// Reason why the newest image is not usable.
+    unusable: Option<Reason>,
 }
 
 impl Controller {
     /// Creates a controller without beliefs: its ticks return halt.
     pub fn new(settings: Settings) -> Self {
-        Self { settings, pending: None, standing: None, settled: None, refused: None }
+        Self { settings, pending: None, standing: None, settled: None, refused: None, checked_ns: 0, unusable: None }
     }
 
     /// Processes a belief. The frame's last belief causes an action at once: by the rule if all steps are present and
@@ -87,6 +93,9 @@ impl Controller {
             return None;
         }
         let captured_ns = belief.header.capture_time_ns;
+        if self.unusable.is_some() {
+            return None;
+        }
         if captured_ns > now_ns {
             self.refused = Some(Reason::ContradictoryBelief);
             return None;
@@ -123,6 +132,29 @@ impl Controller {
         Some(action)
     }
 
+    /// Processes the check of an image. An image that is not usable is decided on at once, with the safe action and its
+    /// condition as the reason; no belief is acted on until a newer image is usable. An older check than the newest is
+    /// ignored.
+    pub fn on_check(&mut self, check: &ImageCheck, now_ns: u64) -> Option<Action> {
+        let captured_ns = check.header.capture_time_ns;
+        let reason = check.condition().ok()?.reason();
+        // Without an advancing clock of the camera, the order of arrival counts.
+        if captured_ns < self.checked_ns && reason != Some(Reason::CameraClock) {
+            return None;
+        }
+        self.checked_ns = self.checked_ns.max(captured_ns.min(now_ns));
+        self.unusable = reason;
+        let reason = reason?;
+        (self.pending, self.standing) = (None, None);
+        Some(Action {
+            header: check.header.at_step(0),
+            is_decision: 1,
+            based_on_frame: check.header.frame_id,
+            latency_ns: now_ns.saturating_sub(captured_ns),
+            ..self.safe_action(reason, now_ns)
+        })
+    }
+
     /// Records that an invalid belief arrived and was dropped.
     pub fn on_invalid(&mut self) {
         self.refused = Some(Reason::InvalidBelief);
@@ -137,7 +169,7 @@ impl Controller {
             return Action { is_decision: 0, ..standing.action };
         }
         let quiet = if self.settled.is_some() { Reason::StaleBelief } else { Reason::NoBeliefYet };
-        self.safe_action(self.refused.unwrap_or(quiet), now_ns)
+        self.safe_action(self.unusable.or(self.refused).unwrap_or(quiet), now_ns)
     }
 
     /// Returns the last action: the safe action.
@@ -169,6 +201,7 @@ impl Controller {
             confidence: decision.confidence as f32,
             hazard_probability: pending.evidence.hazard_probability() as f32,
             is_decision: 1,
+            unknown_probability: pending.evidence.unknown_probability() as f32,
             valid_until_ns: now_ns.saturating_add(self.settings.deadline_ns),
             based_on_frame: pending.header.frame_id,
             latency_ns: now_ns.saturating_sub(pending.header.capture_time_ns),
@@ -185,6 +218,7 @@ impl Controller {
             confidence: 0.0,
             hazard_probability: 1.0,
             is_decision: 0,
+            unknown_probability: 0.0,
             valid_until_ns: now_ns.saturating_add(2 * self.settings.period_ns),
             based_on_frame: u64::MAX,
             latency_ns: 0,

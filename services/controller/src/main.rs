@@ -1,4 +1,4 @@
-//! The controller stage: an action for each belief, and one at each tick. It always publishes.
+//! The controller stage: an action for each belief and each unusable image, and one at each tick. It always publishes.
 
 use anyhow::Context;
 use carff_checkpoint::load_policy;
@@ -16,6 +16,7 @@ fn main() -> std::process::ExitCode {
 
 fn run(stage: &mut StageContext) -> anyhow::Result<()> {
     let mut beliefs = stage.input(&topics::BELIEF)?;
+    let mut checks = stage.input(&topics::CHECK)?;
     let mut actions = stage.output(&topics::ACTION)?;
     let settings = settings(stage)?;
     let mut controller = Controller::new(settings);
@@ -26,8 +27,15 @@ fn run(stage: &mut StageContext) -> anyhow::Result<()> {
     loop {
         // The expiry of a decision is handled at once, not at the next tick.
         let wake_ns = tick_ns.min(controller.expires_ns());
-        if stage.wait_until(&[&beliefs], wake_ns)? == Woken::Stopped {
+        if stage.wait_until(&[&checks, &beliefs], wake_ns)? == Woken::Stopped {
             return Ok(actions.send(controller.on_stop(monotonic_now_ns()))?);
+        }
+        for _ in 0..MOST_AT_ONCE {
+            let Some(check) = checks.next()? else { break };
+            if let Some(action) = controller.on_check(&check, monotonic_now_ns()) {
+                actions.send(action)?;
+                tracing::warn!(frame = check.header.frame_id, condition = check.condition, "the image is not usable");
+            }
         }
         for _ in 0..MOST_AT_ONCE {
             let Some(belief) = beliefs.next()? else { break };

@@ -2,9 +2,11 @@
 //!
 //! `carff-encoder` computes with ONNX Runtime, and `carff-encoder-tch` with libtorch. Only the latter links libtorch.
 
-use carff_messages::{Gaussian, Posterior};
+use carff_config::GraphConfig;
+use carff_messages::{FrameMeta, Gaussian, ImageCheck, Posterior};
 use carff_runtime::{StageContext, frame_span};
 use carff_transport::{monotonic_now_ns, topics};
+use carff_unknown::{CameraCheck, Known, Measurement};
 use ndarray::{Array3, ArrayView3};
 
 /// Side of the image for the warm-up, pixels.
@@ -21,6 +23,9 @@ pub fn run<E>(
 ) -> anyhow::Result<()> {
     let mut frames = stage.input(&topics::FRAME)?;
     let mut posteriors = stage.output(&topics::POSTERIOR)?;
+    let mut checks = stage.output(&topics::CHECK)?;
+    let limits = Known::load(&stage.checkpoint)?.map(|known| known.camera);
+    let mut camera = stage.graph.checks.camera.then(|| CameraCheck::new(limits, frozen_ns(&stage.graph)));
     let mut encoder = load(stage)?;
     // The first frame is then as fast as later ones.
     let grey = Array3::from_elem((WARM_UP_PX, WARM_UP_PX, 3), 128);
@@ -32,6 +37,15 @@ pub fn run<E>(
         let started_ns = monotonic_now_ns();
         let Some(frame) = frames.newest()? else { continue };
         let _span = frame_span(&frame.header);
+        let mut check = ImageCheck::of_frame(frame.header);
+        if let Some(camera) = &mut camera {
+            camera.check(frame.image(), measurement(&frame), &mut check);
+        }
+        checks.send(check)?;
+        if !check.is_usable() {
+            stage.worked(&frame.header, started_ns);
+            continue;
+        }
         match encode(&mut encoder, frame.image()) {
             Ok(gaussian) => {
                 let stage_latency_ns = stage.worked(&frame.header, started_ns);
@@ -41,4 +55,19 @@ pub fn run<E>(
         }
     }
     Ok(())
+}
+
+/// What the check of the camera needs to know of a frame beside its image.
+fn measurement(frame: &FrameMeta) -> Measurement {
+    Measurement {
+        capture_time_ns: frame.header.capture_time_ns,
+        now_ns: monotonic_now_ns(),
+        field_of_view_deg: frame.camera().field_of_view_deg(),
+    }
+}
+
+/// Time for which an image may repeat, nanoseconds; `None` for a camera of rendered images without noise, which shows
+/// a still scene as equal images.
+fn frozen_ns(graph: &GraphConfig) -> Option<u64> {
+    graph.camera.has_noise().then_some(graph.checks.frozen_ms * 1_000_000)
 }

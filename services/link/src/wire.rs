@@ -119,6 +119,7 @@ mod tests {
             confidence: 0.9,
             hazard_probability: 0.3,
             is_decision: 1,
+            unknown_probability: 0.0,
             valid_until_ns: 9_000,
             based_on_frame: 7,
             latency_ns: 1_000,

@@ -1,7 +1,11 @@
-//! The prober stage's arithmetic: from a forecast to a belief over the known states.
+//! The prober stage's arithmetic: from a forecast, and the comparison of its image, to a belief over the known states.
+
+mod images;
+
+pub use images::Images;
 
 use carff_checkpoint::{FieldProbe, Manifest, load_field_probe};
-use carff_decision::mixture_and_draws;
+use carff_decision::{ImageEvidence, mixture_and_draws};
 use carff_messages::{Belief, Forecast};
 use std::path::Path;
 
@@ -16,9 +20,10 @@ pub fn load(checkpoint: &Path) -> anyhow::Result<FieldProbe> {
     Ok(probe)
 }
 
-/// Probes the mixture and the samples of a valid forecast.
-pub fn believe(probe: &mut FieldProbe, forecast: &Forecast) -> Belief {
+/// Probes the mixture and the samples of a valid forecast. `image` is the evidence of the frame's image, if it was
+/// compared.
+pub fn believe(probe: &mut FieldProbe, forecast: &Forecast, image: Option<&ImageEvidence>) -> Belief {
     let (mixture, draws) = mixture_and_draws(forecast);
-    let step = probe.step(mixture, draws, forecast.path_probability);
+    let step = probe.step(mixture, draws, forecast.path_probability, image);
     step.to_belief(forecast, probe.layout(), probe.state_posterior(step.resolved.state))
 }

@@ -1,9 +1,9 @@
-//! The prober stage: forecasts in, beliefs out.
+//! The prober stage: forecasts and camera images in, beliefs and comparisons out.
 
 use carff_messages::Stage;
-use carff_prober::{believe, load};
+use carff_prober::{Images, believe, load};
 use carff_runtime::{StageContext, frame_span};
-use carff_transport::{monotonic_now_ns, topics};
+use carff_transport::{Input, monotonic_now_ns, topics};
 
 fn main() -> std::process::ExitCode {
     carff_runtime::main(Stage::Prober, run)
@@ -12,15 +12,38 @@ fn main() -> std::process::ExitCode {
 fn run(stage: &mut StageContext) -> anyhow::Result<()> {
     let mut forecasts = stage.input(&topics::FORECAST)?;
     let mut beliefs = stage.output(&topics::BELIEF)?;
+    let mut unknowns = stage.output(&topics::UNKNOWN)?;
     let mut probe = load(&stage.checkpoint)?;
+    let mut images = Images::load(&stage.checkpoint, &stage.graph.checks, &probe)?;
+    let mut frames = images.is_some().then(|| stage.input(&topics::FRAME)).transpose()?;
     stage.ready();
-    while stage.wait(&[&forecasts])? {
-        let started_ns = monotonic_now_ns();
-        let Some(forecast) = forecasts.newest()? else { continue };
-        let _span = frame_span(&forecast.header);
-        let mut belief = believe(&mut probe, &forecast);
-        belief.stage_latency_ns = stage.worked(&belief.header, started_ns);
-        beliefs.send(belief)?;
+    loop {
+        let cameras = frames.iter().map(|frames| frames as &dyn Input);
+        let inputs: Vec<&dyn Input> = cameras.chain([&forecasts as &dyn Input]).collect();
+        if !stage.wait(&inputs)? {
+            return Ok(());
+        }
+        let goes_first = images.as_ref().is_some_and(Images::goes_first);
+        for compares in [goes_first, !goes_first] {
+            let started_ns = monotonic_now_ns();
+            if compares {
+                let (Some(images), Some(frames)) = (&mut images, &mut frames) else { continue };
+                let Some(frame) = frames.newest()? else { continue };
+                if !images.is_due(frame.header.capture_time_ns) {
+                    continue;
+                }
+                if let Some(mut compared) = images.compare(&probe, &frame, frame.image(), stage.threads) {
+                    compared.stage_latency_ns = monotonic_now_ns() - started_ns;
+                    unknowns.send(compared)?;
+                }
+            } else {
+                let Some(forecast) = forecasts.newest()? else { continue };
+                let _span = frame_span(&forecast.header);
+                let evidence = images.as_ref().and_then(|images| images.evidence(&forecast.header));
+                let mut belief = believe(&mut probe, &forecast, evidence);
+                belief.stage_latency_ns = stage.worked(&belief.header, started_ns);
+                beliefs.send(belief)?;
+            }
+        }
     }
-    Ok(())
 }

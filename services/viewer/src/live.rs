@@ -474,6 +474,7 @@ mod tests {
             confidence: 0.5,
             hazard_probability: 0.5,
             is_decision,
+            unknown_probability: 0.0,
             valid_until_ns: 0,
             based_on_frame: 4,
             latency_ns: 2_500_000,

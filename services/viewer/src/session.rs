@@ -288,7 +288,7 @@ impl Session {
         let first = moment.belief.is_none();
         if let (Some(forecast), true) = (&moment.forecast, first) {
             let (mixture, draws) = (forecast.mixture.clone(), forecast.draws.clone());
-            moment.belief = Some(self.models.probe.step(mixture, draws, moment.path_probability));
+            moment.belief = Some(self.models.probe.step(mixture, draws, moment.path_probability, None));
         }
         find(&mut self.models, moment);
         if first && moment.belief.is_some() {

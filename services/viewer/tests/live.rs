@@ -99,6 +99,7 @@ fn watches_a_run_from_frame_to_decision() {
         confidence: 0.75,
         hazard_probability: 0.75,
         is_decision: 1,
+        unknown_probability: 0.0,
         valid_until_ns: 0,
         based_on_frame: 4,
         latency_ns: 8_000_000,

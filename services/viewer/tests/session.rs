@@ -47,7 +47,7 @@ fn follows_the_stages_path() {
     let posterior = session.moment().unwrap().source;
     let mut probe = session.models().probe.clone();
     let net = session.models().mixture.as_ref().unwrap();
-    let wanted = look_ahead(|input, _| net.forecast(input), &mut probe, &posterior, plan);
+    let wanted = look_ahead(|input, _| net.forecast(input), &mut probe, &posterior, None, plan);
     session.predict().unwrap();
     for step in &wanted {
         session.probe().unwrap();

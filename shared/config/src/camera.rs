@@ -185,6 +185,14 @@ impl Default for CameraConfig {
 }
 
 impl CameraConfig {
+    /// Reports whether two images of a still scene differ: by the noise that the stage adds, or by a real sensor's.
+    pub fn has_noise(&self) -> bool {
+        match self.source {
+            CameraSource::Drives | CameraSource::FreeDrives | CameraSource::Folder => self.noise.sigma > 0.0,
+            _ => true,
+        }
+    }
+
     /// Returns the paths of the table.
     pub(crate) fn paths_mut(&mut self) -> impl Iterator<Item = &mut PathBuf> {
         let calibration = match &mut self.calibration {

@@ -27,6 +27,9 @@ pub struct GraphConfig {
     /// The images that the camera stage publishes.
     #[serde(default)]
     pub camera: CameraConfig,
+    /// The checks of images against what the model knows.
+    #[serde(default)]
+    pub checks: ChecksConfig,
     /// The views that the renderer stage publishes.
     #[serde(default)]
     pub renderer: RendererConfig,
@@ -79,6 +82,64 @@ pub struct RunConfig {
     /// Waits by spinning instead of sleeping: 20 to 60 us faster, at one full core per stage. Default false.
     #[serde(default)]
     pub busy_polling: bool,
+}
+
+/// The checks of images against what the model knows. An image that is not usable leads to the safe action with its
+/// condition as the reason; something unknown on the lanes adds to the hazard.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct ChecksConfig {
+    /// Checks the camera: black, white, frozen, covered, unfocused, badly exposed images, another lens, its clock.
+    /// Default true.
+    pub camera: bool,
+    /// Time for which an image may repeat before the camera counts as frozen, milliseconds, 50 to 60000. A camera of
+    /// rendered images without sensor noise may repeat images for ever. Default 300.
+    #[schemars(range(min = 50, max = 60_000))]
+    pub frozen_ms: u64,
+    /// Renders the known states from the camera's pose and compares them with the image: `off`, `same-frame` (the
+    /// belief waits for it), or `next-frame` (the belief uses the comparison of an earlier frame, at most 300 ms old).
+    /// A checkpoint without `known.json` has no comparison. Default `same-frame`.
+    pub compare: CompareWhen,
+    /// Largest number of comparisons per second, 0.1 to 1000; frames between them use the last one. Default 15.
+    #[schemars(range(min = 0.1, max = 1000.0))]
+    pub compare_rate_hz: f64,
+    /// What something unknown is to every decision rule that looks at the belief: `hazard` or `ignored`. Default
+    /// `hazard`.
+    pub unknown: UnknownIs,
+}
+
+impl Default for ChecksConfig {
+    fn default() -> Self {
+        Self {
+            camera: true,
+            frozen_ms: 300,
+            compare: CompareWhen::SameFrame,
+            compare_rate_hz: 15.0,
+            unknown: UnknownIs::Hazard,
+        }
+    }
+}
+
+/// The frame whose belief a comparison with the known states weighs.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+pub enum CompareWhen {
+    /// No image is compared.
+    Off,
+    /// The image's own belief, which waits for the comparison.
+    SameFrame,
+    /// A later belief: the comparison delays none.
+    NextFrame,
+}
+
+/// What something unknown is to the decision rules.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+pub enum UnknownIs {
+    /// A hazard.
+    Hazard,
+    /// Nothing: only the belief's hazard probability counts.
+    Ignored,
 }
 
 /// A camera that the renderer looks through.

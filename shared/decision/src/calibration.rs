@@ -162,8 +162,10 @@ impl Calibration {
 /// The belief over the known states that a set of readings amounts to.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Resolved {
-    /// Probability of each known state; they sum to 1.
+    /// Probability of each known state; together with the unknown's they sum to 1.
     pub state_probabilities: Vec<f32>,
+    /// Probability that something is there which no known state explains, 0..=1; 0 without a compared image.
+    pub unknown_probability: f32,
     /// Probability of a hazard state, 0..=1.
     pub hazard_probability: f32,
     /// The most probable state; of equally probable ones, a hazard state first.
@@ -207,6 +209,7 @@ pub fn resolve(
     let state = (0..states).max_by_key(|&s| (key(s), std::cmp::Reverse(s))).unwrap_or(0);
     Resolved {
         state_probabilities: probabilities.iter().map(|p| (p / total) as f32).collect(),
+        unknown_probability: 0.0,
         hazard_probability: (hazard / total_weight).clamp(0.0, 1.0) as f32,
         state,
     }

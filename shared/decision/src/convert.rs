@@ -45,6 +45,7 @@ impl Step {
         belief.component_count = self.components.len() as u32;
         belief.sample_count = self.samples.len() as u32;
         copy(&mut belief.state_probability, &self.resolved.state_probabilities, |p| *p);
+        belief.unknown_probability = self.resolved.unknown_probability;
         belief.hazard_probability = self.resolved.hazard_probability;
         belief.path_probability = self.path_probability;
         copy(&mut belief.component_weights, &self.mixture.weights, |w| *w);
@@ -80,6 +81,7 @@ impl Step {
                     .take(belief.state_count as usize)
                     .copied()
                     .collect(),
+                unknown_probability: belief.unknown_probability,
                 hazard_probability: belief.hazard_probability,
                 state: usize::try_from(belief.resolved_state).unwrap_or(usize::MAX),
             },

@@ -26,6 +26,7 @@ pub struct Evidence {
     is_unknown: [bool; MAX_SAMPLES],
     shows_hazard: [bool; MAX_SAMPLES],
     hazard_probability: f64,
+    unknown_probability: f64,
 }
 
 /// The part of one probed sample that rules look at.
@@ -57,6 +58,7 @@ impl Evidence {
         is_unknown: [false; MAX_SAMPLES],
         shows_hazard: [false; MAX_SAMPLES],
         hazard_probability: 0.0,
+        unknown_probability: 0.0,
     };
 
     /// Returns the evidence of a frame's steps as the library computes them, the first step first.
@@ -65,14 +67,25 @@ impl Evidence {
         for (index, step) in steps.iter().enumerate() {
             let samples = step.samples.iter().map(SampleEvidence::from);
             evidence.add_step(index as u32 + 1, step.resolved.hazard_probability, step.path_probability, samples);
+            evidence.add_unknown(step.resolved.unknown_probability);
         }
         evidence
+    }
+
+    /// Adds the probability of something that no known state explains; the largest one counts. A value that is not a
+    /// number makes every rule halt.
+    pub fn add_unknown(&mut self, probability: f32) {
+        let probability = f64::from(probability);
+        if probability.is_nan() || probability > self.unknown_probability {
+            self.unknown_probability = probability;
+        }
     }
 
     /// Adds the step of a valid message.
     pub fn add_belief(&mut self, belief: &Belief) {
         let samples = belief.samples().iter().map(SampleEvidence::from);
         self.add_step(belief.header.step, belief.hazard_probability, belief.path_probability, samples);
+        self.add_unknown(belief.unknown_probability);
     }
 
     /// Adds one step, counted from 1; steps may come in any order, and a step that comes twice counts once.
@@ -111,6 +124,11 @@ impl Evidence {
     /// Lower bound on the probability that the hazard is met at any step, 0..=1; not a number for invalid steps.
     pub fn hazard_probability(&self) -> f64 {
         self.hazard_probability
+    }
+
+    /// Probability that something is there which no known state explains, 0..=1; not a number for invalid steps.
+    pub fn unknown_probability(&self) -> f64 {
+        self.unknown_probability
     }
 
     /// Share of the samples that show the hazard at any step, 0..=1; not a number without samples.

@@ -9,12 +9,14 @@
 //! | `mixture` | mixtures over the scene latent, and draws from them |
 //! | `layout`, `calibration` | from densities at the places of a scenario to the state that a latent shows |
 //! | `look_ahead` | one step of the belief, and the autoregressive loop |
+//! | `image_evidence` | the known states weighed by how well they explain the image |
 //! | `evidence`, `rule`, `threshold` | from the steps of a frame to an action |
 //! | `convert` | the same steps as messages, and back |
 
 mod calibration;
 mod convert;
 mod evidence;
+mod image_evidence;
 mod layout;
 mod look_ahead;
 mod mixture;
@@ -24,6 +26,7 @@ mod threshold;
 pub use calibration::{Calibration, Reading, Resolved, resolve};
 pub use convert::{mixture_and_draws, set_mixture_and_draws};
 pub use evidence::{Evidence, SampleEvidence};
+pub use image_evidence::ImageEvidence;
 pub use layout::{Place, ProbeLayout, ProbingError};
 pub use look_ahead::{DensityField, DensityProbe, Plan, Probed, Step, look_ahead, path_probability};
 pub use mixture::{Draw, Mixture, Sampling};

@@ -1,6 +1,6 @@
 //! One step of the belief, and the autoregressive loop over steps (paper section 3.2).
 
-use crate::{Calibration, Draw, Mixture, ProbeLayout, Reading, Resolved, Sampling, resolve};
+use crate::{Calibration, Draw, ImageEvidence, Mixture, ProbeLayout, Reading, Resolved, Sampling, resolve};
 use carff_messages::{Gaussian, LATENT_DIM};
 
 /// A radiance field that reports densities at the points of one probe layout.
@@ -90,15 +90,25 @@ impl<F: DensityField> DensityProbe<F> {
         self.densities.chunks_exact(points).map(read).collect()
     }
 
-    /// Probes a mixture's component means and draws, and resolves the state.
-    pub fn step(&mut self, mixture: Mixture, draws: Vec<Draw>, path_probability: f32) -> Step {
+    /// Probes a mixture's component means and draws, and resolves the state; `image` weighs the result, if the frame's
+    /// image was compared with the known states.
+    pub fn step(
+        &mut self,
+        mixture: Mixture,
+        draws: Vec<Draw>,
+        path_probability: f32,
+        image: Option<&ImageEvidence>,
+    ) -> Step {
         let latents: Vec<[f32; LATENT_DIM]> =
             mixture.components.iter().map(|c| c.mean).chain(draws.iter().map(|d| d.latent)).collect();
         let mut components = self.probe_all(&latents);
         let samples = components.split_off(mixture.components.len());
         let readings = |probed: &[Probed]| probed.iter().map(|p| p.reading.clone()).collect::<Vec<_>>();
         let of: Vec<usize> = draws.iter().map(|d| d.component).collect();
-        let resolved = resolve(&self.layout, &mixture.weights, &readings(&components), &readings(&samples), &of);
+        let mut resolved = resolve(&self.layout, &mixture.weights, &readings(&components), &readings(&samples), &of);
+        if let Some(image) = image {
+            resolved.weigh(&self.layout, image);
+        }
         Step { mixture, draws, components, samples, resolved, path_probability }
     }
 }
@@ -130,11 +140,12 @@ pub struct Plan {
 }
 
 /// Looks ahead from one posterior: each step's resolved state feeds the next. `forecast` receives the input and the
-/// known state that it represents (`None` at the first step).
+/// known state that it represents (`None` at the first step); `image` weighs every step, as in [`DensityProbe::step`].
 pub fn look_ahead<F: DensityField>(
     mut forecast: impl FnMut(&Gaussian, Option<usize>) -> Mixture,
     probe: &mut DensityProbe<F>,
     posterior: &Gaussian,
+    image: Option<&ImageEvidence>,
     plan: Plan,
 ) -> Vec<Step> {
     let mut steps = Vec::with_capacity(plan.horizon as usize);
@@ -143,7 +154,7 @@ pub fn look_ahead<F: DensityField>(
     for k in 1..=plan.horizon {
         let mixture = forecast(&input.0, input.1);
         let draws = mixture.draw(plan.samples, plan.sampling, plan.seed, plan.frame, k);
-        let step = probe.step(mixture, draws, path);
+        let step = probe.step(mixture, draws, path, image);
         let state = step.resolved.state;
         path = path_probability(path, step.resolved.state_probability(state));
         steps.push(step);

@@ -3,6 +3,9 @@
 use crate::Evidence;
 use carff_messages::Rule;
 
+/// The paper's rule halts for something unknown from this probability on.
+const LIKELY: f64 = 0.5;
+
 /// A rule with the threshold that it uses.
 ///
 /// ```
@@ -34,11 +37,13 @@ impl Policy {
         Rule::ALL.map(|rule| Self { rule, threshold })
     }
 
-    /// Applies the rule (paper section 4.3). Evidence without samples, or with a hazard probability outside 0..=1,
+    /// Applies the rule (paper section 4.3). Something unknown counts as a hazard: the calibrated rule adds its
+    /// probability, and under the paper's rule it disagrees with every sample once it is likely. Evidence without samples, or with a hazard probability outside 0..=1,
     /// always halts with confidence 0.
     pub fn decide(self, evidence: &Evidence) -> Decision {
-        let p = evidence.hazard_probability();
-        if !(0.0..=1.0).contains(&p) || evidence.sample_count() == 0 {
+        let (hazard, unknown) = (evidence.hazard_probability(), evidence.unknown_probability());
+        let valid = |p: f64| (0.0..=1.0).contains(&p);
+        if !valid(hazard) || !valid(unknown) || evidence.sample_count() == 0 {
             return Decision { halt: true, confidence: 0.0 };
         }
         match self.rule {
@@ -48,10 +53,11 @@ impl Policy {
                 // Samples disagree when some show the hazard and some do not. A sample that shows no known state
                 // disagrees with every other.
                 let share = evidence.hazard_share();
-                let halt = share > 0.0 || evidence.has_unknown();
+                let halt = share > 0.0 || evidence.has_unknown() || unknown >= LIKELY;
                 Decision { halt, confidence: if halt { share.max(1.0 - share) } else { 1.0 - share } }
             }
             Rule::Calibrated => {
+                let p = (hazard + unknown).min(1.0);
                 let halt = p >= self.threshold;
                 Decision { halt, confidence: if halt { p } else { 1.0 - p } }
             }
@@ -79,6 +85,21 @@ mod tests {
         assert!(!paper.decide(&evidence(&[Some(0.0), Some(0.49)], 0.0)).halt);
         assert!(paper.decide(&evidence(&[Some(0.0), Some(0.5)], 0.1)).halt);
         assert!(paper.decide(&evidence(&[Some(0.0), None], 0.0)).halt);
+    }
+
+    /// Something unknown counts as a hazard under both rules that look at the belief.
+    #[test]
+    fn the_unknown_is_a_hazard() {
+        let with = |unknown: f32| {
+            let mut evidence = evidence(&[Some(0.0)], 0.1);
+            evidence.add_unknown(unknown);
+            Policy::all(0.25).map(|policy| policy.decide(&evidence).halt)
+        };
+        // In the order of `Rule::ALL`: always halt, always advance, the paper's, calibrated.
+        assert_eq!(with(0.1), [true, false, false, false]);
+        assert_eq!(with(0.2), [true, false, false, true]);
+        assert_eq!(with(0.6), [true, false, true, true]);
+        assert_eq!(with(f32::NAN), [true; 4]);
     }
 
     /// The calibrated rule halts at its threshold and above.

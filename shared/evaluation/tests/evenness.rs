@@ -32,7 +32,7 @@ fn hidden_views_give_an_even_belief() {
             seed: 1,
             frame: (view * 2 + branch) as u64,
         };
-        let steps = look_ahead(|input, _| models.mixture.forecast(input), &mut models.probe, &posterior, plan);
+        let steps = look_ahead(|input, _| models.mixture.forecast(input), &mut models.probe, &posterior, None, plan);
         (hidden, Evidence::of_steps(&steps).hazard_probability())
     };
     let mut pairs = Vec::new();

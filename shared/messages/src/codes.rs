@@ -98,6 +98,73 @@ codes! {
         ContradictoryBelief = 5 "contradictory belief",
         /// The controller is ending.
         Stopping = 6 "stopping",
+        /// The image is black.
+        BlackImage = 7 "black image",
+        /// The image is white.
+        WhiteImage = 8 "white image",
+        /// The camera repeats an image while time passes.
+        FrozenImage = 9 "frozen image",
+        /// Part of the lens is covered.
+        CoveredLens = 10 "covered lens",
+        /// The image is out of focus.
+        Unfocused = 11 "out of focus",
+        /// The image is underexposed.
+        Underexposed = 12 "underexposed",
+        /// The image is overexposed.
+        Overexposed = 13 "overexposed",
+        /// The image shows another place than the trained one.
+        AnotherPlace = 14 "another place",
+        /// The lens has another field of view than the trained one.
+        AnotherLens = 15 "another lens",
+        /// The camera's capture times stand still or run backwards.
+        CameraClock = 16 "camera clock",
+    }
+}
+
+codes! {
+    /// Condition of a camera image. A decision rests only on a usable image.
+    ImageCondition: u32, "condition" {
+        /// Nothing speaks against the image.
+        Usable = 0 "usable",
+        /// Black.
+        Black = 1 "black",
+        /// White.
+        White = 2 "white",
+        /// The same image as before, beyond the sensor's noise, while time passes.
+        Frozen = 3 "frozen",
+        /// A part of the lens is covered.
+        Covered = 4 "covered",
+        /// Out of focus.
+        Unfocused = 5 "out of focus",
+        /// Too dark.
+        Underexposed = 6 "underexposed",
+        /// Too bright.
+        Overexposed = 7 "overexposed",
+        /// It shows another place than the trained one.
+        AnotherPlace = 8 "another place",
+        /// Another field of view than the trained one.
+        AnotherLens = 9 "another lens",
+        /// Capture times stand still or run backwards.
+        Clock = 10 "camera clock",
+    }
+}
+
+impl ImageCondition {
+    /// Returns the reason of the safe action; `None` for a usable image.
+    pub const fn reason(self) -> Option<Reason> {
+        Some(match self {
+            Self::Usable => return None,
+            Self::Black => Reason::BlackImage,
+            Self::White => Reason::WhiteImage,
+            Self::Frozen => Reason::FrozenImage,
+            Self::Covered => Reason::CoveredLens,
+            Self::Unfocused => Reason::Unfocused,
+            Self::Underexposed => Reason::Underexposed,
+            Self::Overexposed => Reason::Overexposed,
+            Self::AnotherPlace => Reason::AnotherPlace,
+            Self::AnotherLens => Reason::AnotherLens,
+            Self::Clock => Reason::CameraClock,
+        })
     }
 }
 

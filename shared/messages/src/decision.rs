@@ -17,6 +17,7 @@ use iceoryx2::prelude::ZeroCopySend;
 ///     confidence: 0.9,
 ///     hazard_probability: 0.9,
 ///     is_decision: 1,
+///     unknown_probability: 0.0,
 ///     valid_until_ns: 100_001_000,
 ///     based_on_frame: 7,
 ///     latency_ns: 20_000,
@@ -26,7 +27,7 @@ use iceoryx2::prelude::ZeroCopySend;
 /// ```
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, ZeroCopySend)]
-#[type_name("carff.Action.v1")]
+#[type_name("carff.Action.v2")]
 pub struct Action {
     /// Header of the frame that it is based on.
     pub header: Header,
@@ -44,6 +45,8 @@ pub struct Action {
     pub hazard_probability: f32,
     /// 1 for the first action based on its frame; 0 for a repetition or the safe action.
     pub is_decision: u32,
+    /// Probability that something is there which no known state explains, 0..=1; 0 if the image was not compared.
+    pub unknown_probability: f32,
     /// End of its validity: monotonic clock, nanoseconds.
     pub valid_until_ns: u64,
     /// The frame that it is based on; `u64::MAX` for none.
@@ -76,6 +79,7 @@ impl Action {
         at_most("sample_count", self.sample_count.into(), MAX_SAMPLES as u64)?;
         at_most("is_decision", self.is_decision.into(), 1)?;
         probability("confidence", self.confidence)?;
+        probability("unknown_probability", self.unknown_probability)?;
         probability("hazard_probability", self.hazard_probability)
     }
 }

@@ -2,7 +2,7 @@
 
 #![allow(clippy::trivially_copy_pass_by_ref, reason = "serde passes fields by reference")]
 
-use crate::{HealthState, Stage};
+use crate::{HealthState, ImageCondition, Stage};
 use serde::de::{Deserialize, Deserializer, Error};
 use serde::ser::Serializer;
 
@@ -43,3 +43,4 @@ macro_rules! named {
 
 named!(stage: Stage);
 named!(state: HealthState);
+named!(condition: ImageCondition);

@@ -219,7 +219,7 @@ impl ProbeResult {
 /// ```
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, ZeroCopySend)]
-#[type_name("carff.Belief.v2")]
+#[type_name("carff.Belief.v3")]
 pub struct Belief {
     /// Header, at the step of the forecast.
     pub header: Header,
@@ -235,7 +235,7 @@ pub struct Belief {
     pub sample_count: u32,
     /// 1 for the frame's last step (also if the look-ahead ended early), else 0.
     pub is_final: u32,
-    /// Probability of each known state. The remainder to 1 is "none of the known states".
+    /// Probability of each known state. Together with the unknown's they sum to 1.
     pub state_probability: [f32; MAX_STATES],
     /// Probability of the hazard at this step, given the path, 0..=1.
     pub hazard_probability: f32,
@@ -251,8 +251,8 @@ pub struct Belief {
     pub sample_component: [u8; MAX_SAMPLES],
     /// The most probable state, fed back as the next step's input; -1 for none of the known ones.
     pub resolved_state: i32,
-    /// Unused; 0. Without it, `resolved` would move in the layout.
-    pub(crate) reserved: u32,
+    /// Probability that something is there which no known state explains, 0..=1; 0 if the image was not compared.
+    pub unknown_probability: f32,
     /// That state's stored posterior.
     pub resolved: Gaussian,
     /// Duration of the encoding of this frame, nanoseconds.
@@ -282,7 +282,7 @@ impl Belief {
             samples: [ProbeResult::NONE; MAX_SAMPLES],
             sample_component: [0; MAX_SAMPLES],
             resolved_state: -1,
-            reserved: 0,
+            unknown_probability: 0.0,
             resolved: Gaussian::standard(),
             encoder_ns: 0,
             forecaster_ns: 0,
@@ -319,8 +319,9 @@ impl Belief {
         }
         let states = &self.state_probability[..self.state_count as usize];
         within("state_probability", states, 0.0, 1.0)?;
-        let sum: f32 = states.iter().sum();
-        within("sum of state_probability", [&sum], 0.0, 1.001)?;
+        probability("unknown_probability", self.unknown_probability)?;
+        let sum: f32 = states.iter().sum::<f32>() + self.unknown_probability;
+        within("sum of state_probability and unknown_probability", [&sum], 0.0, 1.001)?;
         probability("hazard_probability", self.hazard_probability)?;
         probability("path_probability", self.path_probability)?;
         let (components, samples) = (self.component_count as usize, self.sample_count as usize);

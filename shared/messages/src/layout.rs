@@ -11,8 +11,8 @@
 //! ```
 
 use crate::{
-    Action, Belief, DatasetView, Forecast, FrameMeta, Gaussian, Header, Health, Intrinsics, Posterior, ProbeResult,
-    ViewMeta,
+    Action, Belief, DatasetView, Forecast, FrameMeta, Gaussian, Header, Health, ImageCheck, Intrinsics, Posterior,
+    ProbeResult, UnknownBox, Unknowns, ViewMeta,
 };
 use iceoryx2::prelude::ZeroCopySend;
 use iceoryx2::service::static_config::message_type_details::{TypeDetail, TypeVariant};
@@ -137,6 +137,22 @@ described!(ViewMeta {
     stage_latency_ns
 });
 described!(Gaussian { mean, log_variance });
+described!(ImageCheck { header, condition, luminance, sharpness, change, covered, place_distance });
+described!(UnknownBox { center, half_size, probability, place });
+described!(Unknowns {
+    header,
+    box_count,
+    state_count,
+    probability,
+    residual,
+    noise,
+    gain,
+    offset,
+    reserved,
+    ratios,
+    boxes,
+    stage_latency_ns
+});
 described!(Posterior { header, gaussian, stage_latency_ns });
 described!(Forecast {
     header,
@@ -170,7 +186,7 @@ described!(Belief {
     samples,
     sample_component,
     resolved_state,
-    reserved,
+    unknown_probability,
     resolved,
     encoder_ns,
     forecaster_ns,
@@ -185,6 +201,7 @@ described!(Action {
     confidence,
     hazard_probability,
     is_decision,
+    unknown_probability,
     valid_until_ns,
     based_on_frame,
     latency_ns
@@ -229,6 +246,8 @@ mod tests {
             FrameMeta::layout(),
             ViewMeta::layout(),
             Posterior::layout(),
+            ImageCheck::layout(),
+            Unknowns::layout(),
             Forecast::layout(),
             Belief::layout(),
             Action::layout(),

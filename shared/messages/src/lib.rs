@@ -25,14 +25,18 @@ mod frame;
 mod health;
 mod latent;
 pub mod layout;
+mod novelty;
 
 pub use check::Invalid;
-pub use codes::{ActionCode, ForecastSource, HealthState, Observability, Reason, Rule, Stage, ViewKind};
+pub use codes::{
+    ActionCode, ForecastSource, HealthState, ImageCondition, Observability, Reason, Rule, Stage, ViewKind,
+};
 pub use convert::row_major;
 pub use decision::Action;
 pub use frame::{DatasetView, FrameMeta, Intrinsics, ViewMeta};
 pub use health::Health;
 pub use latent::{Belief, Forecast, Gaussian, Posterior, ProbeResult};
+pub use novelty::{ImageCheck, MAX_UNKNOWNS, UnknownBox, Unknowns};
 
 /// Marks a type as suitable for shared memory, with a name. Derive it with `#[repr(C)]` and `#[type_name(..)]`.
 pub use iceoryx2::prelude::ZeroCopySend;

@@ -74,6 +74,7 @@ fn messages(frame_id: u64) -> Vec<(TopicId, OwnedMessage)> {
         confidence: 0.5,
         hazard_probability: 0.25,
         is_decision: 1,
+        unknown_probability: 0.0,
         valid_until_ns: 77,
         based_on_frame: frame_id,
         latency_ns: 20,

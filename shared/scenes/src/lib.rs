@@ -19,6 +19,7 @@ pub mod config;
 mod error;
 mod free_drives;
 mod free_looks;
+mod lanes;
 mod materials;
 mod movers;
 mod scenario;

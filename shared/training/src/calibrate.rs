@@ -156,7 +156,7 @@ fn judged(context: Context, models: &mut Models, trials: &[Trial]) -> Vec<Calibr
     let (samples, horizon, sampling) = (settings.samples, settings.horizon, Sampling::Stratified);
     let judge = |trial: &Trial| {
         let plan = Plan { samples, sampling, horizon, seed: trial.seed, frame: trial.frame };
-        let steps = look_ahead(|input, _| mixture.forecast(input), probe, &trial.posterior, plan);
+        let steps = look_ahead(|input, _| mixture.forecast(input), probe, &trial.posterior, None, plan);
         let hazard_probability = Evidence::of_steps(&steps).hazard_probability();
         CalibrationTrial { hazard_probability, halt_is_right: trial.kind == DriveKind::Hazard }
     };

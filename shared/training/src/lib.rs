@@ -32,6 +32,7 @@ mod curves;
 mod error;
 mod features;
 mod field;
+mod known;
 mod mixture;
 mod pipeline;
 mod places;
@@ -47,6 +48,7 @@ pub use config::{CalibrationConfig, FieldTraining, FreePoses, MdnTraining, Train
 pub use curves::training_curves;
 pub use error::TrainingError;
 pub use features::FEATURES;
+pub use known::{KnownInput, calibrate_known};
 pub use pipeline::{Phases, Training};
 pub use places::places;
 pub use random_poses::render_random_poses;

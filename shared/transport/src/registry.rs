@@ -207,16 +207,29 @@ impl TopicId {
     pub const FRAME: Self = Self { index: 0, topic: &topics::FRAME };
     /// `encoder/posterior`.
     pub const POSTERIOR: Self = Self { index: 1, topic: &topics::POSTERIOR };
+    /// `encoder/check`.
+    pub const CHECK: Self = Self { index: 2, topic: &topics::CHECK };
     /// `forecaster/forecast`.
-    pub const FORECAST: Self = Self { index: 2, topic: &topics::FORECAST };
+    pub const FORECAST: Self = Self { index: 3, topic: &topics::FORECAST };
     /// `prober/belief`.
-    pub const BELIEF: Self = Self { index: 3, topic: &topics::BELIEF };
+    pub const BELIEF: Self = Self { index: 4, topic: &topics::BELIEF };
+    /// `prober/unknown`.
+    pub const UNKNOWN: Self = Self { index: 5, topic: &topics::UNKNOWN };
     /// `renderer/view`.
-    pub const VIEW: Self = Self { index: 4, topic: &topics::VIEW };
+    pub const VIEW: Self = Self { index: 6, topic: &topics::VIEW };
     /// `controller/action`.
-    pub const ACTION: Self = Self { index: 5, topic: &topics::ACTION };
+    pub const ACTION: Self = Self { index: 7, topic: &topics::ACTION };
     /// The topics from the camera to the action, in the order of the data flow.
-    pub const FLOW: [Self; 6] = [Self::FRAME, Self::POSTERIOR, Self::FORECAST, Self::BELIEF, Self::VIEW, Self::ACTION];
+    pub const FLOW: [Self; 8] = [
+        Self::FRAME,
+        Self::POSTERIOR,
+        Self::CHECK,
+        Self::FORECAST,
+        Self::BELIEF,
+        Self::UNKNOWN,
+        Self::VIEW,
+        Self::ACTION,
+    ];
 
     /// Returns the id of a user's own topic.
     pub fn of(topic: &'static dyn AnyTopic) -> Self {

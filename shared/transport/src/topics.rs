@@ -14,7 +14,7 @@
 
 use crate::payload::Image;
 use crate::topic::{Limits, Topic};
-use carff_messages::{Action, Belief, Forecast, FrameMeta, Health, Posterior, Stage, ViewMeta};
+use carff_messages::{Action, Belief, Forecast, FrameMeta, Health, ImageCheck, Posterior, Stage, Unknowns, ViewMeta};
 
 /// Limits of small messages; some receivers need every message.
 pub const MESSAGES: Limits =
@@ -29,16 +29,20 @@ pub const STATUS: Limits = Limits { history: 1, ..MESSAGES };
 const ONE_IMAGE: Limits =
     Limits { max_subscribers: 1, max_publishers: 2, max_nodes: 4, history: 0, buffer: 1, borrowed: 1, loaned: 1 };
 
-/// Images from camera to encoder.
+/// Images from camera to encoder and prober.
 pub const FRAME: Topic<Image<FrameMeta>> = Topic::new("camera/frame", IMAGES, 500);
 /// Images of a real camera before rectification, for `carff camera check`; published only for it.
 pub const RAW: Topic<Image<FrameMeta>> = Topic::new("camera/raw", ONE_IMAGE, 500);
 /// Posteriors from encoder to forecaster.
 pub const POSTERIOR: Topic<Posterior> = Topic::new("encoder/posterior", MESSAGES, 500);
+/// Checks of images from encoder to controller.
+pub const CHECK: Topic<ImageCheck> = Topic::new("encoder/check", MESSAGES, 500);
 /// Forecasts from forecaster to prober and renderer.
 pub const FORECAST: Topic<Forecast> = Topic::new("forecaster/forecast", MESSAGES, 500);
 /// Beliefs from prober to controller, renderer, and back to the forecaster.
 pub const BELIEF: Topic<Belief> = Topic::new("prober/belief", MESSAGES, 500);
+/// Comparisons of images with the known states, from prober to observers.
+pub const UNKNOWN: Topic<Unknowns> = Topic::new("prober/unknown", MESSAGES, 500);
 /// Views from renderer to viewers, recorder and probes.
 pub const VIEW: Topic<Image<ViewMeta>> = Topic::new("renderer/view", IMAGES, 5000);
 /// Actions from controller to vehicle.

@@ -1,94 +1,147 @@
 //! Render and compare: every known state is rendered from the camera's own pose and compared with the image.
 
+use crate::blobs::{Blob, blobs};
+use crate::lanes::{ErrorMap, Ground, Lanes};
 use carff_base::geometry::PinholeCamera;
-use carff_field::{Field, HypothesisBuffer, RenderOptions};
+use carff_field::{Field, HypothesisBuffer, RenderBuffer, RenderOptions};
 use carff_messages::LATENT_DIM;
-use ndarray::ArrayView3;
+use ndarray::{ArrayView3, s};
 
 /// Longest side of the compared images, pixels.
 const SIDE_PX: u32 = 64;
+/// Pixels around the lanes that are compared too: residuals are smoothed, and what stands beside a lane is followed.
+const MARGIN_PX: usize = 3;
 /// Passes of the robust fit of gain and offset.
 const PASSES: usize = 5;
 /// Pixels beyond this many robust deviations do not count in the fit.
 const TRIM: f32 = 2.5;
-/// Smallest deviation of a pixel, of 1: the field's own error.
-const LEAST_SIGMA: f32 = 0.015;
+/// Smallest deviation of a pixel, of 1.
+const LEAST_NOISE: f32 = 0.015;
+/// Fewest pixels of a fit.
+const FEWEST: f64 = 16.0;
+/// A robust deviation is the median times this, for normally distributed values.
+const OF_MEDIAN: f32 = 1.4826;
 
 /// Gain and offset of a camera against the field, by channel.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Fit {
+    /// Factor from rendered to seen values.
     pub gain: [f32; 3],
+    /// Offset from rendered to seen values, of 1.
     pub offset: [f32; 3],
-    /// Robust deviation of a pixel.
-    pub sigma: f32,
+    /// Robust deviation of a pixel, of 1.
+    pub noise: f32,
 }
 
-/// What an image shows beside each known state.
+/// An image beside the known states, at the compared size.
 #[derive(Clone, Debug)]
 pub struct Comparison {
+    /// The camera at the compared size.
     pub camera: PinholeCamera,
-    pub fit: Fit,
-    /// The image at the compared size, 0..=1.
+    /// The image, 0..=1, RGB, row by row.
     pub image: Vec<f32>,
-    /// For each state, the residual of each pixel in deviations.
+    /// Gain, offset and noise of the image.
+    pub fit: Fit,
+    /// For each pixel, the ground that it looks at.
+    pub ground: Vec<Option<Ground>>,
+    /// True for pixels that were compared.
+    pub judged: Vec<bool>,
+    /// For each state, the residual of each pixel, in deviations; 0 where it was not compared.
     pub residuals: Vec<Vec<f32>>,
-    /// For each state, the depth of each pixel.
-    pub depth_m: Vec<Vec<f32>>,
-    pub rendered: Vec<Vec<f32>>,
 }
 
-/// Renders states and compares.
+impl Comparison {
+    /// Returns the residuals on the lanes with the ground points where they were found, for one state.
+    pub fn on_lanes(&self, state: usize) -> impl Iterator<Item = ([f64; 2], f32)> + '_ {
+        let residual = self.residuals.get(state).into_iter().flatten();
+        let pixels = residual.zip(&self.ground).zip(&self.judged);
+        pixels.filter_map(|((r, ground), judged)| Some((ground.filter(|g| g.on_lanes && *judged)?.at_m, *r)))
+    }
+
+    /// Returns the blobs of a state that stand on the lanes, the strongest first.
+    pub fn blobs(&self, state: usize, errors: &ErrorMap) -> Vec<Blob> {
+        let residual = self.residuals.get(state);
+        residual.map_or(Vec::new(), |r| blobs(&self.camera, r, &self.judged, &self.ground, errors))
+    }
+}
+
+/// Renders the known states and compares images with them. It reuses its memory.
 #[derive(Debug, Default)]
 pub struct Comparer {
     buffer: HypothesisBuffer,
 }
 
 impl Comparer {
-    /// Compares an image (height, width, channel) with each state.
+    /// Compares an image (height, width, channel) with each state. `None` if the camera sees no lane.
     pub fn compare(
         &mut self,
         field: &Field,
         states: &[[f32; LATENT_DIM]],
+        lanes: &Lanes,
         camera: &PinholeCamera,
         image: ArrayView3<'_, u8>,
         threads: usize,
-    ) -> Comparison {
-        let longest = camera.width_px.max(camera.height_px);
-        let scaled = |side: u32| ((u64::from(side) * u64::from(SIDE_PX) / u64::from(longest)) as u32).max(1);
-        let small = camera.resized(scaled(camera.width_px), scaled(camera.height_px));
-        let (w, h) = (small.width_px as usize, small.height_px as usize);
-        let pixels = reduced(image, w, h);
-        let options = RenderOptions { threads, ..RenderOptions::default() };
-        field.render_hypotheses(&small, states, &options, &mut self.buffer);
-        let pictures = &self.buffer.pictures;
-        let first = &pictures[0];
-        let still: Vec<bool> = first.changing.iter().map(|c| !c).collect();
-        let fit = fit(&pixels, &first.rgb, &still);
-        let residuals = pictures.iter().map(|p| residual(&pixels, &p.rgb, &fit, w, h)).collect();
-        Comparison {
-            camera: small,
-            fit,
-            residuals,
-            depth_m: pictures.iter().map(|p| p.depth_m.clone()).collect(),
-            rendered: pictures.iter().map(|p| p.rgb.clone()).collect(),
-            image: pixels,
+    ) -> Option<Comparison> {
+        let small = reduced_camera(camera);
+        let (width, height) = (small.width_px as usize, small.height_px as usize);
+        let ground = lanes.ground_points(&small);
+        let seen: Vec<bool> = ground.iter().map(|g| g.is_some_and(|g| g.on_lanes)).collect();
+        if !seen.contains(&true) || states.is_empty() {
+            return None;
         }
+        let judged = grown(&seen, width, MARGIN_PX);
+        let options = RenderOptions { threads: threads.max(1), ..RenderOptions::default() };
+        field.render_hypotheses_where(&small, states, |i| judged[i], &options, &mut self.buffer);
+        let pictures = &self.buffer.pictures;
+        let image = reduced(image, width, height);
+        let still = |i: usize| judged[i] && !pictures[0].changing[i];
+        let fit = fit(&image, &pictures[0].rgb, still);
+        let residual = |picture: &RenderBuffer| residual(&image, &picture.rgb, &fit, &judged, width);
+        let residuals = pictures.iter().map(residual).collect();
+        Some(Comparison { camera: small, image, fit, ground, judged, residuals })
+    }
+
+    /// The rendered states of the last comparison, RGB, 0..=1, row by row; pixels that were not compared are black.
+    pub fn rendered(&self) -> impl Iterator<Item = &[f32]> {
+        self.buffer.pictures.iter().map(|picture| picture.rgb.as_slice())
     }
 }
 
-/// Means over the cells of a w x h grid.
-fn reduced(image: ArrayView3<'_, u8>, w: usize, h: usize) -> Vec<f32> {
-    let (height, width, _) = image.dim();
-    let mut out = vec![0.0; w * h * 3];
-    for y in 0..h {
-        let (top, bottom) = (y * height / h, ((y + 1) * height / h).max(y * height / h + 1));
-        for x in 0..w {
-            let (left, right) = (x * width / w, ((x + 1) * width / w).max(x * width / w + 1));
-            let cell = image.slice(ndarray::s![top..bottom.min(height), left..right.min(width), ..]);
-            let n = (cell.len() / 3).max(1) as f32 * 255.0;
-            for c in 0..3 {
-                out[(y * w + x) * 3 + c] = cell.slice(ndarray::s![.., .., c]).iter().map(|&v| f32::from(v)).sum::<f32>() / n;
+/// The same camera at the compared size.
+fn reduced_camera(camera: &PinholeCamera) -> PinholeCamera {
+    let longest = u64::from(camera.width_px.max(camera.height_px).max(1));
+    let scaled = |side: u32| ((u64::from(side) * u64::from(SIDE_PX) / longest) as u32).max(1);
+    camera.resized(scaled(camera.width_px), scaled(camera.height_px))
+}
+
+/// Means over the cells of a grid of `width` x `height`, 0..=1.
+fn reduced(image: ArrayView3<'_, u8>, width: usize, height: usize) -> Vec<f32> {
+    let (rows, columns, _) = image.dim();
+    let cell = |i: usize, n: usize, all: usize| {
+        let start = (i * all / n).min(all.saturating_sub(1));
+        start..((i + 1) * all / n).clamp(start + 1, all.max(start + 1))
+    };
+    let mut out = Vec::with_capacity(width * height * 3);
+    for y in 0..height {
+        for x in 0..width {
+            let part = image.slice(s![cell(y, height, rows), cell(x, width, columns), ..]);
+            let n = (part.len() / 3).max(1) as f32 * 255.0;
+            for channel in part.axis_iter(ndarray::Axis(2)).take(3) {
+                out.push(channel.iter().map(|&v| f32::from(v)).sum::<f32>() / n);
             }
+        }
+    }
+    out
+}
+
+/// Pixels at most `margin` rows and columns away from a marked one.
+fn grown(marked: &[bool], width: usize, margin: usize) -> Vec<bool> {
+    let height = marked.len() / width.max(1);
+    let mut out = vec![false; marked.len()];
+    for (i, _) in marked.iter().enumerate().filter(|(_, marked)| **marked) {
+        let (x, y) = (i % width, i / width);
+        for y in y.saturating_sub(margin)..(y + margin + 1).min(height) {
+            out[y * width + x.saturating_sub(margin)..y * width + (x + margin + 1).min(width)].fill(true);
         }
     }
     out
@@ -98,78 +151,131 @@ fn median(values: &mut [f32]) -> f32 {
     if values.is_empty() {
         return 0.0;
     }
-    let mid = values.len() / 2;
-    *values.select_nth_unstable_by(mid, f32::total_cmp).1
+    let middle = values.len() / 2;
+    *values.select_nth_unstable_by(middle, f32::total_cmp).1
 }
 
-fn fit(image: &[f32], rendered: &[f32], counts: &[bool]) -> Fit {
-    let (mut gain, mut offset, mut sigmas) = ([1.0; 3], [0.0; 3], [0.0; 3]);
+/// Fits gain and offset of each channel by least squares over the pixels that count, without outliers.
+fn fit(image: &[f32], rendered: &[f32], counts: impl Fn(usize) -> bool) -> Fit {
+    let (mut gain, mut offset, mut noise) = ([1.0; 3], [0.0; 3], [LEAST_NOISE; 3]);
     for c in 0..3 {
-        let pairs: Vec<(f32, f32)> = counts
-            .iter()
-            .enumerate()
-            .filter(|(_, k)| **k)
-            .map(|(i, _)| (rendered[i * 3 + c], image[i * 3 + c]))
-            .collect();
+        let of_channel = (0..image.len() / 3).filter(|&i| counts(i)).map(|i| (rendered[i * 3 + c], image[i * 3 + c]));
+        let pairs: Vec<(f32, f32)> = of_channel.collect();
         let mut limit = f32::INFINITY;
         for _ in 0..PASSES {
-            let (mut n, mut sx, mut sy, mut sxx, mut sxy) = (0.0_f64, 0.0_f64, 0.0_f64, 0.0_f64, 0.0_f64);
-            for &(x, y) in pairs.iter().filter(|(x, y)| (y - gain[c] * x - offset[c]).abs() <= limit) {
-                let (x, y) = (f64::from(x), f64::from(y));
-                n += 1.0;
-                sx += x;
-                sy += y;
-                sxx += x * x;
-                sxy += x * y;
-            }
-            let spread = n * sxx - sx * sx;
-            if n < 16.0 || spread <= 1e-9 {
-                break;
-            }
-            gain[c] = ((n * sxy - sx * sy) / spread) as f32;
-            offset[c] = ((sy - f64::from(gain[c]) * sx) / n) as f32;
-            let mut errors: Vec<f32> = pairs.iter().map(|(x, y)| (y - gain[c] * x - offset[c]).abs()).collect();
-            sigmas[c] = 1.4826 * median(&mut errors);
-            limit = (TRIM * sigmas[c]).max(LEAST_SIGMA);
+            let error = |(x, y): (f32, f32)| (y - gain[c] * x - offset[c]).abs();
+            let Some(line) = line(pairs.iter().copied().filter(|pair| error(*pair) <= limit)) else { break };
+            (gain[c], offset[c]) = line;
+            let mut errors: Vec<f32> = pairs.iter().map(|(x, y)| (y - line.0 * x - line.1).abs()).collect();
+            noise[c] = OF_MEDIAN * median(&mut errors);
+            limit = (TRIM * noise[c]).max(LEAST_NOISE);
         }
     }
-    let sigma = (sigmas.iter().map(|s| s * s).sum::<f32>() / 3.0).sqrt().max(LEAST_SIGMA);
-    Fit { gain, offset, sigma }
+    let noise = (noise.iter().map(|v| v * v).sum::<f32>() / 3.0).sqrt().max(LEAST_NOISE);
+    Fit { gain, offset, noise }
 }
 
-/// Distance of each pixel from the range of its neighbours' rendered values, smoothed, in deviations.
-fn residual(image: &[f32], rendered: &[f32], fit: &Fit, w: usize, h: usize) -> Vec<f32> {
-    let expected: Vec<f32> = rendered.iter().enumerate().map(|(i, v)| fit.gain[i % 3] * v + fit.offset[i % 3]).collect();
-    let around = |v: usize, n: usize| v.saturating_sub(1)..=(v + 1).min(n - 1);
-    let mut energy = vec![0.0; w * h];
-    for y in 0..h {
-        for x in 0..w {
-            for c in 0..3 {
-                let (mut low, mut high) = (f32::INFINITY, f32::NEG_INFINITY);
-                for ny in around(y, h) {
-                    for nx in around(x, w) {
-                        let v = expected[(ny * w + nx) * 3 + c];
-                        (low, high) = (low.min(v), high.max(v));
-                    }
-                }
-                let v = image[(y * w + x) * 3 + c];
-                let d = (v - high).max(low - v).max(0.0);
-                energy[y * w + x] += d * d;
+/// Slope and offset of the line of least squares; `None` for too few points or equal ones.
+fn line(pairs: impl Iterator<Item = (f32, f32)>) -> Option<(f32, f32)> {
+    let [mut n, mut sx, mut sy, mut sxx, mut sxy] = [0.0_f64; 5];
+    for (x, y) in pairs {
+        let (x, y) = (f64::from(x), f64::from(y));
+        n += 1.0;
+        sx += x;
+        sy += y;
+        sxx += x * x;
+        sxy += x * y;
+    }
+    let spread = n * sxx - sx * sx;
+    if n < FEWEST || spread <= 1e-6 {
+        return None;
+    }
+    let slope = (n * sxy - sx * sy) / spread;
+    Some((slope as f32, ((sy - slope * sx) / n) as f32))
+}
+
+/// Distance of each pixel from the range of its neighbours' rendered values, smoothed over 3 x 3 pixels, in deviations.
+/// The range forgives what a blurred edge, or a pose that is off by half a pixel, changes.
+fn residual(image: &[f32], rendered: &[f32], fit: &Fit, judged: &[bool], width: usize) -> Vec<f32> {
+    let height = judged.len() / width.max(1);
+    let around = |v: usize, n: usize| v.saturating_sub(1)..(v + 2).min(n);
+    let neighbours = |i: usize| {
+        let (x, y) = (i % width, i / width);
+        let all = around(y, height).flat_map(move |y| around(x, width).map(move |x| y * width + x));
+        all.filter(|&n| judged[n])
+    };
+    let energy: Vec<f32> = (0..judged.len())
+        .map(|i| {
+            if !judged[i] {
+                return 0.0;
             }
+            let of_channel = |c: usize| {
+                let expected = neighbours(i).map(|n| fit.gain[c] * rendered[n * 3 + c] + fit.offset[c]);
+                let (low, high) = expected.fold((f32::INFINITY, f32::NEG_INFINITY), |(l, h), v| (l.min(v), h.max(v)));
+                let seen = image[i * 3 + c];
+                (seen - high).max(low - seen).max(0.0).powi(2)
+            };
+            (0..3).map(of_channel).sum()
+        })
+        .collect();
+    (0..judged.len())
+        .map(|i| {
+            let (sum, n) = neighbours(i).fold((0.0, 0), |(sum, n), at| (sum + energy[at], n + 3));
+            if judged[i] { (sum / n.max(1) as f32).sqrt() / fit.noise } else { 0.0 }
+        })
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use ndarray::Array3;
+
+    /// Gain and offset are found with a third of the pixels covered by something else.
+    #[test]
+    fn the_fit_is_robust() {
+        let rendered: Vec<f32> = (0..900).map(|i| 0.1 + 0.8 * ((i * 37 % 100) as f32) / 100.0).collect();
+        let image: Vec<f32> =
+            rendered.iter().enumerate().map(|(i, v)| if i % 9 < 3 { 0.95 } else { 0.6 * v + 0.2 }).collect();
+        let fit = fit(&image, &rendered, |_| true);
+        for c in 0..3 {
+            assert!((fit.gain[c] - 0.6).abs() < 0.05 && (fit.offset[c] - 0.2).abs() < 0.05, "{fit:?}");
         }
     }
-    let mut out = vec![0.0; w * h];
-    for y in 0..h {
-        for x in 0..w {
-            let (mut sum, mut n) = (0.0, 0.0);
-            for ny in around(y, h) {
-                for nx in around(x, w) {
-                    sum += energy[ny * w + nx];
-                    n += 3.0;
+
+    /// A patch that the rendered image does not have is the only residual; a shift by one pixel leaves none.
+    #[test]
+    fn residuals_are_where_something_is() {
+        let width = 32;
+        let rendered: Vec<f32> = (0..width * width * 3).map(|i| if i / 3 % width < 16 { 0.2 } else { 0.7 }).collect();
+        let seen: Vec<f32> = (0..width * width * 3)
+            .map(|i| {
+                let (x, y) = (i / 3 % width, i / 3 / width);
+                if (4..9).contains(&x) && (20..25).contains(&y) {
+                    0.9
+                } else if x < 17 {
+                    0.2
+                } else {
+                    0.7
                 }
-            }
-            out[y * w + x] = (sum / n).sqrt() / fit.sigma;
-        }
+            })
+            .collect();
+        let fit = Fit { gain: [1.0; 3], offset: [0.0; 3], noise: LEAST_NOISE };
+        let judged = vec![true; width * width];
+        let out = residual(&seen, &rendered, &fit, &judged, width);
+        assert!(out[22 * width + 6] > 20.0);
+        let elsewhere =
+            (0..width * width).filter(|i| !(2..11).contains(&(i % width)) || !(18..27).contains(&(i / width)));
+        assert!(elsewhere.map(|i| out[i]).fold(0.0, f32::max) < 1e-3);
     }
-    out
+
+    /// Cells are means; images smaller than the grid repeat their pixels.
+    #[test]
+    fn reduction_averages() {
+        let image = Array3::from_shape_fn((4, 6, 3), |(y, x, c)| if c == 1 { (y * 6 + x) as u8 } else { 51 });
+        let out = reduced(image.view(), 3, 2);
+        assert_eq!((out[0], out[1]), (0.2, (0.0 + 1.0 + 6.0 + 7.0) / 4.0 / 255.0));
+        assert_eq!(reduced(image.view(), 12, 8).len(), 12 * 8 * 3);
+        assert_eq!(grown(&[false, true, false, false], 2, 1), [true; 4]);
+    }
 }

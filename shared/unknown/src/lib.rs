@@ -1,5 +1,21 @@
-//! What the model does not know: images of a bad camera or of another place, and things that no hypothesis explains.
+//! What the model does not know: things that no known state explains, images of a bad camera or of another place.
+//!
+//! | module | content |
+//! |---|---|
+//! | `compare` | every known state, rendered from the camera's own pose and compared with the image |
+//! | `lanes` | the ground on which something unknown counts |
+//! | `blobs` | connected residuals: their size, and the place on the ground where they stand |
+//! | `known` | the limits of the known, calibrated on images without anything unknown, and their file |
+//! | `camera` | the condition of a camera, from its images |
 
+mod blobs;
+mod camera;
 mod compare;
+mod known;
+mod lanes;
 
+pub use blobs::Blob;
+pub use camera::{CameraCheck, CameraLimits, Measured, Measurement};
 pub use compare::{Comparer, Comparison, Fit};
+pub use known::{Known, KnownError, Seen};
+pub use lanes::{ErrorMap, Lanes};

@@ -42,6 +42,7 @@ pub(crate) fn action() -> Action {
         confidence: 0.5,
         hazard_probability: 0.25,
         is_decision: 1,
+        unknown_probability: 0.0,
         valid_until_ns: 77,
         based_on_frame: 1,
         latency_ns: 20,

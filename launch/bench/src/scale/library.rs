@@ -73,7 +73,7 @@ pub(crate) fn candidates(checkpoint: &Path, quick: bool) -> anyhow::Result<Axis>
         Ok(move || {
             let mixture = Mixture { weights: Vec::new(), components: Vec::new() };
             let draws = latents.iter().map(|z| Draw { latent: *z, component: 0 }).collect();
-            std::hint::black_box(probe.step(mixture, draws, 1.0));
+            std::hint::black_box(probe.step(mixture, draws, 1.0, None));
         })
     })?;
     let points_a_place = base.layout().points().len() as f64 / base.layout().places().len() as f64;

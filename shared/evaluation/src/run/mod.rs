@@ -10,7 +10,7 @@ use carff_dataset::{
     drives::{DriveKind, EligibleInput, eligible_inputs},
     sensor::SensorNoise,
 };
-use carff_decision::{Evidence, Plan, Policy, Sampling, Step, look_ahead};
+use carff_decision::{Evidence, ImageEvidence, Plan, Policy, Sampling, Step, look_ahead};
 use carff_inference::MixtureNet;
 use carff_messages::{Gaussian, Rule};
 use carff_scenes::Scenario;
@@ -74,6 +74,8 @@ pub struct DecidedFrame {
     pub observability: Option<Observability>,
     /// Posterior of the encoder, where it was recorded.
     pub posterior: Option<Gaussian>,
+    /// Evidence of the image, if it was compared with the known states.
+    pub image: Option<ImageEvidence>,
     /// True if the action was not an advance.
     pub halted: bool,
     /// Hazard probability of the decision.
@@ -269,7 +271,7 @@ impl JudgedRun {
         let RunSettings { sampling, horizon, seed, .. } = self.settings;
         let plan = Plan { samples, sampling, horizon, seed, frame: frame.frame };
         let forecast = |input: &Gaussian, _| self.forecaster.forecast(input);
-        Some(look_ahead(forecast, probe, &frame.posterior?, plan))
+        Some(look_ahead(forecast, probe, &frame.posterior?, frame.image.as_ref(), plan))
     }
 
     /// Every rule over the drives of the run, and the agreement of the run with the library.
@@ -382,6 +384,7 @@ pub(crate) mod tests {
             view: Some(0),
             observability: Some(Observability::None),
             posterior: None,
+            image: None,
             halted: true,
             hazard_probability: 0.5,
             other_reason: None,

@@ -250,7 +250,7 @@ impl Planner<'_> {
         let of_trial = |probe: &mut FieldProbe, (trial, mixture): (&Trial, &Mixture)| {
             let plan = Plan { samples, sampling, horizon, seed: trial.seed, frame: trial.frame };
             let forecast = |_: &Gaussian, state: Option<usize>| state.map_or(mixture, |s| &later[s]).clone();
-            Evidence::of_steps(&look_ahead(forecast, probe, &trial.posterior, plan))
+            Evidence::of_steps(&look_ahead(forecast, probe, &trial.posterior, None, plan))
         };
         trials.par_iter().zip(&first).map_init(|| self.probe.clone(), of_trial).collect()
     }

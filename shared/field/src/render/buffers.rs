@@ -78,6 +78,16 @@ impl RenderBuffer {
         self.changing.resize(pixels, false);
     }
 
+    /// Clears all pixels, unless each of them has a ray.
+    pub(super) fn blank(&mut self, rays: usize) {
+        if rays < self.depth_m.len() {
+            self.rgb.fill(0.0);
+            self.depth_m.fill(0.0);
+            self.opacity.fill(0.0);
+            self.changing.fill(false);
+        }
+    }
+
     /// Copies a ray's results to a pixel.
     pub(super) fn set(&mut self, pixel: usize, from: &RayPixels, ray: usize) {
         self.rgb[pixel * 3..pixel * 3 + 3].copy_from_slice(&from.rgb[ray * 3..ray * 3 + 3]);

@@ -28,13 +28,25 @@ impl Field {
         options: &RenderOptions,
         out: &mut RenderBuffer,
     ) {
+        self.render_where(camera, latent, |_| true, options, out);
+    }
+
+    /// Renders the pixels of which `selected` is true, by index row by row; the others are black at distance 0.
+    fn render_where(
+        &self,
+        camera: &PinholeCamera,
+        latent: &[f32; LATENT_DIM],
+        selected: impl Fn(usize) -> bool,
+        options: &RenderOptions,
+        out: &mut RenderBuffer,
+    ) {
         let (width, height) = (camera.width_px, camera.height_px);
         out.rays.clear();
         out.pixels.clear();
         for top in (0..height).step_by(TILE_PX as usize) {
             for left in (0..width).step_by(TILE_PX as usize) {
                 for y in top..(top + TILE_PX).min(height) {
-                    for x in left..(left + TILE_PX).min(width) {
+                    for x in (left..(left + TILE_PX).min(width)).filter(|x| selected((y * width + x) as usize)) {
                         out.rays.push(camera.ray(f64::from(x) + 0.5, f64::from(y) + 0.5));
                         out.pixels.push(y * width + x);
                     }
@@ -42,7 +54,8 @@ impl Field {
             }
         }
         self.render_chunks(&out.rays, &[*latent], options, (&mut out.by_ray, &mut out.pool));
-        out.resize(out.rays.len());
+        out.resize(width as usize * height as usize);
+        out.blank(out.rays.len());
         let by_ray = std::mem::take(&mut out.by_ray);
         for ray in 0..out.rays.len() {
             out.set(out.pixels[ray] as usize, &by_ray, ray);
@@ -62,10 +75,23 @@ impl Field {
         options: &RenderOptions,
         out: &mut HypothesisBuffer,
     ) {
+        self.render_hypotheses_where(camera, latents, |_| true, options, out);
+    }
+
+    /// As [`Self::render_hypotheses`], but only the pixels of which `selected` is true, by index row by row; the others
+    /// are black at distance 0.
+    pub fn render_hypotheses_where(
+        &self,
+        camera: &PinholeCamera,
+        latents: &[[f32; LATENT_DIM]],
+        selected: impl Fn(usize) -> bool,
+        options: &RenderOptions,
+        out: &mut HypothesisBuffer,
+    ) {
         let HypothesisBuffer { pictures, changing, rays, by_ray, pool } = out;
         pictures.resize_with(latents.len(), RenderBuffer::default);
         let Some((first, others)) = pictures.split_first_mut() else { return };
-        self.render(camera, &latents[0], options, first);
+        self.render_where(camera, &latents[0], selected, options, first);
         changing.clear();
         changing.extend((0..first.rays.len() as u32).filter(|i| first.by_ray.changing[*i as usize]));
         rays.clear();
@@ -179,6 +205,14 @@ mod tests {
                 apart += usize::from(largest_difference(pixel, first) > 1e-3);
             }
             assert!(if k == 0 { apart == 0 } else { apart > 20 }, "{apart} pixels of image {k}");
+        }
+        // Of selected pixels, the images are the same; the others are black.
+        let mut some = HypothesisBuffer::default();
+        field.render_hypotheses_where(&camera(), &latents, |i| i % 3 == 0, &options, &mut some);
+        for (all, some) in buffer.pictures.iter().zip(&some.pictures) {
+            for (i, (all, some)) in all.rgb.chunks_exact(3).zip(some.rgb.chunks_exact(3)).enumerate() {
+                assert!(if i % 3 == 0 { largest_difference(all, some) < 1e-5 } else { some == [0.0; 3] });
+            }
         }
         field.changing.set_from(|_| false);
         field.render_hypotheses(&camera(), &latents, &options, &mut buffer);

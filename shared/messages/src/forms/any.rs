@@ -1,8 +1,8 @@
 //! Messages with a type that is only known at run time.
 
-use super::{ActionForm, BeliefForm, ForecastForm, FormError, FrameForm, ViewForm};
+use super::{ActionForm, BeliefForm, ForecastForm, FormError, FrameForm, UnknownsForm, ViewForm};
 use crate::layout::Described;
-use crate::{Action, Belief, Forecast, FrameMeta, Header, Health, Message, Posterior, ViewMeta};
+use crate::{Action, Belief, Forecast, FrameMeta, Header, Health, ImageCheck, Message, Posterior, Unknowns, ViewMeta};
 use schemars::JsonSchema;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
@@ -63,12 +63,14 @@ macro_rules! plain {
 plain! {
     Posterior = "carff.Posterior";
     Health = "carff.Health";
+    ImageCheck = "carff.ImageCheck";
 }
 
 readable! {
     FrameMeta: FrameForm = "carff.Frame";
     Forecast: ForecastForm = "carff.Forecast";
     Belief: BeliefForm = "carff.Belief";
+    Unknowns: UnknownsForm = "carff.Unknowns";
     ViewMeta: ViewForm = "carff.View";
     Action: ActionForm = "carff.Action";
 }

@@ -25,6 +25,9 @@ pub struct ActionForm {
     pub hazard_probability: f32,
     /// True for the first action based on its frame.
     pub is_decision: bool,
+    /// Probability of something that no known state explains, 0..=1; recordings before it have 0.
+    #[serde(default)]
+    pub unknown_probability: f32,
     /// End of its validity: monotonic clock, nanoseconds.
     pub valid_until_ns: u64,
     /// The frame that it is based on, if any.
@@ -44,6 +47,7 @@ impl From<&Action> for ActionForm {
             confidence: action.confidence,
             hazard_probability: action.hazard_probability,
             is_decision: action.is_decision(),
+            unknown_probability: action.unknown_probability,
             valid_until_ns: action.valid_until_ns,
             based_on_frame: (action.based_on_frame != u64::MAX).then_some(action.based_on_frame),
             latency_ns: action.latency_ns,
@@ -64,6 +68,7 @@ impl TryFrom<&ActionForm> for Action {
             confidence: form.confidence,
             hazard_probability: form.hazard_probability,
             is_decision: form.is_decision.into(),
+            unknown_probability: form.unknown_probability,
             valid_until_ns: form.valid_until_ns,
             based_on_frame: form.based_on_frame.unwrap_or(u64::MAX),
             latency_ns: form.latency_ns,

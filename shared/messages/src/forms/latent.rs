@@ -163,8 +163,11 @@ pub struct BeliefForm {
     pub is_final: bool,
     /// Number of probed places.
     pub place_count: u32,
-    /// Probability of each known state; the remainder to 1 is "none of the known states".
+    /// Probability of each known state; together with the unknown's they sum to 1.
     pub state_probability: Vec<f32>,
+    /// Probability of something that no known state explains, 0..=1; recordings before it have 0.
+    #[serde(default)]
+    pub unknown_probability: f32,
     /// Probability of the hazard at this step.
     pub hazard_probability: f32,
     /// Probability of the path up to this step's input.
@@ -195,6 +198,7 @@ impl From<&Belief> for BeliefForm {
             is_final: b.is_final(),
             place_count: b.place_count,
             state_probability: b.state_probability.iter().take(b.state_count as usize).copied().collect(),
+            unknown_probability: b.unknown_probability,
             hazard_probability: b.hazard_probability,
             path_probability: b.path_probability,
             components: b.components[..components]
@@ -233,6 +237,7 @@ impl TryFrom<&BeliefForm> for Belief {
         belief.component_count = components.len() as u32;
         belief.sample_count = samples.len() as u32;
         belief.state_probability = begin("state_probability", &form.state_probability, 0.0)?;
+        belief.unknown_probability = form.unknown_probability;
         belief.hazard_probability = form.hazard_probability;
         belief.path_probability = form.path_probability;
         belief.component_weights = begin::<_, MAX_COMPONENTS>("components", &weights, 0.0)?;

@@ -20,12 +20,14 @@ mod any;
 mod decision;
 mod frame;
 mod latent;
+mod novelty;
 mod text;
 
 pub use any::{AnyMessage, DynMessage, OwnedMessage, Readable, read};
 pub use decision::ActionForm;
 pub use frame::{DatasetViewForm, FrameForm, ViewForm};
 pub use latent::{BeliefForm, ComponentForm, DrawForm, ForecastForm, ProbeForm};
+pub use novelty::UnknownsForm;
 pub use text::as_text;
 
 use crate::Invalid;

@@ -136,6 +136,7 @@ fn messages_survive_their_forms() {
             confidence: probability(&mut next),
             hazard_probability: probability(&mut next),
             is_decision: 1,
+            unknown_probability: 0.0,
             valid_until_ns: 99,
             based_on_frame: u64::MAX,
             latency_ns: 0,

@@ -1,0 +1,138 @@
+//! What an image says about the known states beside the encoder: rendering them and comparing.
+
+use crate::{ProbeLayout, Resolved};
+
+/// Prior probability that something stands there which no known state explains.
+const UNKNOWN_PRIOR: f64 = 0.01;
+/// Share of the belief that trusts the encoder's path; the rest starts from equally probable states. The encoder can
+/// be wrong with certainty, for example in rain. Rendering the states shows what this image can say at all.
+const ENCODER_SHARE: f64 = 0.5;
+/// Ratios are limited to this and its inverse, so that no image decides against everything else.
+const MAX_RATIO: f64 = 1e4;
+
+/// For each known state, how much better it explains an image than something unknown does.
+///
+/// ```
+/// use carff_decision::ImageEvidence;
+/// // The image fits state 0 well, and state 1 badly.
+/// let evidence = ImageEvidence::new(&[100.0, 1e-3]);
+/// // The encoder sees the hazard of state 1 with 0.2: the image contradicts it.
+/// let (hazard, unknown) = evidence.weigh(0.2, &[false, true]);
+/// assert!(hazard < 0.01 && unknown < 0.01);
+/// ```
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct ImageEvidence {
+    ratios: Vec<f64>,
+}
+
+impl ImageEvidence {
+    /// Evidence of the likelihood ratios of the known states against something unknown, each above 0. A ratio that is
+    /// not a number counts as the smallest.
+    pub fn new(ratios: &[f64]) -> Self {
+        let limited =
+            |ratio: &f64| if ratio.is_nan() { 1.0 / MAX_RATIO } else { ratio.clamp(1.0 / MAX_RATIO, MAX_RATIO) };
+        Self { ratios: ratios.iter().map(limited).collect() }
+    }
+
+    /// Returns the ratios, one a state.
+    pub fn ratios(&self) -> &[f64] {
+        &self.ratios
+    }
+
+    /// Returns the probability of something unknown, from equally probable states.
+    pub fn unknown_probability(&self, hazard_states: &[bool]) -> f64 {
+        let hazards = hazard_states.iter().filter(|h| **h).count() as f32 / hazard_states.len().max(1) as f32;
+        self.weigh(hazards, hazard_states).1
+    }
+
+    /// Returns the probability of a hazard and of something unknown, from the encoder's hazard probability (0..=1).
+    /// `hazard_states` marks the states with a hazard, and must have one entry a state.
+    ///
+    /// Two opinions are pooled with equal weights: one starts from the encoder's probability, the other from equally
+    /// probable states. Each is weighed by the best explanation with and without a hazard (Bayes' rule).
+    pub fn weigh(&self, hazard_probability: f32, hazard_states: &[bool]) -> (f64, f64) {
+        let best = |hazard: bool| {
+            let of = self.ratios.iter().zip(hazard_states).filter(|(_, h)| **h == hazard).map(|(r, _)| *r);
+            of.fold(0.0, f64::max)
+        };
+        let (with, without) = (best(true), best(false));
+        let hazards = hazard_states.iter().filter(|h| **h).count() as f64 / hazard_states.len().max(1) as f64;
+        let posterior = |hazard: f64| {
+            let known = 1.0 - UNKNOWN_PRIOR;
+            let (h, c) = (known * hazard * with, known * (1.0 - hazard) * without);
+            let all = h + c + UNKNOWN_PRIOR;
+            (h / all, UNKNOWN_PRIOR / all)
+        };
+        let (trusting, doubting) = (posterior(f64::from(hazard_probability).clamp(0.0, 1.0)), posterior(hazards));
+        let pooled = |a: f64, b: f64| ENCODER_SHARE * a + (1.0 - ENCODER_SHARE) * b;
+        (pooled(trusting.0, doubting.0), pooled(trusting.1, doubting.1))
+    }
+}
+
+impl Resolved {
+    /// Weighs the belief by an image's evidence: states with a hazard share the weighed hazard probability, the others
+    /// the rest, and something unknown takes its own.
+    pub fn weigh(&mut self, layout: &ProbeLayout, evidence: &ImageEvidence) {
+        if evidence.ratios.len() != layout.state_count() {
+            return;
+        }
+        let (hazard, unknown) = evidence.weigh(self.hazard_probability, layout.hazard_states());
+        let sum = |probabilities: &[f32], hazard: bool| -> f64 {
+            let of = probabilities.iter().zip(layout.hazard_states()).filter(|(_, h)| **h == hazard);
+            of.map(|(p, _)| f64::from(*p)).sum()
+        };
+        let sides = [false, true].map(|side| sum(&self.state_probabilities, side));
+        let counts = [false, true].map(|side| layout.hazard_states().iter().filter(|h| **h == side).count());
+        let wanted = [1.0 - hazard - unknown, hazard];
+        for (p, &is_hazard) in self.state_probabilities.iter_mut().zip(layout.hazard_states()) {
+            let side = usize::from(is_hazard);
+            // A side that the encoder excludes is spread evenly.
+            let share = if sides[side] > 1e-6 { f64::from(*p) / sides[side] } else { 1.0 / counts[side].max(1) as f64 };
+            *p = (share * wanted[side]) as f32;
+        }
+        self.hazard_probability = hazard as f32;
+        self.unknown_probability = unknown as f32;
+        let key = |s: usize| {
+            let p = (f64::from(self.state_probabilities[s]) * 1e6).round() as i64;
+            (p * 2 + i64::from(layout.hazard_states()[s]), std::cmp::Reverse(s))
+        };
+        self.state = (0..layout.state_count()).max_by_key(|&s| key(s)).unwrap_or(0);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const STATES: [bool; 4] = [true, true, false, false];
+
+    /// Where every state explains the image alike, an even encoder's answer is kept, and nothing is unknown.
+    #[test]
+    fn hidden_views_stay_even() {
+        let (hazard, unknown) = ImageEvidence::new(&[50.0; 4]).weigh(0.5, &STATES);
+        assert!((hazard - 0.5).abs() < 0.01 && unknown < 0.01, "{hazard} {unknown}");
+    }
+
+    /// An image that only a hazard state explains is a hazard, for an encoder that is sure of the opposite.
+    #[test]
+    fn a_visible_hazard_overrules_the_encoder() {
+        let (hazard, unknown) = ImageEvidence::new(&[1e-3, 80.0, 1e-3, 1e-3]).weigh(0.0, &STATES);
+        assert!(hazard + unknown > 0.7, "{hazard} {unknown}");
+    }
+
+    /// Where the image cannot tell, an encoder that is wrongly sure leaves a quarter of the probability to the hazard.
+    #[test]
+    fn what_cannot_be_seen_stays_possible() {
+        let (hazard, _) = ImageEvidence::new(&[50.0; 4]).weigh(0.0, &STATES);
+        assert!((0.2..0.3).contains(&hazard), "{hazard}");
+    }
+
+    /// An image that no state explains is unknown; ratios that are not numbers explain nothing.
+    #[test]
+    fn what_nothing_explains_is_unknown() {
+        for ratios in [[1e-3; 4], [f64::NAN; 4]] {
+            let (hazard, unknown) = ImageEvidence::new(&ratios).weigh(0.0, &STATES);
+            assert!(unknown > 0.8 && hazard < 0.1, "{hazard} {unknown}");
+        }
+    }
+}

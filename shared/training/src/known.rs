@@ -1,0 +1,159 @@
+//! The limits of the known: calibrated on images of known states, for a checkpoint whose field is trained.
+//!
+//! The images come from free poses of the scenario, from a seed that no evaluation uses. A dataset without a scenario
+//! file uses its trained poses, on which the field errs less than elsewhere.
+
+use crate::TrainingError;
+use carff_base::geometry::{OrientedBox, PinholeCamera};
+use carff_base::random::{Key, tag};
+use carff_checkpoint::{Manifest, load_field};
+use carff_dataset::{
+    Image, PoseRole,
+    sensor::{SensorNoise, apply_noise_into},
+};
+use carff_evaluation::{PosedImages, Progress};
+use carff_field::{Field, InstructionSet};
+use carff_messages::LATENT_DIM;
+use carff_scenes::Scenario;
+use carff_unknown::{CameraLimits, Comparer, Comparison, Known, Lanes, Measured};
+use std::path::Path;
+
+/// Part of the seed of these images, so that they share no draws with training, thresholds or evaluation.
+const KNOWN: u64 = tag("known");
+/// Length of the vehicle that carries the camera, times this, is the distance below which nothing is judged.
+const BEYOND_VEHICLE: f64 = 1.25;
+/// Share of a place's size by which the ground around it counts, where a scenario has no roads.
+const AROUND_PLACE: f64 = 0.75;
+/// Largest number of images of the dataset on which the camera's limits rest.
+const MOST_IMAGES: usize = 400;
+/// Factor of the limit where the images are of trained poses.
+const TRAINED_POSES: f32 = 1.5;
+
+/// Input of the calibration.
+#[derive(Clone, Copy)]
+pub struct KnownInput<'a> {
+    /// Folder of the checkpoint; `known.json` is written into it.
+    pub checkpoint: &'a Path,
+    /// Folder of its dataset.
+    pub dataset: &'a Path,
+    /// Scenario of the dataset; `None` for any other dataset.
+    pub scenario: Option<&'a Scenario>,
+    /// Free poses of the scenario, each with an image of each branch.
+    pub free_poses: usize,
+    /// Threads that render.
+    pub threads: usize,
+}
+
+/// Calibrates the limits and writes them into the checkpoint.
+pub fn calibrate_known(input: KnownInput, on_progress: &dyn Fn(&Progress)) -> Result<Known, TrainingError> {
+    let manifest = Manifest::load(input.checkpoint)?;
+    let mut field = load_field(input.checkpoint, &manifest)?;
+    field.set_instruction_set(InstructionSet::detect_for_pictures());
+    let posed = PosedImages::open(input.dataset, manifest.split.seed)?;
+    let mut work = Work {
+        lanes: lanes(&manifest, &field, input.scenario),
+        states: manifest.states.iter().map(|state| state.mean).collect(),
+        field,
+        seed: manifest.seed ^ KNOWN,
+        threads: input.threads,
+        comparer: Comparer::default(),
+    };
+    let comparisons = match input.scenario {
+        Some(scenario) => work.free_poses(scenario, input.free_poses, on_progress)?,
+        None => work.trained_poses(&posed, on_progress),
+    };
+    let mut known = Known::fit(work.lanes.clone(), &comparisons, camera_limits(&posed, work.seed));
+    if input.scenario.is_none() {
+        known.limit *= TRAINED_POSES;
+    }
+    known.save(input.checkpoint).map_err(|e| TrainingError::Unfit(e.to_string()))?;
+    Ok(known)
+}
+
+struct Work {
+    lanes: Lanes,
+    states: Vec<[f32; LATENT_DIM]>,
+    field: Field,
+    seed: u64,
+    threads: usize,
+    comparer: Comparer,
+}
+
+impl Work {
+    fn free_poses(
+        &mut self,
+        scenario: &Scenario,
+        count: usize,
+        on_progress: &dyn Fn(&Progress),
+    ) -> Result<Vec<Comparison>, TrainingError> {
+        let mut all = Vec::new();
+        for number in 0..count {
+            let pose = scenario.free_pose(number as u64, self.seed).map_err(|e| TrainingError::Unfit(e.to_string()))?;
+            for look in &pose.looks {
+                all.extend(self.compare(&pose.camera, &look.image, all.len()));
+            }
+            on_progress(&Progress { phase: "known", done: number + 1, total: count, line: String::new() });
+        }
+        Ok(all)
+    }
+
+    fn trained_poses(&mut self, posed: &PosedImages, on_progress: &dyn Fn(&Progress)) -> Vec<Comparison> {
+        let images = posed.with_roles(&[PoseRole::Rest]);
+        let mut all = Vec::new();
+        for (done, &i) in images.iter().enumerate() {
+            all.extend(self.compare(&posed.dataset.frames()[i].camera, &posed.images[i], i));
+            on_progress(&Progress { phase: "known", done: done + 1, total: images.len(), line: String::new() });
+        }
+        all
+    }
+
+    /// Compares an image with sensor noise.
+    fn compare(&mut self, camera: &PinholeCamera, image: &Image, number: usize) -> Option<Comparison> {
+        let noisy = noisy(image, Key::named("knwn", self.seed, number as u64));
+        let Self { lanes, states, field, threads, comparer, .. } = self;
+        comparer.compare(field, states, lanes, camera, noisy.view()?, *threads)
+    }
+}
+
+/// The image behind a camera in use.
+fn noisy(image: &Image, key: Key) -> Image {
+    let mut noisy = image.clone();
+    // Only noise out of range is refused.
+    let _ = apply_noise_into(&image.rgb, &mut noisy.rgb, &SensorNoise::default(), key);
+    noisy
+}
+
+/// The scenario's roads, else the surroundings of the places.
+fn lanes(manifest: &Manifest, field: &Field, scenario: Option<&Scenario>) -> Lanes {
+    let [low, high] = field.config().bounds_m.map(|corner| corner.map(f64::from));
+    let roads = scenario.map(Scenario::roads).unwrap_or_default();
+    let around = |place: &OrientedBox| {
+        let grown = |half: f64| half * (1.0 + AROUND_PLACE);
+        OrientedBox { half_size: place.half_size.map(grown), ..*place }
+    };
+    let has_roads = !roads.is_empty();
+    let areas = if has_roads { roads } else { manifest.places.iter().map(|p| around(&p.oriented_box)).collect() };
+    let length_m = scenario.and_then(Scenario::ego_length_m).filter(|_| has_roads);
+    Lanes {
+        areas,
+        ground_m: low[2],
+        bounds_m: [[low[0], low[1]], [high[0], high[1]]],
+        nearest_m: length_m.map_or(0.0, |length| length * BEYOND_VEHICLE),
+    }
+}
+
+/// Limits of a camera in order, from the trained images with sensor noise.
+fn camera_limits(posed: &PosedImages, seed: u64) -> CameraLimits {
+    let trained = posed.trained();
+    let step = trained.len().div_ceil(MOST_IMAGES).max(1);
+    let measured: Vec<Measured> = trained
+        .iter()
+        .step_by(step)
+        .filter_map(|&i| Some(Measured::of(noisy(&posed.images[i], Key::named("lims", seed, i as u64)).view()?)))
+        .collect();
+    let fields: Vec<[f64; 2]> = posed.dataset.frames().iter().map(|f| f.camera.field_of_view_deg()).collect();
+    let alike = fields.iter().all(|f| (0..2).all(|i| (f[i] - fields[0][i]).abs() < 0.01 * fields[0][i]));
+    // A dataset of several lenses says nothing about the right one.
+    let field_of_view_deg = fields.first().copied().filter(|_| alike).unwrap_or([0.0; 2]);
+    CameraLimits::fit(&measured, field_of_view_deg)
+}

@@ -1,0 +1,118 @@
+//! Connected residuals: how strong they are, and where on the ground they stand.
+
+use crate::lanes::{ErrorMap, Ground};
+use carff_base::geometry::PinholeCamera;
+
+/// Pixels that count for the strength of a blob: a vehicle of 100 pixels in an image of 128 x 128 has 25 at the
+/// compared size.
+const STRONGEST: usize = 9;
+/// Smallest and largest height of a blob's box, as a share of its width.
+const HEIGHT_SHARE: [f64; 2] = [0.3, 1.2];
+
+/// Connected pixels that a state does not explain, and that stand on the lanes.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Blob {
+    /// Root mean square of the nine largest residuals, in units in which 1 is the field's own error.
+    pub strength: f32,
+    /// Number of pixels at the compared size.
+    pub pixels: usize,
+    /// Place where it stands, x and y, metres: the nearest ground that it covers.
+    pub foot_m: [f64; 2],
+    /// Distance of that place from the camera, metres.
+    pub distance_m: f64,
+    /// Width across the view, metres.
+    pub width_m: f64,
+    /// Height of the box, metres.
+    pub height_m: f64,
+}
+
+impl Blob {
+    /// Returns centre and half sizes of an upright box at the blob's place, metres; its depth equals its width.
+    pub fn upright_box(&self, camera: &PinholeCamera, ground_m: f64) -> ([f64; 3], [f64; 3]) {
+        let eye = camera.position_m();
+        let away = [self.foot_m[0] - eye[0], self.foot_m[1] - eye[1]];
+        let length = away[0].hypot(away[1]).max(1e-9);
+        let half = self.width_m / 2.0;
+        let center = [0, 1].map(|i| self.foot_m[i] + away[i] / length * half);
+        ([center[0], center[1], ground_m + self.height_m / 2.0], [half, half, self.height_m / 2.0])
+    }
+}
+
+/// Finds the blobs of one state that stand on the lanes, the strongest first. `residual` has the residual of each pixel
+/// in deviations, `ground` what the pixels look at, and `judged` is true where a residual was computed.
+pub(crate) fn blobs(
+    camera: &PinholeCamera,
+    residual: &[f32],
+    judged: &[bool],
+    ground: &[Option<Ground>],
+    errors: &ErrorMap,
+) -> Vec<Blob> {
+    let width = camera.width_px as usize;
+    let relative: Vec<f32> = residual
+        .iter()
+        .zip(ground)
+        .zip(judged)
+        .map(|((r, ground), judged)| match ground {
+            Some(ground) if *judged => r / errors.at(ground.at_m),
+            _ => 0.0,
+        })
+        .collect();
+    let mut taken = vec![false; relative.len()];
+    let mut found = Vec::new();
+    for start in 0..relative.len() {
+        if taken[start] || relative[start] <= 1.0 {
+            continue;
+        }
+        let pixels = connected(start, width, &relative, &mut taken);
+        found.extend(blob(camera, &pixels, &relative, ground));
+    }
+    found.sort_by(|a: &Blob, b: &Blob| b.strength.total_cmp(&a.strength));
+    found
+}
+
+/// Takes the pixels above 1 that are connected with a first one by edges or corners.
+fn connected(start: usize, width: usize, relative: &[f32], taken: &mut [bool]) -> Vec<usize> {
+    let height = relative.len() / width;
+    let (mut waiting, mut pixels) = (vec![start], Vec::new());
+    taken[start] = true;
+    while let Some(pixel) = waiting.pop() {
+        pixels.push(pixel);
+        let (x, y) = (pixel % width, pixel / width);
+        for ny in y.saturating_sub(1)..(y + 2).min(height) {
+            for nx in x.saturating_sub(1)..(x + 2).min(width) {
+                let next = ny * width + nx;
+                if !taken[next] && relative[next] > 1.0 {
+                    taken[next] = true;
+                    waiting.push(next);
+                }
+            }
+        }
+    }
+    pixels
+}
+
+/// Describes connected pixels; `None` if they do not stand on the lanes.
+fn blob(camera: &PinholeCamera, pixels: &[usize], relative: &[f32], ground: &[Option<Ground>]) -> Option<Blob> {
+    let seen = || pixels.iter().filter_map(|&p| Some((p, ground[p]?)));
+    let (_, foot) = seen().min_by(|a, b| a.1.distance_m.total_cmp(&b.1.distance_m))?;
+    if !foot.on_lanes {
+        return None;
+    }
+    let mut strongest: Vec<f32> = pixels.iter().map(|&p| relative[p]).collect();
+    strongest.sort_by(|a, b| b.total_cmp(a));
+    let sum: f32 = strongest.iter().take(STRONGEST).map(|v| v * v).sum();
+    let width = camera.width_px as usize;
+    let columns = || pixels.iter().map(|p| p % width);
+    let rows = || pixels.iter().map(|p| p / width);
+    let span = |low: Option<usize>, high: Option<usize>| (high.unwrap_or(0) - low.unwrap_or(0) + 1) as f64;
+    let width_m = span(columns().min(), columns().max()) * foot.distance_m / camera.fl_x_px;
+    let height_m = span(rows().min(), rows().max()) * foot.distance_m / camera.fl_y_px;
+    Some(Blob {
+        strength: (sum / STRONGEST as f32).sqrt(),
+        pixels: pixels.len(),
+        foot_m: foot.at_m,
+        distance_m: foot.distance_m,
+        width_m,
+        height_m: height_m.clamp(HEIGHT_SHARE[0] * width_m, HEIGHT_SHARE[1] * width_m),
+    })
+}

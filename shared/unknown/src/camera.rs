@@ -1,0 +1,238 @@
+//! The condition of a camera, from its images: no network and no pose is needed.
+
+use carff_messages::{ImageCheck, ImageCondition};
+use ndarray::ArrayView3;
+use serde::{Deserialize, Serialize};
+
+/// Cells along each side of the grid in which covered parts are found.
+const CELLS: usize = 12;
+/// Luminance (0..=1) below which a whole image is black, and above which it is white.
+const BLACK: f32 = 0.03;
+const WHITE: f32 = 0.97;
+/// Largest deviation of a cell without detail, of 255, and its largest luminance if it is covered.
+const FLAT: f32 = 4.0;
+const DARK: f32 = 0.14;
+/// Share of the image that may be dark and without detail, beyond that of trained images.
+const COVERED_BEYOND: f32 = 0.06;
+/// Share of the trained images' smallest sharpness below which an image is out of focus.
+const LEAST_SHARPNESS: f32 = 0.12;
+/// Factors of the trained images' darkest and brightest mean luminance.
+const DARKER: f32 = 0.35;
+const BRIGHTER_REST: f32 = 0.25;
+/// Mean absolute difference, of 255, up to which two images are the same one, beyond any sensor's noise.
+const SAME: f32 = 0.3;
+/// Largest relative difference of the fields of view.
+const LENS: f64 = 0.1;
+/// Longest step forward of the capture time against the clock, nanoseconds: the image is older than that.
+const LATE_NS: u64 = 2_000_000_000;
+
+/// Statistics of images of a camera in order.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CameraLimits {
+    /// Smallest and largest mean luminance, 0..=1.
+    pub luminance: [f32; 2],
+    /// Smallest and median contrast of fine detail.
+    pub sharpness: [f32; 2],
+    /// Largest share of the image that is dark and without detail.
+    pub covered: f32,
+    /// Horizontal and vertical field of view, degrees.
+    pub field_of_view_deg: [f64; 2],
+}
+
+/// Measurements of one image.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Measured {
+    /// Mean luminance, 0..=1.
+    pub luminance: f32,
+    /// Contrast of fine detail: mean absolute Laplacian against the image's deviation.
+    pub sharpness: f32,
+    /// Share of the image that is dark and without detail, 0..=1.
+    pub covered: f32,
+}
+
+impl Measured {
+    /// Measures an image (height, width, channel).
+    pub fn of(image: ArrayView3<'_, u8>) -> Self {
+        let (height, width, _) = image.dim();
+        if height < 3 || width < 3 {
+            return Self::default();
+        }
+        let luminance = luminances(image);
+        let mean = luminance.iter().sum::<f32>() / luminance.len() as f32;
+        let deviation = (luminance.iter().map(|v| (v - mean).powi(2)).sum::<f32>() / luminance.len() as f32).sqrt();
+        Self {
+            luminance: (mean / 255.0).clamp(0.0, 1.0),
+            sharpness: detail(&luminance, width) / deviation.max(1.0),
+            covered: covered(&luminance, width),
+        }
+    }
+}
+
+/// Luminance of each pixel, 0..=255.
+fn luminances(image: ArrayView3<'_, u8>) -> Vec<f32> {
+    let pixels = image.rows().into_iter();
+    pixels.map(|p| 0.299 * f32::from(p[0]) + 0.587 * f32::from(p[1]) + 0.114 * f32::from(p[2])).collect()
+}
+
+/// Mean absolute Laplacian over cells of 2 x 2 pixels, which averages the sensor's noise.
+fn detail(luminance: &[f32], width: usize) -> f32 {
+    let height = luminance.len() / width;
+    let (w, h) = (width / 2, height / 2);
+    let at = |x: usize, y: usize| {
+        let i = 2 * y * width + 2 * x;
+        0.25 * (luminance[i] + luminance[i + 1] + luminance[i + width] + luminance[i + width + 1])
+    };
+    let (mut sum, mut n) = (0.0, 0);
+    for y in 1..h.saturating_sub(1) {
+        for x in 1..w.saturating_sub(1) {
+            sum += (4.0 * at(x, y) - at(x - 1, y) - at(x + 1, y) - at(x, y - 1) - at(x, y + 1)).abs();
+            n += 1;
+        }
+    }
+    sum / n.max(1) as f32
+}
+
+/// Share of the cells that are dark and without detail.
+fn covered(luminance: &[f32], width: usize) -> f32 {
+    let height = luminance.len() / width;
+    let (columns, rows) = (CELLS.min(width), CELLS.min(height));
+    let is_covered = |cell: usize| {
+        let (cx, cy) = (cell % columns, cell / columns);
+        let (x, y) = (cx * width / columns..(cx + 1) * width / columns, cy * height / rows..(cy + 1) * height / rows);
+        let values = || y.clone().flat_map(|y| x.clone().map(move |x| luminance[y * width + x]));
+        let n = (x.len() * y.len()).max(1) as f32;
+        let mean = values().sum::<f32>() / n;
+        let deviation = (values().map(|v| (v - mean).powi(2)).sum::<f32>() / n).sqrt();
+        mean < DARK * 255.0 && deviation < FLAT
+    };
+    (0..columns * rows).filter(|&cell| is_covered(cell)).count() as f32 / (columns * rows) as f32
+}
+
+impl CameraLimits {
+    /// Fits on measurements of images of a camera in order, with its field of view in degrees. Without images nothing
+    /// is refused but black and white ones.
+    pub fn fit(measured: &[Measured], field_of_view_deg: [f64; 2]) -> Self {
+        let values = |of: fn(&Measured) -> f32| {
+            let mut values: Vec<f32> = measured.iter().map(of).collect();
+            values.sort_by(f32::total_cmp);
+            values
+        };
+        let (luminance, sharpness, covered) = (values(|m| m.luminance), values(|m| m.sharpness), values(|m| m.covered));
+        let of = |values: &[f32], index: usize, default: f32| values.get(index).copied().unwrap_or(default);
+        Self {
+            luminance: [of(&luminance, 0, 0.0), luminance.last().copied().unwrap_or(1.0)],
+            sharpness: [of(&sharpness, 0, 0.0), of(&sharpness, sharpness.len() / 2, 1.0)],
+            covered: covered.last().copied().unwrap_or(1.0),
+            field_of_view_deg,
+        }
+    }
+}
+
+/// Measurements of a frame that its image alone does not have.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Measurement {
+    /// Capture time: monotonic clock, nanoseconds.
+    pub capture_time_ns: u64,
+    /// The clock's time at which the frame is checked, nanoseconds.
+    pub now_ns: u64,
+    /// Horizontal and vertical field of view, degrees.
+    pub field_of_view_deg: [f64; 2],
+}
+
+/// The check of a camera over its frames.
+#[derive(Clone, Debug)]
+pub struct CameraCheck {
+    limits: Option<CameraLimits>,
+    /// Time for which an image may repeat, nanoseconds; `None` switches the check off.
+    frozen_ns: Option<u64>,
+    /// The image before, its capture time, and the capture time since which the image repeats.
+    before: Option<Before>,
+}
+
+#[derive(Clone, Debug)]
+struct Before {
+    luminance: Vec<f32>,
+    capture_time_ns: u64,
+    same_since_ns: u64,
+}
+
+impl CameraCheck {
+    /// Creates the check. Without limits, only black, white and frozen images and the clock are checked. A camera is
+    /// frozen when its image repeats for `frozen_ns` while capture times advance; `None` accepts repeated images, as a
+    /// camera of rendered images without sensor noise sends them.
+    pub fn new(limits: Option<CameraLimits>, frozen_ns: Option<u64>) -> Self {
+        Self { limits, frozen_ns, before: None }
+    }
+
+    /// Checks a frame and writes condition and measurements to `check`.
+    pub fn check(&mut self, image: ArrayView3<'_, u8>, frame: Measurement, check: &mut ImageCheck) {
+        let measured = Measured::of(image);
+        let luminance = luminances(image);
+        check.luminance = measured.luminance;
+        check.covered = measured.covered;
+        let median = self.limits.map_or(1.0, |limits| limits.sharpness[1]);
+        check.sharpness = measured.sharpness / median.max(1e-6);
+        let clock = self.clock(frame);
+        let same_since_ns = self.same_since_ns(&luminance, frame.capture_time_ns, check);
+        self.before = Some(Before { luminance, capture_time_ns: frame.capture_time_ns, same_since_ns });
+        let repeats_ns = frame.capture_time_ns.saturating_sub(same_since_ns);
+        let frozen = self.frozen_ns.is_some_and(|limit_ns| repeats_ns >= limit_ns);
+        let condition = clock
+            .or_else(|| lens(self.limits, frame))
+            .or_else(|| exposure(self.limits, &measured))
+            .or(frozen.then_some(ImageCondition::Frozen))
+            .or_else(|| focus(self.limits, &measured));
+        check.condition = condition.unwrap_or(ImageCondition::Usable).code();
+    }
+
+    /// Capture times must advance, and be near the clock.
+    fn clock(&self, frame: Measurement) -> Option<ImageCondition> {
+        let stands = self.before.as_ref().is_some_and(|before| frame.capture_time_ns <= before.capture_time_ns);
+        let late = frame.now_ns.saturating_sub(frame.capture_time_ns) > LATE_NS;
+        let early = frame.capture_time_ns > frame.now_ns;
+        (stands || late || early).then_some(ImageCondition::Clock)
+    }
+
+    /// Capture time since which the image repeats; its own for another image.
+    fn same_since_ns(&self, luminance: &[f32], capture_time_ns: u64, check: &mut ImageCheck) -> u64 {
+        let Some(before) = self.before.as_ref().filter(|before| before.luminance.len() == luminance.len()) else {
+            return capture_time_ns;
+        };
+        let sum: f32 = luminance.iter().zip(&before.luminance).map(|(a, b)| (a - b).abs()).sum();
+        check.change = sum / luminance.len().max(1) as f32;
+        if check.change <= SAME { before.same_since_ns } else { capture_time_ns }
+    }
+}
+
+fn lens(limits: Option<CameraLimits>, frame: Measurement) -> Option<ImageCondition> {
+    let limits = limits?;
+    let differs = |i: usize| {
+        let trained = limits.field_of_view_deg[i];
+        trained > 0.0 && (frame.field_of_view_deg[i] / trained - 1.0).abs() > LENS
+    };
+    (differs(0) || differs(1)).then_some(ImageCondition::AnotherLens)
+}
+
+fn exposure(limits: Option<CameraLimits>, measured: &Measured) -> Option<ImageCondition> {
+    let luminance = measured.luminance;
+    if luminance < BLACK {
+        return Some(ImageCondition::Black);
+    }
+    if luminance > WHITE {
+        return Some(ImageCondition::White);
+    }
+    let [darkest, brightest] = limits?.luminance;
+    if luminance < DARKER * darkest {
+        return Some(ImageCondition::Underexposed);
+    }
+    (1.0 - luminance < BRIGHTER_REST * (1.0 - brightest)).then_some(ImageCondition::Overexposed)
+}
+
+fn focus(limits: Option<CameraLimits>, measured: &Measured) -> Option<ImageCondition> {
+    let limits = limits?;
+    if measured.covered > limits.covered + COVERED_BEYOND {
+        return Some(ImageCondition::Covered);
+    }
+    (measured.sharpness < LEAST_SHARPNESS * limits.sharpness[0]).then_some(ImageCondition::Unfocused)
+}

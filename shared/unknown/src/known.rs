@@ -1,0 +1,160 @@
+//! The limits of the known: how much of an image a known state leaves unexplained, and the file of these limits.
+
+use crate::camera::CameraLimits;
+use crate::compare::{Comparer, Comparison};
+use crate::lanes::{ErrorMap, Lanes};
+use carff_base::geometry::PinholeCamera;
+use carff_field::Field;
+use carff_messages::{LATENT_DIM, MAX_UNKNOWNS, UnknownBox};
+use ndarray::ArrayView3;
+use serde::{Deserialize, Serialize};
+use std::path::{Path, PathBuf};
+
+/// File name in a checkpoint.
+const FILE: &str = "known.json";
+/// Version of the file's format.
+const FORMAT_VERSION: u32 = 1;
+/// Steepness of the evidence against a state beyond the limit: at 1.5 times the limit, something unknown explains the
+/// image a hundred times better.
+const STEEPNESS: f64 = 12.0;
+/// Share of the known images that leave less than the limit.
+const WITHIN: f64 = 0.99;
+
+/// What a checkpoint takes as known, calibrated on images of known states from poses of no other use.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Known {
+    /// Format of this file; 1.
+    pub format_version: u32,
+    /// The ground on which something unknown counts.
+    pub lanes: Lanes,
+    /// The field's own errors on that ground.
+    pub errors: ErrorMap,
+    /// Strength of a blob that 99 of 100 images of known states stay below.
+    pub limit: f32,
+    /// Number of images that the limit rests on.
+    pub images: usize,
+    /// Limits of images of a camera in order.
+    pub camera: CameraLimits,
+}
+
+/// Reason why the file cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum KnownError {
+    /// The file cannot be read or written.
+    #[error("{path}: {source}")]
+    Io {
+        /// Path of the file.
+        path: PathBuf,
+        /// Error of the system.
+        source: std::io::Error,
+    },
+    /// The file's contents are not valid.
+    #[error("{path}: {problem}; make it again with `carff train FILE --stage known`")]
+    Format {
+        /// Path of the file.
+        path: PathBuf,
+        /// Description of the error.
+        problem: String,
+    },
+}
+
+/// What the known states leave unexplained in one image.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Seen {
+    /// For each state, how much better it explains the image than something unknown does.
+    pub ratios: Vec<f64>,
+    /// Boxes of what the best state does not explain; their probabilities assume that state.
+    pub boxes: Vec<UnknownBox>,
+    /// Strength of the strongest blob under the best state, in limits.
+    pub residual: f32,
+}
+
+impl Known {
+    /// Fits the limits. Residuals of even images make the error map, and those of odd ones the limit, each under the
+    /// image's own best state.
+    pub fn fit(lanes: Lanes, comparisons: &[Comparison], camera: CameraLimits) -> Self {
+        let mut points = Vec::new();
+        for comparison in comparisons.iter().step_by(2) {
+            points.extend(comparison.on_lanes(best_by_sum(comparison)));
+        }
+        let errors = ErrorMap::fit(&lanes, &points);
+        let mut strengths: Vec<f32> =
+            comparisons.iter().skip(1).step_by(2).map(|c| least_strength(c, &errors)).collect();
+        strengths.sort_by(f32::total_cmp);
+        let at = ((strengths.len() as f64 * WITHIN).ceil() as usize).saturating_sub(1);
+        let limit = strengths.get(at).copied().unwrap_or(1.0).max(1.0);
+        Self { format_version: FORMAT_VERSION, lanes, errors, limit, images: strengths.len(), camera }
+    }
+
+    /// Compares an image with the known states. `None` if the camera sees no lane.
+    pub fn see(
+        &self,
+        comparer: &mut Comparer,
+        field: &Field,
+        states: &[[f32; LATENT_DIM]],
+        (camera, image): (&PinholeCamera, ArrayView3<'_, u8>),
+        threads: usize,
+    ) -> Option<(Seen, Comparison)> {
+        let comparison = comparer.compare(field, states, &self.lanes, camera, image, threads)?;
+        Some((self.judge(&comparison), comparison))
+    }
+
+    /// Judges a comparison.
+    pub fn judge(&self, comparison: &Comparison) -> Seen {
+        let of_states: Vec<_> = (0..comparison.residuals.len()).map(|s| comparison.blobs(s, &self.errors)).collect();
+        let strength = |s: &Vec<crate::Blob>| s.first().map_or(0.0, |blob| blob.strength);
+        let ratio = |strength: f32| f64::from(self.limit / strength.max(0.25 * self.limit)).powf(STEEPNESS);
+        let ratios: Vec<f64> = of_states.iter().map(|s| ratio(strength(s))).collect();
+        let best = of_states.iter().min_by(|a, b| strength(a).total_cmp(&strength(b)));
+        let blobs = best.map_or(&[][..], |blobs| &blobs[..]);
+        let boxes = blobs.iter().take(MAX_UNKNOWNS).filter(|blob| blob.strength > self.limit).map(|blob| {
+            let (center, half_size) = blob.upright_box(&comparison.camera, self.lanes.ground_m);
+            UnknownBox { center, half_size, probability: (1.0 / (1.0 + ratio(blob.strength))) as f32, place: -1 }
+        });
+        Seen { ratios, boxes: boxes.collect(), residual: best.map_or(0.0, strength) / self.limit }
+    }
+
+    /// Reads the file of a checkpoint; `None` if the checkpoint has none.
+    pub fn load(checkpoint: &Path) -> Result<Option<Self>, KnownError> {
+        let path = checkpoint.join(FILE);
+        let text = match std::fs::read_to_string(&path) {
+            Ok(text) => text,
+            Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(None),
+            Err(source) => return Err(KnownError::Io { path, source }),
+        };
+        let format = |problem: String| KnownError::Format { path: path.clone(), problem };
+        let known: Self = serde_json::from_str(&text).map_err(|e| format(e.to_string()))?;
+        if known.format_version != FORMAT_VERSION {
+            let found = known.format_version;
+            return Err(format(format!("`format_version` is {found}, this program reads {FORMAT_VERSION}")));
+        }
+        if !known.errors.is_valid() || !(known.limit.is_finite() && known.limit > 0.0) {
+            return Err(format("`errors` and `limit` must be positive numbers".to_owned()));
+        }
+        Ok(Some(known))
+    }
+
+    /// Writes the file into a checkpoint folder, atomically.
+    pub fn save(&self, checkpoint: &Path) -> Result<(), KnownError> {
+        let path = checkpoint.join(FILE);
+        let text = serde_json::to_string(self)
+            .map_err(|e| KnownError::Format { path: path.clone(), problem: e.to_string() })?;
+        let partial = path.with_extension("partial");
+        std::fs::write(&partial, text + "\n")
+            .and_then(|()| std::fs::rename(&partial, &path))
+            .map_err(|source| KnownError::Io { path, source })
+    }
+}
+
+/// The state with the smallest sum of squared residuals on the lanes.
+fn best_by_sum(comparison: &Comparison) -> usize {
+    let sum = |s: usize| comparison.on_lanes(s).map(|(_, r)| r * r).sum::<f32>();
+    (0..comparison.residuals.len()).min_by(|&a, &b| sum(a).total_cmp(&sum(b))).unwrap_or(0)
+}
+
+/// Strength of the strongest blob under the state that leaves the least.
+fn least_strength(comparison: &Comparison, errors: &ErrorMap) -> f32 {
+    let strongest = |s: usize| comparison.blobs(s, errors).first().map_or(0.0, |blob| blob.strength);
+    (0..comparison.residuals.len()).map(strongest).fold(f32::INFINITY, f32::min)
+}

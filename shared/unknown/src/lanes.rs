@@ -1,0 +1,182 @@
+//! The ground on which something unknown counts, and the field's own errors there.
+
+use carff_base::geometry::{OrientedBox, PinholeCamera};
+use serde::{Deserialize, Serialize};
+
+/// Side of a cell of the error map, as a share of the bounds' longer side.
+const CELL_SHARE: f64 = 1.0 / 32.0;
+
+/// The parts of the ground on which something unknown is a hazard: roads, or the surroundings of the probed places.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Lanes {
+    /// Areas, metres, world space; their heights do not count.
+    pub areas: Vec<OrientedBox>,
+    /// Height of the ground, metres.
+    pub ground_m: f64,
+    /// Limits of the field in x and y, metres: low and high corner. Beyond them nothing is judged.
+    pub bounds_m: [[f64; 2]; 2],
+    /// Distance from the camera below which nothing is judged, metres: the vehicle that carries the camera.
+    pub nearest_m: f64,
+}
+
+impl Lanes {
+    /// Reports whether a point of the ground is on an area, within the bounds.
+    pub fn contain(&self, x: f64, y: f64) -> bool {
+        let [low, high] = self.bounds_m;
+        let inside = x >= low[0] && x <= high[0] && y >= low[1] && y <= high[1];
+        inside && self.areas.iter().any(|area| area.contains([x, y, area.center[2]]))
+    }
+
+    /// Returns the points of the ground that the pixels of a camera look at, row by row: distance along the ray and
+    /// position, metres. `None` where a pixel looks at no ground that is judged: above the horizon, or too near.
+    pub fn ground_points(&self, camera: &PinholeCamera) -> Vec<Option<Ground>> {
+        let (width, height) = (camera.width_px, camera.height_px);
+        let pixels = (0..height).flat_map(|y| (0..width).map(move |x| (x, y)));
+        pixels
+            .map(|(x, y)| {
+                let ray = camera.ray(f64::from(x) + 0.5, f64::from(y) + 0.5);
+                let (origin, direction) = (ray.origin.map(f64::from), ray.direction.map(f64::from));
+                let distance_m = (self.ground_m - origin[2]) / direction[2];
+                let is_below = direction[2] < 0.0 && distance_m.is_finite() && distance_m >= self.nearest_m;
+                is_below.then(|| {
+                    let at_m = [0, 1].map(|i| origin[i] + distance_m * direction[i]);
+                    Ground { distance_m, at_m, on_lanes: self.contain(at_m[0], at_m[1]) }
+                })
+            })
+            .collect()
+    }
+}
+
+/// A point of the ground that a pixel looks at.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Ground {
+    /// Distance from the camera along the ray, metres.
+    pub distance_m: f64,
+    /// Position, x and y, metres, world space.
+    pub at_m: [f64; 2],
+    /// True on the lanes.
+    pub on_lanes: bool,
+}
+
+/// The residual that known states leave on each cell of the ground: the field's own errors, in deviations of a pixel.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ErrorMap {
+    /// Low corner, x and y, metres.
+    origin_m: [f64; 2],
+    /// Side of a cell, metres.
+    cell_m: f64,
+    /// Cells along x and y.
+    size: [usize; 2],
+    /// Residual of each cell that known states hardly exceed, row by row.
+    residual: Vec<f32>,
+}
+
+impl ErrorMap {
+    /// A map over the bounds of lanes in which known states leave `residual` everywhere.
+    pub fn even(lanes: &Lanes, residual: f32) -> Self {
+        let [low, high] = lanes.bounds_m;
+        let side = (high[0] - low[0]).max(high[1] - low[1]).max(1e-6);
+        let cell_m = side * CELL_SHARE;
+        let size = [0, 1].map(|i| (((high[i] - low[i]) / cell_m).ceil() as usize).max(1));
+        Self { origin_m: low, cell_m, size, residual: vec![residual; size[0] * size[1]] }
+    }
+
+    /// Returns the index of a point's cell; points outside the map belong to its nearest cell.
+    fn cell(&self, at_m: [f64; 2]) -> usize {
+        let [x, y] =
+            [0, 1].map(|i| (((at_m[i] - self.origin_m[i]) / self.cell_m).max(0.0) as usize).min(self.size[i] - 1));
+        y * self.size[0] + x
+    }
+
+    /// Returns the residual at a point of the ground.
+    pub fn at(&self, at_m: [f64; 2]) -> f32 {
+        self.residual.get(self.cell(at_m)).copied().unwrap_or(1.0)
+    }
+
+    /// Fits a map on residuals of known images: points of the ground with the residual of the pixel that looks at it.
+    /// A cell has the 90th percentile of its own and its neighbours' residuals, but at least the median cell's.
+    pub fn fit(lanes: &Lanes, points: &[([f64; 2], f32)]) -> Self {
+        let mut map = Self::even(lanes, 1.0);
+        let [columns, rows] = map.size;
+        let mut of_cell: Vec<Vec<f32>> = vec![Vec::new(); columns * rows];
+        for (at_m, residual) in points {
+            of_cell[map.cell(*at_m)].push(*residual);
+        }
+        let around = |v: usize, n: usize| v.saturating_sub(1)..(v + 2).min(n);
+        let mut measured = Vec::new();
+        for y in 0..rows {
+            for x in 0..columns {
+                let mut near: Vec<f32> = around(y, rows)
+                    .flat_map(|y| around(x, columns).map(move |x| y * columns + x))
+                    .flat_map(|cell| of_cell[cell].iter().copied())
+                    .collect();
+                near.sort_by(f32::total_cmp);
+                let value = near.get(near.len() * 9 / 10).copied().unwrap_or(0.0);
+                map.residual[y * columns + x] = value;
+                measured.extend((!near.is_empty()).then_some(value));
+            }
+        }
+        measured.sort_by(f32::total_cmp);
+        let median = measured.get(measured.len() / 2).copied().unwrap_or(1.0).max(0.1);
+        map.residual.iter_mut().for_each(|value| *value = value.max(median));
+        map
+    }
+
+    /// Reports whether the map can be used: sizes that agree, and residuals above 0.
+    pub(crate) fn is_valid(&self) -> bool {
+        self.size[0] * self.size[1] == self.residual.len()
+            && !self.residual.is_empty()
+            && self.cell_m > 0.0
+            && self.residual.iter().all(|v| v.is_finite() && *v > 0.0)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn lanes() -> Lanes {
+        Lanes {
+            areas: vec![OrientedBox { center: [0.0, 0.0, 0.0], half_size: [10.0, 2.0, 1.0], yaw: 0.0 }],
+            ground_m: 0.0,
+            bounds_m: [[-8.0, -8.0], [8.0, 8.0]],
+            nearest_m: 2.0,
+        }
+    }
+
+    /// A point counts on an area and within the bounds, at any height of the area's box.
+    #[test]
+    fn lanes_are_areas_within_the_bounds() {
+        let lanes = lanes();
+        assert!(lanes.contain(7.0, -1.9));
+        assert!(!lanes.contain(9.0, 0.0) && !lanes.contain(0.0, 2.1));
+    }
+
+    /// A camera that looks down at the lane sees it in the middle, and no ground above the horizon.
+    #[test]
+    fn pixels_look_at_the_ground() {
+        let camera = PinholeCamera::look_at([0.0, -6.0, 3.0], [0.0, 0.0, 0.0], [0.0, 0.0, 1.0], 33, 33, 100.0);
+        let points = lanes().ground_points(&camera);
+        let middle = points[16 * 33 + 16].expect("ground in the middle");
+        assert!(middle.on_lanes && middle.at_m.iter().all(|v| v.abs() < 0.3), "{middle:?}");
+        assert!((middle.distance_m - 45.0_f64.sqrt()).abs() < 0.5);
+        assert_eq!(points[16], None);
+    }
+
+    /// A cell with large residuals tolerates more than the others, which tolerate the median.
+    #[test]
+    fn errors_are_local() {
+        let points: Vec<([f64; 2], f32)> = (0..160)
+            .flat_map(|i| {
+                let x = -8.0 + 0.1 * f64::from(i);
+                [([x, 0.0], 1.0), ([x, 0.0], if x > 6.5 { 9.0 } else { 1.0 })]
+            })
+            .collect();
+        let map = ErrorMap::fit(&lanes(), &points);
+        assert!(map.is_valid());
+        assert_eq!((map.at([0.0, 0.0]), map.at([7.5, 0.0])), (1.0, 9.0));
+        assert_eq!(map.at([0.0, -7.0]), 1.0, "a cell that no image showed");
+    }
+}
