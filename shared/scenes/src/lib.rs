@@ -14,6 +14,7 @@
 //! # }
 //! ```
 
+mod bystanders;
 mod cameras;
 pub mod config;
 mod error;
@@ -25,6 +26,8 @@ mod scenario;
 mod scenery;
 mod shapes;
 mod tracer;
+mod unknown_looks;
+mod variations;
 
 pub use cameras::ScenarioCamera;
 pub use error::ScenarioError;
@@ -34,3 +37,4 @@ pub use scenario::{
     ActorView, Detail, Extras, FULL_FRACTION, FULL_PIXELS, NONE_FRACTION, NONE_MEAN_DIFFERENCE, RenderOptions,
     Rendering, Scenario,
 };
+pub use unknown_looks::{IN_SIGHT_PX, UnknownLook, VISIBLE_DIFFERENCE};
