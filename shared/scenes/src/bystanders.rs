@@ -108,7 +108,7 @@ impl Parts {
         for y in [-0.42, 0.42] {
             self.capsule([0.0, y * w, 0.44 * h], [0.0, y * w, 0.76 * h], 0.24 * r, colour);
         }
-        self.ellipsoid([0.0, 0.0, 0.93 * h], [0.62 * r.max(0.16), 0.56 * r.max(0.16), 0.14 * h], SKIN);
+        self.ellipsoid([0.0, 0.0, 0.93 * h], [0.92 * r, 0.84 * r, 0.14 * h], SKIN);
     }
 
     fn add_bicycle(&mut self, [l, w, h]: [f64; 3], colour: [f32; 3]) {
