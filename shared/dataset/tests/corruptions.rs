@@ -63,8 +63,8 @@ fn the_key_names_the_draws() {
     }
 }
 
-/// A higher severity is farther from the clean image. Severities 1, 2 and 3 to 5 of snow and of the elastic transform
-/// are two series, as in their definitions.
+/// A higher severity is farther from the clean image. Snow, frost and the elastic transform are two series each, because
+/// their definitions change another part of the image from severity 2 to 3, or from 3 to 4.
 #[test]
 fn severities_grow() {
     for (width_px, height_px) in [(128, 128), (200, 90)] {
@@ -73,6 +73,7 @@ fn severities_grow() {
             let far = |severity| distance(&image, &corruption.apply(&image, severity, KEY).unwrap());
             let distances: Vec<f64> = corruption.severities().map(far).collect();
             let series: Vec<&[f64]> = match corruption {
+                Corruption::Frost => vec![&distances[..3], &distances[3..]],
                 Corruption::ElasticTransform | Corruption::Snow => vec![&distances[..2], &distances[2..]],
                 _ => vec![&distances],
             };

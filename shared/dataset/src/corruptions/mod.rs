@@ -42,7 +42,7 @@ pub enum Corruption {
     ZoomBlur,
     /// Flakes that fall, over a whitened image. Severity 2 has more and smaller flakes than 3, and is about as strong.
     Snow,
-    /// Crystals on the lens.
+    /// Crystals on the lens. Severities 3 and 4 have the same crystals over an image of another brightness.
     Frost,
     /// A bright veil of uneven density.
     Fog,

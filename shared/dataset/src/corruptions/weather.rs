@@ -104,15 +104,15 @@ pub(super) fn frost(raster: &Raster<3>, level: usize, rng: &mut impl Rng) -> Ras
 fn frosted(noises: &[ValueNoise; 8], x: f32, y: f32) -> f32 {
     let [patch, patches, bend, needle, branch, grain, veil, place] = *noises;
     let cover = 0.65 * patch.at(x / 75.0, y / 75.0) + 0.35 * patches.at(x / 30.0, y / 30.0);
-    let cover = ((cover - 0.3) * 2.4).clamp(0.0, 1.0);
+    let cover = ((cover - 0.34) * 3.2).clamp(0.0, 1.0);
     let bent = 5.0 * bend.at(x / 12.0, y / 12.0);
     let (dx, dy, cell) = crystal(place, x + bent, y - bent);
     let (away, angle) = (dx.hypot(dy), dy.atan2(dx));
     let needles = needle.ridge(angle * 4.5 + cell, away / 45.0 + cell).powi(3);
     let branches = branch.ridge(away / 3.5 - 2.0 * needles, angle * 3.0 + cell).powi(3);
     let grains = grain.at(x / 2.2, y / 2.2) - 0.5;
-    let thick = 0.26 + 0.55 * needles + 0.3 * branches * needles + 0.22 * grains;
-    (0.16 * veil.at(x / 110.0, y / 110.0) + cover * thick).clamp(0.0, 1.0)
+    let thick = 0.34 + 0.75 * needles + 0.3 * branches * needles + 0.25 * grains;
+    (0.07 * veil.at(x / 110.0, y / 110.0) + cover * thick).clamp(0.0, 1.0)
 }
 
 /// Returns the position relative to the middle of the nearest crystal, and a number of the crystal.
