@@ -25,7 +25,7 @@ fn street(width_px: u32, height_px: u32) -> Image {
     for (i, pixel) in image.rgb.chunks_exact_mut(3).enumerate() {
         let u = (i as u32 % width_px) as f64 / f64::from(width_px);
         let v = (i as u32 / width_px) as f64 / f64::from(height_px);
-        let fine = if (u * 37.0) as u32 % 3 == 0 && (v * 29.0) as u32 % 4 == 0 { 35.0 } else { 0.0 };
+        let fine = 25.0 * (u * 61.0 + v * 7.0).sin() * (v * 53.0 - u * 5.0).sin();
         let colour = match (u, v) {
             (0.1..0.35, 0.3..0.7) => [150.0, 70.0, 60.0],
             (0.55..0.7, 0.5..0.65) => [220.0, 180.0, 30.0],

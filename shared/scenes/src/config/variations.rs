@@ -14,7 +14,8 @@ pub enum VariationRole {
     HeldOut,
 }
 
-/// A vehicle that may replace the dynamic vehicle. Places, cameras and all other things stay as they are.
+/// A vehicle that may replace the dynamic vehicle. Places, cameras and all other things stay
+/// the same.
 #[derive(Clone, Debug, PartialEq, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct AppearanceConfig {
