@@ -17,6 +17,7 @@
 
 mod calibration;
 mod camera;
+mod corruptions;
 mod dataset;
 mod degrade;
 pub mod drives;
@@ -41,6 +42,7 @@ mod writer;
 
 pub use calibration::{Calibration, CalibrationError, DistortionModel};
 pub use carff_messages::Observability;
+pub use corruptions::{Corruption, CorruptionError};
 pub use dataset::Dataset;
 pub use degrade::{Degradation, degrade};
 pub use equivalence::Equivalence;

@@ -26,6 +26,7 @@ const FROM_MOVING: f32 = 0.05 / 0.45;
 const MAX_TRIES: usize = 400;
 
 /// Spaces that no camera may enter.
+#[derive(Clone)]
 pub(crate) struct Obstacles {
     boxes: Vec<Aabb>,
     lowest: f32,

@@ -1,6 +1,10 @@
 //! The scenario file: static objects, moving actors per branch, and cameras. All lengths are metres, all angles
 //! degrees, +Z is up, and the ground is z = 0. Unknown keys and values out of range are errors.
 
+mod variations;
+
+pub use variations::{AppearanceConfig, BystanderConfig, BystanderKind, BystanderPlace, VariationRole};
+
 use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::de::Error as _;
 use serde::{Deserialize, Deserializer};
@@ -68,6 +72,13 @@ pub struct ScenarioConfig {
     /// Objects made of simple shapes, static or moving.
     #[serde(default)]
     pub object: Vec<ObjectConfig>,
+    /// Vehicles that may replace the dynamic vehicle. Datasets and free poses show none of them unless one is chosen.
+    #[serde(default)]
+    pub appearance: Vec<AppearanceConfig>,
+    /// Objects that can be added on the road or next to it. Datasets and free poses show none of them unless one is
+    /// added.
+    #[serde(default)]
+    pub bystander: Vec<BystanderConfig>,
     /// Minimum distance of cameras from static things, 0.001 to 100.
     #[serde(default = "default_clearance", deserialize_with = "clearance")]
     pub clearance_m: f64,
@@ -389,6 +400,9 @@ pub struct VehicleConfig {
     pub dynamic: bool,
     /// Poses of the vehicle. In branches without a course, it is absent.
     pub course: Vec<CourseConfig>,
+    /// Rotation of the body about +Z, added to the yaw of its poses: not a key, but part of an appearance.
+    #[serde(skip)]
+    pub heading_deg: f64,
 }
 
 /// Poses of a vehicle in some branches.
@@ -738,6 +752,10 @@ fn elevation<'de, D: Deserializer<'de>>(d: D) -> Result<f64, D::Error> {
 
 fn softness<'de, D: Deserializer<'de>>(d: D) -> Result<f64, D::Error> {
     in_range(d, 0.0, 10.0, "an angle")
+}
+
+fn heading<'de, D: Deserializer<'de>>(d: D) -> Result<f64, D::Error> {
+    in_range(d, -180.0, 180.0, "an angle")
 }
 
 fn whole<'de, D: Deserializer<'de>>(d: D, low: i64, high: i64) -> Result<i64, D::Error> {

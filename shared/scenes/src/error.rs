@@ -83,10 +83,39 @@ pub enum ScenarioError {
         /// Number of drawn poses.
         tries: u32,
     },
+    /// The scenario has no appearance or bystander of this name.
+    #[error("{}: there is no `{key}` named `{name}`{}", path.display(), listed(known, name))]
+    NoSuchVariation {
+        /// Path of the scenario file.
+        path: PathBuf,
+        /// Key of its table: `appearance` or `bystander`.
+        key: &'static str,
+        /// Requested name.
+        name: String,
+        /// Names in the file.
+        known: Vec<String>,
+    },
+    /// No branch can show the unknown at this time step.
+    #[error("{}: {problem}", path.display())]
+    NothingUnknown {
+        /// Path of the scenario file.
+        path: PathBuf,
+        /// The missing part.
+        problem: &'static str,
+    },
     /// The dataset cannot be written.
     #[error(transparent)]
     Dataset(#[from] DatasetError),
     /// The caller stopped the rendering.
     #[error("rendering was stopped; run it again to finish the dataset")]
     Stopped,
+}
+
+/// Returns the known names, with the nearest one.
+fn listed(known: &[String], name: &str) -> String {
+    if known.is_empty() {
+        return "; the file has none".to_owned();
+    }
+    let hint = carff_base::names::hint(name, known.iter().map(String::as_str));
+    format!("; there are {}{hint}", known.iter().map(|k| format!("`{k}`")).collect::<Vec<_>>().join(", "))
 }

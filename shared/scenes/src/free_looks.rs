@@ -54,16 +54,23 @@ impl Scenario {
     /// # }
     /// ```
     pub fn free_pose(&self, number: u64, seed: u64) -> Result<FreePose, ScenarioError> {
-        let info = self.info();
-        let inputs = info.timestamps.saturating_sub(1).max(1) as u64;
+        let (drive, timestamp) = self.free_course(number, seed)?;
+        let (camera, _) = self.free_view(&drive, timestamp);
+        let looks = self.looks(&drive, timestamp, &camera);
+        Ok(FreePose { view_kind: drive.view_kind().to_owned(), timestamp, camera, looks })
+    }
+
+    /// Draws pose `number` as a drive through the first branch, with the time step of its looks.
+    pub(crate) fn free_course(&self, number: u64, seed: u64) -> Result<(FreeDrive, usize), ScenarioError> {
+        let timestamps = self.info().timestamps;
+        let inputs = timestamps.saturating_sub(1).max(1) as u64;
         let timestamp = ((number / 2) % inputs) as usize;
         for sample in 0..MAX_TRIES {
             let mut rng = carff_base::random::stream(Key { seed, frame: number, step: STREAM, sample });
             let (view_kind, course) = self.course(0, number.is_multiple_of(2), &mut rng)?;
-            let drive = FreeDrive::of_course(0, info.timestamps, view_kind.clone(), course);
+            let drive = FreeDrive::of_course(0, timestamps, view_kind, course);
             if self.stands_clear(&drive, timestamp) {
-                let (camera, _) = self.free_view(&drive, timestamp);
-                return Ok(FreePose { view_kind, timestamp, camera, looks: self.looks(&drive, timestamp, &camera) });
+                return Ok((drive, timestamp));
             }
         }
         Err(ScenarioError::NoPose { path: self.path().to_owned(), tries: MAX_TRIES })

@@ -14,6 +14,7 @@
 //! # }
 //! ```
 
+mod bystanders;
 mod cameras;
 pub mod config;
 mod error;
@@ -26,6 +27,8 @@ mod scenario;
 mod scenery;
 mod shapes;
 mod tracer;
+mod unknown_looks;
+mod variations;
 
 pub use cameras::ScenarioCamera;
 pub use error::ScenarioError;
@@ -35,3 +38,4 @@ pub use scenario::{
     ActorView, Detail, Extras, FULL_FRACTION, FULL_PIXELS, NONE_FRACTION, NONE_MEAN_DIFFERENCE, RenderOptions,
     Rendering, Scenario,
 };
+pub use unknown_looks::{IN_SIGHT_PX, UnknownLook, VISIBLE_DIFFERENCE};

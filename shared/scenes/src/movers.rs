@@ -136,7 +136,7 @@ impl<'a> Mover<'a> {
     pub fn bodies(&self, pose: Pose, object: u16) -> Vec<Body> {
         let [x, y, z] = pose.position_m;
         match self {
-            Self::Vehicle(v) => vehicle_bodies(v, [x, y, pose.yaw], object),
+            Self::Vehicle(v) => vehicle_bodies(v, [x, y, pose.yaw + v.heading_deg.to_radians()], object),
             Self::Object(_) => self
                 .parts(pose.variant)
                 .into_iter()
@@ -171,10 +171,10 @@ impl<'a> Mover<'a> {
     /// Returns its bounding box at a pose; `None` for an object without parts.
     pub fn named_box(&self, pose: Pose) -> Option<NamedBox> {
         let [x, y, z] = pose.position_m;
-        let (center, half_size, role) = match self {
+        let (center, half_size, heading, role) = match self {
             Self::Vehicle(v) => {
                 let [l, w, h] = v.size_m;
-                ([x, y, h / 2.0], [l / 2.0, w / 2.0, h / 2.0], &v.role)
+                ([x, y, h / 2.0], [l / 2.0, w / 2.0, h / 2.0], v.heading_deg.to_radians(), &v.role)
             }
             Self::Object(o) => {
                 let boxes = self.parts(pose.variant).into_iter().map(|(solid, _)| solid.aabb());
@@ -186,13 +186,13 @@ impl<'a> Mover<'a> {
                 let middle = ((low + high) * 0.5).to_array().map(round);
                 let (s, c) = pose.yaw.sin_cos();
                 let center = [x + c * middle[0] - s * middle[1], y + s * middle[0] + c * middle[1], z + middle[2]];
-                (center, ((high - low) * 0.5).to_array().map(round), &o.role)
+                (center, ((high - low) * 0.5).to_array().map(round), 0.0, &o.role)
             }
         };
         Some(NamedBox {
             name: self.name().to_owned(),
             role: Some(role.clone()),
-            oriented_box: OrientedBox { center, half_size, yaw: pose.yaw },
+            oriented_box: OrientedBox { center, half_size, yaw: pose.yaw + heading },
             dynamic: self.dynamic(),
         })
     }

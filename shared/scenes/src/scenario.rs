@@ -123,6 +123,16 @@ pub struct Scenario {
     placements: Vec<Vec<Placement>>,
     actor: Option<Actor>,
     scenes: HashMap<PlacementKey, Scene>,
+    unknown: Unknown,
+}
+
+/// The part of a scenario that its file does not place: see [`Scenario::with_appearance`].
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Unknown {
+    /// True if the dynamic vehicle has another appearance.
+    pub appearance: bool,
+    /// Number of added bystanders: the last movers.
+    pub bystanders: usize,
 }
 
 impl std::fmt::Debug for Scenario {
@@ -176,24 +186,7 @@ impl Scenario {
         let (placements, actor, hazard_branches) = check(&source, &config)?;
 
         let scenery = scenery(&config);
-        let mut scenes = HashMap::new();
-        let (mut still_bodies, mut moving_bodies): (Vec<Body>, Vec<Body>) = (Vec::new(), Vec::new());
-        let mut build = |placement: &Placement| {
-            scenes.entry(key_of(placement)).or_insert_with(|| {
-                let (still, moving) = placed(&config, &scenery, placement);
-                still_bodies.clone_from(&still);
-                moving_bodies.extend(moving.iter().cloned());
-                Scene::new(scenery.bodies.iter().cloned().chain(still).chain(moving).collect())
-            });
-        };
-        for steps in &placements {
-            for (timestamp, placement) in steps.iter().enumerate() {
-                build(placement);
-                for other in counterparts(placement, &placements, actor.as_ref(), timestamp) {
-                    build(&other);
-                }
-            }
-        }
+        let (scenes, [still_bodies, moving_bodies]) = scenes(&config, &scenery, &placements, actor.as_ref());
         let obstacles = Obstacles::new(
             config.clearance_m as f32,
             scenery.bodies.iter().chain(&still_bodies).map(|b| b.solid.aabb()),
@@ -223,7 +216,42 @@ impl Scenario {
             placements,
             actor,
             scenes,
+            unknown: Unknown::default(),
         })
+    }
+
+    /// Returns the scenario with another configuration of its movers, of which the last `added` are new and at rest.
+    /// Cameras, and the spaces that no camera may enter, are unchanged.
+    pub(crate) fn varied(&self, config: ScenarioConfig, unknown: Unknown, added: usize) -> Self {
+        let mut placements = self.placements.clone();
+        let known = movers(&config).count() - added;
+        for placement in placements.iter_mut().flatten() {
+            placement.extend(movers(&config).skip(known).map(|mover| mover.still()));
+        }
+        let info = info(&config, &self.scenery, &placements, self.info.hazard_branches.clone());
+        Self {
+            path: self.path.clone(),
+            scenes: scenes(&config, &self.scenery, &placements, self.actor.as_ref()).0,
+            info: ScenarioInfo { bev_view: self.info.bev_view, ..info },
+            scenery: self.scenery.clone(),
+            setting: self.setting.clone(),
+            obstacles: self.obstacles.clone(),
+            cameras: self.cameras.clone(),
+            actor: self.actor.clone(),
+            config,
+            placements,
+            unknown,
+        }
+    }
+
+    /// Returns the part of the scenario that its file does not place.
+    pub(crate) fn unknown(&self) -> &Unknown {
+        &self.unknown
+    }
+
+    /// Returns the dynamic mover and its followers, as indices of movers; empty if nothing is dynamic.
+    pub(crate) fn actors(&self) -> Vec<usize> {
+        self.actor.iter().flat_map(|actor| std::iter::once(actor.dynamic).chain(actor.followers.clone())).collect()
     }
 
     /// Returns the path of its file.
@@ -574,6 +602,34 @@ fn reach(camera: &PinholeCamera, points: impl Iterator<Item = [f64; 3]>) -> ([i6
     }
 }
 
+/// Returns the scenes of all states and of their counterparts, and the solids of movers at rest and in motion.
+fn scenes(
+    config: &ScenarioConfig,
+    scenery: &Scenery,
+    placements: &[Vec<Placement>],
+    actor: Option<&Actor>,
+) -> (HashMap<PlacementKey, Scene>, [Vec<Body>; 2]) {
+    let mut scenes = HashMap::new();
+    let (mut still_bodies, mut moving_bodies): (Vec<Body>, Vec<Body>) = (Vec::new(), Vec::new());
+    let mut build = |placement: &Placement| {
+        scenes.entry(key_of(placement)).or_insert_with(|| {
+            let (still, moving) = placed(config, scenery, placement);
+            still_bodies.clone_from(&still);
+            moving_bodies.extend(moving.iter().cloned());
+            Scene::new(scenery.bodies.iter().cloned().chain(still).chain(moving).collect())
+        });
+    };
+    for steps in placements {
+        for (timestamp, placement) in steps.iter().enumerate() {
+            build(placement);
+            for other in counterparts(placement, placements, actor, timestamp) {
+                build(&other);
+            }
+        }
+    }
+    (scenes, [still_bodies, moving_bodies])
+}
+
 /// Returns the solids of static objects and of all placed movers.
 fn placed(config: &ScenarioConfig, scenery: &Scenery, placement: &Placement) -> (Vec<Body>, Vec<Body>) {
     let (mut still, mut moving) = (Vec::new(), Vec::new());
@@ -744,7 +800,25 @@ fn check(source: &Source, config: &ScenarioConfig) -> Result<Checked, ScenarioEr
             return Err(source.error_at(&group.vehicle, "vehicle", problem));
         }
     }
+    check_variations(source, config)?;
     Ok((placements, actor, hazard_branches))
+}
+
+/// Checks that appearances have a dynamic vehicle, and that names occur once.
+fn check_variations(source: &Source, config: &ScenarioConfig) -> Result<(), ScenarioError> {
+    if !config.appearance.is_empty() && !config.vehicle.iter().any(|v| v.dynamic) {
+        return Err(source.error_in("appearance", "no vehicle is dynamic; set `dynamic = true` of the one to replace"));
+    }
+    let twice =
+        |names: Vec<&str>| (1..names.len()).find(|i| names[..*i].contains(&names[*i])).map(|i| names[i].to_owned());
+    if let Some(name) = twice(config.appearance.iter().map(|a| a.name.as_str()).collect()) {
+        return Err(source.error_in("appearance", format!("`{name}` is named twice")));
+    }
+    let objects = movers(config).map(|m| m.name()).chain(config.bystander.iter().map(|b| b.name.as_str()));
+    match twice(objects.collect()) {
+        Some(name) => Err(source.error_in("bystander", format!("`{name}` is named twice"))),
+        None => Ok(()),
+    }
 }
 
 fn info(
