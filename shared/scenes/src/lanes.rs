@@ -19,6 +19,11 @@ impl Scenario {
         self.config().road.iter().map(road).collect()
     }
 
+    /// Returns the name of the vehicle with the role `ego`.
+    pub fn ego_name(&self) -> Option<&str> {
+        self.config().vehicle.iter().find(|v| v.role == "ego").map(|v| v.name.as_str())
+    }
+
     /// Returns the length of the vehicle with the role `ego`, metres; `None` without one.
     pub fn ego_length_m(&self) -> Option<f64> {
         self.config().vehicle.iter().find(|v| v.role == "ego").map(|v| v.size_m[0])

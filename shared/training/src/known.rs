@@ -15,13 +15,15 @@ use carff_evaluation::{PosedImages, Progress};
 use carff_field::{Field, InstructionSet};
 use carff_messages::LATENT_DIM;
 use carff_scenes::Scenario;
-use carff_unknown::{CameraLimits, Comparer, Comparison, Known, Lanes, Measured};
+use carff_unknown::{CameraLimits, Comparer, Comparison, Known, Lanes, Measured, OwnBox};
 use std::path::Path;
 
 /// Part of the seed of these images, so that they share no draws with training, thresholds or evaluation.
 const KNOWN: u64 = tag("known");
 /// Length of the vehicle that carries the camera, times this, is the distance below which nothing is judged.
 const BEYOND_VEHICLE: f64 = 1.25;
+/// Margin of the vehicle's own pose, metres.
+const POSE_MARGIN_M: f64 = 0.5;
 /// Share of a place's size by which the ground around it counts, where a scenario has no roads.
 const AROUND_PLACE: f64 = 0.75;
 /// Largest number of images of the dataset on which the camera's limits rest.
@@ -139,7 +141,21 @@ fn lanes(manifest: &Manifest, field: &Field, scenario: Option<&Scenario>) -> Lan
         ground_m: low[2],
         bounds_m: [[low[0], low[1]], [high[0], high[1]]],
         nearest_m: length_m.map_or(0.0, |length| length * BEYOND_VEHICLE),
+        own: if has_roads { own_boxes(manifest, scenario) } else { Vec::new() },
     }
+}
+
+/// Boxes of the scenario's ego vehicle in the known states, with the margin of its pose.
+fn own_boxes(manifest: &Manifest, scenario: Option<&Scenario>) -> Vec<OwnBox> {
+    let ego = scenario.and_then(Scenario::ego_name);
+    let places = manifest.places.iter().filter(|place| Some(place.name.as_str()) == ego);
+    places
+        .map(|place| OwnBox {
+            oriented_box: place.oriented_box,
+            margin_m: POSE_MARGIN_M,
+            states: place.occupied_in.clone(),
+        })
+        .collect()
 }
 
 /// Limits of a camera in order, from the trained images with sensor noise.

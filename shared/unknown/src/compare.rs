@@ -96,8 +96,18 @@ impl Comparer {
         let image = reduced(image, width, height);
         let still = |i: usize| judged[i] && !pictures[0].changing[i];
         let fit = fit(&image, &pictures[0].rgb, still);
-        let residual = |picture: &RenderBuffer| residual(&image, &picture.rgb, &fit, &judged, width);
-        let residuals = pictures.iter().map(residual).collect();
+        let energy = |picture: &RenderBuffer| energy(&image, &picture.rgb, &fit, &judged, width);
+        let energies: Vec<Vec<f32>> = pictures.iter().map(energy).collect();
+        let of_state = |(state, energy): (usize, &Vec<f32>)| {
+            let mut energy = energy.clone();
+            // The vehicle itself stands a little beside its known place: a pixel at its edge may show it, or what any
+            // other state has there.
+            for (i, _) in lanes.own_edges(&small, state).into_iter().enumerate().filter(|(_, own)| *own) {
+                energy[i] = energies.iter().map(|other| other[i]).fold(f32::INFINITY, f32::min);
+            }
+            smoothed(&energy, &judged, width, fit.noise)
+        };
+        let residuals: Vec<Vec<f32>> = energies.iter().enumerate().map(of_state).collect();
         Some(Comparison { camera: small, image, fit, ground, judged, residuals })
     }
 
@@ -194,36 +204,34 @@ fn line(pairs: impl Iterator<Item = (f32, f32)>) -> Option<(f32, f32)> {
     Some((slope as f32, ((sy - slope * sx) / n) as f32))
 }
 
-/// Distance of each pixel from the range of its neighbours' rendered values, smoothed over 3 x 3 pixels, in deviations.
-/// The range forgives what a blurred edge, or a pose that is off by half a pixel, changes.
-fn residual(image: &[f32], rendered: &[f32], fit: &Fit, judged: &[bool], width: usize) -> Vec<f32> {
+/// Pixels of a 3 x 3 neighbourhood that were compared.
+fn neighbours(i: usize, judged: &[bool], width: usize) -> impl Iterator<Item = usize> {
     let height = judged.len() / width.max(1);
     let around = |v: usize, n: usize| v.saturating_sub(1)..(v + 2).min(n);
-    let neighbours = |i: usize| {
-        let (x, y) = (i % width, i / width);
-        let all = around(y, height).flat_map(move |y| around(x, width).map(move |x| y * width + x));
-        all.filter(|&n| judged[n])
+    let (columns, rows) = (around(i % width, width), around(i / width, height));
+    let all = rows.flat_map(move |y| columns.clone().map(move |x| y * width + x));
+    all.filter(|&n| judged[n])
+}
+
+/// Squared distance of each pixel from the range of its neighbours' rendered values, summed over the channels. The
+/// range forgives what a blurred edge, or a pose that is off by half a pixel, changes.
+fn energy(image: &[f32], rendered: &[f32], fit: &Fit, judged: &[bool], width: usize) -> Vec<f32> {
+    let of_channel = |i: usize, c: usize| {
+        let expected = neighbours(i, judged, width).map(|n| fit.gain[c] * rendered[n * 3 + c] + fit.offset[c]);
+        let (low, high) = expected.fold((f32::INFINITY, f32::NEG_INFINITY), |(l, h), v| (l.min(v), h.max(v)));
+        let seen = image[i * 3 + c];
+        (seen - high).max(low - seen).max(0.0).powi(2)
     };
-    let energy: Vec<f32> = (0..judged.len())
-        .map(|i| {
-            if !judged[i] {
-                return 0.0;
-            }
-            let of_channel = |c: usize| {
-                let expected = neighbours(i).map(|n| fit.gain[c] * rendered[n * 3 + c] + fit.offset[c]);
-                let (low, high) = expected.fold((f32::INFINITY, f32::NEG_INFINITY), |(l, h), v| (l.min(v), h.max(v)));
-                let seen = image[i * 3 + c];
-                (seen - high).max(low - seen).max(0.0).powi(2)
-            };
-            (0..3).map(of_channel).sum()
-        })
-        .collect();
-    (0..judged.len())
-        .map(|i| {
-            let (sum, n) = neighbours(i).fold((0.0, 0), |(sum, n), at| (sum + energy[at], n + 3));
-            if judged[i] { (sum / n.max(1) as f32).sqrt() / fit.noise } else { 0.0 }
-        })
-        .collect()
+    (0..judged.len()).map(|i| if judged[i] { (0..3).map(|c| of_channel(i, c)).sum() } else { 0.0 }).collect()
+}
+
+/// Root mean square over 3 x 3 pixels and channels, in deviations.
+fn smoothed(energy: &[f32], judged: &[bool], width: usize, noise: f32) -> Vec<f32> {
+    let of_pixel = |i: usize| {
+        let (sum, n) = neighbours(i, judged, width).fold((0.0, 0), |(sum, n), at| (sum + energy[at], n + 3));
+        (sum / n.max(1) as f32).sqrt() / noise
+    };
+    (0..judged.len()).map(|i| if judged[i] { of_pixel(i) } else { 0.0 }).collect()
 }
 
 #[cfg(test)]
@@ -262,7 +270,7 @@ mod tests {
             .collect();
         let fit = Fit { gain: [1.0; 3], offset: [0.0; 3], noise: LEAST_NOISE };
         let judged = vec![true; width * width];
-        let out = residual(&seen, &rendered, &fit, &judged, width);
+        let out = smoothed(&energy(&seen, &rendered, &fit, &judged, width), &judged, width, fit.noise);
         assert!(out[22 * width + 6] > 20.0);
         let elsewhere =
             (0..width * width).filter(|i| !(2..11).contains(&(i % width)) || !(18..27).contains(&(i / width)));

@@ -15,10 +15,10 @@ const FILE: &str = "known.json";
 /// Version of the file's format.
 const FORMAT_VERSION: u32 = 1;
 /// Steepness of the evidence against a state beyond the limit: at 1.5 times the limit, something unknown explains the
-/// image a hundred times better.
-const STEEPNESS: f64 = 12.0;
+/// image 58 times better.
+const STEEPNESS: f64 = 10.0;
 /// Share of the known images that leave less than the limit.
-const WITHIN: f64 = 0.99;
+const WITHIN: f64 = 0.97;
 
 /// What a checkpoint takes as known, calibrated on images of known states from poses of no other use.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -30,7 +30,7 @@ pub struct Known {
     pub lanes: Lanes,
     /// The field's own errors on that ground.
     pub errors: ErrorMap,
-    /// Strength of a blob that 99 of 100 images of known states stay below.
+    /// Strength of a blob that 97 of 100 images of known states stay below.
     pub limit: f32,
     /// Number of images that the limit rests on.
     pub images: usize,
@@ -71,16 +71,16 @@ pub struct Seen {
 }
 
 impl Known {
-    /// Fits the limits. Residuals of even images make the error map, and those of odd ones the limit, each under the
-    /// image's own best state.
+    /// Fits the limits. Residuals of the first half of the images make the error map, and those of the second half the
+    /// limit, each under the image's own best state.
     pub fn fit(lanes: Lanes, comparisons: &[Comparison], camera: CameraLimits) -> Self {
         let mut points = Vec::new();
-        for comparison in comparisons.iter().step_by(2) {
+        let (for_errors, for_limit) = comparisons.split_at(comparisons.len() / 2);
+        for comparison in for_errors {
             points.extend(comparison.on_lanes(best_by_sum(comparison)));
         }
         let errors = ErrorMap::fit(&lanes, &points);
-        let mut strengths: Vec<f32> =
-            comparisons.iter().skip(1).step_by(2).map(|c| least_strength(c, &errors)).collect();
+        let mut strengths: Vec<f32> = for_limit.iter().map(|c| least_strength(c, &errors)).collect();
         strengths.sort_by(f32::total_cmp);
         let at = ((strengths.len() as f64 * WITHIN).ceil() as usize).saturating_sub(1);
         let limit = strengths.get(at).copied().unwrap_or(1.0).max(1.0);

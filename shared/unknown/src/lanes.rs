@@ -18,6 +18,20 @@ pub struct Lanes {
     pub bounds_m: [[f64; 2]; 2],
     /// Distance from the camera below which nothing is judged, metres: the vehicle that carries the camera.
     pub nearest_m: f64,
+    /// Boxes of the vehicle itself, which knows where it stands: nothing is judged behind them.
+    pub own: Vec<OwnBox>,
+}
+
+/// The vehicle itself in some of the known states.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct OwnBox {
+    /// Box of the vehicle, metres, world space.
+    pub oriented_box: OrientedBox,
+    /// Margin of its pose, metres.
+    pub margin_m: f64,
+    /// For each known state, true if the vehicle stands there.
+    pub states: Vec<bool>,
 }
 
 impl Lanes {
@@ -26,6 +40,23 @@ impl Lanes {
         let [low, high] = self.bounds_m;
         let inside = x >= low[0] && x <= high[0] && y >= low[1] && y <= high[1];
         inside && self.areas.iter().any(|area| area.contains([x, y, area.center[2]]))
+    }
+
+    /// Returns for each pixel of a camera, row by row, true if it looks at the edge of the vehicle itself in a state.
+    pub fn own_edges(&self, camera: &PinholeCamera, state: usize) -> Vec<bool> {
+        let [x, y, _] = camera.position_m();
+        let stands = |own: &&OwnBox| own.states.get(state) == Some(&true);
+        // A camera on the vehicle sees none of it beyond the nearest distance.
+        let is_elsewhere = |own: &&OwnBox| !own.oriented_box.contains([x, y, own.oriented_box.center[2]]);
+        let boxes: Vec<[OrientedBox; 2]> =
+            self.own.iter().filter(stands).filter(is_elsewhere).map(OwnBox::edges).collect();
+        let pixels = (0..camera.height_px).flat_map(|y| (0..camera.width_px).map(move |x| (x, y)));
+        pixels
+            .map(|(x, y)| {
+                let ray = camera.ray(f64::from(x) + 0.5, f64::from(y) + 0.5);
+                boxes.iter().any(|[outer, inner]| outer.is_met_by(&ray) && !inner.is_met_by(&ray))
+            })
+            .collect()
     }
 
     /// Returns the points of the ground that the pixels of a camera look at, row by row: distance along the ray and
@@ -45,6 +76,16 @@ impl Lanes {
                 })
             })
             .collect()
+    }
+}
+
+impl OwnBox {
+    /// The boxes that its edges lie between.
+    fn edges(&self) -> [OrientedBox; 2] {
+        [self.margin_m, -self.margin_m].map(|by| OrientedBox {
+            half_size: self.oriented_box.half_size.map(|half| (half + by).max(0.1 * half)),
+            ..self.oriented_box
+        })
     }
 }
 
@@ -96,7 +137,8 @@ impl ErrorMap {
     }
 
     /// Fits a map on residuals of known images: points of the ground with the residual of the pixel that looks at it.
-    /// A cell has the 90th percentile of its own and its neighbours' residuals, but at least the median cell's.
+    /// A cell has the 90th percentile of its own and its neighbours' residuals, but at least the median cell's and one
+    /// deviation.
     pub fn fit(lanes: &Lanes, points: &[([f64; 2], f32)]) -> Self {
         let mut map = Self::even(lanes, 1.0);
         let [columns, rows] = map.size;
@@ -119,7 +161,7 @@ impl ErrorMap {
             }
         }
         measured.sort_by(f32::total_cmp);
-        let median = measured.get(measured.len() / 2).copied().unwrap_or(1.0).max(0.1);
+        let median = measured.get(measured.len() / 2).copied().unwrap_or(1.0).max(1.0);
         map.residual.iter_mut().for_each(|value| *value = value.max(median));
         map
     }
@@ -143,6 +185,7 @@ mod tests {
             ground_m: 0.0,
             bounds_m: [[-8.0, -8.0], [8.0, 8.0]],
             nearest_m: 2.0,
+            own: Vec::new(),
         }
     }
 

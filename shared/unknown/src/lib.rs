@@ -18,4 +18,4 @@ pub use blobs::Blob;
 pub use camera::{CameraCheck, CameraLimits, Measured, Measurement};
 pub use compare::{Comparer, Comparison, Fit};
 pub use known::{Known, KnownError, Seen};
-pub use lanes::{ErrorMap, Lanes};
+pub use lanes::{ErrorMap, Ground, Lanes, OwnBox};
