@@ -151,9 +151,9 @@ mod tests {
         assert_eq!(count(&rainy(0.0)) + count(&Augmentation::default()), 0);
         assert_eq!(count(&rainy(1.0)), 400);
         assert_eq!(rainy(1.0).weathered(&image, key(9)), rainy(1.0).weathered(&image, key(9)));
-        let grey = image.rgb.chunks(3).map(|_| [112_u8; 3]).collect::<Vec<_>>().concat();
+        let grey = Corruption::Monochrome.apply(&image, 1, key(0)).unwrap();
         let made = (0..40).filter_map(|frame| rainy(1.0).weathered(&image, key(frame)));
-        let monochrome = made.filter(|made| made.rgb == grey).count();
+        let monochrome = made.filter(|made| *made == grey).count();
         assert!((5..=35).contains(&monochrome), "both kinds occur: {monochrome} of 40");
     }
 
