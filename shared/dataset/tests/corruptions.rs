@@ -26,7 +26,8 @@ fn street(width_px: u32, height_px: u32) -> Image {
         let u = (i as u32 % width_px) as f64 / f64::from(width_px);
         let v = (i as u32 / width_px) as f64 / f64::from(height_px);
         let fine = 25.0 * (u * 61.0 + v * 7.0).sin() * (v * 53.0 - u * 5.0).sin();
-        let colour = match (u, v) {
+        // Slanted edges, because large pixels may match upright ones by chance.
+        let colour = match (u + 0.13 * v, v + 0.09 * u) {
             (0.1..0.35, 0.3..0.7) => [150.0, 70.0, 60.0],
             (0.55..0.7, 0.5..0.65) => [220.0, 180.0, 30.0],
             (0.8..0.84, 0.2..0.8) => [40.0, 90.0, 160.0],

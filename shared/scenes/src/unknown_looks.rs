@@ -67,7 +67,9 @@ impl Scenario {
         let (branch, parts) = self.unknown_parts(timestamp)?;
         let placement = self.free_view(&drive.through(branch), timestamp).1;
         let mut known = placement.clone();
-        parts.iter().for_each(|&part| known[part] = None);
+        for &part in &parts {
+            known[part] = None;
+        }
         let (image, without) = (self.picture_of(&placement, &camera), self.picture_of(&known, &camera));
         Ok(UnknownLook {
             view_kind: drive.view_kind().to_owned(),

@@ -82,7 +82,7 @@ fn an_appearance_turns_the_vehicle() {
     let scenario = shipped("approaching-intersection");
     let look = scenario.appearances().iter().find(|a| a.heading_deg != 0.0).unwrap();
     let turned = scenario.with_appearance(&look.name).unwrap();
-    let of = |scenario: &Scenario| scenario.info().candidates[0].named_box.oriented_box.clone();
+    let of = |scenario: &Scenario| scenario.info().candidates[0].named_box.oriented_box;
     let (old, new) = (of(&scenario), of(&turned));
     assert_eq!(old.center[..2], new.center[..2]);
     assert!((new.yaw - old.yaw - look.heading_deg.to_radians()).abs() < 1e-12);

@@ -316,6 +316,7 @@ impl TrainingConfig {
             ("augmentation.shift", self.augmentation.shift, 0.5),
             ("augmentation.zoom", self.augmentation.zoom, 0.5),
             ("augmentation.rotation_deg", self.augmentation.rotation_deg, 45.0),
+            ("augmentation.weather", self.augmentation.weather, 1.0),
         ];
         for (key, value, high) in numbers {
             if !(0.0..=high).contains(&value) {
@@ -332,6 +333,7 @@ impl TrainingConfig {
         if self.vae.other_poses > 0 && !self.decoder.pose_condition {
             return Err("`vae.other_poses` asks the decoder for poses: set `decoder.pose_condition` to true".into());
         }
+        self.augmentation.validate_weather()?;
         self.field.validate().map_err(|e| format!("[field] {e}"))?;
         self.calibration.sensor.validate().map_err(|e| format!("[calibration.sensor] {e}"))?;
         self.augmentation.sensor.validate().map_err(|e| format!("[augmentation.sensor] {e}"))

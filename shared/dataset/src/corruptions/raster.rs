@@ -90,12 +90,34 @@ impl<const C: usize> Raster<C> {
             return self.clone();
         }
         if sigma_px >= BOX_SIGMA_PX {
-            let even = vec![1.0; 2 * sigma_px.round() as usize + 1];
-            return (0..3).fold(self.clone(), |raster, _| raster.filtered(&even));
+            let radius = sigma_px.round() as isize;
+            let boxed = |raster: Self| raster.averaged_rows(radius).transposed().averaged_rows(radius).transposed();
+            return (0..3).fold(self.clone(), |raster, _| boxed(raster));
         }
         let radius = (3.0 * sigma_px).ceil() as isize;
         let weights: Vec<f32> = (-radius..=radius).map(|i| (-0.5 * (i as f32 / sigma_px).powi(2)).exp()).collect();
         self.filtered(&weights)
+    }
+
+    /// Returns the means of `2 radius + 1` pixels of each row: a running sum.
+    fn averaged_rows(&self, radius: isize) -> Self {
+        let count = (2 * radius + 1) as f32;
+        let mut pixels = Vec::with_capacity(self.pixels.len());
+        for y in 0..self.height as isize {
+            let mut sum = [0.0; C];
+            (-radius..=radius).for_each(|x| (0..C).for_each(|c| sum[c] += self.at(x, y)[c]));
+            for x in 0..self.width as isize {
+                pixels.push(sum.map(|v| v / count));
+                let (enters, leaves) = (self.at(x + radius + 1, y), self.at(x - radius, y));
+                (0..C).for_each(|c| sum[c] += enters[c] - leaves[c]);
+            }
+        }
+        Self { pixels, ..*self }
+    }
+
+    /// Returns the raster with rows and columns exchanged.
+    fn transposed(&self) -> Self {
+        Self::of(self.height, self.width, |x, y| self.pixels[x * self.width + y])
     }
 
     /// Filters rows, then columns, with an odd number of weights.

@@ -62,7 +62,7 @@ impl ValueNoise {
         1.0 - (2.0 * self.at(x, y) - 1.0).abs()
     }
 
-    /// Returns the value of a corner: the SplitMix64 mix of its position.
+    /// Returns the value of a corner: its position, mixed as in `SplitMix64`.
     fn corner(self, x: i64, y: i64) -> f32 {
         let mut h =
             self.0 ^ (x as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15) ^ (y as u64).wrapping_mul(0xc2b2_ae3d_27d4_eb4f);
