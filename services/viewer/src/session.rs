@@ -328,6 +328,7 @@ impl Session {
             None => Resolved {
                 state,
                 state_probabilities: reading.state_probabilities.clone(),
+                unknown_probability: 0.0,
                 hazard_probability: reading.hazard_likelihood,
             },
         };
