@@ -38,6 +38,16 @@ enum {
     CARFF_REASON_INCOMPLETE_BELIEF = 4,
     CARFF_REASON_CONTRADICTORY_BELIEF = 5,
     CARFF_REASON_STOPPING = 6,
+    CARFF_REASON_BLACK_IMAGE = 7,
+    CARFF_REASON_WHITE_IMAGE = 8,
+    CARFF_REASON_FROZEN_IMAGE = 9,
+    CARFF_REASON_COVERED_LENS = 10,
+    CARFF_REASON_OUT_OF_FOCUS = 11,
+    CARFF_REASON_UNDEREXPOSED = 12,
+    CARFF_REASON_OVEREXPOSED = 13,
+    CARFF_REASON_ANOTHER_PLACE = 14,
+    CARFF_REASON_ANOTHER_LENS = 15,
+    CARFF_REASON_CAMERA_CLOCK = 16,
 };
 
 enum {
@@ -172,6 +182,26 @@ static_assert(offsetof(CarffPosterior, header) == 0, "CarffPosterior.header");
 static_assert(offsetof(CarffPosterior, gaussian) == 56, "CarffPosterior.gaussian");
 static_assert(offsetof(CarffPosterior, stage_latency_ns) == 120, "CarffPosterior.stage_latency_ns");
 
+#define CARFF_IMAGE_CHECK_TYPE_NAME "carff.ImageCheck.v1"
+typedef struct CarffImageCheck {
+    CarffHeader header;
+    uint32_t condition;
+    float luminance;
+    float sharpness;
+    float change;
+    float covered;
+    float place_distance;
+} CarffImageCheck;
+
+static_assert(sizeof(CarffImageCheck) == 80, "CarffImageCheck");
+static_assert(offsetof(CarffImageCheck, header) == 0, "CarffImageCheck.header");
+static_assert(offsetof(CarffImageCheck, condition) == 56, "CarffImageCheck.condition");
+static_assert(offsetof(CarffImageCheck, luminance) == 60, "CarffImageCheck.luminance");
+static_assert(offsetof(CarffImageCheck, sharpness) == 64, "CarffImageCheck.sharpness");
+static_assert(offsetof(CarffImageCheck, change) == 68, "CarffImageCheck.change");
+static_assert(offsetof(CarffImageCheck, covered) == 72, "CarffImageCheck.covered");
+static_assert(offsetof(CarffImageCheck, place_distance) == 76, "CarffImageCheck.place_distance");
+
 #define CARFF_FORECAST_TYPE_NAME "carff.Forecast.v1"
 typedef struct CarffForecast {
     CarffHeader header;
@@ -218,7 +248,7 @@ static_assert(offsetof(CarffProbeResult, confidence) == 4, "CarffProbeResult.con
 static_assert(offsetof(CarffProbeResult, hazard_likelihood) == 8, "CarffProbeResult.hazard_likelihood");
 static_assert(offsetof(CarffProbeResult, occupancies) == 12, "CarffProbeResult.occupancies");
 
-#define CARFF_BELIEF_TYPE_NAME "carff.Belief.v2"
+#define CARFF_BELIEF_TYPE_NAME "carff.Belief.v3"
 typedef struct CarffBelief {
     CarffHeader header;
     uint32_t horizon;
@@ -235,7 +265,7 @@ typedef struct CarffBelief {
     CarffProbeResult samples[64];
     uint8_t sample_component[64];
     int32_t resolved_state;
-    uint32_t reserved;
+    float unknown_probability;
     CarffGaussian resolved;
     uint64_t encoder_ns;
     uint64_t forecaster_ns;
@@ -258,11 +288,55 @@ static_assert(offsetof(CarffBelief, components) == 360, "CarffBelief.components"
 static_assert(offsetof(CarffBelief, samples) == 1176, "CarffBelief.samples");
 static_assert(offsetof(CarffBelief, sample_component) == 14232, "CarffBelief.sample_component");
 static_assert(offsetof(CarffBelief, resolved_state) == 14296, "CarffBelief.resolved_state");
-static_assert(offsetof(CarffBelief, reserved) == 14300, "CarffBelief.reserved");
+static_assert(offsetof(CarffBelief, unknown_probability) == 14300, "CarffBelief.unknown_probability");
 static_assert(offsetof(CarffBelief, resolved) == 14304, "CarffBelief.resolved");
 static_assert(offsetof(CarffBelief, encoder_ns) == 14368, "CarffBelief.encoder_ns");
 static_assert(offsetof(CarffBelief, forecaster_ns) == 14376, "CarffBelief.forecaster_ns");
 static_assert(offsetof(CarffBelief, stage_latency_ns) == 14384, "CarffBelief.stage_latency_ns");
+
+#define CARFF_UNKNOWN_BOX_TYPE_NAME "carff.UnknownBox.v1"
+typedef struct CarffUnknownBox {
+    double center[3];
+    double half_size[3];
+    float probability;
+    int32_t place;
+} CarffUnknownBox;
+
+static_assert(sizeof(CarffUnknownBox) == 56, "CarffUnknownBox");
+static_assert(offsetof(CarffUnknownBox, center) == 0, "CarffUnknownBox.center");
+static_assert(offsetof(CarffUnknownBox, half_size) == 24, "CarffUnknownBox.half_size");
+static_assert(offsetof(CarffUnknownBox, probability) == 48, "CarffUnknownBox.probability");
+static_assert(offsetof(CarffUnknownBox, place) == 52, "CarffUnknownBox.place");
+
+#define CARFF_UNKNOWNS_TYPE_NAME "carff.Unknowns.v1"
+typedef struct CarffUnknowns {
+    CarffHeader header;
+    uint32_t box_count;
+    uint32_t state_count;
+    float probability;
+    float residual;
+    float noise;
+    float gain[3];
+    float offset[3];
+    uint32_t reserved;
+    float ratios[64];
+    CarffUnknownBox boxes[8];
+    uint64_t stage_latency_ns;
+} CarffUnknowns;
+
+static_assert(sizeof(CarffUnknowns) == 816, "CarffUnknowns");
+static_assert(offsetof(CarffUnknowns, header) == 0, "CarffUnknowns.header");
+static_assert(offsetof(CarffUnknowns, box_count) == 56, "CarffUnknowns.box_count");
+static_assert(offsetof(CarffUnknowns, state_count) == 60, "CarffUnknowns.state_count");
+static_assert(offsetof(CarffUnknowns, probability) == 64, "CarffUnknowns.probability");
+static_assert(offsetof(CarffUnknowns, residual) == 68, "CarffUnknowns.residual");
+static_assert(offsetof(CarffUnknowns, noise) == 72, "CarffUnknowns.noise");
+static_assert(offsetof(CarffUnknowns, gain) == 76, "CarffUnknowns.gain");
+static_assert(offsetof(CarffUnknowns, offset) == 88, "CarffUnknowns.offset");
+static_assert(offsetof(CarffUnknowns, reserved) == 100, "CarffUnknowns.reserved");
+static_assert(offsetof(CarffUnknowns, ratios) == 104, "CarffUnknowns.ratios");
+static_assert(offsetof(CarffUnknowns, boxes) == 360, "CarffUnknowns.boxes");
+static_assert(offsetof(CarffUnknowns, stage_latency_ns) == 808, "CarffUnknowns.stage_latency_ns");
 
 #define CARFF_VIEW_META_TYPE_NAME "carff.ViewMeta.v1"
 typedef struct CarffViewMeta {
@@ -292,7 +366,7 @@ static_assert(offsetof(CarffViewMeta, intrinsics) == 112, "CarffViewMeta.intrins
 static_assert(offsetof(CarffViewMeta, world_from_camera) == 144, "CarffViewMeta.world_from_camera");
 static_assert(offsetof(CarffViewMeta, stage_latency_ns) == 272, "CarffViewMeta.stage_latency_ns");
 
-#define CARFF_ACTION_TYPE_NAME "carff.Action.v1"
+#define CARFF_ACTION_TYPE_NAME "carff.Action.v2"
 typedef struct CarffAction {
     CarffHeader header;
     uint32_t action;
@@ -302,6 +376,7 @@ typedef struct CarffAction {
     float confidence;
     float hazard_probability;
     uint32_t is_decision;
+    float unknown_probability;
     uint64_t valid_until_ns;
     uint64_t based_on_frame;
     uint64_t latency_ns;
@@ -316,6 +391,7 @@ static_assert(offsetof(CarffAction, sample_count) == 68, "CarffAction.sample_cou
 static_assert(offsetof(CarffAction, confidence) == 72, "CarffAction.confidence");
 static_assert(offsetof(CarffAction, hazard_probability) == 76, "CarffAction.hazard_probability");
 static_assert(offsetof(CarffAction, is_decision) == 80, "CarffAction.is_decision");
+static_assert(offsetof(CarffAction, unknown_probability) == 84, "CarffAction.unknown_probability");
 static_assert(offsetof(CarffAction, valid_until_ns) == 88, "CarffAction.valid_until_ns");
 static_assert(offsetof(CarffAction, based_on_frame) == 96, "CarffAction.based_on_frame");
 static_assert(offsetof(CarffAction, latency_ns) == 104, "CarffAction.latency_ns");
@@ -355,8 +431,10 @@ static_assert(offsetof(CarffHealth, rss_bytes) == 136, "CarffHealth.rss_bytes");
 /* Names of the topics, and of the types of their messages. */
 #define CARFF_TOPIC_CAMERA_FRAME "camera/frame" /* CarffFrameMeta (user header of a slice of bytes) */
 #define CARFF_TOPIC_ENCODER_POSTERIOR "encoder/posterior" /* CarffPosterior */
+#define CARFF_TOPIC_ENCODER_CHECK "encoder/check" /* CarffImageCheck */
 #define CARFF_TOPIC_FORECASTER_FORECAST "forecaster/forecast" /* CarffForecast */
 #define CARFF_TOPIC_PROBER_BELIEF "prober/belief" /* CarffBelief */
+#define CARFF_TOPIC_PROBER_UNKNOWN "prober/unknown" /* CarffUnknowns */
 #define CARFF_TOPIC_RENDERER_VIEW "renderer/view" /* CarffViewMeta (user header of a slice of bytes) */
 #define CARFF_TOPIC_CONTROLLER_ACTION "controller/action" /* CarffAction */
 #define CARFF_TOPIC_HEALTH_CAMERA "health/camera" /* CarffHealth */

@@ -37,6 +37,16 @@ class Reason(IntEnum):
     INCOMPLETE_BELIEF = 4
     CONTRADICTORY_BELIEF = 5
     STOPPING = 6
+    BLACK_IMAGE = 7
+    WHITE_IMAGE = 8
+    FROZEN_IMAGE = 9
+    COVERED_LENS = 10
+    OUT_OF_FOCUS = 11
+    UNDEREXPOSED = 12
+    OVEREXPOSED = 13
+    ANOTHER_PLACE = 14
+    ANOTHER_LENS = 15
+    CAMERA_CLOCK = 16
 
 
 class Rule(IntEnum):
@@ -158,6 +168,22 @@ class Posterior(ctypes.Structure):
         return "carff.Posterior.v1"
 
 
+class ImageCheck(ctypes.Structure):
+    _fields_ = [
+        ("header", Header),
+        ("condition", ctypes.c_uint32),
+        ("luminance", ctypes.c_float),
+        ("sharpness", ctypes.c_float),
+        ("change", ctypes.c_float),
+        ("covered", ctypes.c_float),
+        ("place_distance", ctypes.c_float),
+    ]
+
+    @staticmethod
+    def type_name() -> str:
+        return "carff.ImageCheck.v1"
+
+
 class Forecast(ctypes.Structure):
     _fields_ = [
         ("header", Header),
@@ -210,7 +236,7 @@ class Belief(ctypes.Structure):
         ("samples", (ProbeResult * 64)),
         ("sample_component", (ctypes.c_uint8 * 64)),
         ("resolved_state", ctypes.c_int32),
-        ("reserved", ctypes.c_uint32),
+        ("unknown_probability", ctypes.c_float),
         ("resolved", Gaussian),
         ("encoder_ns", ctypes.c_uint64),
         ("forecaster_ns", ctypes.c_uint64),
@@ -219,7 +245,41 @@ class Belief(ctypes.Structure):
 
     @staticmethod
     def type_name() -> str:
-        return "carff.Belief.v2"
+        return "carff.Belief.v3"
+
+
+class UnknownBox(ctypes.Structure):
+    _fields_ = [
+        ("center", (ctypes.c_double * 3)),
+        ("half_size", (ctypes.c_double * 3)),
+        ("probability", ctypes.c_float),
+        ("place", ctypes.c_int32),
+    ]
+
+    @staticmethod
+    def type_name() -> str:
+        return "carff.UnknownBox.v1"
+
+
+class Unknowns(ctypes.Structure):
+    _fields_ = [
+        ("header", Header),
+        ("box_count", ctypes.c_uint32),
+        ("state_count", ctypes.c_uint32),
+        ("probability", ctypes.c_float),
+        ("residual", ctypes.c_float),
+        ("noise", ctypes.c_float),
+        ("gain", (ctypes.c_float * 3)),
+        ("offset", (ctypes.c_float * 3)),
+        ("reserved", ctypes.c_uint32),
+        ("ratios", (ctypes.c_float * 64)),
+        ("boxes", (UnknownBox * 8)),
+        ("stage_latency_ns", ctypes.c_uint64),
+    ]
+
+    @staticmethod
+    def type_name() -> str:
+        return "carff.Unknowns.v1"
 
 
 class ViewMeta(ctypes.Structure):
@@ -252,6 +312,7 @@ class Action(ctypes.Structure):
         ("confidence", ctypes.c_float),
         ("hazard_probability", ctypes.c_float),
         ("is_decision", ctypes.c_uint32),
+        ("unknown_probability", ctypes.c_float),
         ("valid_until_ns", ctypes.c_uint64),
         ("based_on_frame", ctypes.c_uint64),
         ("latency_ns", ctypes.c_uint64),
@@ -259,7 +320,7 @@ class Action(ctypes.Structure):
 
     @staticmethod
     def type_name() -> str:
-        return "carff.Action.v1"
+        return "carff.Action.v2"
 
 
 class Health(ctypes.Structure):
@@ -292,11 +353,14 @@ LAYOUTS = {
     FrameMeta: (256, 8, {"header": 0, "width_px": 56, "height_px": 60, "intrinsics": 64, "world_from_camera": 96, "dataset_view": 224}),
     Gaussian: (64, 4, {"mean": 0, "log_variance": 32}),
     Posterior: (128, 8, {"header": 0, "gaussian": 56, "stage_latency_ns": 120}),
+    ImageCheck: (80, 8, {"header": 0, "condition": 56, "luminance": 60, "sharpness": 64, "change": 68, "covered": 72, "place_distance": 76}),
     Forecast: (2480, 8, {"header": 0, "source": 56, "component_count": 60, "sample_count": 64, "horizon": 68, "resolved_state": 72, "path_probability": 76, "weights": 80, "components": 96, "samples": 352, "sample_component": 2400, "encoder_ns": 2464, "stage_latency_ns": 2472}),
     ProbeResult: (204, 4, {"state": 0, "confidence": 4, "hazard_likelihood": 8, "occupancies": 12}),
-    Belief: (14392, 8, {"header": 0, "horizon": 56, "state_count": 60, "place_count": 64, "component_count": 68, "sample_count": 72, "is_final": 76, "state_probability": 80, "hazard_probability": 336, "path_probability": 340, "component_weights": 344, "components": 360, "samples": 1176, "sample_component": 14232, "resolved_state": 14296, "reserved": 14300, "resolved": 14304, "encoder_ns": 14368, "forecaster_ns": 14376, "stage_latency_ns": 14384}),
+    Belief: (14392, 8, {"header": 0, "horizon": 56, "state_count": 60, "place_count": 64, "component_count": 68, "sample_count": 72, "is_final": 76, "state_probability": 80, "hazard_probability": 336, "path_probability": 340, "component_weights": 344, "components": 360, "samples": 1176, "sample_component": 14232, "resolved_state": 14296, "unknown_probability": 14300, "resolved": 14304, "encoder_ns": 14368, "forecaster_ns": 14376, "stage_latency_ns": 14384}),
+    UnknownBox: (56, 8, {"center": 0, "half_size": 24, "probability": 48, "place": 52}),
+    Unknowns: (816, 8, {"header": 0, "box_count": 56, "state_count": 60, "probability": 64, "residual": 68, "noise": 72, "gain": 76, "offset": 88, "reserved": 100, "ratios": 104, "boxes": 360, "stage_latency_ns": 808}),
     ViewMeta: (280, 8, {"header": 0, "hypothesis": 56, "kind": 60, "state": 64, "width_px": 68, "height_px": 72, "probability": 76, "latent": 80, "intrinsics": 112, "world_from_camera": 144, "stage_latency_ns": 272}),
-    Action: (112, 8, {"header": 0, "action": 56, "reason": 60, "rule": 64, "sample_count": 68, "confidence": 72, "hazard_probability": 76, "is_decision": 80, "valid_until_ns": 88, "based_on_frame": 96, "latency_ns": 104}),
+    Action: (112, 8, {"header": 0, "action": 56, "reason": 60, "rule": 64, "sample_count": 68, "confidence": 72, "hazard_probability": 76, "is_decision": 80, "unknown_probability": 84, "valid_until_ns": 88, "based_on_frame": 96, "latency_ns": 104}),
     Health: (144, 8, {"header": 0, "stage": 56, "state": 60, "pid": 64, "received": 72, "published": 80, "skipped": 88, "invalid": 96, "errors": 104, "last_latency_ns": 112, "max_latency_ns": 120, "last_progress_ns": 128, "rss_bytes": 136}),
 }
 
@@ -325,8 +389,10 @@ class Topic(NamedTuple):
 TOPICS = [
     Topic("camera/frame", FrameMeta, True, Limits(8, 2, 12, 0, 8, 2, 2)),
     Topic("encoder/posterior", Posterior, False, Limits(10, 2, 14, 0, 16, 3, 2)),
+    Topic("encoder/check", ImageCheck, False, Limits(10, 2, 14, 0, 16, 3, 2)),
     Topic("forecaster/forecast", Forecast, False, Limits(10, 2, 14, 0, 16, 3, 2)),
     Topic("prober/belief", Belief, False, Limits(10, 2, 14, 0, 16, 3, 2)),
+    Topic("prober/unknown", Unknowns, False, Limits(10, 2, 14, 0, 16, 3, 2)),
     Topic("renderer/view", ViewMeta, True, Limits(8, 2, 12, 0, 8, 2, 2)),
     Topic("controller/action", Action, False, Limits(10, 2, 14, 1, 16, 3, 2)),
     Topic("health/camera", Health, False, Limits(10, 2, 14, 1, 16, 3, 2)),

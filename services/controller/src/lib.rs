@@ -17,6 +17,8 @@ pub struct Settings {
     pub period_ns: u64,
     /// Seed of the run, for headers.
     pub seed: u64,
+    /// True to decide as if nothing unknown could be there.
+    pub ignores_unknown: bool,
 }
 
 /// Content of one step of a frame's belief. A repeated step must be equal.
@@ -109,7 +111,7 @@ impl Controller {
             Some(pending) if pending.header.capture_time_ns == captured_ns => pending,
             slot => slot.insert(Pending::begin(belief)),
         };
-        if !pending.take(belief) {
+        if !pending.take(belief, self.settings.ignores_unknown) {
             return Some(self.refuse(&belief.header, Reason::ContradictoryBelief, now_ns));
         }
         if !belief.is_final() {
@@ -237,7 +239,7 @@ impl Pending {
     }
 
     /// Records a step. Returns false if it contradicts the frame's other messages.
-    fn take(&mut self, belief: &Belief) -> bool {
+    fn take(&mut self, belief: &Belief, ignores_unknown: bool) -> bool {
         let index = belief.header.step as usize - 1;
         let (own, step) = (&self.header, Step::of(belief));
         let same_frame = own.frame_id == belief.header.frame_id
@@ -248,7 +250,11 @@ impl Pending {
             return false;
         }
         self.steps[index] = Some(step);
-        self.evidence.add_belief(belief);
+        if ignores_unknown {
+            self.evidence.add_belief(&Belief { unknown_probability: 0.0, ..*belief });
+        } else {
+            self.evidence.add_belief(belief);
+        }
         true
     }
 }

@@ -2,6 +2,7 @@
 
 use anyhow::Context;
 use carff_checkpoint::load_policy;
+use carff_config::UnknownIs;
 use carff_controller::{Controller, Settings};
 use carff_messages::Stage;
 use carff_runtime::{StageContext, frame_span};
@@ -71,5 +72,6 @@ fn settings(stage: &StageContext) -> anyhow::Result<Settings> {
         deadline_ns: config.deadline_ms * 1_000_000,
         period_ns: (1e9 / config.rate_hz) as u64,
         seed: stage.seed(),
+        ignores_unknown: stage.graph.checks.unknown == UnknownIs::Ignored,
     })
 }

@@ -1,12 +1,12 @@
 use super::*;
-use carff_messages::{ProbeResult, Rule};
+use carff_messages::{ImageCheck, ImageCondition, ProbeResult, Rule};
 
 const MS: u64 = 1_000_000;
 const HORIZON: u32 = 2;
 
 fn controller(rule: Rule) -> Controller {
     let policy = Policy { rule, threshold: 0.3 };
-    Controller::new(Settings { policy, deadline_ns: 150 * MS, period_ns: 50 * MS, seed: 1 })
+    Controller::new(Settings { policy, deadline_ns: 150 * MS, period_ns: 50 * MS, seed: 1, ignores_unknown: false })
 }
 
 fn calibrated() -> Controller {
@@ -215,4 +215,51 @@ fn a_decision_expires_on_time() {
     assert_eq!(told(&controller.on_tick(action.valid_until_ns + 1)), (ActionCode::Halt, Reason::StaleBelief));
     assert_eq!(controller.expires_ns(), u64::MAX);
     assert_eq!(told(&controller.on_stop(300 * MS)), (ActionCode::Halt, Reason::Stopping));
+}
+
+/// An unusable image is decided on at once, with the safe action and its condition as the reason; beliefs are ignored
+/// until a usable image arrives, and then count again.
+#[test]
+fn unusable_images_halt_until_a_usable_one() {
+    let mut controller = calibrated();
+    let check = |frame_id: u64, condition: ImageCondition| ImageCheck {
+        condition: condition.code(),
+        ..ImageCheck::of_frame(Header::of_frame(frame_id, frame_id * 100 * MS, 1))
+    };
+    assert!(controller.on_check(&check(1, ImageCondition::Usable), 101 * MS).is_none());
+    for condition in ImageCondition::ALL.into_iter().filter(|c| *c != ImageCondition::Usable) {
+        let action = controller.on_check(&check(2, condition), 202 * MS).unwrap();
+        action.validate().unwrap();
+        assert_eq!(told(&action), (ActionCode::Halt, condition.reason().unwrap()));
+        assert_eq!((action.based_on_frame, action.is_decision), (2, 1));
+    }
+    controller.on_check(&check(2, ImageCondition::Frozen), 202 * MS);
+    for step in 1..=2 {
+        assert!(controller.on_belief(&belief(2, step, 0.0, 0), 210 * MS).is_none());
+    }
+    assert_eq!(told(&controller.on_tick(250 * MS)), (ActionCode::Halt, Reason::FrozenImage));
+    // An older check, which was delayed, changes nothing.
+    assert!(controller.on_check(&check(1, ImageCondition::Usable), 260 * MS).is_none());
+    assert_eq!(told(&controller.on_tick(270 * MS)), (ActionCode::Halt, Reason::FrozenImage));
+    assert!(controller.on_check(&check(3, ImageCondition::Usable), 301 * MS).is_none());
+    assert!(controller.on_belief(&belief(3, 1, 0.0, 0), 310 * MS).is_none());
+    let action = controller.on_belief(&belief(3, 2, 0.0, 0), 320 * MS).unwrap();
+    assert_eq!(told(&action), (ActionCode::Advance, Reason::Belief));
+}
+
+/// Something unknown halts, unless the graph file ignores it.
+#[test]
+fn the_unknown_halts_unless_ignored() {
+    for ignores_unknown in [false, true] {
+        let settings = Settings { ignores_unknown, ..calibrated().settings };
+        let mut controller = Controller::new(settings);
+        let mut last = None;
+        for step in 1..=2 {
+            let belief = Belief { unknown_probability: 0.9, ..belief(1, step, 0.0, 0) };
+            belief.validate().unwrap();
+            last = controller.on_belief(&belief, 110 * MS);
+        }
+        let wanted = if ignores_unknown { ActionCode::Advance } else { ActionCode::Halt };
+        assert_eq!(last.unwrap().code(), Ok(wanted));
+    }
 }

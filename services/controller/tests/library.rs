@@ -56,11 +56,13 @@ fn steps(next: &mut impl FnMut() -> f32) -> Vec<Step> {
             let weight = next();
             let mixture = Mixture { weights: vec![weight, 1.0 - weight], components: vec![Gaussian::standard(); 2] };
             let draws: Vec<Draw> = mixture.draw(samples, Sampling::Stratified, 1, 0, 1);
+            let unknown_probability = if next() < 0.9 { 0.0 } else { next() };
             let step = Step {
                 components: (0..2).map(|_| probed(next, clear_share)).collect(),
                 samples: (0..samples).map(|_| probed(next, clear_share)).collect(),
                 resolved: Resolved {
-                    state_probabilities: vec![1.0 / STATES as f32; STATES],
+                    state_probabilities: vec![(1.0 - unknown_probability) / STATES as f32; STATES],
+                    unknown_probability,
                     hazard_probability: if next() < 0.3 { 0.3 } else { next() },
                     state: 2,
                 },
@@ -76,7 +78,13 @@ fn steps(next: &mut impl FnMut() -> f32) -> Vec<Step> {
 
 /// Sends the steps of one frame through messages and a controller, and returns its action.
 fn act(policy: Policy, layout: &ProbeLayout, steps: &[Step]) -> Action {
-    let mut controller = Controller::new(Settings { policy, deadline_ns: 150 * MS, period_ns: 50 * MS, seed: 1 });
+    let mut controller = Controller::new(Settings {
+        policy,
+        deadline_ns: 150 * MS,
+        period_ns: 50 * MS,
+        seed: 1,
+        ignores_unknown: false,
+    });
     let mut action = None;
     for (k, step) in steps.iter().enumerate() {
         let header = Header::of_frame(1, 100 * MS, 1).at_step(k as u32 + 1);

@@ -366,11 +366,13 @@ impl GraphConfig {
         let mut graph = self.clone();
         graph.run.dataset = self.resolve(&self.run.dataset);
         graph.run.checkpoint = self.resolve(&self.run.checkpoint);
-        graph.run.scenario = self.scenario_path().map(|path| path.with_extension("").display().to_string());
         graph.camera.paths_mut().for_each(|path| *path = self.resolve(path));
         for path in [&mut graph.run.dataset, &mut graph.run.checkpoint].into_iter().chain(graph.camera.paths_mut()) {
             *path = std::path::absolute(&*path).unwrap_or_else(|_| path.clone());
         }
+        // The copy may lie outside the project, where the scenario's name would not be found.
+        let scenario = self.scenario_path().and_then(|path| std::path::absolute(path).ok());
+        graph.run.scenario = scenario.map(|path| path.with_extension("").display().to_string());
         toml::to_string(&graph)
     }
 

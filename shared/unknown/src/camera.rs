@@ -236,3 +236,89 @@ fn focus(limits: Option<CameraLimits>, measured: &Measured) -> Option<ImageCondi
     }
     (measured.sharpness < LEAST_SHARPNESS * limits.sharpness[0]).then_some(ImageCondition::Unfocused)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use carff_messages::Header;
+    use ndarray::Array3;
+
+    const MS: u64 = 1_000_000;
+
+    /// A checkerboard of `cell` pixels with a little noise that `shot` draws.
+    fn scene(cell: usize, shot: usize) -> Array3<u8> {
+        Array3::from_shape_fn((64, 64, 3), |(y, x, c)| {
+            let noise = (x * 31 + y * 17 + c * 7 + shot * 13) % 5;
+            (if (x / cell + y / cell) % 2 == 0 { 90 } else { 170 }) + noise as u8
+        })
+    }
+
+    fn limits() -> CameraLimits {
+        CameraLimits::fit(&[Measured::of(scene(4, 0).view()), Measured::of(scene(6, 1).view())], [60.0, 60.0])
+    }
+
+    fn checked(check: &mut CameraCheck, image: &Array3<u8>, at_ms: u64) -> ImageCondition {
+        let mut message = ImageCheck::of_frame(Header::of_frame(at_ms, at_ms * MS, 1));
+        let frame =
+            Measurement { capture_time_ns: at_ms * MS, now_ns: (at_ms + 5) * MS, field_of_view_deg: [60.0, 60.0] };
+        check.check(image.view(), frame, &mut message);
+        carff_messages::Message::validate(&message).unwrap();
+        message.condition().unwrap()
+    }
+
+    fn condition(image: &Array3<u8>) -> ImageCondition {
+        checked(&mut CameraCheck::new(Some(limits()), None), image, 100)
+    }
+
+    /// Each bad image has its name, and a good one is usable.
+    #[test]
+    fn bad_images_are_named() {
+        let good = scene(4, 7);
+        assert_eq!(condition(&good), ImageCondition::Usable);
+        assert_eq!(condition(&good.mapv(|v| v / 100)), ImageCondition::Black);
+        assert_eq!(condition(&good.mapv(|v| 252 + v / 90)), ImageCondition::White);
+        assert_eq!(condition(&good.mapv(|v| v / 5)), ImageCondition::Underexposed);
+        assert_eq!(condition(&good.mapv(|v| 220 + v / 10)), ImageCondition::Overexposed);
+        let blurred = Array3::from_shape_fn((64, 64, 3), |(y, x, _)| (100 + (x + y) / 2) as u8);
+        assert_eq!(condition(&blurred), ImageCondition::Unfocused);
+        let mut covered = good.clone();
+        covered.slice_mut(ndarray::s![20.., ..30, ..]).fill(12);
+        assert_eq!(condition(&covered), ImageCondition::Covered);
+        assert_eq!(condition(&Array3::zeros((1, 2, 3))), ImageCondition::Black, "a tiny image is no reason to fail");
+    }
+
+    /// A repeated image is frozen after the limit in capture time, and usable again with the first other image; without
+    /// a limit it may repeat.
+    #[test]
+    fn frozen_cameras_are_noticed_and_recover() {
+        let mut check = CameraCheck::new(Some(limits()), Some(300 * MS));
+        let image = scene(4, 3);
+        let conditions: Vec<_> = (0..5).map(|i| checked(&mut check, &image, 100 + 100 * i)).collect();
+        let (usable, frozen) = (ImageCondition::Usable, ImageCondition::Frozen);
+        assert_eq!(conditions, [usable, usable, usable, frozen, frozen]);
+        assert_eq!(checked(&mut check, &scene(4, 4), 600), usable);
+        let mut patient = CameraCheck::new(Some(limits()), None);
+        assert!((0..9).all(|i| checked(&mut patient, &image, 100 + 1000 * i) == usable));
+    }
+
+    /// Capture times must advance and be near the clock; the lens must be the trained one.
+    #[test]
+    fn clocks_and_lenses_are_checked() {
+        let mut check = CameraCheck::new(Some(limits()), None);
+        assert_eq!(checked(&mut check, &scene(4, 0), 100), ImageCondition::Usable);
+        assert_eq!(checked(&mut check, &scene(4, 1), 100), ImageCondition::Clock);
+        assert_eq!(checked(&mut check, &scene(4, 2), 90), ImageCondition::Clock);
+        assert_eq!(checked(&mut check, &scene(4, 3), 200), ImageCondition::Usable);
+        let mut message = ImageCheck::of_frame(Header::of_frame(1, 300 * MS, 1));
+        for (now_ms, field, wanted) in [
+            (9000, 60.0, ImageCondition::Clock),
+            (200, 60.0, ImageCondition::Clock),
+            (9001, 90.0, ImageCondition::AnotherLens),
+        ] {
+            let capture_time_ns = if wanted == ImageCondition::AnotherLens { 9000 * MS } else { 300 * MS };
+            let frame = Measurement { capture_time_ns, now_ns: now_ms * MS, field_of_view_deg: [field, field] };
+            CameraCheck::new(Some(limits()), None).check(scene(4, 5).view(), frame, &mut message);
+            assert_eq!(message.condition(), Ok(wanted));
+        }
+    }
+}

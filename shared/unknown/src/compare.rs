@@ -11,6 +11,9 @@ use ndarray::{ArrayView3, s};
 const SIDE_PX: u32 = 64;
 /// Pixels around the lanes that are compared too: residuals are smoothed, and what stands beside a lane is followed.
 const MARGIN_PX: usize = 3;
+/// Fewer samples than for images to look at: errors of a few per cent are below the noise.
+const QUICK: RenderOptions =
+    RenderOptions { threads: 1, max_samples_per_ray: 128, min_transmittance: 0.04, min_weight: 0.02 };
 /// Passes of the robust fit of gain and offset.
 const PASSES: usize = 5;
 /// Pixels beyond this many robust deviations do not count in the fit.
@@ -90,7 +93,7 @@ impl Comparer {
             return None;
         }
         let judged = grown(&seen, width, MARGIN_PX);
-        let options = RenderOptions { threads: threads.max(1), ..RenderOptions::default() };
+        let options = RenderOptions { threads: threads.max(1), ..QUICK };
         field.render_hypotheses_where(&small, states, |i| judged[i], &options, &mut self.buffer);
         let pictures = &self.buffer.pictures;
         let image = reduced(image, width, height);

@@ -50,7 +50,7 @@ pub enum KnownError {
         source: std::io::Error,
     },
     /// The file's contents are not valid.
-    #[error("{path}: {problem}; make it again with `carff train FILE --stage known`")]
+    #[error("{path}: {problem}; make it again with `carff checkpoint known`")]
     Format {
         /// Path of the file.
         path: PathBuf,
@@ -157,4 +157,81 @@ fn best_by_sum(comparison: &Comparison) -> usize {
 fn least_strength(comparison: &Comparison, errors: &ErrorMap) -> f32 {
     let strongest = |s: usize| comparison.blobs(s, errors).first().map_or(0.0, |blob| blob.strength);
     (0..comparison.residuals.len()).map(strongest).fold(f32::INFINITY, f32::min)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use carff_base::geometry::OrientedBox;
+    use carff_field::FieldConfig;
+
+    fn known() -> Known {
+        let lanes = Lanes {
+            areas: vec![OrientedBox { center: [0.0; 3], half_size: [9.0, 3.0, 1.0], yaw: 0.3 }],
+            ground_m: 0.0,
+            bounds_m: [[-9.0, -9.0], [9.0, 9.0]],
+            nearest_m: 1.0,
+            own: Vec::new(),
+        };
+        Known {
+            format_version: FORMAT_VERSION,
+            errors: ErrorMap::even(&lanes, 1.0),
+            lanes,
+            limit: 5.0,
+            images: 10,
+            camera: CameraLimits::fit(&[], [60.0; 2]),
+        }
+    }
+
+    /// What is written is read; a missing file is no error; another version and damaged limits are refused.
+    #[test]
+    fn the_file_is_checked() {
+        let folder = tempfile::tempdir().unwrap();
+        assert_eq!(Known::load(folder.path()).unwrap(), None);
+        let known = known();
+        known.save(folder.path()).unwrap();
+        assert_eq!(Known::load(folder.path()).unwrap(), Some(known.clone()));
+        for (broken, word) in [
+            (Known { format_version: 9, ..known.clone() }, "format_version"),
+            (Known { limit: -1.0, ..known.clone() }, "limit"),
+        ] {
+            broken.save(folder.path()).unwrap();
+            assert!(Known::load(folder.path()).unwrap_err().to_string().contains(word));
+        }
+        std::fs::write(folder.path().join(FILE), "{}").unwrap();
+        assert!(Known::load(folder.path()).unwrap_err().to_string().contains("carff checkpoint known"));
+    }
+
+    /// A field's own image is explained by the state that it was rendered from; the same image with a patch on the lane
+    /// is explained by none, and the patch has a box on the ground where it stands.
+    #[test]
+    fn a_patch_on_the_lane_is_unknown() {
+        let config = FieldConfig {
+            log2_table_size: 10,
+            occupancy_resolution: 16,
+            density_offset: -9.0,
+            ..FieldConfig::default()
+        };
+        let field = Field::new(config, 4).unwrap();
+        let camera = PinholeCamera::look_at([0.0, -8.0, 6.0], [0.0; 3], [0.0, 0.0, 1.0], 96, 96, 60.0);
+        let (known, states, mut comparer) = (known(), [[0.0; LATENT_DIM]], Comparer::default());
+        let mut rendered = carff_field::RenderBuffer::new();
+        field.render(&camera, &states[0], &carff_field::RenderOptions::default(), &mut rendered);
+        let mut image = ndarray::Array3::from_shape_fn((96, 96, 3), |(y, x, c)| {
+            (rendered.rgb[(y * 96 + x) * 3 + c].clamp(0.0, 1.0) * 255.0) as u8
+        });
+        let mut see = |image: &ndarray::Array3<u8>| {
+            known.see(&mut comparer, &field, &states, (&camera, image.view()), 1).unwrap().0
+        };
+        let clean = see(&image);
+        assert!(clean.boxes.is_empty() && clean.ratios[0] > 100.0, "{clean:?}");
+        image.slice_mut(ndarray::s![40..52, 40..58, ..]).mapv_inplace(|v| if v > 128 { 0 } else { 255 });
+        let patched = see(&image);
+        assert!(patched.ratios[0] < 0.1 && patched.residual > 1.0, "{patched:?}");
+        let [x, y, _] = patched.boxes[0].center;
+        assert!(x.abs() < 1.5 && y.abs() < 2.5, "{:?}", patched.boxes);
+        // A camera that looks away sees no lane.
+        let away = PinholeCamera::look_at([0.0, -8.0, 6.0], [0.0, -60.0, 40.0], [0.0, 0.0, 1.0], 96, 96, 60.0);
+        assert!(known.see(&mut Comparer::default(), &field, &states, (&away, image.view()), 1).is_none());
+    }
 }
