@@ -140,6 +140,7 @@ fn controller(stage: &mut StageContext) -> anyhow::Result<()> {
                 confidence: 1.0,
                 hazard_probability: 0.25,
                 is_decision: 1,
+                unknown_probability: 0.0,
                 valid_until_ns: monotonic_now_ns(),
                 based_on_frame: belief.header.frame_id,
                 latency_ns: 1,
