@@ -6,8 +6,9 @@ use anyhow::{Context, bail};
 use carff_base::files::check_writable;
 use carff_checkpoint::Manifest;
 use carff_dataset::{Image, drives::DriveKind};
-use carff_evaluation::{EvalOptions, Progress, Subject, Table, evaluate};
-use carff_scenes::{Extras, FreePose, Scenario};
+use carff_evaluation::{EvalOptions, Novelty, Progress, Subject, Table, evaluate};
+use carff_scenes::config::{BystanderPlace, VariationRole};
+use carff_scenes::{Extras, FreePose, Scenario, UnknownLook};
 use carff_training::training_curves;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -66,6 +67,8 @@ enum TableName {
     Planning,
     /// Six kinds of trial, with baselines on the same images.
     Trials,
+    /// Unknown objects and corrupted images.
+    Robustness,
     /// Frequency of each outcome where several are open.
     Frequencies,
     /// t-SNE, reconstructions, curves, beliefs, density.
@@ -80,6 +83,7 @@ impl From<TableName> for Table {
             TableName::Recall => Self::Recall,
             TableName::Planning => Self::Planning,
             TableName::Trials => Self::Trials,
+            TableName::Robustness => Self::Robustness,
             TableName::Frequencies => Self::Frequencies,
             TableName::Pictures => Self::Pictures,
         }
@@ -109,7 +113,10 @@ pub fn run(args: &EvalArgs) -> anyhow::Result<ExitCode> {
         if wants(Table::Planning) {
             subject.free_drives = free_drives(&scenario, args.free_drives, args.seed, &display)?;
         }
-        if wants(Table::Trials) {
+        if wants(Table::Robustness) {
+            subject.novelties = novelties(&scenario, args.free_poses, args.seed, &display)?;
+        }
+        if wants(Table::Trials) || wants(Table::Robustness) {
             subject.free_poses = free_poses(&scenario, args.free_poses, args.seed, &display)?;
         }
     }
@@ -193,6 +200,27 @@ fn free_poses(scenario: &Scenario, count: u32, seed: u64, display: &Display) -> 
             Ok(scenario.free_pose(done as u64, seed)?)
         })
         .collect()
+}
+
+/// The scenario's unknown vehicles and objects, in sight from free poses.
+fn novelties(scenario: &Scenario, count: u32, seed: u64, display: &Display) -> anyhow::Result<Vec<Novelty>> {
+    let held_out = |role: VariationRole| role == VariationRole::HeldOut;
+    let vehicles =
+        scenario.appearances().iter().map(|a| Ok((scenario.with_appearance(&a.name)?, &a.name, a.role, false)));
+    let objects = scenario
+        .bystanders()
+        .iter()
+        .map(|b| Ok((scenario.with_object(&b.name)?, &b.name, b.role, b.place == BystanderPlace::Roadside)));
+    let total = scenario.appearances().len() + scenario.bystanders().len();
+    let of_variation = |(done, varied): (usize, anyhow::Result<(Scenario, &String, VariationRole, bool)>)| {
+        let (varied, name, role, beside) = varied?;
+        display.show(&Progress { phase: "unknown looks", done, total, line: name.clone() });
+        // A vehicle of a hazard branch is absent at some time steps.
+        let looks = (0..u64::from(count)).filter_map(|number| varied.unknown_look(number, seed).ok());
+        let looks = looks.filter(UnknownLook::in_sight).collect();
+        Ok(Novelty { name: name.clone(), held_out: held_out(role), beside, looks })
+    };
+    vehicles.chain(objects).enumerate().map(of_variation).collect()
 }
 
 /// Folder of the training run: the given one, or the default of `carff train`.

@@ -48,6 +48,7 @@ pub use tables::{
     field::{FieldPictures, NovelViews, PictureTable},
     forecast::{ForecastTable, FrequencyTable, RoleCurves},
     planning::{OneImage, PlanningResults, PlanningViews, ViewCounts},
+    robustness::{ByCorruption, CorruptionFigures, Novelty, NoveltyFigures, Robustness},
     trials::{Baseline, ByPart},
 };
 pub use trials::{

@@ -1,5 +1,6 @@
 //! Subject of an evaluation: a checkpoint, a dataset of its scenario, and the posterior of each image.
 
+use crate::tables::robustness::Novelty;
 use crate::trials::planning::{NoisyEncoder, Planner};
 use crate::{ByRole, Decoding, EvaluationError, PosedImages, Progress, ROLES};
 use carff_base::random::Key;
@@ -90,6 +91,8 @@ pub struct Subject {
     pub free_drives: Vec<(Image, DriveKind)>,
     /// Free poses with one image of each branch. Empty until the caller renders them.
     pub free_poses: Vec<FreePose>,
+    /// Unknown vehicles and objects of the scenario, in sight from free poses. Empty until the caller renders them.
+    pub novelties: Vec<Novelty>,
     /// Settings of this evaluation.
     pub options: EvalOptions,
     trained: TrainedWith,
@@ -146,6 +149,7 @@ impl Subject {
             training_curves: Vec::new(),
             free_drives: Vec::new(),
             free_poses: Vec::new(),
+            novelties: Vec::new(),
             options,
             trained,
         };

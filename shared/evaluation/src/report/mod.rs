@@ -3,6 +3,7 @@
 mod gallery;
 mod markdown;
 mod page;
+mod robustness_page;
 mod targets;
 mod trials_page;
 
@@ -11,6 +12,7 @@ use crate::tables::{
     field::{PictureTable, picture_table},
     forecast::{self, ForecastTable, FrequencyTable},
     planning::{self, PlanningResults},
+    robustness::{self, Robustness},
     trials::{self, Baseline, ByPart},
 };
 use crate::{About, ByRole, EvaluationError, Progress, Reliability, Subject};
@@ -35,6 +37,8 @@ pub enum Table {
     Planning,
     /// Six kinds of trial, with baselines on the same images.
     Trials,
+    /// Unknown objects and corrupted images.
+    Robustness,
     /// Frequency of each outcome where several are open.
     Frequencies,
     /// t-SNE, reconstructions, curves, beliefs, density.
@@ -43,8 +47,16 @@ pub enum Table {
 
 impl Table {
     /// All tables.
-    pub const ALL: [Self; 7] =
-        [Self::Psnr, Self::Encoder, Self::Recall, Self::Planning, Self::Trials, Self::Frequencies, Self::Pictures];
+    pub const ALL: [Self; 8] = [
+        Self::Psnr,
+        Self::Encoder,
+        Self::Recall,
+        Self::Planning,
+        Self::Trials,
+        Self::Robustness,
+        Self::Frequencies,
+        Self::Pictures,
+    ];
 
     /// Name of the table for `--only`.
     pub fn name(self) -> &'static str {
@@ -54,6 +66,7 @@ impl Table {
             Self::Recall => "recall",
             Self::Planning => "planning",
             Self::Trials => "trials",
+            Self::Robustness => "robustness",
             Self::Frequencies => "frequencies",
             Self::Pictures => "pictures",
         }
@@ -89,6 +102,9 @@ pub struct Results {
     /// Baselines on the images of the trials, by name.
     #[serde(skip_serializing_if = "BTreeMap::is_empty", default)]
     pub baselines: BTreeMap<String, Baseline>,
+    /// Unknown objects and corrupted images.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub robustness: Option<Robustness>,
     /// Frequency of each outcome where several are open.
     #[serde(skip_serializing_if = "ByRole::is_empty", default)]
     pub frequencies: ByRole<FrequencyTable>,
@@ -139,6 +155,9 @@ pub fn evaluate(
         && let Some((trials, baselines)) = results.kept(Table::Trials, trials::trials(subject, on_progress))
     {
         (results.trials, results.baselines) = (trials, baselines);
+    }
+    if has(Table::Robustness) {
+        results.robustness = results.kept(Table::Robustness, robustness::robustness(subject, on_progress));
     }
     if has(Table::Pictures) {
         results.gallery = Some(gallery::gallery(subject, out, on_progress)?);

@@ -3,6 +3,7 @@
 use super::{
     Results,
     markdown::{db, head, percent, row},
+    robustness_page::robustness,
     trials_page::trials,
 };
 use crate::stats::draws::Frequencies;
@@ -53,6 +54,7 @@ pub fn page(results: &Results) -> String {
         planning(&mut page, table);
     }
     trials(&mut page, results);
+    robustness(&mut page, results);
     reliability(&mut page, results);
     frequencies(&mut page, &results.frequencies);
     for picture in results.gallery.iter().flat_map(|g| &g.pictures) {

@@ -4,6 +4,7 @@ pub mod encoder;
 pub mod field;
 pub mod forecast;
 pub mod planning;
+pub mod robustness;
 pub mod trials;
 
 /// At most `count` entries, evenly spread.

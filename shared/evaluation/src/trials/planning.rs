@@ -8,7 +8,7 @@ use carff_dataset::{
     drives::{DriveKind, EligibleInput},
     sensor::{SensorNoise, apply_noise_into},
 };
-use carff_decision::{Evidence, Mixture, Plan, Policy, Sampling, look_ahead};
+use carff_decision::{Evidence, ImageEvidence, Mixture, Plan, Policy, Sampling, look_ahead};
 use carff_messages::{Gaussian, Rule};
 use carff_networks::{
     encoder::{Encoder, pictures_from_bytes},
@@ -243,16 +243,28 @@ pub struct Planner<'a> {
 impl Planner<'_> {
     /// Returns the evidence of each trial from `samples` samples, on all threads of rayon's pool.
     pub fn evidence(&self, trials: &[Trial], samples: usize) -> Vec<Evidence> {
+        self.weighed_evidence(trials, &vec![None; trials.len()], samples)
+    }
+
+    /// As [`Self::evidence`], weighed by each trial's image where it was compared with the known states. `images` has
+    /// one entry a trial.
+    pub fn weighed_evidence(
+        &self,
+        trials: &[Trial],
+        images: &[Option<ImageEvidence>],
+        samples: usize,
+    ) -> Vec<Evidence> {
         let posteriors: Vec<Gaussian> = trials.iter().map(|t| t.posterior).collect();
         let first = if posteriors.is_empty() { Vec::new() } else { self.net.forecast_all(&posteriors) };
         let later = self.net.forecast_all(self.probe.states());
         let Self { sampling, horizon, .. } = *self;
-        let of_trial = |probe: &mut FieldProbe, (trial, mixture): (&Trial, &Mixture)| {
+        type Of<'a> = ((&'a Trial, &'a Mixture), &'a Option<ImageEvidence>);
+        let of_trial = |probe: &mut FieldProbe, ((trial, mixture), image): Of<'_>| {
             let plan = Plan { samples, sampling, horizon, seed: trial.seed, frame: trial.frame };
             let forecast = |_: &Gaussian, state: Option<usize>| state.map_or(mixture, |s| &later[s]).clone();
-            Evidence::of_steps(&look_ahead(forecast, probe, &trial.posterior, None, plan))
+            Evidence::of_steps(&look_ahead(forecast, probe, &trial.posterior, image.as_ref(), plan))
         };
-        trials.par_iter().zip(&first).map_init(|| self.probe.clone(), of_trial).collect()
+        trials.par_iter().zip(&first).zip(images).map_init(|| self.probe.clone(), of_trial).collect()
     }
 
     /// Runs every trial with every rule and number of samples. Outcomes, in the order of the trials, are those of 10

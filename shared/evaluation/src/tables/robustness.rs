@@ -1,0 +1,221 @@
+//! Decisions on images that no training has seen: corrupted ones, unknown vehicles and objects.
+
+use crate::trials::looks::{Look, free_looks};
+use crate::trials::planning::Trial;
+use crate::{Progress, Subject};
+use carff_base::geometry::PinholeCamera;
+use carff_base::random::Key;
+use carff_dataset::{Corruption, Image, drives::DriveKind, sensor::apply_noise_into};
+use carff_decision::{ImageEvidence, Policy, Sampling};
+use carff_messages::{Header, ImageCheck, Rule};
+use carff_scenes::UnknownLook;
+use carff_unknown::{CameraCheck, Comparer, Known, Measurement};
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+
+/// Samples of each step.
+const SAMPLES: usize = 10;
+/// First frame number of these images, which share no random draws with other trials.
+const FIRST: u64 = 1 << 42;
+/// Time between two checked images, nanoseconds; the checks of an evaluation have no clock.
+const APART_NS: u64 = 100_000_000;
+
+/// Something unknown in the images of a scenario, from free poses.
+#[derive(Clone, Debug)]
+pub struct Novelty {
+    /// Name in the scenario file.
+    pub name: String,
+    /// True if training may not use it.
+    pub held_out: bool,
+    /// True beside the road, where it is harmless.
+    pub beside: bool,
+    /// Images in which it is in sight.
+    pub looks: Vec<UnknownLook>,
+}
+
+/// Decisions on images with something unknown in sight.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct NoveltyFigures {
+    /// True if training may not use it.
+    pub held_out: bool,
+    /// True beside the road, where it is harmless.
+    pub beside: bool,
+    /// Images answered with `advance`.
+    pub advances: usize,
+    /// Images answered with `advance` without the comparison with the known states.
+    pub advances_without_comparison: usize,
+    /// Images with a probability of hazard or unknown below 0.05.
+    pub below_5_percent: usize,
+    /// Images, each from a pose of its own.
+    pub trials: usize,
+}
+
+/// Decisions on images with one corruption.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CorruptionFigures {
+    /// Hazard images answered with `advance`.
+    pub r#unsafe: usize,
+    /// Images with a hazard that is visible, in part or hidden.
+    pub hazard_trials: usize,
+    /// Clear images answered with `advance`.
+    pub kept: usize,
+    /// Images of a visible clear place.
+    pub clear_trials: usize,
+}
+
+/// Figures by corruption and severity; `clean` has severity 0.
+pub type ByCorruption = BTreeMap<String, BTreeMap<u8, CorruptionFigures>>;
+
+/// Decisions on what no training has seen.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Robustness {
+    /// Corrupted images.
+    pub corruptions: ByCorruption,
+    /// Unknown vehicles and objects, by name.
+    pub unknown: BTreeMap<String, NoveltyFigures>,
+}
+
+/// An image to decide on.
+struct Shot<'a> {
+    image: Image,
+    camera: &'a PinholeCamera,
+    frame: u64,
+}
+
+/// The decision on one image.
+struct Verdict {
+    advances: bool,
+    advances_without_comparison: bool,
+    probability: f64,
+}
+
+/// Computes the table, or returns the reason why there is none.
+pub fn robustness(subject: &Subject, on_progress: &dyn Fn(&Progress)) -> Result<Robustness, String> {
+    super::planning::plannable(subject)?;
+    if subject.free_poses.is_empty() {
+        return Err("there are no free poses: the dataset has no scenario file".into());
+    }
+    let known = Known::load(&subject.checkpoint).map_err(|e| e.to_string())?;
+    let known = known.ok_or("the checkpoint has no known.json (`carff checkpoint known` makes it)")?;
+    let threshold = subject.threshold.ok_or("the checkpoint has no threshold")?;
+    let judge = Judge { subject, known: &known, policy: Policy { rule: Rule::Calibrated, threshold } };
+    let mut table = Robustness::default();
+    for novelty in &subject.novelties {
+        let shots = novelty.looks.iter().enumerate().map(|(i, look)| Shot {
+            image: look.image.clone(),
+            camera: &look.camera,
+            frame: FIRST + i as u64,
+        });
+        let verdicts = judge.verdicts(shots.collect())?;
+        let count = |holds: &dyn Fn(&Verdict) -> bool| verdicts.iter().filter(|v| holds(v)).count();
+        let figures = NoveltyFigures {
+            held_out: novelty.held_out,
+            beside: novelty.beside,
+            advances: count(&|v| v.advances),
+            advances_without_comparison: count(&|v| v.advances_without_comparison),
+            below_5_percent: count(&|v| v.probability < 0.05),
+            trials: verdicts.len(),
+        };
+        table.unknown.insert(novelty.name.clone(), figures);
+        let (done, total) = (table.unknown.len(), subject.novelties.len());
+        on_progress(&Progress { phase: "unknown", done, total, line: novelty.name.clone() });
+    }
+    let looks = free_looks(&subject.free_poses, &subject.posed.scenario);
+    let cameras: Vec<&PinholeCamera> = subject.free_poses.iter().map(|pose| &pose.camera).collect();
+    let mut cells: Vec<(Option<Corruption>, u8)> = vec![(None, 0)];
+    cells.extend(Corruption::ALL.into_iter().flat_map(|c| c.severities().map(move |s| (Some(c), s))));
+    let total = cells.len();
+    for (done, (corruption, severity)) in cells.into_iter().enumerate() {
+        let name = corruption.map_or("clean", Corruption::name);
+        let figures = judge.corrupted(&looks, &cameras, corruption, severity)?;
+        table.corruptions.entry(name.to_owned()).or_default().insert(severity, figures);
+        on_progress(&Progress { phase: "corruptions", done: done + 1, total, line: name.to_owned() });
+    }
+    Ok(table)
+}
+
+struct Judge<'a> {
+    subject: &'a Subject,
+    known: &'a Known,
+    policy: Policy,
+}
+
+impl Judge<'_> {
+    fn corrupted(
+        &self,
+        looks: &[Look],
+        cameras: &[&PinholeCamera],
+        corruption: Option<Corruption>,
+        severity: u8,
+    ) -> Result<CorruptionFigures, String> {
+        let counts = |look: &&Look| look.hazard || look.kind == "clear_visible";
+        let mut shots = Vec::new();
+        for look in looks.iter().filter(counts) {
+            let key = Key::named("corr", self.subject.options.seed, look.frame);
+            let image = match corruption {
+                Some(corruption) => corruption.apply(look.image, severity, key).map_err(|e| e.to_string())?,
+                None => look.image.clone(),
+            };
+            shots.push(Shot { image, camera: cameras[look.pose], frame: FIRST + look.frame });
+        }
+        let mut figures = CorruptionFigures::default();
+        for (look, verdict) in looks.iter().filter(counts).zip(self.verdicts(shots)?) {
+            if look.hazard {
+                figures.hazard_trials += 1;
+                figures.r#unsafe += usize::from(verdict.advances);
+            } else {
+                figures.clear_trials += 1;
+                figures.kept += usize::from(verdict.advances);
+            }
+        }
+        Ok(figures)
+    }
+
+    /// Decides on images behind a camera with sensor noise, as the graph does: the check of the camera, the encoder's
+    /// path, and the comparison with the known states.
+    fn verdicts(&self, shots: Vec<Shot>) -> Result<Vec<Verdict>, String> {
+        let planner = self.subject.planner(Sampling::Stratified)?;
+        let states: Vec<_> = planner.probe.states().iter().map(|state| state.mean).collect();
+        let encoder = self.subject.noisy_encoder();
+        let mut comparer = Comparer::default();
+        let (mut trials, mut images, mut usable) = (Vec::new(), Vec::new(), Vec::new());
+        for shot in &shots {
+            let trial = encoder.trial(&shot.image, DriveKind::Hazard, shot.frame);
+            let trial: Trial = trial.ok_or_else(|| "an image cannot be encoded".to_owned())?;
+            let mut noisy = shot.image.clone();
+            let key = Key::named("nove", self.subject.options.seed, shot.frame);
+            apply_noise_into(&shot.image.rgb, &mut noisy.rgb, &self.subject.noise(), key).map_err(|e| e.to_string())?;
+            let view = noisy.view().ok_or("an image without pixels")?;
+            usable.push(self.is_usable(&noisy, shot.camera));
+            let (threads, field) = (self.subject.options.threads, planner.probe.field());
+            let seen = self.known.see(&mut comparer, field, &states, (shot.camera, view), threads);
+            images.push(seen.map(|(seen, _)| ImageEvidence::new(&seen.ratios)));
+            trials.push(trial);
+        }
+        let with = planner.weighed_evidence(&trials, &images, SAMPLES);
+        let without = planner.evidence(&trials, SAMPLES);
+        let verdict = |((with, without), usable): ((_, _), bool)| {
+            let advances = |evidence| usable && !self.policy.decide(evidence).halt;
+            Verdict {
+                advances: advances(with),
+                advances_without_comparison: advances(without),
+                probability: if usable { with.hazard_probability() + with.unknown_probability() } else { 1.0 },
+            }
+        };
+        Ok(with.iter().zip(&without).zip(usable).map(verdict).collect())
+    }
+
+    /// The check of the camera, of a single image.
+    fn is_usable(&self, image: &Image, camera: &PinholeCamera) -> bool {
+        let mut check = ImageCheck::of_frame(Header::default());
+        let frame =
+            Measurement { capture_time_ns: APART_NS, now_ns: APART_NS, field_of_view_deg: camera.field_of_view_deg() };
+        if let Some(view) = image.view() {
+            CameraCheck::new(Some(self.known.camera), None).check(view, frame, &mut check);
+        }
+        check.is_usable()
+    }
+}
