@@ -339,6 +339,7 @@ mod tests {
             confidence: 1.0,
             hazard_probability: 0.1,
             is_decision: 1,
+            unknown_probability: 0.0,
             valid_until_ns: 1,
             based_on_frame: 7,
             latency_ns,
