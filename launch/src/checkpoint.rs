@@ -15,10 +15,9 @@ pub enum CheckpointCommand {
     #[command(after_help = "Example: the shipped encoder
   carff checkpoint onnx configs/checkpoints/approaching-intersection --out encoder.onnx")]
     Onnx(OnnxArgs),
-    /// Calibrate what the checkpoint takes as known, and write `known.json` into it. Training does this too.
-    #[command(after_help = "Example: the shipped checkpoint
-  carff checkpoint known configs/checkpoints/approaching-intersection --dataset data/approaching-intersection \\
-    --scenario configs/scenarios/approaching-intersection.toml")]
+    /// Calibrate what the checkpoint takes as known, and write `known.json` into it.
+    #[command(after_help = "Example: the shipped checkpoint, on free poses of its scenario
+  carff checkpoint known configs/checkpoints/toy --dataset data/toy --scenario configs/scenarios/toy.toml")]
     Known(KnownArgs),
 }
 

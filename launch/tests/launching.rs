@@ -414,7 +414,10 @@ fn decisions_become_json_lines() {
     assert_eq!((last["hazard"].as_f64(), last["source"].is_null()), (Some(0.25), true), "{last}");
     assert!(last["latency_ms"].as_f64().unwrap() > 0.0 && last["capture_time_ns"].as_u64().unwrap() > 0, "{last}");
     let keys: Vec<&str> = last.as_object().unwrap().keys().map(String::as_str).collect();
-    assert_eq!(keys, ["action", "capture_time_ns", "drive", "frame", "hazard", "latency_ms", "reason", "source"]);
+    assert_eq!(
+        keys,
+        ["action", "capture_time_ns", "drive", "frame", "hazard", "latency_ms", "reason", "source", "unknown"]
+    );
 }
 
 /// A full standard output does not disturb the run, and its end reports the error.

@@ -57,7 +57,7 @@ pub fn run<E>(
     Ok(())
 }
 
-/// What the check of the camera needs to know of a frame beside its image.
+/// Returns what the check of the camera needs to know of a frame in addition to its image.
 fn measurement(frame: &FrameMeta) -> Measurement {
     Measurement {
         capture_time_ns: frame.header.capture_time_ns,
@@ -66,7 +66,7 @@ fn measurement(frame: &FrameMeta) -> Measurement {
     }
 }
 
-/// Time for which an image may repeat, nanoseconds; `None` for a camera of rendered images without noise, which shows
+/// Returns the time for which an image may repeat, nanoseconds; `None` for a camera of rendered images without noise, which shows
 /// a still scene as equal images.
 fn frozen_ns(graph: &GraphConfig) -> Option<u64> {
     graph.camera.has_noise().then_some(graph.checks.frozen_ms * 1_000_000)

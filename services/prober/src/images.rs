@@ -79,11 +79,13 @@ impl Images {
         Some(unknowns)
     }
 
-    /// The evidence for a belief's frame: of its own image, else of an earlier one that is not too old.
+    /// The evidence for a belief's frame: of its own image; with `next-frame`, also of an earlier one that is not too
+    /// old.
     pub fn evidence(&self, header: &Header) -> Option<&ImageEvidence> {
         let (compared, evidence) = self.last.as_ref()?;
         let age_ns = header.capture_time_ns.checked_sub(compared.capture_time_ns)?;
-        (age_ns <= LATEST_NS).then_some(evidence)
+        let latest_ns = if self.goes_first() { 0 } else { LATEST_NS };
+        (age_ns <= latest_ns).then_some(evidence)
     }
 }
 

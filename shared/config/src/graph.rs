@@ -93,17 +93,18 @@ pub struct ChecksConfig {
     /// Default true.
     pub camera: bool,
     /// Time for which an image may repeat before the camera counts as frozen, milliseconds, 50 to 60000. A camera of
-    /// rendered images without sensor noise may repeat images for ever. Default 300.
+    /// rendered images without sensor noise may repeat images indefinitely. Default 300.
     #[schemars(range(min = 50, max = 60_000))]
     pub frozen_ms: u64,
     /// Renders the known states from the camera's pose and compares them with the image: `off`, `same-frame` (the
     /// belief waits for it), or `next-frame` (the belief uses the comparison of an earlier frame, at most 300 ms old).
-    /// A checkpoint without `known.json` has no comparison. Default `same-frame`.
+    /// A checkpoint without `known.json` has no comparison. Default `off`: a comparison takes tens of milliseconds.
     pub compare: CompareWhen,
-    /// Largest number of comparisons per second, 0.1 to 1000; frames between them use the last one. Default 15.
+    /// Largest number of comparisons per second, 0.1 to 1000. With `next-frame`, frames between them use the last one.
+    /// Default 15.
     #[schemars(range(min = 0.1, max = 1000.0))]
     pub compare_rate_hz: f64,
-    /// What something unknown is to every decision rule that looks at the belief: `hazard` or `ignored`. Default
+    /// Meaning of something unknown for every decision rule that looks at the belief: `hazard` or `ignored`. Default
     /// `hazard`.
     pub unknown: UnknownIs,
 }
@@ -113,7 +114,7 @@ impl Default for ChecksConfig {
         Self {
             camera: true,
             frozen_ms: 300,
-            compare: CompareWhen::SameFrame,
+            compare: CompareWhen::Off,
             compare_rate_hz: 15.0,
             unknown: UnknownIs::Hazard,
         }
@@ -132,7 +133,7 @@ pub enum CompareWhen {
     NextFrame,
 }
 
-/// What something unknown is to the decision rules.
+/// Meaning of something unknown for the decision rules.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum UnknownIs {

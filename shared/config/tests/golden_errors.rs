@@ -98,7 +98,7 @@ fn wrong_files_have_golden_messages() {
         ("[run]\nname = \"x\"\ncheckpoint = \"c\"\n".to_owned(), "graph.toml:1: `run`: missing field `dataset`"),
         (
             format!("{HEAD}[cameras]\n"),
-            "graph.toml:5: `cameras`: unknown field `cameras`, expected one of `run`, `stages`, `camera`, `renderer`, \
+            "graph.toml:5: `cameras`: unknown field `cameras`, expected one of `run`, `stages`, `camera`, `checks`, `renderer`, \
              `controller`, `launcher`, `overload`; did you mean `camera`?",
         ),
         (

@@ -1,11 +1,11 @@
-//! What an image says about the known states beside the encoder: rendering them and comparing.
+//! Evidence of an image for the known states, in addition to the encoder: they are rendered and compared with it.
 
 use crate::{ProbeLayout, Resolved};
 
-/// Prior probability that something stands there which no known state explains.
+/// Prior probability of something that no known state explains.
 const UNKNOWN_PRIOR: f64 = 0.01;
 /// Share of the belief that trusts the encoder's path; the rest starts from equally probable states. The encoder can
-/// be wrong with certainty, for example in rain. Rendering the states shows what this image can say at all.
+/// be wrong with certainty, for example in rain. Rendering the states shows what this image can distinguish at all.
 const ENCODER_SHARE: f64 = 0.5;
 /// Ratios are limited to this and its inverse, so that no image decides against everything else.
 const MAX_RATIO: f64 = 1e4;
@@ -120,7 +120,7 @@ mod tests {
         assert!(hazard + unknown > 0.7, "{hazard} {unknown}");
     }
 
-    /// Where the image cannot tell, an encoder that is wrongly sure leaves a quarter of the probability to the hazard.
+    /// Where the image shows no difference, an encoder that is wrongly sure leaves a quarter of the probability to the hazard.
     #[test]
     fn what_cannot_be_seen_stays_possible() {
         let (hazard, _) = ImageEvidence::new(&[50.0; 4]).weigh(0.0, &STATES);

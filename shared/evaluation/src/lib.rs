@@ -42,13 +42,13 @@ pub use stats::{
     reliability::{Reliability, ReliabilityBin, reliability},
     ssim::ssim,
 };
-pub use subject::{About, EvalOptions, Subject};
+pub use subject::{About, EvalOptions, Novelty, Subject};
 pub use tables::{
     encoder::{EncoderTable, SvmScore, SvmTable, encoder_table},
     field::{FieldPictures, NovelViews, PictureTable},
     forecast::{ForecastTable, FrequencyTable, RoleCurves},
     planning::{OneImage, PlanningResults, PlanningViews, ViewCounts},
-    robustness::{ByCorruption, CorruptionFigures, Novelty, NoveltyFigures, Robustness},
+    robustness::{ByCorruption, CorruptionFigures, NoveltyFigures, Robustness},
     trials::{Baseline, ByPart},
 };
 pub use trials::{

@@ -1,6 +1,5 @@
 //! Subject of an evaluation: a checkpoint, a dataset of its scenario, and the posterior of each image.
 
-use crate::tables::robustness::Novelty;
 use crate::trials::planning::{NoisyEncoder, Planner};
 use crate::{ByRole, Decoding, EvaluationError, PosedImages, Progress, ROLES};
 use carff_base::random::Key;
@@ -20,7 +19,7 @@ use carff_networks::{
     stored::{load_decoder, load_encoder_on, load_mixture},
 };
 use carff_plots::Panel;
-use carff_scenes::FreePose;
+use carff_scenes::{FreePose, UnknownLook};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 use tch::{Device, Tensor};
@@ -62,6 +61,19 @@ pub struct About {
     pub split_seed: u64,
     /// Seed of the draws of this evaluation.
     pub seed: u64,
+}
+
+/// Something unknown in the images of a scenario, from free poses.
+#[derive(Clone, Debug)]
+pub struct Novelty {
+    /// Name in the scenario file.
+    pub name: String,
+    /// True if training may not use it.
+    pub held_out: bool,
+    /// True next to the road, where it is harmless.
+    pub beside: bool,
+    /// Images in which it is in sight.
+    pub looks: Vec<UnknownLook>,
 }
 
 /// A checkpoint on a dataset.

@@ -87,7 +87,7 @@ pub struct UnknownBox {
     pub center: [f64; 3],
     /// Half of the extent along x, y and z, metres.
     pub half_size: [f64; 3],
-    /// Probability that something unknown stands there, 0..=1.
+    /// Probability that the box holds something unknown, 0..=1.
     pub probability: f32,
     /// Index of the probed place that the box touches; -1 for elsewhere on the lanes.
     pub place: i32,

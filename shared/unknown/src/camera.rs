@@ -129,7 +129,7 @@ impl CameraLimits {
     }
 }
 
-/// Measurements of a frame that its image alone does not have.
+/// Measurements of a frame that are not in its image.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Measurement {
     /// Capture time: monotonic clock, nanoseconds.
@@ -284,7 +284,7 @@ mod tests {
         let mut covered = good.clone();
         covered.slice_mut(ndarray::s![20.., ..30, ..]).fill(12);
         assert_eq!(condition(&covered), ImageCondition::Covered);
-        assert_eq!(condition(&Array3::zeros((1, 2, 3))), ImageCondition::Black, "a tiny image is no reason to fail");
+        assert_eq!(condition(&Array3::zeros((1, 2, 3))), ImageCondition::Black, "a tiny image does not fail the check");
     }
 
     /// A repeated image is frozen after the limit in capture time, and usable again with the first other image; without

@@ -9,7 +9,7 @@ use ndarray::{ArrayView3, s};
 
 /// Longest side of the compared images, pixels.
 const SIDE_PX: u32 = 64;
-/// Pixels around the lanes that are compared too: residuals are smoothed, and what stands beside a lane is followed.
+/// Pixels around the lanes that are compared too: residuals are smoothed, and objects next to a lane are followed.
 const MARGIN_PX: usize = 3;
 /// Fewer samples than for images to look at: errors of a few per cent are below the noise.
 const QUICK: RenderOptions =
@@ -36,7 +36,7 @@ pub struct Fit {
     pub noise: f32,
 }
 
-/// An image beside the known states, at the compared size.
+/// An image with its residuals under the known states, at the compared size.
 #[derive(Clone, Debug)]
 pub struct Comparison {
     /// The camera at the compared size.

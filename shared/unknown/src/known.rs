@@ -20,7 +20,7 @@ const STEEPNESS: f64 = 10.0;
 /// Share of the known images that leave less than the limit.
 const WITHIN: f64 = 0.97;
 
-/// What a checkpoint takes as known, calibrated on images of known states from poses of no other use.
+/// The limits of what a checkpoint takes as known, calibrated on images of known states from poses of no other use.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Known {
@@ -59,7 +59,7 @@ pub enum KnownError {
     },
 }
 
-/// What the known states leave unexplained in one image.
+/// The parts of one image that the known states leave unexplained.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Seen {
     /// For each state, how much better it explains the image than something unknown does.
@@ -183,7 +183,7 @@ mod tests {
         }
     }
 
-    /// What is written is read; a missing file is no error; another version and damaged limits are refused.
+    /// What is written is read; a missing file is not an error; another version and damaged limits are refused.
     #[test]
     fn the_file_is_checked() {
         let folder = tempfile::tempdir().unwrap();

@@ -30,7 +30,7 @@ pub struct OwnBox {
     pub oriented_box: OrientedBox,
     /// Margin of its pose, metres.
     pub margin_m: f64,
-    /// For each known state, true if the vehicle stands there.
+    /// For each known state, true if the vehicle is there.
     pub states: Vec<bool>,
 }
 

@@ -19,7 +19,7 @@ pub fn robustness(page: &mut String, results: &Results) {
     head(page, &["object", "where", "training", "advances", "without comparison", "below 0.05"]);
     for (name, f) in &table.unknown {
         let of = |count: usize| format!("{count} of {}", f.trials);
-        let place = if f.beside { "beside the road" } else { "on the road" };
+        let place = if f.beside { "next to the road" } else { "on the road" };
         let training = if f.held_out { "held out" } else { "may be used" };
         row(
             page,

@@ -8,7 +8,6 @@ use carff_base::random::Key;
 use carff_dataset::{Corruption, Image, drives::DriveKind, sensor::apply_noise_into};
 use carff_decision::{ImageEvidence, Policy, Sampling};
 use carff_messages::{Header, ImageCheck, Rule};
-use carff_scenes::UnknownLook;
 use carff_unknown::{CameraCheck, Comparer, Known, Measurement};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -20,26 +19,13 @@ const FIRST: u64 = 1 << 42;
 /// Time between two checked images, nanoseconds; the checks of an evaluation have no clock.
 const APART_NS: u64 = 100_000_000;
 
-/// Something unknown in the images of a scenario, from free poses.
-#[derive(Clone, Debug)]
-pub struct Novelty {
-    /// Name in the scenario file.
-    pub name: String,
-    /// True if training may not use it.
-    pub held_out: bool,
-    /// True beside the road, where it is harmless.
-    pub beside: bool,
-    /// Images in which it is in sight.
-    pub looks: Vec<UnknownLook>,
-}
-
 /// Decisions on images with something unknown in sight.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct NoveltyFigures {
     /// True if training may not use it.
     pub held_out: bool,
-    /// True beside the road, where it is harmless.
+    /// True next to the road, where it is harmless.
     pub beside: bool,
     /// Images answered with `advance`.
     pub advances: usize,
