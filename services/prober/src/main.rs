@@ -12,9 +12,10 @@ fn main() -> std::process::ExitCode {
 fn run(stage: &mut StageContext) -> anyhow::Result<()> {
     let mut forecasts = stage.input(&topics::FORECAST)?;
     let mut beliefs = stage.output(&topics::BELIEF)?;
-    let mut unknowns = stage.output(&topics::UNKNOWN)?;
     let mut probe = load(&stage.checkpoint)?;
     let mut images = Images::load(&stage.checkpoint, &stage.graph.checks, &probe)?;
+    // A publisher that never sends keeps its connections to receivers that have died.
+    let mut unknowns = images.is_some().then(|| stage.output(&topics::UNKNOWN)).transpose()?;
     let mut frames = images.is_some().then(|| stage.input(&topics::FRAME)).transpose()?;
     stage.ready();
     loop {
@@ -27,7 +28,9 @@ fn run(stage: &mut StageContext) -> anyhow::Result<()> {
         for compares in [goes_first, !goes_first] {
             let started_ns = monotonic_now_ns();
             if compares {
-                let (Some(images), Some(frames)) = (&mut images, &mut frames) else { continue };
+                let (Some(images), Some(frames), Some(unknowns)) = (&mut images, &mut frames, &mut unknowns) else {
+                    continue;
+                };
                 let Some(frame) = frames.newest()? else { continue };
                 if !images.is_due(frame.header.capture_time_ns) {
                     continue;
