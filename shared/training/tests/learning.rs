@@ -140,26 +140,6 @@ fn training_learns() {
     assert_eq!(Models::load(&place.out("learnt")).unwrap().probe.states().len(), 4);
 }
 
-/// Without any label in the loss, the latents identify the states if the decoder is asked for other poses, for every
-/// seed. Asked for the input's own pose only, they do not.
-#[test]
-fn latents_identify_states_without_labels() {
-    let mut place = Place::new();
-    place.config.vae.state_weight = 0.0;
-    place.config.vae.kl_weight = 1e-3;
-    place.config.vae.epochs = 300;
-    let mut accuracy = |other_poses, seed| {
-        place.config.vae.other_poses = other_poses;
-        place.config.seed = seed;
-        let figures = place.train_phases(&format!("unlabelled-{other_poses}-{seed}"), Phases::Vae, None).unwrap();
-        figures.vae.unwrap().trained.full.accuracy
-    };
-    let alive: Vec<f64> = (1..4).map(|seed| accuracy(8, seed)).collect();
-    assert!(alive.iter().all(|accuracy| *accuracy > 0.9), "{alive:?}");
-    let own = accuracy(0, 1);
-    assert!(own < 0.9, "{own}");
-}
-
 /// Training of the decoder only leaves the encoder unchanged and improves the decoder.
 #[test]
 fn the_decoder_learns_alone() {
