@@ -8,8 +8,12 @@ use carff_evaluation::PosedImages;
 use carff_messages::{Gaussian, LATENT_DIM};
 use rayon::prelude::*;
 
-/// Neighbours of a posterior mean.
+/// Largest and smallest number of neighbours of a posterior mean.
 const NEIGHBOURS: usize = 20;
+const FEWEST: usize = 3;
+/// Largest number of neighbours as a share of the images of the state that has the fewest: more would be of other
+/// states, for any view.
+const OF_STATE: f64 = 0.25;
 /// Quantile of the own shares within a state that is taken as the best share that the state can have. It is below 1
 /// for states that no view can distinguish.
 const BEST: f64 = 0.75;
@@ -22,7 +26,7 @@ type Latent = [f32; LATENT_DIM];
 pub fn unambiguous_by_state(posed: &PosedImages, posteriors: &[Gaussian]) -> Vec<Vec<usize>> {
     let images = posed.trained_and_random();
     let (means, states) = means_and_states(posed, posteriors, &images);
-    let chosen = unambiguous(&neighbours(&means), &states, posed.scenario.state_count());
+    let chosen = unambiguous(&neighbours(&means, count(&states)), &states, posed.scenario.state_count());
     chosen.into_iter().map(|of_state| of_state.into_iter().map(|k| images[k]).collect()).collect()
 }
 
@@ -32,7 +36,7 @@ pub fn possible_states(posed: &PosedImages, posteriors: &[Gaussian]) -> Vec<Vec<
     let images = posed.trained_and_random();
     let (means, states) = means_and_states(posed, posteriors, &images);
     let with_own = |(k, near): (usize, Vec<usize>)| near.into_iter().chain([k]).map(|other| states[other]).collect();
-    neighbours(&means).into_iter().enumerate().map(with_own).collect()
+    neighbours(&means, count(&states)).into_iter().enumerate().map(with_own).collect()
 }
 
 fn means_and_states(posed: &PosedImages, posteriors: &[Gaussian], images: &[usize]) -> (Vec<Latent>, Vec<usize>) {
@@ -56,8 +60,15 @@ fn unambiguous(neighbours: &[Vec<usize>], states: &[usize], count: usize) -> Vec
         .collect()
 }
 
-/// Indices of the nearest other means of each mean. Distances are in deviations of each dimension.
-fn neighbours(means: &[Latent]) -> Vec<Vec<usize>> {
+/// Number of neighbours for images of these states.
+fn count(states: &[usize]) -> usize {
+    let of = |state: usize| states.iter().filter(|&&other| other == state).count();
+    let fewest = states.iter().collect::<std::collections::BTreeSet<_>>().into_iter().map(|&state| of(state)).min();
+    ((fewest.unwrap_or(0) as f64 * OF_STATE) as usize).clamp(FEWEST, NEIGHBOURS)
+}
+
+/// Indices of the `count` nearest other means of each mean. Distances are in deviations of each dimension.
+fn neighbours(means: &[Latent], count: usize) -> Vec<Vec<usize>> {
     let n = means.len().max(1) as f32;
     let scale: Latent = std::array::from_fn(|d| {
         let mean = means.iter().map(|m| m[d]).sum::<f32>() / n;
@@ -70,7 +81,7 @@ fn neighbours(means: &[Latent]) -> Vec<Vec<usize>> {
             |other: usize| -> f32 { (0..LATENT_DIM).map(|d| (scaled[k][d] - scaled[other][d]).powi(2)).sum() };
         let mut others: Vec<(f32, usize)> =
             (0..scaled.len()).filter(|&other| other != k).map(|other| (distance(other), other)).collect();
-        let taken = NEIGHBOURS.min(others.len());
+        let taken = count.min(others.len());
         if taken > 0 {
             // Equal distances in the order of the views, so that the choice does not depend on the sort.
             others.select_nth_unstable_by(taken - 1, |a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
@@ -102,7 +113,7 @@ mod tests {
                 hidden.push(view % 3 == 0);
             }
         }
-        let found = unambiguous(&neighbours(&means), &states, 4);
+        let found = unambiguous(&neighbours(&means, NEIGHBOURS), &states, 4);
         for (state, of_state) in found.iter().enumerate().take(2) {
             let expected: Vec<usize> = (0..480).filter(|&k| states[k] == state && !hidden[k]).collect();
             assert_eq!(*of_state, expected, "state {state}");
