@@ -58,6 +58,9 @@ pub fn run(args: &RecordArgs) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
+/// Largest number of runs that start within one second.
+const MOST_IN_A_SECOND: u32 = 1000;
+
 /// Returns the file of one run of several. Runs that start within one second have numbers.
 fn out_of(out: &Path, run: &str) -> PathBuf {
     let stem = out.file_stem().unwrap_or_default().to_string_lossy();
@@ -66,7 +69,7 @@ fn out_of(out: &Path, run: &str) -> PathBuf {
     let named = |number: String| out.with_file_name(format!("{stem}-{run}-{time}{number}.{extension}"));
     let first = named(String::new());
     if first.exists() {
-        (2_u32..).map(|n| named(format!("-{n}"))).find(|path| !path.exists()).unwrap_or(first)
+        (2..=MOST_IN_A_SECOND).map(|n| named(format!("-{n}"))).find(|path| !path.exists()).unwrap_or(first)
     } else {
         first
     }

@@ -249,7 +249,7 @@ mod tests {
     fn scene(cell: usize, shot: usize) -> Array3<u8> {
         Array3::from_shape_fn((64, 64, 3), |(y, x, c)| {
             let noise = (x * 31 + y * 17 + c * 7 + shot * 13) % 5;
-            (if (x / cell + y / cell) % 2 == 0 { 90 } else { 170 }) + noise as u8
+            (if (x / cell + y / cell).is_multiple_of(2) { 90 } else { 170 }) + noise as u8
         })
     }
 
@@ -279,7 +279,7 @@ mod tests {
         assert_eq!(condition(&good.mapv(|v| 252 + v / 90)), ImageCondition::White);
         assert_eq!(condition(&good.mapv(|v| v / 5)), ImageCondition::Underexposed);
         assert_eq!(condition(&good.mapv(|v| 220 + v / 10)), ImageCondition::Overexposed);
-        let blurred = Array3::from_shape_fn((64, 64, 3), |(y, x, _)| (100 + (x + y) / 2) as u8);
+        let blurred = Array3::from_shape_fn((64, 64, 3), |(y, x, _)| (100 + usize::midpoint(x, y)) as u8);
         assert_eq!(condition(&blurred), ImageCondition::Unfocused);
         let mut covered = good.clone();
         covered.slice_mut(ndarray::s![20.., ..30, ..]).fill(12);

@@ -129,7 +129,7 @@ impl Known {
             let found = known.format_version;
             return Err(format(format!("`format_version` is {found}, this program reads {FORMAT_VERSION}")));
         }
-        if !known.errors.is_valid() || !(known.limit.is_finite() && known.limit > 0.0) {
+        if !(known.errors.is_valid() && known.limit.is_finite() && known.limit > 0.0) {
             return Err(format("`errors` and `limit` must be positive numbers".to_owned()));
         }
         Ok(Some(known))

@@ -95,7 +95,7 @@ pub fn robustness(subject: &Subject, on_progress: &dyn Fn(&Progress)) -> Result<
             camera: &look.camera,
             frame: FIRST + i as u64,
         });
-        let verdicts = judge.verdicts(shots.collect())?;
+        let verdicts = judge.verdicts(&shots.collect::<Vec<_>>())?;
         let count = |holds: &dyn Fn(&Verdict) -> bool| verdicts.iter().filter(|v| holds(v)).count();
         let figures = NoveltyFigures {
             held_out: novelty.held_out,
@@ -148,7 +148,7 @@ impl Judge<'_> {
             shots.push(Shot { image, camera: cameras[look.pose], frame: FIRST + look.frame });
         }
         let mut figures = CorruptionFigures::default();
-        for (look, verdict) in looks.iter().filter(counts).zip(self.verdicts(shots)?) {
+        for (look, verdict) in looks.iter().filter(counts).zip(self.verdicts(&shots)?) {
             if look.hazard {
                 figures.hazard_trials += 1;
                 figures.r#unsafe += usize::from(verdict.advances);
@@ -162,13 +162,13 @@ impl Judge<'_> {
 
     /// Decides on images behind a camera with sensor noise, as the graph does: the check of the camera, the encoder's
     /// path, and the comparison with the known states.
-    fn verdicts(&self, shots: Vec<Shot>) -> Result<Vec<Verdict>, String> {
+    fn verdicts(&self, shots: &[Shot]) -> Result<Vec<Verdict>, String> {
         let planner = self.subject.planner(Sampling::Stratified)?;
         let states: Vec<_> = planner.probe.states().iter().map(|state| state.mean).collect();
         let encoder = self.subject.noisy_encoder();
         let mut comparer = Comparer::default();
         let (mut trials, mut images, mut usable) = (Vec::new(), Vec::new(), Vec::new());
-        for shot in &shots {
+        for shot in shots {
             let trial = encoder.trial(&shot.image, DriveKind::Hazard, shot.frame);
             let trial: Trial = trial.ok_or_else(|| "an image cannot be encoded".to_owned())?;
             let mut noisy = shot.image.clone();

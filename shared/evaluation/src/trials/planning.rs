@@ -227,6 +227,9 @@ pub struct TrialOutcome {
     pub kind: DriveKind,
 }
 
+/// A trial, its forecast, and the evidence of its image.
+type WithImage<'a> = ((&'a Trial, &'a Mixture), &'a Option<ImageEvidence>);
+
 /// Forecast, probe and horizon behind a planning table.
 #[derive(Clone, Copy)]
 pub struct Planner<'a> {
@@ -258,8 +261,7 @@ impl Planner<'_> {
         let first = if posteriors.is_empty() { Vec::new() } else { self.net.forecast_all(&posteriors) };
         let later = self.net.forecast_all(self.probe.states());
         let Self { sampling, horizon, .. } = *self;
-        type Of<'a> = ((&'a Trial, &'a Mixture), &'a Option<ImageEvidence>);
-        let of_trial = |probe: &mut FieldProbe, ((trial, mixture), image): Of<'_>| {
+        let of_trial = |probe: &mut FieldProbe, ((trial, mixture), image): WithImage<'_>| {
             let plan = Plan { samples, sampling, horizon, seed: trial.seed, frame: trial.frame };
             let forecast = |_: &Gaussian, state: Option<usize>| state.map_or(mixture, |s| &later[s]).clone();
             Evidence::of_steps(&look_ahead(forecast, probe, &trial.posterior, image.as_ref(), plan))
