@@ -420,7 +420,7 @@ impl Client {
         self.next(op, |message| {
             let Message::Text(text) = message else { return None };
             let said: Value = serde_json::from_str(&text).unwrap();
-            // Warnings, such as one of a repeated subscription, are no answers.
+            // Warnings, such as one of a repeated subscription, do not count as answers.
             (said["op"] == op && said["level"].as_u64().is_none_or(|level| level == 2)).then_some(said)
         })
     }

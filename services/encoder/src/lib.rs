@@ -66,8 +66,8 @@ fn measurement(frame: &FrameMeta) -> Measurement {
     }
 }
 
-/// Returns the time for which an image may repeat, nanoseconds; `None` for a camera of rendered images without noise, which shows
-/// a still scene as equal images.
+/// Returns the time for which an image may repeat, nanoseconds; `None` for a camera of rendered images without noise,
+/// which shows a still scene as equal images.
 fn frozen_ns(graph: &GraphConfig) -> Option<u64> {
     graph.camera.has_noise().then_some(graph.checks.frozen_ms * 1_000_000)
 }

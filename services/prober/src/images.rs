@@ -45,9 +45,10 @@ impl Images {
         self.when == CompareWhen::SameFrame
     }
 
-    /// Reports whether a frame of this capture time is compared: rates above the limit leave frames out.
+    /// Reports whether a frame of this capture time is compared. With `same-frame` every frame is; with `next-frame`,
+    /// rates above the limit leave frames out.
     pub fn is_due(&mut self, capture_time_ns: u64) -> bool {
-        let is_due = capture_time_ns >= self.next_ns;
+        let is_due = self.goes_first() || capture_time_ns >= self.next_ns;
         if is_due {
             // A tenth of a period is jitter.
             self.next_ns = capture_time_ns + self.period_ns - self.period_ns / 10;
@@ -67,7 +68,7 @@ impl Images {
         camera.validate().ok()?;
         let view = (&camera, image);
         let (seen, comparison) = self.known.see(&mut self.comparer, probe.field(), &self.states, view, threads)?;
-        // The ratios as the message has them, so that whoever reads it computes the same belief.
+        // Rounded as in the message: every reader of the message computes the same belief.
         let ratios: Vec<f64> = seen.ratios.iter().map(|&ratio| f64::from(ratio as f32)).collect();
         let evidence = ImageEvidence::new(&ratios);
         let mut unknowns = Unknowns::of_frame(frame.header);

@@ -100,7 +100,7 @@ pub struct ChecksConfig {
     /// belief waits for it), or `next-frame` (the belief uses the comparison of an earlier frame, at most 300 ms old).
     /// A checkpoint without `known.json` has no comparison. Default `off`: a comparison takes tens of milliseconds.
     pub compare: CompareWhen,
-    /// Largest number of comparisons per second, 0.1 to 1000. With `next-frame`, frames between them use the last one.
+    /// Largest number of comparisons per second with `next-frame`, 0.1 to 1000; frames between them use the last one.
     /// Default 15.
     #[schemars(range(min = 0.1, max = 1000.0))]
     pub compare_rate_hz: f64,

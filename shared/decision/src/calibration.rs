@@ -205,14 +205,19 @@ pub fn resolve(
     }
     let total: f64 = probabilities.iter().sum::<f64>().max(1e-12);
     let total_weight: f64 = weights.iter().map(|&w| f64::from(w)).sum::<f64>().max(1e-12);
-    let key = |s: usize| (probabilities[s] / total * 1e6).round() as i64 * 2 + i64::from(layout.hazard_states()[s]);
-    let state = (0..states).max_by_key(|&s| (key(s), std::cmp::Reverse(s))).unwrap_or(0);
+    let state = most_probable(layout, |s| probabilities[s] / total);
     Resolved {
         state_probabilities: probabilities.iter().map(|p| (p / total) as f32).collect(),
         unknown_probability: 0.0,
         hazard_probability: (hazard / total_weight).clamp(0.0, 1.0) as f32,
         state,
     }
+}
+
+/// Returns the most probable state; of equally probable ones (to a millionth), a hazard state first, then the first.
+pub(crate) fn most_probable(layout: &ProbeLayout, probability: impl Fn(usize) -> f64) -> usize {
+    let key = |s: usize| (probability(s) * 1e6).round() as i64 * 2 + i64::from(layout.hazard_states()[s]);
+    (0..layout.state_count()).max_by_key(|&s| (key(s), std::cmp::Reverse(s))).unwrap_or(0)
 }
 
 fn logit(p: f64) -> f64 {

@@ -1,5 +1,6 @@
 //! Evidence of an image for the known states, in addition to the encoder: they are rendered and compared with it.
 
+use crate::calibration::most_probable;
 use crate::{ProbeLayout, Resolved};
 
 /// Prior probability of something that no known state explains.
@@ -92,11 +93,7 @@ impl Resolved {
         }
         self.hazard_probability = hazard as f32;
         self.unknown_probability = unknown as f32;
-        let key = |s: usize| {
-            let p = (f64::from(self.state_probabilities[s]) * 1e6).round() as i64;
-            (p * 2 + i64::from(layout.hazard_states()[s]), std::cmp::Reverse(s))
-        };
-        self.state = (0..layout.state_count()).max_by_key(|&s| key(s)).unwrap_or(0);
+        self.state = most_probable(layout, |s| f64::from(self.state_probabilities[s]));
     }
 }
 
@@ -120,7 +117,8 @@ mod tests {
         assert!(hazard + unknown > 0.7, "{hazard} {unknown}");
     }
 
-    /// Where the image shows no difference, an encoder that is wrongly sure leaves a quarter of the probability to the hazard.
+    /// Where the image shows no difference, an encoder that is wrongly sure leaves a quarter of the probability to the
+    /// hazard.
     #[test]
     fn what_cannot_be_seen_stays_possible() {
         let (hazard, _) = ImageEvidence::new(&[50.0; 4]).weigh(0.0, &STATES);

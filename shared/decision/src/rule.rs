@@ -38,8 +38,8 @@ impl Policy {
     }
 
     /// Applies the rule (paper section 4.3). Something unknown counts as a hazard: the calibrated rule adds its
-    /// probability, and under the paper's rule it disagrees with every sample once it is likely. Evidence without samples, or with a hazard probability outside 0..=1,
-    /// always halts with confidence 0.
+    /// probability, and under the paper's rule it disagrees with every sample once it is likely. Evidence without
+    /// samples, or with a probability outside 0..=1, always halts with confidence 0.
     pub fn decide(self, evidence: &Evidence) -> Decision {
         let (hazard, unknown) = (evidence.hazard_probability(), evidence.unknown_probability());
         let valid = |p: f64| (0.0..=1.0).contains(&p);

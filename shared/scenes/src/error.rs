@@ -84,7 +84,7 @@ pub enum ScenarioError {
         tries: u32,
     },
     /// The scenario has no appearance or bystander of this name.
-    #[error("{}: there is no `{key}` named `{name}`{}", path.display(), listed(known, name))]
+    #[error("{}: no `{key}` named `{name}`{}", path.display(), listed(known, name))]
     NoSuchVariation {
         /// Path of the scenario file.
         path: PathBuf,

@@ -79,7 +79,7 @@ impl Augmentation {
         }
         let kind = self.weather_kinds[rng.random_range(0..self.weather_kinds.len())];
         let severity = rng.random_range(1..=self.weather_severity).min(*kind.severities().end());
-        // An image of the dataset has pixels, and the severity exists: there is no error.
+        // An image of the dataset has pixels, and the severity exists, so the corruption cannot fail.
         kind.apply(image, severity, key).ok()
     }
 
