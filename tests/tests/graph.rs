@@ -97,7 +97,8 @@ fn a_signal_ends_every_command() {
         &["dataset", "render", scenario.to_str().unwrap(), "--out", out],
         &["bench", "field"],
         &["bench", "encoder"],
-        &["metrics", "--listen", "127.0.0.1:0"],
+        // It waits for a run of its own: the runs of other tests end at any time, and the command with them.
+        &["metrics", "--listen", "127.0.0.1:0", "--wait", "--run", "not-running"],
     ];
     for command in commands {
         for signal in [Signal::INT, Signal::TERM, Signal::HUP] {
