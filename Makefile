@@ -32,7 +32,7 @@ build: libtorch onnxruntime ## Build all programs
 	cargo build --release --locked --workspace --bins
 
 test: build ## Run all tests, including whole graphs of processes
-	cargo test --release --locked --workspace
+	cargo test --release --locked --workspace --no-fail-fast
 
 deb: build ## Build a Debian package: programs, checkpoints, configs, systemd units
 	$(PYTHON) launch/packaging/build_deb.py $(TARGET)
