@@ -45,7 +45,7 @@ enum {
     CARFF_REASON_OUT_OF_FOCUS = 11,
     CARFF_REASON_UNDEREXPOSED = 12,
     CARFF_REASON_OVEREXPOSED = 13,
-    CARFF_REASON_ANOTHER_PLACE = 14,
+    CARFF_REASON_NO_POSE = 14,
     CARFF_REASON_ANOTHER_LENS = 15,
     CARFF_REASON_CAMERA_CLOCK = 16,
 };
@@ -190,7 +190,7 @@ typedef struct CarffImageCheck {
     float sharpness;
     float change;
     float covered;
-    float place_distance;
+    float repeats_s;
 } CarffImageCheck;
 
 static_assert(sizeof(CarffImageCheck) == 80, "CarffImageCheck");
@@ -200,7 +200,7 @@ static_assert(offsetof(CarffImageCheck, luminance) == 60, "CarffImageCheck.lumin
 static_assert(offsetof(CarffImageCheck, sharpness) == 64, "CarffImageCheck.sharpness");
 static_assert(offsetof(CarffImageCheck, change) == 68, "CarffImageCheck.change");
 static_assert(offsetof(CarffImageCheck, covered) == 72, "CarffImageCheck.covered");
-static_assert(offsetof(CarffImageCheck, place_distance) == 76, "CarffImageCheck.place_distance");
+static_assert(offsetof(CarffImageCheck, repeats_s) == 76, "CarffImageCheck.repeats_s");
 
 #define CARFF_FORECAST_TYPE_NAME "carff.Forecast.v1"
 typedef struct CarffForecast {
@@ -318,7 +318,7 @@ typedef struct CarffUnknowns {
     float noise;
     float gain[3];
     float offset[3];
-    uint32_t reserved;
+    float explained;
     float ratios[64];
     CarffUnknownBox boxes[8];
     uint64_t stage_latency_ns;
@@ -333,7 +333,7 @@ static_assert(offsetof(CarffUnknowns, residual) == 68, "CarffUnknowns.residual")
 static_assert(offsetof(CarffUnknowns, noise) == 72, "CarffUnknowns.noise");
 static_assert(offsetof(CarffUnknowns, gain) == 76, "CarffUnknowns.gain");
 static_assert(offsetof(CarffUnknowns, offset) == 88, "CarffUnknowns.offset");
-static_assert(offsetof(CarffUnknowns, reserved) == 100, "CarffUnknowns.reserved");
+static_assert(offsetof(CarffUnknowns, explained) == 100, "CarffUnknowns.explained");
 static_assert(offsetof(CarffUnknowns, ratios) == 104, "CarffUnknowns.ratios");
 static_assert(offsetof(CarffUnknowns, boxes) == 360, "CarffUnknowns.boxes");
 static_assert(offsetof(CarffUnknowns, stage_latency_ns) == 808, "CarffUnknowns.stage_latency_ns");

@@ -44,7 +44,7 @@ class Reason(IntEnum):
     OUT_OF_FOCUS = 11
     UNDEREXPOSED = 12
     OVEREXPOSED = 13
-    ANOTHER_PLACE = 14
+    NO_POSE = 14
     ANOTHER_LENS = 15
     CAMERA_CLOCK = 16
 
@@ -176,7 +176,7 @@ class ImageCheck(ctypes.Structure):
         ("sharpness", ctypes.c_float),
         ("change", ctypes.c_float),
         ("covered", ctypes.c_float),
-        ("place_distance", ctypes.c_float),
+        ("repeats_s", ctypes.c_float),
     ]
 
     @staticmethod
@@ -271,7 +271,7 @@ class Unknowns(ctypes.Structure):
         ("noise", ctypes.c_float),
         ("gain", (ctypes.c_float * 3)),
         ("offset", (ctypes.c_float * 3)),
-        ("reserved", ctypes.c_uint32),
+        ("explained", ctypes.c_float),
         ("ratios", (ctypes.c_float * 64)),
         ("boxes", (UnknownBox * 8)),
         ("stage_latency_ns", ctypes.c_uint64),
@@ -353,12 +353,12 @@ LAYOUTS = {
     FrameMeta: (256, 8, {"header": 0, "width_px": 56, "height_px": 60, "intrinsics": 64, "world_from_camera": 96, "dataset_view": 224}),
     Gaussian: (64, 4, {"mean": 0, "log_variance": 32}),
     Posterior: (128, 8, {"header": 0, "gaussian": 56, "stage_latency_ns": 120}),
-    ImageCheck: (80, 8, {"header": 0, "condition": 56, "luminance": 60, "sharpness": 64, "change": 68, "covered": 72, "place_distance": 76}),
+    ImageCheck: (80, 8, {"header": 0, "condition": 56, "luminance": 60, "sharpness": 64, "change": 68, "covered": 72, "repeats_s": 76}),
     Forecast: (2480, 8, {"header": 0, "source": 56, "component_count": 60, "sample_count": 64, "horizon": 68, "resolved_state": 72, "path_probability": 76, "weights": 80, "components": 96, "samples": 352, "sample_component": 2400, "encoder_ns": 2464, "stage_latency_ns": 2472}),
     ProbeResult: (204, 4, {"state": 0, "confidence": 4, "hazard_likelihood": 8, "occupancies": 12}),
     Belief: (14392, 8, {"header": 0, "horizon": 56, "state_count": 60, "place_count": 64, "component_count": 68, "sample_count": 72, "is_final": 76, "state_probability": 80, "hazard_probability": 336, "path_probability": 340, "component_weights": 344, "components": 360, "samples": 1176, "sample_component": 14232, "resolved_state": 14296, "unknown_probability": 14300, "resolved": 14304, "encoder_ns": 14368, "forecaster_ns": 14376, "stage_latency_ns": 14384}),
     UnknownBox: (56, 8, {"center": 0, "half_size": 24, "probability": 48, "place": 52}),
-    Unknowns: (816, 8, {"header": 0, "box_count": 56, "state_count": 60, "probability": 64, "residual": 68, "noise": 72, "gain": 76, "offset": 88, "reserved": 100, "ratios": 104, "boxes": 360, "stage_latency_ns": 808}),
+    Unknowns: (816, 8, {"header": 0, "box_count": 56, "state_count": 60, "probability": 64, "residual": 68, "noise": 72, "gain": 76, "offset": 88, "explained": 100, "ratios": 104, "boxes": 360, "stage_latency_ns": 808}),
     ViewMeta: (280, 8, {"header": 0, "hypothesis": 56, "kind": 60, "state": 64, "width_px": 68, "height_px": 72, "probability": 76, "latent": 80, "intrinsics": 112, "world_from_camera": 144, "stage_latency_ns": 272}),
     Action: (112, 8, {"header": 0, "action": 56, "reason": 60, "rule": 64, "sample_count": 68, "confidence": 72, "hazard_probability": 76, "is_decision": 80, "unknown_probability": 84, "valid_until_ns": 88, "based_on_frame": 96, "latency_ns": 104}),
     Health: (144, 8, {"header": 0, "stage": 56, "state": 60, "pid": 64, "received": 72, "published": 80, "skipped": 88, "invalid": 96, "errors": 104, "last_latency_ns": 112, "max_latency_ns": 120, "last_progress_ns": 128, "rss_bytes": 136}),

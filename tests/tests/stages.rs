@@ -3,9 +3,10 @@
 
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
+use carff_base::geometry::PinholeCamera;
 use carff_messages::{
-    Belief, DatasetView, Forecast, ForecastSource, FrameMeta, Gaussian, Header, Health, HealthState, Intrinsics,
-    Message, Posterior, Stage,
+    Belief, DatasetView, Forecast, ForecastSource, FrameMeta, Gaussian, Header, Health, HealthState, Message,
+    Posterior, Stage,
 };
 use carff_tests::{Process, TestGraph, eventually, shipped_checkpoint};
 use carff_transport::{Node, Receiver, monotonic_now_ns, topics};
@@ -21,22 +22,16 @@ fn header(run_id: u64, frame_id: u64, step: u32) -> Header {
 }
 
 fn frame(run_id: u64, frame_id: u64) -> FrameMeta {
-    let half = f64::from(SIDE) / 2.0;
-    FrameMeta {
-        header: header(run_id, frame_id, 0),
-        width_px: SIDE,
-        height_px: SIDE,
-        intrinsics: Intrinsics { fl_x_px: 110.0, fl_y_px: 110.0, cx_px: half, cy_px: half },
-        world_from_camera: [0.0; 16],
-        dataset_view: DatasetView::UNKNOWN,
-    }
+    let camera = PinholeCamera::look_at([-8.0, -12.0, 9.0], [-8.0, -1.0, 0.0], [0.0, 0.0, 1.0], SIDE, SIDE, 60.0);
+    FrameMeta { header: header(run_id, frame_id, 0), ..FrameMeta::of_camera(&camera, DatasetView::UNKNOWN) }
 }
 
 /// A NaN in a message of any topic, and an image of another size than its description, is dropped and counted by each
 /// stage that reads the topic. No action is based on it, and valid messages are still decided on.
 #[test]
 fn rogue_messages_stop_at_the_next_stage() {
-    let rest = "[controller]\nrate_hz = 4.0\ndeadline_ms = 60000\n";
+    // An image without detail is decided on like any other.
+    let rest = "[checks]\ncamera = false\n[controller]\nrate_hz = 4.0\ndeadline_ms = 60000\n";
     let graph = TestGraph::new(Path::new("none"), &shipped_checkpoint(), rest);
     let run_id = graph.run().id();
     let node = Node::open(graph.run(), "test").unwrap();
@@ -81,11 +76,12 @@ fn rogue_messages_stop_at_the_next_stage() {
     belief.component_weights[0] = 1.0;
     belief.hazard_probability = f32::NAN;
     beliefs.send_unchecked(belief).unwrap();
-    // The forecaster reads beliefs too.
+    // The forecaster reads beliefs too, and the prober frames.
     until("each has dropped the invalid messages", &|stage, health| {
         health.invalid
             == match stage {
                 Stage::Encoder | Stage::Forecaster => 2,
+                Stage::Prober => 3,
                 _ => 1,
             }
     });

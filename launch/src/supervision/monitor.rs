@@ -222,8 +222,7 @@ impl Records {
         self.compared += 1;
         Self::note_time(&mut self.compare_ns, unknowns.stage_latency_ns, self.wanted.keep);
         if let Some(frame) = self.frames.get_mut(&unknowns.header.frame_id) {
-            let ratios: Vec<f64> = unknowns.ratios().iter().map(|&ratio| f64::from(ratio)).collect();
-            frame.image = Some(ImageEvidence::new(&ratios));
+            frame.image = Some(ImageEvidence::new(unknowns.ratios()));
         }
     }
 

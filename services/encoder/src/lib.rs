@@ -25,6 +25,8 @@ pub fn run<E>(
     let mut posteriors = stage.output(&topics::POSTERIOR)?;
     let mut checks = stage.output(&topics::CHECK)?;
     let limits = Known::load(&stage.checkpoint)?.map(|known| known.camera);
+    // The prober compares images with a checkpoint's limits.
+    let needs_pose = stage.graph.checks.compare && limits.is_some();
     let mut camera = stage.graph.checks.camera.then(|| CameraCheck::new(limits, frozen_ns(&stage.graph)));
     let mut encoder = load(stage)?;
     // The first frame is then as fast as later ones.
@@ -39,7 +41,7 @@ pub fn run<E>(
         let _span = frame_span(&frame.header);
         let mut check = ImageCheck::of_frame(frame.header);
         if let Some(camera) = &mut camera {
-            camera.check(frame.image(), measurement(&frame), &mut check);
+            camera.check(frame.image(), measurement(&frame, needs_pose), &mut check);
         }
         checks.send(check)?;
         if !check.is_usable() {
@@ -58,8 +60,9 @@ pub fn run<E>(
 }
 
 /// Returns what the check of the camera needs to know of a frame in addition to its image.
-fn measurement(frame: &FrameMeta) -> Measurement {
+fn measurement(frame: &FrameMeta, needs_pose: bool) -> Measurement {
     Measurement {
+        has_pose: !needs_pose || frame.camera().validate().is_ok(),
         capture_time_ns: frame.header.capture_time_ns,
         now_ns: monotonic_now_ns(),
         field_of_view_deg: frame.camera().field_of_view_deg(),

@@ -1,7 +1,9 @@
 //! The prober stage's arithmetic: from a forecast, and the comparison of its image, to a belief over the known states.
 
+mod frames;
 mod images;
 
+pub use frames::Frames;
 pub use images::Images;
 
 use carff_checkpoint::{FieldProbe, Manifest, load_field_probe};

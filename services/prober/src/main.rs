@@ -1,7 +1,7 @@
 //! The prober stage: forecasts and camera images in, beliefs and comparisons out.
 
 use carff_messages::Stage;
-use carff_prober::{Images, believe, load};
+use carff_prober::{Frames, believe, load};
 use carff_runtime::{StageContext, frame_span};
 use carff_transport::{Input, monotonic_now_ns, topics};
 
@@ -13,40 +13,29 @@ fn run(stage: &mut StageContext) -> anyhow::Result<()> {
     let mut forecasts = stage.input(&topics::FORECAST)?;
     let mut beliefs = stage.output(&topics::BELIEF)?;
     let mut probe = load(&stage.checkpoint)?;
-    let mut images = Images::load(&stage.checkpoint, &stage.graph.checks, &probe)?;
-    // A publisher that never sends keeps its connections to receivers that have died.
-    let mut unknowns = images.is_some().then(|| stage.output(&topics::UNKNOWN)).transpose()?;
-    let mut frames = images.is_some().then(|| stage.input(&topics::FRAME)).transpose()?;
+    let mut frames = Frames::open(stage, &probe)?;
     stage.ready();
     loop {
-        let cameras = frames.iter().map(|frames| frames as &dyn Input);
+        let cameras = frames.iter().map(Frames::input);
         let inputs: Vec<&dyn Input> = cameras.chain([&forecasts as &dyn Input]).collect();
         if !stage.wait(&inputs)? {
             return Ok(());
         }
-        let goes_first = images.as_ref().is_some_and(Images::goes_first);
-        for compares in [goes_first, !goes_first] {
-            let started_ns = monotonic_now_ns();
-            if compares {
-                let (Some(images), Some(frames), Some(unknowns)) = (&mut images, &mut frames, &mut unknowns) else {
-                    continue;
-                };
-                let Some(frame) = frames.newest()? else { continue };
-                if !images.is_due(frame.header.capture_time_ns) {
-                    continue;
-                }
-                if let Some(mut compared) = images.compare(&probe, &frame, frame.image(), stage.threads) {
-                    compared.stage_latency_ns = monotonic_now_ns() - started_ns;
-                    unknowns.send(compared)?;
-                }
-            } else {
-                let Some(forecast) = forecasts.newest()? else { continue };
-                let _span = frame_span(&forecast.header);
-                let evidence = images.as_ref().and_then(|images| images.evidence(&forecast.header));
+        let started_ns = monotonic_now_ns();
+        let forecast = forecasts.newest()?;
+        if let Some(frames) = &mut frames {
+            frames.compare(&probe, forecast.as_ref().map(|forecast| &forecast.header), stage.threads)?;
+        }
+        let Some(forecast) = forecast else { continue };
+        let _span = frame_span(&forecast.header);
+        let evidence = frames.as_ref().map_or(Ok(None), |frames| frames.evidence(&forecast.header));
+        match evidence {
+            Ok(evidence) => {
                 let mut belief = believe(&mut probe, &forecast, evidence);
                 belief.stage_latency_ns = stage.worked(&belief.header, started_ns);
                 beliefs.send(belief)?;
             }
+            Err(error) => stage.refuse(&error),
         }
     }
 }

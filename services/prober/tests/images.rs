@@ -3,7 +3,6 @@
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
 use carff_base::geometry::PinholeCamera;
-use carff_config::{ChecksConfig, CompareWhen};
 use carff_field::{RenderBuffer, RenderOptions};
 use carff_messages::{DatasetView, FrameMeta, Header, Message};
 use carff_prober::{Images, load};
@@ -24,13 +23,11 @@ fn frame(id: u64, at_ms: u64) -> FrameMeta {
     FrameMeta { header: Header::of_frame(id, at_ms * MS, 1), ..FrameMeta::of_camera(&camera, DatasetView::UNKNOWN) }
 }
 
-/// An image of a known state has no unknown box. The same image with a dark patch on the lane has one, where the patch
-/// is. A belief uses the comparison of its own image; with `next-frame`, also one of an earlier image.
+/// An image of a known state has no unknown box. The same image with a bright patch on the lane has one, where the patch
+/// is. A belief only uses the comparison of its own image.
 #[test]
 fn a_patch_on_the_lane_is_unknown() {
     let probe = load(&checkpoint()).unwrap();
-    let checks = |compare| ChecksConfig { compare, ..ChecksConfig::default() };
-    assert!(Images::load(&checkpoint(), &checks(CompareWhen::Off), &probe).unwrap().is_none());
     let clear = probe.states().last().unwrap().mean;
     let mut rendered = RenderBuffer::new();
     probe.field().render(&frame(1, 0).camera(), &clear, &RenderOptions::default(), &mut rendered);
@@ -40,7 +37,7 @@ fn a_patch_on_the_lane_is_unknown() {
     let mut patched = known.clone();
     patched.slice_mut(s![56..74, 50..78, ..]).fill(230);
 
-    let mut images = Images::load(&checkpoint(), &checks(CompareWhen::SameFrame), &probe).unwrap().unwrap();
+    let mut images = Images::load(&checkpoint(), &probe).unwrap().unwrap();
     let before = images.compare(&probe, &frame(1, 100), known.view(), 1).unwrap();
     before.validate().unwrap();
     assert!(before.probability < 0.05 && before.boxes().is_empty(), "{before:?}");
@@ -51,14 +48,11 @@ fn a_patch_on_the_lane_is_unknown() {
     assert!((x + 8.0).abs() < 2.5 && (y + 1.0).abs() < 3.0, "{:?}", after.boxes());
 
     let header = |id, at_ms: u64| Header::of_frame(id, at_ms * MS, 1);
-    assert!(images.is_due(0) && images.is_due(1), "every frame is compared");
-    assert!(images.evidence(&header(2, 200)).is_some() && images.evidence(&header(3, 210)).is_none());
-    let mut later = Images::load(&checkpoint(), &checks(CompareWhen::NextFrame), &probe).unwrap().unwrap();
-    later.compare(&probe, &frame(2, 200), patched.view(), 1).unwrap();
-    assert!(later.evidence(&header(4, 400)).is_some() && later.evidence(&header(9, 900)).is_none());
-    assert!(later.is_due(0) && !later.is_due(1) && later.is_due(70 * MS));
+    assert!(images.evidence(&header(2, 200)).is_some());
+    assert!(!images.has_compared(&header(3, 210)) && images.evidence(&header(3, 210)).is_none());
 
     // A pose that is not a pose, and a camera that sees no lane, give no comparison.
     let lost = FrameMeta { world_from_camera: [0.0; 16], ..frame(5, 500) };
     assert!(images.compare(&probe, &lost, known.view(), 1).is_none());
+    assert!(images.has_compared(&lost.header) && images.evidence(&lost.header).is_none());
 }

@@ -96,14 +96,9 @@ pub struct ChecksConfig {
     /// rendered images without sensor noise may repeat images indefinitely. Default 300.
     #[schemars(range(min = 50, max = 60_000))]
     pub frozen_ms: u64,
-    /// Renders the known states from the camera's pose and compares them with the image: `off`, `same-frame` (the
-    /// belief waits for it), or `next-frame` (the belief uses the comparison of an earlier frame, at most 300 ms old).
-    /// A checkpoint without `known.json` has no comparison. Default `off`: a comparison takes tens of milliseconds.
-    pub compare: CompareWhen,
-    /// Largest number of comparisons per second with `next-frame`, 0.1 to 1000; frames between them use the last one.
-    /// Default 15.
-    #[schemars(range(min = 0.1, max = 1000.0))]
-    pub compare_rate_hz: f64,
+    /// Renders the known states from the camera's pose and compares them with the image, whose belief waits for it. A
+    /// checkpoint without `known.json` has no comparison. Default true.
+    pub compare: bool,
     /// Meaning of something unknown for every decision rule that looks at the belief: `hazard` or `ignored`. Default
     /// `hazard`.
     pub unknown: UnknownIs,
@@ -111,26 +106,8 @@ pub struct ChecksConfig {
 
 impl Default for ChecksConfig {
     fn default() -> Self {
-        Self {
-            camera: true,
-            frozen_ms: 300,
-            compare: CompareWhen::Off,
-            compare_rate_hz: 15.0,
-            unknown: UnknownIs::Hazard,
-        }
+        Self { camera: true, frozen_ms: 300, compare: true, unknown: UnknownIs::Hazard }
     }
-}
-
-/// The frame whose belief a comparison with the known states weighs.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
-#[serde(rename_all = "kebab-case")]
-pub enum CompareWhen {
-    /// No image is compared.
-    Off,
-    /// The image's own belief, which waits for the comparison.
-    SameFrame,
-    /// A later belief: the comparison delays none.
-    NextFrame,
 }
 
 /// Meaning of something unknown for the decision rules.

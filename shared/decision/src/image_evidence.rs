@@ -29,9 +29,10 @@ pub struct ImageEvidence {
 impl ImageEvidence {
     /// Evidence of the likelihood ratios of the known states against something unknown, each above 0. A ratio that is
     /// not a number counts as the smallest.
-    pub fn new(ratios: &[f64]) -> Self {
-        let limited =
-            |ratio: &f64| if ratio.is_nan() { 1.0 / MAX_RATIO } else { ratio.clamp(1.0 / MAX_RATIO, MAX_RATIO) };
+    pub fn new(ratios: &[f32]) -> Self {
+        let limited = |ratio: &f32| {
+            if ratio.is_nan() { 1.0 / MAX_RATIO } else { f64::from(*ratio).clamp(1.0 / MAX_RATIO, MAX_RATIO) }
+        };
         Self { ratios: ratios.iter().map(limited).collect() }
     }
 
@@ -128,7 +129,7 @@ mod tests {
     /// An image that no state explains is unknown; ratios that are not numbers explain nothing.
     #[test]
     fn what_nothing_explains_is_unknown() {
-        for ratios in [[1e-3; 4], [f64::NAN; 4]] {
+        for ratios in [[1e-3; 4], [f32::NAN; 4]] {
             let (hazard, unknown) = ImageEvidence::new(&ratios).weigh(0.0, &STATES);
             assert!(unknown > 0.8 && hazard < 0.1, "{hazard} {unknown}");
         }

@@ -204,11 +204,13 @@ pub struct RenderOptions {
     /// Samples of less weight than this take the mean colour of their ray's other samples (the heaviest sample always
     /// has its own colour).
     pub min_weight: f32,
+    /// Multiplies the steps along rays, at least 1: fewer samples, coarser surfaces.
+    pub step_scale: f32,
 }
 
 impl Default for RenderOptions {
     fn default() -> Self {
-        Self { threads: 1, max_samples_per_ray: 256, min_transmittance: 1e-2, min_weight: 5e-3 }
+        Self { threads: 1, max_samples_per_ray: 256, min_transmittance: 1e-2, min_weight: 5e-3, step_scale: 1.0 }
     }
 }
 

@@ -112,8 +112,8 @@ codes! {
         Underexposed = 12 "underexposed",
         /// The image is overexposed.
         Overexposed = 13 "overexposed",
-        /// The image shows another place than the trained one.
-        AnotherPlace = 14 "another place",
+        /// The camera's pose is missing or not a pose, so its image cannot be compared with the known states.
+        NoPose = 14 "no pose",
         /// The lens has another field of view than the trained one.
         AnotherLens = 15 "another lens",
         /// The camera's capture times stand still or run backwards.
@@ -140,8 +140,8 @@ codes! {
         Underexposed = 6 "underexposed",
         /// Too bright.
         Overexposed = 7 "overexposed",
-        /// It shows another place than the trained one.
-        AnotherPlace = 8 "another place",
+        /// The camera's pose is missing or not a pose.
+        NoPose = 8 "no pose",
         /// Another field of view than the trained one.
         AnotherLens = 9 "another lens",
         /// Capture times stand still or run backwards.
@@ -161,7 +161,7 @@ impl ImageCondition {
             Self::Unfocused => Reason::Unfocused,
             Self::Underexposed => Reason::Underexposed,
             Self::Overexposed => Reason::Overexposed,
-            Self::AnotherPlace => Reason::AnotherPlace,
+            Self::NoPose => Reason::NoPose,
             Self::AnotherLens => Reason::AnotherLens,
             Self::Clock => Reason::CameraClock,
         })

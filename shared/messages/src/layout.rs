@@ -137,7 +137,7 @@ described!(ViewMeta {
     stage_latency_ns
 });
 described!(Gaussian { mean, log_variance });
-described!(ImageCheck { header, condition, luminance, sharpness, change, covered, place_distance });
+described!(ImageCheck { header, condition, luminance, sharpness, change, covered, repeats_s });
 described!(UnknownBox { center, half_size, probability, place });
 described!(Unknowns {
     header,
@@ -148,7 +148,7 @@ described!(Unknowns {
     noise,
     gain,
     offset,
-    reserved,
+    explained,
     ratios,
     boxes,
     stage_latency_ns

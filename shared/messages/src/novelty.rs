@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 /// Maximum number of boxes in [`Unknowns`].
 pub const MAX_UNKNOWNS: usize = 8;
 
-/// The encoder's check of one image: whether the camera is in order and sees the trained place. An image in any other
+/// The encoder's check of one image: whether the camera is in order. An image in any other
 /// condition has no posterior, and the controller publishes the safe action with the condition as its reason.
 ///
 /// ```
@@ -39,8 +39,8 @@ pub struct ImageCheck {
     pub change: f32,
     /// Share of the image that is dark and without detail, 0..=1.
     pub covered: f32,
-    /// Distance from the trained place; another place from 1 on, 0 where the checkpoint cannot measure it.
-    pub place_distance: f32,
+    /// Time for which the image repeats, seconds.
+    pub repeats_s: f32,
 }
 
 impl ImageCheck {
@@ -53,7 +53,7 @@ impl ImageCheck {
             sharpness: 0.0,
             change: 0.0,
             covered: 0.0,
-            place_distance: 0.0,
+            repeats_s: 0.0,
         }
     }
 
@@ -71,7 +71,7 @@ impl ImageCheck {
         self.header.validate()?;
         ImageCondition::try_from(self.condition)?;
         within("luminance and covered", [&self.luminance, &self.covered], 0.0, 1.0)?;
-        within("sharpness, change and place_distance", [&self.sharpness, &self.change, &self.place_distance], 0.0, 1e9)
+        within("sharpness, change and repeats_s", [&self.sharpness, &self.change, &self.repeats_s], 0.0, 1e9)
     }
 }
 
@@ -124,9 +124,11 @@ pub struct Unknowns {
     pub gain: [f32; 3],
     /// Offset of the image against the field, by channel, of 1.
     pub offset: [f32; 3],
-    /// Unused; 0. Without it, memory between the fields would be undefined.
-    pub(crate) reserved: u32,
-    /// For each known state, how much better it explains the image than something unknown does; above 0.
+    /// Share of the view's variation that the place explains, at most 1; 0 or below for a view of another place, or
+    /// from another pose.
+    pub explained: f32,
+    /// For each known state, how much better it explains the image than something unknown does; 0 for a view of another
+    /// place.
     pub ratios: [f32; MAX_STATES],
     /// Boxes, the most probable first.
     pub boxes: [UnknownBox; MAX_UNKNOWNS],
@@ -146,7 +148,7 @@ impl Unknowns {
             noise: 0.0,
             gain: [1.0; 3],
             offset: [0.0; 3],
-            reserved: 0,
+            explained: 1.0,
             ratios: [1.0; MAX_STATES],
             boxes: [UnknownBox::default(); MAX_UNKNOWNS],
             stage_latency_ns: 0,
@@ -169,8 +171,8 @@ impl Unknowns {
         within("ratios", self.ratios(), 0.0, f32::MAX)?;
         at_most("box_count", self.box_count.into(), MAX_UNKNOWNS as u64)?;
         probability("probability", self.probability)?;
-        finite("residual, noise, gain and offset", [&self.residual, &self.noise])?;
-        finite("residual, noise, gain and offset", self.gain.iter().chain(&self.offset))?;
+        finite("residual, noise and explained", [&self.residual, &self.noise, &self.explained])?;
+        finite("gain and offset", self.gain.iter().chain(&self.offset))?;
         for unknown in self.boxes() {
             finite_f64("boxes", unknown.center.iter().chain(&unknown.half_size))?;
             probability("boxes.probability", unknown.probability)?;

@@ -138,6 +138,8 @@ pub struct Measurement {
     pub now_ns: u64,
     /// Horizontal and vertical field of view, degrees.
     pub field_of_view_deg: [f64; 2],
+    /// False for a frame without the pose that its comparison needs.
+    pub has_pose: bool,
 }
 
 /// The check of a camera over its frames.
@@ -178,7 +180,9 @@ impl CameraCheck {
         self.before = Some(Before { luminance, capture_time_ns: frame.capture_time_ns, same_since_ns });
         let repeats_ns = frame.capture_time_ns.saturating_sub(same_since_ns);
         let frozen = self.frozen_ns.is_some_and(|limit_ns| repeats_ns >= limit_ns);
+        check.repeats_s = (repeats_ns as f64 * 1e-9) as f32;
         let condition = clock
+            .or((!frame.has_pose).then_some(ImageCondition::NoPose))
             .or_else(|| lens(self.limits, frame))
             .or_else(|| exposure(self.limits, &measured))
             .or(frozen.then_some(ImageCondition::Frozen))
@@ -259,8 +263,12 @@ mod tests {
 
     fn checked(check: &mut CameraCheck, image: &Array3<u8>, at_ms: u64) -> ImageCondition {
         let mut message = ImageCheck::of_frame(Header::of_frame(at_ms, at_ms * MS, 1));
-        let frame =
-            Measurement { capture_time_ns: at_ms * MS, now_ns: (at_ms + 5) * MS, field_of_view_deg: [60.0, 60.0] };
+        let frame = Measurement {
+            capture_time_ns: at_ms * MS,
+            now_ns: (at_ms + 5) * MS,
+            field_of_view_deg: [60.0, 60.0],
+            has_pose: true,
+        };
         check.check(image.view(), frame, &mut message);
         carff_messages::Message::validate(&message).unwrap();
         message.condition().unwrap()
@@ -301,9 +309,9 @@ mod tests {
         assert!((0..9).all(|i| checked(&mut patient, &image, 100 + 1000 * i) == usable));
     }
 
-    /// Capture times must advance and be near the clock; the lens must be the trained one.
+    /// Capture times must advance and be near the clock; the lens must be the trained one; a needed pose must be there.
     #[test]
-    fn clocks_and_lenses_are_checked() {
+    fn clocks_lenses_and_poses_are_checked() {
         let mut check = CameraCheck::new(Some(limits()), None);
         assert_eq!(checked(&mut check, &scene(4, 0), 100), ImageCondition::Usable);
         assert_eq!(checked(&mut check, &scene(4, 1), 100), ImageCondition::Clock);
@@ -316,9 +324,18 @@ mod tests {
             (9001, 90.0, ImageCondition::AnotherLens),
         ] {
             let capture_time_ns = if wanted == ImageCondition::AnotherLens { 9000 * MS } else { 300 * MS };
-            let frame = Measurement { capture_time_ns, now_ns: now_ms * MS, field_of_view_deg: [field, field] };
+            let field_of_view_deg = [field, field];
+            let frame = Measurement { capture_time_ns, now_ns: now_ms * MS, field_of_view_deg, has_pose: true };
             CameraCheck::new(Some(limits()), None).check(scene(4, 5).view(), frame, &mut message);
             assert_eq!(message.condition(), Ok(wanted));
         }
+        let frame = Measurement {
+            capture_time_ns: 300 * MS,
+            now_ns: 301 * MS,
+            field_of_view_deg: [60.0, 60.0],
+            has_pose: false,
+        };
+        CameraCheck::new(Some(limits()), None).check(scene(4, 5).view(), frame, &mut message);
+        assert_eq!(message.condition(), Ok(ImageCondition::NoPose));
     }
 }

@@ -19,6 +19,11 @@ const FORMAT_VERSION: u32 = 1;
 const STEEPNESS: f64 = 10.0;
 /// Share of the known images that leave less than the limit.
 const WITHIN: f64 = 0.97;
+/// Share of the known images' smallest explained share below which a view is of another place.
+const OF_LEAST_EXPLAINED: f32 = 0.8;
+
+/// Residual of a view of another place, in limits: more than any object's.
+const ELSEWHERE: f32 = 100.0;
 
 /// The limits of what a checkpoint takes as known, calibrated on images of known states from poses of no other use.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -32,8 +37,10 @@ pub struct Known {
     pub errors: ErrorMap,
     /// Strength of a blob that 97 of 100 images of known states stay below.
     pub limit: f32,
-    /// Number of images that the limit rests on.
+    /// Number of images that the limits rest on.
     pub images: usize,
+    /// Share of a view's variation that the field explains, from which on the view is of this place.
+    pub least_explained: f32,
     /// Limits of images of a camera in order.
     pub camera: CameraLimits,
 }
@@ -63,7 +70,7 @@ pub enum KnownError {
 #[derive(Clone, Debug, PartialEq)]
 pub struct Seen {
     /// For each state, how much better it explains the image than something unknown does.
-    pub ratios: Vec<f64>,
+    pub ratios: Vec<f32>,
     /// Boxes of what the best state does not explain; their probabilities assume that state.
     pub boxes: Vec<UnknownBox>,
     /// Strength of the strongest blob under the best state, in limits.
@@ -84,7 +91,16 @@ impl Known {
         strengths.sort_by(f32::total_cmp);
         let at = ((strengths.len() as f64 * WITHIN).ceil() as usize).saturating_sub(1);
         let limit = strengths.get(at).copied().unwrap_or(1.0).max(1.0);
-        Self { format_version: FORMAT_VERSION, lanes, errors, limit, images: strengths.len(), camera }
+        let least = for_limit.iter().map(|c| c.fit.explained).fold(1.0, f32::min);
+        Self {
+            format_version: FORMAT_VERSION,
+            lanes,
+            errors,
+            limit,
+            images: strengths.len(),
+            least_explained: OF_LEAST_EXPLAINED * least.max(0.0),
+            camera,
+        }
     }
 
     /// Compares an image with the known states. `None` if the camera sees no lane.
@@ -100,12 +116,16 @@ impl Known {
         Some((self.judge(&comparison), comparison))
     }
 
-    /// Judges a comparison.
+    /// Judges a comparison. No state explains a view of another place, and nothing has a box in it.
     pub fn judge(&self, comparison: &Comparison) -> Seen {
+        if comparison.fit.explained < self.least_explained {
+            let ratios = vec![0.0; comparison.residuals.len()];
+            return Seen { ratios, boxes: Vec::new(), residual: ELSEWHERE };
+        }
         let of_states: Vec<_> = (0..comparison.residuals.len()).map(|s| comparison.blobs(s, &self.errors)).collect();
         let strength = |s: &Vec<crate::Blob>| s.first().map_or(0.0, |blob| blob.strength);
         let ratio = |strength: f32| f64::from(self.limit / strength.max(0.25 * self.limit)).powf(STEEPNESS);
-        let ratios: Vec<f64> = of_states.iter().map(|s| ratio(strength(s))).collect();
+        let ratios: Vec<f32> = of_states.iter().map(|s| ratio(strength(s)) as f32).collect();
         let best = of_states.iter().min_by(|a, b| strength(a).total_cmp(&strength(b)));
         let blobs = best.map_or(&[][..], |blobs| &blobs[..]);
         let boxes = blobs.iter().take(MAX_UNKNOWNS).filter(|blob| blob.strength > self.limit).map(|blob| {
@@ -179,6 +199,7 @@ mod tests {
             lanes,
             limit: 5.0,
             images: 10,
+            least_explained: 0.5,
             camera: CameraLimits::fit(&[], [60.0; 2]),
         }
     }
@@ -230,6 +251,12 @@ mod tests {
         assert!(patched.ratios[0] < 0.1 && patched.residual > 1.0, "{patched:?}");
         let [x, y, _] = patched.boxes[0].center;
         assert!(x.abs() < 1.5 && y.abs() < 2.5, "{:?}", patched.boxes);
+        // No state explains a view of another place.
+        let mut comparison =
+            known.see(&mut Comparer::default(), &field, &states, (&camera, image.view()), 1).unwrap().1;
+        comparison.fit.explained = 0.4;
+        let elsewhere = known.judge(&comparison);
+        assert!(elsewhere.boxes.is_empty() && elsewhere.ratios == [0.0], "{elsewhere:?}");
         // A camera that looks away sees no lane.
         let away = PinholeCamera::look_at([0.0, -8.0, 6.0], [0.0, -60.0, 40.0], [0.0, 0.0, 1.0], 96, 96, 60.0);
         assert!(known.see(&mut Comparer::default(), &field, &states, (&away, image.view()), 1).is_none());

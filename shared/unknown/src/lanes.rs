@@ -6,6 +6,9 @@ use serde::{Deserialize, Serialize};
 /// Side of a cell of the error map, as a share of the bounds' longer side.
 const CELL_SHARE: f64 = 1.0 / 32.0;
 
+/// Height above the vehicle itself in which a camera is mounted on it, metres.
+const ABOVE_ROOF_M: f64 = 1.0;
+
 /// The parts of the ground on which something unknown is a hazard: roads, or the surroundings of the probed places.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -42,21 +45,28 @@ impl Lanes {
         inside && self.areas.iter().any(|area| area.contains([x, y, area.center[2]]))
     }
 
-    /// Returns for each pixel of a camera, row by row, true if it looks at the edge of the vehicle itself in a state.
-    pub fn own_edges(&self, camera: &PinholeCamera, state: usize) -> Vec<bool> {
-        let [x, y, _] = camera.position_m();
+    /// Returns those of the pixels (by index, row by row) that look at the vehicle itself, or past its margin, in a
+    /// state.
+    pub fn own_pixels(&self, camera: &PinholeCamera, state: usize, pixels: &[usize]) -> Vec<usize> {
+        let [x, y, z] = camera.position_m();
         let stands = |own: &&OwnBox| own.states.get(state) == Some(&true);
-        // A camera on the vehicle sees none of it beyond the nearest distance.
-        let is_elsewhere = |own: &&OwnBox| !own.oriented_box.contains([x, y, own.oriented_box.center[2]]);
-        let boxes: Vec<[OrientedBox; 2]> =
-            self.own.iter().filter(stands).filter(is_elsewhere).map(OwnBox::edges).collect();
-        let pixels = (0..camera.height_px).flat_map(|y| (0..camera.width_px).map(move |x| (x, y)));
-        pixels
-            .map(|(x, y)| {
-                let ray = camera.ray(f64::from(x) + 0.5, f64::from(y) + 0.5);
-                boxes.iter().any(|[outer, inner]| outer.is_met_by(&ray) && !inner.is_met_by(&ray))
-            })
-            .collect()
+        let holds_camera = |own: &OrientedBox| {
+            let top_m = own.center[2] + own.half_size[2] + ABOVE_ROOF_M;
+            z < top_m && own.contains([x, y, own.center[2]])
+        };
+        // Every pixel of a camera inside a box looks past that box: a camera next to the vehicle has no margin, and one
+        // on it sees none of it beyond the nearest distance.
+        let outside = |own: &OwnBox| [own.with_margin(), own.oriented_box].into_iter().find(|own| !holds_camera(own));
+        let boxes: Vec<OrientedBox> = self.own.iter().filter(stands).filter_map(outside).collect();
+        if boxes.is_empty() {
+            return Vec::new();
+        }
+        let width = camera.width_px.max(1) as usize;
+        let shows_it = |&pixel: &usize| {
+            let ray = camera.ray((pixel % width) as f64 + 0.5, (pixel / width) as f64 + 0.5);
+            boxes.iter().any(|own| own.is_met_by(&ray))
+        };
+        pixels.iter().copied().filter(shows_it).collect()
     }
 
     /// Returns the points of the ground that the pixels of a camera look at, row by row: distance along the ray and
@@ -80,12 +90,8 @@ impl Lanes {
 }
 
 impl OwnBox {
-    /// The boxes that its edges lie between.
-    fn edges(&self) -> [OrientedBox; 2] {
-        [self.margin_m, -self.margin_m].map(|by| OrientedBox {
-            half_size: self.oriented_box.half_size.map(|half| (half + by).max(0.1 * half)),
-            ..self.oriented_box
-        })
+    fn with_margin(&self) -> OrientedBox {
+        OrientedBox { half_size: self.oriented_box.half_size.map(|half| half + self.margin_m), ..self.oriented_box }
     }
 }
 
@@ -206,6 +212,26 @@ mod tests {
         assert!(middle.on_lanes && middle.at_m.iter().all(|v| v.abs() < 0.3), "{middle:?}");
         assert!((middle.distance_m - 45.0_f64.sqrt()).abs() < 0.5);
         assert_eq!(points[16], None);
+    }
+
+    /// The pixels of the vehicle itself are those that its box with its margin covers, in the states in which it stands
+    /// there. A camera next to it has no margin, and a camera on it no such pixels.
+    #[test]
+    fn own_pixels_are_those_of_the_vehicle() {
+        let oriented_box = OrientedBox { center: [0.0, 0.0, 0.5], half_size: [2.0, 1.0, 0.5], yaw: 0.0 };
+        let own = OwnBox { oriented_box, margin_m: 0.5, states: vec![true, false] };
+        let lanes = Lanes { own: vec![own], ..lanes() };
+        let share = |from_m: [f64; 3], state: usize| {
+            let camera = PinholeCamera::look_at(from_m, [0.0, 0.0, 0.0], [0.0, 1.0, 0.0], 32, 32, 90.0);
+            let all: Vec<usize> = (0..32 * 32).collect();
+            lanes.own_pixels(&camera, state, &all).len() as f64 / all.len() as f64
+        };
+        // Seen from above: 5 m x 3 m at the height of the roof, of 17 m x 17 m.
+        let above = share([0.0, 0.0, 10.0], 0);
+        assert!((above - 15.0 / 289.0).abs() < 0.02, "{above}");
+        assert_eq!(share([0.0, 0.0, 10.0], 1), 0.0, "it stands elsewhere");
+        assert!((0.1..0.9).contains(&share([2.2, 0.0, 1.2], 0)), "beside it");
+        assert_eq!(share([1.9, 0.0, 1.2], 0), 0.0, "on it");
     }
 
     /// A cell with large residuals tolerates more than the others, which tolerate the median.

@@ -1,4 +1,4 @@
-//! What the model does not know: things that no known state explains, images of a bad camera or of another place.
+//! What the model does not know: things that no known state explains, images of another place, or of a bad camera.
 //!
 //! | module | content |
 //! |---|---|

@@ -197,8 +197,12 @@ impl Judge<'_> {
     /// The check of the camera, of a single image.
     fn is_usable(&self, image: &Image, camera: &PinholeCamera) -> bool {
         let mut check = ImageCheck::of_frame(Header::default());
-        let frame =
-            Measurement { capture_time_ns: APART_NS, now_ns: APART_NS, field_of_view_deg: camera.field_of_view_deg() };
+        let frame = Measurement {
+            capture_time_ns: APART_NS,
+            now_ns: APART_NS,
+            field_of_view_deg: camera.field_of_view_deg(),
+            has_pose: true,
+        };
         if let Some(view) = image.view() {
             CameraCheck::new(Some(self.known.camera), None).check(view, frame, &mut check);
         }

@@ -84,7 +84,7 @@ impl Worker {
         let limits = RayLimits {
             max_samples: options.max_samples_per_ray.max(1),
             min_transmittance: options.min_transmittance,
-            step_scale: 1.0,
+            step_scale: options.step_scale.max(1.0),
             use_occupancy: true,
         };
         samples.march(&March { field, latents: folded, rays, limits }, scratch, |_| 0.5);

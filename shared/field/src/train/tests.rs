@@ -188,7 +188,12 @@ fn constant_density_renders_as_beer_and_lambert_say() {
     let mut fine = field.clone();
     fine.marcher.step_m = 1e-3;
     let mut out = RenderBuffer::new();
-    let options = RenderOptions { max_samples_per_ray: 100_000, min_transmittance: 0.0, min_weight: 0.0, threads: 1 };
+    let options = RenderOptions {
+        max_samples_per_ray: 100_000,
+        min_transmittance: 0.0,
+        min_weight: 0.0,
+        ..RenderOptions::default()
+    };
     let mut config = fine.config.clone();
     config.samples_across = 4000.0;
     config.cone_angle = 0.0;

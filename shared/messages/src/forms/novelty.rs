@@ -21,6 +21,8 @@ pub struct UnknownsForm {
     pub gain: [f32; 3],
     /// Offset of the image against the field, by channel, of 1.
     pub offset: [f32; 3],
+    /// Share of the view's variation that the place explains, at most 1.
+    pub explained: f32,
     /// For each known state, how much better it explains the image than something unknown does.
     pub ratios: Vec<f32>,
     /// Boxes, the most probable first.
@@ -38,6 +40,7 @@ impl From<&Unknowns> for UnknownsForm {
             noise: unknowns.noise,
             gain: unknowns.gain,
             offset: unknowns.offset,
+            explained: unknowns.explained,
             ratios: unknowns.ratios().to_vec(),
             boxes: unknowns.boxes().to_vec(),
             stage_latency_ns: unknowns.stage_latency_ns,
@@ -58,7 +61,7 @@ impl TryFrom<&UnknownsForm> for Unknowns {
             noise: form.noise,
             gain: form.gain,
             offset: form.offset,
-            reserved: 0,
+            explained: form.explained,
             ratios: begin("ratios", &form.ratios, 1.0)?,
             boxes: begin("boxes", &form.boxes, UnknownBox::default())?,
             stage_latency_ns: form.stage_latency_ns,

@@ -1,0 +1,72 @@
+//! The camera's frames, each compared with the known states before its belief.
+
+use crate::Images;
+use carff_checkpoint::FieldProbe;
+use carff_decision::ImageEvidence;
+use carff_messages::{FrameMeta, Header, Unknowns};
+use carff_runtime::StageContext;
+use carff_transport::{Image, Input, Publisher, Receiver, monotonic_now_ns, topics};
+
+/// Compares the frames of the camera, in order, and publishes the comparisons.
+///
+/// Frames wait in the topic's buffer. Without a forecast the oldest is compared, while encoder and forecaster work on
+/// it. A forecast skips the frames before its own: at rates that the prober cannot keep up with, only frames with a
+/// forecast are compared. So each belief rests on the comparison of its own image at any rate.
+#[derive(Debug)]
+pub struct Frames {
+    images: Images,
+    input: Receiver<Image<FrameMeta>>,
+    output: Publisher<Unknowns>,
+}
+
+impl Frames {
+    /// Opens the topics; `None` where the graph switches the comparison off, or the checkpoint has no limits of the
+    /// known. An idle publisher would keep its connections to receivers that have died.
+    pub fn open(stage: &StageContext, probe: &FieldProbe) -> anyhow::Result<Option<Self>> {
+        if !stage.graph.checks.compare {
+            return Ok(None);
+        }
+        let Some(images) = Images::load(&stage.checkpoint, probe)? else { return Ok(None) };
+        let (input, output) = (stage.input(&topics::FRAME)?, stage.output(&topics::UNKNOWN)?);
+        Ok(Some(Self { images, input, output }))
+    }
+
+    /// The input to wait for.
+    pub fn input(&self) -> &dyn Input {
+        &self.input
+    }
+
+    /// Compares the frame of a forecast, unless it has been compared; without a forecast, the next frame.
+    pub fn compare(&mut self, probe: &FieldProbe, forecast: Option<&Header>, threads: usize) -> anyhow::Result<()> {
+        if forecast.is_some_and(|header| self.images.has_compared(header)) {
+            return Ok(());
+        }
+        while let Some(frame) = self.input.next()? {
+            if forecast.is_some_and(|header| frame.header.capture_time_ns < header.capture_time_ns) {
+                continue;
+            }
+            let started_ns = monotonic_now_ns();
+            if let Some(mut unknowns) = self.images.compare(probe, &frame, frame.image(), threads) {
+                unknowns.stage_latency_ns = monotonic_now_ns() - started_ns;
+                self.output.send(unknowns)?;
+            }
+            break;
+        }
+        Ok(())
+    }
+
+    /// The evidence of a forecast's frame, if it shows something to compare.
+    ///
+    /// # Errors
+    ///
+    /// The frame has not been compared: it did not arrive, or was overwritten by newer ones.
+    pub fn evidence(&self, forecast: &Header) -> anyhow::Result<Option<&ImageEvidence>> {
+        anyhow::ensure!(
+            self.images.has_compared(forecast),
+            "a forecast without its frame on `{}`: its image cannot be compared; set `checks.compare = false` for \
+             forecasts of another source",
+            topics::FRAME.name
+        );
+        Ok(self.images.evidence(forecast))
+    }
+}
