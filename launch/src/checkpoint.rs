@@ -1,10 +1,12 @@
 //! `carff checkpoint`: trained models for other programs, and the limits of what a checkpoint knows.
 
+use crate::train::Display;
 use anyhow::Context;
 use carff_base::files::check_writable;
+use carff_base::statistics::percentile_of_sorted;
 use carff_checkpoint::Manifest;
 use carff_scenes::Scenario;
-use carff_training::{KnownInput, calibrate_known};
+use carff_training::{BoundInput, KnownInput, bound_threshold, calibrate_known};
 use std::path::PathBuf;
 use std::process::ExitCode;
 
@@ -19,6 +21,11 @@ pub enum CheckpointCommand {
     #[command(after_help = "Example: the shipped checkpoint, on free poses of its scenario
   carff checkpoint known configs/checkpoints/toy --dataset data/toy --scenario configs/scenarios/toy.toml")]
     Known(KnownArgs),
+    /// Choose the calibrated rule's threshold so that at most a share of the drives with a hazard is answered with
+    /// `advance`, and write it into `planning.json`. Run it after `carff checkpoint known`.
+    #[command(after_help = "Example: at most 1 % of the drives, with 95 % confidence
+  carff checkpoint bound configs/checkpoints/toy --scenario configs/scenarios/toy.toml")]
+    Bound(BoundArgs),
 }
 
 /// Input and output of an export.
@@ -50,11 +57,39 @@ pub struct KnownArgs {
     threads: usize,
 }
 
+/// Input of a bound.
+#[derive(Debug, clap::Args)]
+pub struct BoundArgs {
+    /// Checkpoint folder.
+    checkpoint: PathBuf,
+    /// Scenario file of the checkpoint: its free drives are used.
+    #[arg(long)]
+    scenario: PathBuf,
+    /// Free drives; half of them have the hazard.
+    #[arg(long, default_value_t = 2000)]
+    drives: usize,
+    /// Largest share of advances where the hazard is there, 0 to 1.
+    #[arg(long, default_value_t = 0.01, value_parser = share)]
+    level: f64,
+    /// Probability with which the bound holds, 0 to 1.
+    #[arg(long, default_value_t = 0.95, value_parser = share)]
+    confidence: f64,
+    /// Threads that render.
+    #[arg(long, default_value_t = 2)]
+    threads: usize,
+}
+
+fn share(text: &str) -> Result<f64, String> {
+    let value: f64 = text.parse().map_err(|_| "not a number".to_owned())?;
+    if value > 0.0 && value < 1.0 { Ok(value) } else { Err("must be above 0 and below 1".to_owned()) }
+}
+
 /// Runs the command.
 pub fn run(command: &CheckpointCommand) -> anyhow::Result<ExitCode> {
     match command {
         CheckpointCommand::Onnx(args) => onnx(args)?,
         CheckpointCommand::Known(args) => known(args)?,
+        CheckpointCommand::Bound(args) => bound(args)?,
     }
     Ok(ExitCode::SUCCESS)
 }
@@ -78,6 +113,34 @@ fn known(args: &KnownArgs) -> anyhow::Result<()> {
         threads: args.threads,
     };
     let known = calibrate_known(input, &|_| {}).context("cannot calibrate what the checkpoint knows")?;
-    println!("limit {:.2} on {} images, {} areas", known.limit, known.images, known.lanes.areas.len());
+    for (side, limits) in [("clear", &known.clear), ("hazard", &known.hazard)] {
+        println!("{side}: limit {:.2} on {} images", limits.limit, limits.images);
+    }
+    println!("this place: at least {:.2} of the view explained", known.least_explained);
+    Ok(())
+}
+
+fn bound(args: &BoundArgs) -> anyhow::Result<()> {
+    let scenario = Scenario::load(&args.scenario)?;
+    let display = Display::default();
+    let input = BoundInput {
+        checkpoint: &args.checkpoint,
+        scenario: &scenario,
+        drives: args.drives,
+        level: args.level,
+        confidence: args.confidence,
+        threads: args.threads,
+    };
+    let chosen = bound_threshold(input, &|p| display.show(p)).context("cannot bound the threshold")?;
+    display.finish();
+    let of = |sorted: &[f64], share: f64| percentile_of_sorted(sorted, share).unwrap_or(f64::NAN);
+    println!("threshold {:.4}", chosen.planning.hazard_threshold);
+    for (kind, sorted) in [("hazard", &chosen.hazard), ("clear", &chosen.clear)] {
+        let [p1, p5, p50, p95, p99] = [0.01, 0.05, 0.5, 0.95, 0.99].map(|share| of(sorted, share));
+        println!(
+            "{kind}: {} drives, hazard or unknown at 1, 5, 50, 95, 99 %: {p1:.3} {p5:.3} {p50:.3} {p95:.3} {p99:.3}",
+            sorted.len()
+        );
+    }
     Ok(())
 }

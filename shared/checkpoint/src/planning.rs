@@ -20,6 +20,23 @@ pub struct CheckpointPlanning {
     pub split_seed: u64,
     /// Hazard probability from which on the calibrated rule halts, 0 to 1; chosen on the calibration poses.
     pub hazard_threshold: f64,
+    /// Bound that the threshold keeps, if it was chosen by one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub bound: Option<Bound>,
+}
+
+/// Bound on the calibrated rule: at most a share `level` of the drives with a hazard are answered with `advance`.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Bound {
+    /// Largest share, 0 to 1.
+    pub level: f64,
+    /// Probability, over the draw of the calibration drives, that the bound holds.
+    pub confidence: f64,
+    /// Calibration drives with a hazard.
+    pub drives: usize,
+    /// Calibration drives with a hazard that the threshold answers with `advance`.
+    pub advances: usize,
 }
 
 /// Returns the policy of a rule: with `threshold` if given, else with the checkpoint's threshold. Only the calibrated
@@ -57,7 +74,7 @@ pub enum CheckpointPlanningError {
 impl CheckpointPlanning {
     /// Creates the contents with the current format version.
     pub fn new(split_seed: u64, hazard_threshold: f64) -> Self {
-        Self { format_version: FORMAT_VERSION, split_seed, hazard_threshold }
+        Self { format_version: FORMAT_VERSION, split_seed, hazard_threshold, bound: None }
     }
 
     /// Reads and checks the file of a checkpoint folder.

@@ -15,11 +15,11 @@ const MAX_RATIO: f64 = 1e4;
 ///
 /// ```
 /// use carff_decision::ImageEvidence;
-/// // The image fits state 0 well, and state 1 badly.
-/// let evidence = ImageEvidence::new(&[100.0, 1e-3]);
-/// // The encoder sees the hazard of state 1 with 0.2: the image contradicts it.
+/// // The image fits state 1 well, and state 0 badly.
+/// let evidence = ImageEvidence::new(&[1e-3, 100.0]);
+/// // The encoder sees the hazard of state 1 with 0.2: the image supports it.
 /// let (hazard, unknown) = evidence.weigh(0.2, &[false, true]);
-/// assert!(hazard < 0.01 && unknown < 0.01);
+/// assert!(hazard > 0.9 && unknown < 0.1);
 /// ```
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct ImageEvidence {
@@ -51,7 +51,8 @@ impl ImageEvidence {
     /// `hazard_states` marks the states with a hazard, and must have one entry a state.
     ///
     /// Two opinions are pooled with equal weights: one starts from the encoder's probability, the other from equally
-    /// probable states. Each is weighed by the best explanation with and without a hazard (Bayes' rule).
+    /// probable states. Each is weighed by the best explanation with and without a hazard (Bayes' rule). The image adds
+    /// to the hazard and never takes from it: a hazard may be hidden at a place where no known state has it.
     pub fn weigh(&self, hazard_probability: f32, hazard_states: &[bool]) -> (f64, f64) {
         let best = |hazard: bool| {
             let of = self.ratios.iter().zip(hazard_states).filter(|(_, h)| **h == hazard).map(|(r, _)| *r);
@@ -67,7 +68,9 @@ impl ImageEvidence {
         };
         let (trusting, doubting) = (posterior(f64::from(hazard_probability).clamp(0.0, 1.0)), posterior(hazards));
         let pooled = |a: f64, b: f64| ENCODER_SHARE * a + (1.0 - ENCODER_SHARE) * b;
-        (pooled(trusting.0, doubting.0), pooled(trusting.1, doubting.1))
+        let unknown = pooled(trusting.1, doubting.1);
+        let encoder = f64::from(hazard_probability).clamp(0.0, 1.0);
+        (pooled(trusting.0, doubting.0).max(encoder * (1.0 - unknown)), unknown)
     }
 }
 
@@ -116,6 +119,13 @@ mod tests {
     fn a_visible_hazard_overrules_the_encoder() {
         let (hazard, unknown) = ImageEvidence::new(&[1e-3, 80.0, 1e-3, 1e-3]).weigh(0.0, &STATES);
         assert!(hazard + unknown > 0.7, "{hazard} {unknown}");
+    }
+
+    /// An image that the hazard states do not explain leaves the encoder's probability unchanged.
+    #[test]
+    fn no_hazard_is_argued_away() {
+        let (hazard, unknown) = ImageEvidence::new(&[1e-3, 1e-3, 80.0, 80.0]).weigh(0.3, &STATES);
+        assert!((hazard - 0.3).abs() < 0.01 && unknown < 0.01, "{hazard} {unknown}");
     }
 
     /// Where the image shows no difference, an encoder that is wrongly sure leaves a quarter of the probability to the

@@ -42,7 +42,7 @@ pub use stats::{
     reliability::{Reliability, ReliabilityBin, reliability},
     ssim::ssim,
 };
-pub use subject::{About, EvalOptions, Novelty, Subject};
+pub use subject::{About, DecisiveImage, EvalOptions, Novelty, OtherPlace, Subject};
 pub use tables::{
     encoder::{EncoderTable, SvmScore, SvmTable, encoder_table},
     field::{FieldPictures, NovelViews, PictureTable},

@@ -2,6 +2,7 @@
 
 use crate::trials::planning::{NoisyEncoder, Planner};
 use crate::{ByRole, Decoding, EvaluationError, PosedImages, Progress, ROLES};
+use carff_base::geometry::PinholeCamera;
 use carff_base::random::Key;
 use carff_checkpoint::CheckpointPlanning;
 use carff_checkpoint::{CheckpointError, FieldProbe, Manifest, ScenarioIdentity, files};
@@ -76,6 +77,26 @@ pub struct Novelty {
     pub looks: Vec<UnknownLook>,
 }
 
+/// The image of a drive whose decision has one right answer.
+#[derive(Clone, Debug)]
+pub struct DecisiveImage {
+    /// The image, without sensor noise.
+    pub image: Image,
+    /// The camera.
+    pub camera: PinholeCamera,
+    /// The right answer.
+    pub kind: DriveKind,
+}
+
+/// Images that do not show the scenario's place.
+#[derive(Clone, Debug)]
+pub struct OtherPlace {
+    /// Name of the place, or of the change of the own place's images.
+    pub name: String,
+    /// Images with the cameras that claim to have taken them.
+    pub images: Vec<(PinholeCamera, Image)>,
+}
+
 /// A checkpoint on a dataset.
 pub struct Subject {
     /// Folder of the checkpoint.
@@ -98,13 +119,14 @@ pub struct Subject {
     pub threshold: Option<f64>,
     /// Training curves, where the folder of the training run is available.
     pub training_curves: Vec<Panel>,
-    /// Decisive image of each free drive, without sensor noise, and the correct action. Empty until the caller renders
-    /// them.
-    pub free_drives: Vec<(Image, DriveKind)>,
+    /// Decisive image of each free drive. Empty until the caller renders them.
+    pub free_drives: Vec<DecisiveImage>,
     /// Free poses with one image of each branch. Empty until the caller renders them.
     pub free_poses: Vec<FreePose>,
     /// Unknown vehicles and objects of the scenario, in sight from free poses. Empty until the caller renders them.
     pub novelties: Vec<Novelty>,
+    /// Images of other places. Empty until the caller renders them.
+    pub other_places: Vec<OtherPlace>,
     /// Settings of this evaluation.
     pub options: EvalOptions,
     trained: TrainedWith,
@@ -162,6 +184,7 @@ impl Subject {
             free_drives: Vec::new(),
             free_poses: Vec::new(),
             novelties: Vec::new(),
+            other_places: Vec::new(),
             options,
             trained,
         };

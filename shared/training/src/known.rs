@@ -64,9 +64,11 @@ pub fn calibrate_known(input: KnownInput, on_progress: &dyn Fn(&Progress)) -> Re
         Some(scenario) => work.free_poses(scenario, input.free_poses, on_progress)?,
         None => work.trained_poses(&posed, on_progress),
     };
-    let mut known = Known::fit(work.lanes.clone(), &comparisons, camera_limits(&posed, work.seed));
+    let hazard_states = manifest.scenario.hazard_states();
+    let mut known = Known::fit(work.lanes.clone(), hazard_states, &comparisons, camera_limits(&posed, work.seed));
     if input.scenario.is_none() {
-        known.limit *= TRAINED_POSES;
+        known.clear.limit *= TRAINED_POSES;
+        known.hazard.limit *= TRAINED_POSES;
     }
     known.save(input.checkpoint).map_err(|e| TrainingError::Unfit(e.to_string()))?;
     Ok(known)
@@ -87,23 +89,25 @@ impl Work {
         scenario: &Scenario,
         count: usize,
         on_progress: &dyn Fn(&Progress),
-    ) -> Result<Vec<Comparison>, TrainingError> {
+    ) -> Result<Vec<(usize, Comparison)>, TrainingError> {
         let mut all = Vec::new();
         for number in 0..count {
             let pose = scenario.free_pose(number as u64, self.seed).map_err(|e| TrainingError::Unfit(e.to_string()))?;
-            for look in &pose.looks {
-                all.extend(self.compare(&pose.camera, &look.image, all.len()));
+            for (branch, look) in pose.looks.iter().enumerate() {
+                let Some(state) = scenario.info().state(branch, pose.timestamp) else { continue };
+                all.extend(self.compare(&pose.camera, &look.image, all.len()).map(|compared| (state, compared)));
             }
             on_progress(&Progress { phase: "known", done: number + 1, total: count, line: String::new() });
         }
         Ok(all)
     }
 
-    fn trained_poses(&mut self, posed: &PosedImages, on_progress: &dyn Fn(&Progress)) -> Vec<Comparison> {
+    fn trained_poses(&mut self, posed: &PosedImages, on_progress: &dyn Fn(&Progress)) -> Vec<(usize, Comparison)> {
         let images = posed.with_roles(&[PoseRole::Rest]);
         let mut all = Vec::new();
         for (done, &i) in images.iter().enumerate() {
-            all.extend(self.compare(&posed.dataset.frames()[i].camera, &posed.images[i], i));
+            let compared = self.compare(&posed.dataset.frames()[i].camera, &posed.images[i], i);
+            all.extend(compared.map(|compared| (posed.labels[i].state, compared)));
             on_progress(&Progress { phase: "known", done: done + 1, total: images.len(), line: String::new() });
         }
         all

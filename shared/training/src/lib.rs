@@ -26,6 +26,7 @@
 
 pub mod ablation;
 mod augmentation;
+mod bound;
 mod calibrate;
 mod config;
 mod curves;
@@ -43,6 +44,7 @@ mod unambiguous;
 mod vae;
 
 pub use augmentation::Augmentation;
+pub use bound::{BoundInput, ChosenBound, bound_threshold};
 pub use carff_evaluation::Progress;
 pub use config::{CalibrationConfig, FieldTraining, FreePoses, MdnTraining, TrainingConfig, VaeTraining};
 pub use curves::training_curves;

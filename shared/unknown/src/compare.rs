@@ -81,7 +81,7 @@ impl Comparison {
 #[derive(Debug, Default)]
 pub struct Comparer {
     buffer: HypothesisBuffer,
-    /// What the buffer shows: the camera, the pixels that are judged, and the states.
+    /// The camera, the judged pixels and the states that the buffer shows.
     shown: Option<(PinholeCamera, Vec<bool>, Vec<[f32; LATENT_DIM]>)>,
 }
 
@@ -125,7 +125,7 @@ impl Comparer {
         let pixels: Vec<usize> = (0..judged.len()).filter(|&i| judged[i]).collect();
         let of_state = |(state, energy): (usize, &Vec<f32>)| {
             let mut energy = energy.clone();
-            // The vehicle itself stands a little beside its known place, and nothing else stands there.
+            // The place of the vehicle itself varies, and nothing else can be there.
             for i in lanes.own_pixels(&small, state, &pixels) {
                 energy[i] = 0.0;
             }

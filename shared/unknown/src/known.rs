@@ -1,5 +1,6 @@
 //! The limits of the known: how much of an image a known state leaves unexplained, and the file of these limits.
 
+use crate::blobs::Blob;
 use crate::camera::CameraLimits;
 use crate::compare::{Comparer, Comparison};
 use crate::lanes::{ErrorMap, Lanes};
@@ -33,16 +34,28 @@ pub struct Known {
     pub format_version: u32,
     /// The ground on which something unknown counts.
     pub lanes: Lanes,
-    /// The field's own errors on that ground.
-    pub errors: ErrorMap,
-    /// Strength of a blob that 97 of 100 images of known states stay below.
-    pub limit: f32,
-    /// Number of images that the limits rest on.
-    pub images: usize,
+    /// For each known state, true if it has the hazard.
+    pub hazard_states: Vec<bool>,
+    /// Limits of the states without the hazard.
+    pub clear: Limits,
+    /// Limits of the states with the hazard, whose vehicle has no fixed place.
+    pub hazard: Limits,
     /// Share of a view's variation that the field explains, from which on the view is of this place.
     pub least_explained: f32,
     /// Limits of images of a camera in order.
     pub camera: CameraLimits,
+}
+
+/// Limits of what some of the known states leave unexplained of their own images.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Limits {
+    /// The field's own errors on the lanes.
+    pub errors: ErrorMap,
+    /// Strength of a blob that 97 of 100 images stay below.
+    pub limit: f32,
+    /// Number of images that the limit rests on.
+    pub images: usize,
 }
 
 /// Reason why the file cannot be used.
@@ -78,27 +91,28 @@ pub struct Seen {
 }
 
 impl Known {
-    /// Fits the limits. Residuals of the first half of the images make the error map, and those of the second half the
-    /// limit, each under the image's own best state.
-    pub fn fit(lanes: Lanes, comparisons: &[Comparison], camera: CameraLimits) -> Self {
-        let mut points = Vec::new();
-        let (for_errors, for_limit) = comparisons.split_at(comparisons.len() / 2);
-        for comparison in for_errors {
-            points.extend(comparison.on_lanes(best_by_sum(comparison)));
-        }
-        let errors = ErrorMap::fit(&lanes, &points);
-        let mut strengths: Vec<f32> = for_limit.iter().map(|c| least_strength(c, &errors)).collect();
-        strengths.sort_by(f32::total_cmp);
-        let at = ((strengths.len() as f64 * WITHIN).ceil() as usize).saturating_sub(1);
-        let limit = strengths.get(at).copied().unwrap_or(1.0).max(1.0);
-        let least = for_limit.iter().map(|c| c.fit.explained).fold(1.0, f32::min);
+    /// Fits the limits on comparisons of images, each with the state that it shows.
+    pub fn fit(
+        lanes: Lanes,
+        hazard_states: Vec<bool>,
+        comparisons: &[(usize, Comparison)],
+        camera: CameraLimits,
+    ) -> Self {
+        let of_side = |side: bool| {
+            let states: Vec<usize> = (0..hazard_states.len()).filter(|&s| hazard_states[s] == side).collect();
+            let images: Vec<&Comparison> =
+                comparisons.iter().filter(|(state, _)| states.contains(state)).map(|(_, c)| c).collect();
+            Limits::fit(&lanes, &states, &images)
+        };
+        let (clear, hazard) = (of_side(false), of_side(true));
+        let least = comparisons.iter().map(|(_, c)| c.fit.explained).fold(1.0, f32::min);
         Self {
             format_version: FORMAT_VERSION,
-            lanes,
-            errors,
-            limit,
-            images: strengths.len(),
             least_explained: OF_LEAST_EXPLAINED * least.max(0.0),
+            lanes,
+            hazard_states,
+            clear,
+            hazard,
             camera,
         }
     }
@@ -122,17 +136,23 @@ impl Known {
             let ratios = vec![0.0; comparison.residuals.len()];
             return Seen { ratios, boxes: Vec::new(), residual: ELSEWHERE };
         }
-        let of_states: Vec<_> = (0..comparison.residuals.len()).map(|s| comparison.blobs(s, &self.errors)).collect();
-        let strength = |s: &Vec<crate::Blob>| s.first().map_or(0.0, |blob| blob.strength);
-        let ratio = |strength: f32| f64::from(self.limit / strength.max(0.25 * self.limit)).powf(STEEPNESS);
-        let ratios: Vec<f32> = of_states.iter().map(|s| ratio(strength(s)) as f32).collect();
-        let best = of_states.iter().min_by(|a, b| strength(a).total_cmp(&strength(b)));
-        let blobs = best.map_or(&[][..], |blobs| &blobs[..]);
-        let boxes = blobs.iter().take(MAX_UNKNOWNS).filter(|blob| blob.strength > self.limit).map(|blob| {
+        let limits =
+            |state: usize| if self.hazard_states.get(state) == Some(&true) { &self.hazard } else { &self.clear };
+        let of_states: Vec<Vec<Blob>> =
+            (0..comparison.residuals.len()).map(|s| comparison.blobs(s, &limits(s).errors)).collect();
+        let in_limits = |state: usize, blob: &Blob| blob.strength / limits(state).limit;
+        let strongest = |state: usize| of_states[state].first().map_or(0.0, |blob| in_limits(state, blob));
+        let ratio = |in_limits: f32| f64::from(1.0 / in_limits.max(0.25)).powf(STEEPNESS);
+        let ratios = (0..of_states.len()).map(|s| ratio(strongest(s)) as f32).collect();
+        let best = (0..of_states.len()).min_by(|&a, &b| strongest(a).total_cmp(&strongest(b)));
+        let Some(best) = best else { return Seen { ratios, boxes: Vec::new(), residual: 0.0 } };
+        let unknown = of_states[best].iter().take(MAX_UNKNOWNS).filter(|blob| in_limits(best, blob) > 1.0);
+        let boxes = unknown.map(|blob| {
             let (center, half_size) = blob.upright_box(&comparison.camera, self.lanes.ground_m);
-            UnknownBox { center, half_size, probability: (1.0 / (1.0 + ratio(blob.strength))) as f32, place: -1 }
+            let probability = (1.0 / (1.0 + ratio(in_limits(best, blob)))) as f32;
+            UnknownBox { center, half_size, probability, place: -1 }
         });
-        Seen { ratios, boxes: boxes.collect(), residual: best.map_or(0.0, strength) / self.limit }
+        Seen { ratios, boxes: boxes.collect(), residual: strongest(best) }
     }
 
     /// Reads the file of a checkpoint; `None` if the checkpoint has none.
@@ -149,8 +169,10 @@ impl Known {
             let found = known.format_version;
             return Err(format(format!("`format_version` is {found}, this program reads {FORMAT_VERSION}")));
         }
-        if !(known.errors.is_valid() && known.limit.is_finite() && known.limit > 0.0) {
-            return Err(format("`errors` and `limit` must be positive numbers".to_owned()));
+        for limits in [&known.clear, &known.hazard] {
+            if !(limits.errors.is_valid() && limits.limit.is_finite() && limits.limit > 0.0) {
+                return Err(format("`errors` and `limit` must be positive numbers".to_owned()));
+            }
         }
         Ok(Some(known))
     }
@@ -167,16 +189,26 @@ impl Known {
     }
 }
 
-/// The state with the smallest sum of squared residuals on the lanes.
-fn best_by_sum(comparison: &Comparison) -> usize {
-    let sum = |s: usize| comparison.on_lanes(s).map(|(_, r)| r * r).sum::<f32>();
-    (0..comparison.residuals.len()).min_by(|&a, &b| sum(a).total_cmp(&sum(b))).unwrap_or(0)
-}
-
-/// Strength of the strongest blob under the state that leaves the least.
-fn least_strength(comparison: &Comparison, errors: &ErrorMap) -> f32 {
-    let strongest = |s: usize| comparison.blobs(s, errors).first().map_or(0.0, |blob| blob.strength);
-    (0..comparison.residuals.len()).map(strongest).fold(f32::INFINITY, f32::min)
+impl Limits {
+    /// Fits the limits of some states on comparisons of their images, each under its best one of these states.
+    /// Residuals of the first half of the images make the error map, and those of the second half the limit.
+    fn fit(lanes: &Lanes, states: &[usize], images: &[&Comparison]) -> Self {
+        let (for_errors, for_limit) = images.split_at(images.len() / 2);
+        let mut points = Vec::new();
+        for comparison in for_errors {
+            let sum = |s: usize| comparison.on_lanes(s).map(|(_, r)| r * r).sum::<f32>();
+            let best = states.iter().copied().min_by(|&a, &b| sum(a).total_cmp(&sum(b)));
+            points.extend(best.into_iter().flat_map(|best| comparison.on_lanes(best)));
+        }
+        let errors = ErrorMap::fit(lanes, &points);
+        let strongest = |c: &Comparison, s: usize| c.blobs(s, &errors).first().map_or(0.0, |blob| blob.strength);
+        let least = |c: &&Comparison| states.iter().map(|&s| strongest(c, s)).fold(f32::INFINITY, f32::min);
+        let mut strengths: Vec<f32> = for_limit.iter().map(least).collect();
+        strengths.sort_by(f32::total_cmp);
+        let at = ((strengths.len() as f64 * WITHIN).ceil() as usize).saturating_sub(1);
+        let limit = strengths.get(at).copied().unwrap_or(1.0).max(1.0);
+        Self { errors, limit, images: strengths.len() }
+    }
 }
 
 #[cfg(test)]
@@ -193,12 +225,13 @@ mod tests {
             nearest_m: 1.0,
             own: Vec::new(),
         };
+        let limits = Limits { errors: ErrorMap::even(&lanes, 1.0), limit: 5.0, images: 10 };
         Known {
             format_version: FORMAT_VERSION,
-            errors: ErrorMap::even(&lanes, 1.0),
             lanes,
-            limit: 5.0,
-            images: 10,
+            hazard_states: vec![false],
+            clear: limits.clone(),
+            hazard: limits,
             least_explained: 0.5,
             camera: CameraLimits::fit(&[], [60.0; 2]),
         }
@@ -214,7 +247,7 @@ mod tests {
         assert_eq!(Known::load(folder.path()).unwrap(), Some(known.clone()));
         for (broken, word) in [
             (Known { format_version: 9, ..known.clone() }, "format_version"),
-            (Known { limit: -1.0, ..known.clone() }, "limit"),
+            (Known { clear: Limits { limit: -1.0, ..known.clear.clone() }, ..known.clone() }, "limit"),
         ] {
             broken.save(folder.path()).unwrap();
             assert!(Known::load(folder.path()).unwrap_err().to_string().contains(word));

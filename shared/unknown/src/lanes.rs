@@ -214,7 +214,7 @@ mod tests {
         assert_eq!(points[16], None);
     }
 
-    /// The pixels of the vehicle itself are those that its box with its margin covers, in the states in which it stands
+    /// The pixels of the vehicle itself are those that its box with its margin covers, in the states in which it is
     /// there. A camera next to it has no margin, and a camera on it no such pixels.
     #[test]
     fn own_pixels_are_those_of_the_vehicle() {

@@ -17,5 +17,5 @@ mod lanes;
 pub use blobs::Blob;
 pub use camera::{CameraCheck, CameraLimits, Measured, Measurement};
 pub use compare::{Comparer, Comparison, Fit};
-pub use known::{Known, KnownError, Seen};
+pub use known::{Known, KnownError, Limits, Seen};
 pub use lanes::{ErrorMap, Ground, Lanes, OwnBox};

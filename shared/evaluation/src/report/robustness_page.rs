@@ -33,6 +33,33 @@ pub fn robustness(page: &mut String, results: &Results) {
             ],
         );
     }
+    if !table.other_places.is_empty() {
+        let _ = writeln!(
+            page,
+            "\n## Other places\n\nImages of other scenarios from their own poses, and images of this place that are mirrored, \
+             turned upside down, or claim another pose. `advance` is wrong.\n"
+        );
+        head(page, &["images", "advances", "without comparison"]);
+        for (name, f) in &table.other_places {
+            let of = |count: usize| format!("{count} of {}", f.trials);
+            row(page, &[name.clone(), of(f.advances), of(f.advances_without_comparison)]);
+        }
+    }
+    let b = &table.bound;
+    if b.drives > 0 {
+        let level = b.level.map_or("none".to_owned(), |level| format!("at most {:.1} %", 100.0 * level));
+        let _ = writeln!(
+            page,
+            "\n## Bound\n\nFree drives from another seed than the bound's. Bound of the checkpoint: {level}. Advances with the \
+             hazard: {:.2} % of {} (95 % interval {:.2} to {:.2} %). Clear drives kept: {} of {}.\n",
+            100.0 * b.found,
+            b.drives,
+            100.0 * b.interval[0],
+            100.0 * b.interval[1],
+            b.kept,
+            b.clear_drives
+        );
+    }
     let _ = writeln!(
         page,
         "\n## Corrupted images\n\nUnsafe: hazard images (visible, in part, hidden) answered with `advance`. Kept: images of \

@@ -191,7 +191,7 @@ impl Protocol<'_> {
         let encoder = self.subject.noisy_encoder();
         let drives = self.subject.free_drives.iter().enumerate();
         let taken: Vec<Trial> =
-            drives.filter_map(|(i, (image, kind))| encoder.trial(image, *kind, FIRST_FREE + i as u64)).collect();
+            drives.filter_map(|(i, d)| encoder.trial(&d.image, d.kind, FIRST_FREE + i as u64)).collect();
         self.decide(&taken, Sampling::Stratified)
     }
 

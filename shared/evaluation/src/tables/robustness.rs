@@ -1,10 +1,11 @@
-//! Decisions on images that no training has seen: corrupted ones, unknown vehicles and objects.
+//! Decisions on images that no training has seen: corrupted ones, unknown vehicles and objects, other places.
 
 use crate::trials::looks::{Look, free_looks};
-use crate::trials::planning::Trial;
+use crate::trials::planning::{Count, Trial};
 use crate::{Progress, Subject};
 use carff_base::geometry::PinholeCamera;
 use carff_base::random::Key;
+use carff_checkpoint::CheckpointPlanning;
 use carff_dataset::{Corruption, Image, drives::DriveKind, sensor::apply_noise_into};
 use carff_decision::{ImageEvidence, Policy, Sampling};
 use carff_messages::{Header, ImageCheck, Rule};
@@ -16,6 +17,8 @@ use std::collections::BTreeMap;
 const SAMPLES: usize = 10;
 /// First frame number of these images, which share no random draws with other trials.
 const FIRST: u64 = 1 << 42;
+/// First frame number of free drives.
+const FIRST_DRIVE: u64 = FIRST + (1 << 32);
 /// Time between two checked images, nanoseconds; the checks of an evaluation have no clock.
 const APART_NS: u64 = 100_000_000;
 
@@ -35,6 +38,37 @@ pub struct NoveltyFigures {
     pub below_5_percent: usize,
     /// Images, each from a pose of its own.
     pub trials: usize,
+}
+
+/// Decisions on images that do not show the scenario's place.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct OtherPlaceFigures {
+    /// Images answered with `advance`.
+    pub advances: usize,
+    /// Images answered with `advance` without the comparison with the known states.
+    pub advances_without_comparison: usize,
+    /// Images.
+    pub trials: usize,
+}
+
+/// Decisions on free drives, against the bound that the threshold was chosen by.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct BoundFigures {
+    /// Largest share of advances where the hazard is there; absent for a threshold without a bound.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub level: Option<f64>,
+    /// Share of the drives with the hazard that are answered with `advance`.
+    pub found: f64,
+    /// 95 % interval of that share.
+    pub interval: [f64; 2],
+    /// Drives with the hazard.
+    pub drives: usize,
+    /// Drives without it that are answered with `advance`.
+    pub kept: usize,
+    /// Drives without it.
+    pub clear_drives: usize,
 }
 
 /// Decisions on images with one corruption.
@@ -62,6 +96,12 @@ pub struct Robustness {
     pub corruptions: ByCorruption,
     /// Unknown vehicles and objects, by name.
     pub unknown: BTreeMap<String, NoveltyFigures>,
+    /// Images of other places, by name.
+    #[serde(default)]
+    pub other_places: BTreeMap<String, OtherPlaceFigures>,
+    /// Free drives against the bound.
+    #[serde(default)]
+    pub bound: BoundFigures,
 }
 
 /// An image to decide on.
@@ -109,6 +149,21 @@ pub fn robustness(subject: &Subject, on_progress: &dyn Fn(&Progress)) -> Result<
         let (done, total) = (table.unknown.len(), subject.novelties.len());
         on_progress(&Progress { phase: "unknown", done, total, line: novelty.name.clone() });
     }
+    for other in &subject.other_places {
+        let shots = other.images.iter().enumerate().map(|(i, (camera, image))| Shot {
+            image: image.clone(),
+            camera,
+            frame: FIRST + i as u64,
+        });
+        let verdicts = judge.verdicts(&shots.collect::<Vec<_>>())?;
+        let figures = OtherPlaceFigures {
+            advances: verdicts.iter().filter(|v| v.advances).count(),
+            advances_without_comparison: verdicts.iter().filter(|v| v.advances_without_comparison).count(),
+            trials: verdicts.len(),
+        };
+        table.other_places.insert(other.name.clone(), figures);
+    }
+    table.bound = judge.bound()?;
     let looks = free_looks(&subject.free_poses, &subject.posed.scenario);
     let cameras: Vec<&PinholeCamera> = subject.free_poses.iter().map(|pose| &pose.camera).collect();
     let mut cells: Vec<(Option<Corruption>, u8)> = vec![(None, 0)];
@@ -130,6 +185,30 @@ struct Judge<'a> {
 }
 
 impl Judge<'_> {
+    fn bound(&self) -> Result<BoundFigures, String> {
+        let drives = &self.subject.free_drives;
+        let shots = drives.iter().enumerate().map(|(i, drive)| Shot {
+            image: drive.image.clone(),
+            camera: &drive.camera,
+            frame: FIRST_DRIVE + i as u64,
+        });
+        let verdicts = self.verdicts(&shots.collect::<Vec<_>>())?;
+        let (mut hazard, mut clear) = (Count::default(), Count::default());
+        for (drive, verdict) in drives.iter().zip(&verdicts) {
+            let of_kind = if drive.kind == DriveKind::Hazard { &mut hazard } else { &mut clear };
+            of_kind.add(verdict.advances);
+        }
+        let planning = CheckpointPlanning::load(&self.subject.checkpoint).map_err(|e| e.to_string())?;
+        Ok(BoundFigures {
+            level: planning.bound.map(|bound| bound.level),
+            found: hazard.rate().unwrap_or_default(),
+            interval: hazard.interval,
+            drives: hazard.trials,
+            kept: clear.success,
+            clear_drives: clear.trials,
+        })
+    }
+
     fn corrupted(
         &self,
         looks: &[Look],

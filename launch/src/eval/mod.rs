@@ -1,20 +1,18 @@
 //! `carff eval`: every table and image of a checkpoint, as JSON and one page.
 
+mod images;
+
 use crate::dataset::render;
 use crate::train::Display;
 use anyhow::{Context, bail};
 use carff_base::files::check_writable;
 use carff_checkpoint::Manifest;
-use carff_dataset::{Image, drives::DriveKind};
-use carff_evaluation::{EvalOptions, Novelty, Progress, Subject, Table, evaluate};
-use carff_scenes::config::{BystanderPlace, VariationRole};
-use carff_scenes::{Extras, FreePose, Scenario, UnknownLook};
+use carff_evaluation::{EvalOptions, Subject, Table, evaluate};
+use carff_scenes::{Extras, Scenario};
 use carff_training::training_curves;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
-/// Frames of a free drive between two states.
-const FRAMES_PER_TIMESTAMP: usize = 6;
 /// Largest distance of two cameras that count as the same, metres.
 const SAME_PLACE_M: f64 = 1e-3;
 
@@ -42,7 +40,7 @@ pub struct EvalArgs {
     /// Seed of sensor noise, draws, folds and free drives.
     #[arg(long, default_value_t = 2)]
     seed: u64,
-    /// Number of free drives for planning, half of them with a hazard. They need the scenario file of the dataset.
+    /// Number of free drives for planning and for the bound, half of them with a hazard. They need the scenario file of the dataset.
     #[arg(long, default_value_t = 400, value_parser = clap::value_parser!(u32).range(0..=100_000))]
     free_drives: u32,
     /// Number of free poses for the trials, each with one image of each branch. They need the scenario file of the
@@ -110,14 +108,18 @@ pub fn run(args: &EvalArgs) -> anyhow::Result<ExitCode> {
     let tables = if asked.is_empty() { Table::ALL.to_vec() } else { asked };
     let wants = |table| tables.contains(&table);
     if let Some(scenario) = shown_scenario(&subject).filter(|s| !s.info().hazard_branches.is_empty()) {
-        if wants(Table::Planning) {
-            subject.free_drives = free_drives(&scenario, args.free_drives, args.seed, &display)?;
+        if wants(Table::Planning) || wants(Table::Robustness) {
+            subject.free_drives = images::free_drives(&scenario, args.free_drives, args.seed, &display)?;
         }
         if wants(Table::Robustness) {
-            subject.novelties = novelties(&scenario, args.free_poses, args.seed, &display)?;
+            subject.novelties = images::novelties(&scenario, args.free_poses, args.seed, &display)?;
         }
         if wants(Table::Trials) || wants(Table::Robustness) {
-            subject.free_poses = free_poses(&scenario, args.free_poses, args.seed, &display)?;
+            subject.free_poses = images::free_poses(&scenario, args.free_poses, args.seed, &display)?;
+        }
+        if wants(Table::Robustness) {
+            subject.other_places =
+                images::other_places(&scenario, &subject.free_poses, args.free_poses, args.seed, &display)?;
         }
     }
     let results = evaluate(&subject, &tables, &args.out, &|p| display.show(p))?;
@@ -171,56 +173,6 @@ fn shown_scenario(subject: &Subject) -> Option<Scenario> {
     let same = scenario.cameras().len() == dataset.view_count()
         && scenario.cameras().iter().enumerate().all(|(view, there)| same_place(view, there));
     same.then_some(scenario)
-}
-
-/// Decisive image and correct action of each free drive.
-fn free_drives(
-    scenario: &Scenario,
-    count: u32,
-    seed: u64,
-    display: &Display,
-) -> anyhow::Result<Vec<(Image, DriveKind)>> {
-    let total = count as usize;
-    (0..total)
-        .map(|done| {
-            display.show(&Progress { phase: "free drives", done, total, line: String::new() });
-            let drive = scenario.free_drive(done as u64, FRAMES_PER_TIMESTAMP, seed)?;
-            let frame = scenario.free_frame(&drive, drive.decisive_frame())?;
-            Ok((frame.image, drive.kind()))
-        })
-        .collect()
-}
-
-/// Free poses with their images.
-fn free_poses(scenario: &Scenario, count: u32, seed: u64, display: &Display) -> anyhow::Result<Vec<FreePose>> {
-    let total = count as usize;
-    (0..total)
-        .map(|done| {
-            display.show(&Progress { phase: "free poses", done, total, line: String::new() });
-            Ok(scenario.free_pose(done as u64, seed)?)
-        })
-        .collect()
-}
-
-/// The scenario's unknown vehicles and objects, in sight from free poses.
-fn novelties(scenario: &Scenario, count: u32, seed: u64, display: &Display) -> anyhow::Result<Vec<Novelty>> {
-    let held_out = |role: VariationRole| role == VariationRole::HeldOut;
-    let vehicles =
-        scenario.appearances().iter().map(|a| Ok((scenario.with_appearance(&a.name)?, &a.name, a.role, false)));
-    let objects = scenario
-        .bystanders()
-        .iter()
-        .map(|b| Ok((scenario.with_object(&b.name)?, &b.name, b.role, b.place == BystanderPlace::Roadside)));
-    let total = scenario.appearances().len() + scenario.bystanders().len();
-    let of_variation = |(done, varied): (usize, anyhow::Result<(Scenario, &String, VariationRole, bool)>)| {
-        let (varied, name, role, beside) = varied?;
-        display.show(&Progress { phase: "unknown looks", done, total, line: name.clone() });
-        // A vehicle of a hazard branch is absent at some time steps.
-        let looks = (0..u64::from(count)).filter_map(|number| varied.unknown_look(number, seed).ok());
-        let looks = looks.filter(UnknownLook::in_sight).collect();
-        Ok(Novelty { name: name.clone(), held_out: held_out(role), beside, looks })
-    };
-    vehicles.chain(objects).enumerate().map(of_variation).collect()
 }
 
 /// Folder of the training run: the given one, or the default of `carff train`.

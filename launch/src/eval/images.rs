@@ -1,0 +1,109 @@
+//! Images of a scenario that no dataset has: free drives and poses, unknown objects, other places.
+
+use crate::train::Display;
+use carff_base::geometry::PinholeCamera;
+use carff_dataset::Image;
+use carff_evaluation::{DecisiveImage, Novelty, OtherPlace, Progress};
+use carff_scenes::config::{BystanderPlace, VariationRole};
+use carff_scenes::{FreePose, Scenario, UnknownLook};
+use ndarray::Axis;
+use std::path::PathBuf;
+
+/// Frames of a free drive between two states.
+const FRAMES_PER_TIMESTAMP: usize = 6;
+
+/// Decisive image of each free drive.
+pub fn free_drives(
+    scenario: &Scenario,
+    count: u32,
+    seed: u64,
+    display: &Display,
+) -> anyhow::Result<Vec<DecisiveImage>> {
+    let total = count as usize;
+    (0..total)
+        .map(|done| {
+            display.show(&Progress { phase: "free drives", done, total, line: String::new() });
+            let drive = scenario.free_drive(done as u64, FRAMES_PER_TIMESTAMP, seed)?;
+            let frame = scenario.free_frame(&drive, drive.decisive_frame())?;
+            Ok(DecisiveImage { image: frame.image, camera: frame.camera, kind: drive.kind() })
+        })
+        .collect()
+}
+
+/// Free poses with their images.
+pub fn free_poses(scenario: &Scenario, count: u32, seed: u64, display: &Display) -> anyhow::Result<Vec<FreePose>> {
+    let total = count as usize;
+    (0..total)
+        .map(|done| {
+            display.show(&Progress { phase: "free poses", done, total, line: String::new() });
+            Ok(scenario.free_pose(done as u64, seed)?)
+        })
+        .collect()
+}
+
+/// The scenario's unknown vehicles and objects, in sight from free poses.
+pub fn novelties(scenario: &Scenario, count: u32, seed: u64, display: &Display) -> anyhow::Result<Vec<Novelty>> {
+    let held_out = |role: VariationRole| role == VariationRole::HeldOut;
+    let vehicles =
+        scenario.appearances().iter().map(|a| Ok((scenario.with_appearance(&a.name)?, &a.name, a.role, false)));
+    let objects = scenario
+        .bystanders()
+        .iter()
+        .map(|b| Ok((scenario.with_object(&b.name)?, &b.name, b.role, b.place == BystanderPlace::Roadside)));
+    let total = scenario.appearances().len() + scenario.bystanders().len();
+    let of_variation = |(done, varied): (usize, anyhow::Result<(Scenario, &String, VariationRole, bool)>)| {
+        let (varied, name, role, beside) = varied?;
+        display.show(&Progress { phase: "unknown looks", done, total, line: name.clone() });
+        // A vehicle of a hazard branch is absent at some time steps.
+        let looks = (0..u64::from(count)).filter_map(|number| varied.unknown_look(number, seed).ok());
+        let looks = looks.filter(UnknownLook::in_sight).collect();
+        Ok(Novelty { name: name.clone(), held_out: held_out(role), beside, looks })
+    };
+    vehicles.chain(objects).enumerate().map(of_variation).collect()
+}
+
+/// Images of the other scenarios in the scenario's folder, and changed images of its own free poses.
+pub fn other_places(
+    scenario: &Scenario,
+    own: &[FreePose],
+    count: u32,
+    seed: u64,
+    display: &Display,
+) -> anyhow::Result<Vec<OtherPlace>> {
+    let first = |pose: &FreePose| pose.looks.first().map(|look| (pose.camera, look.image.clone()));
+    let mut places = Vec::new();
+    for path in scenario_files(scenario)? {
+        let other = Scenario::load(&path)?;
+        if other.roads() == scenario.roads() {
+            continue;
+        }
+        let poses = free_poses(&other, count, seed, display)?;
+        places.push(OtherPlace { name: other.info().name.clone(), images: poses.iter().filter_map(first).collect() });
+    }
+    let shown: Vec<(PinholeCamera, Image)> = own.iter().filter_map(first).collect();
+    for (name, axis) in [("mirrored", Axis(1)), ("upside down", Axis(0))] {
+        let images = shown.iter().filter_map(|(camera, image)| Some((*camera, reversed(image, axis)?))).collect();
+        places.push(OtherPlace { name: name.to_owned(), images });
+    }
+    let others = shown.iter().cycle().skip(shown.len() / 2).map(|(camera, _)| *camera);
+    let images = shown.iter().zip(others).map(|((_, image), camera)| (camera, image.clone())).collect();
+    places.push(OtherPlace { name: "another pose".to_owned(), images });
+    Ok(places)
+}
+
+fn reversed(image: &Image, axis: Axis) -> Option<Image> {
+    let mut view = image.view()?;
+    view.invert_axis(axis);
+    Some(Image { rgb: view.iter().copied().collect(), ..image.clone() })
+}
+
+/// The scenario files in a scenario's folder, by name.
+fn scenario_files(scenario: &Scenario) -> anyhow::Result<Vec<PathBuf>> {
+    let Some(folder) = scenario.path().parent() else { return Ok(Vec::new()) };
+    let mut files: Vec<PathBuf> = std::fs::read_dir(folder)?
+        .filter_map(|entry| Some(entry.ok()?.path()))
+        .filter(|path| path.extension().is_some_and(|extension| extension == "toml"))
+        .collect();
+    files.sort();
+    Ok(files)
+}

@@ -1,0 +1,122 @@
+//! The calibrated rule's threshold as a bound: at most a chosen share of advances where the hazard is there.
+//!
+//! The trials are free drives of the scenario, from a seed of their own, decided as the graph decides: with the
+//! comparison of each image.
+
+use crate::TrainingError;
+use carff_base::random::{Key, tag};
+use carff_checkpoint::{Bound, CheckpointPlanning};
+use carff_dataset::{
+    drives::DriveKind,
+    sensor::{SensorNoise, apply_noise_into},
+};
+use carff_decision::{CalibrationTrial, ImageEvidence, Sampling, bounded_threshold, choose_threshold};
+use carff_evaluation::{Models, NoisyEncoder, Planner, Progress, Trial};
+use carff_messages::LATENT_DIM;
+use carff_scenes::Scenario;
+use carff_unknown::{Comparer, Known};
+use std::path::Path;
+
+/// Part of the seed of these drives, so that they share no draws with training, limits or evaluation.
+const BOUND: u64 = tag("bounded");
+/// Frames of a drive between two time steps.
+const FRAMES_PER_TIMESTAMP: usize = 6;
+/// Samples and steps of a decision, as in the graph.
+const SAMPLES: usize = 10;
+const HORIZON: u32 = 2;
+
+/// Input of the bound.
+#[derive(Clone, Copy)]
+pub struct BoundInput<'a> {
+    /// Folder of the checkpoint; `planning.json` is written into it.
+    pub checkpoint: &'a Path,
+    /// The scenario that the checkpoint was trained on.
+    pub scenario: &'a Scenario,
+    /// Free drives; half of them have the hazard.
+    pub drives: usize,
+    /// Largest share of advances where the hazard is there, 0 to 1.
+    pub level: f64,
+    /// Probability with which the bound holds, 0 to 1.
+    pub confidence: f64,
+    /// Threads that render.
+    pub threads: usize,
+}
+
+/// The threshold, its bound, and the probabilities of hazard or unknown that it rests on.
+#[derive(Clone, Debug)]
+pub struct ChosenBound {
+    /// The contents of `planning.json`.
+    pub planning: CheckpointPlanning,
+    /// Probabilities of the drives with a hazard, ascending.
+    pub hazard: Vec<f64>,
+    /// Probabilities of the drives without one, ascending.
+    pub clear: Vec<f64>,
+}
+
+/// Chooses the threshold that separates drives with and without the hazard, at most the largest one that keeps the
+/// bound, and writes it into the checkpoint.
+///
+/// # Errors
+///
+/// There are too few drives for the bound, or the scenario has no hazard.
+pub fn bound_threshold(input: BoundInput, on_progress: &dyn Fn(&Progress)) -> Result<ChosenBound, TrainingError> {
+    let unfit = |problem: String| TrainingError::Unfit(problem);
+    let models = Models::load(input.checkpoint)?;
+    let known = Known::load(input.checkpoint).map_err(|e| unfit(e.to_string()))?;
+    let seed = models.manifest.seed ^ BOUND;
+    let (trials, images) = drives(input, &models, known.as_ref(), seed, on_progress)?;
+    let sampling = Sampling::Stratified;
+    let planner = Planner { net: &models.mixture, probe: &models.probe, sampling, horizon: HORIZON };
+    let (mut hazard, mut clear) = (Vec::new(), Vec::new());
+    for (trial, evidence) in trials.iter().zip(planner.weighed_evidence(&trials, &images, SAMPLES)) {
+        let of_kind = if trial.kind == DriveKind::Hazard { &mut hazard } else { &mut clear };
+        of_kind.push((evidence.hazard_probability() + evidence.unknown_probability()).min(1.0));
+    }
+    hazard.sort_by(f64::total_cmp);
+    clear.sort_by(f64::total_cmp);
+    let BoundInput { level, confidence, .. } = input;
+    let bounded = bounded_threshold(&hazard, level, confidence).ok_or_else(|| {
+        let least = ((1.0 - confidence).ln() / (1.0 - level).ln()).ceil();
+        unfit(format!("{} drives with a hazard are too few for this bound: it needs {least}", hazard.len()))
+    })?;
+    let trial = |halt_is_right: bool| move |&p: &f64| CalibrationTrial { hazard_probability: p, halt_is_right };
+    let drives: Vec<_> = hazard.iter().map(trial(true)).chain(clear.iter().map(trial(false))).collect();
+    let hazard_threshold = choose_threshold(&drives).map_or(bounded.threshold, |t| t.min(bounded.threshold));
+    let advances = hazard.iter().filter(|p| **p < hazard_threshold).count();
+    let old = CheckpointPlanning::load(input.checkpoint).map_err(|e| unfit(e.to_string()))?;
+    let bound = Bound { level, confidence, drives: hazard.len(), advances };
+    let planning = CheckpointPlanning { hazard_threshold, bound: Some(bound), ..old };
+    planning.save(input.checkpoint).map_err(|e| unfit(e.to_string()))?;
+    Ok(ChosenBound { planning, hazard, clear })
+}
+
+/// The decisive image of each drive as a trial, with the evidence of its comparison.
+fn drives(
+    input: BoundInput,
+    models: &Models,
+    known: Option<&Known>,
+    seed: u64,
+    on_progress: &dyn Fn(&Progress),
+) -> Result<(Vec<Trial>, Vec<Option<ImageEvidence>>), TrainingError> {
+    let noise = SensorNoise::default();
+    let encoder = NoisyEncoder { encoder: &models.encoder, noise, seed };
+    let states: Vec<[f32; LATENT_DIM]> = models.probe.states().iter().map(|state| state.mean).collect();
+    let mut comparer = Comparer::default();
+    let (mut trials, mut images) = (Vec::new(), Vec::new());
+    for number in 0..input.drives {
+        let unfit = |e: carff_scenes::ScenarioError| TrainingError::Unfit(e.to_string());
+        let drive = input.scenario.free_drive(number as u64, FRAMES_PER_TIMESTAMP, seed).map_err(unfit)?;
+        let frame = input.scenario.free_frame(&drive, drive.decisive_frame()).map_err(unfit)?;
+        let Some(trial) = encoder.trial(&frame.image, drive.kind(), number as u64) else { continue };
+        let mut noisy = frame.image.clone();
+        // Only noise out of range is refused.
+        let _ = apply_noise_into(&frame.image.rgb, &mut noisy.rgb, &noise, Key::named("boun", seed, number as u64));
+        let seen = known.zip(noisy.view()).and_then(|(known, view)| {
+            known.see(&mut comparer, models.probe.field(), &states, (&frame.camera, view), input.threads)
+        });
+        images.push(seen.map(|(seen, _)| ImageEvidence::new(&seen.ratios)));
+        trials.push(trial);
+        on_progress(&Progress { phase: "drives", done: number + 1, total: input.drives, line: String::new() });
+    }
+    Ok((trials, images))
+}
