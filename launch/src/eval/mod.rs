@@ -40,7 +40,8 @@ pub struct EvalArgs {
     /// Seed of sensor noise, draws, folds and free drives.
     #[arg(long, default_value_t = 2)]
     seed: u64,
-    /// Number of free drives for planning and for the bound, half of them with a hazard. They need the scenario file of the dataset.
+    /// Number of free drives for planning and for the bound, half of them with a hazard. They need the scenario file
+    /// of the dataset.
     #[arg(long, default_value_t = 400, value_parser = clap::value_parser!(u32).range(0..=100_000))]
     free_drives: u32,
     /// Number of free poses for the trials, each with one image of each branch. They need the scenario file of the
@@ -65,7 +66,7 @@ enum TableName {
     Planning,
     /// Six kinds of trial, with baselines on the same images.
     Trials,
-    /// Unknown objects and corrupted images.
+    /// Unknown objects, other places, corrupted images, and the bound.
     Robustness,
     /// Frequency of each outcome where several are open.
     Frequencies,

@@ -131,6 +131,13 @@ impl Evidence {
         self.unknown_probability
     }
 
+    /// Probability of a hazard, or of something that no known state explains, 0..=1: what the calibrated rule compares
+    /// with its threshold. Not a number for invalid steps.
+    pub fn hazard_or_unknown_probability(&self) -> f64 {
+        let sum = self.hazard_probability + self.unknown_probability;
+        if sum.is_nan() { sum } else { sum.min(1.0) }
+    }
+
     /// Share of the samples that show the hazard at any step, 0..=1; not a number without samples.
     pub fn hazard_share(&self) -> f64 {
         let samples = &self.shows_hazard[..self.sample_count];

@@ -31,4 +31,4 @@ pub use layout::{Place, ProbeLayout, ProbingError};
 pub use look_ahead::{DensityField, DensityProbe, Plan, Probed, Step, look_ahead, path_probability};
 pub use mixture::{Draw, Mixture, Sampling};
 pub use rule::{Decision, Policy};
-pub use threshold::{BoundedThreshold, CalibrationTrial, bounded_threshold, choose_threshold, unchosen_threshold};
+pub use threshold::{CalibrationTrial, bounded_threshold, choose_threshold, unchosen_threshold};

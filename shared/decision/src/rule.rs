@@ -57,7 +57,7 @@ impl Policy {
                 Decision { halt, confidence: if halt { share.max(1.0 - share) } else { 1.0 - share } }
             }
             Rule::Calibrated => {
-                let p = (hazard + unknown).min(1.0);
+                let p = evidence.hazard_or_unknown_probability();
                 let halt = p >= self.threshold;
                 Decision { halt, confidence: if halt { p } else { 1.0 - p } }
             }

@@ -75,15 +75,6 @@ pub fn choose_threshold(trials: &[CalibrationTrial]) -> Option<f64> {
     Some(if slope > 0.0 { sigmoid(-offset / slope) } else { 0.0 })
 }
 
-/// A threshold with a bound on the share of hazards below it.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct BoundedThreshold {
-    /// The threshold, 0..=1.
-    pub threshold: f64,
-    /// Hazard trials below the threshold.
-    pub below: usize,
-}
-
 /// Returns the largest threshold below which a share of at most `level` of all hazards is, with a probability of
 /// `confidence` over the draw of the trials. `None` where there are too few trials for any threshold.
 ///
@@ -93,11 +84,11 @@ pub struct BoundedThreshold {
 /// ```
 /// use carff_decision::bounded_threshold;
 /// let hazards: Vec<f64> = (0..1000).map(|i| f64::from(i) / 1000.0).collect();
-/// let bounded = bounded_threshold(&hazards, 0.01, 0.95).unwrap();
-/// assert_eq!((bounded.threshold, bounded.below), (0.004, 4));
+/// // 4 of the 1000 hazards are below it.
+/// assert_eq!(bounded_threshold(&hazards, 0.01, 0.95), Some(0.004));
 /// assert_eq!(bounded_threshold(&hazards[..298], 0.01, 0.95), None);
 /// ```
-pub fn bounded_threshold(hazards: &[f64], level: f64, confidence: f64) -> Option<BoundedThreshold> {
+pub fn bounded_threshold(hazards: &[f64], level: f64, confidence: f64) -> Option<f64> {
     let (n, odds) = (hazards.len() as f64, level / (1.0 - level));
     // Probability of `below` hazards below the threshold if the share were `level`, and of fewer.
     let (mut exactly, mut at_most) = ((n * (1.0 - level).ln()).exp(), 0.0);
@@ -112,8 +103,7 @@ pub fn bounded_threshold(hazards: &[f64], level: f64, confidence: f64) -> Option
     }
     let mut sorted = hazards.to_vec();
     sorted.sort_by(f64::total_cmp);
-    let below = below?;
-    Some(BoundedThreshold { threshold: sorted.get(below)?.clamp(0.0, 1.0), below })
+    Some(sorted.get(below?)?.clamp(0.0, 1.0))
 }
 
 #[cfg(test)]
@@ -129,7 +119,7 @@ mod tests {
         let broken = (0..draws).filter(|_| {
             let hazards: Vec<f64> = (0..500).map(|_| rng.random_range(0.0..1.0)).collect();
             // Of a uniform distribution, the share below the threshold is the threshold.
-            bounded_threshold(&hazards, 0.02, 0.95).unwrap().threshold > 0.02
+            bounded_threshold(&hazards, 0.02, 0.95).unwrap() > 0.02
         });
         let share = broken.count() as f64 / f64::from(draws);
         assert!((0.02..0.06).contains(&share), "{share}");

@@ -61,6 +61,10 @@ pub struct ChosenBound {
 /// There are too few drives for the bound, or the scenario has no hazard.
 pub fn bound_threshold(input: BoundInput, on_progress: &dyn Fn(&Progress)) -> Result<ChosenBound, TrainingError> {
     let unfit = |problem: String| TrainingError::Unfit(problem);
+    let BoundInput { level, confidence, .. } = input;
+    // Every second drive has the hazard. Too few are refused before any is rendered.
+    let expected = input.drives.div_ceil(2);
+    bounded_threshold(&vec![1.0; expected], level, confidence).ok_or_else(|| too_few(&input, expected))?;
     let models = Models::load(input.checkpoint)?;
     let known = Known::load(input.checkpoint).map_err(|e| unfit(e.to_string()))?;
     let seed = models.manifest.seed ^ BOUND;
@@ -70,24 +74,27 @@ pub fn bound_threshold(input: BoundInput, on_progress: &dyn Fn(&Progress)) -> Re
     let (mut hazard, mut clear) = (Vec::new(), Vec::new());
     for (trial, evidence) in trials.iter().zip(planner.weighed_evidence(&trials, &images, SAMPLES)) {
         let of_kind = if trial.kind == DriveKind::Hazard { &mut hazard } else { &mut clear };
-        of_kind.push((evidence.hazard_probability() + evidence.unknown_probability()).min(1.0));
+        of_kind.push(evidence.hazard_or_unknown_probability());
     }
     hazard.sort_by(f64::total_cmp);
     clear.sort_by(f64::total_cmp);
-    let BoundInput { level, confidence, .. } = input;
-    let bounded = bounded_threshold(&hazard, level, confidence).ok_or_else(|| {
-        let least = ((1.0 - confidence).ln() / (1.0 - level).ln()).ceil();
-        unfit(format!("{} drives with a hazard are too few for this bound: it needs {least}", hazard.len()))
-    })?;
+    let largest = bounded_threshold(&hazard, level, confidence).ok_or_else(|| too_few(&input, hazard.len()))?;
     let trial = |halt_is_right: bool| move |&p: &f64| CalibrationTrial { hazard_probability: p, halt_is_right };
     let drives: Vec<_> = hazard.iter().map(trial(true)).chain(clear.iter().map(trial(false))).collect();
-    let hazard_threshold = choose_threshold(&drives).map_or(bounded.threshold, |t| t.min(bounded.threshold));
+    let hazard_threshold = choose_threshold(&drives).map_or(largest, |t| t.min(largest));
     let advances = hazard.iter().filter(|p| **p < hazard_threshold).count();
     let old = CheckpointPlanning::load(input.checkpoint).map_err(|e| unfit(e.to_string()))?;
     let bound = Bound { level, confidence, drives: hazard.len(), advances };
     let planning = CheckpointPlanning { hazard_threshold, bound: Some(bound), ..old };
     planning.save(input.checkpoint).map_err(|e| unfit(e.to_string()))?;
     Ok(ChosenBound { planning, hazard, clear })
+}
+
+fn too_few(input: &BoundInput, hazards: usize) -> TrainingError {
+    let least = ((1.0 - input.confidence).ln() / (1.0 - input.level).ln()).ceil();
+    TrainingError::Unfit(format!(
+        "{hazards} drives with a hazard are too few for this bound: it needs {least}, give more drives"
+    ))
 }
 
 /// The decisive image of each drive as a trial, with the evidence of its comparison.

@@ -267,7 +267,7 @@ impl Judge<'_> {
             Verdict {
                 advances: advances(with),
                 advances_without_comparison: advances(without),
-                probability: if usable { with.hazard_probability() + with.unknown_probability() } else { 1.0 },
+                probability: if usable { with.hazard_or_unknown_probability() } else { 1.0 },
             }
         };
         Ok(with.iter().zip(&without).zip(usable).map(verdict).collect())
