@@ -6,9 +6,9 @@
 #include <stddef.h>
 #include <stdint.h>
 
-#define CARFF_SCHEMA_VERSION 2
+#define CARFF_SCHEMA_VERSION 3
 #define CARFF_LATENT_DIM 8
-#define CARFF_MAX_COMPONENTS 4
+#define CARFF_MAX_COMPONENTS 8
 #define CARFF_MAX_SAMPLES 64
 #define CARFF_MAX_STATES 64
 #define CARFF_MAX_PLACES 48
@@ -142,7 +142,7 @@ static_assert(offsetof(CarffDatasetView, frame_in_drive) == 20, "CarffDatasetVie
 static_assert(offsetof(CarffDatasetView, observability) == 24, "CarffDatasetView.observability");
 static_assert(offsetof(CarffDatasetView, last_of_timestamp) == 28, "CarffDatasetView.last_of_timestamp");
 
-#define CARFF_FRAME_META_TYPE_NAME "carff.FrameMeta.v1"
+#define CARFF_FRAME_META_TYPE_NAME "carff.FrameMeta.v2"
 typedef struct CarffFrameMeta {
     CarffHeader header;
     uint32_t width_px;
@@ -150,15 +150,17 @@ typedef struct CarffFrameMeta {
     CarffIntrinsics intrinsics;
     double world_from_camera[16];
     CarffDatasetView dataset_view;
+    uint64_t take_start;
 } CarffFrameMeta;
 
-static_assert(sizeof(CarffFrameMeta) == 256, "CarffFrameMeta");
+static_assert(sizeof(CarffFrameMeta) == 264, "CarffFrameMeta");
 static_assert(offsetof(CarffFrameMeta, header) == 0, "CarffFrameMeta.header");
 static_assert(offsetof(CarffFrameMeta, width_px) == 56, "CarffFrameMeta.width_px");
 static_assert(offsetof(CarffFrameMeta, height_px) == 60, "CarffFrameMeta.height_px");
 static_assert(offsetof(CarffFrameMeta, intrinsics) == 64, "CarffFrameMeta.intrinsics");
 static_assert(offsetof(CarffFrameMeta, world_from_camera) == 96, "CarffFrameMeta.world_from_camera");
 static_assert(offsetof(CarffFrameMeta, dataset_view) == 224, "CarffFrameMeta.dataset_view");
+static_assert(offsetof(CarffFrameMeta, take_start) == 256, "CarffFrameMeta.take_start");
 
 #define CARFF_GAUSSIAN_TYPE_NAME "carff.Gaussian.v1"
 typedef struct CarffGaussian {
@@ -170,17 +172,19 @@ static_assert(sizeof(CarffGaussian) == 64, "CarffGaussian");
 static_assert(offsetof(CarffGaussian, mean) == 0, "CarffGaussian.mean");
 static_assert(offsetof(CarffGaussian, log_variance) == 32, "CarffGaussian.log_variance");
 
-#define CARFF_POSTERIOR_TYPE_NAME "carff.Posterior.v1"
+#define CARFF_POSTERIOR_TYPE_NAME "carff.Posterior.v2"
 typedef struct CarffPosterior {
     CarffHeader header;
     CarffGaussian gaussian;
+    uint64_t take_start;
     uint64_t stage_latency_ns;
 } CarffPosterior;
 
-static_assert(sizeof(CarffPosterior) == 128, "CarffPosterior");
+static_assert(sizeof(CarffPosterior) == 136, "CarffPosterior");
 static_assert(offsetof(CarffPosterior, header) == 0, "CarffPosterior.header");
 static_assert(offsetof(CarffPosterior, gaussian) == 56, "CarffPosterior.gaussian");
-static_assert(offsetof(CarffPosterior, stage_latency_ns) == 120, "CarffPosterior.stage_latency_ns");
+static_assert(offsetof(CarffPosterior, take_start) == 120, "CarffPosterior.take_start");
+static_assert(offsetof(CarffPosterior, stage_latency_ns) == 128, "CarffPosterior.stage_latency_ns");
 
 #define CARFF_IMAGE_CHECK_TYPE_NAME "carff.ImageCheck.v1"
 typedef struct CarffImageCheck {
@@ -202,7 +206,7 @@ static_assert(offsetof(CarffImageCheck, change) == 68, "CarffImageCheck.change")
 static_assert(offsetof(CarffImageCheck, covered) == 72, "CarffImageCheck.covered");
 static_assert(offsetof(CarffImageCheck, repeats_s) == 76, "CarffImageCheck.repeats_s");
 
-#define CARFF_FORECAST_TYPE_NAME "carff.Forecast.v1"
+#define CARFF_FORECAST_TYPE_NAME "carff.Forecast.v2"
 typedef struct CarffForecast {
     CarffHeader header;
     uint32_t source;
@@ -211,15 +215,16 @@ typedef struct CarffForecast {
     uint32_t horizon;
     int32_t resolved_state;
     float path_probability;
-    float weights[4];
-    CarffGaussian components[4];
+    uint64_t images;
+    float weights[8];
+    CarffGaussian components[8];
     float samples[64][8];
     uint8_t sample_component[64];
     uint64_t encoder_ns;
     uint64_t stage_latency_ns;
 } CarffForecast;
 
-static_assert(sizeof(CarffForecast) == 2480, "CarffForecast");
+static_assert(sizeof(CarffForecast) == 2760, "CarffForecast");
 static_assert(offsetof(CarffForecast, header) == 0, "CarffForecast.header");
 static_assert(offsetof(CarffForecast, source) == 56, "CarffForecast.source");
 static_assert(offsetof(CarffForecast, component_count) == 60, "CarffForecast.component_count");
@@ -227,12 +232,13 @@ static_assert(offsetof(CarffForecast, sample_count) == 64, "CarffForecast.sample
 static_assert(offsetof(CarffForecast, horizon) == 68, "CarffForecast.horizon");
 static_assert(offsetof(CarffForecast, resolved_state) == 72, "CarffForecast.resolved_state");
 static_assert(offsetof(CarffForecast, path_probability) == 76, "CarffForecast.path_probability");
-static_assert(offsetof(CarffForecast, weights) == 80, "CarffForecast.weights");
-static_assert(offsetof(CarffForecast, components) == 96, "CarffForecast.components");
-static_assert(offsetof(CarffForecast, samples) == 352, "CarffForecast.samples");
-static_assert(offsetof(CarffForecast, sample_component) == 2400, "CarffForecast.sample_component");
-static_assert(offsetof(CarffForecast, encoder_ns) == 2464, "CarffForecast.encoder_ns");
-static_assert(offsetof(CarffForecast, stage_latency_ns) == 2472, "CarffForecast.stage_latency_ns");
+static_assert(offsetof(CarffForecast, images) == 80, "CarffForecast.images");
+static_assert(offsetof(CarffForecast, weights) == 88, "CarffForecast.weights");
+static_assert(offsetof(CarffForecast, components) == 120, "CarffForecast.components");
+static_assert(offsetof(CarffForecast, samples) == 632, "CarffForecast.samples");
+static_assert(offsetof(CarffForecast, sample_component) == 2680, "CarffForecast.sample_component");
+static_assert(offsetof(CarffForecast, encoder_ns) == 2744, "CarffForecast.encoder_ns");
+static_assert(offsetof(CarffForecast, stage_latency_ns) == 2752, "CarffForecast.stage_latency_ns");
 
 #define CARFF_PROBE_RESULT_TYPE_NAME "carff.ProbeResult.v2"
 typedef struct CarffProbeResult {
@@ -248,7 +254,7 @@ static_assert(offsetof(CarffProbeResult, confidence) == 4, "CarffProbeResult.con
 static_assert(offsetof(CarffProbeResult, hazard_likelihood) == 8, "CarffProbeResult.hazard_likelihood");
 static_assert(offsetof(CarffProbeResult, occupancies) == 12, "CarffProbeResult.occupancies");
 
-#define CARFF_BELIEF_TYPE_NAME "carff.Belief.v3"
+#define CARFF_BELIEF_TYPE_NAME "carff.Belief.v4"
 typedef struct CarffBelief {
     CarffHeader header;
     uint32_t horizon;
@@ -260,8 +266,8 @@ typedef struct CarffBelief {
     float state_probability[64];
     float hazard_probability;
     float path_probability;
-    float component_weights[4];
-    CarffProbeResult components[4];
+    float component_weights[8];
+    CarffProbeResult components[8];
     CarffProbeResult samples[64];
     uint8_t sample_component[64];
     int32_t resolved_state;
@@ -272,7 +278,7 @@ typedef struct CarffBelief {
     uint64_t stage_latency_ns;
 } CarffBelief;
 
-static_assert(sizeof(CarffBelief) == 14392, "CarffBelief");
+static_assert(sizeof(CarffBelief) == 15224, "CarffBelief");
 static_assert(offsetof(CarffBelief, header) == 0, "CarffBelief.header");
 static_assert(offsetof(CarffBelief, horizon) == 56, "CarffBelief.horizon");
 static_assert(offsetof(CarffBelief, state_count) == 60, "CarffBelief.state_count");
@@ -284,15 +290,15 @@ static_assert(offsetof(CarffBelief, state_probability) == 80, "CarffBelief.state
 static_assert(offsetof(CarffBelief, hazard_probability) == 336, "CarffBelief.hazard_probability");
 static_assert(offsetof(CarffBelief, path_probability) == 340, "CarffBelief.path_probability");
 static_assert(offsetof(CarffBelief, component_weights) == 344, "CarffBelief.component_weights");
-static_assert(offsetof(CarffBelief, components) == 360, "CarffBelief.components");
-static_assert(offsetof(CarffBelief, samples) == 1176, "CarffBelief.samples");
-static_assert(offsetof(CarffBelief, sample_component) == 14232, "CarffBelief.sample_component");
-static_assert(offsetof(CarffBelief, resolved_state) == 14296, "CarffBelief.resolved_state");
-static_assert(offsetof(CarffBelief, unknown_probability) == 14300, "CarffBelief.unknown_probability");
-static_assert(offsetof(CarffBelief, resolved) == 14304, "CarffBelief.resolved");
-static_assert(offsetof(CarffBelief, encoder_ns) == 14368, "CarffBelief.encoder_ns");
-static_assert(offsetof(CarffBelief, forecaster_ns) == 14376, "CarffBelief.forecaster_ns");
-static_assert(offsetof(CarffBelief, stage_latency_ns) == 14384, "CarffBelief.stage_latency_ns");
+static_assert(offsetof(CarffBelief, components) == 376, "CarffBelief.components");
+static_assert(offsetof(CarffBelief, samples) == 2008, "CarffBelief.samples");
+static_assert(offsetof(CarffBelief, sample_component) == 15064, "CarffBelief.sample_component");
+static_assert(offsetof(CarffBelief, resolved_state) == 15128, "CarffBelief.resolved_state");
+static_assert(offsetof(CarffBelief, unknown_probability) == 15132, "CarffBelief.unknown_probability");
+static_assert(offsetof(CarffBelief, resolved) == 15136, "CarffBelief.resolved");
+static_assert(offsetof(CarffBelief, encoder_ns) == 15200, "CarffBelief.encoder_ns");
+static_assert(offsetof(CarffBelief, forecaster_ns) == 15208, "CarffBelief.forecaster_ns");
+static_assert(offsetof(CarffBelief, stage_latency_ns) == 15216, "CarffBelief.stage_latency_ns");
 
 #define CARFF_UNKNOWN_BOX_TYPE_NAME "carff.UnknownBox.v1"
 typedef struct CarffUnknownBox {
@@ -308,7 +314,7 @@ static_assert(offsetof(CarffUnknownBox, half_size) == 24, "CarffUnknownBox.half_
 static_assert(offsetof(CarffUnknownBox, probability) == 48, "CarffUnknownBox.probability");
 static_assert(offsetof(CarffUnknownBox, place) == 52, "CarffUnknownBox.place");
 
-#define CARFF_UNKNOWNS_TYPE_NAME "carff.Unknowns.v1"
+#define CARFF_UNKNOWNS_TYPE_NAME "carff.Unknowns.v2"
 typedef struct CarffUnknowns {
     CarffHeader header;
     uint32_t box_count;
@@ -320,11 +326,12 @@ typedef struct CarffUnknowns {
     float offset[3];
     float explained;
     float ratios[64];
+    float prior;
     CarffUnknownBox boxes[8];
     uint64_t stage_latency_ns;
 } CarffUnknowns;
 
-static_assert(sizeof(CarffUnknowns) == 816, "CarffUnknowns");
+static_assert(sizeof(CarffUnknowns) == 824, "CarffUnknowns");
 static_assert(offsetof(CarffUnknowns, header) == 0, "CarffUnknowns.header");
 static_assert(offsetof(CarffUnknowns, box_count) == 56, "CarffUnknowns.box_count");
 static_assert(offsetof(CarffUnknowns, state_count) == 60, "CarffUnknowns.state_count");
@@ -335,8 +342,9 @@ static_assert(offsetof(CarffUnknowns, gain) == 76, "CarffUnknowns.gain");
 static_assert(offsetof(CarffUnknowns, offset) == 88, "CarffUnknowns.offset");
 static_assert(offsetof(CarffUnknowns, explained) == 100, "CarffUnknowns.explained");
 static_assert(offsetof(CarffUnknowns, ratios) == 104, "CarffUnknowns.ratios");
-static_assert(offsetof(CarffUnknowns, boxes) == 360, "CarffUnknowns.boxes");
-static_assert(offsetof(CarffUnknowns, stage_latency_ns) == 808, "CarffUnknowns.stage_latency_ns");
+static_assert(offsetof(CarffUnknowns, prior) == 360, "CarffUnknowns.prior");
+static_assert(offsetof(CarffUnknowns, boxes) == 368, "CarffUnknowns.boxes");
+static_assert(offsetof(CarffUnknowns, stage_latency_ns) == 816, "CarffUnknowns.stage_latency_ns");
 
 #define CARFF_VIEW_META_TYPE_NAME "carff.ViewMeta.v1"
 typedef struct CarffViewMeta {

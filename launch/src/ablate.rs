@@ -57,14 +57,14 @@ pub fn run(args: &AblateArgs) -> anyhow::Result<ExitCode> {
     let mut table = AblationTable {
         dataset: dataset.display().to_string(),
         epochs: config.vae.epochs,
-        free_poses: random_poses.as_ref().map_or(0, |_| config.free_poses.count),
+        free_poses: if random_poses.is_empty() { 0 } else { config.free_poses.count },
         seed: config.seed,
         rows: Vec::new(),
     };
     let training = Training {
         config: &config,
         dataset: &dataset,
-        random_poses: random_poses.as_deref(),
+        random_poses: &random_poses,
         scenario: None,
         out: &args.out,
         device: options.device,

@@ -6,7 +6,7 @@ use carff_base::files::check_writable;
 use carff_base::statistics::percentile_of_sorted;
 use carff_checkpoint::Manifest;
 use carff_scenes::Scenario;
-use carff_training::{BoundInput, KnownInput, bound_threshold, calibrate_known};
+use carff_training::{BoundInput, KnownInput, MemoryInput, bound_threshold, calibrate_known, learn_memory};
 use std::path::PathBuf;
 use std::process::ExitCode;
 
@@ -26,6 +26,10 @@ pub enum CheckpointCommand {
     #[command(after_help = "Example: at most 1 % of the drives, with 95 % confidence
   carff checkpoint bound configs/checkpoints/toy --scenario configs/scenarios/toy.toml")]
     Bound(BoundArgs),
+    /// Learn the memory of the belief on drives, and write it into `planning.json`.
+    #[command(after_help = "Example: on 200 drives
+  carff checkpoint memory configs/checkpoints/toy --scenario configs/scenarios/toy.toml")]
+    Memory(MemoryArgs),
 }
 
 /// Input and output of an export.
@@ -79,6 +83,19 @@ pub struct BoundArgs {
     threads: usize,
 }
 
+/// Input of the learning of the memory.
+#[derive(Debug, clap::Args)]
+pub struct MemoryArgs {
+    /// Checkpoint folder.
+    checkpoint: PathBuf,
+    /// Scenario file of the checkpoint: its drives are used.
+    #[arg(long)]
+    scenario: PathBuf,
+    /// Drives; branches take turns.
+    #[arg(long, default_value_t = 200)]
+    drives: usize,
+}
+
 fn share(text: &str) -> Result<f64, String> {
     let value: f64 = text.parse().map_err(|_| "not a number".to_owned())?;
     if value > 0.0 && value < 1.0 { Ok(value) } else { Err("must be above 0 and below 1".to_owned()) }
@@ -90,6 +107,7 @@ pub fn run(command: &CheckpointCommand) -> anyhow::Result<ExitCode> {
         CheckpointCommand::Onnx(args) => onnx(args)?,
         CheckpointCommand::Known(args) => known(args)?,
         CheckpointCommand::Bound(args) => bound(args)?,
+        CheckpointCommand::Memory(args) => memory(args)?,
     }
     Ok(ExitCode::SUCCESS)
 }
@@ -142,5 +160,16 @@ fn bound(args: &BoundArgs) -> anyhow::Result<()> {
             sorted.len()
         );
     }
+    Ok(())
+}
+
+fn memory(args: &MemoryArgs) -> anyhow::Result<()> {
+    let scenario = Scenario::load(&args.scenario)?;
+    let display = Display::default();
+    let input = MemoryInput { checkpoint: &args.checkpoint, scenario: &scenario, drives: args.drives };
+    let learned = learn_memory(input, &|p| display.show(p)).context("cannot learn the memory")?;
+    display.finish();
+    println!("share of repeated evidence {}, distrust {}", learned.settings.repeated_share, learned.settings.distrust);
+    println!("log loss a frame {:.4}, without memory {:.4}", learned.log_loss, learned.without_memory);
     Ok(())
 }

@@ -3,10 +3,11 @@
 use crate::supervision::monitor::{FrameRecord, Records};
 use carff::provenance::Origin;
 use carff_checkpoint::CheckpointPlanning;
-use carff_config::{CameraSource, GraphConfig};
+use carff_config::{CameraSource, GraphConfig, MemoryKind};
 use carff_dataset::{ScenarioInfo, drives::DriveKind};
+use carff_decision::TakeFrame;
 use carff_evaluation::run::{DecidedFrame, JudgedRun, RunPlanning, RunSettings, decisive_frames};
-use carff_messages::{ActionCode, Reason, Stage};
+use carff_messages::{ActionCode, Gaussian, Reason, Stage};
 use carff_scenes::Scenario;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -52,7 +53,8 @@ impl Planning {
             return Ok(None);
         }
         carff_networks::allocator::keep_large_blocks();
-        Ok(Some(Self { run: JudgedRun::load(settings(outcome)?)?, decisive }))
+        let posteriors: Vec<_> = outcome.records.frames.values().filter_map(taken).collect();
+        Ok(Some(Self { run: JudgedRun::load(settings(outcome)?, &posteriors)?, decisive }))
     }
 
     /// Computes every rule over the run's drives and over every eligible view.
@@ -70,6 +72,12 @@ impl Planning {
 pub fn decisive(outcome: &RunOutcome) -> Vec<(DecidedFrame, DriveKind)> {
     let frames = outcome.records.frames.values().filter_map(decided);
     outcome.scenario.as_ref().map_or_else(Vec::new, |scenario| decisive_frames(frames, scenario))
+}
+
+/// Posterior of a frame, with its place in its take.
+fn taken(frame: &FrameRecord) -> Option<(TakeFrame, Gaussian)> {
+    let FrameRecord { take_start, frame_id, capture_time_ns, .. } = *frame;
+    Some((TakeFrame { take_start, frame: frame_id, capture_time_ns }, frame.posterior?))
 }
 
 /// Settings of a run, from its graph file and checkpoint.
@@ -92,6 +100,8 @@ fn settings(outcome: &RunOutcome) -> anyhow::Result<RunSettings> {
         samples: graph.run.samples as usize,
         sampling: graph.run.sampling,
         horizon: graph.run.horizon,
+        compares: graph.checks.compare,
+        remembers: graph.step_length(None).filter(|_| graph.run.memory == MemoryKind::Filter),
         noise: graph.camera.noise,
         split_seed: graph.camera.split_seed.unwrap_or(known.split_seed),
         seed: graph.run.seed,

@@ -3,7 +3,10 @@
 use crate::dataset::render;
 use anyhow::{Context, bail};
 use carff_checkpoint::Manifest;
-use carff_scenes::{Extras, Scenario};
+use carff_scenes::{
+    Extras, Scenario,
+    config::{BystanderPlace, VariationRole},
+};
 use carff_training::{
     FreePoses, Phases, Progress, Run, Training, TrainingConfig, TrainingError, forget_run, render_random_poses,
 };
@@ -90,7 +93,7 @@ pub fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
         Some(StageName::Mdn) => Phases::Mixture,
     };
     let result = with_random_poses(rendered, &config, &dataset, &run).and_then(|random_poses| {
-        let (random_poses, scenario) = (random_poses.as_deref(), scenario.as_ref());
+        let (random_poses, scenario) = (&random_poses, scenario.as_ref());
         Training { config: &config, dataset: &dataset, random_poses, scenario, out: &out, device }.run(phases, &run)
     });
     display.finish();
@@ -126,9 +129,9 @@ pub fn stopped(dir: &Path) -> ExitCode {
     ExitCode::from(INTERRUPTED)
 }
 
-/// Folders of the dataset and of the dataset of random poses, if any. Missing ones are rendered from the training
+/// Folders of the dataset and of the datasets of random poses. Missing ones are rendered from the training
 /// file's scenario.
-pub fn datasets(config: &TrainingConfig, given: Option<&Path>) -> anyhow::Result<(PathBuf, Option<PathBuf>)> {
+pub fn datasets(config: &TrainingConfig, given: Option<&Path>) -> anyhow::Result<(PathBuf, Vec<PathBuf>)> {
     let dataset = given.unwrap_or(&config.dataset).to_owned();
     if !dataset.join("transforms.json").is_file() && given.is_none() {
         render(&scenario(config)?, &dataset, Extras::None)?;
@@ -146,33 +149,53 @@ fn scenario(config: &TrainingConfig) -> anyhow::Result<Scenario> {
     }
 }
 
-/// Folder of the dataset of random poses, rendered when it is missing; `None` for a dataset without a scenario file.
-fn rendered_random_poses(config: &TrainingConfig, given: Option<&Path>) -> anyhow::Result<Option<PathBuf>> {
-    let FreePoses { count, seed, .. } = config.free_poses;
+/// Folders of the datasets of random poses, rendered where they are missing; none for a dataset without a scenario file.
+fn rendered_random_poses(config: &TrainingConfig, given: Option<&Path>) -> anyhow::Result<Vec<PathBuf>> {
+    let FreePoses { count, per_appearance, seed, .. } = config.free_poses;
     if count == 0 || given.is_some() || config.scenario.is_none() {
-        return Ok(None);
+        return Ok(Vec::new());
     }
-    let mut name = config.dataset.file_name().unwrap_or_default().to_owned();
-    name.push(format!("-free-{count}-{seed}"));
-    let dir = config.dataset.with_file_name(name);
-    if !dir.join("transforms.json").is_file() {
-        render(&scenario(config)?.with_free_cameras(count, seed)?, &dir, Extras::None)?;
+    let free = |scenario: Scenario, count: usize, seed: u64, suffix: &str| {
+        let mut name = config.dataset.file_name().unwrap_or_default().to_owned();
+        name.push(format!("-free-{count}-{seed}{suffix}"));
+        let dir = config.dataset.with_file_name(name);
+        if !dir.join("transforms.json").is_file() {
+            render(&scenario.with_free_cameras(count, seed)?, &dir, Extras::None)?;
+        }
+        anyhow::Ok(dir)
+    };
+    let mut all = vec![free(scenario(config)?, count, seed, "")?];
+    if per_appearance == 0 {
+        return Ok(all);
     }
-    Ok(Some(dir))
+    let scenario = scenario(config)?;
+    let trained = scenario.appearances().iter().filter(|a| a.role == VariationRole::Trained);
+    let harmless = scenario.bystanders().iter();
+    let harmless = harmless.filter(|b| b.role == VariationRole::Trained && b.place == BystanderPlace::Roadside);
+    let mut objects = harmless.cycle();
+    for (number, appearance) in trained.enumerate() {
+        let mut varied = scenario.with_appearance(&appearance.name)?;
+        if let Some(object) = objects.next().filter(|_| number % 2 == 1) {
+            varied = varied.with_object(&object.name)?;
+        }
+        // Each appearance has poses of its own.
+        all.push(free(varied, per_appearance, seed + 1 + number as u64, &format!("-{}", appearance.name))?);
+    }
+    Ok(all)
 }
 
-/// Folder of the dataset of random poses: the rendered one, else one that a field renders if the training file requests
+/// Folders of the datasets of random poses: the rendered ones, else one that a field renders if the training file requests
 /// it.
 pub fn with_random_poses(
-    rendered: Option<PathBuf>,
+    rendered: Vec<PathBuf>,
     config: &TrainingConfig,
     dataset: &Path,
     run: &Run,
-) -> Result<Option<PathBuf>, TrainingError> {
-    match rendered {
-        Some(dir) => Ok(Some(dir)),
-        None => render_random_poses(config, dataset, run),
+) -> Result<Vec<PathBuf>, TrainingError> {
+    if rendered.is_empty() {
+        return Ok(render_random_poses(config, dataset, run)?.into_iter().collect());
     }
+    Ok(rendered)
 }
 
 const CONFIGURATION: &str = "configuration.json";

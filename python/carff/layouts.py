@@ -4,9 +4,9 @@ import ctypes
 from enum import IntEnum
 from typing import NamedTuple
 
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 LATENT_DIM = 8
-MAX_COMPONENTS = 4
+MAX_COMPONENTS = 8
 MAX_SAMPLES = 64
 MAX_STATES = 64
 MAX_PLACES = 48
@@ -138,11 +138,12 @@ class FrameMeta(ctypes.Structure):
         ("intrinsics", Intrinsics),
         ("world_from_camera", (ctypes.c_double * 16)),
         ("dataset_view", DatasetView),
+        ("take_start", ctypes.c_uint64),
     ]
 
     @staticmethod
     def type_name() -> str:
-        return "carff.FrameMeta.v1"
+        return "carff.FrameMeta.v2"
 
 
 class Gaussian(ctypes.Structure):
@@ -160,12 +161,13 @@ class Posterior(ctypes.Structure):
     _fields_ = [
         ("header", Header),
         ("gaussian", Gaussian),
+        ("take_start", ctypes.c_uint64),
         ("stage_latency_ns", ctypes.c_uint64),
     ]
 
     @staticmethod
     def type_name() -> str:
-        return "carff.Posterior.v1"
+        return "carff.Posterior.v2"
 
 
 class ImageCheck(ctypes.Structure):
@@ -193,8 +195,9 @@ class Forecast(ctypes.Structure):
         ("horizon", ctypes.c_uint32),
         ("resolved_state", ctypes.c_int32),
         ("path_probability", ctypes.c_float),
-        ("weights", (ctypes.c_float * 4)),
-        ("components", (Gaussian * 4)),
+        ("images", ctypes.c_uint64),
+        ("weights", (ctypes.c_float * 8)),
+        ("components", (Gaussian * 8)),
         ("samples", ((ctypes.c_float * 8) * 64)),
         ("sample_component", (ctypes.c_uint8 * 64)),
         ("encoder_ns", ctypes.c_uint64),
@@ -203,7 +206,7 @@ class Forecast(ctypes.Structure):
 
     @staticmethod
     def type_name() -> str:
-        return "carff.Forecast.v1"
+        return "carff.Forecast.v2"
 
 
 class ProbeResult(ctypes.Structure):
@@ -231,8 +234,8 @@ class Belief(ctypes.Structure):
         ("state_probability", (ctypes.c_float * 64)),
         ("hazard_probability", ctypes.c_float),
         ("path_probability", ctypes.c_float),
-        ("component_weights", (ctypes.c_float * 4)),
-        ("components", (ProbeResult * 4)),
+        ("component_weights", (ctypes.c_float * 8)),
+        ("components", (ProbeResult * 8)),
         ("samples", (ProbeResult * 64)),
         ("sample_component", (ctypes.c_uint8 * 64)),
         ("resolved_state", ctypes.c_int32),
@@ -245,7 +248,7 @@ class Belief(ctypes.Structure):
 
     @staticmethod
     def type_name() -> str:
-        return "carff.Belief.v3"
+        return "carff.Belief.v4"
 
 
 class UnknownBox(ctypes.Structure):
@@ -273,13 +276,14 @@ class Unknowns(ctypes.Structure):
         ("offset", (ctypes.c_float * 3)),
         ("explained", ctypes.c_float),
         ("ratios", (ctypes.c_float * 64)),
+        ("prior", ctypes.c_float),
         ("boxes", (UnknownBox * 8)),
         ("stage_latency_ns", ctypes.c_uint64),
     ]
 
     @staticmethod
     def type_name() -> str:
-        return "carff.Unknowns.v1"
+        return "carff.Unknowns.v2"
 
 
 class ViewMeta(ctypes.Structure):
@@ -350,15 +354,15 @@ LAYOUTS = {
     Header: (56, 8, {"schema_version": 0, "step": 4, "run_id": 8, "frame_id": 16, "sequence": 24, "capture_time_ns": 32, "publish_time_ns": 40, "seed": 48}),
     Intrinsics: (32, 8, {"fl_x_px": 0, "fl_y_px": 8, "cx_px": 16, "cy_px": 24}),
     DatasetView: (32, 4, {"known": 0, "view": 4, "branch": 8, "timestamp": 12, "drive": 16, "frame_in_drive": 20, "observability": 24, "last_of_timestamp": 28}),
-    FrameMeta: (256, 8, {"header": 0, "width_px": 56, "height_px": 60, "intrinsics": 64, "world_from_camera": 96, "dataset_view": 224}),
+    FrameMeta: (264, 8, {"header": 0, "width_px": 56, "height_px": 60, "intrinsics": 64, "world_from_camera": 96, "dataset_view": 224, "take_start": 256}),
     Gaussian: (64, 4, {"mean": 0, "log_variance": 32}),
-    Posterior: (128, 8, {"header": 0, "gaussian": 56, "stage_latency_ns": 120}),
+    Posterior: (136, 8, {"header": 0, "gaussian": 56, "take_start": 120, "stage_latency_ns": 128}),
     ImageCheck: (80, 8, {"header": 0, "condition": 56, "luminance": 60, "sharpness": 64, "change": 68, "covered": 72, "repeats_s": 76}),
-    Forecast: (2480, 8, {"header": 0, "source": 56, "component_count": 60, "sample_count": 64, "horizon": 68, "resolved_state": 72, "path_probability": 76, "weights": 80, "components": 96, "samples": 352, "sample_component": 2400, "encoder_ns": 2464, "stage_latency_ns": 2472}),
+    Forecast: (2760, 8, {"header": 0, "source": 56, "component_count": 60, "sample_count": 64, "horizon": 68, "resolved_state": 72, "path_probability": 76, "images": 80, "weights": 88, "components": 120, "samples": 632, "sample_component": 2680, "encoder_ns": 2744, "stage_latency_ns": 2752}),
     ProbeResult: (204, 4, {"state": 0, "confidence": 4, "hazard_likelihood": 8, "occupancies": 12}),
-    Belief: (14392, 8, {"header": 0, "horizon": 56, "state_count": 60, "place_count": 64, "component_count": 68, "sample_count": 72, "is_final": 76, "state_probability": 80, "hazard_probability": 336, "path_probability": 340, "component_weights": 344, "components": 360, "samples": 1176, "sample_component": 14232, "resolved_state": 14296, "unknown_probability": 14300, "resolved": 14304, "encoder_ns": 14368, "forecaster_ns": 14376, "stage_latency_ns": 14384}),
+    Belief: (15224, 8, {"header": 0, "horizon": 56, "state_count": 60, "place_count": 64, "component_count": 68, "sample_count": 72, "is_final": 76, "state_probability": 80, "hazard_probability": 336, "path_probability": 340, "component_weights": 344, "components": 376, "samples": 2008, "sample_component": 15064, "resolved_state": 15128, "unknown_probability": 15132, "resolved": 15136, "encoder_ns": 15200, "forecaster_ns": 15208, "stage_latency_ns": 15216}),
     UnknownBox: (56, 8, {"center": 0, "half_size": 24, "probability": 48, "place": 52}),
-    Unknowns: (816, 8, {"header": 0, "box_count": 56, "state_count": 60, "probability": 64, "residual": 68, "noise": 72, "gain": 76, "offset": 88, "explained": 100, "ratios": 104, "boxes": 360, "stage_latency_ns": 808}),
+    Unknowns: (824, 8, {"header": 0, "box_count": 56, "state_count": 60, "probability": 64, "residual": 68, "noise": 72, "gain": 76, "offset": 88, "explained": 100, "ratios": 104, "prior": 360, "boxes": 368, "stage_latency_ns": 816}),
     ViewMeta: (280, 8, {"header": 0, "hypothesis": 56, "kind": 60, "state": 64, "width_px": 68, "height_px": 72, "probability": 76, "latent": 80, "intrinsics": 112, "world_from_camera": 144, "stage_latency_ns": 272}),
     Action: (112, 8, {"header": 0, "action": 56, "reason": 60, "rule": 64, "sample_count": 68, "confidence": 72, "hazard_probability": 76, "is_decision": 80, "unknown_probability": 84, "valid_until_ns": 88, "based_on_frame": 96, "latency_ns": 104}),
     Health: (144, 8, {"header": 0, "stage": 56, "state": 60, "pid": 64, "received": 72, "published": 80, "skipped": 88, "invalid": 96, "errors": 104, "last_latency_ns": 112, "max_latency_ns": 120, "last_progress_ns": 128, "rss_bytes": 136}),
@@ -388,7 +392,7 @@ class Topic(NamedTuple):
 
 TOPICS = [
     Topic("camera/frame", FrameMeta, True, Limits(8, 2, 12, 0, 8, 2, 2)),
-    Topic("encoder/posterior", Posterior, False, Limits(10, 2, 14, 0, 16, 3, 2)),
+    Topic("encoder/posterior", Posterior, False, Limits(10, 2, 14, 48, 64, 3, 2)),
     Topic("encoder/check", ImageCheck, False, Limits(10, 2, 14, 0, 16, 3, 2)),
     Topic("forecaster/forecast", Forecast, False, Limits(10, 2, 14, 0, 16, 3, 2)),
     Topic("prober/belief", Belief, False, Limits(10, 2, 14, 0, 16, 3, 2)),

@@ -3,7 +3,7 @@
 use crate::train::Display;
 use carff_base::geometry::PinholeCamera;
 use carff_dataset::Image;
-use carff_evaluation::{DecisiveImage, Novelty, OtherPlace, Progress};
+use carff_evaluation::{DecisiveImage, Novelty, OtherPlace, Perception, Progress, Subject, Watch, WatchPlan};
 use carff_scenes::config::{BystanderPlace, VariationRole};
 use carff_scenes::{FreePose, Scenario, UnknownLook};
 use ndarray::Axis;
@@ -28,6 +28,20 @@ pub fn free_drives(
             Ok(DecisiveImage { image: frame.image, camera: frame.camera, kind: drive.kind() })
         })
         .collect()
+}
+
+/// Drives whose camera pans, seen as the graph sees them.
+pub fn watches(
+    subject: &Subject,
+    scenario: &Scenario,
+    count: u32,
+    seed: u64,
+    display: &Display,
+) -> anyhow::Result<Vec<Watch>> {
+    let Ok(net) = &subject.mixture else { return Ok(Vec::new()) };
+    let perception = Perception { known: None, ..subject.perception() };
+    let plan = WatchPlan { count: count as usize, seed, exact: true };
+    Ok(carff_evaluation::watches(scenario, &perception, net, plan, &|p| display.show(p))?)
 }
 
 /// Free poses with their images.

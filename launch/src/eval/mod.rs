@@ -40,7 +40,7 @@ pub struct EvalArgs {
     /// Seed of sensor noise, draws, folds and free drives.
     #[arg(long, default_value_t = 2)]
     seed: u64,
-    /// Number of free drives for planning and for the bound, half of them with a hazard. They need the scenario file
+    /// Number of free drives for planning, for the bound and for the memory, half of them with a hazard. They need the scenario file
     /// of the dataset.
     #[arg(long, default_value_t = 400, value_parser = clap::value_parser!(u32).range(0..=100_000))]
     free_drives: u32,
@@ -68,6 +68,8 @@ enum TableName {
     Trials,
     /// Unknown objects, other places, corrupted images, and the bound.
     Robustness,
+    /// The belief with and without memory, on drives whose camera pans.
+    Memory,
     /// Frequency of each outcome where several are open.
     Frequencies,
     /// t-SNE, reconstructions, curves, beliefs, density.
@@ -83,6 +85,7 @@ impl From<TableName> for Table {
             TableName::Planning => Self::Planning,
             TableName::Trials => Self::Trials,
             TableName::Robustness => Self::Robustness,
+            TableName::Memory => Self::Memory,
             TableName::Frequencies => Self::Frequencies,
             TableName::Pictures => Self::Pictures,
         }
@@ -121,6 +124,9 @@ pub fn run(args: &EvalArgs) -> anyhow::Result<ExitCode> {
         if wants(Table::Robustness) {
             subject.other_places =
                 images::other_places(&scenario, &subject.free_poses, args.free_poses, args.seed, &display)?;
+        }
+        if wants(Table::Memory) && subject.memory.is_some() {
+            subject.watches = images::watches(&subject, &scenario, args.free_drives, args.seed, &display)?;
         }
     }
     let results = evaluate(&subject, &tables, &args.out, &|p| display.show(p))?;

@@ -86,7 +86,8 @@ fn rogue(node: &Node, args: &InjectArgs) -> anyhow::Result<u32> {
             "foreign_run" => header.run_id = header.run_id.wrapping_add(1),
             _ => {}
         }
-        let mut posterior = Posterior { header, gaussian: carff_messages::Gaussian::standard(), stage_latency_ns: 0 };
+        let mut posterior =
+            Posterior { header, gaussian: carff_messages::Gaussian::standard(), take_start: 0, stage_latency_ns: 0 };
         let mut forecast = Forecast::empty(header.at_step(1), carff_messages::ForecastSource::Observed, 2);
         (forecast.component_count, forecast.sample_count, forecast.weights[0]) = (1, 1, 1.0);
         let mut belief = Belief::empty(header.at_step(2), 2);

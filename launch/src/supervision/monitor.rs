@@ -30,6 +30,8 @@ pub struct FrameRecord {
     pub observability: Option<Observability>,
     /// Capture time: monotonic clock, nanoseconds.
     pub capture_time_ns: u64,
+    /// Number of the first frame of the take, where there is a posterior.
+    pub take_start: u64,
     /// Posterior from the encoder.
     pub posterior: Option<Gaussian>,
     /// Evidence of the image, if it was compared with the known states.
@@ -61,6 +63,7 @@ impl FrameRecord {
             last_of_timestamp: view.is_last_of_timestamp(),
             observability: Observability::of_code(view.observability).ok().flatten(),
             capture_time_ns: header.capture_time_ns,
+            take_start: 0,
             posterior: None,
             image: None,
             action: None,
@@ -205,7 +208,7 @@ impl Records {
         self.spoke_ns.insert(Stage::Encoder, posterior.header.publish_time_ns);
         Self::note_time(&mut self.encoder_ns, posterior.stage_latency_ns, self.wanted.keep);
         if let Some(frame) = self.frames.get_mut(&posterior.header.frame_id) {
-            frame.posterior = Some(posterior.gaussian);
+            (frame.posterior, frame.take_start) = (Some(posterior.gaussian), posterior.take_start);
         }
     }
 
@@ -222,7 +225,7 @@ impl Records {
         self.compared += 1;
         Self::note_time(&mut self.compare_ns, unknowns.stage_latency_ns, self.wanted.keep);
         if let Some(frame) = self.frames.get_mut(&unknowns.header.frame_id) {
-            frame.image = Some(ImageEvidence::new(unknowns.ratios()));
+            frame.image = Some(ImageEvidence::new(unknowns.ratios()).after(f64::from(unknowns.prior)));
         }
     }
 

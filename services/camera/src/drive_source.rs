@@ -109,7 +109,8 @@ impl Source for DriveSource {
             observability: Observability::code_of(frame.observability),
             last_of_timestamp: u32::from((frame_in_drive + 1).is_multiple_of(self.frames_per_timestamp)),
         };
-        Ok(Some(FrameMeta::of_camera(&frame.camera, dataset_view)))
+        let start = self.shown as u64 - 1 - frame_in_drive as u64;
+        Ok(Some(FrameMeta { take_start: start, ..FrameMeta::of_camera(&frame.camera, dataset_view) }))
     }
 
     fn write(&mut self, frame_id: u64, picture: &mut [u8]) -> anyhow::Result<()> {

@@ -102,7 +102,10 @@ impl Source for FolderSource {
         let [eye, ahead, up] = [[0.0; 3], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
         let assumed = PinholeCamera::look_at(eye, ahead, up, image.width_px, image.height_px, FIELD_OF_VIEW_DEG);
         let camera = self.camera.unwrap_or(assumed);
-        Ok(Some(FrameMeta::of_camera(&camera, DatasetView { view: *view, ..DatasetView::UNKNOWN })))
+        // Images of a folder need not follow each other: each is a take of its own.
+        let take_start = (self.shown - 1) as u64;
+        let dataset_view = DatasetView { view: *view, ..DatasetView::UNKNOWN };
+        Ok(Some(FrameMeta { take_start, ..FrameMeta::of_camera(&camera, dataset_view) }))
     }
 
     fn write(&mut self, frame_id: u64, picture: &mut [u8]) -> anyhow::Result<()> {

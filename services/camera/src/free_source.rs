@@ -19,6 +19,8 @@ pub struct FreeDriveSource {
     drives: Option<u64>,
     /// Number of the next drive, and the current drive.
     next: u64,
+    /// Frames so far.
+    shown: u64,
     drive: Option<FreeDrive>,
     frame_in_drive: usize,
     current: Option<FreeFrame>,
@@ -42,6 +44,7 @@ impl FreeDriveSource {
             frames_per_timestamp,
             drives: (!graph.camera.repeat).then_some(u64::from(drives)),
             next: 0,
+            shown: 0,
             drive: None,
             frame_in_drive: 0,
             current: None,
@@ -85,7 +88,9 @@ impl Source for FreeDriveSource {
             observability: Observability::code_of(frame.observability),
             last_of_timestamp: u32::from(frame.last_of_timestamp),
         };
-        Ok(Some(FrameMeta::of_camera(&frame.camera, dataset_view)))
+        self.shown += 1;
+        let take_start = self.shown - 1 - self.frame_in_drive as u64;
+        Ok(Some(FrameMeta { take_start, ..FrameMeta::of_camera(&frame.camera, dataset_view) }))
     }
 
     fn write(&mut self, frame_id: u64, picture: &mut [u8]) -> anyhow::Result<()> {

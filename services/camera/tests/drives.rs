@@ -35,6 +35,7 @@ fn write_dataset(folder: &Path) {
         bounds: [[-1.0; 3], [1.0; 3]],
         branches: vec!["hazard".into(), "clear".into()],
         timestamps: 3,
+        step_s: None,
         bev_view: None,
         states: Vec::new(),
         candidates: Vec::new(),

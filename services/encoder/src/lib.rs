@@ -34,6 +34,8 @@ pub fn run<E>(
     for _ in 0..WARM_UPS {
         encode(&mut encoder, grey.view())?;
     }
+    // Images before this frame are not of the same take: the camera was not usable in between.
+    let mut usable_from = 0;
     stage.ready();
     while stage.wait(&[&frames])? {
         let started_ns = monotonic_now_ns();
@@ -45,13 +47,15 @@ pub fn run<E>(
         }
         checks.send(check)?;
         if !check.is_usable() {
+            usable_from = frame.header.frame_id + 1;
             stage.worked(&frame.header, started_ns);
             continue;
         }
         match encode(&mut encoder, frame.image()) {
             Ok(gaussian) => {
                 let stage_latency_ns = stage.worked(&frame.header, started_ns);
-                posteriors.send(Posterior { header: frame.header, gaussian, stage_latency_ns })?;
+                let take_start = frame.take_start.max(usable_from);
+                posteriors.send(Posterior { header: frame.header, gaussian, take_start, stage_latency_ns })?;
             }
             Err(error) => stage.error(&error),
         }

@@ -1,7 +1,8 @@
 //! The forecaster stage's arithmetic: from a posterior, observed or fed back, to a mixture and its samples.
 
-use carff_checkpoint::Manifest;
-use carff_decision::{Sampling, path_probability, set_mixture_and_draws};
+use carff_checkpoint::{CheckpointPlanning, Manifest};
+use carff_config::{GraphConfig, MemoryKind};
+use carff_decision::{Memory, Mixture, Sampling, TakeMemory, path_probability, set_mixture_and_draws};
 use carff_inference::MixtureNet;
 use carff_messages::{Belief, Forecast, ForecastSource, Gaussian, Header, Posterior};
 use std::path::Path;
@@ -13,13 +14,35 @@ pub struct Forecaster {
     samples: usize,
     sampling: Sampling,
     horizon: u32,
+    /// Belief over the frames of a take; `None` if each image counts by itself.
+    memory: Option<TakeMemory>,
+    /// Forecast from the last image and those before it, and the number of images.
+    remembered: Option<(Mixture, u64)>,
 }
 
 impl Forecaster {
-    /// Loads the mixture density network.
-    pub fn load(checkpoint: &Path, samples: usize, sampling: Sampling, horizon: u32) -> anyhow::Result<Self> {
+    /// Loads the mixture density network, and the memory where the graph file asks for it and the checkpoint has learned
+    /// it.
+    pub fn load(checkpoint: &Path, graph: &GraphConfig) -> anyhow::Result<Self> {
         let manifest = Manifest::load(checkpoint)?;
-        Ok(Self { net: MixtureNet::load(checkpoint, &manifest)?, samples, sampling, horizon })
+        let net = MixtureNet::load(checkpoint, &manifest)?;
+        let run = &graph.run;
+        let learned = match run.memory {
+            MemoryKind::Filter => CheckpointPlanning::load(checkpoint)?.memory,
+            MemoryKind::None => None,
+        };
+        let memory = learned.zip(graph.step_length(manifest.step_s)).map(|(settings, step)| {
+            let forecast = |state: &Gaussian| net.forecast(state);
+            TakeMemory::new(Memory::new(manifest.states.clone(), forecast, settings), step)
+        });
+        Ok(Self {
+            net,
+            samples: run.samples as usize,
+            sampling: run.sampling,
+            horizon: run.horizon,
+            memory,
+            remembered: None,
+        })
     }
 
     /// Sets the number of samples from now on, and the horizon of frames that start from now on.
@@ -27,11 +50,28 @@ impl Forecaster {
         (self.samples, self.horizon) = (samples, horizon);
     }
 
-    /// Returns the forecast from an observed posterior: step 1.
+    /// Takes an image into the memory. Called for each posterior in order, also for those that are too old for a
+    /// forecast: a restarted forecaster gets the last ones from shared memory.
+    pub fn remember(&mut self, posterior: &Posterior) {
+        let Some(memory) = &mut self.memory else { return };
+        let (mixture, images) = memory.see(posterior.into(), &self.net.forecast(&posterior.gaussian));
+        if images == 1 {
+            tracing::debug!(take_start = posterior.take_start, "the memory starts anew");
+        }
+        self.remembered = Some((mixture, images));
+    }
+
+    /// Returns the forecast from the last remembered posterior: step 1.
     pub fn from_observation(&self, posterior: &Posterior) -> Forecast {
         let mut forecast = Forecast::empty(posterior.header.at_step(1), ForecastSource::Observed, self.horizon);
         forecast.encoder_ns = posterior.stage_latency_ns;
-        self.fill(&mut forecast, &posterior.gaussian);
+        match &self.remembered {
+            Some((mixture, images)) => {
+                forecast.images = *images;
+                self.fill(&mut forecast, mixture);
+            }
+            None => self.fill(&mut forecast, &self.net.forecast(&posterior.gaussian)),
+        }
         forecast
     }
 
@@ -46,14 +86,13 @@ impl Forecaster {
         forecast.encoder_ns = belief.encoder_ns;
         forecast.resolved_state = belief.resolved_state;
         forecast.path_probability = path_probability(belief.path_probability, belief.state_probability[state]);
-        self.fill(&mut forecast, &belief.resolved);
+        self.fill(&mut forecast, &self.net.forecast(&belief.resolved));
         Some(forecast)
     }
 
-    fn fill(&self, forecast: &mut Forecast, input: &Gaussian) {
-        let mixture = self.net.forecast(input);
+    fn fill(&self, forecast: &mut Forecast, mixture: &Mixture) {
         let Header { seed, frame_id, step, .. } = forecast.header;
         let draws = mixture.draw(self.samples, self.sampling, seed, frame_id, step);
-        set_mixture_and_draws(forecast, &mixture, &draws);
+        set_mixture_and_draws(forecast, mixture, &draws);
     }
 }

@@ -13,15 +13,13 @@ fn run(stage: &mut StageContext) -> anyhow::Result<()> {
     let mut posteriors = stage.input(&topics::POSTERIOR)?;
     let mut beliefs = stage.input(&topics::BELIEF)?;
     let mut forecasts = stage.output(&topics::FORECAST)?;
-    let settings = &stage.graph.run;
     let mut overload = Overload::new(&stage.graph);
-    let mut forecaster =
-        Forecaster::load(&stage.checkpoint, settings.samples as usize, settings.sampling, settings.horizon)?;
+    let mut forecaster = Forecaster::load(&stage.checkpoint, &stage.graph)?;
     let mut newest_frame = 0;
     stage.ready();
     while stage.wait(&[&posteriors, &beliefs])? {
         let started_ns = monotonic_now_ns();
-        if let Some(posterior) = posteriors.newest()? {
+        if let Some(posterior) = posteriors.newest_of(|posterior| forecaster.remember(posterior))? {
             let _span = frame_span(&posterior.header);
             newest_frame = posterior.header.frame_id;
             let mut forecast = forecaster.from_observation(&posterior);

@@ -1,7 +1,7 @@
 //! The comparison of camera images with the known states.
 
-use carff_checkpoint::FieldProbe;
-use carff_decision::{ImageEvidence, Place};
+use carff_checkpoint::{CheckpointPlanning, FieldProbe};
+use carff_decision::{ImageEvidence, ImageMemory, Place};
 use carff_messages::{FrameMeta, Header, LATENT_DIM, MAX_STATES, Unknowns};
 use carff_unknown::{Comparer, Known, Seen};
 use ndarray::ArrayView3;
@@ -19,16 +19,23 @@ pub struct Images {
     states: Vec<[f32; LATENT_DIM]>,
     /// The newest last. No evidence for a frame without a valid pose, or whose camera sees no lane.
     compared: VecDeque<(u64, Option<ImageEvidence>)>,
+    /// Comparisons of the take so far, and the take's first frame.
+    memory: Option<(ImageMemory, u64)>,
 }
 
 impl Images {
-    /// Loads the limits of the known; `None` where the checkpoint has none.
-    pub fn load(checkpoint: &Path, probe: &FieldProbe) -> anyhow::Result<Option<Self>> {
-        Ok(Known::load(checkpoint)?.map(|known| Self {
+    /// Loads the limits of the known; `None` where the checkpoint has none. With `remembers`, earlier images of a take
+    /// count where the checkpoint has learned a memory.
+    pub fn load(checkpoint: &Path, probe: &FieldProbe, remembers: bool) -> anyhow::Result<Option<Self>> {
+        let Some(known) = Known::load(checkpoint)? else { return Ok(None) };
+        let learned = if remembers { CheckpointPlanning::load(checkpoint)?.memory } else { None };
+        let hazards = probe.layout().hazard_states().to_vec();
+        Ok(Some(Self {
             known,
             comparer: Comparer::default(),
             states: probe.states().iter().map(|state| state.mean).collect(),
             compared: VecDeque::with_capacity(REMEMBERED),
+            memory: learned.map(|settings| (ImageMemory::new(hazards, settings), 0)),
         }))
     }
 
@@ -40,8 +47,14 @@ impl Images {
         image: ArrayView3<'_, u8>,
         threads: usize,
     ) -> Option<Unknowns> {
-        let unknowns = self.unknowns(probe, frame, image, threads);
-        let evidence = unknowns.as_ref().map(|unknowns| ImageEvidence::new(unknowns.ratios()));
+        let mut unknowns = self.unknowns(probe, frame, image, threads);
+        let evidence = unknowns.as_mut().map(|unknowns| {
+            let evidence = self.remembered(frame.take_start, ImageEvidence::new(unknowns.ratios()));
+            let hazards = probe.layout().hazard_states();
+            unknowns.prior = evidence.prior_or_even(hazards) as f32;
+            unknowns.probability = evidence.unknown_probability(hazards) as f32;
+            evidence
+        });
         if self.compared.len() == REMEMBERED {
             self.compared.pop_front();
         }
@@ -64,9 +77,17 @@ impl Images {
         (unknowns.noise, unknowns.explained) = (comparison.fit.noise, comparison.fit.explained);
         (unknowns.gain, unknowns.offset) = (comparison.fit.gain, comparison.fit.offset);
         describe(&seen, probe.layout().places(), &mut unknowns);
-        let evidence = ImageEvidence::new(unknowns.ratios());
-        unknowns.probability = evidence.unknown_probability(probe.layout().hazard_states()) as f32;
         Some(unknowns)
+    }
+
+    /// The evidence of an image after the earlier images of its take.
+    fn remembered(&mut self, take_start: u64, evidence: ImageEvidence) -> ImageEvidence {
+        let Some((memory, take)) = &mut self.memory else { return evidence };
+        if *take != take_start {
+            memory.clear();
+            *take = take_start;
+        }
+        memory.see(evidence)
     }
 
     /// Reports whether a frame has been compared, or tried without a result.

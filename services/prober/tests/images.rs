@@ -37,7 +37,7 @@ fn a_patch_on_the_lane_is_unknown() {
     let mut patched = known.clone();
     patched.slice_mut(s![56..74, 50..78, ..]).fill(230);
 
-    let mut images = Images::load(&checkpoint(), &probe).unwrap().unwrap();
+    let mut images = Images::load(&checkpoint(), &probe, true).unwrap().unwrap();
     let before = images.compare(&probe, &frame(1, 100), known.view(), 1).unwrap();
     before.validate().unwrap();
     assert!(before.probability < 0.05 && before.boxes().is_empty(), "{before:?}");

@@ -164,6 +164,9 @@ pub struct Manifest {
     pub format_version: u32,
     /// The scenario.
     pub scenario: ScenarioIdentity,
+    /// Duration of a time step, seconds, if the scenario has one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub step_s: Option<f64>,
     /// Seed of the training.
     pub seed: u64,
     /// Split of the poses for training.

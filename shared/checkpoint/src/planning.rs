@@ -1,6 +1,6 @@
 //! The part of a checkpoint for stages without models: the split of the poses and the calibrated threshold.
 
-use carff_decision::Policy;
+use carff_decision::{MemorySettings, Policy};
 use carff_messages::Rule;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
@@ -23,6 +23,9 @@ pub struct CheckpointPlanning {
     /// Bound that the threshold keeps, if it was chosen by one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub bound: Option<Bound>,
+    /// Learned numbers of the forecaster's memory, if they were learned.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub memory: Option<MemorySettings>,
 }
 
 /// Bound on the calibrated rule: at most a share `level` of the drives with a hazard are answered with `advance`.
@@ -74,7 +77,7 @@ pub enum CheckpointPlanningError {
 impl CheckpointPlanning {
     /// Creates the contents with the current format version.
     pub fn new(split_seed: u64, hazard_threshold: f64) -> Self {
-        Self { format_version: FORMAT_VERSION, split_seed, hazard_threshold, bound: None }
+        Self { format_version: FORMAT_VERSION, split_seed, hazard_threshold, bound: None, memory: None }
     }
 
     /// Reads and checks the file of a checkpoint folder.

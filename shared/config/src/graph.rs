@@ -9,7 +9,7 @@ use crate::error::{Source, read};
 use crate::ranges;
 use crate::stages::{LogFormat, StageConfig, StagesConfig};
 use carff_dataset::{Calibration, CalibrationError};
-use carff_decision::Sampling;
+use carff_decision::{Sampling, StepLength};
 use carff_messages::{Rule, Stage};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -75,6 +75,10 @@ pub struct RunConfig {
     /// Sampling of the mixture: `stratified` over the components, or `independent`. Default `stratified`.
     #[serde(default)]
     pub sampling: Sampling,
+    /// Memory of earlier frames: `filter` carries the belief from frame to frame, where the checkpoint has learned it
+    /// (`carff checkpoint memory`); with `none`, each image counts by itself. Default `none`.
+    #[serde(default)]
+    pub memory: MemoryKind,
     /// Camera frames per second, 0.1 to 1000. Default 10.
     #[schemars(range(min = 0.1, max = 1000.0))]
     #[serde(default = "ten_f64")]
@@ -311,7 +315,29 @@ fn ten_f64() -> f64 {
     10.0
 }
 
+/// Memory of earlier frames.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+pub enum MemoryKind {
+    /// Each image counts by itself.
+    #[default]
+    None,
+    /// The belief is carried from frame to frame.
+    Filter,
+}
+
 impl GraphConfig {
+    /// Returns the length of a time step; `step_s` is the scenario's, seconds. `None` for a real camera of a scenario
+    /// without one.
+    pub fn step_length(&self, step_s: Option<f64>) -> Option<StepLength> {
+        match self.camera.source {
+            CameraSource::Drives | CameraSource::FreeDrives => {
+                Some(StepLength::Frames(u64::from(self.camera.frames_per_timestamp)))
+            }
+            _ => step_s.map(|step_s| StepLength::TimeNs((step_s * 1e9) as u64)),
+        }
+    }
+
     /// Reads and checks a graph file.
     pub fn load(path: &Path) -> Result<Self, ConfigError> {
         Self::parse(&read(path, "graph")?, path)

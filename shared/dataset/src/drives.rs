@@ -222,6 +222,7 @@ mod tests {
             bounds: [[-1.0; 3], [1.0; 3]],
             branches: vec!["hazard".into(), "clear".into()],
             timestamps: 3,
+            step_s: None,
             bev_view: None,
             states,
             candidates: Vec::new(),

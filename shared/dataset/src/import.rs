@@ -75,6 +75,7 @@ pub fn import(from: &Path, out: &Path, options: &ImportOptions) -> Result<Import
         bounds,
         branches: vec!["scene".to_owned()],
         timestamps: 1,
+        step_s: None,
         bev_view: None,
         states: vec![StateInfo { branch: 0, timestamp: 0, boxes: Vec::new() }],
         candidates: Vec::new(),

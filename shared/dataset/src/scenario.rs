@@ -94,6 +94,8 @@ pub struct ScenarioInfo {
     pub branches: Vec<String>,
     /// Number of time steps per branch.
     pub timestamps: usize,
+    /// Duration of a time step, seconds.
+    pub step_s: Option<f64>,
     /// Index of the view that looks straight down.
     pub bev_view: Option<usize>,
     /// All states, `branches * timestamps` of them; state s is branch s / timestamps at time step s % timestamps.

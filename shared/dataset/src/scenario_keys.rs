@@ -125,11 +125,19 @@ pub(crate) fn read_scenario(path: &Path, dir: &Path, value: &Value) -> Result<Sc
             name.clone_into(&mut clear_action);
         }
     }
+    let step_s = match present(map, "step_s") {
+        None => None,
+        Some(value) => match value.as_f64().filter(|s| *s > 0.0 && s.is_finite()) {
+            Some(step_s) => Some(step_s),
+            None => return Err(place.error("step_s", "must be a number of seconds above 0")),
+        },
+    };
     Ok(ScenarioInfo {
         name,
         bounds,
         branches,
         timestamps,
+        step_s,
         bev_view: place.index(map, "bev_view", MAX_FRAMES)?,
         states,
         candidates,

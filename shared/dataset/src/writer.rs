@@ -322,6 +322,8 @@ struct ScenarioFile<'a> {
     branches: &'a [String],
     timestamps: usize,
     #[serde(skip_serializing_if = "Option::is_none")]
+    step_s: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
     bev_view: Option<usize>,
     states: Vec<StateFile<'a>>,
     hazard_branches: &'a [usize],
@@ -353,6 +355,7 @@ impl<'a> ScenarioFile<'a> {
             bounds: scenario.bounds,
             branches: &scenario.branches,
             timestamps: scenario.timestamps,
+            step_s: scenario.step_s,
             bev_view: scenario.bev_view,
             states: scenario
                 .states

@@ -427,6 +427,7 @@ fn written_scenario() -> ScenarioInfo {
         bounds: [[-1.0, -1.0, 0.0], [1.0, 1.0, 1.0]],
         branches: vec!["a".into(), "b".into()],
         timestamps: 1,
+        step_s: None,
         bev_view: Some(1),
         states: vec![
             StateInfo { branch: 0, timestamp: 0, boxes: vec![named_box.clone()] },
@@ -602,6 +603,7 @@ fn degraded_copies_keep_the_truth() {
         branches: vec!["there".into(), "gone".into()],
         timestamps: 1,
         bounds: [[-1.0; 3], [1.0; 3]],
+        step_s: None,
         bev_view: None,
         states: [0, 1].map(|branch| StateInfo { branch, timestamp: 0, boxes: Vec::new() }).to_vec(),
         candidates: Vec::new(),

@@ -1,7 +1,7 @@
 //! Evidence of an image for the known states, in addition to the encoder: they are rendered and compared with it.
 
 use crate::calibration::most_probable;
-use crate::{ProbeLayout, Resolved};
+use crate::{MemorySettings, ProbeLayout, Resolved};
 
 /// Prior probability of something that no known state explains.
 const UNKNOWN_PRIOR: f64 = 0.01;
@@ -24,6 +24,8 @@ const MAX_RATIO: f64 = 1e4;
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct ImageEvidence {
     ratios: Vec<f64>,
+    /// Hazard probability before the image; `None` for equally probable states.
+    prior: Option<f64>,
 }
 
 impl ImageEvidence {
@@ -33,7 +35,24 @@ impl ImageEvidence {
         let limited = |ratio: &f32| {
             if ratio.is_nan() { 1.0 / MAX_RATIO } else { f64::from(*ratio).clamp(1.0 / MAX_RATIO, MAX_RATIO) }
         };
-        Self { ratios: ratios.iter().map(limited).collect() }
+        Self { ratios: ratios.iter().map(limited).collect(), prior: None }
+    }
+
+    /// Returns the same evidence after earlier images of the take, whose comparisons leave the hazard this probability,
+    /// 0..=1.
+    #[must_use]
+    pub fn after(self, hazard_probability: f64) -> Self {
+        Self { prior: Some(hazard_probability.clamp(0.0, 1.0)), ..self }
+    }
+
+    /// Returns the hazard probability before the image, where earlier images have one.
+    pub fn prior(&self) -> Option<f64> {
+        self.prior
+    }
+
+    /// Returns the hazard probability before the image: of earlier images, else of equally probable states.
+    pub fn prior_or_even(&self, hazard_states: &[bool]) -> f64 {
+        self.prior.unwrap_or_else(|| share_of_hazards(hazard_states))
     }
 
     /// Returns the ratios, one a state.
@@ -50,16 +69,12 @@ impl ImageEvidence {
     /// Returns the probability of a hazard and of something unknown, from the encoder's hazard probability (0..=1).
     /// `hazard_states` marks the states with a hazard, and must have one entry a state.
     ///
-    /// Two opinions are pooled with equal weights: one starts from the encoder's probability, the other from equally
-    /// probable states. Each is weighed by the best explanation with and without a hazard (Bayes' rule). The image adds
+    /// Two opinions are pooled with equal weights: one starts from the encoder's probability, the other from earlier
+    /// images of the take, or else from equally probable states. Each is weighed by the best explanation with and without a hazard (Bayes' rule). The image adds
     /// to the hazard and never takes from it: a hazard may be hidden at a place where no known state has it.
     pub fn weigh(&self, hazard_probability: f32, hazard_states: &[bool]) -> (f64, f64) {
-        let best = |hazard: bool| {
-            let of = self.ratios.iter().zip(hazard_states).filter(|(_, h)| **h == hazard).map(|(r, _)| *r);
-            of.fold(0.0, f64::max)
-        };
-        let (with, without) = (best(true), best(false));
-        let hazards = hazard_states.iter().filter(|h| **h).count() as f64 / hazard_states.len().max(1) as f64;
+        let (with, without) = (self.best(true, hazard_states), self.best(false, hazard_states));
+        let hazards = self.prior_or_even(hazard_states);
         let posterior = |hazard: f64| {
             let known = 1.0 - UNKNOWN_PRIOR;
             let (h, c) = (known * hazard * with, known * (1.0 - hazard) * without);
@@ -71,6 +86,62 @@ impl ImageEvidence {
         let unknown = pooled(trusting.1, doubting.1);
         let encoder = f64::from(hazard_probability).clamp(0.0, 1.0);
         (pooled(trusting.0, doubting.0).max(encoder * (1.0 - unknown)), unknown)
+    }
+
+    /// Ratio of the best explanation with or without a hazard.
+    fn best(&self, hazard: bool, hazard_states: &[bool]) -> f64 {
+        let of = self.ratios.iter().zip(hazard_states).filter(|(_, h)| **h == hazard).map(|(r, _)| *r);
+        of.fold(0.0, f64::max)
+    }
+}
+
+fn share_of_hazards(hazard_states: &[bool]) -> f64 {
+    in_message(hazard_states.iter().filter(|h| **h).count() as f64 / hazard_states.len().max(1) as f64)
+}
+
+/// A probability as messages carry it, so that who reads the message computes the same bits.
+fn in_message(probability: f64) -> f64 {
+    f64::from(probability as f32)
+}
+
+/// The comparisons of a take's images so far: a place that was seen clear, or a hazard that was seen, is remembered
+/// while it is hidden.
+#[derive(Clone, Debug)]
+pub struct ImageMemory {
+    hazard_states: Vec<bool>,
+    settings: MemorySettings,
+    /// Logarithm of the odds of a hazard, and the last image's logarithm of its likelihood ratio.
+    log_odds: f64,
+    last: f64,
+}
+
+/// Largest logarithm of the odds: no image excludes a hazard forever.
+const LARGEST_LOG_ODDS: f64 = 12.0;
+
+impl ImageMemory {
+    /// An empty memory. `hazard_states` marks the states with a hazard.
+    pub fn new(hazard_states: Vec<bool>, settings: MemorySettings) -> Self {
+        let mut memory = Self { hazard_states, settings, log_odds: 0.0, last: 0.0 };
+        memory.clear();
+        memory
+    }
+
+    /// Forgets everything: the next image starts a new take.
+    pub fn clear(&mut self) {
+        let hazards = share_of_hazards(&self.hazard_states).clamp(1e-6, 1.0 - 1e-6);
+        (self.log_odds, self.last) = ((hazards / (1.0 - hazards)).ln(), 0.0);
+    }
+
+    /// Adds an image's evidence, and returns it with the hazard probability of the images before.
+    pub fn see(&mut self, evidence: ImageEvidence) -> ImageEvidence {
+        if evidence.ratios.len() != self.hazard_states.len() {
+            return evidence;
+        }
+        let best = |hazard| evidence.best(hazard, &self.hazard_states).max(1.0 / MAX_RATIO);
+        let ratio = (best(true) / best(false)).ln();
+        let before = self.log_odds - self.settings.repeated(ratio, self.last);
+        (self.log_odds, self.last) = ((before + ratio).clamp(-LARGEST_LOG_ODDS, LARGEST_LOG_ODDS), ratio);
+        evidence.after(in_message(1.0 / (1.0 + (-before).exp())))
     }
 }
 
@@ -143,5 +214,25 @@ mod tests {
             let (hazard, unknown) = ImageEvidence::new(&ratios).weigh(0.0, &STATES);
             assert!(unknown > 0.8 && hazard < 0.1, "{hazard} {unknown}");
         }
+    }
+
+    /// A place that was seen clear stays clear while it is hidden, a hazard that was seen stays, and a cleared memory is
+    /// even. Ten like images are not ten observations.
+    #[test]
+    fn comparisons_are_remembered() {
+        let settings = MemorySettings { repeated_share: 0.0, distrust: 0.0 };
+        let hidden = || ImageEvidence::new(&[50.0; 4]);
+        for (seen, low, high) in [([1e-3, 1e-3, 80.0, 80.0], 0.0, 0.01), ([80.0, 80.0, 1e-3, 1e-3], 0.99, 1.0)] {
+            let mut memory = ImageMemory::new(STATES.to_vec(), settings);
+            assert_eq!(memory.see(ImageEvidence::new(&seen)).prior(), Some(0.5));
+            let (hazard, _) = memory.see(hidden()).weigh(low, &STATES);
+            assert!((f64::from(low)..=high).contains(&hazard), "{hazard}");
+            memory.clear();
+            assert_eq!(memory.see(hidden()).prior(), Some(0.5));
+        }
+        let weak = || ImageEvidence::new(&[2.0, 2.0, 1.0, 1.0]);
+        let mut memory = ImageMemory::new(STATES.to_vec(), settings);
+        (0..10).for_each(|_| drop(memory.see(weak())));
+        assert!((memory.see(hidden()).prior().unwrap() - 2.0 / 3.0).abs() < 1e-9);
     }
 }

@@ -9,6 +9,7 @@
 //! | `mixture` | mixtures over the scene latent, and draws from them |
 //! | `layout`, `calibration` | from densities at the places of a scenario to the state that a latent shows |
 //! | `look_ahead` | one step of the belief, and the autoregressive loop |
+//! | `memory`, `take` | the belief over the frames of a take |
 //! | `image_evidence` | the known states weighed by how well they explain the image |
 //! | `evidence`, `rule`, `threshold` | from the steps of a frame to an action |
 //! | `convert` | the same steps as messages, and back |
@@ -19,16 +20,20 @@ mod evidence;
 mod image_evidence;
 mod layout;
 mod look_ahead;
+mod memory;
 mod mixture;
 mod rule;
+mod take;
 mod threshold;
 
 pub use calibration::{Calibration, Reading, Resolved, resolve};
 pub use convert::{mixture_and_draws, set_mixture_and_draws};
 pub use evidence::{Evidence, SampleEvidence};
-pub use image_evidence::ImageEvidence;
+pub use image_evidence::{ImageEvidence, ImageMemory};
 pub use layout::{Place, ProbeLayout, ProbingError};
 pub use look_ahead::{DensityField, DensityProbe, Plan, Probed, Step, look_ahead, path_probability};
+pub use memory::{Memory, MemorySettings};
 pub use mixture::{Draw, Mixture, Sampling};
 pub use rule::{Decision, Policy};
+pub use take::{Progress, StepLength, TakeFrame, TakeMemory};
 pub use threshold::{CalibrationTrial, bounded_threshold, choose_threshold, unchosen_threshold};

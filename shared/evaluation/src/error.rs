@@ -11,6 +11,9 @@ pub enum EvaluationError {
     /// The planning settings of the checkpoint cannot be used.
     #[error(transparent)]
     Planning(#[from] carff_checkpoint::CheckpointPlanningError),
+    /// The known states of the checkpoint cannot be read.
+    #[error(transparent)]
+    Known(#[from] carff_unknown::KnownError),
     /// The dataset cannot be read or written.
     #[error(transparent)]
     Dataset(#[from] carff_dataset::DatasetError),

@@ -47,6 +47,7 @@ pub use tables::{
     encoder::{EncoderTable, SvmScore, SvmTable, encoder_table},
     field::{FieldPictures, NovelViews, PictureTable},
     forecast::{ForecastTable, FrequencyTable, RoleCurves},
+    memory::{ByObserver, MemoryTable, ObserverFigures, RightFrames},
     planning::{OneImage, PlanningResults, PlanningViews, ViewCounts},
     robustness::{ByCorruption, CorruptionFigures, NoveltyFigures, Robustness},
     trials::{Baseline, ByPart},
@@ -56,9 +57,11 @@ pub use trials::{
     birds_eye::{BirdsEye, birds_eye},
     looks::{ByTrialKind, TrialFigures},
     planning::{
-        ByKind, BySamples, Count, NoisyEncoder, Planner, PlanningTable, SAMPLE_COUNTS, Trial, TrialOutcome, trial_frame,
+        ByKind, BySamples, Count, KnownStates, Perception, Planner, PlanningTable, SAMPLE_COUNTS, Trial, TrialOutcome,
+        trial_frame,
     },
     samples::{Input, SampleAccuracy, SampleTrials},
+    watches::{Watch, WatchPlan, Watched, watches},
 };
 
 /// One line of progress.

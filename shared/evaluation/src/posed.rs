@@ -1,7 +1,9 @@
 //! The posed images of one scenario with their labels: the input of training and evaluation.
 
 use crate::EvaluationError;
-use carff_dataset::{Dataset, Equivalence, Frame, Image, Observability, PoseRole, PoseSplit, ScenarioInfo};
+use carff_dataset::{
+    Dataset, Equivalence, Frame, Image, NamedBox, Observability, PoseRole, PoseSplit, ScenarioInfo, StateInfo,
+};
 use carff_networks::decoder::PICTURE_PX;
 use std::path::Path;
 use tch::{Kind, Tensor};
@@ -40,7 +42,8 @@ pub struct PosedImages {
     pub equivalence: Equivalence,
     /// Visual equivalence as the images show it, which training may use. Noise hides it.
     pub seen_equivalence: Equivalence,
-    random_equivalence: Option<Equivalence>,
+    /// Number of the first view of each dataset of random poses, and its equivalence.
+    random_equivalences: Vec<(usize, Equivalence)>,
     /// Mean image of each pose over the states in which a pixel is valid, `[V, 3, 128, 128]`, 0..=1.
     pub pose_means: Tensor,
     index: Vec<Option<usize>>,
@@ -78,22 +81,23 @@ impl PosedImages {
             split,
             equivalence,
             seen_equivalence,
-            random_equivalence: None,
+            random_equivalences: Vec::new(),
             index,
         })
     }
 
-    /// Adds the images of a dataset of random poses of the same scenario.
+    /// Adds the images of a dataset of random poses of the same scenario, in which the dynamic vehicle may look
+    /// different. Several calls add several datasets.
     pub fn add_random_poses(&mut self, dir: &Path) -> Result<(), EvaluationError> {
         let unfit = |what: &str| EvaluationError::Unfit(format!("{}: {what}", dir.display()));
         let free = Dataset::open(dir)?;
-        let same = free.scenario().is_some_and(|s| s.name == self.scenario.name && s.states == self.scenario.states);
-        if !same {
+        if !free.scenario().is_some_and(|scenario| same_places(&self.scenario, scenario)) {
             return Err(unfit("this folder belongs to another scenario: remove it, and it is rendered again"));
         }
         let images = free.load_all_images()?;
-        self.labels.extend(labels(&free, self.dataset.view_count(), |_| None).map_err(|what| unfit(&what))?);
-        self.random_equivalence = Some(Equivalence::from_images(&free, &images));
+        let first_view = self.view_count();
+        self.labels.extend(labels(&free, first_view, |_| None).map_err(|what| unfit(&what))?);
+        self.random_equivalences.push((first_view, Equivalence::from_images(&free, &images)));
         self.images.extend(images);
         Ok(())
     }
@@ -131,10 +135,9 @@ impl PosedImages {
 
     /// States whose images from a view of the dataset or of a random pose look the same, including `state`.
     pub fn seen_alike(&self, view: usize, state: usize) -> Vec<usize> {
-        let poses = self.dataset.view_count();
-        match &self.random_equivalence {
-            Some(free) if view >= poses => free.alike(view - poses, state).collect(),
-            _ => self.seen_equivalence.alike(view, state).collect(),
+        match self.random_equivalences.iter().rev().find(|(first, _)| view >= *first) {
+            Some((first, free)) => free.alike(view - first, state).collect(),
+            None => self.seen_equivalence.alike(view, state).collect(),
         }
     }
 
@@ -177,6 +180,20 @@ fn mean_of_valid(images: &Tensor, valid: Option<&Tensor>) -> Tensor {
     let Some(valid) = valid else { return mean };
     let count = over_images(valid);
     (over_images(&(images * valid)) / count.clamp_min(1.0)).where_self(&count.gt(0.0), &mean)
+}
+
+/// Returns true if both scenarios have the same states, with a box at the same place of the ground for each box of the
+/// other.
+fn same_places(one: &ScenarioInfo, other: &ScenarioInfo) -> bool {
+    let near = |a: &NamedBox, b: &NamedBox| {
+        let (a, b) = (a.oriented_box.center, b.oriented_box.center);
+        (a[0] - b[0]).hypot(a[1] - b[1]) < 1e-3
+    };
+    let same = |(a, b): (&StateInfo, &StateInfo)| {
+        let boxes = a.boxes.len() == b.boxes.len() && a.boxes.iter().zip(&b.boxes).all(|(a, b)| near(a, b));
+        (a.branch, a.timestamp) == (b.branch, b.timestamp) && boxes
+    };
+    one.name == other.name && one.states.len() == other.states.len() && one.states.iter().zip(&other.states).all(same)
 }
 
 /// Labels of a dataset with views numbered from `first_view`. The error names what a frame lacks.

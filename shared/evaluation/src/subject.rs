@@ -1,6 +1,9 @@
 //! Subject of an evaluation: a checkpoint, a dataset of its scenario, and the posterior of each image.
 
-use crate::trials::planning::{NoisyEncoder, Planner};
+use crate::trials::{
+    planning::{KnownStates, Perception, Planner},
+    watches::Watch,
+};
 use crate::{ByRole, Decoding, EvaluationError, PosedImages, Progress, ROLES};
 use carff_base::geometry::PinholeCamera;
 use carff_base::random::Key;
@@ -11,7 +14,7 @@ use carff_dataset::{
     drives::DriveKind,
     sensor::{SensorNoise, apply_noise_into},
 };
-use carff_decision::Sampling;
+use carff_decision::{MemorySettings, Sampling};
 use carff_messages::Gaussian;
 use carff_networks::{
     decoder::Decoder,
@@ -21,6 +24,7 @@ use carff_networks::{
 };
 use carff_plots::Panel;
 use carff_scenes::{FreePose, UnknownLook};
+use carff_unknown::Known;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 use tch::{Device, Tensor};
@@ -111,12 +115,16 @@ pub struct Subject {
     pub mixture: Result<MixtureNet, String>,
     /// Hypothesis to state, or the reason why it is missing.
     pub probe: Result<FieldProbe, String>,
+    /// Limits of the known states, where the checkpoint has them.
+    pub known: Option<Known>,
     /// Images of the dataset.
     pub posed: PosedImages,
     /// Posterior of each image without sensor noise.
     pub posteriors: Vec<Gaussian>,
     /// Threshold of the calibrated rule, where one was chosen.
     pub threshold: Option<f64>,
+    /// Learned numbers of the memory, where the checkpoint has them.
+    pub memory: Option<MemorySettings>,
     /// Training curves, where the folder of the training run is available.
     pub training_curves: Vec<Panel>,
     /// Decisive image of each free drive. Empty until the caller renders them.
@@ -127,6 +135,8 @@ pub struct Subject {
     pub novelties: Vec<Novelty>,
     /// Images of other places. Empty until the caller renders them.
     pub other_places: Vec<OtherPlace>,
+    /// Drives whose camera pans. Empty until the caller renders them.
+    pub watches: Vec<Watch>,
     /// Settings of this evaluation.
     pub options: EvalOptions,
     trained: TrainedWith,
@@ -170,13 +180,16 @@ impl Subject {
             path: checkpoint.join(files::MANIFEST),
             what: format!("`training`: {e}; make the checkpoint again with `carff train`"),
         })?;
+        let planning = CheckpointPlanning::load(checkpoint).ok();
         let mut subject = Self {
             checkpoint: checkpoint.to_owned(),
             decoder: load_decoder(checkpoint, &manifest)?,
             mixture: or_why(load_mixture(checkpoint, &manifest))?,
             probe: or_why(carff_checkpoint::load_field_probe(checkpoint, &manifest))?,
+            known: Known::load(checkpoint)?,
             posteriors: Vec::with_capacity(posed.images.len()),
-            threshold: CheckpointPlanning::load(checkpoint).ok().map(|p| p.hazard_threshold),
+            threshold: planning.map(|p| p.hazard_threshold),
+            memory: planning.and_then(|p| p.memory),
             manifest,
             encoder,
             posed,
@@ -185,6 +198,7 @@ impl Subject {
             free_poses: Vec::new(),
             novelties: Vec::new(),
             other_places: Vec::new(),
+            watches: Vec::new(),
             options,
             trained,
         };
@@ -207,9 +221,15 @@ impl Subject {
         self.trained.calibration.sensor
     }
 
-    /// The encoder behind a camera in use.
-    pub fn noisy_encoder(&self) -> NoisyEncoder<'_> {
-        NoisyEncoder { encoder: &self.encoder, noise: self.noise(), seed: self.options.seed }
+    /// Camera in use, encoder, and comparison where the checkpoint has known states.
+    pub fn perception(&self) -> Perception<'_> {
+        let known = self.known.as_ref().zip(self.probe.as_ref().ok());
+        Perception {
+            encoder: &self.encoder,
+            noise: self.noise(),
+            seed: self.options.seed,
+            known: known.map(|(known, probe)| KnownStates::new(known, probe, self.options.threads)),
+        }
     }
 
     /// Forecast and probe, or the reason why one is missing.

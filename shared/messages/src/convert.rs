@@ -33,6 +33,7 @@ impl FrameMeta {
             intrinsics: camera.into(),
             world_from_camera: row_major(&camera.world_from_camera),
             dataset_view,
+            take_start: 0,
         }
     }
 

@@ -122,13 +122,14 @@ impl DatasetView {
 ///         0.0, 0.0, 0.0, 1.0,
 ///     ],
 ///     dataset_view: DatasetView::UNKNOWN,
+///     take_start: 0,
 /// };
 /// assert!(meta.validate().is_ok());
 /// assert_eq!(meta.image_bytes(), 128 * 96 * 3);
 /// ```
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Default, PartialEq, ZeroCopySend)]
-#[type_name("carff.FrameMeta.v1")]
+#[type_name("carff.FrameMeta.v2")]
 pub struct FrameMeta {
     /// Header, at step 0.
     pub header: Header,
@@ -142,6 +143,9 @@ pub struct FrameMeta {
     pub world_from_camera: [f64; 16],
     /// Position in a dataset, for reports.
     pub dataset_view: DatasetView,
+    /// Number of the take's first frame. The frames of a take follow each other without a cut: a memory of earlier
+    /// frames holds within a take only.
+    pub take_start: u64,
 }
 
 impl FrameMeta {
@@ -150,6 +154,7 @@ impl FrameMeta {
         picture_size(self.width_px, self.height_px)?;
         self.intrinsics.check()?;
         finite_f64("world_from_camera", &self.world_from_camera)?;
+        at_most("take_start", self.take_start, self.header.frame_id)?;
         self.dataset_view.check()
     }
 }

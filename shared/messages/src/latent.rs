@@ -52,12 +52,14 @@ impl Gaussian {
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, ZeroCopySend, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
-#[type_name("carff.Posterior.v1")]
+#[type_name("carff.Posterior.v2")]
 pub struct Posterior {
     /// Header, at step 0.
     pub header: Header,
     /// The latent's distribution.
     pub gaussian: Gaussian,
+    /// Number of the first frame of the take: the frame's, or a later one if the camera was not usable in between.
+    pub take_start: u64,
     /// Time from the arrival of the frame to sending, nanoseconds.
     pub stage_latency_ns: u64,
 }
@@ -65,6 +67,7 @@ pub struct Posterior {
 impl Posterior {
     fn check(&self) -> Result<(), Invalid> {
         self.header.validate()?;
+        at_most("take_start", self.take_start, self.header.frame_id)?;
         self.gaussian.check()
     }
 }
@@ -88,13 +91,13 @@ message!(Posterior);
 /// ```
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, ZeroCopySend)]
-#[type_name("carff.Forecast.v1")]
+#[type_name("carff.Forecast.v2")]
 pub struct Forecast {
     /// Header, at step 1 or more.
     pub header: Header,
     /// Code of a [`ForecastSource`].
     pub source: u32,
-    /// Number of used components, 1..=4.
+    /// Number of used components, 1..=8.
     pub component_count: u32,
     /// Number of drawn samples, 1..=64.
     pub sample_count: u32,
@@ -104,6 +107,8 @@ pub struct Forecast {
     pub resolved_state: i32,
     /// Probability of the path up to the input, 0..=1; 1 at step 1.
     pub path_probability: f32,
+    /// Number of images that the forecast rests on; 1 without a memory.
+    pub images: u64,
     /// Mixture weights.
     pub weights: [f32; MAX_COMPONENTS],
     /// Mixture components.
@@ -129,6 +134,7 @@ impl Forecast {
             horizon,
             resolved_state: -1,
             path_probability: 1.0,
+            images: 1,
             weights: [0.0; MAX_COMPONENTS],
             components: [Gaussian::standard(); MAX_COMPONENTS],
             samples: [[0.0; LATENT_DIM]; MAX_SAMPLES],
@@ -219,7 +225,7 @@ impl ProbeResult {
 /// ```
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, ZeroCopySend)]
-#[type_name("carff.Belief.v3")]
+#[type_name("carff.Belief.v4")]
 pub struct Belief {
     /// Header, at the step of the forecast.
     pub header: Header,
@@ -229,7 +235,7 @@ pub struct Belief {
     pub state_count: u32,
     /// Number of probed places, 1..=48.
     pub place_count: u32,
-    /// Number of mixture components, 1..=4.
+    /// Number of mixture components, 1..=8.
     pub component_count: u32,
     /// Number of samples, 1..=64.
     pub sample_count: u32,

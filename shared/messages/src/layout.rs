@@ -122,7 +122,7 @@ macro_rules! described {
 described!(Header { schema_version, step, run_id, frame_id, sequence, capture_time_ns, publish_time_ns, seed });
 described!(Intrinsics { fl_x_px, fl_y_px, cx_px, cy_px });
 described!(DatasetView { known, view, branch, timestamp, drive, frame_in_drive, observability, last_of_timestamp });
-described!(FrameMeta { header, width_px, height_px, intrinsics, world_from_camera, dataset_view });
+described!(FrameMeta { header, width_px, height_px, intrinsics, world_from_camera, dataset_view, take_start });
 described!(ViewMeta {
     header,
     hypothesis,
@@ -150,10 +150,11 @@ described!(Unknowns {
     offset,
     explained,
     ratios,
+    prior,
     boxes,
     stage_latency_ns
 });
-described!(Posterior { header, gaussian, stage_latency_ns });
+described!(Posterior { header, gaussian, take_start, stage_latency_ns });
 described!(Forecast {
     header,
     source,
@@ -162,6 +163,7 @@ described!(Forecast {
     horizon,
     resolved_state,
     path_probability,
+    images,
     weights,
     components,
     samples,

@@ -47,11 +47,11 @@ use serde::{Deserialize, Serialize};
 use std::fmt::Debug;
 
 /// Version of all layouts in this crate. A process drops messages of another version.
-pub const SCHEMA_VERSION: u32 = 2;
+pub const SCHEMA_VERSION: u32 = 3;
 /// Dimensions of the scene latent.
 pub const LATENT_DIM: usize = 8;
 /// Maximum number of components of a mixture.
-pub const MAX_COMPONENTS: usize = 4;
+pub const MAX_COMPONENTS: usize = 8;
 /// Maximum number of latents drawn from a mixture.
 pub const MAX_SAMPLES: usize = 64;
 /// Maximum number of states (branch, time step) of a scenario.

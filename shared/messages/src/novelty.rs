@@ -106,7 +106,7 @@ pub struct UnknownBox {
 /// ```
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, ZeroCopySend)]
-#[type_name("carff.Unknowns.v1")]
+#[type_name("carff.Unknowns.v2")]
 pub struct Unknowns {
     /// Header, at step 0.
     pub header: Header,
@@ -130,6 +130,8 @@ pub struct Unknowns {
     /// For each known state, how much better it explains the image than something unknown does; 0 for a view of another
     /// place.
     pub ratios: [f32; MAX_STATES],
+    /// Hazard probability before this image, from the comparisons of the take's earlier images, 0..=1.
+    pub prior: f32,
     /// Boxes, the most probable first.
     pub boxes: [UnknownBox; MAX_UNKNOWNS],
     /// Time from the arrival of the frame to sending, nanoseconds.
@@ -150,6 +152,7 @@ impl Unknowns {
             offset: [0.0; 3],
             explained: 1.0,
             ratios: [1.0; MAX_STATES],
+            prior: 0.5,
             boxes: [UnknownBox::default(); MAX_UNKNOWNS],
             stage_latency_ns: 0,
         }
@@ -171,6 +174,7 @@ impl Unknowns {
         within("ratios", self.ratios(), 0.0, f32::MAX)?;
         at_most("box_count", self.box_count.into(), MAX_UNKNOWNS as u64)?;
         probability("probability", self.probability)?;
+        probability("prior", self.prior)?;
         finite("residual, noise and explained", [&self.residual, &self.noise, &self.explained])?;
         finite("gain and offset", self.gain.iter().chain(&self.offset))?;
         for unknown in self.boxes() {

@@ -23,6 +23,10 @@ pub struct ScenarioConfig {
     /// Number of time steps of each branch, 1 to 64.
     #[serde(deserialize_with = "count")]
     pub timestamps: usize,
+    /// Duration of a time step, seconds: how long the belief of a real camera's images stays at a state.
+    #[serde(default, deserialize_with = "duration")]
+    #[schemars(range(min = 0.001, max = 3600.0))]
+    pub step_s: Option<f64>,
     /// Names of the branches.
     pub branches: Vec<String>,
     /// Names of the branches in which the hazard action is right.
@@ -756,6 +760,10 @@ fn softness<'de, D: Deserializer<'de>>(d: D) -> Result<f64, D::Error> {
 
 fn heading<'de, D: Deserializer<'de>>(d: D) -> Result<f64, D::Error> {
     in_range(d, -180.0, 180.0, "an angle")
+}
+
+fn duration<'de, D: Deserializer<'de>>(d: D) -> Result<Option<f64>, D::Error> {
+    in_range(d, 0.001, 3600.0, "a duration").map(Some)
 }
 
 fn whole<'de, D: Deserializer<'de>>(d: D, low: i64, high: i64) -> Result<i64, D::Error> {

@@ -79,6 +79,8 @@ pub(crate) struct Course {
     /// Phase and cycles per time step, for x, y, z and yaw.
     sway: [[f64; 2]; 4],
     camera: Carrier,
+    /// Pan of a roof camera about its mounting direction: amplitude in radians, phase, cycles per time step.
+    pan: [f64; 3],
     /// Scale of all random lengths.
     scale: f64,
 }
@@ -111,9 +113,15 @@ pub struct FreeFrame {
 
 impl FreeDrive {
     /// A drive of one frame per time step without a right answer.
-    pub(crate) fn of_course(branch: usize, timestamps: usize, view_kind: String, course: Course) -> Self {
+    pub(crate) fn of_course(
+        branch: usize,
+        timestamps: usize,
+        frames_per_timestamp: usize,
+        view_kind: String,
+        course: Course,
+    ) -> Self {
         let kind = DriveKind::Clear;
-        Self { branch, kind, eligible_timestamp: 0, timestamps, frames_per_timestamp: 1, view_kind, course }
+        Self { branch, kind, eligible_timestamp: 0, timestamps, frames_per_timestamp, view_kind, course }
     }
 
     /// Returns the same drive through another branch.
@@ -148,7 +156,17 @@ impl FreeDrive {
 
     /// Returns the frame whose decision counts: the last one of the eligible time step.
     pub fn decisive_frame(&self) -> usize {
-        (self.eligible_timestamp + 1) * self.frames_per_timestamp - 1
+        self.last_frame_of(self.eligible_timestamp)
+    }
+
+    /// Returns the time step of a frame.
+    pub fn timestamp_of(&self, frame: usize) -> usize {
+        frame / self.frames_per_timestamp.max(1)
+    }
+
+    /// Returns the last frame of a time step.
+    pub fn last_frame_of(&self, timestamp: usize) -> usize {
+        (timestamp + 1) * self.frames_per_timestamp - 1
     }
 
     /// Returns the time of a frame in time steps: 0 at the first state, whole numbers at the last frame of each time
@@ -212,6 +230,7 @@ impl Scenario {
             heading: within(HEADING),
             sway: [(); 4].map(|()| [within(TAU), 0.3 + (SWAYS - 0.3) * within(1.0).abs()]),
             camera,
+            pan: [0.0; 3],
             scale,
         };
         Ok((view_kind, course))
@@ -219,7 +238,7 @@ impl Scenario {
 
     /// Renders frame `frame` of a drive, 0 to [`FreeDrive::frame_count`] - 1, with its truth.
     pub fn free_frame(&self, drive: &FreeDrive, frame: usize) -> Result<FreeFrame, ScenarioError> {
-        let timestamp = frame / drive.frames_per_timestamp.max(1);
+        let timestamp = drive.timestamp_of(frame);
         if self.info().state(drive.branch, timestamp).is_none() {
             return Err(ScenarioError::NoSuchState {
                 branch: drive.branch,
@@ -277,7 +296,7 @@ impl Scenario {
     pub(crate) fn free_view(&self, drive: &FreeDrive, frame: usize) -> (PinholeCamera, Placement) {
         let (time, course) = (drive.time(frame), &drive.course);
         let steps = &self.placements()[drive.branch];
-        let timestamp = (frame / drive.frames_per_timestamp.max(1)).min(steps.len() - 1);
+        let timestamp = drive.timestamp_of(frame).min(steps.len() - 1);
         let mut placement = steps[timestamp].clone();
         for (v, vehicle) in self.config().vehicle.iter().enumerate().filter(|(_, v)| v.role == "ego") {
             if let Some(pose) = moving(steps, v, time).filter(|_| !vehicle.dynamic) {
@@ -294,7 +313,8 @@ impl Scenario {
                 let pose = placement[*vehicle].or_else(|| moving(steps, *vehicle, time));
                 let [px, py, _] = pose.map_or([0.0; 3], |p| p.position_m);
                 let facing = pose.map_or(0.0, |p| p.yaw);
-                let mount = Mount { height_m: mount.height_m + z, left: mount.left + yaw, ..*mount };
+                let left = mount.left + yaw + course.panned(time);
+                let mount = Mount { height_m: mount.height_m + z, left, ..*mount };
                 let (eye, target) = mount.at([px + x, py + y, facing]);
                 look(eye, target, [0.0, 0.0, 1.0])
             }
@@ -321,6 +341,21 @@ impl Course {
         let [x, y, z] = pose.position_m;
         let position_m = [x + c * self.along_m - s * self.aside_m, y + s * self.along_m + c * self.aside_m, z];
         Pose { position_m, yaw: pose.yaw + self.heading, ..pose }
+    }
+
+    /// Lets a roof camera pan over a range of directions, radians left of straight ahead. Any other camera stays as
+    /// drawn.
+    pub(crate) fn pan_over(&mut self, [low, high]: [f64; 2], phase: f64, cycles: f64) {
+        if let Carrier::Roof { mount, .. } = &mut self.camera {
+            mount.left = (low + high) / 2.0;
+            self.pan = [(high - low) / 2.0, phase, cycles];
+        }
+    }
+
+    /// Returns the pan, radians.
+    fn panned(&self, time: f64) -> f64 {
+        let [amplitude, phase, cycles] = self.pan;
+        amplitude * (phase + TAU * cycles * time).sin()
     }
 
     /// Returns the sway: x, y, z in metres and yaw in radians.

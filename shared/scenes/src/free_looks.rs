@@ -68,7 +68,7 @@ impl Scenario {
         for sample in 0..MAX_TRIES {
             let mut rng = carff_base::random::stream(Key { seed, frame: number, step: STREAM, sample });
             let (view_kind, course) = self.course(0, number.is_multiple_of(2), &mut rng)?;
-            let drive = FreeDrive::of_course(0, timestamps, view_kind, course);
+            let drive = FreeDrive::of_course(0, timestamps, 1, view_kind, course);
             if self.stands_clear(&drive, timestamp) {
                 return Ok((drive, timestamp));
             }

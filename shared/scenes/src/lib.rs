@@ -29,6 +29,7 @@ mod shapes;
 mod tracer;
 mod unknown_looks;
 mod variations;
+mod watches;
 
 pub use cameras::ScenarioCamera;
 pub use error::ScenarioError;

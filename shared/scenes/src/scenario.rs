@@ -853,6 +853,7 @@ fn info(
         bounds: config.bounds_m,
         branches: config.branches.clone(),
         timestamps: config.timestamps,
+        step_s: config.step_s,
         bev_view: config.bev_view.as_ref().map(|v| *v.get_ref()),
         states,
         candidates,

@@ -4,17 +4,13 @@
 //! comparison of each image.
 
 use crate::TrainingError;
-use carff_base::random::{Key, tag};
+use carff_base::random::tag;
 use carff_checkpoint::{Bound, CheckpointPlanning};
-use carff_dataset::{
-    drives::DriveKind,
-    sensor::{SensorNoise, apply_noise_into},
-};
-use carff_decision::{CalibrationTrial, ImageEvidence, Sampling, bounded_threshold, choose_threshold};
-use carff_evaluation::{Models, NoisyEncoder, Planner, Progress, Trial};
-use carff_messages::LATENT_DIM;
+use carff_dataset::{drives::DriveKind, sensor::SensorNoise};
+use carff_decision::{CalibrationTrial, Sampling, bounded_threshold, choose_threshold};
+use carff_evaluation::{KnownStates, Models, Perception, Planner, Progress, Trial};
 use carff_scenes::Scenario;
-use carff_unknown::{Comparer, Known};
+use carff_unknown::Known;
 use std::path::Path;
 
 /// Part of the seed of these drives, so that they share no draws with training, limits or evaluation.
@@ -68,11 +64,11 @@ pub fn bound_threshold(input: BoundInput, on_progress: &dyn Fn(&Progress)) -> Re
     let models = Models::load(input.checkpoint)?;
     let known = Known::load(input.checkpoint).map_err(|e| unfit(e.to_string()))?;
     let seed = models.manifest.seed ^ BOUND;
-    let (trials, images) = drives(input, &models, known.as_ref(), seed, on_progress)?;
+    let trials = drives(input, &models, known.as_ref(), seed, on_progress)?;
     let sampling = Sampling::Stratified;
     let planner = Planner { net: &models.mixture, probe: &models.probe, sampling, horizon: HORIZON };
     let (mut hazard, mut clear) = (Vec::new(), Vec::new());
-    for (trial, evidence) in trials.iter().zip(planner.weighed_evidence(&trials, &images, SAMPLES)) {
+    for (trial, evidence) in trials.iter().zip(planner.evidence(&trials, SAMPLES)) {
         let of_kind = if trial.kind == DriveKind::Hazard { &mut hazard } else { &mut clear };
         of_kind.push(evidence.hazard_or_unknown_probability());
     }
@@ -97,33 +93,28 @@ fn too_few(input: &BoundInput, hazards: usize) -> TrainingError {
     ))
 }
 
-/// The decisive image of each drive as a trial, with the evidence of its comparison.
+/// The decisive image of each drive as a trial.
 fn drives(
     input: BoundInput,
     models: &Models,
     known: Option<&Known>,
     seed: u64,
     on_progress: &dyn Fn(&Progress),
-) -> Result<(Vec<Trial>, Vec<Option<ImageEvidence>>), TrainingError> {
-    let noise = SensorNoise::default();
-    let encoder = NoisyEncoder { encoder: &models.encoder, noise, seed };
-    let states: Vec<[f32; LATENT_DIM]> = models.probe.states().iter().map(|state| state.mean).collect();
-    let mut comparer = Comparer::default();
-    let (mut trials, mut images) = (Vec::new(), Vec::new());
+) -> Result<Vec<Trial>, TrainingError> {
+    let probe = &models.probe;
+    let perception = Perception {
+        encoder: &models.encoder,
+        noise: SensorNoise::default(),
+        seed,
+        known: known.map(|known| KnownStates::new(known, probe, input.threads)),
+    };
+    let mut trials = Vec::new();
     for number in 0..input.drives {
         let unfit = |e: carff_scenes::ScenarioError| TrainingError::Unfit(e.to_string());
         let drive = input.scenario.free_drive(number as u64, FRAMES_PER_TIMESTAMP, seed).map_err(unfit)?;
         let frame = input.scenario.free_frame(&drive, drive.decisive_frame()).map_err(unfit)?;
-        let Some(trial) = encoder.trial(&frame.image, drive.kind(), number as u64) else { continue };
-        let mut noisy = frame.image.clone();
-        // Only noise out of range is refused.
-        let _ = apply_noise_into(&frame.image.rgb, &mut noisy.rgb, &noise, Key::named("boun", seed, number as u64));
-        let seen = known.zip(noisy.view()).and_then(|(known, view)| {
-            known.see(&mut comparer, models.probe.field(), &states, (&frame.camera, view), input.threads)
-        });
-        images.push(seen.map(|(seen, _)| ImageEvidence::new(&seen.ratios)));
-        trials.push(trial);
+        trials.extend(perception.trial((&frame.camera, &frame.image), drive.kind(), number as u64));
         on_progress(&Progress { phase: "drives", done: number + 1, total: input.drives, line: String::new() });
     }
-    Ok((trials, images))
+    Ok(trials)
 }

@@ -18,7 +18,7 @@ use carff_decision::{
     Calibration, CalibrationTrial, Evidence, Plan, ProbeLayout, Sampling, choose_threshold, look_ahead,
     unchosen_threshold,
 };
-use carff_evaluation::{Models, NoisyEncoder, Progress, Trial, trial_frame};
+use carff_evaluation::{Models, Perception, Progress, Trial, trial_frame};
 use carff_field::Field;
 use carff_messages::LATENT_DIM;
 use carff_scenes::Scenario;
@@ -109,7 +109,7 @@ fn free_trials(context: Context, models: &Models, scenario: &Scenario) -> Result
     let Context { config, run, .. } = context;
     let settings = &config.calibration;
     let seed = config.seed ^ CALIBRATION;
-    let encoder = NoisyEncoder { encoder: &models.encoder, noise: settings.sensor, seed };
+    let perception = Perception { encoder: &models.encoder, noise: settings.sensor, seed, known: None };
     let mut trials = Vec::new();
     for number in 0..settings.free_poses {
         if run.stopped() {
@@ -118,7 +118,7 @@ fn free_trials(context: Context, models: &Models, scenario: &Scenario) -> Result
         let pose = scenario.free_pose(number as u64, seed).map_err(|e| TrainingError::Unfit(e.to_string()))?;
         for (branch, look) in pose.looks.iter().enumerate() {
             if let Some(kind) = scenario.info().trial_kind(branch, pose.timestamp, look.observability) {
-                trials.extend(encoder.trial(&look.image, kind, trial_frame(number, branch)));
+                trials.extend(perception.trial((&pose.camera, &look.image), kind, trial_frame(number, branch)));
             }
         }
     }
@@ -143,7 +143,7 @@ fn calibration_trials(context: Context, models: &Models) -> Result<Vec<Trial>, T
             let image = augmentation.inputs(posed, &[index], repeat, augmentation_seed);
             let (kind, frame, seed) = (input.kind, trial_frame(index, repeat), config.seed);
             let posteriors = models.encoder.encode(&image).into_iter();
-            trials.extend(posteriors.map(|posterior| Trial { posterior, kind, frame, seed }));
+            trials.extend(posteriors.map(|posterior| Trial { posterior, image: None, kind, frame, seed }));
         }
     }
     Ok(trials)

@@ -93,6 +93,10 @@ impl Default for CalibrationConfig {
 pub struct FreePoses {
     /// Number of poses; 0 turns them off.
     pub count: usize,
+    /// Number of further poses for each appearance of the scenario file with the role `trained`: the dynamic vehicle
+    /// has this appearance in their images, and those of every second appearance have a trained roadside object too. A
+    /// dataset without a scenario file has none.
+    pub per_appearance: usize,
     /// Seed of the draw.
     pub seed: u64,
     /// Steps of the field that renders them for a dataset without a scenario file; 0 turns them off for such datasets.
@@ -101,7 +105,7 @@ pub struct FreePoses {
 
 impl Default for FreePoses {
     fn default() -> Self {
-        Self { count: 0, seed: 0, field_steps: 8000 }
+        Self { count: 0, per_appearance: 0, seed: 0, field_steps: 8000 }
     }
 }
 
@@ -286,6 +290,7 @@ impl TrainingConfig {
             ("mdn.steps", self.mdn.steps, 1, 1_000_000),
             ("mdn.batch", self.mdn.batch, 2, 65_536),
             ("free_poses.count", self.free_poses.count, 0, 10_000),
+            ("free_poses.per_appearance", self.free_poses.per_appearance, 0, 10_000),
             ("free_poses.field_steps", self.free_poses.field_steps as usize, 0, 1_000_000),
             ("augmentation.copies", self.augmentation.copies, 0, 64),
             ("augmentation.own_copies", self.augmentation.own_copies, 0, 64),

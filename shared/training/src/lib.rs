@@ -8,7 +8,7 @@
 //! let stop = AtomicBool::new(false);
 //! let run = Run { dir: "runs/toy".into(), on_progress: &|p| println!("{}", p.line), stop: &stop };
 //! let (dataset, out, device) = (config.dataset.as_path(), config.out.as_path(), tch::Device::Cpu);
-//! let training = Training { config: &config, dataset, random_poses: None, scenario: None, out, device };
+//! let training = Training { config: &config, dataset, random_poses: &[], scenario: None, out, device };
 //! println!("{}", training.run(Phases::All, &run)?.summary());
 //! # Ok(())
 //! # }
@@ -34,6 +34,7 @@ mod error;
 mod features;
 mod field;
 mod known;
+mod memory;
 mod mixture;
 mod pipeline;
 mod places;
@@ -51,6 +52,7 @@ pub use curves::training_curves;
 pub use error::TrainingError;
 pub use features::FEATURES;
 pub use known::{KnownInput, calibrate_known};
+pub use memory::{LearnedMemory, MemoryInput, learn_memory};
 pub use pipeline::{Phases, Training};
 pub use places::places;
 pub use random_poses::render_random_poses;

@@ -15,7 +15,7 @@ use carff_checkpoint::{FORMAT_VERSION, Manifest, ScenarioIdentity, SplitRecord, 
 use carff_dataset::{Observability, PoseRole, drives::eligible_inputs};
 use carff_decision::{Policy, Sampling};
 use carff_evaluation::{
-    BirdsEye, CheckpointFigures, FieldRenderer, Input, Models, NoisyEncoder, Planner, PlanningFigures, PosedImages,
+    BirdsEye, CheckpointFigures, FieldRenderer, Input, Models, Perception, Planner, PlanningFigures, PosedImages,
     ProbingFigures, SampleFigures, SampleTrials, TrainedAndUnseen, ViewFigures, birds_eye, to_bytes, to_unit,
 };
 use carff_field::Field;
@@ -23,7 +23,7 @@ use carff_messages::{Gaussian, LATENT_DIM};
 use carff_networks::stored::save_weights;
 use carff_scenes::Scenario;
 use serde_json::Value;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use tch::Device;
 
 /// Trials of each image in the planning tables.
@@ -53,8 +53,8 @@ pub struct Training<'a> {
     pub config: &'a TrainingConfig,
     /// Folder of the dataset.
     pub dataset: &'a Path,
-    /// Folder of the dataset of random poses.
-    pub random_poses: Option<&'a Path>,
+    /// Folders of the datasets of random poses.
+    pub random_poses: &'a [PathBuf],
     /// Scenario of the dataset, from which calibration poses are rendered; `None` for any other dataset.
     pub scenario: Option<&'a Scenario>,
     /// Folder of the checkpoint.
@@ -72,7 +72,7 @@ impl Training<'_> {
         tch::set_num_threads(config.threads);
         tch::manual_seed(config.seed as i64);
         let mut posed = PosedImages::open(self.dataset, config.split_seed)?;
-        if let Some(dir) = self.random_poses {
+        for dir in self.random_poses {
             posed.add_random_poses(dir)?;
         }
         let context = Context { config, posed: &posed, run };
@@ -207,12 +207,13 @@ impl Training<'_> {
         let unfit = |e: &dyn std::fmt::Display| TrainingError::Unfit(e.to_string());
         let threshold = CheckpointPlanning::load(self.out).map_err(|e| unfit(&e))?.hazard_threshold;
         let Models { encoder, mixture, probe, .. } = models;
-        let encoder = NoisyEncoder { encoder, noise: config.calibration.sensor, seed: config.seed + 1 };
+        let noise = config.calibration.sensor;
+        let perception = Perception { encoder, noise, seed: config.seed + 1, known: None };
         let horizon = config.calibration.horizon;
         let planner = Planner { net: mixture, probe, sampling: Sampling::Stratified, horizon };
         let table = |role| {
             let inputs = eligible_inputs(&posed.dataset, &posed.split.views(role)).map_err(|e| unfit(&e))?;
-            let trials = encoder.trials(&posed.dataset, &inputs, PLANNING_REPEATS)?;
+            let trials = perception.trials(&posed.dataset, &inputs, PLANNING_REPEATS)?;
             Ok::<_, TrainingError>(planner.table(&trials, &Policy::all(threshold)).0)
         };
         Ok(PlanningFigures {
@@ -240,6 +241,7 @@ fn new_manifest(context: Context, states: Vec<Gaussian>) -> Manifest {
     Manifest {
         format_version: FORMAT_VERSION,
         scenario: ScenarioIdentity::of(&posed.scenario, posed.dataset.view_count()),
+        step_s: posed.scenario.step_s,
         seed: config.seed,
         split: SplitRecord {
             seed: config.split_seed,

@@ -83,6 +83,7 @@ mod tests {
             bounds: [[-9.0; 3], [9.0; 3]],
             branches: vec!["moves".into(), "stands".into()],
             timestamps,
+            step_s: None,
             bev_view: None,
             states: (0..2 * timestamps).map(state).collect(),
             candidates: Vec::new(),

@@ -159,7 +159,7 @@ fn a_set_without_boxes_is_refused_at_once() {
     let training = Training {
         config: &place.config,
         dataset: &dataset,
-        random_poses: None,
+        random_poses: &[],
         scenario: None,
         out: &out,
         device: Device::Cpu,

@@ -115,7 +115,7 @@ impl Place {
         std::fs::create_dir_all(&dir).unwrap();
         let run = Run { dir, on_progress: &on_progress, stop: &stop };
         let (dataset, out, device) = (self.out("set"), self.out(name), tch::Device::Cpu);
-        Training { config: &self.config, dataset: &dataset, random_poses: None, scenario: None, out: &out, device }
+        Training { config: &self.config, dataset: &dataset, random_poses: &[], scenario: None, out: &out, device }
             .run(phases, &run)
     }
 }

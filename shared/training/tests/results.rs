@@ -107,7 +107,7 @@ impl Place {
     }
 
     fn training<'a>(&'a self, dataset: &'a Path, out: &'a Path) -> Training<'a> {
-        Training { config: &self.config, dataset, random_poses: None, scenario: None, out, device: tch::Device::Cpu }
+        Training { config: &self.config, dataset, random_poses: &[], scenario: None, out, device: tch::Device::Cpu }
     }
 
     fn train(&self, phases: Phases) {

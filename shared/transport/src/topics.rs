@@ -19,6 +19,8 @@ use carff_messages::{Action, Belief, Forecast, FrameMeta, Health, ImageCheck, Po
 /// Limits of small messages; some receivers need every message.
 pub const MESSAGES: Limits =
     Limits { max_subscribers: 10, max_publishers: 2, max_nodes: 14, history: 0, buffer: 16, borrowed: 3, loaned: 2 };
+/// Limits of messages that a restarted receiver takes up again: those of the last seconds.
+pub const REMEMBERED: Limits = Limits { history: 48, buffer: 64, ..MESSAGES };
 /// Limits of images: only a few wait, because they are large and only the newest counts.
 pub const IMAGES: Limits =
     Limits { max_subscribers: 8, max_publishers: 2, max_nodes: 12, history: 0, buffer: 8, borrowed: 2, loaned: 2 };
@@ -34,7 +36,7 @@ pub const FRAME: Topic<Image<FrameMeta>> = Topic::new("camera/frame", IMAGES, 50
 /// Images of a real camera before rectification, for `carff camera check`; published only for it.
 pub const RAW: Topic<Image<FrameMeta>> = Topic::new("camera/raw", ONE_IMAGE, 500);
 /// Posteriors from encoder to forecaster.
-pub const POSTERIOR: Topic<Posterior> = Topic::new("encoder/posterior", MESSAGES, 500);
+pub const POSTERIOR: Topic<Posterior> = Topic::new("encoder/posterior", REMEMBERED, 500);
 /// Checks of images from encoder to controller.
 pub const CHECK: Topic<ImageCheck> = Topic::new("encoder/check", MESSAGES, 500);
 /// Forecasts from forecaster to prober and renderer.

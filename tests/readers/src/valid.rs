@@ -13,13 +13,13 @@ const INTRINSICS: Intrinsics = Intrinsics { fl_x_px: 3.3, fl_y_px: 3.4, cx_px: 2
 const WORLD_FROM_CAMERA: [f64; 16] = [1.0, 0.0, 0.0, 0.1, 0.0, 1.0, 0.0, 0.2, 0.0, 0.0, 1.0, 0.3, 0.0, 0.0, 0.0, 1.0];
 
 pub(crate) fn posterior() -> Posterior {
-    Posterior { header: header(), gaussian: Gaussian::standard(), stage_latency_ns: 3 }
+    Posterior { header: header(), gaussian: Gaussian::standard(), take_start: 0, stage_latency_ns: 3 }
 }
 
 pub(crate) fn forecast() -> Forecast {
     let mut forecast = Forecast::empty(header().at_step(1), ForecastSource::Observed, 2);
     (forecast.component_count, forecast.sample_count) = (2, 10);
-    forecast.weights = [0.25, 0.75, 0.0, 0.0];
+    forecast.weights[..2].copy_from_slice(&[0.25, 0.75]);
     forecast
 }
 
@@ -75,6 +75,7 @@ pub(crate) fn frame() -> FrameMeta {
         intrinsics: INTRINSICS,
         world_from_camera: WORLD_FROM_CAMERA,
         dataset_view: DatasetView::UNKNOWN,
+        take_start: 0,
     }
 }
 

@@ -2,6 +2,7 @@
 
 mod gallery;
 mod markdown;
+mod memory_page;
 mod page;
 mod robustness_page;
 mod targets;
@@ -11,6 +12,7 @@ use crate::tables::{
     encoder::{EncoderTable, encoder_table},
     field::{PictureTable, picture_table},
     forecast::{self, ForecastTable, FrequencyTable},
+    memory::{self, MemoryTable},
     planning::{self, PlanningResults},
     robustness::{self, Robustness},
     trials::{self, Baseline, ByPart},
@@ -39,6 +41,8 @@ pub enum Table {
     Trials,
     /// Unknown objects and corrupted images.
     Robustness,
+    /// The belief with and without memory.
+    Memory,
     /// Frequency of each outcome where several are open.
     Frequencies,
     /// t-SNE, reconstructions, curves, beliefs, density.
@@ -47,13 +51,14 @@ pub enum Table {
 
 impl Table {
     /// All tables.
-    pub const ALL: [Self; 8] = [
+    pub const ALL: [Self; 9] = [
         Self::Psnr,
         Self::Encoder,
         Self::Recall,
         Self::Planning,
         Self::Trials,
         Self::Robustness,
+        Self::Memory,
         Self::Frequencies,
         Self::Pictures,
     ];
@@ -67,6 +72,7 @@ impl Table {
             Self::Planning => "planning",
             Self::Trials => "trials",
             Self::Robustness => "robustness",
+            Self::Memory => "memory",
             Self::Frequencies => "frequencies",
             Self::Pictures => "pictures",
         }
@@ -105,6 +111,9 @@ pub struct Results {
     /// Unknown objects and corrupted images.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub robustness: Option<Robustness>,
+    /// The belief with and without memory.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub memory: Option<MemoryTable>,
     /// Frequency of each outcome where several are open.
     #[serde(skip_serializing_if = "ByRole::is_empty", default)]
     pub frequencies: ByRole<FrequencyTable>,
@@ -158,6 +167,9 @@ pub fn evaluate(
     }
     if has(Table::Robustness) {
         results.robustness = results.kept(Table::Robustness, robustness::robustness(subject, on_progress));
+    }
+    if has(Table::Memory) {
+        results.memory = results.kept(Table::Memory, memory::memory(subject, on_progress));
     }
     if has(Table::Pictures) {
         results.gallery = Some(gallery::gallery(subject, out, on_progress)?);

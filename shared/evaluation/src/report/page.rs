@@ -3,6 +3,7 @@
 use super::{
     Results,
     markdown::{db, head, percent, row},
+    memory_page::memory,
     robustness_page::robustness,
     trials_page::trials,
 };
@@ -55,6 +56,7 @@ pub fn page(results: &Results) -> String {
     }
     trials(&mut page, results);
     robustness(&mut page, results);
+    memory(&mut page, results);
     reliability(&mut page, results);
     frequencies(&mut page, &results.frequencies);
     for picture in results.gallery.iter().flat_map(|g| &g.pictures) {

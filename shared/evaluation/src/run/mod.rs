@@ -2,18 +2,22 @@
 
 mod filmstrip;
 
-use crate::trials::planning::{NoisyEncoder, Planner};
+use crate::trials::planning::{KnownStates, Perception, Planner};
 use crate::{CheckpointFigures, Count, EvaluationError, Models, PlanningTable, SAMPLE_COUNTS};
-use carff_checkpoint::FieldProbe;
+use carff_checkpoint::{CheckpointPlanning, FieldProbe};
 use carff_dataset::{
     Dataset, Observability, PoseRole, PoseSplit, ScenarioInfo,
     drives::{DriveKind, EligibleInput, eligible_inputs},
     sensor::SensorNoise,
 };
-use carff_decision::{Evidence, ImageEvidence, Plan, Policy, Sampling, Step, look_ahead};
+use carff_decision::{
+    Evidence, ImageEvidence, Memory, Mixture, Plan, Policy, Sampling, Step, StepLength, TakeFrame, TakeMemory,
+    look_ahead,
+};
 use carff_inference::MixtureNet;
 use carff_messages::{Gaussian, Rule};
 use carff_scenes::Scenario;
+use carff_unknown::Known;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::fmt::Write;
@@ -47,6 +51,10 @@ pub struct RunSettings {
     pub sampling: Sampling,
     /// Steps that are looked ahead.
     pub horizon: u32,
+    /// True if images were compared with the known states.
+    pub compares: bool,
+    /// Length of a time step, if the forecaster has a memory.
+    pub remembers: Option<StepLength>,
     /// Noise of the camera.
     pub noise: SensorNoise,
     /// Seed of the split into trained and held-out poses.
@@ -212,19 +220,37 @@ pub struct JudgedRun {
     dataset: Dataset,
     scenario: ScenarioInfo,
     models: Models,
+    /// Known states, where images were compared with them.
+    known: Option<Known>,
     /// The forecaster as the graph computes it: the same bits.
     forecaster: MixtureNet,
+    /// Forecasts of the run's frames from all images of their takes, by frame; `None` without a memory.
+    remembered: Option<BTreeMap<u64, Mixture>>,
 }
 
 impl JudgedRun {
     /// Reads dataset and models of a run.
-    pub fn load(settings: RunSettings) -> Result<Self, EvaluationError> {
+    ///
+    /// `posteriors` are those of the run, in the order of their frames: a memory rests on all images of a take.
+    pub fn load(settings: RunSettings, posteriors: &[(TakeFrame, Gaussian)]) -> Result<Self, EvaluationError> {
         let dataset = Dataset::open(&settings.dataset)?;
         let scenario =
             dataset.scenario().cloned().ok_or_else(|| EvaluationError::Unfit("it has no scenario".into()))?;
         let models = Models::load(&settings.checkpoint)?;
         let forecaster = MixtureNet::load(&settings.checkpoint, &models.manifest)?;
-        Ok(Self { settings, dataset, scenario, models, forecaster })
+        let known = if settings.compares { Known::load(&settings.checkpoint)? } else { None };
+        let learned = CheckpointPlanning::load(&settings.checkpoint)?.memory;
+        let remembered = learned.zip(settings.remembers).map(|(learned, step)| {
+            let states = models.probe.states().to_vec();
+            let memory = Memory::new(states, |state| forecaster.forecast(state), learned);
+            let mut memory = TakeMemory::new(memory, step);
+            let see = |(frame, posterior): &(TakeFrame, Gaussian)| {
+                let forecast = forecaster.forecast(posterior);
+                (frame.frame, memory.see(*frame, &forecast).0)
+            };
+            posteriors.iter().map(see).collect()
+        });
+        Ok(Self { settings, dataset, scenario, models, known, forecaster, remembered })
     }
 
     /// Scenario of the run.
@@ -270,7 +296,14 @@ impl JudgedRun {
     fn look_ahead(&self, probe: &mut FieldProbe, frame: &DecidedFrame, samples: usize) -> Option<Vec<Step>> {
         let RunSettings { sampling, horizon, seed, .. } = self.settings;
         let plan = Plan { samples, sampling, horizon, seed, frame: frame.frame };
-        let forecast = |input: &Gaussian, _| self.forecaster.forecast(input);
+        let remembered = match &self.remembered {
+            Some(all) => Some(all.get(&frame.frame)?),
+            None => None,
+        };
+        let forecast = |input: &Gaussian, state: Option<usize>| match (state, remembered) {
+            (None, Some(remembered)) => remembered.clone(),
+            _ => self.forecaster.forecast(input),
+        };
         Some(look_ahead(forecast, probe, &frame.posterior?, frame.image.as_ref(), plan))
     }
 
@@ -313,7 +346,8 @@ impl JudgedRun {
             repeats: TRIALS.div_ceil(inputs.len().max(1)).min(MOST_REPEATS),
         };
         let Models { encoder, mixture, probe, .. } = &self.models;
-        let trials = NoisyEncoder { encoder, noise, seed }.trials(&self.dataset, &inputs, counts.repeats)?;
+        let known = self.known.as_ref().map(|known| KnownStates::new(known, probe, 1));
+        let trials = Perception { encoder, noise, seed, known }.trials(&self.dataset, &inputs, counts.repeats)?;
         let (table, _) =
             Planner { net: mixture, probe, sampling, horizon }.table(&trials, &Policy::all(self.settings.threshold));
         Ok((table, counts))
@@ -418,6 +452,7 @@ pub(crate) mod tests {
             bounds: [[-1.0; 3], [1.0; 3]],
             branches: vec!["hazard".into(), "clear".into()],
             timestamps: 3,
+            step_s: None,
             bev_view: None,
             states: Vec::new(),
             candidates: Vec::new(),

@@ -3,6 +3,7 @@
 pub mod encoder;
 pub mod field;
 pub mod forecast;
+pub mod memory;
 pub mod planning;
 pub mod robustness;
 pub mod trials;

@@ -188,15 +188,16 @@ impl Protocol<'_> {
     }
 
     fn free_drives(&self) -> PlanningTable {
-        let encoder = self.subject.noisy_encoder();
+        let perception = self.subject.perception();
         let drives = self.subject.free_drives.iter().enumerate();
-        let taken: Vec<Trial> =
-            drives.filter_map(|(i, d)| encoder.trial(&d.image, d.kind, FIRST_FREE + i as u64)).collect();
+        let taken: Vec<Trial> = drives
+            .filter_map(|(i, d)| perception.trial((&d.camera, &d.image), d.kind, FIRST_FREE + i as u64))
+            .collect();
         self.decide(&taken, Sampling::Stratified)
     }
 
     fn take(&self, inputs: &[EligibleInput], repeats: usize) -> Result<Vec<Trial>, EvaluationError> {
-        Ok(self.subject.noisy_encoder().trials(&self.subject.posed.dataset, inputs, repeats)?)
+        Ok(self.subject.perception().trials(&self.subject.posed.dataset, inputs, repeats)?)
     }
 
     fn decide(&self, trials: &[Trial], sampling: Sampling) -> PlanningTable {

@@ -1,15 +1,15 @@
 //! Decisions on images that no training has seen: corrupted ones, unknown vehicles and objects, other places.
 
 use crate::trials::looks::{Look, free_looks};
-use crate::trials::planning::{Count, Trial};
+use crate::trials::planning::Count;
 use crate::{Progress, Subject};
 use carff_base::geometry::PinholeCamera;
 use carff_base::random::Key;
 use carff_checkpoint::CheckpointPlanning;
-use carff_dataset::{Corruption, Image, drives::DriveKind, sensor::apply_noise_into};
-use carff_decision::{ImageEvidence, Policy, Sampling};
+use carff_dataset::{Corruption, Image, drives::DriveKind};
+use carff_decision::{Policy, Sampling};
 use carff_messages::{Header, ImageCheck, Rule};
-use carff_unknown::{CameraCheck, Comparer, Known, Measurement};
+use carff_unknown::{CameraCheck, Known, Measurement};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
@@ -124,10 +124,9 @@ pub fn robustness(subject: &Subject, on_progress: &dyn Fn(&Progress)) -> Result<
     if subject.free_poses.is_empty() {
         return Err("there are no free poses: the dataset has no scenario file".into());
     }
-    let known = Known::load(&subject.checkpoint).map_err(|e| e.to_string())?;
-    let known = known.ok_or("the checkpoint has no known.json (`carff checkpoint known` makes it)")?;
+    let known = subject.known.as_ref().ok_or("the checkpoint has no known.json (`carff checkpoint known` makes it)")?;
     let threshold = subject.threshold.ok_or("the checkpoint has no threshold")?;
-    let judge = Judge { subject, known: &known, policy: Policy { rule: Rule::Calibrated, threshold } };
+    let judge = Judge { subject, known, policy: Policy { rule: Rule::Calibrated, threshold } };
     let mut table = Robustness::default();
     for novelty in &subject.novelties {
         let shots = novelty.looks.iter().enumerate().map(|(i, look)| Shot {
@@ -165,13 +164,12 @@ pub fn robustness(subject: &Subject, on_progress: &dyn Fn(&Progress)) -> Result<
     }
     table.bound = judge.bound()?;
     let looks = free_looks(&subject.free_poses, &subject.posed.scenario);
-    let cameras: Vec<&PinholeCamera> = subject.free_poses.iter().map(|pose| &pose.camera).collect();
     let mut cells: Vec<(Option<Corruption>, u8)> = vec![(None, 0)];
     cells.extend(Corruption::ALL.into_iter().flat_map(|c| c.severities().map(move |s| (Some(c), s))));
     let total = cells.len();
     for (done, (corruption, severity)) in cells.into_iter().enumerate() {
         let name = corruption.map_or("clean", Corruption::name);
-        let figures = judge.corrupted(&looks, &cameras, corruption, severity)?;
+        let figures = judge.corrupted(&looks, corruption, severity)?;
         table.corruptions.entry(name.to_owned()).or_default().insert(severity, figures);
         on_progress(&Progress { phase: "corruptions", done: done + 1, total, line: name.to_owned() });
     }
@@ -212,7 +210,6 @@ impl Judge<'_> {
     fn corrupted(
         &self,
         looks: &[Look],
-        cameras: &[&PinholeCamera],
         corruption: Option<Corruption>,
         severity: u8,
     ) -> Result<CorruptionFigures, String> {
@@ -224,7 +221,7 @@ impl Judge<'_> {
                 Some(corruption) => corruption.apply(look.image, severity, key).map_err(|e| e.to_string())?,
                 None => look.image.clone(),
             };
-            shots.push(Shot { image, camera: cameras[look.pose], frame: FIRST + look.frame });
+            shots.push(Shot { image, camera: look.camera, frame: FIRST + look.frame });
         }
         let mut figures = CorruptionFigures::default();
         for (look, verdict) in looks.iter().filter(counts).zip(self.verdicts(&shots)?) {
@@ -243,24 +240,16 @@ impl Judge<'_> {
     /// path, and the comparison with the known states.
     fn verdicts(&self, shots: &[Shot]) -> Result<Vec<Verdict>, String> {
         let planner = self.subject.planner(Sampling::Stratified)?;
-        let states: Vec<_> = planner.probe.states().iter().map(|state| state.mean).collect();
-        let encoder = self.subject.noisy_encoder();
-        let mut comparer = Comparer::default();
-        let (mut trials, mut images, mut usable) = (Vec::new(), Vec::new(), Vec::new());
+        let perception = self.subject.perception();
+        let (mut trials, mut usable) = (Vec::new(), Vec::new());
         for shot in shots {
-            let trial = encoder.trial(&shot.image, DriveKind::Hazard, shot.frame);
-            let trial: Trial = trial.ok_or_else(|| "an image cannot be encoded".to_owned())?;
-            let mut noisy = shot.image.clone();
-            let key = Key::named("nove", self.subject.options.seed, shot.frame);
-            apply_noise_into(&shot.image.rgb, &mut noisy.rgb, &self.subject.noise(), key).map_err(|e| e.to_string())?;
-            let view = noisy.view().ok_or("an image without pixels")?;
+            let taken = perception.noisy_trial((shot.camera, &shot.image), DriveKind::Hazard, shot.frame);
+            let (trial, noisy) = taken.ok_or_else(|| "an image cannot be encoded".to_owned())?;
             usable.push(self.is_usable(&noisy, shot.camera));
-            let (threads, field) = (self.subject.options.threads, planner.probe.field());
-            let seen = self.known.see(&mut comparer, field, &states, (shot.camera, view), threads);
-            images.push(seen.map(|(seen, _)| ImageEvidence::new(&seen.ratios)));
             trials.push(trial);
         }
-        let with = planner.weighed_evidence(&trials, &images, SAMPLES);
+        let with = planner.evidence(&trials, SAMPLES);
+        trials.iter_mut().for_each(|trial| trial.image = None);
         let without = planner.evidence(&trials, SAMPLES);
         let verdict = |((with, without), usable): ((_, _), bool)| {
             let advances = |evidence| usable && !self.policy.decide(evidence).halt;

@@ -2,7 +2,7 @@
 
 use crate::trials::{
     baselines::{ReadOut, nearest_neighbour},
-    looks::{Answer, ByTrialKind, Look, encoded, figures, free_looks, looks_of_role},
+    looks::{Answer, ByTrialKind, Look, figures, free_looks, looks_of_role, taken},
     planning::Trial,
 };
 use crate::{Progress, Subject};
@@ -60,7 +60,7 @@ pub fn trials(subject: &Subject, on_progress: &dyn Fn(&Progress)) -> Result<Tria
     let total = parts.len();
     for (done, (part, looks)) in parts.into_iter().enumerate() {
         on_progress(&Progress { phase: "trials", done, total, line: part.to_owned() });
-        let taken = encoded(&subject.noisy_encoder(), &looks);
+        let taken = taken(&subject.perception(), &looks);
         let evidence = planner.evidence(&taken, SAMPLES);
         let by_rule = |rule| by_rule(&evidence, Policy { rule, threshold });
         own.insert(part.to_owned(), figures(&looks, &by_rule(Rule::Calibrated)));
@@ -87,7 +87,7 @@ pub fn trials(subject: &Subject, on_progress: &dyn Fn(&Progress)) -> Result<Tria
 
 fn by_rule(evidence: &[Evidence], policy: Policy) -> Vec<Answer> {
     let answer = |evidence: &Evidence| Answer {
-        hazard_probability: evidence.hazard_probability(),
+        hazard_probability: evidence.hazard_or_unknown_probability(),
         halt: policy.decide(evidence).halt,
     };
     evidence.iter().map(answer).collect()
@@ -96,7 +96,7 @@ fn by_rule(evidence: &[Evidence], policy: Policy) -> Vec<Answer> {
 /// Threshold of the read-out, chosen like that of the calibrated rule on the calibration poses.
 fn read_out_threshold(subject: &Subject, read_out: &ReadOut) -> Option<f64> {
     let looks = looks_of_role(&subject.posed, PoseRole::Calibration);
-    let taken = encoded(&subject.noisy_encoder(), &looks);
+    let taken = taken(&subject.perception(), &looks);
     let trials: Vec<CalibrationTrial> = looks
         .iter()
         .zip(&taken)

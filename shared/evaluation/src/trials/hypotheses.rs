@@ -109,6 +109,7 @@ mod tests {
             bounds: [[-1.0; 3], [1.0; 3]],
             branches: vec!["truck".into(), "nothing".into()],
             timestamps: 2,
+            step_s: None,
             bev_view: None,
             states: (0..4).map(state).collect(),
             candidates: Vec::new(),

@@ -1,7 +1,8 @@
 //! Looks: images with a hazard or without, from poses that give both, and their six kinds.
 
-use super::planning::{NoisyEncoder, Trial, trial_frame};
+use super::planning::{Perception, Trial, trial_frame};
 use crate::PosedImages;
+use carff_base::geometry::PinholeCamera;
 use carff_base::statistics::wilson_interval_of_share;
 use carff_dataset::{Image, Observability, PoseRole, ScenarioInfo, drives::DriveKind};
 use carff_scenes::FreePose;
@@ -21,6 +22,8 @@ pub const SUREST: f64 = 1e-3;
 pub struct Look<'a> {
     /// The image, without sensor noise.
     pub image: &'a Image,
+    /// The camera.
+    pub camera: &'a PinholeCamera,
     /// Pose of the camera; looks from one pose are not independent.
     pub pose: usize,
     /// Name of the kind.
@@ -108,6 +111,7 @@ pub fn looks_of_role(posed: &PosedImages, role: PoseRole) -> Vec<Look<'_>> {
             let hazard = scenario.is_hazard(scenario.branch_of(label.state));
             Look {
                 image: &posed.images[i],
+                camera: &posed.dataset.frames()[i].camera,
                 pose: label.view,
                 kind: kind_name(hazard, label.observability),
                 hazard,
@@ -127,6 +131,7 @@ pub fn free_looks<'a>(poses: &'a [FreePose], scenario: &ScenarioInfo) -> Vec<Loo
             let observability = look.observability.unwrap_or(Observability::Full);
             Look {
                 image: &look.image,
+                camera: &free.camera,
                 pose,
                 kind: kind_name(hazard, observability),
                 hazard,
@@ -138,10 +143,10 @@ pub fn free_looks<'a>(poses: &'a [FreePose], scenario: &ScenarioInfo) -> Vec<Loo
     poses.iter().enumerate().flat_map(of_pose).collect()
 }
 
-/// Posteriors of looks behind a camera with sensor noise.
-pub fn encoded(encoder: &NoisyEncoder, looks: &[Look]) -> Vec<Trial> {
+/// Trials of looks.
+pub fn taken(perception: &Perception, looks: &[Look]) -> Vec<Trial> {
     let kind = |hazard| if hazard { DriveKind::Hazard } else { DriveKind::Clear };
-    looks.iter().filter_map(|look| encoder.trial(look.image, kind(look.hazard), look.frame)).collect()
+    looks.iter().filter_map(|look| perception.trial((look.camera, look.image), kind(look.hazard), look.frame)).collect()
 }
 
 /// Figures of the answers to looks, in the same order.
@@ -178,8 +183,10 @@ mod tests {
     #[test]
     fn figures_of_a_known_case() {
         let image = Image::filled(2, 2, [0; 3]);
+        let camera = PinholeCamera::look_at([1.0; 3], [0.0; 3], [0.0, 0.0, 1.0], 2, 2, 60.0);
         let look = |pose, hazard| Look {
             image: &image,
+            camera: &camera,
             pose,
             kind: kind_name(hazard, Observability::None),
             hazard,

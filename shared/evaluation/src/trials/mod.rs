@@ -6,6 +6,7 @@ pub mod hypotheses;
 pub mod looks;
 pub mod planning;
 pub mod samples;
+pub mod watches;
 
 use carff_checkpoint::{CheckpointError, FieldProbe, Manifest};
 use carff_networks::{encoder::Encoder, mixture::MixtureNet};

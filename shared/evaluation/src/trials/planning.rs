@@ -1,5 +1,6 @@
 //! The planning table (paper section 4.3): success of each decision rule over eligible input views.
 
+use carff_base::geometry::PinholeCamera;
 use carff_base::random::Key;
 use carff_base::statistics::wilson_interval;
 use carff_checkpoint::FieldProbe;
@@ -9,14 +10,16 @@ use carff_dataset::{
     sensor::{SensorNoise, apply_noise_into},
 };
 use carff_decision::{Evidence, ImageEvidence, Mixture, Plan, Policy, Sampling, look_ahead};
-use carff_messages::{Gaussian, Rule};
+use carff_field::Field;
+use carff_messages::{Gaussian, LATENT_DIM, Rule};
 use carff_networks::{
     encoder::{Encoder, pictures_from_bytes},
     mixture::MixtureNet,
 };
+use carff_unknown::{Comparer, Known};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
-use std::collections::BTreeMap;
+use std::{cell::RefCell, collections::BTreeMap};
 use tch::Tensor;
 
 /// Numbers of samples that the table has columns for.
@@ -26,10 +29,12 @@ pub const SAMPLE_COUNTS: [usize; 3] = [2, 10, 35];
 const OUTCOME_SAMPLES: usize = 10;
 
 /// One trial: the posterior of an input view with one correct action.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct Trial {
     /// The posterior.
     pub posterior: Gaussian,
+    /// Evidence of the image for the known states, where it was compared with them.
+    pub image: Option<ImageEvidence>,
     /// The correct action.
     pub kind: DriveKind,
     /// Frame number, which names the random draws of this trial.
@@ -173,18 +178,44 @@ impl PlanningTable {
     }
 }
 
-/// Encoder behind a noisy sensor.
-#[derive(Clone, Copy)]
-pub struct NoisyEncoder<'a> {
+/// The known states of a checkpoint, with which images are compared.
+pub struct KnownStates<'a> {
+    known: &'a Known,
+    field: &'a Field,
+    states: Vec<[f32; LATENT_DIM]>,
+    threads: usize,
+    comparer: RefCell<Comparer>,
+}
+
+impl<'a> KnownStates<'a> {
+    /// The known states of a probe's field. `threads` render.
+    pub fn new(known: &'a Known, probe: &'a FieldProbe, threads: usize) -> Self {
+        let states = probe.states().iter().map(|state| state.mean).collect();
+        Self { known, field: probe.field(), states, threads, comparer: RefCell::default() }
+    }
+
+    /// Evidence of an image for the known states; `None` if the camera sees no lane.
+    pub fn evidence(&self, camera: &PinholeCamera, image: &Image) -> Option<ImageEvidence> {
+        let mut comparer = self.comparer.borrow_mut();
+        let seen = self.known.see(&mut comparer, self.field, &self.states, (camera, image.view()?), self.threads);
+        seen.map(|(seen, _)| ImageEvidence::new(&seen.ratios))
+    }
+}
+
+/// From an image to a trial, as the graph sees it: a camera with sensor noise, the encoder, and the comparison of the
+/// same noisy image with the known states.
+pub struct Perception<'a> {
     /// The encoder.
     pub encoder: &'a Encoder,
     /// Noise of the sensor.
     pub noise: SensorNoise,
     /// Seed of the noise.
     pub seed: u64,
+    /// Known states; `None` if images are not compared.
+    pub known: Option<KnownStates<'a>>,
 }
 
-impl NoisyEncoder<'_> {
+impl Perception<'_> {
     /// Trials of each input's image, `repeats` times with fresh sensor noise.
     pub fn trials(
         &self,
@@ -198,37 +229,47 @@ impl NoisyEncoder<'_> {
             let Some(index) = state.and_then(|state| dataset.frame_index(state, input.view)) else { continue };
             let image = dataset.load_image(index)?;
             for repeat in 0..repeats {
-                trials.extend(self.trial(&image, input.kind, trial_frame(index, repeat)));
+                let shot = (&dataset.frames()[index].camera, &image);
+                trials.extend(self.trial(shot, input.kind, trial_frame(index, repeat)));
             }
         }
         Ok(trials)
     }
 
-    /// A trial of one image. `frame` names its random draws.
-    pub fn trial(&self, image: &Image, kind: DriveKind, frame: u64) -> Option<Trial> {
-        let mut noisy = vec![0_u8; image.rgb.len()];
+    /// A trial of one camera's image. `frame` names its random draws.
+    pub fn trial(&self, (camera, image): (&PinholeCamera, &Image), kind: DriveKind, frame: u64) -> Option<Trial> {
+        self.noisy_trial((camera, image), kind, frame).map(|(trial, _)| trial)
+    }
+
+    /// As [`Self::trial`], with the noisy image.
+    pub fn noisy_trial(
+        &self,
+        (camera, image): (&PinholeCamera, &Image),
+        kind: DriveKind,
+        frame: u64,
+    ) -> Option<(Trial, Image)> {
+        let mut noisy = image.clone();
         let key = Key { seed: self.seed, frame, step: 0, sample: 0 };
-        if apply_noise_into(&image.rgb, &mut noisy, &self.noise, key).is_err() {
-            noisy.copy_from_slice(&image.rgb);
+        if apply_noise_into(&image.rgb, &mut noisy.rgb, &self.noise, key).is_err() {
+            // Only settings out of range are refused; those of a checkpoint were validated.
+            noisy.rgb.copy_from_slice(&image.rgb);
         }
-        let sides = [1, i64::from(image.height_px), i64::from(image.width_px), 3];
-        let input = pictures_from_bytes(&Tensor::from_slice(&noisy).view(sides));
+        let sides = [1, i64::from(noisy.height_px), i64::from(noisy.width_px), 3];
+        let input = pictures_from_bytes(&Tensor::from_slice(&noisy.rgb).view(sides));
         let posterior = self.encoder.encode(&input).into_iter().next()?;
-        Some(Trial { posterior, kind, frame, seed: self.seed })
+        let image = self.known.as_ref().and_then(|known| known.evidence(camera, &noisy));
+        Some((Trial { posterior, image, kind, frame, seed: self.seed }, noisy))
     }
 }
 
 /// Result of one trial.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct TrialOutcome {
-    /// Hazard probability over the horizon, 0..=1.
+    /// Probability of a hazard or of something unknown over the horizon, 0..=1.
     pub hazard_probability: f32,
     /// The correct action.
     pub kind: DriveKind,
 }
-
-/// A trial, its forecast, and the evidence of its image.
-type WithImage<'a> = ((&'a Trial, &'a Mixture), &'a Option<ImageEvidence>);
 
 /// Forecast, probe and horizon behind a planning table.
 #[derive(Clone, Copy)]
@@ -246,27 +287,16 @@ pub struct Planner<'a> {
 impl Planner<'_> {
     /// Returns the evidence of each trial from `samples` samples, on all threads of rayon's pool.
     pub fn evidence(&self, trials: &[Trial], samples: usize) -> Vec<Evidence> {
-        self.weighed_evidence(trials, &vec![None; trials.len()], samples)
-    }
-
-    /// As [`Self::evidence`], weighed by each trial's image where it was compared with the known states. `images` has
-    /// one entry a trial.
-    pub fn weighed_evidence(
-        &self,
-        trials: &[Trial],
-        images: &[Option<ImageEvidence>],
-        samples: usize,
-    ) -> Vec<Evidence> {
         let posteriors: Vec<Gaussian> = trials.iter().map(|t| t.posterior).collect();
         let first = if posteriors.is_empty() { Vec::new() } else { self.net.forecast_all(&posteriors) };
         let later = self.net.forecast_all(self.probe.states());
         let Self { sampling, horizon, .. } = *self;
-        let of_trial = |probe: &mut FieldProbe, ((trial, mixture), image): WithImage<'_>| {
+        let of_trial = |probe: &mut FieldProbe, (trial, mixture): (&Trial, &Mixture)| {
             let plan = Plan { samples, sampling, horizon, seed: trial.seed, frame: trial.frame };
             let forecast = |_: &Gaussian, state: Option<usize>| state.map_or(mixture, |s| &later[s]).clone();
-            Evidence::of_steps(&look_ahead(forecast, probe, &trial.posterior, image.as_ref(), plan))
+            Evidence::of_steps(&look_ahead(forecast, probe, &trial.posterior, trial.image.as_ref(), plan))
         };
-        trials.par_iter().zip(&first).zip(images).map_init(|| self.probe.clone(), of_trial).collect()
+        trials.par_iter().zip(&first).map_init(|| self.probe.clone(), of_trial).collect()
     }
 
     /// Runs every trial with every rule and number of samples. Outcomes, in the order of the trials, are those of 10
@@ -280,7 +310,7 @@ impl Planner<'_> {
                     table.add(policy.rule, samples, trial.kind, right);
                 }
                 if samples == OUTCOME_SAMPLES {
-                    let hazard_probability = evidence.hazard_probability() as f32;
+                    let hazard_probability = evidence.hazard_or_unknown_probability() as f32;
                     outcomes.push(TrialOutcome { hazard_probability, kind: trial.kind });
                 }
             }

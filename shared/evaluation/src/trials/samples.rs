@@ -118,6 +118,7 @@ mod tests {
             bounds: [[-1.0; 3], [1.0; 3]],
             branches: vec!["one".into(), "other".into()],
             timestamps: 2,
+            step_s: None,
             bev_view: None,
             states: Vec::new(),
             candidates: Vec::new(),

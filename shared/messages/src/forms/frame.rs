@@ -39,6 +39,8 @@ pub struct FrameForm {
     pub intrinsics: Intrinsics,
     /// Row-major 4x4: camera space (OpenGL axes) to world space (metres).
     pub world_from_camera: Vec<f64>,
+    /// Number of the take's first frame.
+    pub take_start: u64,
     /// Position in a dataset, if known.
     pub dataset_view: Option<DatasetViewForm>,
 }
@@ -67,6 +69,7 @@ impl From<&FrameMeta> for FrameForm {
             height_px: meta.height_px,
             intrinsics: meta.intrinsics,
             world_from_camera: meta.world_from_camera.to_vec(),
+            take_start: meta.take_start,
             dataset_view: view.is_known().then(|| DatasetViewForm {
                 view: index(view.view),
                 branch: index(view.branch),
@@ -104,6 +107,7 @@ impl TryFrom<&FrameForm> for FrameMeta {
             intrinsics: form.intrinsics,
             world_from_camera: array("world_from_camera", &form.world_from_camera)?,
             dataset_view,
+            take_start: form.take_start,
         };
         meta.validate()?;
         Ok(meta)

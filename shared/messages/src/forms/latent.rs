@@ -42,6 +42,8 @@ pub struct ForecastForm {
     pub resolved_state: Option<u32>,
     /// Probability of the path up to the input.
     pub path_probability: f32,
+    /// Number of images that the forecast rests on; 1 without a memory.
+    pub images: u64,
     /// The mixture.
     pub components: Vec<ComponentForm>,
     /// The drawn latents.
@@ -61,6 +63,7 @@ impl From<&Forecast> for ForecastForm {
             horizon: f.horizon,
             resolved_state: index(f.resolved_state),
             path_probability: f.path_probability,
+            images: f.images,
             components: f.weights[..components]
                 .iter()
                 .zip(&f.components)
@@ -98,6 +101,7 @@ impl TryFrom<&ForecastForm> for Forecast {
             horizon: form.horizon,
             resolved_state: signed(form.resolved_state),
             path_probability: form.path_probability,
+            images: form.images,
             weights: begin("components", &weights, 0.0)?,
             components: begin("components", &components, Gaussian::standard())?,
             samples: begin("samples", &latents, [0.0; LATENT_DIM])?,

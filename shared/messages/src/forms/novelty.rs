@@ -25,6 +25,8 @@ pub struct UnknownsForm {
     pub explained: f32,
     /// For each known state, how much better it explains the image than something unknown does.
     pub ratios: Vec<f32>,
+    /// Hazard probability before this image, from the comparisons of the take's earlier images.
+    pub prior: f32,
     /// Boxes, the most probable first.
     pub boxes: Vec<UnknownBox>,
     /// Time from the arrival of the frame to sending, nanoseconds.
@@ -42,6 +44,7 @@ impl From<&Unknowns> for UnknownsForm {
             offset: unknowns.offset,
             explained: unknowns.explained,
             ratios: unknowns.ratios().to_vec(),
+            prior: unknowns.prior,
             boxes: unknowns.boxes().to_vec(),
             stage_latency_ns: unknowns.stage_latency_ns,
         }
@@ -63,6 +66,7 @@ impl TryFrom<&UnknownsForm> for Unknowns {
             offset: form.offset,
             explained: form.explained,
             ratios: begin("ratios", &form.ratios, 1.0)?,
+            prior: form.prior,
             boxes: begin("boxes", &form.boxes, UnknownBox::default())?,
             stage_latency_ns: form.stage_latency_ns,
         };

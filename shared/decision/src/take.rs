@@ -1,0 +1,172 @@
+//! The memory of a take: its steps in time, and its cuts.
+
+use crate::{Memory, Mixture};
+use carff_messages::Posterior;
+
+/// Length of a time step.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum StepLength {
+    /// In frames, for a camera that shows a dataset or a scenario.
+    Frames(u64),
+    /// In capture time, nanoseconds.
+    TimeNs(u64),
+}
+
+/// A frame of a take.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct TakeFrame {
+    /// Number of the take's first frame.
+    pub take_start: u64,
+    /// Number of the frame.
+    pub frame: u64,
+    /// Capture time, nanoseconds.
+    pub capture_time_ns: u64,
+}
+
+impl From<&Posterior> for TakeFrame {
+    fn from(posterior: &Posterior) -> Self {
+        Self {
+            take_start: posterior.take_start,
+            frame: posterior.header.frame_id,
+            capture_time_ns: posterior.header.capture_time_ns,
+        }
+    }
+}
+
+/// The belief over the frames of a take. It starts anew with each take, and after a gap of more than a time step.
+#[derive(Clone, Debug)]
+pub struct TakeMemory {
+    memory: Memory,
+    step: StepLength,
+    progress: Option<Progress>,
+}
+
+/// Progress of a take.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Progress {
+    /// Capture time of the first image that was seen, nanoseconds.
+    pub first_ns: u64,
+    /// Time steps that the belief has been moved by.
+    pub steps: u64,
+    /// The last image.
+    pub last: TakeFrame,
+    /// Images so far.
+    pub images: u64,
+}
+
+impl TakeMemory {
+    /// A memory without a take.
+    pub fn new(memory: Memory, step: StepLength) -> Self {
+        Self { memory, step, progress: None }
+    }
+
+    /// Returns the forecast from all images of the take so far, given that of its newest image, and their number: 1 if
+    /// the memory starts anew.
+    pub fn see(&mut self, frame: TakeFrame, image: &Mixture) -> (Mixture, u64) {
+        let fits = |p: &Progress| p.last.take_start == frame.take_start && !self.is_gap(p.last, frame);
+        let mut progress = match self.progress.filter(fits) {
+            Some(progress) => progress,
+            None => {
+                self.memory.clear();
+                let first_ns = frame.capture_time_ns;
+                Progress { first_ns, steps: self.steps(first_ns, frame), last: frame, images: 0 }
+            }
+        };
+        let steps = self.steps(progress.first_ns, frame);
+        (progress.steps..steps).for_each(|_| self.memory.advance());
+        progress = Progress { steps, last: frame, images: progress.images + 1, ..progress };
+        self.progress = Some(progress);
+        (self.memory.see(image), progress.images)
+    }
+
+    /// Time steps from the start of the take to a frame.
+    fn steps(&self, first_ns: u64, frame: TakeFrame) -> u64 {
+        match self.step {
+            StepLength::Frames(frames) => frame.frame.saturating_sub(frame.take_start) / frames.max(1),
+            StepLength::TimeNs(step_ns) => frame.capture_time_ns.saturating_sub(first_ns) / step_ns.max(1),
+        }
+    }
+
+    /// Reports whether more than a time step passed without an image, or time went back.
+    fn is_gap(&self, last: TakeFrame, now: TakeFrame) -> bool {
+        let (passed, longest) = match self.step {
+            StepLength::Frames(frames) => (now.frame.checked_sub(last.frame), frames),
+            StepLength::TimeNs(step_ns) => (now.capture_time_ns.checked_sub(last.capture_time_ns), step_ns),
+        };
+        passed.is_none_or(|passed| passed > longest)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::MemorySettings;
+    use carff_messages::Gaussian;
+
+    fn at(x: f32) -> Gaussian {
+        Gaussian { mean: [x; 8], log_variance: [-4.0; 8] }
+    }
+
+    /// Two branches of two steps: states 0 -> 1 and 2 -> 3, which stay.
+    fn memory(step: StepLength) -> TakeMemory {
+        let states: Vec<Gaussian> = [-3.0, -1.0, 1.0, 3.0].map(at).to_vec();
+        let forecast = |state: &Gaussian| {
+            let next = if state.mean[0] < 0.0 { at(-1.0) } else { at(3.0) };
+            Mixture { weights: vec![1.0], components: vec![next] }
+        };
+        TakeMemory::new(Memory::new(states, forecast, MemorySettings { repeated_share: 0.2, distrust: 0.01 }), step)
+    }
+
+    fn image(first_branch: f32) -> Mixture {
+        Mixture { weights: vec![first_branch, 1.0 - first_branch], components: vec![at(-1.0), at(3.0)] }
+    }
+
+    /// Weight of the first branch.
+    fn first_branch(mixture: &Mixture) -> f32 {
+        mixture.weights.iter().zip(&mixture.components).filter(|(_, c)| c.mean[0] < 0.0).map(|(w, _)| w).sum()
+    }
+
+    fn frame(take_start: u64, frame: u64) -> TakeFrame {
+        TakeFrame { take_start, frame, capture_time_ns: 100 * frame }
+    }
+
+    /// What one image showed holds over later images that show nothing, over time steps, until the take ends.
+    #[test]
+    fn a_take_is_remembered() {
+        for step in [StepLength::Frames(3), StepLength::TimeNs(300)] {
+            let mut memory = memory(step);
+            let even = |(mixture, images)| ((first_branch(&mixture) - 0.5).abs() < 0.01, images);
+            assert_eq!(even(memory.see(frame(0, 0), &image(0.5))), (true, 1));
+            memory.see(frame(0, 1), &image(0.999));
+            for later in 2..9 {
+                let (mixture, images) = memory.see(frame(0, later), &image(0.5));
+                assert!(first_branch(&mixture) > 0.95, "{mixture:?}");
+                assert_eq!(images, later + 1);
+            }
+            assert_eq!(even(memory.see(frame(9, 9), &image(0.5))), (true, 1), "a new take");
+            memory.see(frame(9, 10), &image(0.001));
+            assert_eq!(even(memory.see(frame(9, 20), &image(0.5))), (true, 1), "a gap");
+        }
+    }
+
+    /// An image that is wrong with certainty is corrected by the next ones.
+    #[test]
+    fn a_wrong_glance_is_corrected() {
+        let mut memory = memory(StepLength::Frames(6));
+        memory.see(frame(0, 0), &image(0.999));
+        memory.see(frame(0, 1), &image(0.001));
+        let (mixture, _) = memory.see(frame(0, 2), &image(0.001));
+        assert!(first_branch(&mixture) < 0.5, "{mixture:?}");
+    }
+
+    /// A component far from all known states passes through unchanged.
+    #[test]
+    fn the_unknown_passes_through() {
+        let mut memory = memory(StepLength::Frames(6));
+        let image = Mixture { weights: vec![0.25, 0.75], components: vec![at(-1.0), at(40.0)] };
+        let (mixture, _) = memory.see(frame(0, 0), &image);
+        let far: f32 =
+            mixture.weights.iter().zip(&mixture.components).filter(|(_, c)| c.mean[0] > 9.0).map(|x| x.0).sum();
+        assert!((far - 0.75).abs() < 1e-6, "{mixture:?}");
+    }
+}

@@ -1,0 +1,211 @@
+//! The belief with and without memory, on drives whose camera pans.
+
+use crate::stats::reliability::reliability;
+use crate::trials::{
+    looks::SUREST,
+    watches::{Watch, Watched},
+};
+use crate::{Progress, Subject};
+use carff_checkpoint::FieldProbe;
+use carff_decision::{Memory, MemorySettings, Mixture, Sampling};
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+
+/// Samples of a forecast.
+const SAMPLES: usize = 10;
+/// Bins of the calibration error.
+const BINS: usize = 10;
+/// A belief is sure of a hazard at or above this probability, and of none at or below its complement.
+const SURE: f64 = 0.95;
+/// The exact observer is sure beyond this probability.
+const EXACTLY_SURE: f64 = 0.999;
+/// Frames in which a wrong belief is to be corrected.
+const CORRECTED_IN: usize = 3;
+
+/// Frames of one kind, and those with the right belief.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RightFrames {
+    /// Frames with the right belief.
+    pub right: usize,
+    /// Frames.
+    pub frames: usize,
+    /// Drives with such frames: what is independent.
+    pub drives: usize,
+}
+
+/// Figures of one observer.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ObserverFigures {
+    /// Mean of -ln of the probability given to what is true (hazard or none), clamped to 0.001..=0.999.
+    pub log_loss: f64,
+    /// Expected calibration error of the hazard probability.
+    pub calibration_error: f64,
+    /// The hazard was in sight and is hidden: at least 0.95.
+    pub seen_then_hidden: RightFrames,
+    /// The clear place was in sight and is hidden: at most 0.05.
+    pub clear_then_hidden: RightFrames,
+    /// Nothing was seen: 0.4 to 0.6.
+    pub never_seen: RightFrames,
+    /// Wrong beliefs about what the image shows (`frames`), and those corrected within three frames (`right`).
+    pub corrected: RightFrames,
+}
+
+/// Figures by observer: `none` (each image by itself), `filter` (with memory), and the exact observers `exact` (each
+/// image by itself) and `exact_filter`.
+pub type ByObserver = BTreeMap<String, ObserverFigures>;
+
+/// The table.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct MemoryTable {
+    /// Learned numbers of the memory.
+    pub settings: MemorySettings,
+    /// Drives.
+    pub drives: usize,
+    /// Frames.
+    pub frames: usize,
+    /// Figures by observer.
+    pub observers: ByObserver,
+}
+
+/// Computes the table, or returns the reason why there is none.
+pub fn memory(subject: &Subject, on_progress: &dyn Fn(&Progress)) -> Result<MemoryTable, String> {
+    super::planning::plannable(subject)?;
+    if subject.watches.is_empty() {
+        return Err("there are no drives: the dataset has no scenario file".into());
+    }
+    let planner = subject.planner(Sampling::Stratified)?;
+    let settings = subject.memory.ok_or("the checkpoint has no memory (`carff checkpoint memory` learns it)")?;
+    let forecast = |state: &_| planner.net.forecast(state);
+    let memory = Memory::new(planner.probe.states().to_vec(), forecast, settings);
+    let mut probe = planner.probe.clone();
+    let mut observers: BTreeMap<&str, Vec<Vec<f64>>> = BTreeMap::new();
+    let total = subject.watches.len();
+    for (done, watch) in subject.watches.iter().enumerate() {
+        let seed = subject.options.seed;
+        let mut probability = |mixture: &Mixture, frame: &Watched| hazard(&mut probe, mixture, frame, seed);
+        let filtered = with_memory(&memory, watch);
+        let none = watch.frames.iter().map(|f| probability(&f.forecast, f)).collect();
+        let filter = watch.frames.iter().zip(&filtered).map(|(f, mixture)| probability(mixture, f)).collect();
+        observers.entry("none").or_default().push(none);
+        observers.entry("filter").or_default().push(filter);
+        observers.entry("exact").or_default().push(watch.frames.iter().map(|f| f.exact).collect());
+        let exact = watch.frames.iter().map(|f| f.exact_with_memory).collect();
+        observers.entry("exact_filter").or_default().push(exact);
+        on_progress(&Progress { phase: "memory", done: done + 1, total, line: String::new() });
+    }
+    let figures = |(name, found): (&str, Vec<Vec<f64>>)| (name.to_owned(), figures(&subject.watches, &found));
+    Ok(MemoryTable {
+        settings,
+        drives: total,
+        frames: subject.watches.iter().map(|watch| watch.frames.len()).sum(),
+        observers: observers.into_iter().map(figures).collect(),
+    })
+}
+
+/// The forecast of each frame of a watch from all its images so far.
+pub fn with_memory(memory: &Memory, watch: &Watch) -> Vec<Mixture> {
+    let mut memory = memory.clone();
+    memory.clear();
+    let mut step = watch.frames.first().map_or(0, |frame| frame.timestamp);
+    let seen = watch.frames.iter().map(|frame| {
+        (step..frame.timestamp).for_each(|_| memory.advance());
+        step = frame.timestamp;
+        memory.see(&frame.forecast)
+    });
+    seen.collect()
+}
+
+/// Hazard probability of the next state, as the prober reads it.
+fn hazard(probe: &mut FieldProbe, mixture: &Mixture, frame: &Watched, seed: u64) -> f64 {
+    let draws = mixture.draw(SAMPLES, Sampling::Stratified, seed, frame.frame, 1);
+    let step = probe.step(mixture.clone(), draws, 1.0, frame.image.as_ref());
+    f64::from(step.resolved.hazard_probability) + f64::from(step.resolved.unknown_probability)
+}
+
+/// Figures of the probabilities `[watch][frame]` of an observer.
+fn figures(watches: &[Watch], found: &[Vec<f64>]) -> ObserverFigures {
+    let mut figures = ObserverFigures::default();
+    let mut forecasts = Vec::new();
+    for (watch, found) in watches.iter().zip(found) {
+        let of_watch = kinds(watch, found);
+        for (sum, of) in figures.kinds().into_iter().zip(of_watch) {
+            sum.right += of.right;
+            sum.frames += of.frames;
+            sum.drives += usize::from(of.frames > 0);
+        }
+        forecasts.extend(found.iter().map(|&p| (p, watch.hazard)));
+    }
+    let loss = |&(p, hazard): &(f64, bool)| {
+        let p = p.clamp(SUREST, 1.0 - SUREST);
+        -(if hazard { p } else { 1.0 - p }).ln()
+    };
+    figures.log_loss = forecasts.iter().map(loss).sum::<f64>() / forecasts.len().max(1) as f64;
+    figures.calibration_error = reliability(&forecasts, BINS).expected_calibration_error;
+    figures
+}
+
+impl ObserverFigures {
+    fn kinds(&mut self) -> [&mut RightFrames; 4] {
+        [&mut self.seen_then_hidden, &mut self.clear_then_hidden, &mut self.never_seen, &mut self.corrected]
+    }
+}
+
+/// Counts of one watch, in the order of [`ObserverFigures::kinds`].
+fn kinds(watch: &Watch, found: &[f64]) -> [RightFrames; 4] {
+    let mut counts = [RightFrames::default(); 4];
+    let sure = |p: f64| !(1.0 - EXACTLY_SURE..=EXACTLY_SURE).contains(&p);
+    for (k, (frame, &p)) in watch.frames.iter().zip(found).enumerate() {
+        let (kind, right) = match (sure(frame.exact), sure(frame.exact_with_memory)) {
+            (false, true) if watch.hazard => (0, p >= SURE),
+            (false, true) => (1, p <= 1.0 - SURE),
+            (_, false) if (0.4..=0.6).contains(&frame.exact_with_memory) => (2, (0.4..=0.6).contains(&p)),
+            (true, _) if (p >= 0.5) != watch.hazard => {
+                let later = found.iter().enumerate().skip(k + 1).take(CORRECTED_IN);
+                (3, later.clone().any(|(_, &p)| (p >= 0.5) == watch.hazard))
+            }
+            _ => continue,
+        };
+        counts[kind].frames += 1;
+        counts[kind].right += usize::from(right);
+    }
+    counts
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use carff_messages::Gaussian;
+
+    /// A watch with these exact probabilities without and with memory.
+    fn watch(hazard: bool, exact: &[(f64, f64)]) -> Watch {
+        let forecast = Mixture { weights: vec![1.0], components: vec![Gaussian::standard()] };
+        let frame = |(exact, exact_with_memory): &(f64, f64)| Watched {
+            timestamp: 0,
+            frame: 0,
+            forecast: forecast.clone(),
+            image: None,
+            exact: *exact,
+            exact_with_memory: *exact_with_memory,
+        };
+        Watch { number: 0, hazard, frames: exact.iter().map(frame).collect() }
+    }
+
+    /// A hazard is hidden, seen, and hidden again. Each kind of frame is counted where it is, and the loss is the closed
+    /// form.
+    #[test]
+    fn frames_are_counted_by_kind() {
+        let watches = [watch(true, &[(0.5, 0.5), (1.0, 1.0), (1.0, 1.0), (0.5, 1.0)])];
+        let forgets = figures(&watches, &[vec![0.5, 0.2, 0.99, 0.5]]);
+        let one = |right| RightFrames { right, frames: 1, drives: 1 };
+        assert_eq!((forgets.never_seen, forgets.seen_then_hidden, forgets.corrected), (one(1), one(0), one(1)));
+        assert_eq!(forgets.clear_then_hidden, RightFrames::default());
+        let loss = -(0.5_f64.ln() + 0.2_f64.ln() + 0.99_f64.ln() + 0.5_f64.ln()) / 4.0;
+        assert!((forgets.log_loss - loss).abs() < 1e-12);
+        assert_eq!(figures(&watches, &[vec![0.5, 0.9, 0.99, 0.96]]).seen_then_hidden, one(1));
+        let clear = figures(&[watch(false, &[(0.0, 0.0), (0.5, 0.0)])], &[vec![0.0, 0.04]]);
+        assert_eq!(clear.clear_then_hidden, one(1));
+    }
+}

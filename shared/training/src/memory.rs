@@ -1,0 +1,101 @@
+//! The two numbers of the memory, learned on drives.
+
+use crate::TrainingError;
+use carff_base::random::tag;
+use carff_checkpoint::CheckpointPlanning;
+use carff_dataset::sensor::SensorNoise;
+use carff_decision::{Memory, MemorySettings};
+use carff_evaluation::{Models, Perception, Progress, Watch, WatchPlan, watches};
+use carff_scenes::Scenario;
+use rayon::prelude::*;
+use std::path::Path;
+
+/// Part of the seed of these drives, so that they share no draws with training, limits or evaluation.
+const MEMORY: u64 = tag("remember");
+/// Candidates of the two numbers.
+const REPEATED_SHARES: [f64; 8] = [0.0, 0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0];
+const DISTRUSTS: [f64; 6] = [1e-3, 3e-3, 1e-2, 3e-2, 0.1, 0.2];
+/// Probabilities are clamped to this and its complement in the log loss.
+const SUREST: f64 = 1e-3;
+
+/// Input of the learning.
+#[derive(Clone, Copy)]
+pub struct MemoryInput<'a> {
+    /// Folder of the checkpoint; `planning.json` is written into it.
+    pub checkpoint: &'a Path,
+    /// The scenario that the checkpoint was trained on.
+    pub scenario: &'a Scenario,
+    /// Drives.
+    pub drives: usize,
+}
+
+/// The learned numbers, with the mean log loss of the hazard probability a frame.
+#[derive(Clone, Copy, Debug)]
+pub struct LearnedMemory {
+    /// The numbers.
+    pub settings: MemorySettings,
+    /// Log loss with memory.
+    pub log_loss: f64,
+    /// Log loss of each image by itself.
+    pub without_memory: f64,
+}
+
+/// Chooses the numbers with the smallest log loss of the hazard probability over all frames of drives whose camera
+/// pans, and writes them into the checkpoint.
+///
+/// # Errors
+///
+/// The checkpoint has no forecaster or field, or the scenario has no such drive.
+pub fn learn_memory(input: MemoryInput, on_progress: &dyn Fn(&Progress)) -> Result<LearnedMemory, TrainingError> {
+    let unfit = |problem: String| TrainingError::Unfit(problem);
+    let models = Models::load(input.checkpoint)?;
+    let seed = models.manifest.seed ^ MEMORY;
+    let noise = SensorNoise::default();
+    let perception = Perception { encoder: &models.encoder, noise, seed, known: None };
+    let plan = WatchPlan { count: input.drives, seed, exact: false };
+    let drives = watches(input.scenario, &perception, &models.mixture, plan, on_progress);
+    let drives = drives.map_err(|e| unfit(e.to_string()))?;
+    let memory =
+        |settings| Memory::new(models.probe.states().to_vec(), |state| models.mixture.forecast(state), settings);
+    let hazards = models.probe.layout().hazard_states();
+    let of = |settings| mean_log_loss(&memory(settings), hazards, &drives);
+    let candidates = REPEATED_SHARES
+        .into_iter()
+        .flat_map(|repeated_share| DISTRUSTS.map(|distrust| MemorySettings { repeated_share, distrust }));
+    let scored: Vec<(MemorySettings, f64)> = candidates.map(|settings| (settings, of(settings))).collect();
+    let best = scored.into_iter().min_by(|a, b| a.1.total_cmp(&b.1));
+    let (settings, log_loss) = best.ok_or_else(|| unfit("there are no drives".into()))?;
+    let old = CheckpointPlanning::load(input.checkpoint).map_err(|e| unfit(e.to_string()))?;
+    let planning = CheckpointPlanning { memory: Some(settings), ..old };
+    planning.save(input.checkpoint).map_err(|e| unfit(e.to_string()))?;
+    let alone = memory(settings);
+    let without_memory = drives.par_iter().map(|drive| log_loss_of(&alone, hazards, drive, true)).sum::<f64>();
+    let frames: usize = drives.iter().map(|drive| drive.frames.len()).sum();
+    Ok(LearnedMemory { settings, log_loss, without_memory: without_memory / frames.max(1) as f64 })
+}
+
+/// Mean log loss a frame.
+fn mean_log_loss(memory: &Memory, hazards: &[bool], drives: &[Watch]) -> f64 {
+    let sum: f64 = drives.par_iter().map(|drive| log_loss_of(memory, hazards, drive, false)).sum();
+    sum / drives.iter().map(|drive| drive.frames.len()).sum::<usize>().max(1) as f64
+}
+
+/// Sum of the log losses of a drive's frames. `forgets` clears the memory before each image.
+fn log_loss_of(memory: &Memory, hazards: &[bool], drive: &Watch, forgets: bool) -> f64 {
+    let mut memory = memory.clone();
+    memory.clear();
+    let mut step = drive.frames.first().map_or(0, |frame| frame.timestamp);
+    let mut sum = 0.0;
+    for frame in &drive.frames {
+        (step..frame.timestamp).for_each(|_| memory.advance());
+        step = frame.timestamp;
+        if forgets {
+            memory.clear();
+        }
+        memory.see(&frame.forecast);
+        let hazard: f64 = memory.weights().iter().zip(hazards).filter(|(_, h)| **h).map(|(w, _)| w).sum();
+        let p = hazard.clamp(SUREST, 1.0 - SUREST);
+        sum -= (if drive.hazard { p } else { 1.0 - p }).ln();
+    }
+    sum
+}
