@@ -2,6 +2,7 @@
 
 use crate::planning::{self, RunOutcome};
 use anyhow::Context;
+use carff::conditions::{ConditionCount, Conditions};
 use carff::provenance;
 use carff_base::files::check_writable;
 use carff_base::statistics::percentile;
@@ -72,7 +73,7 @@ pub fn json(outcome: &RunOutcome) -> Value {
         "actions": records.actions,
         "actions_not_recorded": records.actions_not_recorded,
         "safe_actions": records.safe_actions,
-        "unusable_images": records.unusable_images,
+        "unusable_images": unusable_images(&records.conditions),
         "images_compared": records.compared,
         "skipped": records.skipped(),
         "skipped_by_stage": by_stage(&|s| Some(stage(s)?.skipped.into())),
@@ -98,6 +99,29 @@ pub fn json(outcome: &RunOutcome) -> Value {
         report["checkpoint_metrics"] = json!(figures);
     }
     report
+}
+
+/// Counts of the images that no decision rests on, by condition.
+fn unusable_images(conditions: &Conditions) -> Map<String, Value> {
+    let count = |count: &ConditionCount| {
+        json!({
+            "images": count.images,
+            "episodes": count.episodes,
+            "worst_frames_to_safe_action": count.worst_frames_to_safe_action,
+        })
+    };
+    conditions.unusable().map(|(condition, counted)| (condition.name().to_owned(), count(counted))).collect()
+}
+
+/// Returns the same as lines of text; empty if every image was usable.
+fn unusable_text(conditions: &Conditions) -> String {
+    conditions.unusable().fold(String::new(), |text, (condition, count)| {
+        let ConditionCount { images, episodes, .. } = count;
+        let action = count.worst_frames_to_safe_action.map_or("none was recorded".to_owned(), |frames| {
+            format!("at the latest with frame {frames} of an episode")
+        });
+        text + &format!("unusable images: {images} {condition} ({episodes}x); safe action: {action}\n")
+    })
 }
 
 /// Correct decisions of the run's drives; `None` for a run without a decisive frame.
@@ -138,6 +162,7 @@ pub fn text(outcome: &RunOutcome, report: &Value) -> String {
              decisions and drives are without them"
         );
     }
+    text += &unusable_text(&outcome.records.conditions);
     if let Some(drives) = drives(outcome) {
         let _ = writeln!(text, "\n{}", drives.text());
     }
@@ -151,6 +176,7 @@ pub fn text(outcome: &RunOutcome, report: &Value) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use carff_messages::{Header, ImageCheck, ImageCondition};
 
     /// Quantiles are measured times; of a hundred, p99 is the 99th and max the last; of none, they are null.
     #[test]
@@ -159,5 +185,21 @@ mod tests {
         assert_eq!(quantiles_ms(&times), json!({ "p50": 50.0, "p99": 99.0, "max": 100.0, "count": 100 }));
         assert_eq!(quantiles_ms(&[7_000_000])["p99"], json!(7.0));
         assert_eq!(quantiles_ms(&[])["p50"], Value::Null);
+    }
+
+    /// Each unusable condition has its counts in JSON and a line of text; usable images have none.
+    #[test]
+    fn unusable_images_are_reported() {
+        let mut conditions = Conditions::default();
+        for (frame_id, condition) in
+            [(1, ImageCondition::Usable), (2, ImageCondition::Black), (3, ImageCondition::Black)]
+        {
+            let check = ImageCheck::of_frame(Header::of_frame(frame_id, frame_id, 1));
+            conditions.take_check(&ImageCheck { condition: condition.code(), ..check });
+        }
+        let counts = json!({ "images": 2, "episodes": 1, "worst_frames_to_safe_action": null });
+        assert_eq!(Value::from(unusable_images(&conditions)), json!({ "black": counts }));
+        let text = unusable_text(&conditions);
+        assert_eq!(text, "unusable images: 2 black (1x); safe action: none was recorded\n");
     }
 }

@@ -7,6 +7,7 @@
 pub mod bridge;
 pub mod camera;
 mod complete;
+pub mod conditions;
 #[cfg(feature = "recording")]
 pub mod export;
 #[cfg(feature = "film")]

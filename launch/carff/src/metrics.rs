@@ -1,12 +1,13 @@
 //! `carff metrics`: serves a run's metrics over HTTP, for Prometheus and for scripts.
 
+use crate::conditions::{ConditionCount, Conditions};
 use crate::http::{Response, Server};
 use crate::provenance::{self, Origin};
 use crate::session::{Sessions, WaitArgs};
 use crate::vitals::{Labels, RunVitals, StageVitals};
 use anyhow::{Context, ensure};
 use carff_base::statistics::percentile;
-use carff_messages::Stage;
+use carff_messages::{ImageCondition, Stage};
 use carff_transport::monotonic_now_ns;
 use clap::Args;
 use prometheus_client::encoding::prometheus_text;
@@ -144,6 +145,8 @@ fn status(run: &str, origin: &Origin, vitals: &RunVitals) -> Value {
         "decisions": vitals.decisions,
         "actions": vitals.actions,
         "safe_actions": vitals.safe_actions,
+        "camera": vitals.conditions.current().map(ImageCondition::name),
+        "images": vitals.conditions.counts().map(|(c, n)| (c.name(), n.images)).collect::<BTreeMap<_, _>>(),
         "action": vitals.last_action.map(|(action, _)| action),
         "reason": vitals.last_action.map(|(_, reason)| reason),
         "hazard_probability": vitals.hazard_probability,
@@ -171,6 +174,7 @@ fn prometheus(run: &str, origin: &Origin, vitals: &RunVitals) -> String {
     registry.register("actions", "Actions published since this exporter started", actions);
     let safe_actions = labelled("reason", &vitals.safe_actions);
     registry.register("safe_actions", "Safe actions since this exporter started, by reason", safe_actions);
+    camera(&mut registry, &vitals.conditions);
     let hazard = ConstGauge::new(f64::from(vitals.hazard_probability));
     registry.register("hazard_probability", "Hazard probability of the latest action, 0 to 1", hazard);
     let histograms = &vitals.histograms;
@@ -181,6 +185,26 @@ fn prometheus(run: &str, origin: &Origin, vitals: &RunVitals) -> String {
     registry.register("stage_latency_seconds", help, histograms.stages.clone());
     stages(&mut registry, vitals);
     text(&registry)
+}
+
+/// Registers the conditions of the camera.
+fn camera(registry: &mut Registry, conditions: &Conditions) {
+    let current = Family::<Labels, Gauge>::default();
+    for condition in ImageCondition::ALL.into_iter().filter(|_| conditions.current().is_some()) {
+        let is_current = conditions.current() == Some(condition);
+        current.get_or_create(&[("condition", condition.name())]).set(is_current.into());
+    }
+    registry.register("camera_condition", "1 for the condition of the latest checked image, else 0", current);
+    let mut counter = |name: &str, help: &str, value: &dyn Fn(&ConditionCount) -> u64| {
+        let family = Family::<Labels, Counter>::default();
+        for (condition, count) in conditions.counts() {
+            family.get_or_create(&[("condition", condition.name())]).inc_by(value(count));
+        }
+        registry.register(name, help, family);
+    };
+    counter("camera_frames", "Checked frames since this exporter started, by condition", &|count| count.images);
+    let help = "Sequences of frames of one condition since this exporter started, by condition";
+    counter("camera_episodes", help, &|count| count.episodes);
 }
 
 /// Registers the metrics that each stage has.
@@ -216,7 +240,7 @@ fn stages(registry: &mut Registry, vitals: &RunVitals) {
 mod tests {
     use super::*;
     use carff_messages::forms::AnyMessage;
-    use carff_messages::{Gaussian, Posterior};
+    use carff_messages::{Gaussian, ImageCheck, Posterior};
 
     fn vitals() -> RunVitals {
         let mut vitals = RunVitals::default();
@@ -293,6 +317,12 @@ mod tests {
         vitals.actions.insert("halt", 2);
         vitals.safe_actions.insert("stale belief", 1);
         vitals.histograms.camera_to_action.observe(0.03);
+        for (frame_id, condition) in
+            [(1, ImageCondition::Usable), (2, ImageCondition::Black), (3, ImageCondition::Black)]
+        {
+            let check = ImageCheck::of_frame(carff_messages::Header::of_frame(frame_id, frame_id, 1));
+            vitals.take(AnyMessage::new(&ImageCheck { condition: condition.code(), ..check }, &[]));
+        }
         let text = prometheus("r", &origin(), &vitals);
         for (name, (kind, series)) in parsed(&text) {
             let words: Vec<&str> = name.split('_').collect();
@@ -323,6 +353,12 @@ mod tests {
             "carff_stage_latency_seconds_sum{run=\"r\",stage=\"encoder\"} 0.015"
         );
         assert!(line("carff_camera_to_action_seconds_count").ends_with(" 1"));
+        let of = |name: &str, condition: &str| format!("carff_camera_{name}{{run=\"r\",condition=\"{condition}\"}}");
+        for (name, black, usable) in [("frames_total", 2, 1), ("episodes_total", 1, 1), ("condition", 1, 0)] {
+            assert!(line(&of(name, "black")).ends_with(&format!(" {black}")), "{text}");
+            assert!(line(&of(name, "usable")).ends_with(&format!(" {usable}")), "{text}");
+        }
+        assert!(line(&of("condition", "frozen")).ends_with(" 0"));
     }
 
     /// Names of runs, hosts and reasons are escaped.

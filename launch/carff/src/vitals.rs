@@ -1,9 +1,11 @@
 //! Health, rates and resource use of a run's stages over time, for the full-screen view and the metrics.
 
+use crate::conditions::Conditions;
 use crate::session::{Going, Session};
 use carff_messages::forms::AnyMessage;
 use carff_messages::{
-    Action, ActionCode, Belief, Forecast, FrameMeta, Health, HealthState, Posterior, Reason, Stage, ViewMeta,
+    Action, ActionCode, Belief, Forecast, FrameMeta, Health, HealthState, ImageCheck, Posterior, Reason, Stage,
+    ViewMeta,
 };
 use carff_transport::TopicId;
 use carff_transport::monotonic_now_ns;
@@ -81,6 +83,8 @@ pub(crate) struct RunVitals {
     pub(crate) actions: BTreeMap<&'static str, u64>,
     /// Number of safe actions by reason.
     pub(crate) safe_actions: BTreeMap<&'static str, u64>,
+    /// Conditions of the camera.
+    pub(crate) conditions: Conditions,
     /// Number of decisions on a frame.
     pub(crate) decisions: u64,
     /// Time from camera to action of the latest decisions, milliseconds.
@@ -139,6 +143,9 @@ impl RunVitals {
         let header = message.header();
         if let Some(health) = message.get::<Health>() {
             return self.take_health(health);
+        }
+        if let Some(check) = message.get::<ImageCheck>() {
+            return self.conditions.take_check(check);
         }
         // Camera and controller report their latency in heartbeats only.
         let (stage, latency_ns) = if message.get::<FrameMeta>().is_some() {

@@ -1,10 +1,11 @@
 //! Subscribes to all topics of a run and records every frame.
 
+use carff::conditions::Conditions;
 use carff_config::GraphConfig;
 use carff_decision::ImageEvidence;
 use carff_messages::{
     Action, ActionCode, Belief, DatasetView, FrameMeta, Gaussian, Header, Health, HealthState, ImageCheck,
-    ImageCondition, Observability, Posterior, Reason, Stage, Unknowns, ViewMeta,
+    Observability, Posterior, Reason, Stage, Unknowns, ViewMeta,
 };
 use carff_transport::{Image, Node, OpenError, ReceiveError, Receiver, topics};
 use std::collections::{BTreeMap, VecDeque};
@@ -128,8 +129,8 @@ pub struct Records {
     next_action: u64,
     /// Safe actions by reason.
     pub safe_actions: BTreeMap<&'static str, u64>,
-    /// Images that no decision could rest on, by condition.
-    pub unusable_images: BTreeMap<&'static str, u64>,
+    /// Conditions of the camera, by its checked images.
+    pub conditions: Conditions,
     /// Number of images that were compared with the known states.
     pub compared: u64,
     /// Duration of each comparison, nanoseconds.
@@ -214,11 +215,7 @@ impl Records {
 
     fn take_check(&mut self, check: &ImageCheck) {
         self.spoke_ns.insert(Stage::Encoder, check.header.publish_time_ns);
-        if let Ok(condition) = check.condition()
-            && condition != ImageCondition::Usable
-        {
-            *self.unusable_images.entry(condition.name()).or_default() += 1;
-        }
+        self.conditions.take_check(check);
     }
 
     fn take_unknowns(&mut self, unknowns: &Unknowns) {
@@ -253,6 +250,7 @@ impl Records {
         self.actions_not_recorded += action.header.sequence.saturating_sub(self.next_action);
         self.next_action = action.header.sequence + 1;
         self.spoke_ns.insert(Stage::Controller, action.header.publish_time_ns);
+        self.conditions.take_action(action);
         let reason = action.reason().ok()?;
         if reason != Reason::Belief {
             *self.safe_actions.entry(reason.name()).or_default() += 1;

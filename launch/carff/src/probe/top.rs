@@ -28,6 +28,8 @@ const ONCE_S: f64 = 3.0;
 const SPARKS: usize = 24;
 /// Maximum width of the lines above the table in plain text.
 const PLAIN_WIDTH: usize = 120;
+/// Maximum width of the camera's line.
+const CAMERA_WIDTH: usize = 80;
 
 /// Columns of the table.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
@@ -200,13 +202,20 @@ fn lines(texts: &[String], width: usize) -> Vec<String> {
     lines
 }
 
+/// Returns the lines above the table: the facts about the run, and the camera's conditions in a line of their own.
+fn heading(live: &LiveRun, vitals: &RunVitals, width: usize) -> Vec<String> {
+    let mut heading = lines(&summary(live, vitals), width);
+    heading.push(vitals.conditions.line(width.min(CAMERA_WIDTH)));
+    heading
+}
+
 /// Returns the screen as plain text.
 fn plain(live: &LiveRun, vitals: &RunVitals, shape: &Shape, width: usize) -> String {
     let stats = rows(vitals, shape);
     let fit = shape.fit(&stats, width);
     let mut table = vec![fit.iter().map(|(column, _)| column.head().to_owned()).collect::<Vec<_>>()];
     table.extend(stats.iter().map(|row| fit.iter().map(|(column, _)| column.text(row)).collect()));
-    format!("{}\n\n{}", lines(&summary(live, vitals), width.min(PLAIN_WIDTH)).join("\n"), columns(&table))
+    format!("{}\n\n{}", heading(live, vitals, width.min(PLAIN_WIDTH)).join("\n"), columns(&table))
 }
 
 fn sparks(values: &VecDeque<f64>) -> String {
@@ -329,7 +338,7 @@ fn rows(vitals: &RunVitals, shape: &Shape) -> Vec<Stats> {
 
 fn draw(frame: &mut Frame<'_>, live: &LiveRun, vitals: &RunVitals, shape: &Shape) {
     let width = usize::from(frame.area().width);
-    let (stats, summary) = (rows(vitals, shape), lines(&summary(live, vitals), width));
+    let (stats, heading) = (rows(vitals, shape), heading(live, vitals, width));
     let fit = shape.fit(&stats, width.saturating_sub(2));
     let mut hint = vec!["q quits".to_owned(), "s, r: sort, reverse".to_owned()];
     let hidden = shape.columns.len() - fit.len();
@@ -337,11 +346,11 @@ fn draw(frame: &mut Frame<'_>, live: &LiveRun, vitals: &RunVitals, shape: &Shape
         hint.push(format!("{hidden} columns hidden: widen, or choose with --columns"));
     }
     let hint = lines(&hint, width);
-    let heights = [summary.len() as u16 + 1, stats.len() as u16 + 3, hint.len() as u16].map(Constraint::Length);
+    let heights = [heading.len() as u16 + 1, stats.len() as u16 + 3, hint.len() as u16].map(Constraint::Length);
     let areas = Layout::vertical(heights).split(frame.area());
     let no_colour = std::env::var_os("NO_COLOR").is_some_and(|v| !v.is_empty());
     let style = |c: Option<Color>| c.filter(|_| !no_colour).map_or(Style::new(), |c| Style::new().fg(c));
-    frame.render_widget(Paragraph::new(summary.join("\n")), areas[0]);
+    frame.render_widget(Paragraph::new(heading.join("\n")), areas[0]);
     let body = stats.iter().map(|row| {
         Row::new(fit.iter().map(|(column, _)| Cell::from(Span::styled(column.text(row), style(column.colour(row))))))
     });
@@ -358,6 +367,8 @@ fn draw(frame: &mut Frame<'_>, live: &LiveRun, vitals: &RunVitals, shape: &Shape
 #[cfg(test)]
 mod tests {
     use super::*;
+    use carff_messages::forms::AnyMessage;
+    use carff_messages::{Header, ImageCheck, ImageCondition};
     use ratatui::Terminal;
     use ratatui::backend::TestBackend;
 
@@ -387,6 +398,10 @@ mod tests {
     /// A run with wide values in each column.
     fn busy() -> RunVitals {
         let mut vitals = RunVitals { frames: 1_234_567, decisions: 1_234_321, ..RunVitals::default() };
+        for condition in ImageCondition::ALL {
+            let usable = ImageCheck::of_frame(Header::default());
+            vitals.take(AnyMessage::new(&ImageCheck { condition: condition.code(), ..usable }, &[]));
+        }
         vitals.decided_ms.extend([123.4, 567.8]);
         for (i, stage) in (1..).zip(Stage::ALL) {
             let v = vitals.stages.entry(stage).or_default();
@@ -397,7 +412,7 @@ mod tests {
         vitals
     }
 
-    /// Each screen names the run and every stage. Every shown column has its whole values; a narrow terminal shows the
+    /// Each screen names the run, the camera's condition and every stage. Every shown column has its whole values; a narrow terminal shows the
     /// important columns, and reports the number of hidden ones.
     #[test]
     fn narrow_screens_hide_whole_columns() {
@@ -428,6 +443,8 @@ mod tests {
                     );
                 }
             }
+            let camera = vitals.conditions.line(usize::from(width).min(CAMERA_WIDTH));
+            assert!(screen.lines().any(|l| l.trim_matches('"').trim_end() == camera), "{width}: {camera}: {screen}");
             for fact in summary(&live(), &vitals) {
                 assert!(screen.contains(&fact), "{width}: {fact}: {screen}");
             }
