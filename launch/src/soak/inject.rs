@@ -1,10 +1,12 @@
-//! Injectors of a soak, in their own processes: a rogue publisher, and probes that come and go. The stages do not know
-//! them.
+//! Injectors of a soak, in their own processes: a rogue publisher, a camera with bad images, and probes that come and go.
+//! The stages do not know them.
 
+use super::stand_in;
 use anyhow::{Context, ensure};
 use carff_base::random::{Key, stream};
+use carff_config::Kind;
 use carff_messages::{Belief, Forecast, FrameMeta, Header, Posterior};
-use carff_transport::{Image, Node, Publisher, Run, Stop, Waiter, Woken, monotonic_now_ns, topics};
+use carff_transport::{Image, Node, Publisher, Receiver, Run, Stop, Waiter, Woken, monotonic_now_ns, topics};
 use rand::Rng;
 use rustix::process::{Signal, set_parent_process_death_signal};
 use std::time::Duration;
@@ -17,6 +19,8 @@ const LOOKS: usize = 300;
 const BURST: u32 = 12;
 /// Delay of a late frame.
 const LATE: Duration = Duration::from_millis(400);
+/// Time for which an injector outlives its last message: readers map its memory at their first read.
+pub(super) const LINGER: Duration = Duration::from_millis(300);
 /// Interval between two rogue messages: long enough that each receiver counts each message.
 const BETWEEN: Duration = Duration::from_millis(5);
 
@@ -42,8 +46,12 @@ pub fn run(args: &InjectArgs) -> anyhow::Result<()> {
     let beliefs = match args.what.as_str() {
         "probe" => return probe(&node, args.count),
         "nan" | "garbage" | "schema" | "foreign_run" => rogue(&node, args)?,
-        _ => {
-            frames(&node, args)?;
+        what => {
+            let kind = Kind::ALL.iter().copied().find(|kind| kind.name() == what);
+            match kind.filter(|&kind| stand_in::condition(kind).is_some()) {
+                Some(kind) => return stand_in::run(&node, kind, args.seed),
+                None => frames(&node, args)?,
+            }
             0
         }
     };
@@ -122,18 +130,18 @@ fn rogue(node: &Node, args: &InjectArgs) -> anyhow::Result<u32> {
         beliefs.send_unchecked(belief)?;
         std::thread::sleep(BETWEEN);
     }
-    // Readers map this process's memory at their first read; it must still exist then.
-    std::thread::sleep(Duration::from_millis(300));
+    std::thread::sleep(LINGER);
     Ok(args.count)
 }
 
-/// Sends recorded frames again: late, repeated, or out of order.
-fn frames(node: &Node, args: &InjectArgs) -> anyhow::Result<()> {
-    let mut input = node.receiver(&topics::FRAME)?;
-    let waiter = Waiter::new(Stop::on_signals()?);
-    let mut seen: Vec<(FrameMeta, Vec<u8>)> = Vec::new();
+/// Returns the next frames of the camera, in order: about three.
+pub(super) fn seen(
+    input: &mut Receiver<Image<FrameMeta>>,
+    waiter: &Waiter,
+) -> anyhow::Result<Vec<(FrameMeta, Vec<u8>)>> {
+    let mut seen = Vec::new();
     for _ in 0..LOOKS {
-        if seen.len() >= 3 || waiter.wait_until(&[&input], monotonic_now_ns() + LOOK_NS)? == Woken::Stopped {
+        if seen.len() >= 3 || waiter.wait_until(&[input], monotonic_now_ns() + LOOK_NS)? == Woken::Stopped {
             break;
         }
         while let Some(frame) = input.next()? {
@@ -141,6 +149,13 @@ fn frames(node: &Node, args: &InjectArgs) -> anyhow::Result<()> {
         }
     }
     ensure!(!seen.is_empty(), "no frames to send again");
+    Ok(seen)
+}
+
+/// Sends recorded frames again: late, repeated, or out of order.
+fn frames(node: &Node, args: &InjectArgs) -> anyhow::Result<()> {
+    let mut input = node.receiver(&topics::FRAME)?;
+    let seen = seen(&mut input, &Waiter::new(Stop::on_signals()?))?;
     // Frames of other sizes are up to twice as large along each side.
     let most = 4 * seen.iter().map(|(_, bytes)| bytes.len()).max().unwrap_or(0);
     let mut output = node.image_publisher(&topics::FRAME, most)?;
@@ -148,20 +163,14 @@ fn frames(node: &Node, args: &InjectArgs) -> anyhow::Result<()> {
     match args.what.as_str() {
         "late" => {
             std::thread::sleep(LATE);
-            send(&mut output, &seen[newest], 0)?;
+            send(&mut output, &seen[newest])?;
         }
-        "duplicate" => (0..args.count).try_for_each(|_| send(&mut output, &seen[newest], 0))?,
-        "reorder" => seen.iter().rev().try_for_each(|frame| send(&mut output, frame, 0))?,
-        "burst" => (0..args.count * BURST).try_for_each(|_| send(&mut output, &seen[newest], 0))?,
-        "clock_jump" => {
-            // Up to a minute forward or back.
-            let jump_ns = (args.seed % 60_000_000_000) as i64;
-            let jump_ns = if args.seed & (1 << 60) == 0 { jump_ns } else { -jump_ns };
-            (0..args.count).try_for_each(|_| send(&mut output, &seen[newest], jump_ns))?;
-        }
+        "duplicate" => (0..args.count).try_for_each(|_| send(&mut output, &seen[newest]))?,
+        "reorder" => seen.iter().rev().try_for_each(|frame| send(&mut output, frame))?,
+        "burst" => (0..args.count * BURST).try_for_each(|_| send(&mut output, &seen[newest]))?,
         "resolution" => {
             let sizes = [[4, 4], [1, 2], [3, 1], [1, 1]];
-            (0..args.count as usize).try_for_each(|i| send(&mut output, &rescaled(&seen[newest], sizes[i % 4]), 0))?;
+            (0..args.count as usize).try_for_each(|i| send(&mut output, &rescaled(&seen[newest], sizes[i % 4])))?;
         }
         "corrupt" => {
             let mut random = stream(Key { seed: args.seed, frame: 0, step: 1, sample: 0 });
@@ -173,12 +182,12 @@ fn frames(node: &Node, args: &InjectArgs) -> anyhow::Result<()> {
                     1 => bytes.truncate(bytes.len() / 2),
                     _ => (meta.width_px, bytes) = (0, vec![0]),
                 }
-                send(&mut output, &(meta, bytes), 0)?;
+                send(&mut output, &(meta, bytes))?;
             }
         }
         other => anyhow::bail!("`{other}` is not a fault that can be injected"),
     }
-    std::thread::sleep(Duration::from_millis(300));
+    std::thread::sleep(LINGER);
     Ok(())
 }
 
@@ -197,10 +206,8 @@ fn rescaled((meta, bytes): &(FrameMeta, Vec<u8>), halves: [u32; 2]) -> (FrameMet
     (meta, scaled)
 }
 
-fn send(output: &mut Publisher<Image<FrameMeta>>, frame: &(FrameMeta, Vec<u8>), jump_ns: i64) -> anyhow::Result<()> {
-    let (mut meta, bytes) = (frame.0, &frame.1);
-    meta.header.capture_time_ns = meta.header.capture_time_ns.saturating_add_signed(jump_ns);
+fn send(output: &mut Publisher<Image<FrameMeta>>, (meta, bytes): &(FrameMeta, Vec<u8>)) -> anyhow::Result<()> {
     let mut loan = output.loan(bytes.len())?;
     loan.bytes_mut().copy_from_slice(bytes);
-    Ok(output.send_image_unchecked(loan, meta)?)
+    Ok(output.send_image_unchecked(loan, *meta)?)
 }

@@ -7,32 +7,36 @@
 //!  \<------------- beliefs, actions, heartbeats --------- topics
 //! ```
 
+mod answer;
 mod graph;
 mod inject;
 mod patience;
 mod recorder;
 mod report;
 mod schedule;
+mod stand_in;
 mod watch;
 
 pub use inject::{InjectArgs, run as inject};
 pub use schedule::{Fault, fault};
 
+use answer::Answer;
 use anyhow::{Context, ensure};
 use carff_base::files::check_writable;
 use carff_config::{CameraSource, Kind, SoakConfig};
-use carff_messages::Stage;
+use carff_messages::{ImageCondition, Stage};
 use carff_transport::{Node, Run, SHARED_MEMORY_DIR, Stop, Waiter, monotonic_now_ns};
+use carff_unknown::Known;
 use graph::{Graph, Holdings, Victim, resident_bytes};
 use patience::Patience;
 use recorder::{Cramped, FlightRecorder, small_disk};
 use report::{Lives, Outcome};
 use rustix::process::Signal;
 use std::collections::BTreeMap;
-use std::io::{BufRead, BufReader, Read};
+use std::io::{BufRead, BufReader, Read, Write};
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, ExitCode, Stdio};
+use std::process::{Child, Command, ExitCode, ExitStatus, Stdio};
 use watch::{Notes, Terms, Watcher};
 
 const NS_PER_MS: u64 = 1_000_000;
@@ -362,15 +366,23 @@ impl Soak<'_> {
                 }
                 self.lose_device(fault, &pids)?;
             }
-            Kind::Burst
-            | Kind::Late
-            | Kind::Duplicate
-            | Kind::Reorder
-            | Kind::ClockJump
-            | Kind::Resolution
-            | Kind::Corrupt => {
+            Kind::Burst | Kind::Late | Kind::Duplicate | Kind::Reorder | Kind::Resolution | Kind::Corrupt => {
                 self.injector(fault.kind.name(), fault)?;
                 self.recover(None)?;
+            }
+            Kind::Black
+            | Kind::White
+            | Kind::Frozen
+            | Kind::Covered
+            | Kind::Unfocused
+            | Kind::Underexposed
+            | Kind::Overexposed
+            | Kind::ClockStall
+            | Kind::ClockJump => {
+                let Some(condition) = stand_in::condition(fault.kind).filter(|&c| self.names(c)) else {
+                    return Ok(false);
+                };
+                self.stand_in(fault, condition, &pids)?;
             }
             Kind::ProbeStorm => self.storm(fault)?,
             Kind::FullMemory => {
@@ -484,7 +496,7 @@ impl Soak<'_> {
                 &count.to_string(),
                 &seed.to_string(),
             ])
-            .stdin(Stdio::null())
+            .stdin(Stdio::piped())
             .stdout(Stdio::piped())
             .spawn()
             .context("cannot start an injector")
@@ -493,20 +505,92 @@ impl Soak<'_> {
     /// Runs an injector; returns its output.
     fn injector(&mut self, what: &str, fault: &Fault) -> anyhow::Result<String> {
         let mut child = self.helper(what, fault.count, fault.seed)?;
+        let status = self.ended(&mut child)?;
+        ensure!(status.success(), "the injector of `{what}` failed: {status}");
+        let mut said = String::new();
+        child.stdout.take().context("the injector has no output")?.read_to_string(&mut said)?;
+        Ok(said)
+    }
+
+    /// Waits for the end of an injector.
+    fn ended(&mut self, child: &mut Child) -> anyhow::Result<ExitStatus> {
         let mut patience = Patience::of_ms(INJECTOR_MS);
-        let status = loop {
+        loop {
             if let Some(status) = child.try_wait()? {
-                break status;
+                return Ok(status);
             }
             if patience.ran_out() {
                 child.kill()?;
             }
             self.look()?;
-        };
-        ensure!(status.success(), "the injector of `{what}` failed: {status}");
-        let mut said = String::new();
-        child.stdout.take().context("the injector has no output")?.read_to_string(&mut said)?;
-        Ok(said)
+        }
+    }
+
+    /// Returns the first line of an injector; empty if it ended without one.
+    fn first_line(&mut self, child: &mut Child) -> anyhow::Result<String> {
+        let mut line = String::new();
+        let mut stdout = BufReader::new(child.stdout.take().context("the injector has no output")?);
+        let said = std::thread::spawn(move || stdout.read_line(&mut line).map(|_| line));
+        while !said.is_finished() {
+            self.look()?;
+        }
+        Ok(said.join().ok().and_then(Result::ok).unwrap_or_default())
+    }
+
+    /// Returns true if the encoder of the graph can name a condition.
+    fn names(&self, condition: ImageCondition) -> bool {
+        use ImageCondition::{Black, Clock, Frozen, White};
+        let config = &self.graph.config;
+        config.checks.camera
+            && match condition {
+                Black | White | Clock => true,
+                Frozen => config.camera.has_noise(),
+                _ => Known::load(&self.graph.checkpoint).is_ok_and(|known| known.is_some()),
+            }
+    }
+
+    /// Lets an injector with bad images stand in for the camera. The safe action must come in time, with the condition
+    /// as its reason, and end with the fault.
+    fn stand_in(
+        &mut self,
+        fault: &Fault,
+        condition: ImageCondition,
+        pids: &BTreeMap<Stage, u32>,
+    ) -> anyhow::Result<()> {
+        let config = &self.graph.config;
+        let (period_ns, frozen_ns) = ((1e9 / config.run.frame_rate_hz) as u64, config.checks.frozen_ms * NS_PER_MS);
+        // The launcher would replace a camera that stands still for longer.
+        let hold_ms = fault.hold_ms.min(config.launcher.hang_timeout_ms / 2);
+        let mut injector = self.helper(fault.kind.name(), fault.count, fault.seed)?;
+        let first = self.first_line(&mut injector)?;
+        let first = first.trim().parse().with_context(|| format!("the injector of `{}` failed", fault.kind.name()))?;
+        let answer = Answer::new(condition, first, frozen_ns);
+        let limit_ms = answer.limit_ns(period_ns) / NS_PER_MS + self.config.contract.slack_ms;
+        self.notes.answer = Some(answer);
+        let begun_ns = monotonic_now_ns();
+        injector.stdin.take().context("the injector has no input")?.write_all(b"\n")?;
+        let camera = pids.get(&Stage::Camera).copied();
+        let is_replaced = |soak: &Self| soak.pids().get(&Stage::Camera).copied() != camera;
+        self.look_until(limit_ms, |soak| {
+            let is_answered = soak.notes.answer.as_ref().is_some_and(|answer| answer.frames.is_some());
+            Ok(is_answered || is_replaced(soak) || soak.notes.violation.is_some())
+        })?;
+        let answer = self.notes.answer.take();
+        match answer.and_then(|answer| answer.frames) {
+            Some(frames) => {
+                let worst = self.outcome.worst_answers_frames.entry(fault.kind.name()).or_default();
+                *worst = frames.max(*worst);
+            }
+            None if !is_replaced(self) && !self.waiter.stop().is_stopped() => {
+                self.violated(format!("no safe action for `{condition}` within {limit_ms} ms"));
+            }
+            None => {}
+        }
+        self.look_for(hold_ms.saturating_sub((monotonic_now_ns() - begun_ns) / NS_PER_MS))?;
+        Victim::new(injector.id())?.signal(Signal::TERM);
+        let status = self.ended(&mut injector)?;
+        ensure!(status.success(), "the injector of `{}` failed: {status}", fault.kind.name());
+        self.recover(None)
     }
 
     /// Attaches probes; half of them detach, the others are killed while they hold a frame.
@@ -515,14 +599,7 @@ impl Soak<'_> {
         // As many as fit in addition to the graph's own subscribers, the soak and its recorder.
         for i in 0..fault.count.min(3) {
             let mut probe = self.helper("probe", i, 0)?;
-            let mut ready = String::new();
-            let mut stdout = BufReader::new(probe.stdout.take().context("the probe has no output")?);
-            let said = std::thread::spawn(move || stdout.read_line(&mut ready).map(|_| ready));
-            while !said.is_finished() {
-                self.look()?;
-            }
-            let ready = said.join().ok().and_then(Result::ok);
-            ensure!(ready.as_deref() == Some("ready\n"), "a probe could not attach");
+            ensure!(self.first_line(&mut probe)? == "ready\n", "a probe could not attach");
             probes.push(probe);
         }
         self.look_for(fault.hold_ms)?;

@@ -23,6 +23,8 @@ pub(super) struct Outcome {
     pub(super) recoveries_ms: Vec<f64>,
     /// Longest recovery by kind of fault.
     pub(super) worst_recoveries_ms: BTreeMap<&'static str, f64>,
+    /// Largest number of frames from the first bad image to the safe action, by kind of fault.
+    pub(super) worst_answers_frames: BTreeMap<&'static str, u64>,
     pub(super) worst_start_ms: f64,
     pub(super) leaked_files: usize,
     pub(super) growth_percent_per_hour: Option<f64>,
@@ -119,6 +121,7 @@ impl Outcome {
             "evidence": self.evidence,
             "worst_recovery_ms": self.recoveries_ms.iter().copied().reduce(f64::max),
             "worst_recovery_ms_by_kind": self.worst_recoveries_ms,
+            "worst_frames_to_safe_action_by_kind": self.worst_answers_frames,
             "median_recovery_ms": percentile(&self.recoveries_ms, 0.5),
             "worst_start_ms": self.worst_start_ms,
             "worst_safe_action_ms": ms(notes.judge.worst_safe_action_ns),

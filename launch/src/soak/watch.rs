@@ -2,12 +2,13 @@
 //!
 //! All checks of actions use the times that the controller wrote into them.
 
+use super::answer::Answer;
 use anyhow::Context;
 use carff_checkpoint::load_policy;
 use carff_config::Contract;
 use carff_config::GraphConfig;
 use carff_decision::{Evidence, Policy};
-use carff_messages::{Action, ActionCode, Belief, Health, HealthState, Message, Reason, Stage};
+use carff_messages::{Action, ActionCode, Belief, Health, HealthState, ImageCheck, Message, Reason, Stage};
 use carff_transport::{Input, Node, Receiver, Waiter, monotonic_now_ns, topics};
 use std::collections::{BTreeMap, VecDeque};
 use std::path::Path;
@@ -190,6 +191,7 @@ impl Judge {
 /// Subscriptions to a running graph.
 pub(super) struct Watcher {
     beliefs: Receiver<Belief>,
+    checks: Receiver<ImageCheck>,
     actions: Receiver<Action>,
     healths: Vec<Receiver<Health>>,
     waiter: Waiter,
@@ -207,6 +209,8 @@ pub(super) struct Watcher {
 /// Observations that outlive the watcher, while the graph starts and stops.
 pub(super) struct Notes {
     pub(super) judge: Judge,
+    /// The answer to the bad images of the current fault.
+    pub(super) answer: Option<Answer>,
     /// Times from camera to decision of undisturbed frames, milliseconds.
     pub(super) latency_ms: Vec<f64>,
     /// True while frames are undisturbed.
@@ -221,6 +225,7 @@ impl Watcher {
         let healths = Stage::ALL.iter().map(|&stage| node.receiver(topics::health(stage)));
         Ok(Self {
             beliefs: node.receiver(&topics::BELIEF)?,
+            checks: node.receiver(&topics::CHECK)?,
             actions: node.receiver(&topics::ACTION)?,
             healths: healths.collect::<Result<_, _>>().context("cannot subscribe to the stages")?,
             waiter,
@@ -234,7 +239,7 @@ impl Watcher {
 
     /// Sleeps briefly, and reads all messages.
     pub(super) fn look(&mut self, notes: &mut Notes) -> anyhow::Result<()> {
-        let mut inputs: Vec<&dyn Input> = vec![&self.beliefs, &self.actions];
+        let mut inputs: Vec<&dyn Input> = vec![&self.beliefs, &self.checks, &self.actions];
         inputs.extend(self.healths.iter().map(|h| h as &dyn Input));
         let begun_ns = monotonic_now_ns();
         self.waiter.wait_until(&inputs, begun_ns + LOOK_NS)?;
@@ -272,9 +277,16 @@ impl Watcher {
                 }
             }
         }
+        while let Some(check) = self.checks.next()? {
+            if !check.is_usable() {
+                notes.note(format!("{:?}", *check));
+            }
+            notes.answered(|answer| answer.checked(&check));
+        }
         while let Some(action) = self.actions.next()? {
             notes.note(format!("{:?}", *action));
-            if action.is_decision() {
+            notes.answered(|answer| answer.acted(&action));
+            if action.is_decision() && action.reason() == Ok(Reason::Belief) {
                 self.decided_ns = action.header.publish_time_ns;
                 if notes.calm {
                     notes.latency_ms.push((self.decided_ns - action.header.capture_time_ns) as f64 / NS_PER_MS);
@@ -304,10 +316,18 @@ impl Notes {
     pub(super) fn new(terms: Terms) -> Self {
         Self {
             judge: Judge::new(terms),
+            answer: None,
             latency_ms: Vec::new(),
             calm: false,
             evidence: VecDeque::new(),
             violation: None,
+        }
+    }
+
+    /// Passes a message to the awaited answer.
+    fn answered(&mut self, take: impl FnOnce(&mut Answer) -> Result<(), String>) {
+        if let Some(Err(violation)) = self.answer.as_mut().map(take) {
+            self.violation.get_or_insert(violation);
         }
     }
 

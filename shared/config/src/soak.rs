@@ -90,7 +90,24 @@ weights! {
     full_memory => FullMemory,
     /// A disk that fills under a recorder.
     full_disk => FullDisk,
-    /// Frames from a clock that has jumped, forward or back.
+    /// A camera whose images are black. This and the following kinds stop the camera and publish in its place; the safe
+    /// action must come with the condition as its reason.
+    black => Black,
+    /// A camera whose images are white.
+    white => White,
+    /// A camera that repeats an image.
+    frozen => Frozen,
+    /// A camera with half of its lens covered.
+    covered => Covered,
+    /// A camera out of focus.
+    unfocused => Unfocused,
+    /// A camera with too little light.
+    underexposed => Underexposed,
+    /// A camera with too much light.
+    overexposed => Overexposed,
+    /// A camera whose capture times stand still.
+    clock_stall => ClockStall,
+    /// A camera whose clock has jumped, forward or back.
     clock_jump => ClockJump,
     /// Subscribers that come, go and are killed.
     probe_storm => ProbeStorm,
