@@ -7,7 +7,7 @@ const IMAGES: u64 = 3;
 /// Time after the limit of a frozen camera within which it must be named, nanoseconds.
 const FROZEN_NS: u64 = 200_000_000;
 
-/// What the graph makes of the images of one fault.
+/// The checks and the safe action that follow the bad images of one fault.
 #[derive(Clone, Debug)]
 pub(super) struct Answer {
     /// Condition of the images.

@@ -1,26 +1,21 @@
 //! Injectors of a soak, in their own processes: a rogue publisher, a camera with bad images, and probes that come and go.
 //! The stages do not know them.
 
+use super::seen::{LINGER, LOOK_NS, seen};
 use super::stand_in;
-use anyhow::{Context, ensure};
+use anyhow::Context;
 use carff_base::random::{Key, stream};
 use carff_config::Kind;
 use carff_messages::{Belief, Forecast, FrameMeta, Header, Posterior};
-use carff_transport::{Image, Node, Publisher, Receiver, Run, Stop, Waiter, Woken, monotonic_now_ns, topics};
+use carff_transport::{Image, Node, Publisher, Run, Stop, Waiter, Woken, monotonic_now_ns, topics};
 use rand::Rng;
 use rustix::process::{Signal, set_parent_process_death_signal};
 use std::time::Duration;
 
-/// Longest sleep between two checks, nanoseconds.
-const LOOK_NS: u64 = 100_000_000;
-/// Number of checks for frames before it gives up. It counts checks, because the process may get no processor time.
-const LOOKS: usize = 300;
 /// Number of frames in a burst, for each requested frame.
 const BURST: u32 = 12;
 /// Delay of a late frame.
 const LATE: Duration = Duration::from_millis(400);
-/// Time for which an injector outlives its last message: readers map its memory at their first read.
-pub(super) const LINGER: Duration = Duration::from_millis(300);
 /// Interval between two rogue messages: long enough that each receiver counts each message.
 const BETWEEN: Duration = Duration::from_millis(5);
 
@@ -132,24 +127,6 @@ fn rogue(node: &Node, args: &InjectArgs) -> anyhow::Result<u32> {
     }
     std::thread::sleep(LINGER);
     Ok(args.count)
-}
-
-/// Returns the next frames of the camera, in order: about three.
-pub(super) fn seen(
-    input: &mut Receiver<Image<FrameMeta>>,
-    waiter: &Waiter,
-) -> anyhow::Result<Vec<(FrameMeta, Vec<u8>)>> {
-    let mut seen = Vec::new();
-    for _ in 0..LOOKS {
-        if seen.len() >= 3 || waiter.wait_until(&[input], monotonic_now_ns() + LOOK_NS)? == Woken::Stopped {
-            break;
-        }
-        while let Some(frame) = input.next()? {
-            seen.push((*frame, frame.bytes().to_vec()));
-        }
-    }
-    ensure!(!seen.is_empty(), "no frames to send again");
-    Ok(seen)
 }
 
 /// Sends recorded frames again: late, repeated, or out of order.

@@ -14,6 +14,7 @@ mod patience;
 mod recorder;
 mod report;
 mod schedule;
+mod seen;
 mod stand_in;
 mod watch;
 
@@ -25,7 +26,7 @@ use anyhow::{Context, ensure};
 use carff_base::files::check_writable;
 use carff_config::{CameraSource, Kind, SoakConfig};
 use carff_messages::{ImageCondition, Stage};
-use carff_transport::{Node, Run, SHARED_MEMORY_DIR, Stop, Waiter, monotonic_now_ns};
+use carff_transport::{INTERRUPTED, Node, Run, SHARED_MEMORY_DIR, Stop, Waiter, monotonic_now_ns};
 use carff_unknown::Known;
 use graph::{Graph, Holdings, Victim, resident_bytes};
 use patience::Patience;
@@ -589,7 +590,8 @@ impl Soak<'_> {
         self.look_for(hold_ms.saturating_sub((monotonic_now_ns() - begun_ns) / NS_PER_MS))?;
         Victim::new(injector.id())?.signal(Signal::TERM);
         let status = self.ended(&mut injector)?;
-        ensure!(status.success(), "the injector of `{}` failed: {status}", fault.kind.name());
+        let is_stopped = status.code() == Some(INTERRUPTED.into());
+        ensure!(is_stopped, "the injector of `{}` failed: {status}", fault.kind.name());
         self.recover(None)
     }
 

@@ -1,7 +1,7 @@
 //! A camera whose images are bad: a process that stops the camera and publishes in its place. No stage knows it.
 
 use super::graph::Victim;
-use super::inject::{LINGER, seen};
+use super::seen::{LINGER, seen};
 use anyhow::Context;
 use carff_base::random::Key;
 use carff_config::Kind;
@@ -10,8 +10,8 @@ use carff_messages::{Header, ImageCondition, Stage};
 use carff_transport::{Node, Stop, Waiter, Woken, monotonic_now_ns, topics};
 use rustix::process::Signal;
 
-/// Passes of the strongest defocus of [`Corruption`]: an eighth of the sharpness, and less, remains.
-const DEFOCUS_PASSES: usize = 4;
+/// Passes of the strongest defocus of [`Corruption`]: at most a tenth of a trained image's sharpness remains.
+const DEFOCUS_PASSES: usize = 16;
 /// Value of a covered pixel.
 const COVERED: u8 = 12;
 /// Share of its light that an underexposed pixel keeps, and of its distance from white that an overexposed one keeps.
@@ -43,8 +43,11 @@ pub(super) fn run(node: &Node, kind: Kind, seed: u64) -> anyhow::Result<()> {
     let waiter = Waiter::new(Stop::on_signals()?);
     let mut frames = node.receiver(&topics::FRAME)?;
     let mut healths = node.receiver(topics::health(Stage::Camera))?;
-    let mut last = seen(&mut frames, &waiter)?;
-    let period_ns = period_ns(&last.iter().map(|(meta, _)| meta.header).collect::<Vec<_>>());
+    let seen = seen(&mut frames, &waiter)?;
+    let period_ns = period_ns(&seen.iter().map(|(meta, _)| meta.header).collect::<Vec<_>>());
+    let (mut meta, rgb) = seen.into_iter().next_back().context("no frames to replace")?;
+    let image = spoilt(kind, &Image { width_px: meta.width_px, height_px: meta.height_px, rgb })?;
+    let mut output = node.image_publisher(&topics::FRAME, image.rgb.len())?;
     let pid = loop {
         if let Some(health) = healths.newest()? {
             break health.pid;
@@ -56,11 +59,8 @@ pub(super) fn run(node: &Node, kind: Kind, seed: u64) -> anyhow::Result<()> {
     let camera = Stopped::new(pid)?;
     waiter.wait_until(&[], monotonic_now_ns() + period_ns)?;
     while let Some(frame) = frames.next()? {
-        last.push((*frame, frame.bytes().to_vec()));
+        meta.header = frame.header;
     }
-    let (mut meta, rgb) = last.pop().context("no frames to replace")?;
-    let image = spoilt(kind, &Image { width_px: meta.width_px, height_px: meta.height_px, rgb })?;
-    let mut output = node.image_publisher(&topics::FRAME, image.rgb.len())?;
     println!("{}", meta.header.frame_id + 1);
     std::io::stdin().read_line(&mut String::new())?;
     let mut due_ns = monotonic_now_ns();
@@ -107,7 +107,7 @@ fn period_ns(headers: &[Header]) -> u64 {
     mean.unwrap_or(most).clamp(least, most)
 }
 
-/// Returns the image of a bad camera that looks at an image. Bad clocks leave it as it is, and so does a frozen camera.
+/// Returns the image of a bad camera that looks at an image. Bad clocks and a frozen camera leave it unchanged.
 fn spoilt(kind: Kind, image: &Image) -> anyhow::Result<Image> {
     let mapped = |value: &dyn Fn(u8) -> f32| {
         let rgb = image.rgb.iter().map(|&v| value(v).round() as u8).collect();
@@ -162,9 +162,10 @@ mod tests {
     const MS: u64 = 1_000_000;
     const FIELD_OF_VIEW_DEG: [f64; 2] = [60.0; 2];
 
-    /// A street of blocks with edges, as bright as trained images are.
+    /// A bright sky over a darker ground, with blocks in front, as bright as trained images are.
     fn scene() -> Image {
-        let mut image = Image::filled(128, 128, [170; 3]);
+        let mut image = Image::filled(128, 128, [210; 3]);
+        image.paste(&Image::filled(128, 64, [110; 3]), 0, 64);
         for i in 0..60 {
             let value = 80 + (i * 37 % 120) as u8;
             image.paste(&Image::filled(9 + i % 7, 5 + i % 11, [value; 3]), i * 53 % 120, i * 29 % 120);
