@@ -136,7 +136,9 @@ fn spoilt(kind: Kind, image: &Image) -> anyhow::Result<Image> {
 /// Changes the brightness of every second image by one step, so that only a frozen camera repeats its images.
 fn flicker(kind: Kind, frame_id: u64, rgb: &mut [u8]) {
     if kind != Kind::Frozen && frame_id.is_multiple_of(2) {
-        rgb.iter_mut().for_each(|v| *v = v.saturating_add(1));
+        for value in rgb {
+            *value = value.saturating_add(1);
+        }
     }
 }
 
