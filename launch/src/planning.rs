@@ -144,6 +144,7 @@ mod tests {
             last_of_timestamp: false,
             observability: Some(Observability::None),
             capture_time_ns: 0,
+            take_start: 0,
             posterior: None,
             image: None,
             action: Some(ActionCode::Halt),

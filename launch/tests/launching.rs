@@ -55,6 +55,7 @@ fn camera(stage: &mut StageContext) -> anyhow::Result<()> {
             intrinsics: Intrinsics { fl_x_px: 8.0, fl_y_px: 8.0, cx_px: 8.0, cy_px: 8.0 },
             world_from_camera: [0.0; 16],
             dataset_view: DatasetView::UNKNOWN,
+            take_start: 0,
         };
         let mut loan = frames.loan((SIDE * SIDE * 3) as usize)?;
         loan.bytes_mut().fill(frame_id as u8);
@@ -84,7 +85,7 @@ fn encoder(stage: &mut StageContext, fault: &str) -> anyhow::Result<()> {
         gaussian.mean[0] = f32::from(frame.bytes()[0]);
         let header = frame.header;
         let stage_latency_ns = stage.worked(&header, monotonic_now_ns());
-        posteriors.send(Posterior { header, gaussian, stage_latency_ns })?;
+        posteriors.send(Posterior { header, gaussian, take_start: frame.take_start, stage_latency_ns })?;
     }
     Ok(())
 }

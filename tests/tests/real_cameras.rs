@@ -118,6 +118,7 @@ fn foreign_frames_are_validated() {
             intrinsics: Intrinsics { fl_x_px: 4.0, fl_y_px: 4.0, cx_px: 2.0, cy_px: 2.0 },
             world_from_camera: [0.0; 16],
             dataset_view: DatasetView::UNKNOWN,
+            take_start: 0,
         };
         meta.header.schema_version = SCHEMA_VERSION + 1;
         launcher.wait_for("report of the wrong frames", |text| {

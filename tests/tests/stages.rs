@@ -63,8 +63,12 @@ fn rogue_messages_stop_at_the_next_stage() {
     blind.intrinsics.fl_x_px = f64::NAN;
     frames.send_image_unchecked(frames.loan(BYTES).unwrap(), blind).unwrap();
     frames.send_image_unchecked(frames.loan(BYTES / 2).unwrap(), frame(run_id, 901)).unwrap();
-    let mut posterior =
-        Posterior { header: header(run_id, 902, 0), gaussian: Gaussian::standard(), stage_latency_ns: 0 };
+    let mut posterior = Posterior {
+        header: header(run_id, 902, 0),
+        gaussian: Gaussian::standard(),
+        take_start: 0,
+        stage_latency_ns: 0,
+    };
     posterior.gaussian.mean[5] = f32::NAN;
     posteriors.send_unchecked(posterior).unwrap();
     let mut forecast = Forecast::empty(header(run_id, 903, 1), ForecastSource::Observed, 2);

@@ -227,7 +227,8 @@ mod tests {
             let mut meta = FrameMeta { header, width_px: 2, height_px: 1, ..FrameMeta::default() };
             (meta.intrinsics.fl_x_px, meta.intrinsics.fl_y_px) = (1.0, 1.0);
             writer.write(TopicId::FRAME, AnyMessage::new(&meta, &[frame as u8; 6])).unwrap();
-            let posterior = Posterior { header, gaussian: Gaussian::standard(), stage_latency_ns: frame };
+            let posterior =
+                Posterior { header, gaussian: Gaussian::standard(), take_start: 0, stage_latency_ns: frame };
             writer.write(TopicId::POSTERIOR, AnyMessage::new(&posterior, &[])).unwrap();
         }
         writer.finish().unwrap();

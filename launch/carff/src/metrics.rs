@@ -245,7 +245,8 @@ mod tests {
     fn vitals() -> RunVitals {
         let mut vitals = RunVitals::default();
         let header = carff_messages::Header::of_frame(1, 1, 1);
-        let posterior = Posterior { header, gaussian: Gaussian::standard(), stage_latency_ns: 15_000_000 };
+        let posterior =
+            Posterior { header, gaussian: Gaussian::standard(), take_start: 0, stage_latency_ns: 15_000_000 };
         vitals.take(AnyMessage::new(&posterior, &[]));
         vitals
     }

@@ -111,7 +111,8 @@ mod tests {
     #[test]
     fn spans_are_where_the_messages_say() {
         let header = Header { publish_time_ns: 30_000_000, ..Header::of_frame(4, 10_000_000, 1) };
-        let posterior = Posterior { header, gaussian: Gaussian::standard(), stage_latency_ns: 15_000_000 };
+        let posterior =
+            Posterior { header, gaussian: Gaussian::standard(), take_start: 0, stage_latency_ns: 15_000_000 };
         let span = Span::of(AnyMessage::new(&posterior, &[])).unwrap();
         assert_eq!(
             (span.stage, span.frame_id, span.begin_ns, span.end_ns),

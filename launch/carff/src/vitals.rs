@@ -331,7 +331,8 @@ mod tests {
         }
         assert_eq!(run.decided_ms.len(), 3);
         // The heartbeat with the new maximum comes after the output.
-        let posterior = Posterior { header, gaussian: Gaussian::standard(), stage_latency_ns: 7_000_000 };
+        let posterior =
+            Posterior { header, gaussian: Gaussian::standard(), take_start: 0, stage_latency_ns: 7_000_000 };
         run.take(AnyMessage::new(&posterior, &[]));
         assert_eq!(run.stages[&Stage::Encoder].max_latency_ms, 7.0);
     }

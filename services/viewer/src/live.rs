@@ -386,7 +386,12 @@ mod tests {
 
     fn posterior(frame_id: u64) -> Posterior {
         let header = Header::of_frame(frame_id, 5, 77);
-        Posterior { header, gaussian: Gaussian { mean: [0.5; 8], ..Gaussian::standard() }, stage_latency_ns: 0 }
+        Posterior {
+            header,
+            gaussian: Gaussian { mean: [0.5; 8], ..Gaussian::standard() },
+            take_start: 0,
+            stage_latency_ns: 0,
+        }
     }
 
     fn forecast(frame_id: u64, step: u32) -> carff_messages::Forecast {

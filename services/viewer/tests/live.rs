@@ -62,13 +62,16 @@ fn watches_a_run_from_frame_to_decision() {
         intrinsics: Intrinsics { fl_x_px: 2.0, fl_y_px: 2.0, cx_px: 1.0, cy_px: 1.0 },
         world_from_camera,
         dataset_view: DatasetView::UNKNOWN,
+        take_start: 0,
     };
     let mut loan = frames.loan(12).unwrap();
     loan.bytes_mut().copy_from_slice(&[7; 12]);
     frames.send_image(loan, meta).unwrap();
     // As in a graph: each message follows the one that it depends on.
     wait_for(|| (feed.watched().frames == 5).then_some(()));
-    posteriors.send(Posterior { header, gaussian: Gaussian::standard(), stage_latency_ns: 3_000_000 }).unwrap();
+    posteriors
+        .send(Posterior { header, gaussian: Gaussian::standard(), take_start: 0, stage_latency_ns: 3_000_000 })
+        .unwrap();
     let mut forecast = Forecast::empty(header.at_step(1), ForecastSource::Observed, 1);
     (forecast.component_count, forecast.sample_count) = (1, 2);
     forecast.weights[0] = 1.0;

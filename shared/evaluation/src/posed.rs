@@ -231,6 +231,7 @@ fn at_target_size(image: &Tensor) -> Tensor {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use carff_base::geometry::OrientedBox;
 
     /// A pixel's mean is over the images in which it is valid, and over all where it is valid in none.
     #[test]
@@ -239,5 +240,37 @@ mod tests {
         let valid = Tensor::from_slice(&[1.0_f32, 1.0, 0.0, 1.0, 0.0, 0.0]).view([2, 1, 1, 3]);
         let mean = mean_of_valid(&images, Some(&valid));
         assert!(mean.allclose(&Tensor::from_slice(&[0.5_f32, 0.4, 0.3]).view([1, 1, 3]), 1e-6, 1e-6, false));
+    }
+
+    /// Another vehicle at the same places is the same scenario; a vehicle at another place, and another number of states,
+    /// is not.
+    #[test]
+    fn appearances_keep_their_places() {
+        let named = |at: [f64; 3], size_m: f64| NamedBox {
+            name: "actor".into(),
+            role: None,
+            oriented_box: OrientedBox { center: at, half_size: [size_m; 3], yaw: 0.0 },
+            dynamic: true,
+        };
+        let scenario = |states: usize, at: [f64; 3], size_m: f64| ScenarioInfo {
+            name: "small".into(),
+            bounds: [[-9.0; 3], [9.0; 3]],
+            branches: vec!["moves".into()],
+            timestamps: states,
+            step_s: None,
+            bev_view: None,
+            states: (0..states)
+                .map(|timestamp| StateInfo { branch: 0, timestamp, boxes: vec![named(at, size_m)] })
+                .collect(),
+            candidates: Vec::new(),
+            static_boxes: Vec::new(),
+            hazard_branches: vec![0],
+            hazard_action: "halt".into(),
+            clear_action: "advance".into(),
+        };
+        let own = scenario(2, [1.0, 2.0, 0.9], 0.9);
+        assert!(same_places(&own, &own) && same_places(&own, &scenario(2, [1.0, 2.0, 1.2], 1.2)));
+        assert!(!same_places(&own, &scenario(2, [1.5, 2.0, 0.9], 0.9)));
+        assert!(!same_places(&own, &scenario(3, [1.0, 2.0, 0.9], 0.9)));
     }
 }

@@ -135,3 +135,26 @@ fn free_poses_show_every_branch() {
     }
     assert_ne!(scenario.free_pose(0, 3).unwrap(), scenario.free_pose(0, 4).unwrap());
 }
+
+/// Watches go through the branches alternately, and their camera pans. A frame looks like its own state, and like others
+/// only where the actor or its place is hidden.
+#[test]
+fn watches_pan_and_know_what_looks_alike() {
+    let scenario = shipped("approaching-intersection");
+    let (mut alone, mut together) = (0, 0);
+    for number in 0..6 {
+        let drive = scenario.watch(number, 2, 5).unwrap();
+        assert_eq!(drive, scenario.watch(number, 2, 5).unwrap());
+        assert_eq!(drive.branch() as u64, number % 2);
+        let first = scenario.free_image(&drive, 0).0;
+        let turned = (1..drive.frame_count()).map(|frame| apart(&first, &scenario.free_image(&drive, frame).0).1);
+        assert!(turned.fold(0.0, f64::max) > 0.1, "watch {number} does not pan");
+        for frame in [0, drive.frame_count() - 1] {
+            let own = scenario.info().state(drive.branch(), drive.timestamp_of(frame)).unwrap();
+            let alike = scenario.alike(&drive, frame);
+            assert!(alike.contains(&own), "watch {number}, frame {frame}: {alike:?}");
+            if alike.len() == 1 { alone += 1 } else { together += 1 }
+        }
+    }
+    assert!(alone > 0 && together > 0, "{alone} frames show their state, {together} do not");
+}

@@ -117,16 +117,25 @@ fn exact_posteriors(info: &ScenarioInfo, frames: &[(usize, &[usize])]) -> Vec<(f
 #[cfg(test)]
 mod tests {
     use super::*;
+    use carff_dataset::StateInfo;
 
     /// Two branches of three time steps: a hazard that was in sight stays certain when it is hidden, and a look alone
     /// does not.
     #[test]
     fn exact_memory_keeps_what_was_seen() {
         let info = ScenarioInfo {
+            name: "small".into(),
+            bounds: [[-1.0; 3], [1.0; 3]],
             branches: vec!["hazard".into(), "clear".into()],
             timestamps: 3,
+            step_s: None,
+            bev_view: None,
+            states: (0..6).map(|s| StateInfo { branch: s / 3, timestamp: s % 3, boxes: Vec::new() }).collect(),
+            candidates: Vec::new(),
+            static_boxes: Vec::new(),
             hazard_branches: vec![0],
-            ..ScenarioInfo::default()
+            hazard_action: "halt".into(),
+            clear_action: "advance".into(),
         };
         let frames: [(usize, &[usize]); 4] = [(0, &[0, 3]), (0, &[0]), (1, &[1, 4]), (2, &[2, 5])];
         let found = exact_posteriors(&info, &frames);
