@@ -33,6 +33,7 @@ fn frame() -> FrameMeta {
         intrinsics: Intrinsics { fl_x_px: 100.0, fl_y_px: 100.0, cx_px: 64.0, cy_px: 48.0 },
         world_from_camera: [0.0; 16],
         dataset_view: DatasetView::UNKNOWN,
+        take_start: 0,
     }
 }
 

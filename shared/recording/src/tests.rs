@@ -42,11 +42,12 @@ fn messages(frame_id: u64) -> Vec<(TopicId, OwnedMessage)> {
         intrinsics: Intrinsics { fl_x_px: 3.3, fl_y_px: 3.4, cx_px: 2.0, cy_px: 1.0 },
         world_from_camera: [1.0, 0.0, 0.0, 0.1, 0.0, 1.0, 0.0, 0.2, 0.0, 0.0, 1.0, 0.3, 0.0, 0.0, 0.0, 1.0],
         dataset_view: DatasetView::UNKNOWN,
+        take_start: 0,
     };
     let pixels: Vec<u8> = (0..24).map(|i| (i * 7 + frame_id * 3) as u8).collect();
     let mut gaussian = Gaussian::standard();
     gaussian.mean[0] = 0.1 * frame_id as f32;
-    let posterior = Posterior { header: header(frame_id), gaussian, stage_latency_ns: 3 };
+    let posterior = Posterior { header: header(frame_id), gaussian, take_start: 0, stage_latency_ns: 3 };
     let mut belief = Belief::empty(header(frame_id).at_step(1), 1);
     (belief.state_count, belief.place_count, belief.component_count, belief.sample_count) = (2, 1, 1, 1);
     belief.state_probability[..2].copy_from_slice(&[0.3, 0.6]);

@@ -91,9 +91,16 @@ fn heartbeats_tell_state_and_counts() {
 
     for frame_id in 0..3 {
         let header = Header::of_frame(frame_id, 1, 1);
-        posteriors.send(Posterior { header, gaussian: Gaussian::standard(), stage_latency_ns: 0 }).unwrap();
+        posteriors
+            .send(Posterior { header, gaussian: Gaussian::standard(), take_start: 0, stage_latency_ns: 0 })
+            .unwrap();
     }
-    let mut bad = Posterior { header: Header::of_frame(3, 1, 1), gaussian: Gaussian::standard(), stage_latency_ns: 0 };
+    let mut bad = Posterior {
+        header: Header::of_frame(3, 1, 1),
+        gaussian: Gaussian::standard(),
+        take_start: 0,
+        stage_latency_ns: 0,
+    };
     bad.gaussian.log_variance[0] = f32::NAN;
     posteriors.send_unchecked(bad).unwrap();
     assert!(stage.wait(&[&input]).unwrap());

@@ -84,7 +84,8 @@ fn belief(next: &mut impl FnMut() -> f32) -> Belief {
 fn messages_survive_their_forms() {
     let mut next = numbers();
     for _ in 0..200 {
-        let posterior = Posterior { header: header(), gaussian: gaussian(&mut next), stage_latency_ns: 7 };
+        let posterior =
+            Posterior { header: header(), gaussian: gaussian(&mut next), take_start: 0, stage_latency_ns: 7 };
         assert_eq!(there_and_back(&posterior), posterior);
 
         let belief = belief(&mut next);
@@ -107,6 +108,7 @@ fn messages_survive_their_forms() {
             intrinsics: Intrinsics { fl_x_px: 100.1, fl_y_px: 1.0 / 3.0, cx_px: 64.0, cy_px: f64::MIN_POSITIVE },
             world_from_camera: std::array::from_fn(|_| f64::from(next()) / 3.0),
             dataset_view: DatasetView { known: 1, view: 3, observability: 2, ..DatasetView::UNKNOWN },
+            take_start: 0,
         };
         assert_eq!(there_and_back(&frame), frame);
         let nowhere = FrameMeta { dataset_view: DatasetView::UNKNOWN, ..frame };
@@ -156,7 +158,7 @@ fn what_is_no_message_is_refused() {
     form.hazard_probability = 2.0;
     assert!(Belief::try_from(&form).unwrap_err().to_string().contains("hazard_probability"));
 
-    let posterior = Posterior { header: header(), gaussian: Gaussian::standard(), stage_latency_ns: 0 };
+    let posterior = Posterior { header: header(), gaussian: Gaussian::standard(), take_start: 0, stage_latency_ns: 0 };
     let mut form = serde_json::to_value(posterior).unwrap();
     form["gaussian"]["mean"].as_array_mut().unwrap().pop();
     assert!(serde_json::from_value::<Posterior>(form).unwrap_err().to_string().contains("array of length 8"));

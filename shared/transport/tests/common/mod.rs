@@ -32,7 +32,7 @@ pub fn in_seconds(seconds: u64) -> u64 {
 pub fn posterior(frame_id: u64) -> Posterior {
     let mut gaussian = Gaussian::standard();
     gaussian.mean[0] = frame_id as f32;
-    Posterior { header: Header::of_frame(frame_id, 1, 2), gaussian, stage_latency_ns: 3 }
+    Posterior { header: Header::of_frame(frame_id, 1, 2), gaussian, take_start: 0, stage_latency_ns: 3 }
 }
 
 pub fn frame(frame_id: u64, width_px: u32, height_px: u32) -> FrameMeta {
@@ -43,6 +43,7 @@ pub fn frame(frame_id: u64, width_px: u32, height_px: u32) -> FrameMeta {
         intrinsics: Intrinsics { fl_x_px: 1.0, fl_y_px: 1.0, cx_px: 0.0, cy_px: 0.0 },
         world_from_camera: [0.0; 16],
         dataset_view: DatasetView::UNKNOWN,
+        take_start: 0,
     }
 }
 
