@@ -10,7 +10,7 @@ fn forecast() -> Forecast {
     let mut forecast = Forecast::empty(header().at_step(1), ForecastSource::Observed, 2);
     forecast.component_count = 2;
     forecast.sample_count = 10;
-    forecast.weights = [0.25, 0.75, 0.0, 0.0];
+    forecast.weights[..2].copy_from_slice(&[0.25, 0.75]);
     forecast
 }
 
@@ -20,7 +20,7 @@ fn belief() -> Belief {
     belief.place_count = 3;
     belief.component_count = 2;
     belief.sample_count = 10;
-    belief.component_weights = [0.25, 0.75, 0.0, 0.0];
+    belief.component_weights[..2].copy_from_slice(&[0.25, 0.75]);
     belief.state_probability[4] = 0.9;
     belief
 }
