@@ -47,7 +47,7 @@ impl MemorySettings {
 /// use carff_decision::{Memory, Mixture, MemorySettings};
 /// use carff_messages::Gaussian;
 /// let at = |x: f32| Gaussian { mean: [x; 8], log_variance: [-4.0; 8] };
-/// // Two states that stay as they are.
+/// // Two states that stay unchanged.
 /// let stays = |state: &Gaussian| Mixture { weights: vec![1.0], components: vec![*state] };
 /// let settings = MemorySettings { repeated_share: 0.1, distrust: 0.001 };
 /// let mut memory = Memory::new(vec![at(-1.0), at(1.0)], stays, settings);

@@ -141,7 +141,7 @@ fn free_poses_show_every_branch() {
 #[test]
 fn watches_pan_and_know_what_looks_alike() {
     let scenario = shipped("approaching-intersection");
-    let (mut alone, mut together) = (0, 0);
+    let (mut certain, mut together) = (0, 0);
     for number in 0..6 {
         let drive = scenario.watch(number, 2, 5).unwrap();
         assert_eq!(drive, scenario.watch(number, 2, 5).unwrap());
@@ -153,8 +153,8 @@ fn watches_pan_and_know_what_looks_alike() {
             let own = scenario.info().state(drive.branch(), drive.timestamp_of(frame)).unwrap();
             let alike = scenario.alike(&drive, frame);
             assert!(alike.contains(&own), "watch {number}, frame {frame}: {alike:?}");
-            if alike.len() == 1 { alone += 1 } else { together += 1 }
+            if alike.len() == 1 { certain += 1 } else { together += 1 }
         }
     }
-    assert!(alone > 0 && together > 0, "{alone} frames show their state, {together} do not");
+    assert!(certain > 0 && together > 0, "{certain} frames show their state, {together} do not");
 }
