@@ -78,6 +78,9 @@ pub struct BoundArgs {
     /// Probability with which the bound holds, 0 to 1.
     #[arg(long, default_value_t = 0.95, value_parser = share)]
     confidence: f64,
+    /// Bound the threshold with the memory, over all frames before the last time step.
+    #[arg(long)]
+    memory: bool,
     /// Threads that render.
     #[arg(long, default_value_t = 2)]
     threads: usize,
@@ -147,12 +150,13 @@ fn bound(args: &BoundArgs) -> anyhow::Result<()> {
         drives: args.drives,
         level: args.level,
         confidence: args.confidence,
+        remembers: args.memory,
         threads: args.threads,
     };
     let chosen = bound_threshold(input, &|p| display.show(p)).context("cannot bound the threshold")?;
     display.finish();
     let of = |sorted: &[f64], share: f64| percentile_of_sorted(sorted, share).unwrap_or(f64::NAN);
-    println!("threshold {:.4}", chosen.planning.hazard_threshold);
+    println!("threshold {:.4}", chosen.planning.threshold(args.memory));
     for (kind, sorted) in [("hazard", &chosen.hazard), ("clear", &chosen.clear)] {
         let [p1, p5, p50, p95, p99] = [0.01, 0.05, 0.5, 0.95, 0.99].map(|share| of(sorted, share));
         println!(

@@ -3,7 +3,7 @@
 use crate::supervision::monitor::{FrameRecord, Records};
 use carff::provenance::Origin;
 use carff_checkpoint::CheckpointPlanning;
-use carff_config::{CameraSource, GraphConfig, MemoryKind};
+use carff_config::{CameraSource, GraphConfig};
 use carff_dataset::{ScenarioInfo, drives::DriveKind};
 use carff_decision::TakeFrame;
 use carff_evaluation::run::{DecidedFrame, JudgedRun, RunPlanning, RunSettings, decisive_frames};
@@ -88,7 +88,7 @@ fn settings(outcome: &RunOutcome) -> anyhow::Result<RunSettings> {
         (CameraSource::FreeDrives, Some(path)) => Some(Scenario::load(&path)?),
         _ => None,
     };
-    let threshold = graph.controller.threshold.unwrap_or(known.hazard_threshold);
+    let threshold = graph.controller.threshold.unwrap_or(known.threshold(graph.remembers()));
     Ok(RunSettings {
         run: outcome.run.clone(),
         dataset: outcome.dataset.clone(),
@@ -101,7 +101,7 @@ fn settings(outcome: &RunOutcome) -> anyhow::Result<RunSettings> {
         sampling: graph.run.sampling,
         horizon: graph.run.horizon,
         compares: graph.checks.compare,
-        remembers: graph.step_length(None).filter(|_| graph.run.memory == MemoryKind::Filter),
+        remembers: graph.step_length(None).filter(|_| graph.remembers()),
         noise: graph.camera.noise,
         split_seed: graph.camera.split_seed.unwrap_or(known.split_seed),
         seed: graph.run.seed,

@@ -36,7 +36,7 @@ impl Terms {
     pub(super) fn new(graph: &GraphConfig, checkpoint: &Path, contract: &Contract) -> anyhow::Result<Self> {
         let controller = &graph.controller;
         Ok(Self {
-            policy: load_policy(controller.rule, controller.threshold, checkpoint)?,
+            policy: load_policy(controller.rule, controller.threshold, checkpoint, graph.remembers())?,
             deadline_ns: controller.deadline_ms * 1_000_000,
             period_ns: (1e9 / controller.rate_hz) as u64,
             slack_ns: contract.slack_ms * 1_000_000,

@@ -82,6 +82,7 @@ pub fn run(stage: &mut StageContext, source: &mut dyn Recorded) -> anyhow::Resul
                     break;
                 }
                 source.rewind()?;
+                output.cut();
                 schedule.recorded_ns = None;
                 continue;
             }

@@ -65,7 +65,7 @@ fn run(stage: &mut StageContext) -> anyhow::Result<()> {
 
 fn settings(stage: &StageContext) -> anyhow::Result<Settings> {
     let config = &stage.graph.controller;
-    let policy = load_policy(config.rule, config.threshold, &stage.checkpoint)
+    let policy = load_policy(config.rule, config.threshold, &stage.checkpoint, stage.graph.remembers())
         .context("no threshold for the calibrated rule: set `controller.threshold`, or use a checkpoint")?;
     Ok(Settings {
         policy,

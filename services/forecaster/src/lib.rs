@@ -1,7 +1,7 @@
 //! The forecaster stage's arithmetic: from a posterior, observed or fed back, to a mixture and its samples.
 
 use carff_checkpoint::{CheckpointPlanning, Manifest};
-use carff_config::{GraphConfig, MemoryKind};
+use carff_config::GraphConfig;
 use carff_decision::{Memory, Mixture, Sampling, TakeMemory, path_probability, set_mixture_and_draws};
 use carff_inference::MixtureNet;
 use carff_messages::{Belief, Forecast, ForecastSource, Gaussian, Header, Posterior};
@@ -27,13 +27,10 @@ impl Forecaster {
         let manifest = Manifest::load(checkpoint)?;
         let net = MixtureNet::load(checkpoint, &manifest)?;
         let run = &graph.run;
-        let learned = match run.memory {
-            MemoryKind::Filter => CheckpointPlanning::load(checkpoint)?.memory,
-            MemoryKind::None => None,
-        };
-        let memory = learned.zip(graph.step_length(manifest.step_s)).map(|(settings, step)| {
+        let learned = if graph.remembers() { CheckpointPlanning::load(checkpoint)?.memory } else { None };
+        let memory = learned.zip(graph.step_length(manifest.step_s)).map(|(learned, step)| {
             let forecast = |state: &Gaussian| net.forecast(state);
-            TakeMemory::new(Memory::new(manifest.states.clone(), forecast, settings), step)
+            TakeMemory::new(Memory::new(manifest.states.clone(), forecast, learned.settings), step)
         });
         Ok(Self {
             net,

@@ -2,7 +2,6 @@
 
 use crate::Images;
 use carff_checkpoint::FieldProbe;
-use carff_config::MemoryKind;
 use carff_decision::ImageEvidence;
 use carff_messages::{FrameMeta, Header, Unknowns};
 use carff_runtime::StageContext;
@@ -27,8 +26,7 @@ impl Frames {
         if !stage.graph.checks.compare {
             return Ok(None);
         }
-        let remembers = stage.graph.run.memory == MemoryKind::Filter;
-        let Some(images) = Images::load(&stage.checkpoint, probe, remembers)? else { return Ok(None) };
+        let Some(images) = Images::load(&stage.checkpoint, probe, stage.graph.remembers())? else { return Ok(None) };
         let (input, output) = (stage.input(&topics::FRAME)?, stage.output(&topics::UNKNOWN)?);
         Ok(Some(Self { images, input, output }))
     }

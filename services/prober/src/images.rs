@@ -35,7 +35,7 @@ impl Images {
             comparer: Comparer::default(),
             states: probe.states().iter().map(|state| state.mean).collect(),
             compared: VecDeque::with_capacity(REMEMBERED),
-            memory: learned.map(|settings| (ImageMemory::new(hazards, settings), 0)),
+            memory: learned.map(|learned| (ImageMemory::new(hazards, learned.settings), 0)),
         }))
     }
 

@@ -13,7 +13,7 @@ pub mod shapes;
 mod tensors;
 
 pub use field::{load_field, save_field};
-pub use planning::{Bound, CheckpointPlanning, CheckpointPlanningError, load_policy};
+pub use planning::{Bound, CheckpointPlanning, CheckpointPlanningError, PlanningMemory, load_policy};
 pub use probe::{FieldProbe, PreparedField, load_field_probe, load_probing};
 pub use tensors::{Row, read_tensors};
 

@@ -23,9 +23,23 @@ pub struct CheckpointPlanning {
     /// Bound that the threshold keeps, if it was chosen by one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub bound: Option<Bound>,
-    /// Learned numbers of the forecaster's memory, if they were learned.
+    /// The belief's memory, if it was learned.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub memory: Option<MemorySettings>,
+    pub memory: Option<PlanningMemory>,
+}
+
+/// Memory of the belief, with the threshold of the calibrated rule for it.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PlanningMemory {
+    /// Learned numbers.
+    pub settings: MemorySettings,
+    /// Hazard probability from which on the calibrated rule halts, 0 to 1; the threshold without memory if absent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub hazard_threshold: Option<f64>,
+    /// Bound that the threshold keeps over all frames of a drive.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub bound: Option<Bound>,
 }
 
 /// Bound on the calibrated rule: at most a share `level` of the drives with a hazard are answered with `advance`.
@@ -42,12 +56,17 @@ pub struct Bound {
     pub advances: usize,
 }
 
-/// Returns the policy of a rule: with `threshold` if given, else with the checkpoint's threshold. Only the calibrated
-/// rule reads the threshold.
-pub fn load_policy(rule: Rule, threshold: Option<f64>, checkpoint: &Path) -> Result<Policy, CheckpointPlanningError> {
+/// Returns the policy of a rule: with `threshold` if given, else with the checkpoint's threshold, with or without a
+/// memory. Only the calibrated rule reads the threshold.
+pub fn load_policy(
+    rule: Rule,
+    threshold: Option<f64>,
+    checkpoint: &Path,
+    remembers: bool,
+) -> Result<Policy, CheckpointPlanningError> {
     let threshold = match (rule, threshold) {
         (_, Some(threshold)) => threshold,
-        (Rule::Calibrated, None) => CheckpointPlanning::load(checkpoint)?.hazard_threshold,
+        (Rule::Calibrated, None) => CheckpointPlanning::load(checkpoint)?.threshold(remembers),
         (_, None) => 1.0,
     };
     Ok(Policy { rule, threshold })
@@ -80,6 +99,12 @@ impl CheckpointPlanning {
         Self { format_version: FORMAT_VERSION, split_seed, hazard_threshold, bound: None, memory: None }
     }
 
+    /// Returns the threshold of the calibrated rule, with or without a memory.
+    pub fn threshold(&self, remembers: bool) -> f64 {
+        let of_memory = self.memory.filter(|_| remembers).and_then(|memory| memory.hazard_threshold);
+        of_memory.unwrap_or(self.hazard_threshold)
+    }
+
     /// Reads and checks the file of a checkpoint folder.
     pub fn load(checkpoint: &Path) -> Result<Self, CheckpointPlanningError> {
         let path = checkpoint.join(FILE);
@@ -91,8 +116,10 @@ impl CheckpointPlanning {
             let found = planning.format_version;
             return Err(format(format!("`format_version` is {found}, this program reads {FORMAT_VERSION}")));
         }
-        if !(0.0..=1.0).contains(&planning.hazard_threshold) {
-            return Err(format(format!("`hazard_threshold` is {}; allowed: 0 to 1", planning.hazard_threshold)));
+        for threshold in [planning.hazard_threshold, planning.threshold(true)] {
+            if !(0.0..=1.0).contains(&threshold) {
+                return Err(format(format!("`hazard_threshold` is {threshold}; allowed: 0 to 1")));
+            }
         }
         Ok(planning)
     }

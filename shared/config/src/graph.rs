@@ -327,6 +327,11 @@ pub enum MemoryKind {
 }
 
 impl GraphConfig {
+    /// Reports whether the belief has a memory, if the checkpoint has learned one.
+    pub fn remembers(&self) -> bool {
+        self.run.memory == MemoryKind::Filter
+    }
+
     /// Returns the length of a time step; `step_s` is the scenario's, seconds. `None` for a real camera of a scenario
     /// without one.
     pub fn step_length(&self, step_s: Option<f64>) -> Option<StepLength> {

@@ -57,8 +57,8 @@ pub use trials::{
     birds_eye::{BirdsEye, birds_eye},
     looks::{ByTrialKind, TrialFigures},
     planning::{
-        ByKind, BySamples, Count, KnownStates, Perception, Planner, PlanningTable, SAMPLE_COUNTS, Trial, TrialOutcome,
-        trial_frame,
+        ByKind, BySamples, Count, KnownStates, Perception, Planner, PlanningTable, SAMPLE_COUNTS, TakeMemories, Trial,
+        TrialOutcome, trial_frame,
     },
     samples::{Input, SampleAccuracy, SampleTrials},
     watches::{Watch, WatchPlan, Watched, watches},

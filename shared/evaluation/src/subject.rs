@@ -189,7 +189,7 @@ impl Subject {
             known: Known::load(checkpoint)?,
             posteriors: Vec::with_capacity(posed.images.len()),
             threshold: planning.map(|p| p.hazard_threshold),
-            memory: planning.and_then(|p| p.memory),
+            memory: planning.and_then(|p| p.memory).map(|memory| memory.settings),
             manifest,
             encoder,
             posed,

@@ -28,6 +28,8 @@ pub struct FrameOutput {
     /// The camera's pose on the vehicle, and the vehicle's poses.
     ego: Option<(Pose, Receiver<EgoPose>)>,
     frame_id: u64,
+    /// Number of the first frame since the last cut.
+    take_start: u64,
     limit: u64,
 }
 
@@ -57,6 +59,7 @@ impl FrameOutput {
             world_from_camera: camera.world_from_camera.or(camera.vehicle_from_camera).unwrap_or(IDENTITY),
             ego,
             frame_id: stage.args.first_frame,
+            take_start: stage.args.first_frame,
             limit: stage.args.frames.unwrap_or(u64::MAX),
         })
     }
@@ -69,6 +72,11 @@ impl FrameOutput {
     /// Returns the number of the next frame.
     pub fn next_frame(&self) -> u64 {
         self.frame_id
+    }
+
+    /// Starts a new take: the next frame does not follow the last one, for example because a recording starts again.
+    pub fn cut(&mut self) {
+        self.take_start = self.frame_id;
     }
 
     /// Checks that an image can become a frame: its size is that of the calibration, or small enough to be published.
@@ -110,6 +118,7 @@ impl FrameOutput {
         }
         let mut meta = FrameMeta::of_camera(&self.camera(raw), DatasetView::UNKNOWN);
         meta.header = Header::of_frame(self.frame_id, capture_time_ns, stage.seed());
+        meta.take_start = self.take_start;
         let _span = frame_span(&meta.header);
         let bytes = meta.image_bytes();
         if self.publisher.as_ref().is_some_and(|(max_bytes, _)| *max_bytes < bytes) {

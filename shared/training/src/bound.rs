@@ -5,18 +5,21 @@
 
 use crate::TrainingError;
 use carff_base::random::tag;
-use carff_checkpoint::{Bound, CheckpointPlanning};
+use carff_checkpoint::{Bound, CheckpointPlanning, PlanningMemory};
 use carff_dataset::{drives::DriveKind, sensor::SensorNoise};
-use carff_decision::{CalibrationTrial, Sampling, bounded_threshold, choose_threshold};
-use carff_evaluation::{KnownStates, Models, Perception, Planner, Progress, Trial};
+use carff_decision::{CalibrationTrial, Evidence, MemorySettings, Sampling, bounded_threshold, choose_threshold};
+use carff_evaluation::{KnownStates, Models, Perception, Planner, Progress, TakeMemories, Trial};
 use carff_scenes::Scenario;
 use carff_unknown::Known;
+use rayon::prelude::*;
 use std::path::Path;
 
 /// Part of the seed of these drives, so that they share no draws with training, limits or evaluation.
 const BOUND: u64 = tag("bounded");
 /// Frames of a drive between two time steps.
 const FRAMES_PER_TIMESTAMP: usize = 6;
+/// Largest number of frames of a drive; it names random draws.
+const MOST_FRAMES: usize = 1000;
 /// Samples and steps of a decision, as in the graph.
 const SAMPLES: usize = 10;
 const HORIZON: u32 = 2;
@@ -34,6 +37,9 @@ pub struct BoundInput<'a> {
     pub level: f64,
     /// Probability with which the bound holds, 0 to 1.
     pub confidence: f64,
+    /// True for the threshold with the memory: a drive with a hazard counts by its most doubtful frame before the last
+    /// time step.
+    pub remembers: bool,
     /// Threads that render.
     pub threads: usize,
 }
@@ -43,7 +49,7 @@ pub struct BoundInput<'a> {
 pub struct ChosenBound {
     /// The contents of `planning.json`.
     pub planning: CheckpointPlanning,
-    /// Probabilities of the drives with a hazard, ascending.
+    /// Probabilities of the drives with a hazard, of each its lowest one, ascending.
     pub hazard: Vec<f64>,
     /// Probabilities of the drives without one, ascending.
     pub clear: Vec<f64>,
@@ -64,13 +70,21 @@ pub fn bound_threshold(input: BoundInput, on_progress: &dyn Fn(&Progress)) -> Re
     let models = Models::load(input.checkpoint)?;
     let known = Known::load(input.checkpoint).map_err(|e| unfit(e.to_string()))?;
     let seed = models.manifest.seed ^ BOUND;
-    let trials = drives(input, &models, known.as_ref(), seed, on_progress)?;
+    let old = CheckpointPlanning::load(input.checkpoint).map_err(|e| unfit(e.to_string()))?;
+    let settings = match old.memory.filter(|_| input.remembers) {
+        None if input.remembers => {
+            return Err(unfit("no memory was learned: run `carff checkpoint memory` first".into()));
+        }
+        memory => memory.map(|memory| memory.settings),
+    };
+    let drives = drives(input, &models, known.as_ref(), settings, seed, on_progress)?;
     let sampling = Sampling::Stratified;
     let planner = Planner { net: &models.mixture, probe: &models.probe, sampling, horizon: HORIZON };
     let (mut hazard, mut clear) = (Vec::new(), Vec::new());
-    for (trial, evidence) in trials.iter().zip(planner.evidence(&trials, SAMPLES)) {
-        let of_kind = if trial.kind == DriveKind::Hazard { &mut hazard } else { &mut clear };
-        of_kind.push(evidence.hazard_or_unknown_probability());
+    for (kind, trials) in drives {
+        let evidence = planner.evidence(&trials, SAMPLES);
+        let lowest = evidence.iter().map(Evidence::hazard_or_unknown_probability).fold(1.0, f64::min);
+        if kind == DriveKind::Hazard { hazard.push(lowest) } else { clear.push(lowest) }
     }
     hazard.sort_by(f64::total_cmp);
     clear.sort_by(f64::total_cmp);
@@ -79,9 +93,14 @@ pub fn bound_threshold(input: BoundInput, on_progress: &dyn Fn(&Progress)) -> Re
     let drives: Vec<_> = hazard.iter().map(trial(true)).chain(clear.iter().map(trial(false))).collect();
     let hazard_threshold = choose_threshold(&drives).map_or(largest, |t| t.min(largest));
     let advances = hazard.iter().filter(|p| **p < hazard_threshold).count();
-    let old = CheckpointPlanning::load(input.checkpoint).map_err(|e| unfit(e.to_string()))?;
-    let bound = Bound { level, confidence, drives: hazard.len(), advances };
-    let planning = CheckpointPlanning { hazard_threshold, bound: Some(bound), ..old };
+    let bound = Some(Bound { level, confidence, drives: hazard.len(), advances });
+    let planning = match settings {
+        Some(settings) => {
+            let hazard_threshold = Some(hazard_threshold);
+            CheckpointPlanning { memory: Some(PlanningMemory { settings, hazard_threshold, bound }), ..old }
+        }
+        None => CheckpointPlanning { hazard_threshold, bound, ..old },
+    };
     planning.save(input.checkpoint).map_err(|e| unfit(e.to_string()))?;
     Ok(ChosenBound { planning, hazard, clear })
 }
@@ -93,28 +112,51 @@ fn too_few(input: &BoundInput, hazards: usize) -> TrainingError {
     ))
 }
 
-/// The decisive image of each drive as a trial.
+/// The trials of each drive: its decisive image, or with a memory all images before the last time step of a drive with a
+/// hazard.
 fn drives(
     input: BoundInput,
     models: &Models,
     known: Option<&Known>,
+    memory: Option<MemorySettings>,
     seed: u64,
     on_progress: &dyn Fn(&Progress),
-) -> Result<Vec<Trial>, TrainingError> {
-    let probe = &models.probe;
+) -> Result<Vec<(DriveKind, Vec<Trial>)>, TrainingError> {
+    let (probe, net) = (&models.probe, &models.mixture);
     let perception = Perception {
         encoder: &models.encoder,
         noise: SensorNoise::default(),
         seed,
         known: known.map(|known| KnownStates::new(known, probe, input.threads)),
     };
-    let mut trials = Vec::new();
+    let memories = memory.map(|settings| TakeMemories::new(net, probe, settings, FRAMES_PER_TIMESTAMP as u64));
+    let mut all = Vec::with_capacity(input.drives);
     for number in 0..input.drives {
         let unfit = |e: carff_scenes::ScenarioError| TrainingError::Unfit(e.to_string());
         let drive = input.scenario.free_drive(number as u64, FRAMES_PER_TIMESTAMP, seed).map_err(unfit)?;
-        let frame = input.scenario.free_frame(&drive, drive.decisive_frame()).map_err(unfit)?;
-        trials.extend(perception.trial((&frame.camera, &frame.image), drive.kind(), number as u64));
+        let decisive = drive.decisive_frame();
+        let (first, last) = match (&memories, drive.kind()) {
+            (None, _) => (decisive, decisive),
+            (Some(_), DriveKind::Clear) => (0, decisive),
+            (Some(_), DriveKind::Hazard) => (0, drive.frame_count() - FRAMES_PER_TIMESTAMP - 1),
+        };
+        let render = |frame: usize| input.scenario.free_image(&drive, frame);
+        let images: Vec<_> = (first..=last).into_par_iter().map(render).collect();
+        let mut memories = memories.clone();
+        let mut trials = Vec::with_capacity(images.len());
+        for (frame, (camera, image)) in (first..=last).zip(&images) {
+            let name = if memories.is_some() { number * MOST_FRAMES + frame } else { number } as u64;
+            let Some(trial) = perception.trial((camera, image), drive.kind(), name) else { continue };
+            trials.push(match &mut memories {
+                Some(memories) => memories.remember(net, trial, frame as u64),
+                None => trial,
+            });
+        }
+        if drive.kind() == DriveKind::Clear {
+            trials.drain(..trials.len().saturating_sub(1));
+        }
+        all.push((drive.kind(), trials));
         on_progress(&Progress { phase: "drives", done: number + 1, total: input.drives, line: String::new() });
     }
-    Ok(trials)
+    Ok(all)
 }

@@ -143,7 +143,14 @@ fn calibration_trials(context: Context, models: &Models) -> Result<Vec<Trial>, T
             let image = augmentation.inputs(posed, &[index], repeat, augmentation_seed);
             let (kind, frame, seed) = (input.kind, trial_frame(index, repeat), config.seed);
             let posteriors = models.encoder.encode(&image).into_iter();
-            trials.extend(posteriors.map(|posterior| Trial { posterior, image: None, kind, frame, seed }));
+            trials.extend(posteriors.map(|posterior| Trial {
+                posterior,
+                image: None,
+                remembered: None,
+                kind,
+                frame,
+                seed,
+            }));
         }
     }
     Ok(trials)

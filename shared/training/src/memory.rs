@@ -2,7 +2,7 @@
 
 use crate::TrainingError;
 use carff_base::random::tag;
-use carff_checkpoint::CheckpointPlanning;
+use carff_checkpoint::{CheckpointPlanning, PlanningMemory};
 use carff_dataset::sensor::SensorNoise;
 use carff_decision::{Memory, MemorySettings};
 use carff_evaluation::{Models, Perception, Progress, Watch, WatchPlan, watches};
@@ -66,7 +66,8 @@ pub fn learn_memory(input: MemoryInput, on_progress: &dyn Fn(&Progress)) -> Resu
     let best = scored.into_iter().min_by(|a, b| a.1.total_cmp(&b.1));
     let (settings, log_loss) = best.ok_or_else(|| unfit("there are no drives".into()))?;
     let old = CheckpointPlanning::load(input.checkpoint).map_err(|e| unfit(e.to_string()))?;
-    let planning = CheckpointPlanning { memory: Some(settings), ..old };
+    let planning =
+        CheckpointPlanning { memory: Some(PlanningMemory { settings, hazard_threshold: None, bound: None }), ..old };
     planning.save(input.checkpoint).map_err(|e| unfit(e.to_string()))?;
     let alone = memory(settings);
     let without_memory = drives.par_iter().map(|drive| log_loss_of(&alone, hazards, drive, true)).sum::<f64>();

@@ -242,7 +242,7 @@ impl JudgedRun {
         let learned = CheckpointPlanning::load(&settings.checkpoint)?.memory;
         let remembered = learned.zip(settings.remembers).map(|(learned, step)| {
             let states = models.probe.states().to_vec();
-            let memory = Memory::new(states, |state| forecaster.forecast(state), learned);
+            let memory = Memory::new(states, |state| forecaster.forecast(state), learned.settings);
             let mut memory = TakeMemory::new(memory, step);
             let see = |(frame, posterior): &(TakeFrame, Gaussian)| {
                 let forecast = forecaster.forecast(posterior);

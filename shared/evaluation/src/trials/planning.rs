@@ -9,7 +9,10 @@ use carff_dataset::{
     drives::{DriveKind, EligibleInput},
     sensor::{SensorNoise, apply_noise_into},
 };
-use carff_decision::{Evidence, ImageEvidence, Mixture, Plan, Policy, Sampling, look_ahead};
+use carff_decision::{
+    Evidence, ImageEvidence, ImageMemory, Memory, MemorySettings, Mixture, Plan, Policy, Sampling, StepLength,
+    TakeFrame, TakeMemory, look_ahead,
+};
 use carff_field::Field;
 use carff_messages::{Gaussian, LATENT_DIM, Rule};
 use carff_networks::{
@@ -35,6 +38,8 @@ pub struct Trial {
     pub posterior: Gaussian,
     /// Evidence of the image for the known states, where it was compared with them.
     pub image: Option<ImageEvidence>,
+    /// Forecast from all images of the take, where there is a memory.
+    pub remembered: Option<Mixture>,
     /// The correct action.
     pub kind: DriveKind,
     /// Frame number, which names the random draws of this trial.
@@ -258,7 +263,33 @@ impl Perception<'_> {
         let input = pictures_from_bytes(&Tensor::from_slice(&noisy.rgb).view(sides));
         let posterior = self.encoder.encode(&input).into_iter().next()?;
         let image = self.known.as_ref().and_then(|known| known.evidence(camera, &noisy));
-        Some((Trial { posterior, image, kind, frame, seed: self.seed }, noisy))
+        Some((Trial { posterior, image, remembered: None, kind, frame, seed: self.seed }, noisy))
+    }
+}
+
+/// The belief's memory and that of the comparisons, for the frames of a drive.
+#[derive(Clone, Debug)]
+pub struct TakeMemories {
+    forecasts: TakeMemory,
+    images: ImageMemory,
+}
+
+impl TakeMemories {
+    /// Memories with the learned numbers; a time step takes `frames_per_timestamp` frames.
+    pub fn new(net: &MixtureNet, probe: &FieldProbe, settings: MemorySettings, frames_per_timestamp: u64) -> Self {
+        let memory = Memory::new(probe.states().to_vec(), |state| net.forecast(state), settings);
+        Self {
+            forecasts: TakeMemory::new(memory, StepLength::Frames(frames_per_timestamp)),
+            images: ImageMemory::new(probe.layout().hazard_states().to_vec(), settings),
+        }
+    }
+
+    /// Adds the trial of the next frame of a drive, and returns it with its memory.
+    pub fn remember(&mut self, net: &MixtureNet, trial: Trial, frame_in_drive: u64) -> Trial {
+        let frame = TakeFrame { take_start: 0, frame: frame_in_drive, capture_time_ns: 0 };
+        let (remembered, _) = self.forecasts.see(frame, &net.forecast(&trial.posterior));
+        let image = trial.image.map(|image| self.images.see(image));
+        Trial { image, remembered: Some(remembered), ..trial }
     }
 }
 
@@ -293,6 +324,7 @@ impl Planner<'_> {
         let Self { sampling, horizon, .. } = *self;
         let of_trial = |probe: &mut FieldProbe, (trial, mixture): (&Trial, &Mixture)| {
             let plan = Plan { samples, sampling, horizon, seed: trial.seed, frame: trial.frame };
+            let mixture = trial.remembered.as_ref().unwrap_or(mixture);
             let forecast = |_: &Gaussian, state: Option<usize>| state.map_or(mixture, |s| &later[s]).clone();
             Evidence::of_steps(&look_ahead(forecast, probe, &trial.posterior, trial.image.as_ref(), plan))
         };
