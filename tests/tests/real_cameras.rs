@@ -50,7 +50,7 @@ fn another_process_is_the_camera() {
     assert_eq!(info["camera"]["source"], "external");
     assert_eq!(info["camera"]["trained"]["width_px"], 128);
     let frame = &info["topics"][0]["user_header"];
-    assert_eq!((&frame["type_name"], &frame["size_bytes"]), (&"carff.FrameMeta.v1".into(), &256.into()));
+    assert_eq!((&frame["type_name"], &frame["size_bytes"]), (&"carff.FrameMeta.v2".into(), &264.into()));
     assert_eq!(
         (&frame["fields"][4]["name"], &frame["fields"][4]["offset_bytes"]),
         (&"world_from_camera".into(), &96.into())

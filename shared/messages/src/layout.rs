@@ -258,11 +258,11 @@ mod tests {
             check(&layout);
         }
         let frame = FrameMeta::layout();
-        assert_eq!((frame.type_name.as_str(), frame.size_bytes), ("carff.FrameMeta.v1", 256));
+        assert_eq!((frame.type_name.as_str(), frame.size_bytes), ("carff.FrameMeta.v2", 264));
         let pose = &frame.fields[4];
         assert_eq!((pose.name, pose.offset_bytes, &pose.shape[..]), ("world_from_camera", 96, &[16][..]));
         assert_eq!((pose.kind.type_name.as_str(), pose.kind.size_bytes), ("f64", 8));
-        let samples = Forecast::layout().fields.remove(9);
+        let samples = Forecast::layout().fields.remove(10);
         assert_eq!((samples.name, &samples.shape[..]), ("samples", &[64, 8][..]));
     }
 }

@@ -7,7 +7,7 @@
 //! ```
 //! use carff_messages::{Gaussian, Header, Message, Posterior};
 //! let header = Header::of_frame(7, 1_000, 42);
-//! let mut posterior = Posterior { header, gaussian: Gaussian::standard(), stage_latency_ns: 0 };
+//! let mut posterior = Posterior { header, gaussian: Gaussian::standard(), take_start: 0, stage_latency_ns: 0 };
 //! assert!(posterior.validate().is_ok());
 //! posterior.gaussian.mean[3] = f32::NAN;
 //! assert!(posterior.validate().unwrap_err().to_string().contains("gaussian.mean"));

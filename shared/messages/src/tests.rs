@@ -50,7 +50,7 @@ fn one_wrong_field_is_enough() {
         |m| m.header.step = 0,
         |m| m.header.step = 3,
         |m| m.source = 9,
-        |m| m.component_count = 5,
+        |m| m.component_count = 9,
         |m| m.sample_count = 0,
         |m| m.weights[0] = 0.5,
         |m| m.components[1].log_variance[0] = f32::INFINITY,
@@ -186,5 +186,5 @@ fn layouts_are_fixed() {
         (80, 88, 112)
     );
     assert_eq!((offset_of!(Health, pid), offset_of!(Health, received), size_of::<Health>()), (64, 72, 144));
-    assert_eq!((offset_of!(Belief, resolved_state), offset_of!(Belief, resolved)), (14_296, 14_304));
+    assert_eq!((offset_of!(Belief, resolved_state), offset_of!(Belief, resolved)), (15_128, 15_136));
 }

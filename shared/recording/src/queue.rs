@@ -59,7 +59,7 @@ impl Item {
 /// let writer = RotatingWriter::create(&path, About::default(), Vec::new(), limits)?;
 /// let queue = RecordingQueue::start(writer, 64 << 20)?;
 /// let header = Header::of_frame(7, 1_000, 42);
-/// let posterior = Posterior { header, gaussian: Gaussian::standard(), stage_latency_ns: 0 };
+/// let posterior = Posterior { header, gaussian: Gaussian::standard(), take_start: 0, stage_latency_ns: 0 };
 /// assert!(queue.push(TopicId::POSTERIOR, OwnedMessage::new(Box::new(posterior), Vec::new())));
 /// assert_eq!(queue.finish()?.written, 1);
 /// # Ok::<(), Box<dyn std::error::Error>>(())

@@ -27,7 +27,7 @@ const CHUNK_BYTES: u64 = 1 << 20;
 /// # let path = folder.path().join("run.mcap");
 /// let mut writer = Writer::create(&path, &About { run: "crossing".into(), ..About::default() }, &[])?;
 /// let header = Header::of_frame(7, 1_000, 42);
-/// let posterior = Posterior { header, gaussian: Gaussian::standard(), stage_latency_ns: 0 };
+/// let posterior = Posterior { header, gaussian: Gaussian::standard(), take_start: 0, stage_latency_ns: 0 };
 /// writer.write(TopicId::POSTERIOR, AnyMessage::new(&posterior, &[]))?;
 /// writer.finish()?;
 ///

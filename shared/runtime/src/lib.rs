@@ -23,7 +23,8 @@
 //!         let gaussian = Gaussian::standard(); // computed from frame.image(), read in place
 //!         let header = frame.header;
 //!         let stage_latency_ns = stage.worked(&header, started_ns);
-//!         posteriors.send(Posterior { header, gaussian, stage_latency_ns })?;
+//!         let take_start = frame.take_start;
+//!         posteriors.send(Posterior { header, gaussian, take_start, stage_latency_ns })?;
 //!     }
 //!     Ok(())
 //! }

@@ -17,7 +17,7 @@
 //! let mut output = node.publisher(&topics::POSTERIOR)?;
 //!
 //! let header = Header::of_frame(7, monotonic_now_ns(), 42);
-//! output.send(Posterior { header, gaussian: Gaussian::standard(), stage_latency_ns: 0 })?;
+//! output.send(Posterior { header, gaussian: Gaussian::standard(), take_start: 0, stage_latency_ns: 0 })?;
 //!
 //! let waiter = Waiter::new(Stop::new()?);
 //! assert_eq!(waiter.wait_until(&[&input], monotonic_now_ns() + 1_000_000_000)?, Woken::Input);

@@ -126,7 +126,7 @@ impl<M: Readable> DynMessage for M {
 /// use carff_messages::forms::AnyMessage;
 /// use carff_messages::{Action, Gaussian, Header, Posterior};
 /// let header = Header::of_frame(7, 1_000, 42);
-/// let posterior = Posterior { header, gaussian: Gaussian::standard(), stage_latency_ns: 5 };
+/// let posterior = Posterior { header, gaussian: Gaussian::standard(), take_start: 0, stage_latency_ns: 5 };
 /// let message = AnyMessage::new(&posterior, &[]);
 /// assert_eq!(message.get::<Posterior>(), Some(&posterior));
 /// assert!(message.get::<Action>().is_none());
@@ -181,7 +181,7 @@ impl<'a> AnyMessage<'a> {
 /// use carff_messages::forms::OwnedMessage;
 /// use carff_messages::{Gaussian, Header, Posterior};
 /// let header = Header::of_frame(7, 1_000, 42);
-/// let posterior = Posterior { header, gaussian: Gaussian::standard(), stage_latency_ns: 0 };
+/// let posterior = Posterior { header, gaussian: Gaussian::standard(), take_start: 0, stage_latency_ns: 0 };
 /// let mut message = OwnedMessage::new(Box::new(posterior), Vec::new());
 /// message.get_mut::<Posterior>().expect("it is a posterior").stage_latency_ns = 9;
 /// assert_eq!(message.as_message().get::<Posterior>().map(|p| p.stage_latency_ns), Some(9));

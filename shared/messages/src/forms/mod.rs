@@ -9,7 +9,7 @@
 //! use carff_messages::forms::{Readable, read};
 //! use carff_messages::{Gaussian, Header, Posterior};
 //! let header = Header::of_frame(7, 1_000, 42);
-//! let posterior = Posterior { header, gaussian: Gaussian::standard(), stage_latency_ns: 5 };
+//! let posterior = Posterior { header, gaussian: Gaussian::standard(), take_start: 0, stage_latency_ns: 5 };
 //! let text = serde_json::to_string(&posterior.to_form())?;
 //! assert!(text.contains(r#""frame_id":7"#));
 //! assert_eq!(read::<Posterior>(text.as_bytes())?, posterior);
