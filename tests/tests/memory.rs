@@ -79,7 +79,7 @@ fn a_killed_forecaster_remembers_its_take() {
     let states = Manifest::load(&shipped_checkpoint()).unwrap().states;
     // One state in sight, then views between two states.
     let between = Gaussian {
-        mean: std::array::from_fn(|i| (states[0].mean[i] + states[3].mean[i]) / 2.0),
+        mean: std::array::from_fn(|i| f32::midpoint(states[0].mean[i], states[3].mean[i])),
         log_variance: [0.0; 8],
     };
     let image = |frame: u64| if frame < 3 { states[0] } else { between };

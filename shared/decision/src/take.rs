@@ -64,13 +64,12 @@ impl TakeMemory {
     /// the memory starts anew.
     pub fn see(&mut self, frame: TakeFrame, image: &Mixture) -> (Mixture, u64) {
         let fits = |p: &Progress| p.last.take_start == frame.take_start && !self.is_gap(p.last, frame);
-        let mut progress = match self.progress.filter(fits) {
-            Some(progress) => progress,
-            None => {
-                self.memory.clear();
-                let first_ns = frame.capture_time_ns;
-                Progress { first_ns, steps: self.steps(first_ns, frame), last: frame, images: 0 }
-            }
+        let mut progress = if let Some(progress) = self.progress.filter(fits) {
+            progress
+        } else {
+            self.memory.clear();
+            let first_ns = frame.capture_time_ns;
+            Progress { first_ns, steps: self.steps(first_ns, frame), last: frame, images: 0 }
         };
         let steps = self.steps(progress.first_ns, frame);
         (progress.steps..steps).for_each(|_| self.memory.advance());

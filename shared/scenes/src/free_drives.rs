@@ -347,7 +347,7 @@ impl Course {
     /// drawn.
     pub(crate) fn pan_over(&mut self, [low, high]: [f64; 2], phase: f64, cycles: f64) {
         if let Carrier::Roof { mount, .. } = &mut self.camera {
-            mount.left = (low + high) / 2.0;
+            mount.left = f64::midpoint(low, high);
             self.pan = [(high - low) / 2.0, phase, cycles];
         }
     }

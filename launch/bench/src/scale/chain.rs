@@ -70,10 +70,10 @@ impl Output {
         Ok(Self { publisher: node.image_publisher(&topics::FRAME, IMAGE_BYTES)?, _node: node })
     }
 
-    fn send(&mut self, bytes: &[u8], meta: FrameMeta) -> anyhow::Result<()> {
+    fn send(&mut self, bytes: &[u8], meta: &FrameMeta) -> anyhow::Result<()> {
         let mut loan = self.publisher.loan(bytes.len())?;
         loan.bytes_mut().copy_from_slice(bytes);
-        Ok(self.publisher.send_image(loan, meta)?)
+        Ok(self.publisher.send_image(loan, *meta)?)
     }
 }
 
@@ -106,7 +106,7 @@ pub(crate) fn relay(args: &RelayArgs) -> anyhow::Result<()> {
                 (To::Next, Some(next)) => next,
                 _ => &mut back,
             };
-            output.send(image.bytes(), meta)?;
+            output.send(image.bytes(), &meta)?;
         }
     }
     Ok(())
@@ -159,7 +159,7 @@ impl Chain {
             dataset_view: DatasetView::UNKNOWN,
             ..FrameMeta::default()
         };
-        output.send(&self.image, meta)?;
+        output.send(&self.image, &meta)?;
         let woken = self.waiter.wait_until(&[&*back], started_ns + PATIENCE_NS)?;
         ensure!(woken != Woken::Stopped, "interrupted");
         let image = back.newest()?.with_context(|| format!("an image was lost on its way past {relays} relays"))?;

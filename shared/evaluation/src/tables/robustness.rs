@@ -249,7 +249,9 @@ impl Judge<'_> {
             trials.push(trial);
         }
         let with = planner.evidence(&trials, SAMPLES);
-        trials.iter_mut().for_each(|trial| trial.image = None);
+        for trial in &mut trials {
+            trial.image = None;
+        }
         let without = planner.evidence(&trials, SAMPLES);
         let verdict = |((with, without), usable): ((_, _), bool)| {
             let advances = |evidence| usable && !self.policy.decide(evidence).halt;
