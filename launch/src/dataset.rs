@@ -17,7 +17,10 @@ use indicatif::{ProgressBar, ProgressStyle};
 pub enum DatasetCommand {
     /// Render a scenario into a posed dataset.
     #[command(after_help = "Example: random cameras
-  carff dataset render approaching-intersection --free-poses 50 --seed 3 --out data/free")]
+  carff dataset render approaching-intersection --free-poses 50 --seed 3 --out data/free
+
+Example: an actor that no shipped model knows
+  carff dataset render approaching-intersection --appearance red-van --out data/red-van")]
     Render {
         /// A scenario file, or the name of one in configs/scenarios.
         scenario: PathBuf,
@@ -33,6 +36,12 @@ pub enum DatasetCommand {
         /// Seed of the random cameras.
         #[arg(long, default_value_t = 1)]
         seed: u64,
+        /// Give the actor another look: the name of an `appearance` of the scenario.
+        #[arg(long)]
+        appearance: Option<String>,
+        /// Add an object to every state: the name of a `bystander` of the scenario.
+        #[arg(long)]
+        object: Option<String>,
     },
     /// Convert a dataset in the format of nerfstudio or instant-ngp into a dataset of one state.
     #[command(after_help = "Example: a dataset with its region of interest
@@ -95,9 +104,15 @@ pub enum DatasetCommand {
 /// Runs one of the commands.
 pub fn run(command: DatasetCommand) -> anyhow::Result<()> {
     match command {
-        DatasetCommand::Render { scenario, out, depth, free_poses, seed } => {
+        DatasetCommand::Render { scenario, out, depth, free_poses, seed, appearance, object } => {
             let path = find_scenario(&scenario)?;
             let mut scenario = Scenario::load(&path)?;
+            if let Some(name) = appearance {
+                scenario = scenario.with_appearance(&name)?;
+            }
+            if let Some(name) = object {
+                scenario = scenario.with_object(&name)?;
+            }
             if let Some(count) = free_poses {
                 scenario = scenario.with_free_cameras(count as usize, seed)?;
             }
@@ -251,7 +266,7 @@ spread_m = 1.0
 
     fn render_command(scenario: &Path, out: &Path) -> DatasetCommand {
         let (scenario, out) = (scenario.to_owned(), out.to_owned());
-        DatasetCommand::Render { scenario, out, depth: true, free_poses: None, seed: 1 }
+        DatasetCommand::Render { scenario, out, depth: true, free_poses: None, seed: 1, appearance: None, object: None }
     }
 
     /// A rendered dataset passes its own check and can be rendered again; a folder with other files is not changed.

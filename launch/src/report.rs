@@ -1,6 +1,7 @@
 //! The report of a run: its own figures as JSON and text, and the files that hold it.
 
 use crate::planning::{self, RunOutcome};
+use crate::supervision::monitor::UnknownImages;
 use anyhow::Context;
 use carff::conditions::{ConditionCount, Conditions};
 use carff::provenance;
@@ -9,7 +10,7 @@ use carff_base::statistics::percentile;
 use carff_checkpoint::Manifest;
 use carff_evaluation::CheckpointFigures;
 use carff_evaluation::run::DriveCounts;
-use carff_messages::Stage;
+use carff_messages::{Stage, UnknownBox};
 use serde_json::{Map, Value, json};
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
@@ -75,6 +76,7 @@ pub fn json(outcome: &RunOutcome) -> Value {
         "safe_actions": records.safe_actions,
         "unusable_images": unusable_images(&records.conditions),
         "images_compared": records.compared,
+        "unknown_images": unknown_images(&records.unknown),
         "skipped": records.skipped(),
         "skipped_by_stage": by_stage(&|s| Some(stage(s)?.skipped.into())),
         "invalid_by_stage": by_stage(&|s| Some(stage(s)?.invalid.into())),
@@ -124,6 +126,27 @@ fn unusable_text(conditions: &Conditions) -> String {
     })
 }
 
+/// Images with something that no known state explains, and the box of the most probable one.
+fn unknown_images(unknown: &UnknownImages) -> Value {
+    let surest = unknown.surest.map(|(frame_id, surest)| {
+        let UnknownBox { center, half_size, probability, .. } = surest;
+        json!({ "frame_id": frame_id, "probability": probability, "center_m": center, "half_size_m": half_size })
+    });
+    json!({ "images": unknown.images, "surest": surest })
+}
+
+/// Returns the same as a line of text; empty without such images.
+fn unknown_text(unknown: &UnknownImages) -> String {
+    let surest = unknown.surest.map(|(frame_id, surest)| {
+        let ([x, y, _], percent) = (surest.center, 100.0 * surest.probability);
+        format!("; the surest box is in frame {frame_id} at x {x:.1} m, y {y:.1} m ({percent:.0} %)")
+    });
+    match unknown.images {
+        0 => String::new(),
+        images => format!("something unknown: {images} images{}\n", surest.unwrap_or_default()),
+    }
+}
+
 /// Correct decisions of the run's drives; `None` for a run without a decisive frame.
 fn drives(outcome: &RunOutcome) -> Option<DriveCounts> {
     let decisive = planning::decisive(outcome);
@@ -163,6 +186,7 @@ pub fn text(outcome: &RunOutcome, report: &Value) -> String {
         );
     }
     text += &unusable_text(&outcome.records.conditions);
+    text += &unknown_text(&outcome.records.unknown);
     if let Some(drives) = drives(outcome) {
         let _ = writeln!(text, "\n{}", drives.text());
     }
@@ -185,6 +209,20 @@ mod tests {
         assert_eq!(quantiles_ms(&times), json!({ "p50": 50.0, "p99": 99.0, "max": 100.0, "count": 100 }));
         assert_eq!(quantiles_ms(&[7_000_000])["p99"], json!(7.0));
         assert_eq!(quantiles_ms(&[])["p50"], Value::Null);
+    }
+
+    /// The report has the number of images with something unknown, and the box of the most probable one.
+    #[test]
+    fn unknown_images_are_reported() {
+        assert_eq!(unknown_text(&UnknownImages::default()), "");
+        assert_eq!(unknown_images(&UnknownImages::default()), json!({ "images": 0, "surest": null }));
+        let (center, half_size) = ([-6.25, -1.5, 0.5], [1.0, 2.0, 0.5]);
+        let surest = UnknownBox { center, half_size, probability: 0.75, place: -1 };
+        let unknown = UnknownImages { images: 3, surest: Some((41, surest)) };
+        let found = json!({ "frame_id": 41, "probability": 0.75, "center_m": center, "half_size_m": half_size });
+        assert_eq!(unknown_images(&unknown), json!({ "images": 3, "surest": found }));
+        let text = unknown_text(&unknown);
+        assert_eq!(text, "something unknown: 3 images; the surest box is in frame 41 at x -6.2 m, y -1.5 m (75 %)\n");
     }
 
     /// Each unusable condition has its counts in JSON and a line of text; usable images have none.

@@ -150,6 +150,7 @@ fn status(run: &str, origin: &Origin, vitals: &RunVitals) -> Value {
         "action": vitals.last_action.map(|(action, _)| action),
         "reason": vitals.last_action.map(|(_, reason)| reason),
         "hazard_probability": vitals.hazard_probability,
+        "unknown_probability": vitals.unknown_probability,
         "camera_to_action_ms": { "p50": percentile(&decided, 0.5), "p99": percentile(&decided, 0.99) },
         "stages": stages,
     })
@@ -177,6 +178,9 @@ fn prometheus(run: &str, origin: &Origin, vitals: &RunVitals) -> String {
     camera(&mut registry, &vitals.conditions);
     let hazard = ConstGauge::new(f64::from(vitals.hazard_probability));
     registry.register("hazard_probability", "Hazard probability of the latest action, 0 to 1", hazard);
+    let unknown = ConstGauge::new(f64::from(vitals.unknown_probability));
+    let help = "Probability of something that no known state explains, in the latest action, 0 to 1";
+    registry.register("unknown_probability", help, unknown);
     let histograms = &vitals.histograms;
     let camera_to_action = histograms.camera_to_action.clone();
     registry.register("camera_to_action_seconds", "Time from capture to decision", camera_to_action);

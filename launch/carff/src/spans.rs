@@ -66,13 +66,13 @@ fn what(message: AnyMessage<'_>) -> String {
     } else if let Some(m) = message.get::<Forecast>() {
         format!("{} samples of {} components", m.sample_count, m.component_count)
     } else if let Some(m) = message.get::<Belief>() {
-        format!("hazard {:.3}", m.hazard_probability)
+        format!("hazard {:.3}, unknown {:.3}", m.hazard_probability, m.unknown_probability)
     } else if let Some(m) = message.get::<ViewMeta>() {
         format!("view of hypothesis {}", m.hypothesis)
     } else if let Some(m) = message.get::<Action>() {
         let action = m.code().map_or("?", ActionCode::name);
         let reason = m.reason().map_or("?", Reason::name);
-        format!("{action} ({reason}), hazard {:.3}", m.hazard_probability)
+        format!("{action} ({reason}), hazard {:.3}, unknown {:.3}", m.hazard_probability, m.unknown_probability)
     } else {
         "posterior".to_owned()
     }

@@ -91,6 +91,8 @@ pub(crate) struct RunVitals {
     pub(crate) decided_ms: VecDeque<f64>,
     /// Hazard probability of the latest action.
     pub(crate) hazard_probability: f32,
+    /// Probability of something unknown in the latest action.
+    pub(crate) unknown_probability: f32,
     /// The latest action and its reason.
     pub(crate) last_action: Option<(&'static str, &'static str)>,
     pub(crate) histograms: Histograms,
@@ -187,6 +189,7 @@ impl RunVitals {
             self.histograms.camera_to_action.observe(m.latency_ns as f64 / 1e9);
         }
         (self.hazard_probability, self.last_action) = (m.hazard_probability, Some((action, reason)));
+        self.unknown_probability = m.unknown_probability;
     }
 
     fn take_health(&mut self, m: &Health) {

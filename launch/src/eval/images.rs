@@ -2,15 +2,21 @@
 
 use crate::train::Display;
 use carff_base::geometry::PinholeCamera;
+use carff_base::random::{Key, gaussians};
 use carff_dataset::Image;
-use carff_evaluation::{DecisiveImage, Novelty, OtherPlace, Perception, Progress, Subject, Watch, WatchPlan};
+use carff_evaluation::{
+    DecisiveImage, MaskedView, Novelty, OtherPlace, Perception, Progress, Subject, Watch, WatchPlan,
+};
 use carff_scenes::config::{BystanderPlace, VariationRole};
-use carff_scenes::{FreePose, Scenario, UnknownLook};
+use carff_scenes::{Detail, FreePose, RenderOptions, Scenario, UnknownLook};
 use ndarray::Axis;
 use std::path::PathBuf;
 
 /// Frames of a free drive between two states.
 const FRAMES_PER_TIMESTAMP: usize = 6;
+/// Views with masks of each state, and deviation of their cameras' positions along x and y, metres.
+const VIEWS_PER_STATE: usize = 12;
+const VIEW_SHIFT_M: f64 = 0.4;
 
 /// Decisive image of each free drive.
 pub fn free_drives(
@@ -42,6 +48,43 @@ pub fn watches(
     let perception = Perception { known: None, ..subject.perception() };
     let plan = WatchPlan { count: count as usize, seed, exact: true };
     Ok(carff_evaluation::watches(scenario, &perception, net, plan, &|p| display.show(p))?)
+}
+
+/// Views from above of every state with the class of each pixel. The camera of each is moved a little.
+pub fn masked_views(
+    subject: &Subject,
+    scenario: &Scenario,
+    seed: u64,
+    display: &Display,
+) -> anyhow::Result<Vec<MaskedView>> {
+    let Ok(probe) = &subject.probe else { return Ok(Vec::new()) };
+    let camera = carff_evaluation::view_camera(&subject.posed.dataset, probe.field());
+    let classes: Vec<(u16, u8)> = carff_evaluation::occupants(probe.layout())
+        .iter()
+        .zip(1..)
+        .filter_map(|(name, class)| Some((scenario.object_of(name)?, class)))
+        .collect();
+    let states = scenario.info().state_count();
+    let total = states * VIEWS_PER_STATE;
+    (0..total)
+        .map(|done| {
+            display.show(&Progress { phase: "masked views", done, total, line: String::new() });
+            let mut moved = camera;
+            let shift = gaussians::<2>(Key::named("mask", seed, done as u64));
+            for (axis, shift) in shift.into_iter().enumerate() {
+                moved.world_from_camera[axis][3] += VIEW_SHIFT_M * f64::from(shift);
+            }
+            let state = done % states;
+            let (branch, timestamp) = (scenario.info().branch_of(state), scenario.info().timestamp_of(state));
+            let options = RenderOptions { detail: Detail::Picture, ..RenderOptions::default() };
+            let rendering = scenario.render(branch, timestamp, &moved, &options)?;
+            let class = |object: &u16| classes.iter().find(|(of, _)| of == object).map_or(0, |(_, class)| *class);
+            Ok(MaskedView {
+                rgb: carff_evaluation::to_unit(&rendering.image.rgb),
+                classes: rendering.object_id.iter().map(class).collect(),
+            })
+        })
+        .collect()
 }
 
 /// Free poses with their images.

@@ -68,6 +68,8 @@ enum TableName {
     Trials,
     /// Unknown objects, other places, corrupted images, and the bound.
     Robustness,
+    /// Density probing and segmentation of rendered views, on the same samples.
+    Localisation,
     /// The belief with and without memory, on drives whose camera pans.
     Memory,
     /// Frequency of each outcome where several are open.
@@ -85,6 +87,7 @@ impl From<TableName> for Table {
             TableName::Planning => Self::Planning,
             TableName::Trials => Self::Trials,
             TableName::Robustness => Self::Robustness,
+            TableName::Localisation => Self::Localisation,
             TableName::Memory => Self::Memory,
             TableName::Frequencies => Self::Frequencies,
             TableName::Pictures => Self::Pictures,
@@ -115,8 +118,10 @@ pub fn run(args: &EvalArgs) -> anyhow::Result<ExitCode> {
         if wants(Table::Planning) || wants(Table::Robustness) {
             subject.free_drives = images::free_drives(&scenario, args.free_drives, args.seed, &display)?;
         }
-        if wants(Table::Robustness) {
-            subject.novelties = images::novelties(&scenario, args.free_poses, args.seed, &display)?;
+        // The gallery shows one pose of each.
+        let novelty_poses = if wants(Table::Robustness) { args.free_poses } else { args.free_poses.min(1) };
+        if wants(Table::Robustness) || wants(Table::Pictures) {
+            subject.novelties = images::novelties(&scenario, novelty_poses, args.seed, &display)?;
         }
         if wants(Table::Trials) || wants(Table::Robustness) {
             subject.free_poses = images::free_poses(&scenario, args.free_poses, args.seed, &display)?;
@@ -124,6 +129,9 @@ pub fn run(args: &EvalArgs) -> anyhow::Result<ExitCode> {
         if wants(Table::Robustness) {
             subject.other_places =
                 images::other_places(&scenario, &subject.free_poses, args.free_poses, args.seed, &display)?;
+        }
+        if wants(Table::Localisation) {
+            subject.masked_views = images::masked_views(&subject, &scenario, args.seed, &display)?;
         }
         if wants(Table::Memory) && subject.memory.is_some() {
             subject.watches = images::watches(&subject, &scenario, args.free_drives, args.seed, &display)?;

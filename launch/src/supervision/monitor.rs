@@ -5,7 +5,7 @@ use carff_config::GraphConfig;
 use carff_decision::ImageEvidence;
 use carff_messages::{
     Action, ActionCode, Belief, DatasetView, FrameMeta, Gaussian, Header, Health, HealthState, ImageCheck,
-    Observability, Posterior, Reason, Stage, Unknowns, ViewMeta,
+    Observability, Posterior, Reason, Stage, UnknownBox, Unknowns, ViewMeta,
 };
 use carff_transport::{Image, Node, OpenError, ReceiveError, Receiver, topics};
 use std::collections::{BTreeMap, VecDeque};
@@ -112,6 +112,27 @@ impl StageSummary {
     }
 }
 
+/// Images in which something stands that no known state explains.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct UnknownImages {
+    /// Images with a probability of something unknown of at least 0.5.
+    pub images: u64,
+    /// Frame number and box of the most probable one; `None` if no image has a box.
+    pub surest: Option<(u64, UnknownBox)>,
+}
+
+impl UnknownImages {
+    fn take(&mut self, unknowns: &Unknowns) {
+        self.images += u64::from(unknowns.probability >= 0.5);
+        // Boxes begin with the most probable one.
+        if let Some(first) = unknowns.boxes().first()
+            && self.surest.is_none_or(|(_, known)| first.probability > known.probability)
+        {
+            self.surest = Some((unknowns.header.frame_id, *first));
+        }
+    }
+}
+
 /// Records of a run: the newest frames and times, up to a limit.
 #[derive(Clone, Debug, Default)]
 pub struct Records {
@@ -133,6 +154,8 @@ pub struct Records {
     pub conditions: Conditions,
     /// Number of images that were compared with the known states.
     pub compared: u64,
+    /// Images among them with something unknown.
+    pub unknown: UnknownImages,
     /// Duration of each comparison, nanoseconds.
     pub compare_ns: VecDeque<u64>,
     /// Reductions under overload: beliefs with fewer samples, frames with fewer steps, and views with fewer pixels than
@@ -220,6 +243,7 @@ impl Records {
 
     fn take_unknowns(&mut self, unknowns: &Unknowns) {
         self.compared += 1;
+        self.unknown.take(unknowns);
         Self::note_time(&mut self.compare_ns, unknowns.stage_latency_ns, self.wanted.keep);
         if let Some(frame) = self.frames.get_mut(&unknowns.header.frame_id) {
             frame.image = Some(ImageEvidence::new(unknowns.ratios()).after(f64::from(unknowns.prior)));

@@ -1,6 +1,6 @@
 //! The user's camera: orbit, pan and zoom about a target point, and projection of world points into its image.
 
-use carff_base::geometry::{OrientedBox, PinholeCamera};
+use carff_base::geometry::PinholeCamera;
 
 /// Rotation for a drag across the image's shorter side, degrees.
 const ORBIT_DEG_PER_SIDE: f64 = 180.0;
@@ -12,8 +12,6 @@ const LEAST_ELEVATION_DEG: f64 = -5.0;
 const DISTANCE_M: [f64; 2] = [1.0, 200.0];
 /// Narrowest and widest field of view, degrees.
 pub const FOV_DEG: [f64; 2] = [15.0, 110.0];
-/// Distance of the near plane, metres.
-const NEAR_M: f64 = 0.05;
 /// Widest field of view across an image's longer side, degrees: wider images are distorted.
 const MOST_WIDE_DEG: f64 = 150.0;
 
@@ -129,39 +127,6 @@ impl OrbitCamera {
     }
 }
 
-/// Projects a segment into an image, pixels. The part behind the camera is cut off; `None` if nothing remains.
-pub fn project_segment(camera: &PinholeCamera, a_m: [f64; 3], b_m: [f64; 3]) -> Option<[[f64; 2]; 2]> {
-    let m = &camera.world_from_camera;
-    let eye_m = camera.position_m();
-    let depth = |p: [f64; 3]| -(0..3).map(|i| m[i][2] * (p[i] - eye_m[i])).sum::<f64>();
-    let (mut a_m, mut b_m) = (a_m, b_m);
-    let (depth_a, depth_b) = (depth(a_m), depth(b_m));
-    if depth_a < NEAR_M && depth_b < NEAR_M {
-        return None;
-    }
-    let between = |share: f64| [0, 1, 2].map(|i| a_m[i] + share * (b_m[i] - a_m[i]));
-    let cut = between((NEAR_M - depth_a) / (depth_b - depth_a));
-    if depth_a < NEAR_M {
-        a_m = cut;
-    } else if depth_b < NEAR_M {
-        b_m = cut;
-    }
-    Some([camera.project(a_m)?.0, camera.project(b_m)?.0])
-}
-
-/// Returns the twelve edges of a box, metres, world space.
-pub fn edges(of: &OrientedBox) -> [[[f64; 3]; 2]; 12] {
-    let corner = |i: usize| of.point([0, 1, 2].map(|axis| if i >> axis & 1 == 1 { 1.0 } else { -1.0 }));
-    let pairs = [0, 1, 2].map(|axis| {
-        let across = [(axis + 1) % 3, (axis + 2) % 3];
-        [0, 1, 2, 3].map(|k| {
-            let from = (k & 1) << across[0] | (k >> 1) << across[1];
-            [corner(from), corner(from | 1 << axis)]
-        })
-    });
-    std::array::from_fn(|i| pairs[i / 4][i % 4])
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -258,28 +223,6 @@ mod tests {
                 assert!((a - b).abs() < 1e-6, "{own:?}\n{other:?}");
             }
             assert!((own.fl_x_px - other.fl_x_px).abs() < 1e-6);
-        }
-    }
-
-    /// A segment that crosses the camera's plane is cut off there; a segment behind the camera is not drawn.
-    #[test]
-    fn segments_are_cut_at_the_camera() {
-        let camera = PinholeCamera::look_at([0.0; 3], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0], 100, 100, 90.0);
-        assert_eq!(project_segment(&camera, [-1.0, 0.0, 0.0], [-5.0, 1.0, 0.0]), None);
-        let [a, b] = project_segment(&camera, [4.0, 0.0, 0.0], [-4.0, 1.0, 0.0]).unwrap();
-        assert!(near(a[0], 50.0) && near(a[1], 50.0));
-        assert!(b[0] < 0.0 && b[0].is_finite());
-    }
-
-    /// The edges of a box join each corner with its three neighbours.
-    #[test]
-    fn a_box_has_twelve_edges() {
-        let of = OrientedBox { center: [1.0, 2.0, 3.0], half_size: [1.0, 2.0, 3.0], yaw: 0.4 };
-        let mut lengths: Vec<f64> =
-            edges(&of).iter().map(|[a, b]| (0..3).map(|i| (a[i] - b[i]).powi(2)).sum::<f64>().sqrt()).collect();
-        lengths.sort_by(f64::total_cmp);
-        for (i, length) in lengths.into_iter().enumerate() {
-            assert!(near(length, [2.0, 4.0, 6.0][i / 4]), "{length}");
         }
     }
 }

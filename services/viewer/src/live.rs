@@ -6,7 +6,8 @@ use crate::session::{Forecast, Moment};
 use carff_dataset::Image;
 use carff_decision::Step;
 use carff_messages::{
-    Action, ActionCode, Belief, FrameMeta, Gaussian, Health, Observability, Posterior, Reason, Rule, Stage,
+    Action, ActionCode, Belief, FrameMeta, Gaussian, Health, Observability, Posterior, Reason, Rule, Stage, UnknownBox,
+    Unknowns,
 };
 use carff_observe::{AttachError, Attached, LiveRun, attach};
 use carff_transport::{OpenError, ReceiveError, Receiver, topics};
@@ -165,6 +166,7 @@ struct Watcher {
     frames: Receiver<carff_transport::Image<FrameMeta>>,
     posteriors: Receiver<Posterior>,
     forecasts: Receiver<carff_messages::Forecast>,
+    unknowns: Receiver<Unknowns>,
     beliefs: Receiver<Belief>,
     actions: Receiver<Action>,
     healths: Vec<Receiver<Health>>,
@@ -182,6 +184,7 @@ impl Watcher {
             frames: node.receiver(&topics::FRAME)?.polled(),
             posteriors: node.receiver(&topics::POSTERIOR)?.polled(),
             forecasts: node.receiver(&topics::FORECAST)?.polled(),
+            unknowns: node.receiver(&topics::UNKNOWN)?.polled(),
             beliefs: node.receiver(&topics::BELIEF)?.polled(),
             actions: node.receiver(&topics::ACTION)?.polled(),
             healths: healths.collect::<Result<_, OpenError>>()?,
@@ -207,6 +210,9 @@ impl Watcher {
         }
         while let Some(forecast) = self.forecasts.next()? {
             self.assembly.forecast(&forecast);
+        }
+        while let Some(unknowns) = self.unknowns.next()? {
+            self.assembly.unknowns(&unknowns);
         }
         while let Some(belief) = self.beliefs.next()? {
             let frame = belief.header.frame_id as f64;
@@ -274,6 +280,7 @@ struct Assembly {
 
 struct Parts {
     input: Arc<Input>,
+    unknowns: Arc<[UnknownBox]>,
     forecasts: BTreeMap<u32, carff_messages::Forecast>,
     moments: Vec<Moment>,
     /// The state that the last belief resolved to, and its posterior: the source of the next forecast.
@@ -282,8 +289,14 @@ struct Parts {
 
 impl Assembly {
     fn frame(&mut self, frame_id: u64, input: Input) {
-        let (forecasts, moments) = (BTreeMap::new(), Vec::new());
-        self.frames.insert(frame_id, Parts { input: Arc::new(input), forecasts, moments, fed_back: None });
+        let parts = Parts {
+            input: Arc::new(input),
+            unknowns: Arc::default(),
+            forecasts: BTreeMap::new(),
+            moments: Vec::new(),
+            fed_back: None,
+        };
+        self.frames.insert(frame_id, parts);
         while self.frames.len() > MOST_FRAMES {
             self.frames.pop_first();
         }
@@ -301,6 +314,12 @@ impl Assembly {
         }
     }
 
+    fn unknowns(&mut self, unknowns: &Unknowns) {
+        if let Some(parts) = self.frames.get_mut(&unknowns.header.frame_id) {
+            parts.unknowns = unknowns.boxes().into();
+        }
+    }
+
     /// Returns all moments of a frame when its last belief arrives.
     fn belief(&mut self, belief: &Belief) -> Option<Vec<Moment>> {
         let frame_id = belief.header.frame_id;
@@ -315,10 +334,13 @@ impl Assembly {
         if !belief.is_final() {
             return None;
         }
-        let whole = self.frames.remove(&frame_id)?.moments;
+        let Parts { mut moments, unknowns, .. } = self.frames.remove(&frame_id)?;
+        for moment in &mut moments {
+            moment.unknowns = unknowns.clone();
+        }
         // Older frames are no longer needed.
         self.frames.retain(|id, _| *id > frame_id);
-        Some(whole)
+        Some(moments)
     }
 }
 
@@ -427,9 +449,13 @@ mod tests {
         for step in [1, 2] {
             assembly.forecast(&forecast(3, step));
         }
+        let mut unknowns = Unknowns::of_frame(Header::of_frame(3, 5, 77));
+        (unknowns.box_count, unknowns.boxes[0].probability) = (1, 0.9);
+        assembly.unknowns(&unknowns);
         assert!(assembly.belief(&belief(3, 1)).is_none());
         let moments = assembly.belief(&belief(3, 2)).unwrap();
         assert_eq!(moments.iter().map(|m| m.step).collect::<Vec<_>>(), [0, 1, 2]);
+        assert!(moments.iter().all(|m| m.unknowns[..] == unknowns.boxes[..1]));
         let input = &moments[0].input;
         assert_eq!((input.image.rgb.as_slice(), input.seed), ([1, 2, 3, 4, 5, 6].as_slice(), Some(77)));
         let truth = input.truth.unwrap();

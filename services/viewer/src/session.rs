@@ -12,7 +12,7 @@ use crate::input::Input;
 use crate::journal::{Decision, Journal};
 use crate::models::Models;
 use carff_decision::{Draw, Evidence, Mixture, Probed, Resolved, Sampling, Step, path_probability};
-use carff_messages::{Gaussian, LATENT_DIM, MAX_HORIZON, MAX_SAMPLES};
+use carff_messages::{Gaussian, LATENT_DIM, MAX_HORIZON, MAX_SAMPLES, UnknownBox};
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -65,6 +65,8 @@ pub struct Forecast {
 pub struct Moment {
     /// The input image.
     pub input: Arc<Input>,
+    /// Boxes in which a running graph's prober finds what no known state explains.
+    pub unknowns: Arc<[UnknownBox]>,
     /// Number of steps after the image.
     pub step: u32,
     /// Input of the forecast: the image's posterior, or that of a known state.
@@ -92,6 +94,7 @@ impl Moment {
     pub fn of_posterior(input: Arc<Input>, posterior: Gaussian) -> Self {
         Self {
             input,
+            unknowns: Arc::default(),
             step: 0,
             source: posterior,
             source_state: None,

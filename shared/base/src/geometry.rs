@@ -12,6 +12,9 @@
 
 use serde::{Deserialize, Serialize};
 
+/// Distance of the near plane of a projected segment, metres.
+const NEAR_M: f64 = 0.05;
+
 /// A ray in world space; `direction` has unit length.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Ray {
@@ -142,6 +145,22 @@ impl PinholeCamera {
             .then(|| ([self.cx_px + self.fl_x_px * c[0] / depth, self.cy_px - self.fl_y_px * c[1] / depth], depth))
     }
 
+    /// Projects a segment, pixels. The part behind the near plane is cut off; `None` if nothing remains.
+    pub fn project_segment(&self, a_m: [f64; 3], b_m: [f64; 3]) -> Option<[[f64; 2]; 2]> {
+        let m = &self.world_from_camera;
+        let eye_m = self.position_m();
+        let depth_m = |p: [f64; 3]| -(0..3).map(|i| m[i][2] * (p[i] - eye_m[i])).sum::<f64>();
+        let (depth_a_m, depth_b_m) = (depth_m(a_m), depth_m(b_m));
+        if depth_a_m < NEAR_M && depth_b_m < NEAR_M {
+            return None;
+        }
+        let share = (NEAR_M - depth_a_m) / (depth_b_m - depth_a_m);
+        let cut = [0, 1, 2].map(|i| a_m[i] + share * (b_m[i] - a_m[i]));
+        let a_m = if depth_a_m < NEAR_M { cut } else { a_m };
+        let b_m = if depth_b_m < NEAR_M { cut } else { b_m };
+        Some([self.project(a_m)?.0, self.project(b_m)?.0])
+    }
+
     /// Returns the horizontal and vertical field of view, degrees.
     pub fn field_of_view_deg(&self) -> [f64; 2] {
         let angle = |centre: f64, side: u32, focal: f64| {
@@ -226,6 +245,19 @@ impl OrientedBox {
         [self.center[0] + c * l[0] - s * l[1], self.center[1] + s * l[0] + c * l[1], self.center[2] + l[2]]
     }
 
+    /// Returns the twelve edges, metres, world space.
+    pub fn edges(&self) -> [[[f64; 3]; 2]; 12] {
+        let corner = |i: usize| self.point([0, 1, 2].map(|axis| if i >> axis & 1 == 1 { 1.0 } else { -1.0 }));
+        let pairs = [0, 1, 2].map(|axis| {
+            let across = [(axis + 1) % 3, (axis + 2) % 3];
+            [0, 1, 2, 3].map(|k| {
+                let from = (k & 1) << across[0] | (k >> 1) << across[1];
+                [corner(from), corner(from | 1 << axis)]
+            })
+        });
+        std::array::from_fn(|i| pairs[i / 4][i % 4])
+    }
+
     /// Returns true if a ray hits the box in front of its origin.
     pub fn is_met_by(&self, ray: &Ray) -> bool {
         let (s, c) = self.yaw.sin_cos();
@@ -284,6 +316,28 @@ mod tests {
         let (pixel, depth) = camera.project(point).unwrap();
         assert!((pixel[0] - 17.5).abs() < 1e-4 && (pixel[1] - 80.5).abs() < 1e-4);
         assert!(depth > 0.0 && depth < 7.0);
+    }
+
+    /// A segment that crosses the camera's plane is cut off there; a segment behind the camera is not drawn.
+    #[test]
+    fn segments_are_cut_at_the_camera() {
+        let camera = PinholeCamera::look_at([0.0; 3], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0], 100, 100, 90.0);
+        assert_eq!(camera.project_segment([-1.0, 0.0, 0.0], [-5.0, 1.0, 0.0]), None);
+        let [a, b] = camera.project_segment([4.0, 0.0, 0.0], [-4.0, 1.0, 0.0]).unwrap();
+        assert!((a[0] - 50.0).abs() < 1e-6 && (a[1] - 50.0).abs() < 1e-6);
+        assert!(b[0] < 0.0 && b[0].is_finite());
+    }
+
+    /// The edges of a box join each corner with its three neighbours.
+    #[test]
+    fn a_box_has_twelve_edges() {
+        let of = OrientedBox { center: [1.0, 2.0, 3.0], half_size: [1.0, 2.0, 3.0], yaw: 0.4 };
+        let mut lengths: Vec<f64> =
+            of.edges().iter().map(|[a, b]| (0..3).map(|i| (a[i] - b[i]).powi(2)).sum::<f64>().sqrt()).collect();
+        lengths.sort_by(f64::total_cmp);
+        for (i, length) in lengths.into_iter().enumerate() {
+            assert!((length - [2.0, 4.0, 6.0][i / 4]).abs() < 1e-9, "{length}");
+        }
     }
 
     /// A camera can look straight down, with the given up direction in the image.

@@ -2,7 +2,7 @@
 //!
 //! The stages wrap these functions in topics, and evaluations call them in a loop: a report therefore shows what a
 //! running graph would have published, bit for bit. The crate holds no network, no field, no file and no clock; the
-//! field enters as a [`DensityField`].
+//! field enters as a [`Localiser`].
 //!
 //! | module | content |
 //! |---|---|
@@ -31,7 +31,7 @@ pub use convert::{mixture_and_draws, set_mixture_and_draws};
 pub use evidence::{Evidence, SampleEvidence};
 pub use image_evidence::{ImageEvidence, ImageMemory};
 pub use layout::{Place, ProbeLayout, ProbingError};
-pub use look_ahead::{DensityField, DensityProbe, Plan, Probed, Step, look_ahead, path_probability};
+pub use look_ahead::{Localiser, Plan, Probed, SceneProbe, Step, look_ahead, path_probability};
 pub use memory::{Memory, MemorySettings};
 pub use mixture::{Draw, Mixture, Sampling};
 pub use rule::{Decision, Policy};

@@ -3,20 +3,22 @@
 use crate::{Calibration, Draw, ImageEvidence, Mixture, ProbeLayout, Reading, Resolved, Sampling, resolve};
 use carff_messages::{Gaussian, LATENT_DIM};
 
-/// A radiance field that reports densities at the points of one probe layout.
-pub trait DensityField {
-    /// Writes the density (1/m) at each point of the layout for each latent: `latents.len()` rows of one value a point.
-    fn densities(&self, latents: &[[f32; LATENT_DIM]], densities: &mut [f32]);
+/// Finds out which places of a scenario are taken in the scenes of latents (paper section 3.2: by the density of the
+/// field, or by segmentation of rendered views).
+pub trait Localiser {
+    /// Writes the occupancy (0..=1) of each place of the layout for each latent: `latents.len()` rows of one value a
+    /// place.
+    fn occupancies(&mut self, layout: &ProbeLayout, latents: &[[f32; LATENT_DIM]], occupancies: &mut [f32]);
 }
 
-/// Probes latents: queries a field's density at the places of a scenario and reads which known state it shows.
+/// Probes latents: finds out which places of a scenario are taken, and reads which known state that is.
 #[derive(Clone, Debug)]
-pub struct DensityProbe<F> {
-    field: F,
+pub struct SceneProbe<L> {
+    localiser: L,
     layout: ProbeLayout,
     calibration: Calibration,
     states: Vec<Gaussian>,
-    densities: Vec<f32>,
+    occupancies: Vec<f32>,
 }
 
 /// One probed latent.
@@ -45,10 +47,10 @@ pub struct Step {
     pub path_probability: f32,
 }
 
-impl<F: DensityField> DensityProbe<F> {
+impl<L: Localiser> SceneProbe<L> {
     /// Puts the parts together; `states` are the posteriors that represent the known states.
-    pub fn new(field: F, layout: ProbeLayout, calibration: Calibration, states: Vec<Gaussian>) -> Self {
-        Self { field, layout, calibration, states, densities: Vec::new() }
+    pub fn new(localiser: L, layout: ProbeLayout, calibration: Calibration, states: Vec<Gaussian>) -> Self {
+        Self { localiser, layout, calibration, states, occupancies: Vec::new() }
     }
 
     /// The places and states.
@@ -56,9 +58,9 @@ impl<F: DensityField> DensityProbe<F> {
         &self.layout
     }
 
-    /// The field.
-    pub fn field(&self) -> &F {
-        &self.field
+    /// The localiser; a field's densities are one.
+    pub fn field(&self) -> &L {
+        &self.localiser
     }
 
     /// The posteriors that represent the known states.
@@ -78,16 +80,14 @@ impl<F: DensityField> DensityProbe<F> {
 
     /// Probes latents, one result each.
     pub fn probe_all(&mut self, latents: &[[f32; LATENT_DIM]]) -> Vec<Probed> {
-        let points = self.layout.points().len().max(1);
-        self.densities.resize(points * latents.len(), 0.0);
-        self.field.densities(latents, &mut self.densities);
-        let read = |densities: &[f32]| {
-            let mut occupancies = vec![0.0; self.layout.places().len()];
-            self.layout.occupancies(densities, &mut occupancies);
-            let reading = self.calibration.read(&self.layout, &occupancies);
-            Probed { occupancies, reading }
+        let places = self.layout.places().len().max(1);
+        self.occupancies.resize(places * latents.len(), 0.0);
+        self.localiser.occupancies(&self.layout, latents, &mut self.occupancies);
+        let read = |occupancies: &[f32]| {
+            let reading = self.calibration.read(&self.layout, occupancies);
+            Probed { occupancies: occupancies.to_vec(), reading }
         };
-        self.densities.chunks_exact(points).map(read).collect()
+        self.occupancies.chunks_exact(places).map(read).collect()
     }
 
     /// Probes a mixture's component means and draws, and resolves the state; `image` weighs the result, if the frame's
@@ -140,10 +140,10 @@ pub struct Plan {
 }
 
 /// Looks ahead from one posterior: each step's resolved state feeds the next. `forecast` receives the input and the
-/// known state that it represents (`None` at the first step); `image` weighs every step, as in [`DensityProbe::step`].
-pub fn look_ahead<F: DensityField>(
+/// known state that it represents (`None` at the first step); `image` weighs every step, as in [`SceneProbe::step`].
+pub fn look_ahead<L: Localiser>(
     mut forecast: impl FnMut(&Gaussian, Option<usize>) -> Mixture,
-    probe: &mut DensityProbe<F>,
+    probe: &mut SceneProbe<L>,
     posterior: &Gaussian,
     image: Option<&ImageEvidence>,
     plan: Plan,

@@ -1,11 +1,13 @@
 //! Evaluation of a trained scenario: accuracy, images and planning, as tables and as one page.
 //!
 //! Tables are computed with the library functions that the stages run. Every table gives its trials, and separates
-//! held-out poses from trained ones. Nothing here trains a model or chooses a setting.
+//! held-out poses from trained ones. Nothing here trains a model of a checkpoint or chooses a setting; baselines are
+//! fitted where a table needs them.
 //!
 //! | module | content |
 //! |---|---|
 //! | `posed`, `accuracy`, `decoded`, `render` | the labelled images, and what the models make of them |
+//! | `segmentation` | localisation by segmentation of rendered views |
 //! | `trials` | trials of decision rules and samples, and the images from above |
 //! | `stats` | arithmetic on trials: recall curves, frequencies, reliability, support vector machine, SSIM |
 //! | `tables`, `report` | the tables of `carff eval`, `results.json` and its page |
@@ -21,6 +23,7 @@ mod render;
 mod report;
 mod role;
 pub mod run;
+mod segmentation;
 mod stats;
 mod subject;
 mod tables;
@@ -36,6 +39,7 @@ pub use posed::{Label, PosedImages};
 pub use render::{FieldRenderer, to_bytes, to_unit};
 pub use report::{Gallery, Results, Table, Target, encoder_rows, evaluate};
 pub use role::{ByRole, ROLES, role_name};
+pub use segmentation::{MaskedView, occupants, view_camera};
 pub use stats::{
     draws::{Curve, Frequencies, Frequency, expected_recall},
     pairs::PairMeans,
@@ -47,6 +51,7 @@ pub use tables::{
     encoder::{EncoderTable, SvmScore, SvmTable, encoder_table},
     field::{FieldPictures, NovelViews, PictureTable},
     forecast::{ForecastTable, FrequencyTable, RoleCurves},
+    localisation::{LocalisationFigures, LocalisationTable, MethodFigures},
     memory::{ByObserver, MemoryTable, ObserverFigures, RightFrames},
     planning::{OneImage, PlanningResults, PlanningViews, ViewCounts},
     robustness::{ByCorruption, CorruptionFigures, NoveltyFigures, Robustness},

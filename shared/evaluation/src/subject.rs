@@ -4,7 +4,7 @@ use crate::trials::{
     planning::{KnownStates, Perception, Planner},
     watches::Watch,
 };
-use crate::{ByRole, Decoding, EvaluationError, PosedImages, Progress, ROLES};
+use crate::{ByRole, Decoding, EvaluationError, MaskedView, PosedImages, Progress, ROLES};
 use carff_base::geometry::PinholeCamera;
 use carff_base::random::Key;
 use carff_checkpoint::CheckpointPlanning;
@@ -137,6 +137,8 @@ pub struct Subject {
     pub other_places: Vec<OtherPlace>,
     /// Drives whose camera pans. Empty until the caller renders them.
     pub watches: Vec<Watch>,
+    /// Views from above of every state, with masks. Empty until the caller renders them.
+    pub masked_views: Vec<MaskedView>,
     /// Settings of this evaluation.
     pub options: EvalOptions,
     trained: TrainedWith,
@@ -199,6 +201,7 @@ impl Subject {
             novelties: Vec::new(),
             other_places: Vec::new(),
             watches: Vec::new(),
+            masked_views: Vec::new(),
             options,
             trained,
         };

@@ -1,12 +1,16 @@
 //! Messages in the standard robotics schemas: images, calibrations, poses, boxes, logs.
 
+use carff_base::geometry::OrientedBox;
 use carff_decision::Place;
 use carff_messages::forms::AnyMessage;
-use carff_messages::{Action, ActionCode, Belief, Health, HealthState, Intrinsics, Reason, Stage};
+use carff_messages::{
+    Action, ActionCode, Belief, Header, Health, HealthState, Intrinsics, Reason, Stage, UnknownBox, Unknowns,
+};
 use foxglove::messages::log::Level;
+use foxglove::messages::scene_entity_deletion::Type as Deleted;
 use foxglove::messages::{
     CameraCalibration, Color, CubePrimitive, Duration, FrameTransform, Log, Pose, Quaternion, RawImage, SceneEntity,
-    SceneUpdate, TextPrimitive, Timestamp, Vector3,
+    SceneEntityDeletion, SceneUpdate, TextPrimitive, Timestamp, Vector3,
 };
 use std::collections::BTreeMap;
 
@@ -25,26 +29,45 @@ pub(crate) fn timestamp(wall_ns: u64) -> Timestamp {
 /// Returns the places, each with its occupancy probability at the belief's step.
 pub(crate) fn boxes(captured: Timestamp, belief: &Belief, places: &[Place]) -> SceneUpdate {
     let header = &belief.header;
-    // A lifetime counts from the time of capture.
-    let shown_ns = header.publish_time_ns.saturating_sub(header.capture_time_ns).saturating_add(BOXES_SHOWN_NS);
-    let lifetime = Duration::new_checked((shown_ns / 1_000_000_000) as i32, (shown_ns % 1_000_000_000) as u32);
     let states = belief.state_probability.iter().take(belief.state_count as usize);
     let entities = places.iter().enumerate().map(|(index, place)| {
         let taken: f32 = states.clone().zip(&place.occupied_in).filter(|(_, taken)| **taken).map(|(p, _)| p).sum();
         let taken = f64::from(taken.clamp(0.0, 1.0));
-        let step = header.step;
+        let (name, step) = (&place.name, header.step);
         SceneEntity {
-            timestamp: Some(captured),
-            frame_id: WORLD.to_owned(),
             // Several places have one name: the possible positions of one actor.
-            id: format!("step {step}, place {index}: {}", place.name),
-            lifetime,
-            cubes: vec![cube(place, taken)],
-            texts: vec![label(place, format!("{}, step {step}: {:.0} %", place.name, 100.0 * taken))],
-            ..SceneEntity::default()
+            id: format!("step {step}, place {index}: {name}"),
+            // From green to red, more opaque for higher probabilities.
+            cubes: vec![cube(&place.oriented_box, Color { r: taken, g: 1.0 - taken, b: 0.1, a: 0.15 + 0.7 * taken })],
+            texts: vec![label(&place.oriented_box, format!("{name}, step {step}: {:.0} %", 100.0 * taken))],
+            ..entity(captured, header)
         }
     });
     SceneUpdate { deletions: Vec::new(), entities: entities.collect() }
+}
+
+/// Returns the boxes in which something stands that no known state explains. They replace those of earlier images.
+pub(crate) fn unknown_boxes(captured: Timestamp, unknowns: &Unknowns) -> SceneUpdate {
+    let entities = unknowns.boxes().iter().enumerate().map(|(index, unknown)| {
+        let UnknownBox { center, half_size, probability, .. } = *unknown;
+        let (oriented, sure) = (OrientedBox { center, half_size, yaw: 0.0 }, f64::from(probability.clamp(0.0, 1.0)));
+        SceneEntity {
+            id: format!("unknown {index}"),
+            cubes: vec![cube(&oriented, Color { r: 0.8, g: 0.1, b: 0.9, a: 0.15 + 0.7 * sure })],
+            texts: vec![label(&oriented, format!("unknown: {:.0} %", 100.0 * sure))],
+            ..entity(captured, &unknowns.header)
+        }
+    });
+    let earlier = SceneEntityDeletion { timestamp: Some(captured), r#type: Deleted::All.into(), id: String::new() };
+    SceneUpdate { deletions: vec![earlier], entities: entities.collect() }
+}
+
+/// Returns an empty entity of the world that is shown for a while after its publication.
+fn entity(captured: Timestamp, header: &Header) -> SceneEntity {
+    // A lifetime counts from the time of capture.
+    let shown_ns = header.publish_time_ns.saturating_sub(header.capture_time_ns).saturating_add(BOXES_SHOWN_NS);
+    let lifetime = Duration::new_checked((shown_ns / 1_000_000_000) as i32, (shown_ns % 1_000_000_000) as u32);
+    SceneEntity { timestamp: Some(captured), frame_id: WORLD.to_owned(), lifetime, ..SceneEntity::default() }
 }
 
 /// Returns an image of the camera `frame`.
@@ -119,8 +142,7 @@ fn quaternion(r: &[[f64; 3]; 3]) -> Quaternion {
     }
 }
 
-fn cube(place: &Place, taken: f64) -> CubePrimitive {
-    let oriented = &place.oriented_box;
+fn cube(oriented: &OrientedBox, color: Color) -> CubePrimitive {
     let half_yaw = oriented.yaw / 2.0;
     let [x, y, z] = oriented.center;
     let size = oriented.half_size.map(|half| half * 2.0);
@@ -130,14 +152,13 @@ fn cube(place: &Place, taken: f64) -> CubePrimitive {
             orientation: Some(Quaternion { x: 0.0, y: 0.0, z: half_yaw.sin(), w: half_yaw.cos() }),
         }),
         size: Some(Vector3 { x: size[0], y: size[1], z: size[2] }),
-        // From green to red, more opaque for higher probabilities.
-        color: Some(Color { r: taken, g: 1.0 - taken, b: 0.1, a: 0.15 + 0.7 * taken }),
+        color: Some(color),
     }
 }
 
-/// Returns a text above a place.
-fn label(place: &Place, text: String) -> TextPrimitive {
-    let ([x, y, z], [.., half_height]) = (place.oriented_box.center, place.oriented_box.half_size);
+/// Returns a text above a box.
+fn label(oriented: &OrientedBox, text: String) -> TextPrimitive {
+    let ([x, y, z], [.., half_height]) = (oriented.center, oriented.half_size);
     let position = Some(Vector3 { x, y, z: z + half_height });
     let orientation = Some(Quaternion { x: 0.0, y: 0.0, z: 0.0, w: 1.0 });
     TextPrimitive {

@@ -179,7 +179,7 @@ fn summary(live: &LiveRun, vitals: &RunVitals) -> Vec<String> {
         format!("run {}", live.name),
         format!("graph {}", live.graph.file_name().map(|n| n.to_string_lossy()).unwrap_or_default()),
         format!("action {action} ({reason})"),
-        format!("hazard {:.3}", vitals.hazard_probability),
+        format!("hazard {:.3}, unknown {:.3}", vitals.hazard_probability, vitals.unknown_probability),
         format!("camera to action p50 {} ms, p99 {} ms", ms(0.5), ms(0.99)),
         format!("since the start of this probe: frames {}", vitals.frames),
         format!("decisions {}", vitals.decisions),

@@ -14,6 +14,8 @@ const NAMES: f32 = 96.0;
 /// Width of the numbers after the bars, and of the second of them.
 const NUMBERS: f32 = 98.0;
 const COUNTS: f32 = 53.0;
+/// Smallest probability of something unknown that is shown.
+const LEAST_SHOWN: f32 = 0.005;
 
 /// A labelled bar.
 struct Bar<'a> {
@@ -48,6 +50,10 @@ impl Viewer {
                 let hazard = belief.resolved.hazard_probability;
                 let color = if hazard >= TAKEN { palette.hazard } else { palette.weak };
                 ui.label(theme::strong(format!("hazard {:.0} %", 100.0 * hazard)).color(color));
+                let unknown = belief.resolved.unknown_probability;
+                if unknown >= LEAST_SHOWN {
+                    ui.label(theme::strong(format!("unknown {:.0} %", 100.0 * unknown)).color(palette.error));
+                }
             } else {
                 ui.weak("press Probe to read the scenes");
             }

@@ -1,8 +1,9 @@
 //! The shown scene from above: a rendered image, and a slice of density at a height.
 
-use super::scene_pane::TAKEN;
+use super::scene_pane::{TAKEN, oriented_box};
 use super::theme::Palette;
 use super::{Latent, Viewer, theme};
+use carff_base::geometry::OrientedBox;
 use eframe::egui::{Color32, Painter, Pos2, Rect, Sense, Slider, Stroke, TextureId, Ui, pos2, vec2};
 
 /// Length of the drawn line of sight, metres.
@@ -54,16 +55,15 @@ impl Viewer {
         if self.overlays.boxes {
             for (i, place) in self.session.models().probe.layout().places().iter().enumerate() {
                 let taken = found.and_then(|f| f.probed.occupancies.get(i)).is_some_and(|o| *o >= TAKEN);
-                let corners = [[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]].map(|[x, y]| {
-                    let p = place.oriented_box.point([x, y, 0.0]);
-                    at([p[0], p[1]])
-                });
                 let stroke = if taken {
                     Stroke::new(2.0, palette.of_place(&place.name))
                 } else {
                     Stroke::new(1.0, palette.weak.gamma_multiply(0.6))
                 };
-                outline(&painter, &corners, stroke);
+                outline(&painter, &place.oriented_box, stroke, at);
+            }
+            for unknown in self.unknowns() {
+                outline(&painter, &oriented_box(unknown), Stroke::new(2.0, palette.error), at);
             }
         }
         // The pose of the image, and the pose of the view.
@@ -76,7 +76,12 @@ impl Viewer {
     }
 }
 
-fn outline(painter: &Painter, corners: &[Pos2; 4], stroke: Stroke) {
+/// Draws the outline of a box from above.
+fn outline(painter: &Painter, oriented: &OrientedBox, stroke: Stroke, at: impl Fn([f64; 2]) -> Pos2) {
+    let corners = [[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]].map(|[x, y]| {
+        let p = oriented.point([x, y, 0.0]);
+        at([p[0], p[1]])
+    });
     for i in 0..4 {
         painter.line_segment([corners[i], corners[(i + 1) % 4]], stroke);
     }

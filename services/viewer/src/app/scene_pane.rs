@@ -1,8 +1,9 @@
 //! The pane in the middle: the shown scene from the user's camera, with the results of probing.
 
 use super::{Command, Viewer, theme};
-use crate::camera::{FOV_DEG, edges, project_segment};
-use carff_base::geometry::PinholeCamera;
+use crate::camera::FOV_DEG;
+use carff_base::geometry::{OrientedBox, PinholeCamera};
+use carff_messages::UnknownBox;
 use eframe::egui::{
     Align2, Button, Color32, DragValue, FontId, Painter, PointerButton, Rect, Response, Sense, Slider, Stroke,
     TextStyle, Ui, UiBuilder, pos2, vec2,
@@ -102,11 +103,7 @@ impl Viewer {
                 Some(_) => Stroke::new(1.0, Color32::from_white_alpha(70)),
                 None => Stroke::new(1.0, Color32::from_white_alpha(110)),
             };
-            for [a, b] in edges(&place.oriented_box) {
-                if let Some([a, b]) = project_segment(camera, a, b) {
-                    painter.line_segment([at(a), at(b)], stroke);
-                }
-            }
+            wireframe(painter, rect, camera, &place.oriented_box, stroke);
             if let Some(o) = occupancy.filter(|o| *o >= TAKEN) {
                 let top = place.oriented_box.point([0.0, 0.0, 1.6]);
                 if let Some((pixel, _)) = camera.project(top) {
@@ -114,6 +111,18 @@ impl Viewer {
                 }
             }
         }
+        for unknown in self.unknowns() {
+            let oriented = oriented_box(unknown);
+            wireframe(painter, rect, camera, &oriented, Stroke::new(2.0, palette.error));
+            if let Some((pixel, _)) = camera.project(oriented.point([0.0, 0.0, 1.3])) {
+                label(painter, at(pixel), &format!("unknown {:.0} %", 100.0 * unknown.probability), palette.error);
+            }
+        }
+    }
+
+    /// Returns the boxes of the shown image in which something stands that no known state explains.
+    pub(super) fn unknowns(&self) -> &[UnknownBox] {
+        self.session.moment().map_or(&[], |m| &m.unknowns)
     }
 
     /// Draws the captions: name of the scene, and resolution.
@@ -172,6 +181,20 @@ impl Viewer {
                 ui.checkbox(&mut self.overlays.densities, "densities");
             });
         });
+    }
+}
+
+/// Returns the box of something unknown. Its sides are parallel to the axes.
+pub(super) fn oriented_box(unknown: &UnknownBox) -> OrientedBox {
+    OrientedBox { center: unknown.center, half_size: unknown.half_size, yaw: 0.0 }
+}
+
+fn wireframe(painter: &Painter, rect: Rect, camera: &PinholeCamera, oriented: &OrientedBox, stroke: Stroke) {
+    let at = |p: [f64; 2]| rect.min + vec2(p[0] as f32, p[1] as f32);
+    for [a, b] in oriented.edges() {
+        if let Some([a, b]) = camera.project_segment(a, b) {
+            painter.line_segment([at(a), at(b)], stroke);
+        }
     }
 }
 

@@ -1,5 +1,6 @@
 //! Gallery of images (table 6).
 
+use super::unknown_sheet::unknown_objects;
 use crate::render::FieldRenderer;
 use crate::tables::spread;
 use crate::trials::hypotheses::{birds_eye_camera, hypotheses};
@@ -44,12 +45,12 @@ const HYPOTHESES: usize = 4;
 const SLICE_PX: u32 = 160;
 /// Path length through the field that gives a slice its opacity, metres: the field's surfaces are thin.
 const SLICE_DEPTH_M: f32 = 0.25;
-const HAZARD: [u8; 3] = [236, 140, 20];
+pub(super) const HAZARD: [u8; 3] = [236, 140, 20];
 
 /// Draws all images of the gallery into `out`.
 pub fn gallery(subject: &Subject, out: &Path, on_progress: &dyn Fn(&Progress)) -> Result<Gallery, EvaluationError> {
     let mut gallery = Gallery::default();
-    let tell = |done, line: &str| on_progress(&Progress { phase: "pictures", done, total: 6, line: line.to_owned() });
+    let tell = |done, line: &str| on_progress(&Progress { phase: "pictures", done, total: 7, line: line.to_owned() });
     let mut add = |drawn: bool, file: &str, title: &str, text: &str| {
         if drawn {
             let [file, title, text] = [file, title, text].map(str::to_owned);
@@ -100,11 +101,20 @@ pub fn gallery(subject: &Subject, out: &Path, on_progress: &dyn Fn(&Progress)) -
         carff_plots::curves(&out.join("curves.png"), "Training", curves)?;
     }
     add(!curves.is_empty(), "curves.png", "Training curves", "From the folder of the training run.");
-    tell(6, "");
+    tell(6, "unknown objects");
+    add(
+        unknown_objects(subject, &out.join("unknown.png"))?,
+        "unknown.png",
+        "Unknown objects",
+        "Camera image with the boxes of what no known state explains, the known state that explains the image best, and \
+         the residual: how far each pixel is from that state, in deviations of the image's noise. Images come from the \
+         first free pose of each object.",
+    );
+    tell(7, "");
     Ok(gallery)
 }
 
-fn cell(image: Image, caption: &[String]) -> StripCell {
+pub(super) fn cell(image: Image, caption: &[String]) -> StripCell {
     StripCell { image, caption: caption.to_vec(), emphasis: None }
 }
 

@@ -1,17 +1,20 @@
 //! The results of a checkpoint on a dataset: `results.json`, the images, and one page.
 
 mod gallery;
+mod localisation_page;
 mod markdown;
 mod memory_page;
 mod page;
 mod robustness_page;
 mod targets;
 mod trials_page;
+mod unknown_sheet;
 
 use crate::tables::{
     encoder::{EncoderTable, encoder_table},
     field::{PictureTable, picture_table},
     forecast::{self, ForecastTable, FrequencyTable},
+    localisation::{self, LocalisationTable},
     memory::{self, MemoryTable},
     planning::{self, PlanningResults},
     robustness::{self, Robustness},
@@ -41,6 +44,8 @@ pub enum Table {
     Trials,
     /// Unknown objects and corrupted images.
     Robustness,
+    /// Density probing and segmentation of rendered views.
+    Localisation,
     /// The belief with and without memory.
     Memory,
     /// Frequency of each outcome where several are open.
@@ -51,13 +56,14 @@ pub enum Table {
 
 impl Table {
     /// All tables.
-    pub const ALL: [Self; 9] = [
+    pub const ALL: [Self; 10] = [
         Self::Psnr,
         Self::Encoder,
         Self::Recall,
         Self::Planning,
         Self::Trials,
         Self::Robustness,
+        Self::Localisation,
         Self::Memory,
         Self::Frequencies,
         Self::Pictures,
@@ -72,6 +78,7 @@ impl Table {
             Self::Planning => "planning",
             Self::Trials => "trials",
             Self::Robustness => "robustness",
+            Self::Localisation => "localisation",
             Self::Memory => "memory",
             Self::Frequencies => "frequencies",
             Self::Pictures => "pictures",
@@ -111,6 +118,9 @@ pub struct Results {
     /// Unknown objects and corrupted images.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub robustness: Option<Robustness>,
+    /// Density probing and segmentation of rendered views.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub localisation: Option<LocalisationTable>,
     /// The belief with and without memory.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     pub memory: Option<MemoryTable>,
@@ -167,6 +177,9 @@ pub fn evaluate(
     }
     if has(Table::Robustness) {
         results.robustness = results.kept(Table::Robustness, robustness::robustness(subject, on_progress));
+    }
+    if has(Table::Localisation) {
+        results.localisation = results.kept(Table::Localisation, localisation::localisation(subject, on_progress));
     }
     if has(Table::Memory) {
         results.memory = results.kept(Table::Memory, memory::memory(subject, on_progress));

@@ -2,6 +2,7 @@
 
 use super::{
     Results,
+    localisation_page::localisation,
     markdown::{db, head, percent, row},
     memory_page::memory,
     robustness_page::robustness,
@@ -56,6 +57,7 @@ pub fn page(results: &Results) -> String {
     }
     trials(&mut page, results);
     robustness(&mut page, results);
+    localisation(&mut page, results);
     memory(&mut page, results);
     reliability(&mut page, results);
     frequencies(&mut page, &results.frequencies);

@@ -19,7 +19,7 @@ use carff_networks::{
     encoder::{Encoder, pictures_from_bytes},
     mixture::MixtureNet,
 };
-use carff_unknown::{Comparer, Known};
+use carff_unknown::{Comparer, Comparison, Known, Seen};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::{cell::RefCell, collections::BTreeMap};
@@ -201,10 +201,31 @@ impl<'a> KnownStates<'a> {
 
     /// Evidence of an image for the known states; `None` if the camera sees no lane.
     pub fn evidence(&self, camera: &PinholeCamera, image: &Image) -> Option<ImageEvidence> {
-        let mut comparer = self.comparer.borrow_mut();
-        let seen = self.known.see(&mut comparer, self.field, &self.states, (camera, image.view()?), self.threads);
-        seen.map(|(seen, _)| ImageEvidence::new(&seen.ratios))
+        self.compare(camera, image).map(|compared| ImageEvidence::new(&compared.seen.ratios))
     }
+
+    /// Compares an image; `None` if the camera sees no lane.
+    pub fn compare(&self, camera: &PinholeCamera, image: &Image) -> Option<Compared> {
+        let mut comparer = self.comparer.borrow_mut();
+        let (seen, comparison) =
+            self.known.see(&mut comparer, self.field, &self.states, (camera, image.view()?), self.threads)?;
+        let best = (0..seen.ratios.len()).max_by(|&a, &b| seen.ratios[a].total_cmp(&seen.ratios[b]))?;
+        let rendered = comparer.rendered().nth(best)?.to_vec();
+        Some(Compared { seen, comparison, best, rendered })
+    }
+}
+
+/// An image that was compared with the known states.
+pub struct Compared {
+    /// Boxes and ratios: the parts that the states leave unexplained.
+    pub seen: Seen,
+    /// The residuals.
+    pub comparison: Comparison,
+    /// The state that explains the image best.
+    pub best: usize,
+    /// That state, rendered from the camera's pose at the compared size: RGB, 0..=1, row by row; black where nothing was
+    /// compared.
+    pub rendered: Vec<f32>,
 }
 
 /// From an image to a trial, as the graph sees it: a camera with sensor noise, the encoder, and the comparison of the

@@ -1,6 +1,7 @@
 //! The channels for other tools, as these read them.
 
 use super::*;
+use carff_messages::{UnknownBox, Unknowns};
 use foxglove::Decode;
 use foxglove::messages::log::Level;
 use foxglove::messages::{CameraCalibration, FrameTransform, Log, RawImage, SceneUpdate, Timestamp};
@@ -122,6 +123,31 @@ fn boxes_are_all_shown() {
     assert_eq!(ids.len(), 6, "{ids:?}");
     assert!(ids.values().all(|uses| uses.len() == 1), "{ids:?}");
     assert_eq!(ids.values().flatten().map(|(channel, _)| channel).collect::<BTreeSet<_>>().len(), 2);
+}
+
+/// Boxes of something unknown replace those of the image before, and a comparison without any removes them.
+#[test]
+fn unknown_boxes_replace_the_earlier_ones() {
+    let unknowns = |frame_id: u64, probabilities: &[f32]| {
+        let mut unknowns = Unknowns::of_frame(late(frame_id, 0));
+        unknowns.box_count = probabilities.len() as u32;
+        for (unknown, &probability) in unknowns.boxes.iter_mut().zip(probabilities) {
+            *unknown = UnknownBox { center: [1.0, 2.0, 0.5], half_size: [1.0; 3], probability, place: -1 };
+        }
+        (TopicId::UNKNOWN, OwnedMessage::new(Box::new(unknowns), Vec::new()))
+    };
+    let sent = [unknowns(0, &[0.9, 0.25]), unknowns(1, &[])];
+    let updates: Vec<SceneUpdate> = recorded(&sent, &[])
+        .into_iter()
+        .filter(|(channel, ..)| channel == "prober/boxes/unknown")
+        .map(|(_, _, data)| SceneUpdate::decode(&data[..]).unwrap())
+        .collect();
+    let shown = updates.iter().map(|u| (u.deletions.len(), u.entities.len())).collect::<Vec<_>>();
+    assert_eq!(shown, [(1, 2), (1, 0)]);
+    let [first, second] = &updates[0].entities[..] else { panic!("two boxes") };
+    assert_eq!([first, second].map(|e| e.texts[0].text.as_str()), ["unknown: 90 %", "unknown: 25 %"]);
+    assert_ne!(first.id, second.id);
+    assert_eq!(first.cubes[0].size, Some(foxglove::messages::Vector3 { x: 2.0, y: 2.0, z: 2.0 }));
 }
 
 /// The log has an entry for each change of the action and of a stage's health, with its source and level.

@@ -1,0 +1,121 @@
+//! Images of unknown objects: the input, the best known state, the residual, and the boxes.
+
+use super::gallery::{HAZARD, cell};
+use crate::trials::planning::Compared;
+use crate::{EvaluationError, Subject};
+use carff_base::geometry::{OrientedBox, PinholeCamera};
+use carff_dataset::Image;
+use carff_decision::ImageEvidence;
+use carff_plots::{StripCell, StripRow};
+use std::path::Path;
+
+/// Residual that is drawn white, in deviations of the image's noise.
+const WHITE_DEVIATIONS: f32 = 12.0;
+/// Colour of the boxes.
+const BOX: [u8; 3] = [230, 30, 230];
+/// Steps along a drawn line for each pixel of its length.
+const STEPS_PER_PX: f64 = 2.0;
+
+/// Draws one row for each object; returns false if nothing is compared.
+pub fn unknown_objects(subject: &Subject, path: &Path) -> Result<bool, EvaluationError> {
+    let perception = subject.perception();
+    let (Some(known), Ok(probe)) = (&perception.known, &subject.probe) else { return Ok(false) };
+    let mut rows = Vec::new();
+    for novelty in &subject.novelties {
+        // The first pose, whatever its result.
+        let Some(look) = novelty.looks.first() else { continue };
+        let Some(compared) = known.compare(&look.camera, &look.image) else { continue };
+        let evidence = ImageEvidence::new(&compared.seen.ratios);
+        let unknown = evidence.unknown_probability(probe.layout().hazard_states());
+        let place = if novelty.beside { "next to the road" } else { "on the road" };
+        let boxes = compared.seen.boxes.len();
+        let image = StripCell {
+            emphasis: (unknown >= 0.5).then_some(HAZARD),
+            ..cell(with_boxes(&look.image, &look.camera, &compared), &[format!("unknown {unknown:.2}")])
+        };
+        let best = subject.state_name(compared.best);
+        let cells = vec![
+            image,
+            cell(rendered(&compared), &["best state".into(), best]),
+            cell(residual(&compared), &["residual".into(), format!("{boxes} boxes")]),
+        ];
+        rows.push(StripRow { caption: vec![novelty.name.clone(), place.to_owned()], cells });
+    }
+    if rows.is_empty() {
+        return Ok(false);
+    }
+    let subtitle = format!(
+        "Orange frame: unknown with a probability of 0.5 or more. Only the lanes, with a margin, are compared. White in \
+         the residual: {WHITE_DEVIATIONS} deviations."
+    );
+    carff_plots::filmstrip(path, &format!("{}: unknown objects", subject.posed.scenario.name), &subtitle, &rows)?;
+    Ok(true)
+}
+
+/// The image with the boxes that were found.
+fn with_boxes(image: &Image, camera: &PinholeCamera, compared: &Compared) -> Image {
+    let mut drawn = image.clone();
+    for unknown in &compared.seen.boxes {
+        let oriented = OrientedBox { center: unknown.center, half_size: unknown.half_size, yaw: 0.0 };
+        for [a, b] in oriented.edges() {
+            if let Some(segment) = camera.project_segment(a, b) {
+                line(&mut drawn, segment);
+            }
+        }
+    }
+    drawn
+}
+
+/// Draws the part of a line that the image shows.
+fn line(image: &mut Image, [from, to]: [[f64; 2]; 2]) {
+    let (width, height) = (f64::from(image.width_px), f64::from(image.height_px));
+    let along = [to[0] - from[0], to[1] - from[1]];
+    // A line from far outside has only a short part in the image.
+    let steps = (along[0].hypot(along[1]) * STEPS_PER_PX).clamp(1.0, 1e5) as u32;
+    for step in 0..=steps {
+        let share = f64::from(step) / f64::from(steps);
+        let [x, y] = [0, 1].map(|i| from[i] + share * along[i]);
+        if (0.0..width).contains(&x) && (0.0..height).contains(&y) {
+            let at = 3 * (y as usize * image.width_px as usize + x as usize);
+            image.rgb[at..at + 3].copy_from_slice(&BOX);
+        }
+    }
+}
+
+/// The best state under the image's gain and offset.
+fn rendered(compared: &Compared) -> Image {
+    let fit = &compared.comparison.fit;
+    let pixel = |(i, value): (usize, &f32)| {
+        let seen = if compared.comparison.judged[i / 3] { fit.gain[i % 3] * value + fit.offset[i % 3] } else { 0.0 };
+        (255.0 * seen.clamp(0.0, 1.0)) as u8
+    };
+    of_size(compared, compared.rendered.iter().enumerate().map(pixel).collect())
+}
+
+/// The residual of the best state, black to white.
+fn residual(compared: &Compared) -> Image {
+    let residual = &compared.comparison.residuals[compared.best];
+    let grey = residual.iter().flat_map(|r| [(255.0 * (r / WHITE_DEVIATIONS).clamp(0.0, 1.0)) as u8; 3]);
+    of_size(compared, grey.collect())
+}
+
+fn of_size(compared: &Compared, rgb: Vec<u8>) -> Image {
+    let camera = &compared.comparison.camera;
+    Image { width_px: camera.width_px, height_px: camera.height_px, rgb }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A line marks the pixels between its ends, and parts outside the image are left out.
+    #[test]
+    fn lines_are_clipped() {
+        let mut image = Image { width_px: 8, height_px: 4, rgb: vec![0; 96] };
+        line(&mut image, [[2.5, 1.5], [1e4, 1.5]]);
+        let marked: Vec<usize> = (0..32).filter(|i| image.rgb[3 * i..3 * i + 3] == BOX).collect();
+        assert_eq!(marked, [10, 11, 12, 13, 14, 15]);
+        line(&mut image, [[-5.0, -5.0], [f64::NAN, 3.0]]);
+        assert_eq!(image.rgb.iter().filter(|v| **v == BOX[0]).count(), 12);
+    }
+}
