@@ -8,6 +8,8 @@ use std::error::Error;
 /// let cause = std::io::Error::other("disk on fire");
 /// assert_eq!(carff_base::errors::sentence(&cause), "disk on fire");
 /// ```
+///
+/// Control characters, which names of files can contain, are replaced, so that they do not reach a terminal.
 pub fn sentence(error: &(dyn Error + 'static)) -> String {
     let mut sentence = error.to_string();
     let mut source = error.source();
@@ -18,7 +20,18 @@ pub fn sentence(error: &(dyn Error + 'static)) -> String {
         }
         source = error.source();
     }
-    sentence
+    printable(&sentence)
+}
+
+/// Returns a text whose control characters, other than tabs and the ends of lines, are replaced by U+FFFD.
+///
+/// ```
+/// assert_eq!(carff_base::errors::printable("a\u{1b}[31m\nb"), "a\u{fffd}[31m\nb");
+/// ```
+pub fn printable(text: &str) -> String {
+    text.chars()
+        .map(|c| if c.is_control() && !matches!(c, '\n' | '\t') { char::REPLACEMENT_CHARACTER } else { c })
+        .collect()
 }
 
 /// Returns a description, with a remedy, of a file that tools leave in place of the wanted data: a Git LFS pointer, a
@@ -34,7 +47,7 @@ pub fn stand_in(head: &[u8]) -> Option<&'static str> {
     if text.starts_with("version https://git-lfs.github.com/spec") {
         return Some("a Git LFS pointer, not the data; run `git lfs pull` in the repository that it is from");
     }
-    ["<!doctype", "<html", "<?xml", "<head"].iter().any(|start| text.starts_with(start)).then_some(
+    ["<!doctype", "<!--", "<html", "<?xml", "<head"].iter().any(|start| text.starts_with(start)).then_some(
         "a web page or an XML reply, not the data; download the file from its direct (`raw` or `resolve`) address",
     )
 }

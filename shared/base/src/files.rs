@@ -1,10 +1,11 @@
 //! Files that a program writes at its end, and their check at its start.
 
-use std::fs::{OpenOptions, create_dir_all, remove_file};
+use std::fs::{OpenOptions, canonicalize, create_dir_all, metadata, remove_file};
 use std::io::{Error, Result};
 use std::path::Path;
 
-/// Checks that a file can be written, and creates its folder. A file that exists is not changed.
+/// Checks that a file can be written, and creates its folder. A file that exists is not changed; a pipe or a device is
+/// not opened.
 ///
 /// # Errors
 ///
@@ -14,9 +15,16 @@ pub fn check_writable(path: &Path) -> Result<()> {
         if let Some(folder) = path.parent() {
             create_dir_all(folder)?;
         }
-        let existed = path.exists();
-        OpenOptions::new().append(true).create(true).open(path)?;
-        if existed { Ok(()) } else { remove_file(path) }
+        match metadata(path) {
+            // Opening a pipe waits for its reader.
+            Ok(found) if !found.is_file() && !found.is_dir() => Ok(()),
+            Ok(_) => OpenOptions::new().append(true).open(path).map(drop),
+            Err(_) => {
+                OpenOptions::new().append(true).create(true).open(path)?;
+                // A link remains; only the file that it names was created here.
+                remove_file(canonicalize(path)?)
+            }
+        }
     };
     attempt().map_err(|e: Error| Error::new(e.kind(), format!("cannot write {}: {e}", path.display())))
 }
@@ -35,6 +43,16 @@ mod tests {
         std::fs::write(&path, "kept").unwrap();
         check_writable(&path).unwrap();
         assert_eq!(std::fs::read_to_string(&path).unwrap(), "kept");
+        // A link to a file that is yet to be written remains, and its file is not left behind.
+        let link = dir.path().join("link.json");
+        std::os::unix::fs::symlink("new/later.json", &link).unwrap();
+        check_writable(&link).unwrap();
+        assert!(link.is_symlink() && !link.exists());
+        // Neither a pipe without a reader nor a device is opened.
+        let pipe = dir.path().join("pipe");
+        assert!(std::process::Command::new("mkfifo").arg(&pipe).status().unwrap().success());
+        check_writable(&pipe).unwrap();
+        check_writable(Path::new("/dev/full")).unwrap();
         for wrong in [path.join("below-a-file"), dir.path().to_owned(), "/proc/nowhere/report.json".into()] {
             let error = check_writable(&wrong).unwrap_err().to_string();
             assert!(error.contains(&*wrong.to_string_lossy()), "{error}");

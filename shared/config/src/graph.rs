@@ -326,6 +326,13 @@ pub enum MemoryKind {
     Filter,
 }
 
+/// Returns true for a file that only this process can read, or that can be read only once: a pipe, or a descriptor
+/// (`/dev/stdin`).
+pub fn is_stream(path: &Path) -> bool {
+    let is_descriptor = ["/dev/fd", "/dev/stdin", "/proc"].iter().any(|folder| path.starts_with(folder));
+    is_descriptor || path.metadata().is_ok_and(|found| !found.is_file() && !found.is_dir())
+}
+
 impl GraphConfig {
     /// Reports whether the belief has a memory, if the checkpoint has learned one.
     pub fn remembers(&self) -> bool {
@@ -391,6 +398,8 @@ impl GraphConfig {
         source.refuse_moved(&MOVED)?;
         let mut graph: Self = ranges::read(&source)?;
         graph.check(&source)?;
+        // A pipe has no place of its own: its paths are those of the folder in which its text was written.
+        let path = if is_stream(path) { Path::new("graph.toml") } else { path };
         let absolute = std::path::absolute(path).unwrap_or_else(|_| path.to_owned());
         graph.project_root = absolute
             .ancestors()

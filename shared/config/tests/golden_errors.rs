@@ -2,7 +2,7 @@
 
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
-use carff_config::{ConfigError, GraphConfig, RestartPolicy, ViewChoice};
+use carff_config::{ConfigError, GraphConfig, RestartPolicy, ViewChoice, is_stream};
 use carff_messages::Stage;
 use std::path::Path;
 
@@ -171,6 +171,22 @@ fn the_shipped_graph_is_valid() {
     assert!(graph.scenario_path().unwrap().is_file());
     // Paths fall back to the project's root from any working directory.
     assert!(graph.resolve(Path::new("configs/graphs")).is_dir());
+}
+
+/// A graph that comes from a pipe has its relative paths from the current folder, not from that of the descriptor.
+#[test]
+fn paths_of_a_pipe() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).ancestors().nth(2).unwrap();
+    let text = std::fs::read_to_string(root.join("configs/graphs/toy.toml")).unwrap();
+    for path in ["/dev/fd/63", "/dev/stdin", "/proc/self/fd/0", "configs/graphs/x.toml"] {
+        let graph = GraphConfig::parse(&text, Path::new(path)).unwrap();
+        assert_eq!(graph.resolve(Path::new("data/none")), root.join("data/none"), "{path}");
+        assert!(graph.scenario_path().unwrap().is_file(), "{path}");
+    }
+    assert!(is_stream(Path::new("/dev/stdin")) && is_stream(Path::new("/dev/null")));
+    for file in [root.join("Cargo.toml"), root.to_owned(), "/dev/shm/graph.toml".into(), "none.toml".into()] {
+        assert!(!is_stream(&file), "{}", file.display());
+    }
 }
 
 /// Every shipped graph loads without a warning, and its scenario exists.

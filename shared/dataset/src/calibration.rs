@@ -160,11 +160,14 @@ impl Calibration {
         };
         let zero = |values: &[f64]| values.iter().all(|v| v.abs() <= 1e-12);
         let (model, used) = match model {
-            _ if zero(d) => (DistortionModel::Pinhole, 0),
+            // An equidistant lens has zeros too, and is no pinhole.
+            "equidistant" | "fisheye" => (DistortionModel::Fisheye, 4),
+            "" | "none" | "plumb_bob" | "rational_polynomial" | "thin_prism_model" if zero(d) => {
+                (DistortionModel::Pinhole, 0)
+            }
             "plumb_bob" => (DistortionModel::PlumbBob, 5),
             // Equal to plumb_bob without its denominator.
             "rational_polynomial" if zero(d.get(5..).unwrap_or_default()) => (DistortionModel::PlumbBob, 5),
-            "equidistant" | "fisheye" => (DistortionModel::Fisheye, 4),
             other => {
                 let allowed = "supported are plumb_bob and equidistant (fisheye): calibrate with one of them";
                 return Err(value("distortion_model", format!("`{other}`"), allowed));
@@ -270,8 +273,14 @@ mod tests {
         assert_eq!((plumb_bob.model, plumb_bob.distortion[1]), (DistortionModel::PlumbBob, 0.11));
         let fisheye = load(ECHOED).unwrap();
         assert_eq!((fisheye.model, fisheye.distortion.len()), (DistortionModel::Fisheye, 4));
-        let straight = load(&CALIBRATOR.replace("[-0.36, 0.11, 0.001, 0.0005, 0.0]", "[0, 0, 0, 0, 0]")).unwrap();
-        assert_eq!(straight.model, DistortionModel::Pinhole);
+        let zeros = CALIBRATOR.replace("[-0.36, 0.11, 0.001, 0.0005, 0.0]", "[0, 0, 0, 0, 0]");
+        assert_eq!(load(&zeros).unwrap().model, DistortionModel::Pinhole);
+        // An equidistant lens with coefficients of zero bends as well.
+        let equidistant = load(&ECHOED.replace("- 0.1\n", "- 0.0\n")).unwrap();
+        assert_eq!(equidistant.model, DistortionModel::Fisheye);
+        assert_eq!(equidistant.lens(), Lens::Fisheye([0.0; 4]));
+        let other = load(&zeros.replace("plumb_bob", "omnidirectional")).unwrap_err().to_string();
+        assert!(other.contains("`distortion_model` is `omnidirectional`"), "{other}");
     }
 
     /// Wrong files are errors that name the file or the key.

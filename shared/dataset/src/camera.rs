@@ -17,6 +17,13 @@ const ROUNDING: f64 = 0.02;
 /// Largest distance of the principal point from the image's centre, as a share of the side, if the file does not
 /// contain the size of its images.
 const MAX_OFF_CENTRE: f64 = 0.15;
+/// Largest distance of the principal point from the image's centre, as a share of the side. A part of a large image has
+/// its principal point outside.
+const MAX_CROPPED: f64 = 10.0;
+/// Range of a camera's field of view, degrees.
+const FIELD_OF_VIEW_DEG: [f64; 2] = [0.1, 179.0];
+/// Largest coordinate of a camera: maps that span a country have less.
+const MAX_POSITION: f64 = 1e9;
 
 /// Returns the path of a file that a frame names, and an error if it does not exist. Backslashes separate folders, as
 /// on Windows, unless a file has them in its name.
@@ -71,6 +78,17 @@ pub(crate) struct Keys<'a> {
     pub top: &'a Map<String, Value>,
 }
 
+/// Source of a camera's size.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum SizeOf {
+    /// The keys `w` and `h`.
+    Keys,
+    /// The image.
+    Image,
+    /// Neither: the image cannot be read, and the frame is not used.
+    Nothing,
+}
+
 impl Keys<'_> {
     fn number(&self, key: &str) -> Result<Option<f64>, DatasetError> {
         match self.place.number(self.frame, key)? {
@@ -90,24 +108,33 @@ impl Keys<'_> {
         }
     }
 
-    /// Returns the focal length in pixels. A frame's own angle has precedence over a focal length at top level.
-    fn focal_length_px(&self, width_px: u32) -> Result<f64, DatasetError> {
+    /// Returns the focal lengths along x and y, pixels. A frame's own angle has precedence over a focal length at top
+    /// level. Without a value for y, pixels are square.
+    fn focal_lengths_px(&self, width_px: u32, height_px: u32) -> Result<[f64; 2], DatasetError> {
         for (place, map) in [(self.place, self.frame), (&self.place.within("top level".to_owned()), self.top)] {
-            if let Some(fl) = place.number(map, "fl_x")? {
-                return Ok(fl);
-            }
-            match place.number(map, "camera_angle_x")? {
-                Some(angle) if angle > 0.0 && angle < std::f64::consts::PI => {
-                    return Ok(f64::from(width_px) / 2.0 / (angle / 2.0).tan());
-                }
-                Some(angle) => {
-                    let allowed = format!("must be above 0 and below pi radians, found {angle}");
-                    return Err(self.place.error("camera_angle_x", allowed));
-                }
-                None => {}
+            let x_px = match place.number(map, "fl_x")? {
+                Some(fl) => Some(fl),
+                None => self.by_angle(place.number(map, "camera_angle_x")?, "camera_angle_x", width_px)?,
+            };
+            if let Some(x_px) = x_px {
+                let y_px = match self.number("fl_y")? {
+                    Some(fl) => Some(fl),
+                    None => self.by_angle(place.number(map, "camera_angle_y")?, "camera_angle_y", height_px)?,
+                };
+                return Ok([x_px, y_px.unwrap_or(x_px)]);
             }
         }
         Err(self.place.error("fl_x", "is missing, and so is `camera_angle_x`; one of them is needed"))
+    }
+
+    /// Returns the focal length of an angle of view over a side of the image, pixels.
+    fn by_angle(&self, angle: Option<f64>, key: &str, side_px: u32) -> Result<Option<f64>, DatasetError> {
+        match angle {
+            Some(angle) if !(angle > 0.0 && angle < std::f64::consts::PI) => {
+                Err(self.place.error(key, format!("must be above 0 and below pi radians, found {angle}")))
+            }
+            angle => Ok(angle.map(|angle| f64::from(side_px) / 2.0 / (angle / 2.0).tan())),
+        }
     }
 
     /// Returns the camera. `image_size_px` is the image's size if it can be read; it is only read if the keys do not
@@ -117,8 +144,8 @@ impl Keys<'_> {
         image_size_px: impl FnOnce() -> Option<(u32, u32)>,
     ) -> Result<(PinholeCamera, bool), DatasetError> {
         let place = self.place;
-        let (width_px, height_px, assumed) = match (self.side_px("w")?, self.side_px("h")?) {
-            (Some(w), Some(h)) => (w, h, false),
+        let (width_px, height_px, size_of) = match (self.side_px("w")?, self.side_px("h")?) {
+            (Some(w), Some(h)) => (w, h, SizeOf::Keys),
             (None, Some(_)) => return Err(place.error("w", "is missing while `h` is given")),
             (Some(_), None) => return Err(place.error("h", "is missing while `w` is given")),
             (None, None) => match image_size_px() {
@@ -126,18 +153,17 @@ impl Keys<'_> {
                     let limit = format!("{w}x{h} pixels; at most {MAX_IMAGE_SIDE_PX} a side");
                     return Err(place.error("file_path", limit));
                 }
-                Some((w, h)) => (w, h, true),
-                // Such an image is reported, and its frame is not used.
-                None => (1, 1, false),
+                Some((w, h)) => (w, h, SizeOf::Image),
+                None => (1, 1, SizeOf::Nothing),
             },
         };
-        let fl_x_px = self.focal_length_px(width_px)?;
+        let [fl_x_px, fl_y_px] = self.focal_lengths_px(width_px, height_px)?;
         let (world_from_camera, exact) = exact_pose(place, read_matrix(place, self.frame)?)?;
         let camera = PinholeCamera {
             width_px,
             height_px,
             fl_x_px,
-            fl_y_px: self.number("fl_y")?.unwrap_or(fl_x_px),
+            fl_y_px,
             cx_px: self.number("cx")?.unwrap_or(f64::from(width_px) / 2.0),
             cy_px: self.number("cy")?.unwrap_or(f64::from(height_px) / 2.0),
             world_from_camera,
@@ -150,10 +176,38 @@ impl Keys<'_> {
             let form = "a camera-to-world matrix is a rotation and a translation over the row 0 0 0 1";
             place.error(key, format!("{error}; {form}"))
         })?;
-        if assumed {
+        if size_of != SizeOf::Nothing {
+            self.check_range(&camera)?;
+        }
+        if size_of == SizeOf::Image {
             self.check_size(&camera)?;
         }
         Ok((camera, !exact))
+    }
+
+    /// Checks that the numbers can be those of a camera.
+    fn check_range(&self, camera: &PinholeCamera) -> Result<(), DatasetError> {
+        let (w, h) = (f64::from(camera.width_px), f64::from(camera.height_px));
+        let [least, most] = FIELD_OF_VIEW_DEG;
+        for (key, focal, side) in [("fl_x", camera.fl_x_px, w), ("fl_y", camera.fl_y_px, h)] {
+            let angle = 2.0 * (side / 2.0 / focal).atan().to_degrees();
+            if !(least..=most).contains(&angle) {
+                let what = format!("{focal:e} pixels is a field of view of {angle:e} degrees over {side} pixels");
+                return Err(self.place.error(key, format!("{what}; allowed are {least} to {most} degrees")));
+            }
+        }
+        for (key, centre, side) in [("cx", camera.cx_px, w), ("cy", camera.cy_px, h)] {
+            if (centre / side - 0.5).abs() > MAX_CROPPED {
+                let what = format!("is {centre}, far outside of the image of {side} pixels");
+                return Err(self.place.error(key, what));
+            }
+        }
+        match camera.position_m().into_iter().find(|x| x.abs() > MAX_POSITION) {
+            Some(x) => {
+                Err(self.place.error("transform_matrix", format!("has the position {x:e}; at most {MAX_POSITION:e}")))
+            }
+            None => Ok(()),
+        }
     }
 
     /// Checks that intrinsics without a size can be for images of the size that was found.

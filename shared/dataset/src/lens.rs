@@ -50,10 +50,15 @@ impl Lens {
                 return Err(place.error(key, format!("is {value}; this lens is not supported; {SUPPORTED}")));
             }
         }
+        let radius = "fisheye_crop_radius";
+        if let Some(value) = present(map(radius), radius).filter(|v| is_set(v)) {
+            let problem = format!("is {value}, and is not supported; write the circle as a mask (`mask_path`)");
+            return Err(place.error(radius, problem));
+        }
         let model = place.text(map("camera_model"), "camera_model")?;
         let fisheye = match model.map(str::to_ascii_uppercase).as_deref() {
             None | Some("OPENCV" | "PINHOLE" | "SIMPLE_PINHOLE" | "SIMPLE_RADIAL" | "RADIAL" | "PERSPECTIVE") => {
-                present(map("is_fisheye"), "is_fisheye").is_some_and(is_set)
+                place.flag(map("is_fisheye"), "is_fisheye")?
             }
             Some("OPENCV_FISHEYE" | "RADIAL_FISHEYE" | "SIMPLE_RADIAL_FISHEYE") => true,
             Some(other) => return Err(place.error("camera_model", format!("is `{other}`; {SUPPORTED}"))),

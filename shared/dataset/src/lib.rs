@@ -37,6 +37,7 @@ mod seen;
 pub mod sensor;
 mod split;
 mod transforms;
+mod unique;
 mod views;
 mod writer;
 

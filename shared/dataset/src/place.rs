@@ -58,6 +58,13 @@ impl<'a> Place<'a> {
         value.as_str().map(Some).ok_or_else(|| self.error(key, format!("must be a text, found {}", kind(value))))
     }
 
+    /// Returns a flag; a missing one is false. Tools write `true`, or 1.
+    pub fn flag(&self, map: &Map<String, Value>, key: &str) -> Result<bool, DatasetError> {
+        let Some(value) = present(map, key) else { return Ok(false) };
+        let flag = value.as_bool().or_else(|| value.as_f64().map(|number| number != 0.0));
+        flag.ok_or_else(|| self.error(key, format!("must be true or false, found {}", kind(value))))
+    }
+
     pub fn vector(&self, map: &Map<String, Value>, key: &str) -> Result<[f64; 3], DatasetError> {
         let value = present(map, key).ok_or_else(|| self.error(key, "is missing"))?;
         numbers::<3>(value).ok_or_else(|| self.error(key, "must be a list of 3 finite numbers"))

@@ -14,6 +14,7 @@ use crate::place::{Place, present};
 use crate::scenario::MAX_FRAMES;
 use crate::scenario::{Frame, ScenarioInfo};
 use crate::scenario_keys::{read_scenario, read_state};
+use crate::unique::Unique;
 use crate::views::{check_views, derive_states_without_scenario, number_views_by_pose, number_views_of_parts};
 
 /// Maximum size of a transforms file, bytes.
@@ -132,7 +133,8 @@ fn parse(path: &Path) -> Result<Value, DatasetError> {
         }
         None => bytes,
     };
-    serde_json::from_slice(text.strip_prefix("\u{feff}".as_bytes()).unwrap_or(&text)).map_err(json)
+    let text = text.strip_prefix("\u{feff}".as_bytes()).unwrap_or(&text);
+    serde_json::from_slice(text).map(|Unique(root)| root).map_err(json)
 }
 
 type ByteOrder = fn([u8; 2]) -> u16;
@@ -140,8 +142,8 @@ type ByteOrder = fn([u8; 2]) -> u16;
 /// Returns the byte order of UTF-16, which has a byte order mark, or a zero next to the first character of a JSON file.
 fn utf16_order(bytes: &[u8]) -> Option<ByteOrder> {
     match bytes {
-        [0xFF, 0xFE, ..] | [b'{' | b'\n' | b'\r' | b' ', 0, ..] => Some(u16::from_le_bytes),
-        [0xFE, 0xFF, ..] | [0, b'{' | b'\n' | b'\r' | b' ', ..] => Some(u16::from_be_bytes),
+        [0xFF, 0xFE, ..] | [b'{' | b'\n' | b'\r' | b'\t' | b' ', 0, ..] => Some(u16::from_le_bytes),
+        [0xFE, 0xFF, ..] | [0, b'{' | b'\n' | b'\r' | b'\t' | b' ', ..] => Some(u16::from_be_bytes),
         _ => None,
     }
 }
@@ -153,7 +155,13 @@ fn decode_utf16(bytes: &[u8], order: ByteOrder) -> Option<Vec<u8>> {
     rest.is_empty().then(|| text.into_bytes())
 }
 
-/// Warns about lenses and rounded poses of a file's frames.
+/// Returns true if instant-ngp would find a mask next to the image; its masks are white where a pixel is ignored.
+fn has_unnamed_mask(frame: &Frame) -> bool {
+    let name = frame.image_path.file_stem().map(|stem| format!("dynamic_mask_{}.png", stem.display()));
+    frame.mask_path.is_none() && name.is_some_and(|name| frame.image_path.with_file_name(name).is_file())
+}
+
+/// Warns about lenses, rounded poses and unnamed masks of a file's frames.
 fn warn(path: &Path, frames: &[Frame], rounded: usize, warnings: &mut Vec<String>) {
     let bent: Vec<&Frame> = frames.iter().filter(|f| f.lens != Lens::Pinhole).collect();
     if let Some(first) = bent.first() {
@@ -163,6 +171,27 @@ fn warn(path: &Path, frames: &[Frame], rounded: usize, warnings: &mut Vec<String
             path.display(),
             first.lens.key(),
             bent.len(),
+            frames.len()
+        ));
+    }
+    let outside = |centre: f64, side: u32| !(0.0..=f64::from(side)).contains(&centre);
+    let cropped =
+        |f: &&Frame| outside(f.camera.cx_px, f.camera.width_px) || outside(f.camera.cy_px, f.camera.height_px);
+    let outside = frames.iter().filter(cropped).count();
+    if outside > 0 {
+        warnings.push(format!(
+            "{}: the principal point (keys `cx` and `cy`) of {outside} of {} images is outside of them, as in parts of \
+             larger images",
+            path.display(),
+            frames.len()
+        ));
+    }
+    let unnamed = frames.iter().filter(|frame| has_unnamed_mask(frame)).count();
+    if unnamed > 0 {
+        warnings.push(format!(
+            "{}: {unnamed} of {} images have a `dynamic_mask_` file next to them, which is not used; name inverted masks \
+             (zero where a pixel is ignored) with the key `mask_path`",
+            path.display(),
             frames.len()
         ));
     }

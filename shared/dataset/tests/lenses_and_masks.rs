@@ -123,6 +123,8 @@ fn other_lenses_are_refused() {
         ("k6", json!(0.02), "is 0.02"),
         ("distortion_params", json!([0.1, 0.2]), "must be 6 finite numbers"),
         ("k1", json!("much"), "must be a finite number"),
+        ("is_fisheye", json!("false"), "must be true or false, found a text"),
+        ("fisheye_crop_radius", json!(900), "is 900, and is not supported; write the circle as a mask"),
     ] {
         for in_frame in [false, true] {
             let with = json!({key: value});
@@ -196,6 +198,19 @@ fn masks_are_used() {
     assert!(Dataset::open(dir.path()).unwrap_err().to_string().contains("a.png: no pixel remains"));
     image::GrayImage::new(9, 9).save(&path).unwrap();
     assert!(refused(dir.path()).contains("masks/a.png: the mask has 9x9 pixels, and its image 240x180"));
+}
+
+/// Masks that no key names are not passed over in silence.
+#[test]
+fn unnamed_masks_are_warned_of() {
+    let dir = tempfile::tempdir().unwrap();
+    put(dir.path(), &dot([100.0, 100.0]), &json!({}), &json!({}));
+    image::GrayImage::new(W, H).save(dir.path().join("dynamic_mask_a.png")).unwrap();
+    let warnings = Dataset::open(dir.path()).unwrap().warnings().to_vec();
+    assert!(warnings[0].contains("1 of 1 images have a `dynamic_mask_` file") && warnings[0].contains("`mask_path`"));
+    image::GrayImage::from_pixel(W, H, image::Luma([9])).save(dir.path().join("mask.png")).unwrap();
+    put(dir.path(), &dot([100.0, 100.0]), &json!({}), &json!({"mask_path": "mask.png"}));
+    assert!(Dataset::open(dir.path()).unwrap().warnings().is_empty());
 }
 
 /// States that differ only in masked pixels look the same.

@@ -94,6 +94,11 @@ fn encodings() {
         std::fs::write(&path, bytes).unwrap();
         assert_eq!(opened_and_imported(dir.path()).frames().len(), 4);
     }
+    let indented = format!("\t{}", text.replace("],", "],\r\n\t"));
+    for bytes in [indented.clone().into_bytes(), little(&indented), big(&indented)] {
+        std::fs::write(&path, bytes).unwrap();
+        assert_eq!(opened_and_imported(dir.path()).frames().len(), 4);
+    }
     std::fs::write(&path, &little(&marked)[..301]).unwrap();
     assert!(refused(dir.path()).contains("transforms.json: not valid JSON: not valid UTF-16"));
     std::fs::write(&path, "version https://git-lfs.github.com/spec/v1\noid sha256:0\n").unwrap();
@@ -218,6 +223,78 @@ fn matrices() {
     assert!(refused(dir.path()).contains("is mirrored: its determinant is -8.0000,"));
     changed(&|i, j, v| if (i, j) == (0, 0) { v + 0.3 } else { v });
     assert!(refused(dir.path()).contains("the rotation part of `transform_matrix` is not a rotation"));
+}
+
+/// A key that appears twice, NaN, numbers beyond the range and deep nesting are errors of the file; none of two values is
+/// chosen in silence.
+#[test]
+fn ambiguous_and_odd_json() {
+    let dir = tempfile::tempdir().unwrap();
+    put(dir.path(), &plain());
+    let text = plain().to_string();
+    let with = |more: &str| std::fs::write(dir.path().join("transforms.json"), text.replacen('{', more, 1)).unwrap();
+    with("{\"frames\": [],");
+    assert!(refused(dir.path()).contains("transforms.json: not valid JSON: key `frames` appears twice"));
+    for value in ["NaN", "-Infinity", "1e999", &"[".repeat(100_000)] {
+        with(&format!("{{\"k1\": {value},"));
+        assert!(refused(dir.path()).contains("transforms.json: not valid JSON"), "{value:.9}");
+    }
+    with("{\"k1\": 1e300,");
+    assert!(refused(dir.path()).contains("images/3.png: no pixel remains"), "the lens shows nothing");
+}
+
+/// Numbers that no camera has are refused by key; a principal point outside of the image is warned of.
+#[test]
+fn numbers_of_cameras() {
+    let dir = tempfile::tempdir().unwrap();
+    let with = |key: &str, value: f64| {
+        let mut set = plain();
+        set[key] = json!(value);
+        put(dir.path(), &set);
+    };
+    for (key, value) in
+        [("fl_x", 1e300), ("fl_x", 1e-300), ("fl_y", 1e6), ("fl_y", 1e-3), ("cx", 1e9), ("cx", -400.0), ("cy", 1e300)]
+    {
+        with(key, value);
+        assert!(refused(dir.path()).contains(&format!("frame 0 (images/0.png): key `{key}`: ")), "{key} {value}");
+    }
+    for (key, value, warned) in [("cx", -5.0, true), ("cy", 33.0, true), ("cx", 32.0, false), ("fl_x", 5000.0, false)] {
+        with(key, value);
+        let set = opened_and_imported(dir.path());
+        assert_eq!(set.warnings().iter().any(|w| w.contains("principal point")), warned, "{:?}", set.warnings());
+    }
+    for (value, allowed) in [(1e300, false), (-2e9, false), (5e6, true)] {
+        let mut set = plain();
+        set["frames"][0]["transform_matrix"][0][3] = json!(value);
+        put(dir.path(), &set);
+        assert_eq!(Dataset::open(dir.path()).is_ok(), allowed, "{value}");
+    }
+}
+
+/// A vertical field of view gives the focal length along y, with that of its own level along x.
+#[test]
+fn both_fields_of_view() {
+    let dir = tempfile::tempdir().unwrap();
+    let focal = |change: &dyn Fn(&mut Value)| {
+        let mut set = plain();
+        set.as_object_mut().unwrap().retain(|key, _| !["fl_x", "fl_y"].contains(&key.as_str()));
+        change(&mut set);
+        put(dir.path(), &set);
+        let camera = opened_and_imported(dir.path()).frames()[0].camera;
+        [camera.fl_x_px, camera.fl_y_px].map(|f| (f * 1e6).round() / 1e6)
+    };
+    let [x, y] = [1.0_f64, 0.8].map(|angle| (16.0 / (angle / 2.0).tan() * 1e6).round() / 1e6);
+    assert_eq!(focal(&|set| set["camera_angle_x"] = json!(1.0)), [x, x]);
+    let both = |set: &mut Value| {
+        set["camera_angle_x"] = json!(1.0);
+        set["camera_angle_y"] = json!(0.8);
+    };
+    assert_eq!(focal(&both), [x, y]);
+    let own = |set: &mut Value| {
+        both(set);
+        set["frames"][0]["fl_x"] = json!(40.0);
+    };
+    assert_eq!(focal(&own), [40.0, 40.0]);
 }
 
 /// Intrinsics without a size that belong to images of another size are refused with both numbers; with the size, an
