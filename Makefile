@@ -21,10 +21,11 @@ endif
 help: ## List the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
 
-# The programs of a run. `make run` leaves out the window, the benchmarks, films and the bridge.
+# The programs of a run. `make run` leaves out what needs libtorch (training, evaluation, the window), the benchmarks,
+# films and the bridge.
 RUNNING := carff carff-launch carff-camera carff-encoder carff-forecaster carff-prober carff-renderer carff-controller
 
-run: libtorch onnxruntime ## Drive the shipped model through the intersection; show decisions, then write report, JSON and filmstrip
+run: onnxruntime ## Drive the shipped model through the intersection; show decisions, then write report, JSON and filmstrip
 	cargo build --release --locked --bins --no-default-features $(addprefix -p ,$(RUNNING))
 	$(TARGET)/release/carff launch $(GRAPH) --report $(REPORT)
 
@@ -34,11 +35,11 @@ build: libtorch onnxruntime ## Build all programs
 test: build ## Run all tests, including whole graphs of processes
 	cargo test --release --locked --workspace --no-fail-fast
 
-deb: build ## Build a Debian package: programs, checkpoints, configs, systemd units
+deb: build ## Build two Debian packages: for a vehicle (programs, checkpoints, configs, units), and what needs libtorch
 	$(PYTHON) launch/packaging/build_deb.py $(TARGET)
 
-check-deb: deb ## Install the package here, drive, try to access it as another user, purge it (as root)
-	$(PYTHON) tests/scripts/check_deb.py $(TARGET)/carff_*.deb
+check-deb: deb ## Install the packages here, drive, try to access a run as another user, purge them (as root)
+	$(PYTHON) tests/scripts/check_deb.py $(TARGET)/carff_*.deb $(TARGET)/carff-lab_*.deb
 
 link: ## Build carff-link, which forwards topics to another machine (optional; zenoh adds 300 crates)
 	cargo build --release --locked --manifest-path services/link/Cargo.toml --target-dir $(TARGET)/link

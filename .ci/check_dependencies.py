@@ -2,7 +2,7 @@
 """Checks dependencies and house rules without network, after the crates are fetched.
 
 The rules of deny.toml cover licences, banned crates, duplicate versions and sources. This program also checks the
-direction of dependencies between our crates. House rules: no unfinished code, no paths of one machine, `unsafe` in named
+direction of dependencies between our crates, and which of them may use libtorch. House rules: no unfinished code, no paths of one machine, `unsafe` in named
 modules only.
 
 Usage: python3 .ci/check_dependencies.py      (from anywhere; exit code 1 and one line per finding)
@@ -36,6 +36,17 @@ UNSAFE_MODULES = {
     "shared/transport/src/untyped.rs": "reads the header of messages whose type is not known",
 }
 
+# The only crates that may use libtorch, each with its reason. No other program links it, and `make run` builds none.
+TENSOR_CRATE = "torch-sys"
+TENSOR_USERS = {
+    "carff-encoder": "`carff-encoder-tch`; `carff-encoder` and a build without the feature `tch` do not link it",
+    "carff-evaluation": "the networks of training, evaluated",
+    "carff-lab": "training and evaluation",
+    "carff-networks": "the networks in tensors",
+    "carff-readers": "the reader of training files",
+    "carff-training": "training",
+    "carff-viewer": "the window, which computes without a graph",
+}
 
 UNFINISHED = re.compile(r"\b(?:todo|unimplemented)!|\bdbg!\(|\b(?:FIXME|TODO|XXX)\b")
 MACHINE_PATH = re.compile(r"(?<![\w.}$])/(?:home|root|work|Users|mnt|media|tmp)/(?!carff-)")
@@ -169,8 +180,8 @@ def check_arrows(metadata: dict) -> None:
         name = package["name"]
         for dependency in package["dependencies"]:
             used = dependency["name"]
-            # `carff-launch` is every command: also those of `carff` and the benchmarks.
-            if used not in room or (name == "carff-launch" and room[used] == "launch"):
+            # `carff-launch` is every command: also those of `carff` and the benchmarks. `carff-lab` is the rest of it.
+            if used not in room or (name in ("carff-launch", "carff-lab") and room[used] == "launch"):
                 continue
             if room[used] != "shared" and room[name] != "tests":
                 find(f"{name} ({room[name]}/) depends on {used} ({room[used]}/): crates may only depend on shared/")
@@ -178,6 +189,31 @@ def check_arrows(metadata: dict) -> None:
                 find(f"{name} depends on {used}: nothing depends on tests/")
             if name == "carff-messages" and used != "carff-base":
                 find(f"carff-messages depends on {used}: of our crates it may only use carff-base")
+
+
+def check_tensors(metadata: dict) -> None:
+    """Checks that only the named crates depend on libtorch, over any number of crates; tests may."""
+    names = {package["id"]: package["name"] for package in metadata["packages"]}
+    uses = {
+        node["id"]: [d["pkg"] for d in node["deps"] if any(kind["kind"] is None for kind in d["dep_kinds"])]
+        for node in metadata["resolve"]["nodes"]
+    }
+
+    def way(package: str) -> list[str]:
+        """Returns the names of the crates from a package to libtorch's; none if there is no way."""
+        ways, seen = [[package]], {package}
+        while ways:
+            here = ways.pop(0)
+            if names[here[-1]] == TENSOR_CRATE:
+                return [names[p] for p in here]
+            ways += [[*here, used] for used in uses[here[-1]] if used not in seen and not seen.add(used)]
+        return []
+
+    users = {names[package]: found for package in metadata["workspace_members"] if (found := way(package))}
+    for name in sorted(users.keys() - TENSOR_USERS.keys()):
+        find(f"{name} links libtorch, which only {', '.join(TENSOR_USERS)} may: {' -> '.join(users[name])}")
+    for name in sorted(TENSOR_USERS.keys() - users.keys()):
+        find(f".ci/check_dependencies.py: {name} does not use libtorch any more")
 
 
 def check_sources() -> None:
@@ -218,6 +254,7 @@ def main() -> None:
     )
     check_crates(metadata, deny)
     check_arrows(metadata)
+    check_tensors(metadata)
     check_sources()
     for text in findings:
         print(f"error: {text}", file=sys.stderr)

@@ -51,7 +51,7 @@ FIRST_LINE = re.compile(r"(?:What|Which|Who|How|Whether|Where|When|Of)\b")
 ALLOWED: dict[tuple[str, str], str] = {
     ("launch/src/dataset.rs", "picture"): "key of the scenario file",
     ("services/viewer/src/main.rs", "picture"): "option `--picture`",
-    ("shared/evaluation/src/figures.rs", "unseen"): "key of the manifest",
+    ("shared/trials/src/figures.rs", "unseen"): "key of the manifest",
     ("shared/evaluation/src/role.rs", "unseen"): "key of `results.json`",
     ("shared/scenes/tests/rendering.rs", "picture"): "key of the scenario file",
     ("shared/training/tests/one_state.rs", "picture"): "key of the scenario file",

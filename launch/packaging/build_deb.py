@@ -1,17 +1,21 @@
 #!/usr/bin/env python3
-"""Builds a Debian package from the built programs.
+"""Builds two Debian packages from the built programs: what a vehicle carries, and what needs libtorch.
 
-Usage: python3 launch/packaging/build_deb.py [TARGET] [OUT]     (default: target, target/carff_VERSION_ARCH.deb)
+Usage: python3 launch/packaging/build_deb.py [TARGET] [OUT]     (default: target, TARGET)
+
+OUT is the folder of carff_VERSION_ARCH.deb and carff-lab_VERSION_ARCH.deb. Content of the first:
 
 | content | path |
 |---|---|
-| programs (the link and optional cameras only if they were built), libtorch, ONNX Runtime | /usr/lib/carff/bin, /usr/lib/carff/lib |
+| programs (the link and optional cameras only if they were built), ONNX Runtime | /usr/lib/carff/bin, /usr/lib/carff/lib |
 | checkpoints, graphs, scenarios, schemas | /usr/share/carff/configs |
 | graph file of the service | /etc/carff/vehicle.toml |
 | units | /lib/systemd/system |
 | manual pages, completions, documents | the system's usual paths |
 
-Needs dpkg-deb. With cargo-cyclonedx, the documents include a bill of materials. Equal files give an equal package: its
+The second adds to the same folders: `carff-lab` (training, evaluation), the window, `carff-encoder-tch`, and libtorch.
+
+Needs dpkg-deb. With cargo-cyclonedx, the documents include a bill of materials. Equal files give equal packages: their
 times are those of the last commit.
 """
 
@@ -27,16 +31,19 @@ from pathlib import Path
 import build_sbom
 
 ROOT = Path(__file__).resolve().parents[2]
-PROGRAMS = ["carff", "carff-launch", "carff-camera", "carff-encoder", "carff-encoder-tch", "carff-forecaster", "carff-prober",
-            "carff-renderer", "carff-controller", "carff-viewer"]
+PROGRAMS = ["carff", "carff-launch", "carff-camera", "carff-encoder", "carff-forecaster", "carff-prober", "carff-renderer",
+            "carff-controller"]
 # Included if they were built with `make link`, `make camera-rtsp` and `make camera-gst`.
 OPTIONAL = ["carff-link", "carff-camera-rtsp", "carff-camera-gst"]
+# Programs that link libtorch.
+LAB_PROGRAMS = ["carff-lab", "carff-encoder-tch", "carff-viewer"]
 # The run path of a program built in the project, and its replacement in the package.
 BUILT_RUNPATH = b"$ORIGIN/../../.libtorch/lib:$ORIGIN/../../../.libtorch/lib"
 INSTALLED_RUNPATH = b"$ORIGIN/../lib"
-DEPENDS = "libc6 (>= 2.34), libgcc-s1, libstdc++6, libgomp1, passwd"
+DEPENDS = "libc6 (>= 2.34), libgcc-s1, libstdc++6, passwd"
+LAB_DEPENDS = "libc6 (>= 2.34), libgcc-s1, libstdc++6, libgomp1"
 # Only the window needs the libraries of a display.
-SUGGESTS = "libgl1, libxkbcommon0, libwayland-client0, ffmpeg"
+LAB_SUGGESTS = "libgl1, libxkbcommon0, libwayland-client0"
 
 
 def run(*command: str, **kwargs) -> str:
@@ -77,11 +84,6 @@ def fill(tree: Path, target: Path) -> None:
     home, share, doc = tree / "usr/lib/carff", tree / "usr/share/carff", tree / "usr/share/doc/carff"
     for program in PROGRAMS + [name for name in OPTIONAL if (target / "release" / name).is_file()]:
         put_program(target / "release" / program, home / "bin" / program)
-    libtorch = Path(os.environ.get("LIBTORCH") or ROOT / ".libtorch")
-    for library in sorted((libtorch / "lib").glob("*.so*")):
-        put(library, home / "lib" / library.name)
-    if (libtorch / "build-version").is_file():
-        put(libtorch / "build-version", home / "build-version")
     put(Path(os.environ.get("ORT_DYLIB_PATH") or ROOT / ".onnxruntime/lib/libonnxruntime.so.1"), home / "lib/libonnxruntime.so.1")
     (tree / "usr/bin").mkdir(parents=True)
     (tree / "usr/bin/carff").symlink_to("../lib/carff/bin/carff")
@@ -104,9 +106,8 @@ def fill(tree: Path, target: Path) -> None:
     put(debian / "carff.tmpfiles", tree / "usr/lib/tmpfiles.d/carff.conf")
 
     carff = str(target / "release/carff")
-    environment = {**os.environ, "LD_LIBRARY_PATH": str(libtorch / "lib")}
     with tempfile.TemporaryDirectory() as folder:
-        run(carff, "man", folder, env=environment)
+        run(carff, "man", folder)
         for page in sorted(Path(folder).iterdir()):
             put_compressed(page.read_bytes(), tree / "usr/share/man/man1" / f"{page.name}.gz")
     for shell, place in [
@@ -115,42 +116,83 @@ def fill(tree: Path, target: Path) -> None:
         ("fish", "usr/share/fish/vendor_completions.d/carff.fish"),
     ]:
         (tree / place).parent.mkdir(parents=True, exist_ok=True)
-        (tree / place).write_text(run(carff, "completions", shell, env=environment) + "\n")
+        (tree / place).write_text(run(carff, "completions", shell) + "\n")
 
 
-def control(tree: Path, version: str, architecture: str) -> None:
+def fill_lab(tree: Path, target: Path) -> None:
+    home = tree / "usr/lib/carff"
+    for program in LAB_PROGRAMS:
+        put_program(target / "release" / program, home / "bin" / program)
+    libtorch = Path(os.environ.get("LIBTORCH") or ROOT / ".libtorch")
+    for library in sorted((libtorch / "lib").glob("*.so*")):
+        put(library, home / "lib" / library.name)
+    if (libtorch / "build-version").is_file():
+        put(libtorch / "build-version", home / "build-version")
+    for page in ["LICENSE-MIT", "LICENSE-APACHE", "THIRD_PARTY.md"]:
+        put(ROOT / page, tree / "usr/share/doc/carff-lab" / page)
+
+
+def write_control(tree: Path, fields: dict[str, str], description: str) -> Path:
     folder = tree / "DEBIAN"
     folder.mkdir()
     kilobytes = sum(p.stat().st_size for p in tree.rglob("*") if p.is_file() and not p.is_symlink()) // 1024
-    (folder / "control").write_text(
-        f"Package: carff\nVersion: {version}\nArchitecture: {architecture}\nMaintainer: The CARFF engineers\n"
-        f"Installed-Size: {kilobytes}\nDepends: {DEPENDS}\nSuggests: {SUGGESTS}\nSection: science\nPriority: optional\n"
-        "Description: driving decisions from one camera image under occlusion\n"
+    fields = {**fields, "Maintainer": "The CARFF engineers", "Installed-Size": str(kilobytes), "Section": "science",
+              "Priority": "optional", "Description": description}
+    (folder / "control").write_text("".join(f"{key}: {value}\n" for key, value in fields.items()))
+    return folder
+
+
+def control(tree: Path, version: str, architecture: str) -> None:
+    fields = {"Package": "carff", "Version": version, "Architecture": architecture, "Depends": DEPENDS,
+              "Suggests": f"carff-lab (= {version}), ffmpeg"}
+    folder = write_control(
+        tree,
+        fields,
+        "driving decisions from one camera image under occlusion\n"
         " CARFF computes a belief over the possible 3D scenes of a camera image, forecasts them, and decides to\n"
         " advance or to halt. It runs as processes over shared memory, with probes, recordings and a systemd\n"
-        " service.\n"
+        " service.",
     )
     for script in ["postinst", "prerm", "postrm"]:
         put(ROOT / "launch/packaging/debian" / script, folder / script, 0o755)
     put(ROOT / "launch/packaging/debian/conffiles", folder / "conffiles")
 
 
+def control_lab(tree: Path, version: str, architecture: str) -> None:
+    fields = {"Package": "carff-lab", "Version": version, "Architecture": architecture,
+              "Depends": f"carff (= {version}), {LAB_DEPENDS}", "Suggests": LAB_SUGGESTS}
+    write_control(
+        tree,
+        fields,
+        "training, evaluation and window of CARFF\n"
+        " The programs of CARFF that compute with libtorch, and libtorch. A vehicle that drives does not need them.",
+    )
+
+
+def build(name: str, folder: Path, out: Path) -> None:
+    tree = folder / name
+    for path in tree.rglob("*"):
+        if path.is_dir():
+            path.chmod(0o755)
+    environment = {**os.environ, "SOURCE_DATE_EPOCH": run("git", "log", "-1", "--format=%ct")}
+    run("dpkg-deb", "--root-owner-group", "-Zzstd", "-z9", "--build", str(tree), str(out), env=environment)
+    print(f"{out}: {out.stat().st_size / 1e6:.0f} MB")
+
+
 def main() -> None:
     target = Path(sys.argv[1] if len(sys.argv) > 1 else "target").resolve()
     version = re.search(r'^version = "(.+)"$', (ROOT / "Cargo.toml").read_text(), re.M).group(1)
     architecture = run("dpkg", "--print-architecture")
-    out = Path(sys.argv[2] if len(sys.argv) > 2 else target / f"carff_{version}_{architecture}.deb").resolve()
+    out = Path(sys.argv[2] if len(sys.argv) > 2 else target).resolve()
+    out.mkdir(parents=True, exist_ok=True)
+    parts = [("carff", fill, control), ("carff-lab", fill_lab, control_lab)]
     with tempfile.TemporaryDirectory(dir=target) as folder:
-        tree = Path(folder) / "carff"
-        tree.mkdir(mode=0o755)
-        fill(tree, target)
-        control(tree, version, architecture)
-        for path in tree.rglob("*"):
-            if path.is_dir():
-                path.chmod(0o755)
-        environment = {**os.environ, "SOURCE_DATE_EPOCH": run("git", "log", "-1", "--format=%ct")}
-        run("dpkg-deb", "--root-owner-group", "-Zzstd", "-z9", "--build", str(tree), str(out), env=environment)
-    print(f"{out}: {out.stat().st_size / 1e6:.0f} MB")
+        for name, content, describe in parts:
+            tree = Path(folder) / name
+            tree.mkdir(mode=0o755)
+            content(tree, target)
+            describe(tree, version, architecture)
+            build(name, Path(folder), out / f"{name}_{version}_{architecture}.deb")
 
 
 if __name__ == "__main__":

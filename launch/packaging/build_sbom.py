@@ -22,7 +22,7 @@ from fetch_libraries import LIBRARIES
 
 ROOT = Path(__file__).resolve().parents[2]
 TARGET = "x86_64-unknown-linux-gnu"
-PROGRAMS = ["launch", "launch/carff", "services/camera", "services/encoder", "services/forecaster", "services/prober",
+PROGRAMS = ["launch", "launch/carff", "launch/lab", "services/camera", "services/encoder", "services/forecaster", "services/prober",
             "services/renderer", "services/controller", "services/viewer"]
 TOOL = ["cargo", "cyclonedx"]
 # The crate that uses each library.

@@ -9,7 +9,7 @@ use carff_dataset::{
     sensor::SensorNoise,
 };
 use carff_scenes::{Extras, Scenario};
-use carff_training::places;
+use carff_trials::places;
 use indicatif::{ProgressBar, ProgressStyle};
 
 /// Commands for datasets.

@@ -1,14 +1,15 @@
-//! The parts of the `carff` command that start graphs or compute with models: launch, replay, soak, training,
-//! evaluation and datasets. The crate `carff` contains the commands that observe a run.
+//! The commands that start graphs: launch, replay and soak; datasets, schemas, the doctor, and the options of all other
+//! commands. Never linked with libtorch.
+//!
+//! The crate `carff` contains the commands that observe a run, and the crate `carff-lab` those that compute with
+//! libtorch.
 
-pub mod ablate;
-#[cfg(feature = "import")]
-pub mod backbone;
 pub mod checkpoint;
+pub mod command;
 pub mod dataset;
 mod decisions;
 pub mod doctor;
-pub mod eval;
+pub mod lab;
 pub mod launch;
 pub mod planning;
 #[cfg(feature = "recording")]
@@ -19,4 +20,3 @@ pub mod shell;
 #[cfg(feature = "recording")]
 pub mod soak;
 pub mod supervision;
-pub mod train;

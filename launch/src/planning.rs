@@ -1,4 +1,4 @@
-//! A finished run, and the inputs by which `carff_evaluation::run` judges its drives.
+//! A finished run, and the inputs by which `carff_trials::run` judges its drives.
 
 use crate::supervision::monitor::{FrameRecord, Records};
 use carff::provenance::Origin;
@@ -6,9 +6,9 @@ use carff_checkpoint::CheckpointPlanning;
 use carff_config::{CameraSource, GraphConfig};
 use carff_dataset::{ScenarioInfo, drives::DriveKind};
 use carff_decision::TakeFrame;
-use carff_evaluation::run::{DecidedFrame, JudgedRun, RunPlanning, RunSettings, decisive_frames};
 use carff_messages::{ActionCode, Gaussian, Reason, Stage};
 use carff_scenes::Scenario;
+use carff_trials::run::{DecidedFrame, JudgedRun, RunPlanning, RunSettings, decisive_frames};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
@@ -52,7 +52,6 @@ impl Planning {
         if decisive.iter().all(|(frame, _)| frame.posterior.is_none()) {
             return Ok(None);
         }
-        carff_networks::allocator::keep_large_blocks();
         let posteriors: Vec<_> = outcome.records.frames.values().filter_map(taken).collect();
         Ok(Some(Self { run: JudgedRun::load(settings(outcome)?, &posteriors)?, decisive }))
     }

@@ -2,9 +2,10 @@
 //! it for completion and checks. `configs/schemas` contains the generated files. With `--python` or `--c`, the layouts of
 //! the messages in shared memory.
 
+use anyhow::Context;
 use carff_config::{GraphConfig, SoakConfig};
 use carff_scenes::config::ScenarioConfig;
-use carff_training::TrainingConfig;
+use schemars::JsonSchema;
 use schemars::generate::SchemaSettings;
 use serde_json::Value;
 
@@ -69,25 +70,34 @@ impl FileKind {
     }
 }
 
-/// Returns the schema of a kind of file: draft 7, which editors support best.
-pub fn schema(kind: FileKind) -> Value {
-    let generator = SchemaSettings::draft07().into_generator();
-    let mut schema = match kind {
-        FileKind::Graph => generator.into_root_schema_for::<GraphConfig>(),
-        FileKind::Scenario => generator.into_root_schema_for::<ScenarioConfig>(),
-        FileKind::Training => generator.into_root_schema_for::<TrainingConfig>(),
-        FileKind::Soak => generator.into_root_schema_for::<SoakConfig>(),
-    };
+/// Returns the schema of a kind of file; `None` for training files, whose structure only `carff-lab` has.
+pub fn schema(kind: FileKind) -> Option<Value> {
+    match kind {
+        FileKind::Graph => Some(schema_of::<GraphConfig>(kind)),
+        FileKind::Scenario => Some(schema_of::<ScenarioConfig>(kind)),
+        FileKind::Training => None,
+        FileKind::Soak => Some(schema_of::<SoakConfig>(kind)),
+    }
+}
+
+/// Returns the schema of a structure that reads a kind of file: draft 7, which editors support best.
+pub fn schema_of<T: JsonSchema>(kind: FileKind) -> Value {
+    let mut schema = SchemaSettings::draft07().into_generator().into_root_schema_for::<T>();
     schema.insert("title".to_owned(), kind.title().into());
     let mut schema = schema.to_value();
     tidy(&mut schema);
     schema
 }
 
+/// Returns a schema as the text of its file.
+pub fn text(schema: &Value) -> serde_json::Result<String> {
+    Ok(serde_json::to_string_pretty(schema)? + "\n")
+}
+
 /// Prints the schema or the layouts.
 pub fn run(args: &SchemaArgs) -> anyhow::Result<()> {
     let text = match args.kind {
-        Some(kind) => serde_json::to_string_pretty(&schema(kind))? + "\n",
+        Some(kind) => text(&schema(kind).context("`carff schema` prints this schema")?)?,
         None if args.python => carff::layout::python(),
         None => carff::layout::c(),
     };
@@ -125,7 +135,7 @@ mod tests {
     /// A file's keys are in its schema with their descriptions, no other keys are allowed, and defaults are readable.
     #[test]
     fn schemas_say_what_keys_mean() {
-        let graph = schema(FileKind::Graph);
+        let graph = schema(FileKind::Graph).unwrap();
         assert_eq!(graph["title"], "CARFF graph file");
         assert_eq!(graph["additionalProperties"], false);
         assert_eq!(graph["required"], serde_json::json!(["run"]));
@@ -134,7 +144,7 @@ mod tests {
         assert_eq!(horizon["default"], 2);
         let gain = &graph["definitions"]["SensorNoise"]["properties"]["gain_sigma"];
         assert_eq!(gain["default"], 0.02, "{gain}");
-        let scenario = schema(FileKind::Scenario);
+        let scenario = schema(FileKind::Scenario).unwrap();
         let ground = &scenario["properties"]["ground_colour"];
         assert_eq!((&ground["type"], &ground["default"]), (&"string".into(), &"#5d8a3c".into()), "{ground}");
         assert!(scenario["properties"]["branches"]["items"]["type"] == "string", "{scenario}");

@@ -45,3 +45,24 @@ fn exit_codes() {
     assert_eq!(help.status.code(), Some(0));
     assert!(String::from_utf8_lossy(&help.stdout).contains("Exit codes:"));
 }
+
+/// A build without `carff-lab` accepts its commands' arguments, and names the missing program and the remedy. The
+/// encoder is exported without it.
+#[test]
+fn a_missing_lab_is_named() {
+    let folder = tempfile::tempdir().unwrap();
+    let program = folder.path().join("carff-launch");
+    std::fs::copy(env!("CARGO_BIN_EXE_carff-launch"), &program).unwrap();
+    let run = |args: &[&str]| Command::new(&program).args(args).output().unwrap();
+    for args in [&["train", "x.toml"][..], &["eval", "x", "--out", "y"], &["schema", "training"]] {
+        let output = run(args);
+        let error = String::from_utf8(output.stderr).unwrap();
+        assert_eq!((output.status.code(), error.lines().count()), (Some(1), 1), "{error}");
+        assert!(error.contains("carff-lab") && error.contains("make build"), "{error}");
+    }
+    assert_eq!(run(&["train", "--no-such-option"]).status.code(), Some(2));
+    let checkpoint = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/checkpoints/toy");
+    let out = folder.path().join("encoder.onnx");
+    let exported = run(&["checkpoint", "onnx", checkpoint.to_str().unwrap(), "--out", out.to_str().unwrap()]);
+    assert!(exported.status.success() && out.is_file(), "{}", String::from_utf8_lossy(&exported.stderr));
+}

@@ -10,19 +10,15 @@ fn configs() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs")
 }
 
-/// The files in configs/schemas equal the output of `carff schema`.
+/// The files in configs/schemas equal the output of `carff schema`. (That of training files is tested in `carff-lab`.)
 #[test]
 fn the_shipped_schemas_are_up_to_date() {
     for kind in FileKind::ALL {
+        let Some(schema) = schema(kind) else { continue };
         let path = configs().join("schemas").join(kind.file());
         let there: Value =
             std::fs::read_to_string(&path).ok().and_then(|t| serde_json::from_str(&t).ok()).unwrap_or_default();
-        assert!(
-            there == schema(kind),
-            "run `carff schema {} > {}`",
-            format!("{kind:?}").to_lowercase(),
-            path.display()
-        );
+        assert!(there == schema, "run `carff schema {} > {}`", format!("{kind:?}").to_lowercase(), path.display());
     }
 }
 
@@ -30,7 +26,8 @@ fn the_shipped_schemas_are_up_to_date() {
 #[test]
 fn schemas_know_the_keys_of_shipped_files() {
     for kind in FileKind::ALL {
-        let schema = schema(kind);
+        let path = configs().join("schemas").join(kind.file());
+        let schema: Value = serde_json::from_str(&std::fs::read_to_string(path).unwrap()).unwrap();
         let mut files = 0;
         for entry in std::fs::read_dir(configs().join(kind.folder())).unwrap() {
             let path = entry.unwrap().path();

@@ -1,12 +1,13 @@
 #!/usr/bin/env python3
-"""Installs the Debian package, drives as its user, tries to access the run as another user, and removes the package.
+"""Installs the Debian packages, drives as their user, tries to access the run as another user, and removes them.
 
-Usage (as root, on a machine where carff is not installed): python3 tests/scripts/check_deb.py PACKAGE.deb
+Usage (as root, on a machine where carff is not installed): python3 tests/scripts/check_deb.py CARFF.deb [CARFF-LAB.deb]
 
 Requirements:
 - The units are valid, and the doctor finds no error.
-- A drive as user carff ends with exit code 0.
+- With only the first package, which contains no libtorch, a drive as user carff ends with exit code 0.
 - During the drive another user (nobody) can neither read nor write any of its files.
+- With the second package, a command that computes with libtorch starts.
 - After a purge no file, user or shared memory of the package is left.
 """
 
@@ -56,11 +57,15 @@ def look_as_nobody(files: list[Path]) -> None:
 
 
 def main() -> None:
-    package = str(Path(sys.argv[1]).resolve()) if len(sys.argv) == 2 else sys.exit(__doc__)
+    packages = [str(Path(name).resolve()) for name in sys.argv[1:]]
+    if not 1 <= len(packages) <= 2:
+        sys.exit(__doc__)
     if os.geteuid() != 0 or any(os.path.lexists(home) for home in HOMES):
         sys.exit("this must be root, on a machine where carff is not installed")
     try:
-        run("dpkg", "--install", package)
+        run("dpkg", "--install", packages[0])
+        if list(Path("/usr/lib/carff").rglob("libtorch*")):
+            sys.exit("the package of a vehicle contains libtorch")
         uid = pwd.getpwnam("carff").pw_uid
         say(f"installed, user carff is {uid}")
         units = [f"/lib/systemd/system/{unit}"
@@ -88,10 +93,14 @@ def main() -> None:
         found = json.loads(Path(report).read_text(encoding="utf-8"))
         say(f"{found['frames']} frames, {found['actions']} actions, {found['restarts']} restarts, "
             f"camera to action p50 {found['latency_ms']['camera_to_action']['p50']:.1f} ms")
+        for package in packages[1:]:
+            run("dpkg", "--install", package)
+            run("carff", "schema", "training", user="carff")
+            say("carff-lab computes with its own libtorch")
     finally:
         # After a failure its processes may still run, and their user could not be removed.
         run("pkill", "-KILL", "-u", "carff", check=False)
-        run("dpkg", "--purge", "carff", check=False)
+        run("dpkg", "--purge", "carff-lab", "carff", check=False)
     left = [home for home in HOMES if os.path.lexists(home)] + run_files(uid)
     left += [entry.pw_name for entry in pwd.getpwall() if entry.pw_name == "carff"]
     if left:

@@ -83,7 +83,7 @@ fn an_interrupt_leaves_nothing() {
 }
 
 /// A signal ends each command in each phase with exit code 130, also while it computes with models. (`carff` becomes
-/// `carff-launch` for the commands that need models.)
+/// `carff-launch` for the commands that start graphs.)
 #[test]
 fn a_signal_ends_every_command() {
     let (set, checkpoint) = (scenario_set(), shipped_checkpoint());

@@ -133,7 +133,7 @@ fn few_open_files() {
     graph.assert_nothing_left();
 }
 
-/// A foreign libtorch in `LD_LIBRARY_PATH` is named, with the remedy.
+/// A foreign libtorch in `LD_LIBRARY_PATH` is named, with the remedy, by commands that compute with it. Others start.
 #[test]
 fn a_foreign_libtorch_is_named() {
     let folder = tempfile::tempdir().unwrap();
@@ -145,9 +145,13 @@ fn a_foreign_libtorch_is_named() {
         let built = Command::new("cc").args(["-shared", "-fPIC", &soname, "-o"]).arg(library).arg(&source).status();
         assert!(built.unwrap().success());
     }
-    for args in [&["doctor"][..], &["--help"], &["launch", "x.toml"]] {
+    let start = |args: &[&str]| {
         let mut command = Command::new(program("carff"));
-        let finished = Process::start(command.args(args).env("LD_LIBRARY_PATH", folder.path())).end();
+        Process::start(command.args(args).env("LD_LIBRARY_PATH", folder.path())).end()
+    };
+    start(&["--help"]).assert_success();
+    for args in [&["eval", "x", "--out", "y"][..], &["train", "x.toml"], &["bench", "encoder"]] {
+        let finished = start(args);
         let library = folder.path().join("libtorch_cpu.so");
         finished.assert_one_error(&[library.to_str().unwrap(), "take its folder out of LD_LIBRARY_PATH"]);
     }

@@ -4,19 +4,20 @@
 //! times depend on the machine and on its load. Each benchmark prints a table. It can also write its figures as JSON,
 //! with a description of the machine, and compare them with an earlier run.
 
-mod encoder;
-mod field;
+mod birds_eye;
 mod graph;
 mod graph_loop;
 mod helper;
 mod ipc;
-mod limits;
 mod machine;
 mod probes;
-pub mod reference;
-mod report;
+pub mod report;
 mod scale;
-mod stats;
+pub mod stats;
+mod tensors;
+
+pub use birds_eye::birds_eye;
+pub use tensors::{EncoderArgs, FieldArgs, TensorBench};
 
 use report::Report;
 use std::path::PathBuf;
@@ -25,14 +26,17 @@ use std::process::ExitCode;
 /// The benchmarks.
 #[derive(Debug, clap::Subcommand)]
 pub enum BenchCommand {
-    /// Compare the field's kernels with the same model in tensor operations and with the machine's limits.
-    #[command(after_help = "Example: on one thread, compared with an earlier run
-  carff bench field --threads 1 --baseline docs/performance.json")]
-    Field(field::FieldArgs),
-    /// Measure encoder and forecaster, one frame at a time.
-    #[command(after_help = "Example: only the shipped networks
-  carff bench encoder --no-vit --json reports/performance.json")]
-    Encoder(encoder::EncoderArgs),
+    /// Benchmarks against tensor operations.
+    #[command(flatten)]
+    Tensors(TensorBench),
+    /// Benchmarks of processes.
+    #[command(flatten)]
+    Graph(GraphBench),
+}
+
+/// Benchmarks of processes and topics, which need no libtorch.
+#[derive(Debug, clap::Subcommand)]
+pub enum GraphBench {
     /// Measure payloads between processes: this program's topics, bare iceoryx2, Unix sockets, zenoh.
     #[command(after_help = "Example: with the figures as JSON
   carff bench ipc --json reports/performance.json")]
@@ -56,11 +60,9 @@ pub enum BenchCommand {
     Probes(probes::ProbesArgs),
 }
 
-impl BenchCommand {
+impl GraphBench {
     fn output(&self) -> Option<&OutputArgs> {
         match self {
-            Self::Field(args) => Some(&args.output),
-            Self::Encoder(args) => Some(&args.output),
             Self::Ipc(args) => Some(&args.output),
             Self::Loop(args) => Some(&args.output),
             Self::Scale(args) => Some(&args.output),
@@ -80,43 +82,47 @@ pub struct OutputArgs {
     baseline: Option<PathBuf>,
 }
 
-/// Runs a benchmark, prints its tables, and writes its figures if requested.
-pub fn run(command: BenchCommand) -> anyhow::Result<ExitCode> {
-    if let Some(path) = command.output().and_then(|output| output.json.as_deref()) {
-        carff_base::files::check_writable(path)?;
+impl OutputArgs {
+    /// Refuses a file that cannot be written, before the long part.
+    pub fn check(&self) -> anyhow::Result<()> {
+        self.json.as_deref().map_or(Ok(()), carff_base::files::check_writable).map_err(Into::into)
     }
+
+    /// Prints the machine, and compares and writes the figures of a benchmark as requested.
+    pub fn finish(&self, report: &Report) -> anyhow::Result<()> {
+        let machine = machine::describe();
+        println!("\nmachine: {}", machine::sentence(&machine));
+        if let Some(path) = &self.baseline {
+            print!("\n{}", report.compared_with(&report::read(path)?));
+        }
+        if let Some(path) = &self.json {
+            report.write(path, &machine)?;
+            println!("figures: {}", path.display());
+        }
+        Ok(())
+    }
+}
+
+/// Runs a benchmark, prints its tables, and writes its figures if requested.
+pub fn run(command: GraphBench) -> anyhow::Result<ExitCode> {
+    command.output().map_or(Ok(()), OutputArgs::check)?;
     let (report, output) = match command {
-        BenchCommand::Field(args) => (field::run(&args)?, args.output),
-        BenchCommand::Encoder(args) => (encoder::run(&args)?, args.output),
-        BenchCommand::Ipc(args) => (ipc::run(&args)?, args.output),
-        BenchCommand::Loop(args) => (graph_loop::run(&args)?, args.output),
-        BenchCommand::Scale(args) => (scale::run(&args)?, args.output),
-        BenchCommand::IpcPeer(args) => {
+        GraphBench::Ipc(args) => (ipc::run(&args)?, args.output),
+        GraphBench::Loop(args) => (graph_loop::run(&args)?, args.output),
+        GraphBench::Scale(args) => (scale::run(&args)?, args.output),
+        GraphBench::IpcPeer(args) => {
             ipc::peer(&args)?;
             return Ok(ExitCode::SUCCESS);
         }
-        BenchCommand::Relay(args) => {
+        GraphBench::Relay(args) => {
             scale::relay(&args)?;
             return Ok(ExitCode::SUCCESS);
         }
-        BenchCommand::Probes(args) => {
+        GraphBench::Probes(args) => {
             probes::run(&args)?;
             return Ok(ExitCode::SUCCESS);
         }
     };
-    finish(&report, &output)?;
+    output.finish(&report)?;
     Ok(ExitCode::SUCCESS)
-}
-
-fn finish(report: &Report, output: &OutputArgs) -> anyhow::Result<()> {
-    let machine = machine::describe();
-    println!("\nmachine: {}", machine::sentence(&machine));
-    if let Some(path) = &output.baseline {
-        print!("\n{}", report.compared_with(&report::read(path)?));
-    }
-    if let Some(path) = &output.json {
-        report.write(path, &machine)?;
-        println!("figures: {}", path.display());
-    }
-    Ok(())
 }

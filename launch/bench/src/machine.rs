@@ -7,7 +7,8 @@ use std::time::SystemTime;
 /// Instruction sets that the kernels use, in the system's spelling.
 const FEATURES: [&str; 9] = ["avx2", "fma", "f16c", "avx512f", "avx512vl", "avx512_bf16", "amx_bf16", "asimd", "bf16"];
 
-/// Returns processor, its features, cores, memory, system, libtorch and date. Unknown values are null.
+/// Returns processor, its features, cores, memory, system, libtorch and date. Unknown values are null; so is libtorch in
+/// a program without it.
 pub(crate) fn describe() -> Value {
     let cpuinfo = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
     let field = |name: &str| {
@@ -37,14 +38,14 @@ pub(crate) fn sentence(machine: &Value) -> String {
     let text = |key: &str| machine[key].as_str().unwrap_or("unknown").to_owned();
     let features: Vec<&str> = machine["features"].as_array().into_iter().flatten().filter_map(Value::as_str).collect();
     format!(
-        "{} ({}; {}), {} cores, {} GB, Linux {}, libtorch {}, {}",
+        "{} ({}; {}), {} cores, {} GB, Linux {}{}, {}",
         text("cpu"),
         text("cpu_family_and_model"),
         features.join(" "),
         machine["cores"],
         machine["memory_gb"],
         text("system"),
-        text("libtorch"),
+        machine["libtorch"].as_str().map_or(String::new(), |version| format!(", libtorch {version}")),
         text("date")
     )
 }

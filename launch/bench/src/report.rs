@@ -7,20 +7,20 @@ use std::path::Path;
 
 /// The figures of a benchmark. Keys are dotted paths that begin with the benchmark's name.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct Report {
+pub struct Report {
     figures: Map<String, Value>,
 }
 
 impl Report {
     /// Records a figure under a path such as `field.render_fps`. A value that is not finite becomes null.
-    pub(crate) fn set(&mut self, key: &str, value: f64) {
+    pub fn set(&mut self, key: &str, value: f64) {
         // No figure is more precise than six digits.
         let rounded = format!("{value:.6e}").parse().unwrap_or(value);
         self.set_value(key, json!(rounded));
     }
 
     /// Records any other value.
-    pub(crate) fn set_value(&mut self, key: &str, value: Value) {
+    pub fn set_value(&mut self, key: &str, value: Value) {
         let mut parts: Vec<&str> = key.split('.').collect();
         let Some(last) = parts.pop() else { return };
         let mut map = &mut self.figures;
@@ -36,25 +36,30 @@ impl Report {
     }
 
     /// Writes figures and machine. Other benchmarks' figures in the file are kept if they are of this machine.
-    pub(crate) fn write(&self, path: &Path, machine: &Value) -> anyhow::Result<()> {
-        let without_date = |machine: &Value| {
+    pub fn write(&self, path: &Path, machine: &Value) -> anyhow::Result<()> {
+        let hardware = |machine: &Value| {
             let mut machine = machine.clone();
             if let Some(map) = machine.as_object_mut() {
-                map.remove("date");
+                map.retain(|key, _| !["date", "libtorch"].contains(&key.as_str()));
             }
             machine
         };
+        let mut machine = machine.clone();
         let mut all = Map::new();
         if path.is_file()
             && let Value::Object(old) = read(path)?
         {
-            if old.get("machine").map(without_date) == Some(without_date(machine)) {
+            if let Some(there) = old.get("machine").filter(|there| hardware(there) == hardware(&machine)) {
+                // A benchmark without libtorch keeps the version of the others.
+                if machine["libtorch"].is_null() {
+                    machine["libtorch"] = there["libtorch"].clone();
+                }
                 all = old;
             } else {
                 println!("{} is of another machine; its figures are replaced", path.display());
             }
         }
-        all.insert("machine".to_owned(), machine.clone());
+        all.insert("machine".to_owned(), machine);
         all.extend(self.figures.clone());
         let context = || format!("cannot write {}", path.display());
         if let Some(folder) = path.parent().filter(|f| !f.as_os_str().is_empty()) {
@@ -64,7 +69,7 @@ impl Report {
     }
 
     /// Returns a table of all common figures with their ratios, new over old.
-    pub(crate) fn compared_with(&self, baseline: &Value) -> String {
+    pub fn compared_with(&self, baseline: &Value) -> String {
         let mut rows = vec![["figure", "before", "now", "now / before"].map(str::to_owned)];
         let (mut now, mut then) = (Vec::new(), Vec::new());
         flatten("", &Value::Object(self.figures.clone()), &mut now);
@@ -82,7 +87,7 @@ impl Report {
 }
 
 /// Reads the figures of a file.
-pub(crate) fn read(path: &Path) -> anyhow::Result<Value> {
+pub fn read(path: &Path) -> anyhow::Result<Value> {
     let text = std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
     serde_json::from_str(&text)
         .with_context(|| format!("{} does not contain figures that `--json` wrote", path.display()))
@@ -103,7 +108,7 @@ fn flatten(path: &str, value: &Value, out: &mut Vec<(String, f64)>) {
 }
 
 /// Formats a number with three significant digits.
-pub(crate) fn number(value: f64) -> String {
+pub fn number(value: f64) -> String {
     match value.abs() {
         a if !a.is_finite() => "-".to_owned(),
         a if a >= 100.0 => format!("{value:.0}"),
@@ -114,7 +119,7 @@ pub(crate) fn number(value: f64) -> String {
 }
 
 /// Formats columns: the first is left-aligned, the others are right-aligned. The first row is the heading.
-pub(crate) fn table<const N: usize>(rows: &[[String; N]]) -> String {
+pub fn table<const N: usize>(rows: &[[String; N]]) -> String {
     let widths: [usize; N] =
         std::array::from_fn(|c| rows.iter().map(|row| row[c].chars().count()).max().unwrap_or_default());
     let mut text = String::new();
@@ -148,13 +153,14 @@ mod tests {
     }
 
     /// Keys are nested. Another benchmark's figures are kept on the same machine at any date, and dropped on another
-    /// one.
+    /// one. A benchmark without libtorch keeps its version.
     #[test]
     fn files_are_merged_by_machine() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("new/figures.json");
         let machine = |name: &str, date: &str| json!({ "cpu": name, "date": date });
-        report(30.0).write(&path, &machine("a", "Monday")).unwrap();
+        let with_libtorch = json!({ "cpu": "a", "date": "Monday", "libtorch": "2.11.0" });
+        report(30.0).write(&path, &with_libtorch).unwrap();
         let mut other = Report::default();
         other.set("loop.p50_ms", f64::NAN);
         other.write(&path, &machine("a", "Tuesday")).unwrap();
@@ -162,7 +168,7 @@ mod tests {
         assert_eq!(value["field"]["render_fps"], json!(30.0));
         assert_eq!(value["field"]["limit"]["gflops"], json!(200.0));
         assert_eq!(value["loop"]["p50_ms"], Value::Null);
-        assert_eq!(value["machine"]["date"], json!("Tuesday"));
+        assert_eq!(value["machine"], json!({ "cpu": "a", "date": "Tuesday", "libtorch": "2.11.0" }));
         other.write(&path, &machine("b", "Tuesday")).unwrap();
         assert_eq!(read(&path).unwrap().get("field"), None);
         std::fs::write(&path, "{").unwrap();

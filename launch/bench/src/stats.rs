@@ -5,42 +5,48 @@ use std::time::Instant;
 
 /// Sorted times of one variant.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub(crate) struct Times {
+pub struct Times {
     sorted: Vec<f64>,
 }
 
 impl Times {
-    pub(crate) fn new(mut times: Vec<f64>) -> Self {
+    /// Takes times in any order; those that are not finite are left out.
+    pub fn new(mut times: Vec<f64>) -> Self {
         times.retain(|t| t.is_finite());
         times.sort_by(f64::total_cmp);
         Self { sorted: times }
     }
 
     /// Returns the smallest time that a share (0..=1) of all times does not exceed; NaN without times.
-    pub(crate) fn quantile(&self, share: f64) -> f64 {
+    pub fn quantile(&self, share: f64) -> f64 {
         percentile_of_sorted(&self.sorted, share).unwrap_or(f64::NAN)
     }
 
-    pub(crate) fn median(&self) -> f64 {
+    /// Returns the median; NaN without times.
+    pub fn median(&self) -> f64 {
         self.quantile(0.5)
     }
 
-    pub(crate) fn len(&self) -> usize {
+    /// Returns the number of times.
+    pub fn count(&self) -> usize {
         self.sorted.len()
     }
 }
 
 /// Ratio of two alternately measured times: that of the medians, and the quartiles of the ratios of turns.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct Ratio {
-    pub(crate) of_medians: f64,
-    pub(crate) low: f64,
-    pub(crate) high: f64,
+pub struct Ratio {
+    /// Ratio of the medians.
+    pub of_medians: f64,
+    /// Lower quartile of the ratios of turns.
+    pub low: f64,
+    /// Upper quartile of the ratios of turns.
+    pub high: f64,
 }
 
 impl Ratio {
     /// Compares `slow` with `fast`, both in the order of their turns.
-    pub(crate) fn new(slow: &[f64], fast: &[f64]) -> Self {
+    pub fn new(slow: &[f64], fast: &[f64]) -> Self {
         let turns = Times::new(slow.iter().zip(fast).map(|(s, f)| s / f).collect());
         Self {
             of_medians: Times::new(slow.to_vec()).median() / Times::new(fast.to_vec()).median(),
@@ -57,10 +63,10 @@ impl std::fmt::Display for Ratio {
 }
 
 /// A variant to measure: it returns its time, seconds.
-pub(crate) type Contender<'a> = Box<dyn FnMut() -> f64 + 'a>;
+pub type Contender<'a> = Box<dyn FnMut() -> f64 + 'a>;
 
 /// Returns a variant that times an action.
-pub(crate) fn timed<'a>(mut action: impl FnMut() + 'a) -> Contender<'a> {
+pub fn timed<'a>(mut action: impl FnMut() + 'a) -> Contender<'a> {
     Box::new(move || {
         let start = Instant::now();
         action();
@@ -74,7 +80,7 @@ const PATIENCE_S: f64 = 12.0;
 /// Measures all variants alternately for `rounds` rounds, after a warm-up round. Every second round runs backwards, so
 /// that no variant always follows the same one. A slow variant takes part in the first rounds only, at least in one.
 /// Returns the seconds of each variant, in the order of its turns.
-pub(crate) fn alternate(rounds: usize, contenders: &mut [Contender<'_>]) -> Vec<Vec<f64>> {
+pub fn alternate(rounds: usize, contenders: &mut [Contender<'_>]) -> Vec<Vec<f64>> {
     let mut seconds = vec![Vec::with_capacity(rounds); contenders.len()];
     let own_rounds: Vec<usize> =
         contenders.iter_mut().map(|c| ((PATIENCE_S / c()) as usize).clamp(1, rounds.max(1))).collect();
@@ -98,10 +104,10 @@ mod tests {
     fn quantiles_are_exact() {
         let times = Times::new((1..=1000).rev().map(f64::from).collect());
         assert_eq!([0.5, 0.99, 0.999, 1.0].map(|q| times.quantile(q)), [500.0, 990.0, 999.0, 1000.0]);
-        assert_eq!((times.median(), times.len()), (500.0, 1000));
+        assert_eq!((times.median(), times.count()), (500.0, 1000));
         assert_eq!(Times::new(vec![7.0]).quantile(0.999), 7.0);
         assert!(Times::default().median().is_nan());
-        assert_eq!(Times::new(vec![f64::NAN, 1.0]).len(), 1);
+        assert_eq!(Times::new(vec![f64::NAN, 1.0]).count(), 1);
     }
 
     /// The ratio is that of the medians in any order; the spread is that of the turns.

@@ -1,5 +1,5 @@
 //! The `carff` command. It runs the commands that observe a run, and executes `carff-launch` for all others.
-//! `carff-launch` knows every command and links libtorch.
+//! `carff-launch` knows every command, and executes `carff-lab` for those that compute with libtorch.
 
 use carff::{Attach, become_program, run_program};
 use clap::{Parser, Subcommand};

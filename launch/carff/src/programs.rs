@@ -30,7 +30,10 @@ pub fn become_program(name: &str, args: &[OsString]) -> anyhow::Result<ExitCode>
         }
     }
     let error = Command::new(&program).args(args).exec();
-    Err(error).with_context(|| format!("cannot start {}; build it with `make build`", program.display()))
+    let package = if name == "carff-launch" { "carff" } else { "carff-lab" };
+    Err(error).with_context(|| {
+        format!("cannot start {}; build it with `make build`, or install the package `{package}`", program.display())
+    })
 }
 
 /// Returns the first library of libtorch in `LD_LIBRARY_PATH`, which the loader prefers to the one of the build.

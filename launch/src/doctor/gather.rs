@@ -16,6 +16,8 @@ const READINGS: u32 = 10_000;
 /// Bits of the effective capabilities: locking memory, setting priorities.
 const CAP_IPC_LOCK: u32 = 14;
 const CAP_SYS_NICE: u32 = 23;
+/// Folders of libtorch, relative to the folder of the programs: installed, built, and of tests.
+const LIBTORCH_FOLDERS: [&str; 3] = ["../lib", "../../.libtorch/lib", "../../../.libtorch/lib"];
 /// Folders of logind's settings; later ones take precedence.
 const LOGIND_FOLDERS: [&str; 3] =
     ["/usr/lib/systemd/logind.conf.d", "/run/systemd/logind.conf.d", "/etc/systemd/logind.conf.d"];
@@ -217,13 +219,12 @@ pub fn logind() -> Logind {
     }
 }
 
-/// Returns the libtorch that this process has loaded, and the version in the file next to it.
-pub fn libtorch() -> (Option<PathBuf>, Option<String>) {
-    let maps = read("/proc/self/maps").unwrap_or_default();
-    let library = maps
-        .lines()
-        .find(|line| line.contains("libtorch_cpu.so"))
-        .and_then(|line| line.find('/').map(|at| PathBuf::from(&line[at..])));
+/// Returns the libtorch that the loader finds for the programs of a folder, and the version in the file next to it.
+pub fn libtorch(programs: &Path) -> (Option<PathBuf>, Option<String>) {
+    let first = std::env::var_os("LD_LIBRARY_PATH").unwrap_or_default();
+    let first = std::env::split_paths(&first).filter(|folder| folder.is_absolute());
+    let stored = LIBTORCH_FOLDERS.map(|folder| programs.join(folder));
+    let library = first.chain(stored).find_map(|folder| folder.join("libtorch_cpu.so").canonicalize().ok());
     let version = library.as_deref().and_then(Path::parent).and_then(Path::parent);
     let version = version.and_then(|root| read(root.join("build-version")));
     (library, version)
@@ -267,6 +268,22 @@ mod tests {
         }
     }
 
+    /// libtorch is found next to the programs' folder, with its version, and may be missing.
+    #[test]
+    fn libtorch_next_to_the_programs() {
+        let folder = tempfile::tempdir().unwrap();
+        let (programs, library) = (folder.path().join("bin"), folder.path().join("lib/libtorch_cpu.so"));
+        std::fs::create_dir_all(&programs).unwrap();
+        assert_eq!(libtorch(&programs).1, None);
+        std::fs::create_dir_all(library.parent().unwrap()).unwrap();
+        std::fs::write(&library, "").unwrap();
+        std::fs::write(folder.path().join("build-version"), "2.11.0\n").unwrap();
+        // A libtorch in LD_LIBRARY_PATH comes first, as for the loader.
+        if std::env::var_os("LD_LIBRARY_PATH").is_none() {
+            assert_eq!(libtorch(&programs), (library.canonicalize().ok(), Some("2.11.0".to_owned())));
+        }
+    }
+
     /// The facts of this machine can be read: it has a processor, a clock that does not go back, and limits.
     #[test]
     fn this_machine_can_be_read() {
@@ -274,7 +291,6 @@ mod tests {
         assert!(available_memory().is_some_and(|bytes| bytes > 0));
         assert_eq!(clock().steps_back, 0);
         assert!(online().contains(&0) || online().is_empty());
-        assert!(libtorch().0.is_some_and(|path| path.is_file()));
         assert!(runs().is_ok());
     }
 }

@@ -78,13 +78,14 @@ pub fn examine(args: &DoctorArgs) -> anyhow::Result<Vec<Finding>> {
     findings.extend(checks::bound_cores(&gather::online(), &stages));
     findings.push(checks::remove_ipc(&gather::logind()));
 
-    let (library, version) = gather::libtorch();
-    findings.push(checks::libtorch(library.as_deref(), version.as_deref()));
+    let folder = std::env::current_exe()?.parent().context("this program has no folder")?.to_owned();
+    let (library, version) = gather::libtorch(&folder);
+    let needed = stages.encoder_backend() == Backend::Tch;
+    findings.push(checks::libtorch(library.as_deref(), version.as_deref(), needed));
     let onnx = carff_inference::library::build().map_err(|e| e.to_string());
     let needed = stages.encoder_backend() == Backend::Onnx;
     let onnx = onnx.as_ref().copied().map_err(String::as_str);
     findings.push(checks::onnx_runtime(&carff_inference::library::path(), onnx, needed));
-    let folder = std::env::current_exe()?.parent().context("this program has no folder")?.to_owned();
     findings.push(checks::programs(&folder, &gather::missing_programs(&folder, &stages)));
 
     match (&args.graph, graph) {

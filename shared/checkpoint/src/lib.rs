@@ -7,12 +7,14 @@
 
 pub mod backbones;
 mod field;
+mod networks;
 mod planning;
 mod probe;
 pub mod shapes;
 mod tensors;
 
 pub use field::{load_field, save_field};
+pub use networks::{Encodes, Forecasts};
 pub use planning::{Bound, CheckpointPlanning, CheckpointPlanningError, PlanningMemory, load_policy};
 pub use probe::{FieldProbe, PreparedField, load_field_probe, load_probing};
 pub use tensors::{Row, read_tensors};

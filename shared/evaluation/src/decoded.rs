@@ -5,25 +5,11 @@ use carff_base::statistics::psnr_of_mse;
 use carff_dataset::PIXEL_TOLERANCE;
 use carff_messages::LATENT_DIM;
 use carff_networks::decoder::Decoder;
-use serde::{Deserialize, Serialize};
+use carff_trials::DecodedQuality;
 use tch::{Device, Kind, Tensor};
 
 /// Images that are decoded at a time.
 const BATCH: usize = 60;
-
-/// Quality of decoded images, over all valid pixels of all images.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct DecodedQuality {
-    /// PSNR, dB.
-    pub psnr_db: f64,
-    /// PSNR of each pose's mean image over the states, which needs no encoder, dB.
-    pub mean_picture_psnr_db: f64,
-    /// PSNR over the pixels that differ from the mean image by more than [`PIXEL_TOLERANCE`], dB.
-    pub changed_pixels_psnr_db: f64,
-    /// Images.
-    pub pictures: usize,
-}
 
 /// Mask `[N, 1, H, W]` of the pixels in which `difference` `[N, 3, H, W]` exceeds [`PIXEL_TOLERANCE`].
 pub fn changed_pixels(difference: &Tensor) -> Tensor {

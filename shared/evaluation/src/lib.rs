@@ -6,37 +6,32 @@
 //!
 //! | module | content |
 //! |---|---|
-//! | `posed`, `accuracy`, `decoded`, `render` | the labelled images, and what the models make of them |
+//! | `posed`, `accuracy`, `decoded` | the labelled images, and what the models make of them |
 //! | `segmentation` | localisation by segmentation of rendered views |
-//! | `trials` | trials of decision rules and samples, and the images from above |
+//! | `trials` | images with known answers, baselines, watches |
 //! | `stats` | arithmetic on trials: recall curves, frequencies, reliability, support vector machine, SSIM |
 //! | `tables`, `report` | the tables of `carff eval`, `results.json` and its page |
-//! | `run` | planning tables and the filmstrip of a run of the graph |
-//! | `figures` | the figures in a checkpoint's manifest |
 
 mod accuracy;
 mod decoded;
-mod error;
-mod figures;
 mod posed;
-mod render;
 mod report;
 mod role;
-pub mod run;
 mod segmentation;
 mod stats;
 mod subject;
 mod tables;
 mod trials;
 
-pub use accuracy::{Accuracy, ByObservability, Centroids, Share, state_accuracy};
-pub use decoded::{DecodedQuality, Decoding, changed_pixels};
-pub use error::EvaluationError;
-pub use figures::{
-    CheckpointFigures, PlanningFigures, ProbingFigures, SampleFigures, TrainedAndUnseen, VaeFigures, ViewFigures,
+pub use accuracy::{Centroids, state_accuracy};
+pub use carff_trials::{
+    Accuracy, BirdsEye, ByKind, ByObservability, BySamples, CheckpointFigures, Count, DecodedQuality, EvaluationError,
+    FieldRenderer, Input, KnownStates, Perception, Planner, PlanningFigures, PlanningTable, ProbingFigures,
+    SAMPLE_COUNTS, SampleAccuracy, SampleFigures, SampleTrials, Share, TakeMemories, TrainedAndUnseen, Trial,
+    TrialOutcome, VaeFigures, ViewFigures, birds_eye, places, to_bytes, to_unit, trial_frame,
 };
+pub use decoded::{Decoding, changed_pixels};
 pub use posed::{Label, PosedImages};
-pub use render::{FieldRenderer, to_bytes, to_unit};
 pub use report::{Gallery, Results, Table, Target, encoder_rows, evaluate};
 pub use role::{ByRole, ROLES, role_name};
 pub use segmentation::{MaskedView, occupants, view_camera};
@@ -59,13 +54,7 @@ pub use tables::{
 };
 pub use trials::{
     Models,
-    birds_eye::{BirdsEye, birds_eye},
     looks::{ByTrialKind, TrialFigures},
-    planning::{
-        ByKind, BySamples, Count, KnownStates, Perception, Planner, PlanningTable, SAMPLE_COUNTS, TakeMemories, Trial,
-        TrialOutcome, trial_frame,
-    },
-    samples::{Input, SampleAccuracy, SampleTrials},
     watches::{Watch, WatchPlan, Watched, watches},
 };
 

@@ -3,14 +3,13 @@
 //!
 //! It is an alternative to density probing that `carff eval` compares; a running graph probes densities.
 
-use crate::FieldRenderer;
-use crate::trials::hypotheses::birds_eye_camera;
 use carff_base::geometry::PinholeCamera;
 use carff_base::random::{Key, gaussians, stream};
 use carff_dataset::Dataset;
 use carff_decision::{Calibration, Localiser, Place, ProbeLayout, SceneProbe};
 use carff_field::Field;
 use carff_messages::{Gaussian, LATENT_DIM};
+use carff_trials::{FieldRenderer, hypotheses::birds_eye_camera};
 use rand::Rng;
 use tch::{
     Device, Kind, Tensor,

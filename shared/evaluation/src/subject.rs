@@ -1,9 +1,6 @@
 //! Subject of an evaluation: a checkpoint, a dataset of its scenario, and the posterior of each image.
 
-use crate::trials::{
-    planning::{KnownStates, Perception, Planner},
-    watches::Watch,
-};
+use crate::trials::watches::Watch;
 use crate::{ByRole, Decoding, EvaluationError, MaskedView, PosedImages, Progress, ROLES};
 use carff_base::geometry::PinholeCamera;
 use carff_base::random::Key;
@@ -24,6 +21,7 @@ use carff_networks::{
 };
 use carff_plots::Panel;
 use carff_scenes::{FreePose, UnknownLook};
+use carff_trials::{KnownStates, Perception, Planner};
 use carff_unknown::Known;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};

@@ -2,7 +2,7 @@
 
 use crate::InferenceError;
 use crate::weights::Weights;
-use carff_checkpoint::{CheckpointError, Manifest, files};
+use carff_checkpoint::{CheckpointError, Forecasts, Manifest, files};
 use carff_decision::Mixture;
 use carff_messages::{Gaussian, LATENT_DIM};
 use std::path::Path;
@@ -69,6 +69,12 @@ impl MixtureNet {
             Gaussian { mean: *mean, log_variance: log_variance.map(|v: f32| v.clamp(low, high)) }
         });
         Mixture { weights: softmax(&logits), components: components.collect() }
+    }
+}
+
+impl Forecasts for MixtureNet {
+    fn forecast(&self, posterior: &Gaussian) -> Mixture {
+        self.forecast(posterior)
     }
 }
 

@@ -3,9 +3,11 @@
 use crate::{
     ModelError,
     backbone::{self, Backbone},
+    borrow,
 };
-use carff_checkpoint::shapes::EncoderConfig;
+use carff_checkpoint::{Encodes, shapes::EncoderConfig};
 use carff_messages::{Gaussian, LATENT_DIM};
+use ndarray::ArrayView3;
 use std::path::Path;
 use tch::{Kind, Tensor, nn, nn::Module};
 
@@ -124,6 +126,12 @@ impl Encoder {
     /// Returns the posterior of one image, `[H, W, 3]` bytes.
     pub fn encode_bytes(&self, picture: &Tensor) -> Option<Gaussian> {
         self.encode(&pictures_from_bytes(&picture.unsqueeze(0))).into_iter().next()
+    }
+}
+
+impl Encodes for Encoder {
+    fn posterior_of(&self, image: ArrayView3<'_, u8>) -> Option<Gaussian> {
+        borrow::with_image(image, |tensor| self.encode_bytes(tensor)).flatten()
     }
 }
 

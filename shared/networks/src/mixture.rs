@@ -1,7 +1,7 @@
 //! The mixture density network: from one posterior to the belief over the next scene latent (paper section 3.4).
 
 use crate::{ModelError, encoder::gaussians};
-use carff_checkpoint::shapes::MixtureConfig;
+use carff_checkpoint::{Forecasts, shapes::MixtureConfig};
 use carff_decision::Mixture;
 use carff_messages::{Gaussian, LATENT_DIM};
 use tch::{Kind, Tensor, nn, nn::Module};
@@ -102,6 +102,16 @@ impl MixtureNet {
                 .map(|(w, c)| Mixture { weights: w.to_vec(), components: c.to_vec() })
                 .collect()
         })
+    }
+}
+
+impl Forecasts for MixtureNet {
+    fn forecast(&self, posterior: &Gaussian) -> Mixture {
+        self.forecast(posterior)
+    }
+
+    fn forecast_all(&self, posteriors: &[Gaussian]) -> Vec<Mixture> {
+        self.forecast_all(posteriors)
     }
 }
 

@@ -17,7 +17,7 @@
 //! | module | content |
 //! |---|---|
 //! | `config`, `augmentation` | the training file |
-//! | `pipeline`, `calibrate`, `places` | from images to a checkpoint |
+//! | `pipeline`, `calibrate` | from images to a checkpoint |
 //! | `run` | the loop of all phases, and the folder of a run |
 //! | `vae`, `field`, `mixture` | the training phases |
 //! | `features`, `records`, `curves` | files of a run: backbone features, metrics, curves |
@@ -37,7 +37,6 @@ mod known;
 mod memory;
 mod mixture;
 mod pipeline;
-mod places;
 mod random_poses;
 mod records;
 mod run;
@@ -46,7 +45,7 @@ mod vae;
 
 pub use augmentation::Augmentation;
 pub use bound::{BoundInput, ChosenBound, bound_threshold};
-pub use carff_evaluation::Progress;
+pub use carff_evaluation::{Progress, places};
 pub use config::{CalibrationConfig, FieldTraining, FreePoses, MdnTraining, TrainingConfig, VaeTraining};
 pub use curves::training_curves;
 pub use error::TrainingError;
@@ -54,7 +53,6 @@ pub use features::FEATURES;
 pub use known::{KnownInput, calibrate_known};
 pub use memory::{LearnedMemory, MemoryInput, learn_memory};
 pub use pipeline::{Phases, Training};
-pub use places::places;
 pub use random_poses::render_random_poses;
 pub use run::{Run, forget_run};
 pub use vae::losses;

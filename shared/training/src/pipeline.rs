@@ -5,7 +5,7 @@ use crate::{
     calibrate::{calibrated_probing, choose_and_save_threshold},
     field::{Clouds, FieldPhase, saved_field},
     mixture::{Mdn, MixturePhase},
-    places::places,
+    places,
     records::{DoneRecord, names},
     run::{Context, Run, drive},
     vae::{Inputs, Vae, VaePhase},

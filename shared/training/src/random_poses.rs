@@ -8,7 +8,7 @@ use crate::{
     TrainingError,
     config::TrainingConfig,
     field::{Clouds, FieldPhase},
-    places::places,
+    places,
     records::names,
     run::{Context, RANDOM_IMAGES, Run},
 };

@@ -2,7 +2,7 @@
 //! thread, as in the stages by default.
 
 use super::{Axis, Law, Row};
-use crate::field::birds_eye;
+use crate::birds_eye;
 use crate::stats::{Contender, Times, alternate, timed};
 use anyhow::ensure;
 use carff_checkpoint::{FieldProbe, Manifest, PreparedField, load_field_probe};

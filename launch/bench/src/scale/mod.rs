@@ -104,12 +104,11 @@ impl Row {
     /// Summarises times in milliseconds.
     fn new(x: u32, times: &Times, cost: f64) -> Self {
         let [p50_ms, p99_ms, max_ms] = [0.5, 0.99, 1.0].map(|q| times.quantile(q));
-        Self { x, p50_ms, p99_ms, max_ms, counted: times.len(), missed: None, cost, more: Vec::new() }
+        Self { x, p50_ms, p99_ms, max_ms, counted: times.count(), missed: None, cost, more: Vec::new() }
     }
 }
 
 pub(crate) fn run(args: &ScaleArgs) -> anyhow::Result<Report> {
-    carff_networks::allocator::keep_large_blocks();
     let names: Vec<AxisName> =
         AxisName::ALL.into_iter().filter(|name| args.axes.is_empty() || args.axes.contains(name)).collect();
     let subject = args.subject.load()?;

@@ -6,25 +6,27 @@ use std::path::Path;
 /// The libtorch version that the programs are built for.
 pub const LIBTORCH: &str = "2.11.0";
 
-/// Checks the version of the libtorch that this process has loaded.
-pub fn libtorch(library: Option<&Path>, version: Option<&str>) -> Finding {
+/// Checks the version of the libtorch that the programs find; `needed` if the encoder computes with it.
+pub fn libtorch(library: Option<&Path>, version: Option<&str>, needed: bool) -> Finding {
     let area = Area::Programs;
     let advice = "make libtorch, or use your own libtorch: make build LIBTORCH=/path/to/libtorch, and \
                   LD_LIBRARY_PATH=/path/to/libtorch/lib at run time";
     let Some(library) = library else {
-        return Finding::error(area, "libtorch", "it is not loaded", "models cannot run", advice);
+        if needed {
+            return Finding::error(area, "libtorch", "it is missing", "the encoder stage cannot start", advice);
+        }
+        let found = "none; training, evaluation, the window and `backend = \"tch\"` need it, this graph does not";
+        return Finding::ok(area, "libtorch", found);
     };
     match version {
         Some(version) if version == LIBTORCH || version.starts_with(&format!("{LIBTORCH}+")) => {
             Finding::ok(area, "libtorch", format!("{version} ({})", library.display()))
         }
-        Some(version) => Finding::error(
-            area,
-            "libtorch",
-            format!("{version} ({}); the programs are built for {LIBTORCH}", library.display()),
-            "programs may crash, or compute wrong results",
-            advice,
-        ),
+        Some(version) => {
+            let found = format!("{version} ({}); the programs are built for {LIBTORCH}", library.display());
+            let finding = if needed { Finding::error } else { Finding::warning };
+            finding(area, "libtorch", found, "its programs may crash, or compute wrong results", advice)
+        }
         None => Finding::warning(
             area,
             "libtorch",
@@ -77,16 +79,18 @@ mod tests {
     use super::*;
     use crate::doctor::finding::Level;
 
-    /// The version must be the version of the build, with any suffix.
+    /// The version must be the version of the build, with any suffix. Without need of it, none may be there.
     #[test]
     fn versions_of_libtorch() {
         let library = Some(Path::new("lib/libtorch_cpu.so"));
-        assert_level(&libtorch(library, Some("2.11.0")), Level::Ok);
-        assert_level(&libtorch(library, Some("2.11.0+cu130")), Level::Ok);
-        assert_level(&libtorch(library, Some("2.11.01")), Level::Error);
-        assert_level(&libtorch(library, Some("2.13.0")), Level::Error);
-        assert_level(&libtorch(library, None), Level::Warning);
-        assert_level(&libtorch(None, None), Level::Error);
+        assert_level(&libtorch(library, Some("2.11.0"), true), Level::Ok);
+        assert_level(&libtorch(library, Some("2.11.0+cu130"), true), Level::Ok);
+        assert_level(&libtorch(library, Some("2.11.01"), true), Level::Error);
+        assert_level(&libtorch(library, Some("2.13.0"), true), Level::Error);
+        assert_level(&libtorch(library, Some("2.13.0"), false), Level::Warning);
+        assert_level(&libtorch(library, None, true), Level::Warning);
+        assert_level(&libtorch(None, None, true), Level::Error);
+        assert_level(&libtorch(None, None, false), Level::Ok);
     }
 
     /// A missing library is an error where the encoder needs it; another version is a warning.

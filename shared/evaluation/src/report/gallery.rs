@@ -1,9 +1,7 @@
 //! Gallery of images (table 6).
 
 use super::unknown_sheet::unknown_objects;
-use crate::render::FieldRenderer;
 use crate::tables::spread;
-use crate::trials::hypotheses::{birds_eye_camera, hypotheses};
 use crate::{EvaluationError, Progress, Subject};
 use carff_base::random::Key;
 use carff_dataset::{Image, Observability, PoseRole};
@@ -11,6 +9,8 @@ use carff_decision::Sampling;
 use carff_field::Field;
 use carff_messages::LATENT_DIM;
 use carff_plots::{Marks, Panel, Series, StripCell, StripRow};
+use carff_trials::hypotheses::{birds_eye_camera, hypotheses};
+use carff_trials::render::FieldRenderer;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 use tch::{Kind, Tensor};

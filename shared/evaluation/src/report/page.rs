@@ -10,11 +10,11 @@ use super::{
 };
 use crate::stats::draws::Frequencies;
 use crate::tables::planning::{PlanningResults, ViewCounts};
-use crate::trials::planning::{Count, PlanningTable};
 use crate::{
     ByRole, EncoderTable, FieldPictures, FrequencyTable, PairMeans, PictureTable, ReliabilityBin, SAMPLE_COUNTS, Share,
     SvmScore,
 };
+use carff_trials::{Count, PlanningTable};
 use std::fmt::Write;
 
 /// Returns the page as Markdown. Writing into a `String` cannot fail, so results of `write!` are dropped.

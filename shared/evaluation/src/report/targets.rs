@@ -1,8 +1,8 @@
 //! Target figures of a scenario against measured ones. Missed targets are shown like reached ones.
 
 use super::Results;
-use crate::trials::planning::{BySamples, Count, PlanningTable};
 use carff_dataset::drives::DriveKind;
+use carff_trials::{BySamples, Count, PlanningTable};
 use serde::{Deserialize, Serialize};
 
 /// One figure and its target.

@@ -1,12 +1,12 @@
 //! Images of unknown objects: the input, the best known state, the residual, and the boxes.
 
 use super::gallery::{HAZARD, cell};
-use crate::trials::planning::Compared;
 use crate::{EvaluationError, Subject};
 use carff_base::geometry::{OrientedBox, PinholeCamera};
 use carff_dataset::Image;
 use carff_decision::ImageEvidence;
 use carff_plots::{StripCell, StripRow};
+use carff_trials::Compared;
 use std::path::Path;
 
 /// Residual that is drawn white, in deviations of the image's noise.

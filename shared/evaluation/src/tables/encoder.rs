@@ -1,11 +1,12 @@
 //! Encoder table: decoder images, support vector machine, and state accuracy (paper table 2).
 
 use super::spread;
-use crate::accuracy::{ByObservability, Centroids, Share, state_accuracy};
+use crate::accuracy::{Centroids, state_accuracy};
 use crate::stats::svm::{cross_validated, fit_and_name, grouped_folds, stratified_folds};
 use crate::{ByRole, DecodedQuality, ROLES, Subject};
 use carff_dataset::PoseRole;
 use carff_messages::LATENT_DIM;
+use carff_trials::{ByObservability, Share};
 use serde::{Deserialize, Serialize};
 
 /// Folds of the support vector machine's cross-validation (the paper's number).

@@ -1,7 +1,6 @@
 //! Images of the field against true images, from above and from held-out poses (table 1).
 
 use super::spread;
-use crate::render::{FieldRenderer, mean_image, psnr_of_changed, to_unit};
 use crate::stats::pairs::{PairMeans, pair_means};
 use crate::{ByRole, Progress, Subject, role_name, ssim};
 use carff_base::geometry::PinholeCamera;
@@ -10,6 +9,7 @@ use carff_dataset::{Observability, PoseRole};
 use carff_decision::Sampling;
 use carff_field::Field;
 use carff_messages::LATENT_DIM;
+use carff_trials::render::{FieldRenderer, mean_image, psnr_of_changed, to_unit};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 

@@ -4,7 +4,6 @@ use crate::stats::draws::{
     Curve, Frequencies, OpenInput, Shown, TrialCurve, accuracy_curve, expected_recall, frequencies, met_all,
     recall_curve, right_shares,
 };
-use crate::trials::planning::Planner;
 use crate::{ByRole, EvaluationError, Progress, ROLES, Subject, role_name};
 use carff_base::random::Key;
 use carff_checkpoint::FieldProbe;
@@ -12,6 +11,7 @@ use carff_dataset::{Observability, PoseRole};
 use carff_decision::{Mixture, Sampling};
 use carff_messages::{Gaussian, LATENT_DIM};
 use carff_plots::{Panel, Series};
+use carff_trials::Planner;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;

@@ -1,7 +1,6 @@
 //! Decisions on images that no training has seen: corrupted ones, unknown vehicles and objects, other places.
 
 use crate::trials::looks::{Look, free_looks};
-use crate::trials::planning::Count;
 use crate::{Progress, Subject};
 use carff_base::geometry::PinholeCamera;
 use carff_base::random::Key;
@@ -9,6 +8,7 @@ use carff_checkpoint::CheckpointPlanning;
 use carff_dataset::{Corruption, Image, drives::DriveKind};
 use carff_decision::{Policy, Sampling};
 use carff_messages::{Header, ImageCheck, Rule};
+use carff_trials::Count;
 use carff_unknown::{CameraCheck, Known, Measurement};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;

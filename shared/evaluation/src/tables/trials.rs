@@ -3,12 +3,12 @@
 use crate::trials::{
     baselines::{ReadOut, nearest_neighbour},
     looks::{Answer, ByTrialKind, Look, figures, free_looks, looks_of_role, taken},
-    planning::Trial,
 };
 use crate::{Progress, Subject};
 use carff_dataset::PoseRole;
 use carff_decision::{CalibrationTrial, Evidence, Policy, Sampling, choose_threshold};
 use carff_messages::Rule;
+use carff_trials::Trial;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 

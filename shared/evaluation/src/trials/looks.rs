@@ -1,11 +1,11 @@
 //! Looks: images with a hazard or without, from poses that give both, and their six kinds.
 
-use super::planning::{Perception, Trial, trial_frame};
 use crate::PosedImages;
 use carff_base::geometry::PinholeCamera;
 use carff_base::statistics::wilson_interval_of_share;
 use carff_dataset::{Image, Observability, PoseRole, ScenarioInfo, drives::DriveKind};
 use carff_scenes::FreePose;
+use carff_trials::{Perception, Trial, trial_frame};
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
 

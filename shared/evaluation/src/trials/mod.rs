@@ -1,11 +1,7 @@
-//! Trials: the models on images with known answers.
+//! Trials with known answers: images, baselines and watches. `carff_trials` computes with them.
 
 pub mod baselines;
-pub mod birds_eye;
-pub mod hypotheses;
 pub mod looks;
-pub mod planning;
-pub mod samples;
 pub mod watches;
 
 use carff_checkpoint::{CheckpointError, FieldProbe, Manifest};

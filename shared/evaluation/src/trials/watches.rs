@@ -1,11 +1,11 @@
 //! Watches: whole drives whose camera pans, with the exact posteriors of observers with and without a memory.
 
-use super::planning::Perception;
 use crate::Progress;
 use carff_dataset::{ScenarioInfo, drives::DriveKind};
 use carff_decision::{ImageEvidence, Mixture};
 use carff_networks::mixture::MixtureNet;
 use carff_scenes::{Scenario, ScenarioError};
+use carff_trials::Perception;
 use rayon::prelude::*;
 
 /// Frames of a watch between two time steps: the cameras of the shipped graphs take six.

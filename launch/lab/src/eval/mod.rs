@@ -2,12 +2,13 @@
 
 mod images;
 
-use crate::dataset::render;
 use crate::train::Display;
 use anyhow::{Context, bail};
 use carff_base::files::check_writable;
 use carff_checkpoint::Manifest;
 use carff_evaluation::{EvalOptions, Subject, Table, evaluate};
+use carff_launch::dataset::render;
+use carff_launch::lab::{EvalArgs, TableName};
 use carff_scenes::{Extras, Scenario};
 use carff_training::training_curves;
 use std::path::{Path, PathBuf};
@@ -16,82 +17,19 @@ use std::process::ExitCode;
 /// Largest distance of two cameras that count as the same, metres.
 const SAME_PLACE_M: f64 = 1e-3;
 
-/// Options of `carff eval`.
-#[derive(Debug, clap::Args)]
-pub struct EvalArgs {
-    /// Folder of the checkpoint.
-    checkpoint: PathBuf,
-    /// Dataset of the evaluation, instead of the training dataset.
-    #[arg(long)]
-    dataset: Option<PathBuf>,
-    /// Compute only this table; may be given several times.
-    #[arg(long, value_enum, value_name = "TABLE")]
-    only: Vec<TableName>,
-    /// Device of the encoder: `auto`, `cpu` or `cuda:N`.
-    #[arg(long, default_value = "auto")]
-    device: String,
-    /// Folder of the training run, for its curves. Default: runs/NAME or the checkpoint's parent, where they have
-    /// metrics.
-    #[arg(long)]
-    run_dir: Option<PathBuf>,
-    /// Threads that render and probe.
-    #[arg(long, default_value_t = 2, value_parser = clap::value_parser!(u16).range(1..=256))]
-    threads: u16,
-    /// Seed of sensor noise, draws, folds and free drives.
-    #[arg(long, default_value_t = 2)]
-    seed: u64,
-    /// Number of free drives for planning, for the bound and for the memory, half of them with a hazard. They need the scenario file
-    /// of the dataset.
-    #[arg(long, default_value_t = 400, value_parser = clap::value_parser!(u32).range(0..=100_000))]
-    free_drives: u32,
-    /// Number of free poses for the trials, each with one image of each branch. They need the scenario file of the
-    /// dataset.
-    #[arg(long, default_value_t = 300, value_parser = clap::value_parser!(u32).range(0..=100_000))]
-    free_poses: u32,
-    /// Folder for results.json, README.md and images; files of an earlier evaluation are overwritten.
-    #[arg(long)]
-    out: PathBuf,
-}
-
-/// A table.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
-enum TableName {
-    /// PSNR matrices from above, and novel views.
-    Psnr,
-    /// Decoder, support vector machine, state accuracy.
-    Encoder,
-    /// Accuracy and recall against the number of samples.
-    Recall,
-    /// Every decision rule, and the reliability of the hazard probability.
-    Planning,
-    /// Six kinds of trial, with baselines on the same images.
-    Trials,
-    /// Unknown objects, other places, corrupted images, and the bound.
-    Robustness,
-    /// Density probing and segmentation of rendered views, on the same samples.
-    Localisation,
-    /// The belief with and without memory, on drives whose camera pans.
-    Memory,
-    /// Frequency of each outcome where several are open.
-    Frequencies,
-    /// t-SNE, reconstructions, curves, beliefs, density.
-    Pictures,
-}
-
-impl From<TableName> for Table {
-    fn from(name: TableName) -> Self {
-        match name {
-            TableName::Psnr => Self::Psnr,
-            TableName::Encoder => Self::Encoder,
-            TableName::Recall => Self::Recall,
-            TableName::Planning => Self::Planning,
-            TableName::Trials => Self::Trials,
-            TableName::Robustness => Self::Robustness,
-            TableName::Localisation => Self::Localisation,
-            TableName::Memory => Self::Memory,
-            TableName::Frequencies => Self::Frequencies,
-            TableName::Pictures => Self::Pictures,
-        }
+/// Returns the table of a name.
+fn table(name: TableName) -> Table {
+    match name {
+        TableName::Psnr => Table::Psnr,
+        TableName::Encoder => Table::Encoder,
+        TableName::Recall => Table::Recall,
+        TableName::Planning => Table::Planning,
+        TableName::Trials => Table::Trials,
+        TableName::Robustness => Table::Robustness,
+        TableName::Localisation => Table::Localisation,
+        TableName::Memory => Table::Memory,
+        TableName::Frequencies => Table::Frequencies,
+        TableName::Pictures => Table::Pictures,
     }
 }
 
@@ -111,7 +49,7 @@ pub fn run(args: &EvalArgs) -> anyhow::Result<ExitCode> {
     if let Some(run_dir) = run_dir(args) {
         subject.training_curves = training_curves(&run_dir)?;
     }
-    let asked: Vec<Table> = args.only.iter().map(|t| Table::from(*t)).collect();
+    let asked: Vec<Table> = args.only.iter().map(|&name| table(name)).collect();
     let tables = if asked.is_empty() { Table::ALL.to_vec() } else { asked };
     let wants = |table| tables.contains(&table);
     if let Some(scenario) = shown_scenario(&subject).filter(|s| !s.info().hazard_branches.is_empty()) {

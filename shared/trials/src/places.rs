@@ -1,6 +1,6 @@
 //! Places that are probed, from the boxes of a scenario's states.
 
-use crate::TrainingError;
+use crate::EvaluationError;
 use carff_dataset::{NamedBox, ScenarioInfo};
 use carff_decision::Place;
 use carff_messages::{MAX_PLACES, MAX_STATES};
@@ -10,10 +10,10 @@ use carff_messages::{MAX_PLACES, MAX_STATES};
 /// dynamic are left out too.
 ///
 /// Too many states are an error, and so are states without any distinguishing box: there would be nothing to probe.
-pub fn places(scenario: &ScenarioInfo) -> Result<Vec<Place>, TrainingError> {
+pub fn places(scenario: &ScenarioInfo) -> Result<Vec<Place>, EvaluationError> {
     let states = scenario.state_count();
     if states > MAX_STATES {
-        return Err(TrainingError::Unfit(format!(
+        return Err(EvaluationError::Unfit(format!(
             "the scenario has {states} states (branches x timestamps); at most {MAX_STATES} are supported"
         )));
     }
@@ -25,13 +25,13 @@ pub fn places(scenario: &ScenarioInfo) -> Result<Vec<Place>, TrainingError> {
         places = moved(all.into_iter().filter(|(_, named)| named.dynamic), states);
     }
     match places.len() {
-        0 => Err(TrainingError::Unfit(
+        0 => Err(EvaluationError::Unfit(
             "no box distinguishes the scenario's states, so there is nothing to probe: `scenario.states[].boxes` must \
              have the boxes of the dynamic objects of each state"
                 .into(),
         )),
         1..=MAX_PLACES => Ok(places),
-        many => Err(TrainingError::Unfit(format!(
+        many => Err(EvaluationError::Unfit(format!(
             "the scenario's dynamic boxes stand in {many} different places; at most {MAX_PLACES} can be probed"
         ))),
     }

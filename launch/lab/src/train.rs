@@ -1,8 +1,9 @@
 //! `carff train`: trains a scenario's models and writes the checkpoint.
 
-use crate::dataset::render;
 use anyhow::{Context, bail};
 use carff_checkpoint::Manifest;
+use carff_launch::dataset::render;
+use carff_launch::lab::{StageName, TrainArgs};
 use carff_scenes::{
     Extras, Scenario,
     config::{BystanderPlace, VariationRole},
@@ -24,42 +25,6 @@ use std::{
 
 /// Longest time from a signal to the end of the process.
 const GRACE: Duration = Duration::from_millis(1500);
-
-/// Options of `carff train`.
-#[derive(Debug, clap::Args)]
-pub struct TrainArgs {
-    /// The training file, for example configs/training/approaching-intersection.toml.
-    config: PathBuf,
-    /// Dataset to train on, instead of the training file's.
-    #[arg(long)]
-    dataset: Option<PathBuf>,
-    /// Folder for the finished checkpoint, instead of the training file's.
-    #[arg(long)]
-    out: Option<PathBuf>,
-    /// Train only one model; the models before it must be finished.
-    #[arg(long, value_enum)]
-    stage: Option<StageName>,
-    /// Device of the VAE and the mixture density network: `auto`, `cpu` or `cuda:N`. The field is trained on the CPU.
-    #[arg(long, default_value = "auto")]
-    device: String,
-    /// Folder for saved states, metrics and curves.
-    #[arg(long)]
-    run_dir: Option<PathBuf>,
-    /// Replace a finished checkpoint, and remove saved states of another configuration.
-    #[arg(long)]
-    force: bool,
-}
-
-/// A model to train.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
-enum StageName {
-    /// The pose-conditional VAE.
-    Vae,
-    /// The latent-conditioned field.
-    Nerf,
-    /// The mixture density network.
-    Mdn,
-}
 
 /// Runs the command.
 pub fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
@@ -325,7 +290,7 @@ mod tests {
     fn a_run_folder_belongs_to_one_configuration() {
         let folder = tempfile::tempdir().unwrap();
         let saved = folder.path().join("configuration.json");
-        let text = include_str!("../../configs/training/approaching-intersection.toml");
+        let text = include_str!("../../../configs/training/approaching-intersection.toml");
         let config: TrainingConfig = toml::from_str(text).unwrap();
         let refused = |dataset: &str| refuse_another_configuration(folder.path(), &config, Path::new(dataset)).is_err();
         assert!(!refused("data/x") && saved.is_file());
@@ -356,7 +321,7 @@ mod tests {
     #[test]
     fn a_finished_checkpoint_is_kept() {
         let folder = tempfile::tempdir().unwrap();
-        let shipped = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/checkpoints/approaching-intersection");
+        let shipped = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs/checkpoints/approaching-intersection");
         let error = refuse_finished(folder.path(), &shipped).unwrap_err().to_string();
         assert!(error.contains("--out") && error.contains("--force"), "{error}");
         refuse_finished(folder.path(), &folder.path().join("new")).unwrap();

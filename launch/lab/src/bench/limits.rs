@@ -1,6 +1,6 @@
 //! Limits of the machine: matrix products in libtorch, and memory bandwidth.
 
-use crate::stats::{Contender, timed};
+use carff_bench::stats::{Contender, timed};
 use tch::{Device, Kind, Tensor};
 
 /// Returns a matrix product of `[m, k]` and `[k, n]`, and its number of operations.

@@ -2,41 +2,24 @@
 
 use crate::eval;
 use crate::train::{Display, datasets, refuse_another_configuration, stop_on_signals, stopped, with_random_poses};
-use anyhow::Context;
+use anyhow::{Context, anyhow};
+use carff_launch::lab::AblateArgs;
 use carff_training::ablation::{AblationTable, Variant, folders, row, write_table};
 use carff_training::{Progress, Run, Training, TrainingConfig, TrainingError};
-use std::path::PathBuf;
 use std::process::ExitCode;
 
-/// Options of `carff ablate`.
-#[derive(Debug, clap::Args)]
-pub struct AblateArgs {
-    /// The training file, for example configs/training/approaching-intersection-ablation.toml.
-    config: PathBuf,
-    /// Dataset to train on, instead of the training file's.
-    #[arg(long)]
-    dataset: Option<PathBuf>,
-    /// Train only these variants, by the name of their folder: full, stem, conv-net, unfrozen, transformer, no-pose.
-    #[arg(long, value_parser = variant)]
-    only: Vec<Variant>,
-    /// Device of training and scoring: `auto`, `cpu` or `cuda:N`.
-    #[arg(long, default_value = "auto")]
-    device: String,
-    /// Folder for ablation.json, README.md, and a folder for each variant. The same command resumes a stopped run.
-    #[arg(long)]
-    out: PathBuf,
-}
-
-fn variant(name: &str) -> Result<Variant, String> {
+fn variant(name: &str) -> anyhow::Result<Variant> {
     let names = || Variant::ALL.map(Variant::name).join(", ");
     Variant::ALL.into_iter().find(|v| v.name() == name).ok_or_else(|| {
         let hint = carff_base::names::hint(name, Variant::ALL.map(Variant::name));
-        format!("one of {} is wanted{hint}", names())
+        anyhow!("--only {name}: one of {} is wanted{hint}", names())
     })
 }
 
 /// Runs the command.
 pub fn run(args: &AblateArgs) -> anyhow::Result<ExitCode> {
+    let named = args.only.iter().map(|name| variant(name)).collect::<anyhow::Result<Vec<_>>>()?;
+    let variants = if named.is_empty() { Variant::ALL.to_vec() } else { named };
     let config = TrainingConfig::load(&args.config)?;
     let (dataset, rendered) = datasets(&config, args.dataset.as_deref())?;
     let threads = u16::try_from(config.threads).unwrap_or(1);
@@ -53,7 +36,6 @@ pub fn run(args: &AblateArgs) -> anyhow::Result<ExitCode> {
         Err(TrainingError::Stopped) => return Ok(stopped(&args.out)),
         made => made?,
     };
-    let variants = if args.only.is_empty() { Variant::ALL.to_vec() } else { args.only.clone() };
     let mut table = AblationTable {
         dataset: dataset.display().to_string(),
         epochs: config.vae.epochs,

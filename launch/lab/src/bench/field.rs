@@ -1,20 +1,19 @@
 //! Compares the field's kernels with the same model in tensor operations and with the machine's limits.
 
-use crate::OutputArgs;
-use crate::limits::{matrix_product, triad};
+use super::limits::{matrix_product, triad};
 use crate::reference::{Precision, Rays, ReferenceField, Samples, huber_sum};
-use crate::report::{Report, number, table};
-use crate::stats::{Contender, Ratio, Times, alternate, timed};
 use anyhow::Context;
 use carff_base::geometry::{PinholeCamera, Ray};
 use carff_base::random::{Key, gaussians, uniform};
+use carff_bench::report::{Report, number, table};
+use carff_bench::stats::{Contender, Ratio, Times, alternate, timed};
+use carff_bench::{FieldArgs, birds_eye};
 use carff_checkpoint::{FieldProbe, Manifest, load_field_probe};
 use carff_decision::{Draw, Mixture};
 use carff_field::{
     Field, FieldConfig, FieldTrainer, HypothesisBuffer, InstructionSet, LATENT_DIM, RayBatch, RayLimits, RaySamples,
     RenderBuffer, RenderOptions, TrainerConfig,
 };
-use std::path::PathBuf;
 use std::time::Instant;
 use tch::{Kind, Tensor, nn::OptimizerConfig};
 
@@ -28,25 +27,6 @@ const STANDSTILL: f32 = 1e-12;
 /// Points for the rate of the networks; with the latents, the features stay in the second-level cache.
 const POINTS: usize = 2048;
 const LATENTS: usize = 32;
-
-/// Compare the field's kernels with the same model in tensor operations and with the machine's limits.
-#[derive(Clone, Debug, clap::Args)]
-pub struct FieldArgs {
-    /// Folder of the checkpoint whose field is measured.
-    #[arg(long, default_value = "configs/checkpoints/approaching-intersection")]
-    checkpoint: PathBuf,
-    /// Number of threads. Default: all cores.
-    #[arg(long)]
-    threads: Option<usize>,
-    /// Side of the bird's-eye view, pixels.
-    #[arg(long, default_value_t = 128)]
-    side_px: u32,
-    /// Measure fewer rounds.
-    #[arg(long)]
-    quick: bool,
-    #[command(flatten)]
-    pub(crate) output: OutputArgs,
-}
 
 pub(crate) fn run(args: &FieldArgs) -> anyhow::Result<Report> {
     carff_networks::allocator::keep_large_blocks();
@@ -84,17 +64,6 @@ pub(crate) fn run(args: &FieldArgs) -> anyhow::Result<Report> {
     bench.probes(&mut probe, &states, &mut report);
     bench.training(&field, &states, &mut report)?;
     Ok(report)
-}
-
-/// Returns a camera straight above the bounds; the image's up is +Y.
-pub(crate) fn birds_eye(config: &FieldConfig, side_px: u32) -> PinholeCamera {
-    let [low, high] = config.bounds_m.map(|corner| corner.map(f64::from));
-    let centre = [0, 1, 2].map(|i| f64::midpoint(low[i], high[i]));
-    let extent = (high[0] - low[0]).max(high[1] - low[1]);
-    let fov_deg = 60.0_f64;
-    let height = low[2] + extent / 2.0 / (fov_deg / 2.0).to_radians().tan();
-    let eye = [centre[0], centre[1], height];
-    PinholeCamera::look_at(eye, [centre[0], centre[1], low[2]], [0.0, 1.0, 0.0], side_px, side_px, fov_deg)
 }
 
 /// Number of multiplications and additions of the density network for one sample.

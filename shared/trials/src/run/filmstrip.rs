@@ -1,7 +1,7 @@
 //! Filmstrip of a run's drives: the camera image, the true next state, and the forecast states.
 
 use super::{DecidedFrame, JudgedRun};
-use crate::trials::hypotheses::{birds_eye_camera, hypotheses, state_names};
+use crate::hypotheses::{birds_eye_camera, hypotheses, state_names};
 use crate::{EvaluationError, FieldRenderer};
 use carff_checkpoint::FieldProbe;
 use carff_dataset::{Image, drives::DriveKind};
@@ -25,7 +25,7 @@ const HAZARD: [u8; 3] = [236, 140, 20];
 impl JudgedRun {
     /// Draws some drives of the run into a PNG file, each by its decisive frame.
     pub fn write_filmstrip(&self, path: &Path, decisive: &[(DecidedFrame, DriveKind)]) -> Result<(), EvaluationError> {
-        let probe = self.models.probe.clone();
+        let probe = self.probe.clone();
         let names = state_names(&self.scenario, probe.layout().places());
         let threads = std::thread::available_parallelism().map_or(1, std::num::NonZero::get);
         let mut artist = Artist { run: self, names, probe, renderer: FieldRenderer::new(threads) };

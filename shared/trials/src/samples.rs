@@ -1,10 +1,9 @@
 //! State accuracy of probed samples of the next step.
 
-use carff_checkpoint::FieldProbe;
+use carff_checkpoint::{FieldProbe, Forecasts};
 use carff_dataset::{Equivalence, ScenarioInfo};
 use carff_decision::Sampling;
 use carff_messages::Gaussian;
-use carff_networks::mixture::MixtureNet;
 use serde::{Deserialize, Serialize};
 
 /// Counts over all samples of all views of one kind.
@@ -60,7 +59,7 @@ pub struct Input {
 #[derive(Clone, Copy)]
 pub struct SampleTrials<'a> {
     /// Posterior to mixture.
-    pub net: &'a MixtureNet,
+    pub net: &'a dyn Forecasts,
     /// Scenario of the inputs.
     pub scenario: &'a ScenarioInfo,
     /// Visual equivalence of its states.

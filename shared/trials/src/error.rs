@@ -14,6 +14,9 @@ pub enum EvaluationError {
     /// The known states of the checkpoint cannot be read.
     #[error(transparent)]
     Known(#[from] carff_unknown::KnownError),
+    /// The encoder cannot be computed.
+    #[error(transparent)]
+    Inference(#[from] carff_inference::InferenceError),
     /// The dataset cannot be read or written.
     #[error(transparent)]
     Dataset(#[from] carff_dataset::DatasetError),

@@ -3,7 +3,7 @@
 use carff_base::geometry::PinholeCamera;
 use carff_base::random::Key;
 use carff_base::statistics::wilson_interval;
-use carff_checkpoint::FieldProbe;
+use carff_checkpoint::{Encodes, FieldProbe, Forecasts};
 use carff_dataset::{
     Dataset, DatasetError, Image,
     drives::{DriveKind, EligibleInput},
@@ -15,15 +15,10 @@ use carff_decision::{
 };
 use carff_field::Field;
 use carff_messages::{Gaussian, LATENT_DIM, Rule};
-use carff_networks::{
-    encoder::{Encoder, pictures_from_bytes},
-    mixture::MixtureNet,
-};
 use carff_unknown::{Comparer, Comparison, Known, Seen};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::{cell::RefCell, collections::BTreeMap};
-use tch::Tensor;
 
 /// Numbers of samples that the table has columns for.
 pub const SAMPLE_COUNTS: [usize; 3] = [2, 10, 35];
@@ -56,7 +51,7 @@ pub fn trial_frame(image: usize, repeat: usize) -> u64 {
 /// Correct actions among trials, with a 95 % Wilson interval.
 ///
 /// ```
-/// let mut count = carff_evaluation::Count::default();
+/// let mut count = carff_trials::Count::default();
 /// [true, true, false].into_iter().for_each(|right| count.add(right));
 /// assert_eq!((count.success, count.trials), (2, 3));
 /// ```
@@ -128,7 +123,7 @@ pub type BySamples = BTreeMap<usize, ByKind<Count>>;
 ///
 /// ```
 /// use carff_dataset::drives::DriveKind;
-/// use carff_evaluation::PlanningTable;
+/// use carff_trials::PlanningTable;
 /// use carff_messages::Rule;
 /// let mut table = PlanningTable::default();
 /// table.add(Rule::Paper, 10, DriveKind::Hazard, true);
@@ -232,7 +227,7 @@ pub struct Compared {
 /// same noisy image with the known states.
 pub struct Perception<'a> {
     /// The encoder.
-    pub encoder: &'a Encoder,
+    pub encoder: &'a dyn Encodes,
     /// Noise of the sensor.
     pub noise: SensorNoise,
     /// Seed of the noise.
@@ -280,9 +275,7 @@ impl Perception<'_> {
             // Only settings out of range are refused; those of a checkpoint were validated.
             noisy.rgb.copy_from_slice(&image.rgb);
         }
-        let sides = [1, i64::from(noisy.height_px), i64::from(noisy.width_px), 3];
-        let input = pictures_from_bytes(&Tensor::from_slice(&noisy.rgb).view(sides));
-        let posterior = self.encoder.encode(&input).into_iter().next()?;
+        let posterior = self.encoder.posterior_of(noisy.view()?)?;
         let image = self.known.as_ref().and_then(|known| known.evidence(camera, &noisy));
         Some((Trial { posterior, image, remembered: None, kind, frame, seed: self.seed }, noisy))
     }
@@ -297,7 +290,7 @@ pub struct TakeMemories {
 
 impl TakeMemories {
     /// Memories with the learned numbers; a time step takes `frames_per_timestamp` frames.
-    pub fn new(net: &MixtureNet, probe: &FieldProbe, settings: MemorySettings, frames_per_timestamp: u64) -> Self {
+    pub fn new(net: &dyn Forecasts, probe: &FieldProbe, settings: MemorySettings, frames_per_timestamp: u64) -> Self {
         let memory = Memory::new(probe.states().to_vec(), |state| net.forecast(state), settings);
         Self {
             forecasts: TakeMemory::new(memory, StepLength::Frames(frames_per_timestamp)),
@@ -306,7 +299,7 @@ impl TakeMemories {
     }
 
     /// Adds the trial of the next frame of a drive, and returns it with its memory.
-    pub fn remember(&mut self, net: &MixtureNet, trial: Trial, frame_in_drive: u64) -> Trial {
+    pub fn remember(&mut self, net: &dyn Forecasts, trial: Trial, frame_in_drive: u64) -> Trial {
         let frame = TakeFrame { take_start: 0, frame: frame_in_drive, capture_time_ns: 0 };
         let (remembered, _) = self.forecasts.see(frame, &net.forecast(&trial.posterior));
         let image = trial.image.map(|image| self.images.see(image));
@@ -327,7 +320,7 @@ pub struct TrialOutcome {
 #[derive(Clone, Copy)]
 pub struct Planner<'a> {
     /// Posterior to mixture.
-    pub net: &'a MixtureNet,
+    pub net: &'a dyn Forecasts,
     /// Hypothesis to state.
     pub probe: &'a FieldProbe,
     /// Spread of the samples over the mixture's components.

@@ -1,9 +1,9 @@
 //! Measures encoder and forecaster one frame at a time, as their stages run them.
 
-use crate::OutputArgs;
-use crate::report::{Report, number, table};
-use crate::stats::{Contender, Ratio, Times, alternate, timed};
 use anyhow::Context;
+use carff_bench::EncoderArgs;
+use carff_bench::report::{Report, number, table};
+use carff_bench::stats::{Contender, Ratio, Times, alternate, timed};
 use carff_checkpoint::{
     Manifest,
     shapes::{BackboneConfig, BackboneKind, EncoderConfig},
@@ -15,29 +15,12 @@ use carff_networks::{
     encoder::{Encoder, gaussians, pictures_from_bytes},
 };
 use ndarray::ArrayView3;
-use std::path::PathBuf;
 use tch::{Device, Kind, nn::VarStore};
 
 /// Side of the measured image, pixels.
 const SIDE_PX: usize = 128;
 /// Latents drawn from a forecast.
 const SAMPLES: usize = 10;
-
-/// Measure encoder and forecaster, one frame at a time.
-#[derive(Clone, Debug, clap::Args)]
-pub struct EncoderArgs {
-    /// Checkpoint folder.
-    #[arg(long, default_value = "configs/checkpoints/approaching-intersection")]
-    checkpoint: PathBuf,
-    /// Leave out the vision transformer, which takes 1.3 GB and seconds per frame.
-    #[arg(long)]
-    no_vit: bool,
-    /// Measure fewer rounds.
-    #[arg(long)]
-    quick: bool,
-    #[command(flatten)]
-    pub(crate) output: OutputArgs,
-}
 
 pub(crate) fn run(args: &EncoderArgs) -> anyhow::Result<Report> {
     carff_networks::allocator::keep_large_blocks();
@@ -52,7 +35,7 @@ pub(crate) fn run(args: &EncoderArgs) -> anyhow::Result<Report> {
     let mut note = |name: &str, key: &str, seconds: &[f64]| {
         let times = Times::new(seconds.iter().map(|s| s * 1e3).collect());
         let [p50, p99, max] = [0.5, 0.99, 1.0].map(|q| times.quantile(q));
-        rows.push([name.to_owned(), number(p50), number(p99), number(max), times.len().to_string()]);
+        rows.push([name.to_owned(), number(p50), number(p99), number(max), times.count().to_string()]);
         report.set(&format!("{key}p50_ms"), p50);
         report.set(&format!("{key}p99_ms"), p99);
     };

@@ -11,12 +11,12 @@ use std::{
 /// `--force`.
 #[test]
 fn the_shipped_weights_are_imported() {
-    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..");
     let shipped = root.join("configs/checkpoints/backbones/efficientnet-lite0.safetensors");
     let dir = tempfile::tempdir().unwrap();
     let out = dir.path().join("folder/weights.safetensors");
     let import = |more: &[&str]| -> Output {
-        Command::new(env!("CARGO_BIN_EXE_carff-launch"))
+        Command::new(env!("CARGO_BIN_EXE_carff-lab"))
             .args(["backbone", "import"])
             .args([&shipped, Path::new("--out"), &out])
             .args(more)
@@ -41,7 +41,7 @@ fn the_shipped_weights_are_imported() {
 fn unfit_weights_are_refused() {
     let dir = tempfile::tempdir().unwrap();
     let refused = |name: &str, more: &[&str]| {
-        let out = Command::new(env!("CARGO_BIN_EXE_carff-launch"))
+        let out = Command::new(env!("CARGO_BIN_EXE_carff-lab"))
             .args(["backbone", "import", name, "--out", "weights.safetensors"])
             .args(more)
             .current_dir(dir.path())
@@ -56,8 +56,8 @@ fn unfit_weights_are_refused() {
     std::fs::write(dir.path().join("page.safetensors"), "<!doctype html><html></html>").unwrap();
     assert!(refused("page.safetensors", &[]).contains("page.safetensors: a web page or an XML reply, not the data"));
 
-    let shipped =
-        Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/checkpoints/backbones/efficientnet-lite0.safetensors");
+    let shipped = Path::new(env!("CARGO_MANIFEST_DIR"))
+        .join("../../configs/checkpoints/backbones/efficientnet-lite0.safetensors");
     let mut tensors = weights::read(&shipped).unwrap();
     weights::write(&dir.path().join("whole.safetensors"), &tensors, tch::Kind::Half).unwrap();
     let error = refused("whole.safetensors", &["--imagenet-normalised"]);

@@ -1,10 +1,12 @@
-//! Planning tables of a run of the graph: every rule over the run's drives, and over every eligible view.
+//! Planning tables of a run of the graph: every rule over the run's drives, and over every eligible view. The networks
+//! are those of the stages: the encoder in ONNX Runtime, the mixture density network in native code.
 
 mod filmstrip;
 
-use crate::trials::planning::{KnownStates, Perception, Planner};
-use crate::{CheckpointFigures, Count, EvaluationError, Models, PlanningTable, SAMPLE_COUNTS};
-use carff_checkpoint::{CheckpointPlanning, FieldProbe};
+use crate::onnx::OnnxEncoder;
+use crate::planning::{KnownStates, Perception, Planner};
+use crate::{Count, EvaluationError, PlanningTable, SAMPLE_COUNTS};
+use carff_checkpoint::{CheckpointPlanning, FieldProbe, Manifest, load_field_probe};
 use carff_dataset::{
     Dataset, Observability, PoseRole, PoseSplit, ScenarioInfo,
     drives::{DriveKind, EligibleInput, eligible_inputs},
@@ -129,7 +131,7 @@ impl DriveCounts {
     /// Counts the decisive frames.
     ///
     /// ```
-    /// use carff_evaluation::run::DriveCounts;
+    /// use carff_trials::run::DriveCounts;
     /// let counts = DriveCounts::of(carff_messages::Rule::Calibrated, 10, &[]);
     /// assert_eq!(counts.hazard.trials, 0);
     /// ```
@@ -219,7 +221,8 @@ pub struct JudgedRun {
     settings: RunSettings,
     dataset: Dataset,
     scenario: ScenarioInfo,
-    models: Models,
+    manifest: Manifest,
+    probe: FieldProbe,
     /// Known states, where images were compared with them.
     known: Option<Known>,
     /// The forecaster as the graph computes it: the same bits.
@@ -236,12 +239,13 @@ impl JudgedRun {
         let dataset = Dataset::open(&settings.dataset)?;
         let scenario =
             dataset.scenario().cloned().ok_or_else(|| EvaluationError::Unfit("it has no scenario".into()))?;
-        let models = Models::load(&settings.checkpoint)?;
-        let forecaster = MixtureNet::load(&settings.checkpoint, &models.manifest)?;
+        let manifest = Manifest::load(&settings.checkpoint)?;
+        let probe = load_field_probe(&settings.checkpoint, &manifest)?;
+        let forecaster = MixtureNet::load(&settings.checkpoint, &manifest)?;
         let known = if settings.compares { Known::load(&settings.checkpoint)? } else { None };
         let learned = CheckpointPlanning::load(&settings.checkpoint)?.memory;
         let remembered = learned.zip(settings.remembers).map(|(learned, step)| {
-            let states = models.probe.states().to_vec();
+            let states = probe.states().to_vec();
             let memory = Memory::new(states, |state| forecaster.forecast(state), learned.settings);
             let mut memory = TakeMemory::new(memory, step);
             let see = |(frame, posterior): &(TakeFrame, Gaussian)| {
@@ -250,17 +254,12 @@ impl JudgedRun {
             };
             posteriors.iter().map(see).collect()
         });
-        Ok(Self { settings, dataset, scenario, models, known, forecaster, remembered })
+        Ok(Self { settings, dataset, scenario, manifest, probe, known, forecaster, remembered })
     }
 
     /// Scenario of the run.
     pub fn scenario(&self) -> &ScenarioInfo {
         &self.scenario
-    }
-
-    /// Figures of the checkpoint, as measured in training.
-    pub fn checkpoint_figures(&self) -> Result<CheckpointFigures, EvaluationError> {
-        CheckpointFigures::of(&self.models.manifest, &self.settings.checkpoint)
     }
 
     /// Computes the planning tables from the decisive frames of the run.
@@ -272,11 +271,13 @@ impl JudgedRun {
     ) -> Result<RunPlanning, EvaluationError> {
         progress("planning tables, 1 of 3: the drives".to_owned());
         let (drives, live) = self.drives_table(decisive);
+        let encoder = OnnxEncoder::load(&self.settings.checkpoint, &self.manifest)?;
         let split = PoseSplit::for_dataset(&self.dataset, self.settings.split_seed);
         progress("planning tables, 2 of 3: every eligible image of trained poses".to_owned());
-        let (all_views, of_all) = self.views_table(&split.views(PoseRole::Rest))?;
+        let (all_views, of_all) = self.views_table(&encoder, &split.views(PoseRole::Rest))?;
         progress("planning tables, 3 of 3: every eligible image of held-out poses".to_owned());
-        let (unseen_views, of_unseen) = self.views_table(&split.views(PoseRole::Unseen))?;
+        let (unseen_views, of_unseen) = self.views_table(&encoder, &split.views(PoseRole::Unseen))?;
+        encoder.finish()?;
         let (drives, free_drives) =
             if self.settings.free.is_some() { (None, Some(drives)) } else { (Some(drives), None) };
         let views = RunViews { all_views: of_all, unseen_views: of_unseen };
@@ -309,7 +310,7 @@ impl JudgedRun {
 
     /// Every rule over the drives of the run, and the agreement of the run with the library.
     fn drives_table(&self, decisive: &[(DecidedFrame, DriveKind)]) -> (PlanningTable, LiveAgreement) {
-        let mut probe = self.models.probe.clone();
+        let mut probe = self.probe.clone();
         let mut table = PlanningTable::default();
         let mut live = LiveAgreement {
             rule: self.settings.rule.name().to_owned(),
@@ -336,7 +337,11 @@ impl JudgedRun {
     }
 
     /// Every rule over all eligible images of some poses, and the number of images.
-    fn views_table(&self, views: &[usize]) -> Result<(PlanningTable, RunViewCounts), EvaluationError> {
+    fn views_table(
+        &self,
+        encoder: &OnnxEncoder,
+        views: &[usize],
+    ) -> Result<(PlanningTable, RunViewCounts), EvaluationError> {
         let RunSettings { sampling, horizon, noise, seed, .. } = self.settings;
         let inputs = eligible_inputs(&self.dataset, views)?;
         let of = |kind| inputs.iter().filter(|i: &&EligibleInput| i.kind == kind).count();
@@ -345,11 +350,11 @@ impl JudgedRun {
             clear: of(DriveKind::Clear),
             repeats: TRIALS.div_ceil(inputs.len().max(1)).min(MOST_REPEATS),
         };
-        let Models { encoder, mixture, probe, .. } = &self.models;
+        let (probe, net) = (&self.probe, &self.forecaster);
         let known = self.known.as_ref().map(|known| KnownStates::new(known, probe, 1));
         let trials = Perception { encoder, noise, seed, known }.trials(&self.dataset, &inputs, counts.repeats)?;
         let (table, _) =
-            Planner { net: mixture, probe, sampling, horizon }.table(&trials, &Policy::all(self.settings.threshold));
+            Planner { net, probe, sampling, horizon }.table(&trials, &Policy::all(self.settings.threshold));
         Ok((table, counts))
     }
 }
@@ -359,7 +364,7 @@ impl RunPlanning {
     ///
     /// ```
     /// use carff_dataset::drives::DriveKind;
-    /// use carff_evaluation::run::RunPlanning;
+    /// use carff_trials::run::RunPlanning;
     /// use carff_messages::Rule;
     /// let mut planning = RunPlanning::default();
     /// planning.all_views.add(Rule::Paper, 2, DriveKind::Clear, true);

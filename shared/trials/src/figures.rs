@@ -1,6 +1,6 @@
 //! Figures of a finished training: `metrics` of a checkpoint's manifest.
 
-use crate::{Accuracy, BirdsEye, ByObservability, DecodedQuality, EvaluationError, PlanningTable, SampleAccuracy};
+use crate::{Accuracy, BirdsEye, ByObservability, EvaluationError, PlanningTable, SampleAccuracy};
 use carff_checkpoint::{Manifest, files};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
@@ -10,7 +10,7 @@ use std::path::Path;
 /// The names of the fields are the keys of the file: an unknown key is an error, never a missing figure.
 ///
 /// ```
-/// use carff_evaluation::CheckpointFigures;
+/// use carff_trials::CheckpointFigures;
 /// let text = r#"{"views": {"trained": {"poses": 24, "psnr_db": 31.5}, "unseen": {"poses": 3, "psnr_db": null}}}"#;
 /// let figures: CheckpointFigures = serde_json::from_str(text)?;
 /// assert_eq!(figures.summary(), "PSNR of views: trained poses 31.5 dB");
@@ -69,6 +69,20 @@ pub struct VaeFigures {
     /// PSNR over the pixels that differ from the mean image, dB.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub changed_pixels_psnr_db: Option<f64>,
+}
+
+/// Quality of decoded images, over all valid pixels of all images.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct DecodedQuality {
+    /// PSNR, dB.
+    pub psnr_db: f64,
+    /// PSNR of each pose's mean image over the states, which needs no encoder, dB.
+    pub mean_picture_psnr_db: f64,
+    /// PSNR over the pixels that differ from the mean image by more than [`carff_dataset::PIXEL_TOLERANCE`], dB.
+    pub changed_pixels_psnr_db: f64,
+    /// Images.
+    pub pictures: usize,
 }
 
 impl VaeFigures {

@@ -4,11 +4,11 @@
 
 use carff_base::geometry::Ray;
 use carff_base::random::{Key, gaussians};
-use carff_bench::reference::{Precision, Rays, ReferenceField, Samples, huber_sum};
 use carff_field::{
     Field, FieldConfig, FieldTrainer, InstructionSet, LATENT_DIM, RayBatch, RayLimits, RaySamples, RenderBuffer,
     RenderOptions, TrainerConfig,
 };
+use carff_lab::reference::{Precision, Rays, ReferenceField, Samples, huber_sum};
 use tch::Tensor;
 
 fn normals<const N: usize>(seed: u64, i: usize) -> [f32; N] {

@@ -1,0 +1,74 @@
+//! `carff checkpoint`: the limits of what a checkpoint knows, and its memory.
+
+use crate::train::Display;
+use anyhow::Context;
+use carff_base::statistics::percentile_of_sorted;
+use carff_launch::lab::{BoundArgs, CheckpointCommand, KnownArgs, MemoryArgs};
+use carff_scenes::Scenario;
+use carff_training::{BoundInput, KnownInput, MemoryInput, bound_threshold, calibrate_known, learn_memory};
+use std::process::ExitCode;
+
+/// Runs the command.
+pub fn run(command: &CheckpointCommand) -> anyhow::Result<ExitCode> {
+    match command {
+        CheckpointCommand::Onnx(args) => carff_launch::checkpoint::onnx(args)?,
+        CheckpointCommand::Known(args) => known(args)?,
+        CheckpointCommand::Bound(args) => bound(args)?,
+        CheckpointCommand::Memory(args) => memory(args)?,
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+fn known(args: &KnownArgs) -> anyhow::Result<()> {
+    let scenario = args.scenario.as_deref().map(Scenario::load).transpose()?;
+    let input = KnownInput {
+        checkpoint: &args.checkpoint,
+        dataset: &args.dataset,
+        scenario: scenario.as_ref(),
+        free_poses: args.free_poses,
+        threads: args.threads,
+    };
+    let known = calibrate_known(input, &|_| {}).context("cannot calibrate what the checkpoint knows")?;
+    for (side, limits) in [("clear", &known.clear), ("hazard", &known.hazard)] {
+        println!("{side}: limit {:.2} on {} images", limits.limit, limits.images);
+    }
+    println!("this place: at least {:.2} of the view explained", known.least_explained);
+    Ok(())
+}
+
+fn bound(args: &BoundArgs) -> anyhow::Result<()> {
+    let scenario = Scenario::load(&args.scenario)?;
+    let display = Display::default();
+    let input = BoundInput {
+        checkpoint: &args.checkpoint,
+        scenario: &scenario,
+        drives: args.drives,
+        level: args.level,
+        confidence: args.confidence,
+        remembers: args.memory,
+        threads: args.threads,
+    };
+    let chosen = bound_threshold(input, &|p| display.show(p)).context("cannot bound the threshold")?;
+    display.finish();
+    let of = |sorted: &[f64], share: f64| percentile_of_sorted(sorted, share).unwrap_or(f64::NAN);
+    println!("threshold {:.4}", chosen.planning.threshold(args.memory));
+    for (kind, sorted) in [("hazard", &chosen.hazard), ("clear", &chosen.clear)] {
+        let [p1, p5, p50, p95, p99] = [0.01, 0.05, 0.5, 0.95, 0.99].map(|share| of(sorted, share));
+        println!(
+            "{kind}: {} drives, hazard or unknown at 1, 5, 50, 95, 99 %: {p1:.3} {p5:.3} {p50:.3} {p95:.3} {p99:.3}",
+            sorted.len()
+        );
+    }
+    Ok(())
+}
+
+fn memory(args: &MemoryArgs) -> anyhow::Result<()> {
+    let scenario = Scenario::load(&args.scenario)?;
+    let display = Display::default();
+    let input = MemoryInput { checkpoint: &args.checkpoint, scenario: &scenario, drives: args.drives };
+    let learned = learn_memory(input, &|p| display.show(p)).context("cannot learn the memory")?;
+    display.finish();
+    println!("share of repeated evidence {}, distrust {}", learned.settings.repeated_share, learned.settings.distrust);
+    println!("log loss a frame {:.4}, without memory {:.4}", learned.log_loss, learned.without_memory);
+    Ok(())
+}
