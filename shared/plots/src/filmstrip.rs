@@ -26,6 +26,13 @@ pub struct StripCell {
     pub emphasis: Option<[u8; 3]>,
 }
 
+impl StripCell {
+    /// Creates a cell without a frame.
+    pub fn new(image: Image, caption: &[String]) -> Self {
+        Self { image, caption: caption.to_vec(), emphasis: None }
+    }
+}
+
 const MARGIN: u32 = 28;
 const TITLE: Font = Font::bold(26.0);
 const SUBTITLE: Font = Font::regular(14.0);

@@ -45,7 +45,7 @@ const HYPOTHESES: usize = 4;
 const SLICE_PX: u32 = 160;
 /// Path length through the field that gives a slice its opacity, metres: the field's surfaces are thin.
 const SLICE_DEPTH_M: f32 = 0.25;
-pub(super) const HAZARD: [u8; 3] = [236, 140, 20];
+const HAZARD: [u8; 3] = [236, 140, 20];
 
 /// Draws all images of the gallery into `out`.
 pub fn gallery(subject: &Subject, out: &Path, on_progress: &dyn Fn(&Progress)) -> Result<Gallery, EvaluationError> {
@@ -114,10 +114,6 @@ pub fn gallery(subject: &Subject, out: &Path, on_progress: &dyn Fn(&Progress)) -
     Ok(gallery)
 }
 
-pub(super) fn cell(image: Image, caption: &[String]) -> StripCell {
-    StripCell { image, caption: caption.to_vec(), emphasis: None }
-}
-
 fn from_above(subject: &Subject, path: &Path) -> Result<bool, EvaluationError> {
     let posed = &subject.posed;
     let (Ok(probe), Some(view)) = (&subject.probe, posed.scenario.bev_view) else { return Ok(false) };
@@ -136,7 +132,7 @@ fn from_above(subject: &Subject, path: &Path) -> Result<bool, EvaluationError> {
                     let Some(index) = posed.at(state, view) else { continue };
                     posed.images[index].clone()
                 };
-                cells.push(cell(image, &[subject.state_name(state)]));
+                cells.push(StripCell::new(image, &[subject.state_name(state)]));
             }
             rows.push(StripRow { caption: vec![name.clone(), kind.to_owned()], cells });
         }
@@ -156,7 +152,10 @@ fn density(subject: &Subject, path: &Path) -> Result<bool, EvaluationError> {
     for (branch, name) in scenario.branches.iter().enumerate() {
         let states: Vec<usize> = scenario.states_of_branch(branch).collect();
         let cells = spread(&states, ROWS).into_iter().map(|state| {
-            cell(slice(probe.field(), &subject.manifest.states[state].mean, height_m), &[subject.state_name(state)])
+            StripCell::new(
+                slice(probe.field(), &subject.manifest.states[state].mean, height_m),
+                &[subject.state_name(state)],
+            )
         });
         rows.push(StripRow { caption: vec![name.clone()], cells: cells.collect() });
     }
@@ -220,10 +219,14 @@ fn beliefs(subject: &Subject, path: &Path) -> Result<bool, EvaluationError> {
             .map(|p| p.reading.state.map_or_else(|| "no known state".to_owned(), |s| subject.state_name(s)));
         let groups = hypotheses(names.collect::<Vec<_>>());
         let seen = if label.role == Some(PoseRole::Unseen) { "held out" } else { "trained" };
-        let mut cells = vec![cell(posed.images[i].clone(), &["camera".into(), format!("pose {}", label.view)])];
+        let mut cells =
+            vec![StripCell::new(posed.images[i].clone(), &["camera".into(), format!("pose {}", label.view)])];
         let above = posed.scenario.bev_view.and_then(|view| posed.at(next, view));
         if let Some(above) = above {
-            cells.push(cell(posed.images[above].clone(), &["true next state".into(), subject.state_name(next)]));
+            cells.push(StripCell::new(
+                posed.images[above].clone(),
+                &["true next state".into(), subject.state_name(next)],
+            ));
         }
         for group in groups.into_iter().take(HYPOTHESES) {
             let hazard = probed[group.sample].reading.hazard_likelihood > 0.5;
@@ -264,13 +267,13 @@ fn reconstructions(subject: &Subject, path: &Path) -> Result<bool, EvaluationErr
             Observability::None => "place hidden",
         };
         let mut cells = vec![
-            cell(image_of(&subject.noisy_input(i)), &["input".into(), "with sensor noise".into()]),
-            cell(image_of(&posed.targets(&[i])), &["true".into()]),
+            StripCell::new(image_of(&subject.noisy_input(i)), &["input".into(), "with sensor noise".into()]),
+            StripCell::new(image_of(&posed.targets(&[i])), &["true".into()]),
         ];
         let (out, mean) = subject.decoding().images(&[(i, subject.posteriors[i].mean)]);
         if !unseen {
-            cells.push(cell(image_of(&out), &["decoded".into()]));
-            cells.push(cell(image_of(&mean), &["mean of the pose".into(), "no model".into()]));
+            cells.push(StripCell::new(image_of(&out), &["decoded".into()]));
+            cells.push(StripCell::new(image_of(&mean), &["mean of the pose".into(), "no model".into()]));
         }
         if let Ok(probe) = &subject.probe {
             let camera = posed.dataset.frames()[i].camera;
@@ -278,7 +281,7 @@ fn reconstructions(subject: &Subject, path: &Path) -> Result<bool, EvaluationErr
             let longest = camera.width_px.max(camera.height_px).max(1);
             let shown = |side: u32| (side * 128 / longest).max(1);
             let camera = camera.resized(shown(camera.width_px), shown(camera.height_px));
-            cells.push(cell(
+            cells.push(StripCell::new(
                 renderer.image(probe.field(), &camera, latent),
                 &["field".into(), "latent of the input".into()],
             ));

@@ -1,6 +1,5 @@
 //! Images of unknown objects: the input, the best known state, the residual, and the boxes.
 
-use super::gallery::{HAZARD, cell};
 use crate::{EvaluationError, Subject};
 use carff_base::geometry::{OrientedBox, PinholeCamera};
 use carff_dataset::Image;
@@ -13,6 +12,8 @@ use std::path::Path;
 const WHITE_DEVIATIONS: f32 = 12.0;
 /// Colour of the boxes.
 const BOX: [u8; 3] = [230, 30, 230];
+/// Colour of the frame of images with something unknown.
+const UNKNOWN: [u8; 3] = [236, 140, 20];
 /// Steps along a drawn line for each pixel of its length.
 const STEPS_PER_PX: f64 = 2.0;
 
@@ -30,14 +31,14 @@ pub fn unknown_objects(subject: &Subject, path: &Path) -> Result<bool, Evaluatio
         let place = if novelty.beside { "next to the road" } else { "on the road" };
         let boxes = compared.seen.boxes.len();
         let image = StripCell {
-            emphasis: (unknown >= 0.5).then_some(HAZARD),
-            ..cell(with_boxes(&look.image, &look.camera, &compared), &[format!("unknown {unknown:.2}")])
+            emphasis: (unknown >= 0.5).then_some(UNKNOWN),
+            ..StripCell::new(with_boxes(&look.image, &look.camera, &compared), &[format!("unknown {unknown:.2}")])
         };
         let best = subject.state_name(compared.best);
         let cells = vec![
             image,
-            cell(rendered(&compared), &["best state".into(), best]),
-            cell(residual(&compared), &["residual".into(), format!("{boxes} boxes")]),
+            StripCell::new(rendered(&compared), &["best state".into(), best]),
+            StripCell::new(residual(&compared), &["residual".into(), format!("{boxes} boxes")]),
         ];
         rows.push(StripRow { caption: vec![novelty.name.clone(), place.to_owned()], cells });
     }
