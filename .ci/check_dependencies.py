@@ -30,7 +30,7 @@ UNSAFE_MODULES = {
     "shared/messages/src/tests.rs": "makes messages out of arbitrary bytes",
     "shared/networks/src/allocator.rs": "mallopt",
     "shared/networks/src/borrow.rs": "tensors that borrow shared memory",
-    "shared/runtime/src/realtime.rs": "sched_setscheduler",
+    "shared/runtime/src/realtime.rs": "sched_setscheduler, malloc_trim",
     "tests/readers/src/raw.rs": "overwrites bytes of messages",
     "shared/transport/src/descriptors.rs": "file descriptors of iceoryx2's listeners",
     "shared/transport/src/untyped.rs": "reads the header of messages whose type is not known",

@@ -21,13 +21,24 @@ pub(crate) fn schedule(settings: &StageConfig, nice: Option<i32>) {
     }
 }
 
-/// Touches the heap and locks memory, once all models have been loaded.
+/// Gives back what loading the models has left in the heap, or touches the heap; then locks memory.
 pub(crate) fn settle(settings: &StageConfig) {
-    if settings.prefault_mb > 0 {
+    if settings.prefault_mb == 0 {
+        trim_heap();
+    } else {
         prefault(settings.prefault_mb as usize * (1 << 20));
     }
     if settings.lock_memory {
         warn_if_refused("lock_memory", lock_memory());
+    }
+}
+
+/// Returns free pages of the heap to the system: 5 MB of the encoder, whose copies of the weights were built there.
+fn trim_heap() {
+    #[cfg(all(target_os = "linux", target_env = "gnu"))]
+    {
+        // SAFETY: the call only returns pages that no allocation uses, and may be made at any time from any thread.
+        unsafe { libc::malloc_trim(0) };
     }
 }
 
