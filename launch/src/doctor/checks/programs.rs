@@ -4,7 +4,7 @@ use crate::doctor::finding::{Area, Finding};
 use std::path::Path;
 
 /// The libtorch version that the programs are built for.
-pub const LIBTORCH: &str = "2.11.0";
+const LIBTORCH: &str = "2.11.0";
 
 /// Checks the version of the libtorch that the programs find; `needed` if the encoder computes with it.
 pub fn libtorch(library: Option<&Path>, version: Option<&str>, needed: bool) -> Finding {
