@@ -212,7 +212,7 @@ fn check(dir: &Path, sheet: Option<&Path>, columns: usize) -> anyhow::Result<()>
     sheet.map_or(Ok(()), carff_base::files::check_writable)?;
     let (dataset, faults) = Dataset::survey(dir)?;
     for fault in &faults {
-        println!("broken: {fault}");
+        println!("broken: {}", carff_base::errors::sentence(fault));
     }
     if let Some(dataset) = dataset {
         describe(&dataset, sheet, columns)?;

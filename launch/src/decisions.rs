@@ -159,17 +159,22 @@ fn latency_ms(frame: &FrameRecord) -> f64 {
     frame.latency_ns as f64 / 1e6
 }
 
-/// A decided frame as one JSON object. `source` is the image file, or the view of the dataset; null for a random pose.
-fn record(frame: &FrameRecord, images: &[PathBuf]) -> serde_json::Value {
-    let view = usize::try_from(frame.view).ok();
-    let source = match view.and_then(|view| images.get(view)) {
-        Some(file) => json!(file),
+/// Image file of a view, or its number; null for a random pose.
+fn source(view: i32, images: &[PathBuf]) -> serde_json::Value {
+    let view = usize::try_from(view).ok();
+    match view.and_then(|view| images.get(view)) {
+        // A name that is not UTF-8 has no exact form in JSON.
+        Some(file) => json!(file.to_string_lossy()),
         None => json!(view),
-    };
+    }
+}
+
+/// A decided frame as one JSON object.
+fn record(frame: &FrameRecord, images: &[PathBuf]) -> serde_json::Value {
     json!({
         "frame": frame.frame_id,
         "drive": u32::try_from(frame.drive).ok(),
-        "source": source,
+        "source": source(frame.view, images),
         "capture_time_ns": frame.capture_time_ns,
         "hazard": frame.hazard_probability,
         "unknown": frame.unknown_probability,
@@ -177,4 +182,20 @@ fn record(frame: &FrameRecord, images: &[PathBuf]) -> serde_json::Value {
         "reason": frame.reason.map(Reason::name),
         "latency_ms": latency_ms(frame),
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::ffi::OsStr;
+    use std::os::unix::ffi::OsStrExt;
+
+    /// A source is a file, under any name that the system allows, or a view, or unknown.
+    #[test]
+    fn sources_have_any_name() {
+        let images = ["a b.png".into(), PathBuf::from(OsStr::from_bytes(b"\xff.png"))];
+        assert_eq!(source(0, &images), "a b.png");
+        assert_eq!(source(1, &images), "\u{fffd}.png");
+        assert_eq!((source(2, &images), source(-1, &images)), (json!(2), json!(null)));
+    }
 }

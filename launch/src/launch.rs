@@ -9,8 +9,9 @@ use anyhow::{Context, bail, ensure};
 use carff::provenance;
 use carff::runs::log_path;
 use carff::terminal::Terminal;
+use carff_base::files::check_writable;
 use carff_checkpoint::{Manifest, ScenarioIdentity};
-use carff_config::{CameraSource, GraphConfig};
+use carff_config::{CameraSource, GraphConfig, is_stream};
 use carff_dataset::{Dataset, ScenarioInfo};
 use carff_observe::{RunLock, RunRecord};
 use carff_runtime::StageArgs;
@@ -77,6 +78,7 @@ pub fn run(args: &LaunchArgs) -> anyhow::Result<ExitCode> {
         return Ok(ExitCode::SUCCESS);
     }
     let files = args.report.as_deref().map(ReportFiles::checked).transpose()?;
+    args.decisions.as_deref().map_or(Ok(()), check_writable)?;
     let terminal = Arc::new(Terminal::new());
     let (ended, outcome) = run_graph(args, None, &terminal)?;
     report(args, files.as_ref(), ended, &outcome, &terminal)?;
@@ -140,7 +142,7 @@ pub(crate) fn run_graph(
     let checkpoint = graph.resolve(args.checkpoint.as_ref().unwrap_or(&graph.run.checkpoint));
     let absolute = |path: &Path| std::path::absolute(path).map(|p| p.display().to_string());
     // Settings of the command line and a piped file exist only here: stages and probes read a copy.
-    let copied = !args.set.is_empty() || !args.graph.is_file();
+    let copied = !args.set.is_empty() || is_stream(&args.graph);
     let graph_file = if copied { runtime_dir().join(format!("{name}.toml")) } else { args.graph.clone() };
     let record = RunRecord {
         pid: std::process::id(),

@@ -4,6 +4,8 @@
 //! The crate `carff` contains the commands that observe a run, and the crate `carff-lab` those that compute with
 //! libtorch.
 
+#![warn(clippy::print_stderr, reason = "`eprintln!` panics where standard error is full: `carff::say` does not")]
+
 pub mod checkpoint;
 pub mod command;
 pub mod dataset;

@@ -2,7 +2,7 @@
 
 use crate::planning::{self, RunOutcome};
 use crate::supervision::monitor::UnknownImages;
-use anyhow::Context;
+use anyhow::{Context, ensure};
 use carff::conditions::{ConditionCount, Conditions};
 use carff::provenance;
 use carff_base::files::check_writable;
@@ -37,6 +37,13 @@ impl ReportFiles {
     /// Names the files, and checks that they can be written.
     pub fn checked(json: &Path) -> anyhow::Result<Self> {
         let files = Self { json: json.to_owned(), text: json.with_extension("txt"), strip: json.with_extension("png") };
+        ensure!(
+            files.json != files.text && files.json != files.strip,
+            "--report {}: this is the JSON file; its text and its filmstrip get the endings .txt and .png, so name it \
+             with another one, such as {}",
+            json.display(),
+            json.with_extension("json").display()
+        );
         for path in [&files.json, &files.text, &files.strip] {
             check_writable(path)?;
         }
@@ -223,6 +230,20 @@ mod tests {
         assert_eq!(unknown_images(&unknown), json!({ "images": 3, "surest": found }));
         let text = unknown_text(&unknown);
         assert_eq!(text, "something unknown: 3 images; the surest box is in frame 41 at x -6.2 m, y -1.5 m (75 %)\n");
+    }
+
+    /// The files of a report are three, and a path that would make two of them one is refused.
+    #[test]
+    fn reports_do_not_overwrite_themselves() {
+        let dir = tempfile::tempdir().unwrap();
+        for name in ["run.json", "run", "run.report", ".json"] {
+            let files = ReportFiles::checked(&dir.path().join(name)).unwrap();
+            assert!(files.json != files.text && files.json != files.strip, "{files:?}");
+        }
+        for name in ["run.txt", "run.png"] {
+            let error = ReportFiles::checked(&dir.path().join(name)).unwrap_err().to_string();
+            assert!(error.contains(name) && error.contains("run.json"), "{error}");
+        }
     }
 
     /// Each unusable condition has its counts in JSON and a line of text; usable images have none.

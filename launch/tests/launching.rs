@@ -366,6 +366,31 @@ fn an_interrupt_ends_everything() {
     }
 }
 
+/// A launcher that is stopped (Ctrl-Z) while its stages continue counts what it could not read, so that the figures of the
+/// report agree.
+#[test]
+fn a_stopped_launcher_counts_what_it_missed() {
+    const FRAMES: u64 = 200;
+    let graph = Graph::new("none");
+    let mut child = deciding_as(&mut graph.command(FRAMES));
+    signal(&child, Signal::STOP);
+    // The camera has ended, and its stopped parent has not noticed.
+    let children = format!("/proc/{0}/task/{0}/children", child.id());
+    let has_ended = |pid: &str| std::fs::read_to_string(format!("/proc/{pid}/stat")).is_ok_and(|s| s.contains(") Z "));
+    let any_ended = || std::fs::read_to_string(&children).unwrap().split_whitespace().any(has_ended);
+    let ended = eventually(any_ended);
+    signal(&child, Signal::CONT);
+    assert!(ended, "the camera did not end");
+    assert_eq!(child.wait().unwrap().code(), Some(0));
+    let (report, text) = (graph.report(), std::fs::read_to_string(graph.path("report.txt")).unwrap());
+    let count = |key: &str| report[key].as_u64().unwrap();
+    assert_eq!(count("frames"), FRAMES, "{report}");
+    assert!(count("decisions") + count("frames_not_recorded") <= FRAMES, "{report}");
+    assert!(count("frames_not_recorded") + count("actions_not_recorded") > 0, "{report}");
+    assert!(text.contains("not recorded, because the launcher was stopped or slow"), "{text}");
+    graph.assert_nothing_left();
+}
+
 /// `nohup` keeps a run alive when its terminal ends.
 #[test]
 fn nohup_is_respected() {
@@ -385,18 +410,25 @@ fn nohup_is_respected() {
     assert!(graph.report()["interrupted"].as_bool().unwrap());
 }
 
-/// A report that cannot be written is refused before any stage starts.
+/// A report or a file of decisions that cannot be written is refused before any stage starts, and so is a report whose
+/// text would overwrite it.
 #[test]
 fn an_unwritable_report_is_refused_first() {
     let graph = Graph::new("start");
-    for report in ["/proc/nowhere/report.json", "/dev/null/report.json"] {
+    let refused = |option: &str, path: &str, wanted: &str| {
         let mut command = Command::new(env!("CARGO_BIN_EXE_carff-launch"));
         command.arg("launch").arg(graph.path("graph.toml")).arg("--stages").arg(graph.folder.path());
-        let output = command.args(["--report", report]).output().unwrap();
+        let output = command.args([option, path]).output().unwrap();
         assert_eq!(output.status.code(), Some(1));
-        assert!(text(&output).contains(&format!("error: cannot write {report}")), "{}", text(&output));
+        assert!(text(&output).contains(&format!("error: {wanted}")), "{}", text(&output));
         assert!(!text(&output).contains("did not start"), "{}", text(&output));
+    };
+    for option in ["--report", "--decisions"] {
+        for path in ["/proc/nowhere/report.json", "/dev/null/report.json"] {
+            refused(option, path, &format!("cannot write {path}"));
+        }
     }
+    refused("--report", "report.txt", "--report report.txt: this is the JSON file; its text");
 }
 
 /// Each decision is one line of the JSON file, with its source and without the truth; without `--verbose`, a source

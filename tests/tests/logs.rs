@@ -70,3 +70,17 @@ fn scenarios_are_found_by_name_from_any_folder() {
     std::fs::write(folder.path().join("taken"), "text").unwrap();
     render("two-lane-merge", "taken").assert_one_error(&["two-lane-merge.toml", "taken"]);
 }
+
+/// A reader that closes the pipe (`| head`) ends a long output without an error.
+#[test]
+fn a_closed_pipe_is_no_error() {
+    let graph = TestGraph::new(&scenario_set(), &shipped_checkpoint(), PATIENT_AND_ENDLESS);
+    let log = graph.run().dir().join(format!("{}.log", graph.run().name()));
+    // More than a pipe holds.
+    std::fs::write(&log, "a line of a log\n".repeat(100_000)).unwrap();
+    let script =
+        format!("'{}' logs {} | head -n 1; exit ${{PIPESTATUS[0]}}", program("carff").display(), graph.run().name());
+    let read = Process::start(Command::new("bash").args(["-c", &script])).end();
+    std::fs::remove_file(&log).unwrap();
+    assert_eq!((read.status.code(), read.text.trim()), (Some(141), "a line of a log"), "{}", read.text);
+}

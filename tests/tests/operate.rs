@@ -151,7 +151,16 @@ fn probes_come_and_go() {
     crowd.pop();
     probe(&graph, &["echo", "frame"], &["--count", "1"]);
     drop((crowd, here));
-    stop(&graph, launcher);
+
+    // A probe that cannot report the end of the run ends with it all the same.
+    let mut command = Command::new("sh");
+    command.args(["-c", "exec \"$0\" \"$@\" 2> /dev/full"]).arg(program("carff"));
+    let mut deaf = Process::start(command.args(["probe", "echo", "action", "--json", "--run", graph.run().name()]));
+    deaf.wait_for("an action", |text| !text.is_empty());
+    launcher.signal(Signal::INT);
+    assert_eq!(deaf.end().status.code(), Some(0));
+    assert_eq!(launcher.end().status.code(), Some(130));
+    graph.assert_nothing_left();
 }
 
 fn replay(graph: &TestGraph, words: &[&str]) -> Finished {
@@ -232,6 +241,11 @@ fn a_recording_is_decided_again_as_it_was() {
     let (again, mut recorded) = (decided(&only.text), live.iter());
     assert!(!again.is_empty() && again.iter().all(|d| recorded.any(|r| r == d)), "{again:?}\n{live:?}");
     graph.assert_nothing_left();
+
+    for range in [["--from", "1e9", "--to", "2e9"], ["--from", "2", "--to", "1"]] {
+        let none = carff(&graph, &[&["replay", "run.mcap"], &range[..]].concat(), &[]).end();
+        none.assert_one_error(&["run.mcap", "has no message to replay from"]);
+    }
 
     export(&graph, &["run.mcap", "--png", "png", "--csv", "csv", "--mp4", "film.mp4", "--trace", "t.json"])
         .assert_success();

@@ -6,6 +6,7 @@ use carff_messages::Stage;
 use carff_observe::{LockError, RunLock, RunRecord};
 use carff_tests::{PATIENT_AND_ENDLESS, Process, TestGraph, eventually, program, scenario_set, shipped_checkpoint};
 use rustix::process::{Pid, Signal, kill_process};
+use std::path::Path;
 use std::process::{Command, Stdio};
 
 fn running() -> (TestGraph, Process) {
@@ -20,33 +21,66 @@ fn carff(graph: &TestGraph, words: &[&str]) -> Process {
     Process::start(command.args(words).args(["--run", graph.run().name()]))
 }
 
-/// When a cleaner removes the files of a run, the launcher and a probe that has joined report it, `doctor` finds it and
-/// does not advise to remove the living run's memory, a second launch is refused, and a stage that dies ends the run
-/// with the cause.
+/// When a cleaner removes the files of a run, or some of them, the launcher and a probe that has joined report it,
+/// `doctor` finds it and does not advise to remove the living run's memory, a second launch is refused, and a stage that
+/// dies ends the run with the cause.
 #[test]
 fn a_cleaner_that_removes_the_files() {
+    a_cleaner_removes(|folder, record| {
+        std::fs::remove_dir_all(folder).unwrap();
+        std::fs::remove_file(record).unwrap();
+    });
+}
+
+/// As above, when only the record is old enough.
+#[test]
+fn a_cleaner_that_removes_the_record() {
+    a_cleaner_removes(|_, record| std::fs::remove_file(record).unwrap());
+}
+
+/// As above, when the folders of the run remain.
+#[test]
+fn a_cleaner_that_leaves_folders() {
+    a_cleaner_removes(|folder, _| remove_files(folder));
+}
+
+/// Removes all files of a folder, not its folders.
+fn remove_files(folder: &Path) {
+    for entry in std::fs::read_dir(folder).unwrap().flatten() {
+        if entry.path().is_dir() {
+            remove_files(&entry.path());
+        } else {
+            std::fs::remove_file(entry.path()).unwrap();
+        }
+    }
+}
+
+fn a_cleaner_removes(remove: impl Fn(&Path, &Path)) {
     let (graph, mut launcher) = running();
     let mut probe = carff(&graph, &["probe", "echo", "action"]);
     probe.wait_for("an action", |text| !text.is_empty());
-    std::fs::remove_dir_all(graph.run().folder()).unwrap();
-    std::fs::remove_file(RunRecord::path(graph.run().dir(), graph.run().name())).unwrap();
+    let record = RunRecord::path(graph.run().dir(), graph.run().name());
+    remove(&graph.run().folder(), &record);
 
-    launcher.wait_for("the loss", |text| text.contains("is gone") && text.contains("tmpfiles.d"));
+    launcher.wait_for("the loss", |text| text.contains("are gone") && text.contains("tmpfiles.d"));
     let seen = probe.end();
     assert_eq!(seen.status.code(), Some(1), "{}", seen.text);
     assert!(seen.text.contains("are gone although it runs"), "{}", seen.text);
     let doctor = Process::start(Command::new(program("carff")).arg("doctor")).end();
     assert_eq!(doctor.status.code(), Some(1), "{}", doctor.text);
-    assert!(doctor.text.contains("lost folder") && !doctor.text.contains("rm /dev/shm"), "{}", doctor.text);
+    assert!(doctor.text.contains("lost folder") && !doctor.text.contains("orphans"), "{}", doctor.text);
+    assert!(!doctor.text.contains(&graph.run().shared_memory_prefix()), "{}", doctor.text);
     let second = graph.launch_to_end(&[]);
     assert_eq!(second.status.code(), Some(1), "{}", second.text);
-    assert!(second.text.contains("are still alive: stop them"), "{}", second.text);
+    let refused = second.text.contains("are still alive: stop them") || second.text.contains("is already running");
+    assert!(refused, "{}", second.text);
 
     let encoder = graph.stage_pid(Stage::Encoder).unwrap();
     kill_process(Pid::from_raw(encoder as i32).unwrap(), Signal::KILL).unwrap();
     let finished = launcher.end();
     assert_eq!(finished.status.code(), Some(1), "{}", finished.text);
     assert!(finished.text.contains("error: stage `encoder` is lost: killed by signal 9"), "{}", finished.text);
+    let _ = std::fs::remove_file(record);
     graph.assert_nothing_left();
 }
 

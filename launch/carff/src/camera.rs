@@ -4,6 +4,7 @@
 use crate::probe::{Inline, columns};
 use crate::session::colours;
 use anyhow::{Context, bail, ensure};
+use carff_base::files::check_writable;
 use carff_base::statistics::percentile;
 use carff_checkpoint::Manifest;
 use carff_config::{CameraSource, GraphConfig};
@@ -72,6 +73,7 @@ pub struct CheckArgs {
 pub fn run(command: &CameraCommand) -> anyhow::Result<ExitCode> {
     let CameraCommand::Check(args) = command;
     ensure!((0.5..=3600.0).contains(&args.seconds), "--seconds is {}; allowed: 0.5 to 3600", args.seconds);
+    args.image.as_deref().map_or(Ok(()), check_writable)?;
     let graph = GraphConfig::load_with(&args.graph, &args.set)?;
     let dataset = graph.resolve(args.dataset.as_ref().unwrap_or(&graph.run.dataset));
     let stop = Stop::on_signals().context("cannot handle signals")?;

@@ -4,7 +4,8 @@
 use crate::film;
 use crate::probe::image::named_image;
 use crate::spans::{recorded_spans, trace_events};
-use anyhow::Context;
+use anyhow::{Context, ensure};
+use carff_base::files::check_writable;
 use carff_checkpoint::Manifest;
 use carff_recording::{About, Entry, Reader};
 use carff_transport::TopicId;
@@ -47,6 +48,9 @@ pub struct ExportArgs {
 pub fn run(args: &ExportArgs) -> anyhow::Result<ExitCode> {
     let Outputs { png, csv, mp4, trace } = &args.outputs;
     let path = &args.recording;
+    for file in mp4.iter().chain(trace) {
+        check_writable(file)?;
+    }
     if let Some(folder) = png {
         println!("{}: {} images", folder.display(), pictures(path, folder)?);
     }
@@ -67,6 +71,13 @@ pub fn run(args: &ExportArgs) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
+/// Notes on standard error that a recording is incomplete.
+fn note_cut_off(reader: &Reader, recording: &Path) {
+    if reader.is_cut_off() {
+        crate::say(&format!("warning: {} is cut off; the messages before its end are exported", recording.display()));
+    }
+}
+
 fn make_folder(folder: &Path) -> anyhow::Result<()> {
     std::fs::create_dir_all(folder).with_context(|| format!("cannot create the folder {}", folder.display()))
 }
@@ -74,6 +85,7 @@ fn make_folder(folder: &Path) -> anyhow::Result<()> {
 fn pictures(recording: &Path, folder: &Path) -> anyhow::Result<u64> {
     make_folder(folder)?;
     let mut reader = Reader::open(recording)?;
+    note_cut_off(&reader, recording);
     let mut topics = vec![TopicId::FRAME, TopicId::VIEW];
     // One of the two is enough.
     if topics.iter().any(|topic| reader.has(*topic)) {
@@ -173,11 +185,13 @@ impl States {
 fn tables(recording: &Path, folder: &Path) -> anyhow::Result<Vec<(PathBuf, u64)>> {
     make_folder(folder)?;
     let mut reader = Reader::open(recording)?.without_images();
+    note_cut_off(&reader, recording);
     let states = States::of(reader.about());
     let mut columns: BTreeMap<TopicId, BTreeSet<String>> = BTreeMap::new();
     while let Some(entry) = reader.next()? {
         columns.entry(entry.topic).or_default().extend(cells_of(&entry)?.into_keys());
     }
+    ensure!(!columns.is_empty(), "{} contains no messages", recording.display());
     let mut files = BTreeMap::new();
     for (topic, columns) in columns {
         let mut columns: Vec<String> = columns.into_iter().collect();
@@ -265,6 +279,8 @@ mod tests {
         Writer::create(&empty, &About::default(), &[]).unwrap().finish().unwrap();
         let error = film::export(&empty, &folder.path().join("none.mp4")).unwrap_err().to_string();
         assert!(error.contains("no camera frame") && !folder.path().join("none.mp4").exists(), "{error}");
+        let error = super::tables(&empty, folder.path()).unwrap_err().to_string();
+        assert!(error.ends_with("empty.mcap contains no messages"), "{error}");
     }
 
     /// Columns of lists are in numerical order.

@@ -62,7 +62,7 @@ pub fn info(live: &LiveRun) -> anyhow::Result<Value> {
             "name": "iceoryx2",
             "version": TRANSPORT_VERSION,
             "prefix": run.shared_memory_prefix(),
-            "root_path": run.folder(),
+            "root_path": run.folder().to_string_lossy(),
         },
         "graph": live.graph,
         "dataset": live.dataset,

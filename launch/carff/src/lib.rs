@@ -3,6 +3,8 @@
 //! This crate contains commands without a model, and the terminal's output. It never links libtorch, which would make
 //! the start of a probe thirty times as expensive.
 
+#![warn(clippy::print_stderr, reason = "`eprintln!` panics where standard error is full: `carff::say` does not")]
+
 #[cfg(feature = "bridge")]
 pub mod bridge;
 pub mod camera;
@@ -158,6 +160,14 @@ impl Attach {
     }
 }
 
+/// Exit code of a program whose reader has closed the pipe, as of one that SIGPIPE ends.
+const CLOSED_PIPE: u8 = 141;
+
+fn is_closed_pipe(error: &anyhow::Error) -> bool {
+    let is_closed = |error: &std::io::Error| error.kind() == std::io::ErrorKind::BrokenPipe;
+    error.chain().any(|cause| cause.downcast_ref().is_some_and(is_closed))
+}
+
 /// Runs a program to its end, and returns its exit code. An error is printed as one sentence. After a signal the code is
 /// [`INTERRUPTED`]; a signal also ends each phase that waits for no stop.
 pub fn run_program(program: impl FnOnce() -> anyhow::Result<ExitCode>) -> ExitCode {
@@ -171,7 +181,7 @@ pub fn run_program(program: impl FnOnce() -> anyhow::Result<ExitCode>) -> ExitCo
     let result = std::panic::catch_unwind(AssertUnwindSafe(program)).unwrap_or_else(|payload| {
         match failed_output(&*payload) {
             // The reader has closed the pipe (`| head`): no message, and the shell's exit code for it.
-            Some(cause) if cause.contains("Broken pipe") => Ok(ExitCode::from(141)),
+            Some(cause) if cause.contains("Broken pipe") => Ok(ExitCode::from(CLOSED_PIPE)),
             Some(cause) => Err(anyhow!("cannot write to standard output: {cause}")),
             None => std::panic::resume_unwind(payload),
         }
@@ -180,12 +190,19 @@ pub fn run_program(program: impl FnOnce() -> anyhow::Result<ExitCode>) -> ExitCo
     match result {
         Ok(ExitCode::SUCCESS) if interrupted => ExitCode::from(INTERRUPTED),
         Ok(code) => code,
+        // Some commands write to standard output without `println!`.
+        Err(error) if is_closed_pipe(&error) => ExitCode::from(CLOSED_PIPE),
         Err(error) => {
             // Standard error may be full or closed as well.
             let _ = writeln!(std::io::stderr(), "error: {}", carff_base::errors::sentence(&*error));
             if interrupted { ExitCode::from(INTERRUPTED) } else { ExitCode::FAILURE }
         }
     }
+}
+
+/// Prints a line on standard error. Standard error may be full or closed, which must not end the work.
+pub fn say(line: &str) {
+    let _ = writeln!(std::io::stderr(), "{line}");
 }
 
 /// Returns the cause if a panic is that of `println!` on a standard output that takes no more.

@@ -83,17 +83,18 @@ fn record(args: &RecordArgs, mut session: Session, out: &Path) -> anyhow::Result
     let (states, places) = match Manifest::load(&live.checkpoint) {
         Ok(manifest) => (manifest.scenario.state_names(), manifest.places),
         Err(error) => {
-            eprintln!("warning: neither boxes nor names of states are recorded: {error}");
+            crate::say(&format!("warning: neither boxes nor names of states are recorded: {error}"));
             Default::default()
         }
     };
     let limits = Limits {
-        file_bytes: args.file_mb.map(|mb| mb * 1_000_000),
-        file_ns: args.file_seconds.map(|s| s * 1_000_000_000),
+        file_bytes: args.file_mb.map(|mb| mb.saturating_mul(1_000_000)),
+        file_ns: args.file_seconds.map(|s| s.saturating_mul(1_000_000_000)),
         files: args.keep.map(|n| n as usize),
     };
     let writer = RotatingWriter::create(out, about(live, states)?, places, limits)?;
-    let queue = RecordingQueue::start(writer, args.queue_mb * 1_000_000).context("cannot start the writer")?;
+    let queue =
+        RecordingQueue::start(writer, args.queue_mb.saturating_mul(1_000_000)).context("cannot start the writer")?;
     let mut log = RunLog::of(live, args.topics.is_empty());
     let terminal = Terminal::new();
     let name = live.name.clone();

@@ -59,7 +59,7 @@ pub fn ps(args: &PsArgs) -> anyhow::Result<ExitCode> {
     if args.json {
         let list = runs.iter().map(|run| {
             let (up_s, folder) = (up(run).as_secs(), &run.dir);
-            json!({ "run": run.name, "pid": run.pid, "up_s": up_s, "graph": run.graph, "folder": folder })
+            json!({ "run": run.name, "pid": run.pid, "up_s": up_s, "graph": run.graph, "folder": folder.to_string_lossy() })
         });
         println!("{}", serde_json::to_string_pretty(&list.collect::<Vec<_>>())?);
         return Ok(ExitCode::SUCCESS);
@@ -83,7 +83,7 @@ pub fn stop(args: &StopArgs) -> anyhow::Result<ExitCode> {
     );
     let pid = i32::try_from(live.pid).ok().and_then(Pid::from_raw).context("the launcher has no process id")?;
     kill_process(pid, Signal::INT).with_context(|| format!("cannot stop process {}", live.pid))?;
-    let end_ns = monotonic_now_ns() + args.seconds * 1_000_000_000;
+    let end_ns = monotonic_now_ns().saturating_add(args.seconds.saturating_mul(1_000_000_000));
     let waiter = Waiter::new(Stop::on_signals()?);
     while live.is_alive() {
         if monotonic_now_ns() >= end_ns {

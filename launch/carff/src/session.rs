@@ -57,7 +57,7 @@ impl<'a> Sessions<'a> {
             find(args.session.run.as_deref())?;
         }
         let stop = Stop::on_signals().context("cannot handle signals")?;
-        let until_ns = args.session.seconds.map(|s| monotonic_now_ns() + (s * 1e9) as u64);
+        let until_ns = args.session.seconds.map(|s| later_ns(monotonic_now_ns(), s));
         Ok(Self { args, name, stop, until_ns, has_joined: false })
     }
 
@@ -102,6 +102,11 @@ fn is_started(live: &LiveRun) -> bool {
     processes.is_some_and(|processes| processes.contains(&live.pid))
 }
 
+/// Returns the time after some seconds; the last possible time if they are too many.
+fn later_ns(now_ns: u64, seconds: f64) -> u64 {
+    now_ns.saturating_add((seconds * 1e9) as u64)
+}
+
 fn positive(text: &str) -> Result<f64, String> {
     match text.parse::<f64>() {
         Ok(seconds) if seconds.is_finite() && seconds > 0.0 => Ok(seconds),
@@ -143,7 +148,7 @@ impl Session {
             attached,
             waiter: Waiter::new(stop.clone()),
             stop,
-            until_ns: args.seconds.map(|s| now_ns + (s * 1e9) as u64),
+            until_ns: args.seconds.map(|s| later_ns(now_ns, s)),
             alive_ns: now_ns + ALIVE_NS,
         })
     }
@@ -203,13 +208,14 @@ impl Session {
         }
         if now_ns >= self.alive_ns {
             self.alive_ns = now_ns + ALIVE_NS;
-            if !self.attached.live.is_alive() {
-                let name = &self.attached.live.name;
-                ensure!(
-                    !self.attached.live.has_lost_files(),
-                    "the files of run `{name}` are gone although it runs: a cleaner of temporary files may have removed \
-                     them; start the run again"
-                );
+            let live = &self.attached.live;
+            ensure!(
+                !live.has_lost_files(),
+                "the files of run `{}` are gone although it runs: a cleaner of temporary files may have removed them; \
+                 start the run again",
+                live.name
+            );
+            if !live.is_alive() {
                 return Ok(Going::RunEnded);
             }
         }
@@ -245,10 +251,10 @@ impl Session {
     pub(crate) fn say_end(&self, going: Going) {
         let invalid = self.attached.node.counters().invalid();
         if invalid > 0 {
-            eprintln!("{invalid} messages were dropped: their header or content is not valid");
+            crate::say(&format!("{invalid} messages were dropped: their header or content is not valid"));
         }
         if going == Going::RunEnded {
-            eprintln!("run `{}` has ended", self.attached.live.name);
+            crate::say(&format!("run `{}` has ended", self.attached.live.name));
         }
     }
 }
@@ -262,4 +268,21 @@ pub(crate) fn since_capture_ms(header: &Header, at_ns: u64) -> f64 {
 pub(crate) fn colours() -> bool {
     use std::io::IsTerminal;
     std::io::stdout().is_terminal() && std::env::var_os("NO_COLOR").is_none_or(|v| v.is_empty())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A time limit is a number above 0, and one beyond the clock's range never comes.
+    #[test]
+    fn limits_of_time() {
+        assert_eq!(later_ns(5, 1.5), 1_500_000_005);
+        for seconds in ["1e11", "1e300"] {
+            assert_eq!(later_ns(5, positive(seconds).unwrap()), u64::MAX);
+        }
+        for wrong in ["0", "-1", "nan", "inf", "1e999", "", "1s"] {
+            assert!(positive(wrong).is_err(), "{wrong}");
+        }
+    }
 }

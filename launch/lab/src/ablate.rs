@@ -3,6 +3,7 @@
 use crate::eval;
 use crate::train::{Display, datasets, refuse_another_configuration, stop_on_signals, stopped, with_random_poses};
 use anyhow::{Context, anyhow};
+use carff_base::files::check_writable;
 use carff_launch::lab::AblateArgs;
 use carff_training::ablation::{AblationTable, Variant, folders, row, write_table};
 use carff_training::{Progress, Run, Training, TrainingConfig, TrainingError};
@@ -21,6 +22,7 @@ pub fn run(args: &AblateArgs) -> anyhow::Result<ExitCode> {
     let named = args.only.iter().map(|name| variant(name)).collect::<anyhow::Result<Vec<_>>>()?;
     let variants = if named.is_empty() { Variant::ALL.to_vec() } else { named };
     let config = TrainingConfig::load(&args.config)?;
+    check_writable(&args.out.join("ablation.json"))?;
     let (dataset, rendered) = datasets(&config, args.dataset.as_deref())?;
     let threads = u16::try_from(config.threads).unwrap_or(1);
     let options = eval::options(&args.device, threads, config.seed + 1)?;
@@ -52,7 +54,7 @@ pub fn run(args: &AblateArgs) -> anyhow::Result<ExitCode> {
         device: options.device,
     };
     for variant in variants {
-        eprintln!("{}: {}", variant.name(), variant.description(&config));
+        carff::say(&format!("{}: {}", variant.name(), variant.description(&config)));
         let (dir, _) = folders(&args.out, variant);
         std::fs::create_dir_all(&dir).with_context(|| format!("cannot make {}", dir.display()))?;
         refuse_another_configuration(&dir, &variant.apply(&config), &dataset)?;

@@ -2,10 +2,13 @@
 
 use crate::train::Display;
 use anyhow::Context;
+use carff_base::files::check_writable;
 use carff_base::statistics::percentile_of_sorted;
+use carff_checkpoint::Manifest;
 use carff_launch::lab::{BoundArgs, CheckpointCommand, KnownArgs, MemoryArgs};
 use carff_scenes::Scenario;
 use carff_training::{BoundInput, KnownInput, MemoryInput, bound_threshold, calibrate_known, learn_memory};
+use std::path::Path;
 use std::process::ExitCode;
 
 /// Runs the command.
@@ -19,7 +22,14 @@ pub fn run(command: &CheckpointCommand) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
+/// Checks, before minutes of work, that the folder is a checkpoint into which files can be written.
+fn check_output(checkpoint: &Path) -> anyhow::Result<()> {
+    Manifest::load(checkpoint)?;
+    Ok(check_writable(&checkpoint.join(".writable"))?)
+}
+
 fn known(args: &KnownArgs) -> anyhow::Result<()> {
+    check_output(&args.checkpoint)?;
     let scenario = args.scenario.as_deref().map(Scenario::load).transpose()?;
     let input = KnownInput {
         checkpoint: &args.checkpoint,
@@ -37,6 +47,7 @@ fn known(args: &KnownArgs) -> anyhow::Result<()> {
 }
 
 fn bound(args: &BoundArgs) -> anyhow::Result<()> {
+    check_output(&args.checkpoint)?;
     let scenario = Scenario::load(&args.scenario)?;
     let display = Display::default();
     let input = BoundInput {
@@ -63,6 +74,7 @@ fn bound(args: &BoundArgs) -> anyhow::Result<()> {
 }
 
 fn memory(args: &MemoryArgs) -> anyhow::Result<()> {
+    check_output(&args.checkpoint)?;
     let scenario = Scenario::load(&args.scenario)?;
     let display = Display::default();
     let input = MemoryInput { checkpoint: &args.checkpoint, scenario: &scenario, drives: args.drives };

@@ -1,6 +1,7 @@
 //! `carff train`: trains a scenario's models and writes the checkpoint.
 
 use anyhow::{Context, bail};
+use carff_base::files::check_writable;
 use carff_checkpoint::Manifest;
 use carff_launch::dataset::render;
 use carff_launch::lab::{StageName, TrainArgs};
@@ -33,6 +34,7 @@ pub fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
     if args.dataset.is_some() && args.out.is_none() {
         bail!("--dataset without --out would overwrite {}: name the folder of this checkpoint", config.out.display());
     }
+    check_writable(&out.join(carff_checkpoint::files::MANIFEST))?;
     let (dataset, rendered) = datasets(&config, args.dataset.as_deref())?;
     let name = out.file_name().map_or_else(|| "training".into(), |n| n.to_string_lossy().into_owned());
     let dir = args.run_dir.clone().unwrap_or_else(|| Path::new("runs").join(name));
@@ -90,7 +92,7 @@ pub fn stop_on_signals(dir: &Path) -> anyhow::Result<Stop> {
 
 /// Reports that the user stopped a training.
 pub fn stopped(dir: &Path) -> ExitCode {
-    eprintln!("\nstopped; the same command resumes from the states saved in {}", dir.display());
+    carff::say(&format!("\nstopped; the same command resumes from the states saved in {}", dir.display()));
     ExitCode::from(INTERRUPTED)
 }
 
@@ -261,7 +263,7 @@ impl Display {
         if !live && (last.elapsed() >= LINE_EVERY || progress.done == progress.total) {
             *last = Instant::now();
             let Progress { phase, done, total, line } = progress;
-            eprintln!("{phase} {done}/{total}  {line}, {:.0} s left", bar.eta().as_secs_f64());
+            carff::say(&format!("{phase} {done}/{total}  {line}, {:.0} s left", bar.eta().as_secs_f64()));
         }
         if progress.done == progress.total {
             bar.finish();

@@ -1,10 +1,11 @@
 //! Collects facts about the machine, without judging them.
 
 use super::checks::{Allowed, Clock, Logind, RunFiles, SharedMemory, Strays};
+use crate::supervision::LAUNCHER;
 use carff_config::StagesConfig;
 use carff_messages::Stage;
 use carff_transport::{
-    Run, SHARED_MEMORY_DIR, living_processes, mapping_processes, monotonic_now_ns, runtime_dir, runtime_dirs,
+    Run, SHARED_MEMORY_DIR, living_nodes, mapping_processes, monotonic_now_ns, runtime_dir, runtime_dirs,
 };
 use rustix::process::{Resource, getrlimit};
 use std::collections::{BTreeMap, BTreeSet};
@@ -137,9 +138,19 @@ pub fn runs() -> anyhow::Result<(Vec<RunFiles>, Strays)> {
         let Ok(run) = Run::within(&key.0, &key.1, 0) else { continue };
         let segments = run.shared_memory_files().unwrap_or_default();
         known.insert(run.shared_memory_prefix());
+        let nodes = if run.folder().is_dir() { living_nodes(&run)? } else { Vec::new() };
+        let launcher = launchers.get(&key).copied();
+        let mapping = run.mapping_processes();
+        let joined = nodes.iter().find(|(name, _)| name == LAUNCHER).map(|(_, pid)| *pid);
+        let lost = match launcher {
+            Some(pid) => mapping.contains(&pid) && nodes.iter().all(|(_, joined)| *joined != pid),
+            // Without the record, a living launcher is still a member; without any member, its memory is still mapped.
+            None => joined.is_some() || nodes.is_empty() && !mapping.is_empty(),
+        };
         runs.push(RunFiles {
-            launcher: launchers.get(&key).copied(),
-            living: if run.folder().is_dir() { living_processes(&run)? } else { run.mapping_processes() },
+            lost: launcher.or(joined).or(mapping.first().copied()).filter(|_| lost),
+            launcher,
+            living: if run.folder().is_dir() { nodes.into_iter().map(|(_, pid)| pid).collect() } else { mapping },
             segment_bytes: segments.iter().filter_map(|path| std::fs::metadata(path).ok()).map(|m| m.len()).sum(),
             name: key.1,
             small,

@@ -128,7 +128,8 @@ impl Player {
                         ));
                     }
                     // At rate 0 everything is sent at once.
-                    let due_ns = begun_ns + ((at_ns - self.from_ns.min(at_ns)) as f64 / rate.max(1e-9)) as u64;
+                    let waited_ns = (at_ns - self.from_ns.min(at_ns)) as f64 / rate.max(1e-9);
+                    let due_ns = begun_ns.saturating_add(waited_ns as u64);
                     let due_ns = if rate > 0.0 { due_ns } else { 0 };
                     self.look_until(&waiter, &mut back, due_ns, |_| false)?
                 }

@@ -167,7 +167,26 @@ fn check(args: &ReplayArgs, topics: &BTreeSet<TopicId>) -> anyhow::Result<(Optio
         args.recording.display(),
         COMPARED.map(|topic| format!("`{topic}`")).join(", ")
     );
+    if args.from.is_some() || args.to.is_some() {
+        check_range(args, &sent)?;
+    }
     Ok((reader.about().cloned(), sent))
+}
+
+/// Checks that at least one of the topics has a message between `--from` and `--to`.
+fn check_range(args: &ReplayArgs, topics: &BTreeSet<TopicId>) -> anyhow::Result<()> {
+    let (from_s, to_s) = (args.from.unwrap_or(0.0), args.to.unwrap_or(f64::INFINITY));
+    let mut reader = Reader::open(&args.recording)?.without_images();
+    reader.select(topics.iter().copied())?;
+    let mut last_s = 0.0;
+    while let Some(entry) = reader.next()? {
+        last_s = entry.wall_time_ns.saturating_sub(reader.first_ns()) as f64 / 1e9;
+        if (from_s..=to_s).contains(&last_s) {
+            return Ok(());
+        }
+    }
+    let file = args.recording.display();
+    bail!("{file} has no message to replay from {from_s} s to {to_s} s; its last one is at {last_s:.1} s")
 }
 
 fn write_graph(folder: &Path, text: &str) -> anyhow::Result<PathBuf> {

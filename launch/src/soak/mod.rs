@@ -82,7 +82,7 @@ pub fn run(args: &SoakArgs) -> anyhow::Result<ExitCode> {
     ensure!(args.minutes > 0.0 && args.minutes.is_finite(), "--minutes is {}; it must be above 0", args.minutes);
     if !args.own_memory && (config.faults.full_memory > 0 || config.faults.full_disk > 0) {
         with_own_memory();
-        eprintln!("this system does not let users mount: full shared memory and full disks are not tested");
+        carff::say("this system does not let users mount: full shared memory and full disks are not tested");
     }
     let stop = Stop::on_signals().context("cannot handle signals")?;
     let graph = Graph::new(&config, args.dataset.as_deref(), args.checkpoint.as_deref(), args.seed)?;
@@ -163,7 +163,7 @@ fn with_own_memory() {
             .args(std::env::args_os().skip(1))
             .arg("--own-memory")
             .exec();
-        eprintln!("cannot enter a private mount: {error}");
+        carff::say(&format!("cannot enter a private mount: {error}"));
     }
 }
 

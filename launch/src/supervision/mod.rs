@@ -20,6 +20,7 @@ use anyhow::{Context, anyhow, bail, ensure};
 use carff::terminal::Terminal;
 use carff_config::{CameraSource, GraphConfig, WhenLost};
 use carff_messages::{HealthState, Stage};
+use carff_observe::RunRecord;
 use carff_runtime::StageArgs;
 use carff_transport::{Node, Run, Stop, Waiter, Woken, monotonic_now_ns, topics};
 use external::ForeignCamera;
@@ -106,7 +107,7 @@ pub(crate) struct Supervisor<'a> {
     /// Time of the next refresh of the run's files.
     refresh_ns: u64,
     /// True after the loss of the run's folder was reported.
-    folder_is_lost: bool,
+    files_are_lost: bool,
     /// The lost stage without which the run continues at a halt, and the cause.
     lost: Option<String>,
 }
@@ -138,7 +139,7 @@ impl<'a> Supervisor<'a> {
             watched_ns: monotonic_now_ns(),
             cleanup_ns: monotonic_now_ns(),
             refresh_ns: monotonic_now_ns() + REFRESH_NS,
-            folder_is_lost: false,
+            files_are_lost: false,
             lost: None,
         })
     }
@@ -371,11 +372,11 @@ impl<'a> Supervisor<'a> {
             self.refresh_ns = now_ns + REFRESH_NS;
             run.refresh();
         }
-        let is_lost = !run.folder().is_dir();
-        if is_lost && !self.folder_is_lost {
-            self.terminal.log(LAUNCHER, &format!("ERROR {}", lost_folder(run)));
+        let is_lost = has_lost_files(run);
+        if is_lost && !self.files_are_lost {
+            self.terminal.log(LAUNCHER, &format!("ERROR {}", lost_files(run)));
         }
-        self.folder_is_lost = is_lost;
+        self.files_are_lost = is_lost;
     }
 
     /// Handles the end of a stage: a restart by its policy, a run without it, or an error.
@@ -385,11 +386,7 @@ impl<'a> Supervisor<'a> {
         let watched = &mut self.stages[index];
         let stage = watched.stage;
         ensure!(watched.health.was_ready(), "stage `{stage}` did not start: {cause}");
-        ensure!(
-            self.node.run().folder().is_dir(),
-            "stage `{stage}` is lost: {cause}; {}",
-            lost_folder(self.node.run())
-        );
+        ensure!(!has_lost_files(self.node.run()), "stage `{stage}` is lost: {cause}; {}", lost_files(self.node.run()));
         if let Verdict::RestartAt(at_ns) = watched.budget.died(now_ns) {
             watched.restart_at_ns = Some(at_ns);
             watched.health.died();
@@ -473,10 +470,15 @@ impl<'a> Supervisor<'a> {
     }
 }
 
-fn lost_folder(run: &Run) -> String {
+/// Returns true if another process cannot find this run: its record, its folder or files in it are gone.
+fn has_lost_files(run: &Run) -> bool {
+    !RunRecord::path(run.dir(), run.name()).exists() || run.has_lost(std::process::id())
+}
+
+fn lost_files(run: &Run) -> String {
     format!(
-        "the run's folder {} is gone, so that probes see nothing and no stage can restart: keep cleaners of temporary \
-         files from it (systemd: a line `x {}` in /etc/tmpfiles.d/carff.conf), and start the run again",
+        "files of the run are gone ({0} and {0}.run), so that probes see nothing and no stage can restart: keep cleaners \
+         of temporary files from them (systemd: a line `x {1}` in /etc/tmpfiles.d/carff.conf), and start the run again",
         run.folder().display(),
         run.dir().display()
     )

@@ -44,7 +44,6 @@ pub struct Segmenter {
     layers: nn::Sequential,
     /// Width and height of a view, pixels.
     size_px: [u32; 2],
-    _weights: nn::VarStore,
 }
 
 impl Segmenter {
@@ -59,8 +58,8 @@ impl Segmenter {
         }
         tch::manual_seed(seed as i64);
         let weights = nn::VarStore::new(Device::Cpu);
-        let this = Self { layers: layers(&weights.root(), classes as i64), size_px, _weights: weights };
-        let mut adam = nn::Adam::default().build(&this._weights, LEARNING_RATE).ok()?;
+        let this = Self { layers: layers(&weights.root(), classes as i64), size_px };
+        let mut adam = nn::Adam::default().build(&weights, LEARNING_RATE).ok()?;
         let mut of_class = vec![OBJECT_WEIGHT; classes.max(1)];
         of_class[0] = 1.0;
         let of_class = Tensor::from_slice(&of_class);

@@ -113,6 +113,12 @@ fn sharded(index: &Path) -> Result<Tensors, PretrainedError> {
             shards[shard].get(name).ok_or_else(|| format(index, &format!("{shard} has no tensor `{name}`")))?;
         tensors.insert(name.clone(), tensor.shallow_clone());
     }
+    // A tensor that the index does not list must not be dropped in silence.
+    for (shard, own) in &shards {
+        if let Some(name) = own.keys().find(|name| !tensors.contains_key(*name)) {
+            return Err(format(index, &format!("`weight_map` does not list `{name}`, which {shard} has")));
+        }
+    }
     Ok(tensors)
 }
 

@@ -335,6 +335,10 @@ fn shards_are_read() {
     };
     assert!(refused("norm.bias", "absent.safetensors").contains("absent.safetensors"));
     assert!(refused("absent", &shard_of(0)).contains("has no tensor `absent`"));
+    let mut short = map.clone();
+    short.remove("norm.bias");
+    let error = put(&short).unwrap_err().to_string();
+    assert!(error.contains("does not list `norm.bias`, which model-"), "a tensor is not dropped: {error}");
     for outside in ["../model.safetensors", "/etc/passwd", "a/b.safetensors", ".."] {
         assert!(refused("norm.bias", outside).contains("`norm.bias`: a shard is a file name without a folder"));
     }

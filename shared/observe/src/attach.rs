@@ -33,10 +33,11 @@ impl LiveRun {
         living(&self.dir, &self.name).is_some_and(|run| run.run_id == self.run_id)
     }
 
-    /// Returns true if the record is gone although the launcher maps the run's shared memory: then nobody can join it.
+    /// Returns true if the record or files of the run are gone although the launcher maps the run's shared memory: then
+    /// nobody can join it.
     pub fn has_lost_files(&self) -> bool {
-        let run = Run::within(&self.dir, &self.name, self.run_id);
-        !self.is_alive() && run.is_ok_and(|run| run.mapping_processes().contains(&self.pid))
+        let Ok(run) = Run::within(&self.dir, &self.name, self.run_id) else { return false };
+        (!self.is_alive() || run.has_lost(self.pid)) && run.mapping_processes().contains(&self.pid)
     }
 }
 

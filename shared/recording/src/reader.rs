@@ -239,7 +239,10 @@ impl Reader {
     /// Goes through the file, up to its end or to the first damage.
     fn scan(&mut self) -> McapResult<()> {
         let mut magic = [0; mcap::MAGIC.len()];
-        self.file.read_exact(&mut magic)?;
+        self.file.read_exact(&mut magic).map_err(|error| match error.kind() {
+            std::io::ErrorKind::UnexpectedEof => McapError::BadMagic,
+            _ => error.into(),
+        })?;
         if magic != *mcap::MAGIC {
             return Err(McapError::BadMagic);
         }

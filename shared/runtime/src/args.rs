@@ -1,7 +1,7 @@
 //! Arguments of all stages.
 
 use clap::Parser;
-use std::ffi::OsString;
+use std::ffi::{OsStr, OsString};
 use std::path::{Path, PathBuf};
 
 /// Run one stage of a CARFF graph. `carff launch` starts all stages; if you start them yourself, use the same run name
@@ -60,12 +60,16 @@ impl StageArgs {
 
     /// Returns the command line of these arguments, without the program's name.
     pub fn to_command_line(&self) -> Vec<OsString> {
-        let mut line: Vec<OsString> = vec!["--graph".into(), self.graph.clone().into()];
-        let mut add = |name: &str, value: Option<OsString>| {
-            if let Some(value) = value {
-                line.extend([OsString::from(name), value]);
+        let mut line: Vec<OsString> = Vec::new();
+        let mut add = |name: &str, value: Option<OsString>| match value {
+            // A value that begins as an option does.
+            Some(value) if value.as_encoded_bytes().starts_with(b"-") => {
+                line.push([OsStr::new(name), OsStr::new("="), &value].into_iter().collect());
             }
+            Some(value) => line.extend([OsString::from(name), value]),
+            None => {}
         };
+        add("--graph", Some(self.graph.clone().into()));
         add("--run", self.run.as_ref().map(Into::into));
         add("--run-id", Some(self.run_id.to_string().into()));
         add("--dataset", self.dataset.as_ref().map(Into::into));
@@ -87,11 +91,16 @@ mod tests {
     #[test]
     fn command_line_round_trips() {
         let mut args = StageArgs::new("a b/graph.toml".as_ref(), "run-1", u64::MAX);
-        for _ in 0..2 {
+        for _ in 0..3 {
             let line = std::iter::once("stage".into()).chain(args.to_command_line());
             assert_eq!(StageArgs::try_parse_from(line).unwrap(), args);
+            // Names that begin as an option does.
+            if args.dataset.is_some() {
+                (args.graph, args.run, args.checkpoint) = ("-g.toml".into(), Some("--run".into()), Some("-".into()));
+            } else {
+                args.checkpoint = Some("checkpoint".into());
+            }
             args.dataset = Some("data".into());
-            args.checkpoint = Some("checkpoint".into());
             (args.drives, args.frames, args.parent_pid) = (Some(2), Some(30), Some(1));
             (args.first_frame, args.raw) = (17, true);
         }

@@ -12,6 +12,7 @@ use carff_transport::{
 };
 use clap::Parser;
 use rustix::process::{Signal, getppid, set_parent_process_death_signal};
+use std::io::Write;
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::sync::Arc;
@@ -27,7 +28,8 @@ pub fn run_with(stage: Stage, args: StageArgs, run: impl FnOnce(&mut StageContex
     match start(stage, args).and_then(|mut context| context.finish(run)) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("ERROR {}", sentence(&*error));
+            // Standard error may be closed.
+            let _ = writeln!(std::io::stderr(), "ERROR {}", sentence(&*error));
             ExitCode::FAILURE
         }
     }
@@ -257,6 +259,8 @@ fn init_log(level: LogLevel, format: LogFormat) {
     let log = tracing_subscriber::fmt()
         .with_max_level(level)
         .with_writer(std::io::stderr)
+        // A line that cannot be written would be reported on the same full output, which panics.
+        .log_internal_errors(false)
         .with_ansi(false)
         .with_target(false)
         .without_time();

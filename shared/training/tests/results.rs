@@ -158,8 +158,13 @@ fn every_table_is_made() {
     assert!(planning.free_drives.is_none());
     assert!(results.hazard_reliability.trained.as_ref().unwrap().trials > 0);
     assert!(results.frequencies.trained.as_ref().unwrap().by_branch[0].outcomes.len() == 2);
-    // Drives and unknown objects need a scenario file.
-    assert_eq!(results.left_out.keys().collect::<Vec<_>>(), ["memory", "robustness"], "{:?}", results.left_out);
+    // Drives, unknown objects and masks need a scenario file.
+    assert_eq!(
+        results.left_out.keys().collect::<Vec<_>>(),
+        ["localisation", "memory", "robustness"],
+        "{:?}",
+        results.left_out
+    );
 
     let page = std::fs::read_to_string(place.at("results/README.md")).unwrap();
     let files: Vec<&str> = page.split("](").skip(1).filter_map(|rest| rest.split(')').next()).collect();

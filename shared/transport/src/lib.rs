@@ -59,7 +59,7 @@ pub use payload::{Image, Payload};
 pub use publisher::{ImageLoan, Publisher};
 pub use receiver::{Receiver, Sample};
 pub use registry::{AnyPublisher, AnyReceiver, AnyTopic, Received, TopicId, UnknownTopic, graph_bytes};
-pub use run::{Run, cleanup_dead, living_processes, remove_run_leftovers, run_id_of};
+pub use run::{Run, cleanup_dead, living_nodes, living_processes, remove_run_leftovers, run_id_of};
 pub use space::{SHARED_MEMORY_DIR, check_space};
 pub use stop::{INTERRUPTED, Stop, exit_on_signals, is_interrupted};
 pub use topic::{Limits, Topic};

@@ -72,10 +72,21 @@ impl Run {
         &self.dir
     }
 
-    /// Makes the files of a living run young again. Call it about once an hour: some cleaners of temporary files go by
-    /// age only.
+    /// Makes the files of a living run young again, also those next to its folder: its record, its log and the copy of
+    /// its graph file. Call it about once an hour: some cleaners of temporary files go by age only.
     pub fn refresh(&self) {
         folder::refresh(&self.folder());
+        let begin = format!("{}.", self.name);
+        let beside = std::fs::read_dir(&self.dir).into_iter().flatten().flatten();
+        beside
+            .filter(|entry| entry.file_name().to_string_lossy().starts_with(&begin))
+            .for_each(|entry| folder::refresh(&entry.path()));
+    }
+
+    /// Returns true if a process that has joined the run and is alive cannot be found any more, because a cleaner has
+    /// removed the run's folder or files in it. Then no other process can join.
+    pub fn has_lost(&self, pid: u32) -> bool {
+        !self.folder().is_dir() || living_processes(self).is_ok_and(|living| !living.contains(&pid))
     }
 
     /// Returns the processes that map the run's shared memory, also if its folder is gone.
@@ -152,11 +163,18 @@ pub fn cleanup_dead(run: &Run) -> Result<u32, CleanupError> {
 
 /// Returns the living processes of a run.
 pub fn living_processes(run: &Run) -> Result<Vec<u32>, CleanupError> {
+    Ok(living_nodes(run)?.into_iter().map(|(_, pid)| pid).collect())
+}
+
+/// Returns the living members of a run: the name under which each has joined, and its process.
+pub fn living_nodes(run: &Run) -> Result<Vec<(String, u32)>, CleanupError> {
     crate::log::quiet();
     let failed = |cause: String| CleanupError::List { run: run.name.clone(), cause };
     let config = run.config().map_err(failed)?;
     let living = nodes(run, &config).map_err(failed)?.into_iter().filter_map(|node| match node {
-        NodeState::Alive(node) => node.details().as_ref().map(|d| d.process_id().value() as u32),
+        NodeState::Alive(node) => {
+            node.details().as_ref().map(|d| (d.name().as_str().to_owned(), d.process_id().value() as u32))
+        }
         _ => None,
     });
     Ok(living.collect())

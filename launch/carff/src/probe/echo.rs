@@ -43,7 +43,9 @@ pub(super) fn run(args: &EchoArgs) -> anyhow::Result<()> {
             }
             if shown == 0 && message.message().get::<HeaderOnly>().is_some() {
                 let (message, _) = topic.schema();
-                eprintln!("topic `{topic}`: this program does not know `{message}`; it shows only the header");
+                crate::say(&format!(
+                    "topic `{topic}`: this program does not know `{message}`; it shows only the header"
+                ));
             }
             let value = message.message().to_json()?;
             // A closed pipe (`| head`) is the end, not an error.

@@ -4,6 +4,7 @@ use super::structure::columns;
 use crate::session::{Session, SessionArgs};
 use crate::spans::{Span, trace_events};
 use anyhow::{Context, bail, ensure};
+use carff_base::files::check_writable;
 use carff_messages::Stage;
 use carff_transport::TopicId;
 use carff_transport::monotonic_now_ns;
@@ -79,6 +80,7 @@ pub(super) fn run(args: &TraceArgs) -> anyhow::Result<()> {
     if let Some(recording) = &args.recording {
         return recorded(args, recording);
     }
+    args.perfetto.as_deref().map_or(Ok(()), check_writable)?;
     let mut session = Session::open(&args.session, "probe-trace")?;
     session.listen(TopicId::FLOW)?;
     session.take(|_, _| Ok(()))?;

@@ -76,7 +76,7 @@ pub fn masked_views(
             }
             let state = done % states;
             let (branch, timestamp) = (scenario.info().branch_of(state), scenario.info().timestamp_of(state));
-            let options = RenderOptions { detail: Detail::Picture, ..RenderOptions::default() };
+            let options = RenderOptions { detail: Detail::Picture };
             let rendering = scenario.render(branch, timestamp, &moved, &options)?;
             let class = |object: &u16| classes.iter().find(|(of, _)| of == object).map_or(0, |(_, class)| *class);
             Ok(MaskedView {

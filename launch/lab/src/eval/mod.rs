@@ -16,6 +16,8 @@ use std::process::ExitCode;
 
 /// Largest distance of two cameras that count as the same, metres.
 const SAME_PLACE_M: f64 = 1e-3;
+/// Free poses among which the gallery looks for one with an unknown object in sight.
+const GALLERY_POSES: u32 = 12;
 
 /// Returns the table of a name.
 fn table(name: TableName) -> Table {
@@ -56,8 +58,8 @@ pub fn run(args: &EvalArgs) -> anyhow::Result<ExitCode> {
         if wants(Table::Planning) || wants(Table::Robustness) {
             subject.free_drives = images::free_drives(&scenario, args.free_drives, args.seed, &display)?;
         }
-        // The gallery shows one pose of each.
-        let novelty_poses = if wants(Table::Robustness) { args.free_poses } else { args.free_poses.min(1) };
+        // The gallery shows the first pose that has each in sight.
+        let novelty_poses = if wants(Table::Robustness) { args.free_poses } else { args.free_poses.min(GALLERY_POSES) };
         if wants(Table::Robustness) || wants(Table::Pictures) {
             subject.novelties = images::novelties(&scenario, novelty_poses, args.seed, &display)?;
         }

@@ -11,6 +11,8 @@ pub struct RunFiles {
     pub name: String,
     /// Process number of its launcher, if alive.
     pub launcher: Option<u32>,
+    /// Process to stop if the run lives, but its record or files in its folder are gone.
+    pub lost: Option<u32>,
     /// Numbers of its living processes.
     pub living: Vec<u32>,
     /// Its small files: a folder and a record.
@@ -49,18 +51,30 @@ pub fn run_folder(folder: &Path, writable: bool) -> Finding {
 pub fn leftovers(runs: &[RunFiles], strays: &Strays) -> Vec<Finding> {
     let area = Area::SharedMemory;
     let list = |pids: &[u32]| pids.iter().map(u32::to_string).collect::<Vec<_>>().join(" ");
+    let lost = |found: String, pid: u32| {
+        Finding::error(
+            area,
+            "lost folder",
+            found,
+            "no probe sees the run, and none of its stages can restart: a cleaner of temporary files may have removed it",
+            format!("stop the run (kill -INT {pid}), start it again, and keep the cleaner from its folder"),
+        )
+    };
     let mut findings: Vec<Finding> = runs
         .iter()
-        .map(|run| match (run.launcher, run.living.as_slice()) {
-            (Some(pid), living) => {
+        .map(|run| match (run.lost, run.launcher, run.living.as_slice()) {
+            (Some(pid), ..) => {
+                lost(format!("run `{}` lives, but its record or files in its folder are gone", run.name), pid)
+            }
+            (None, Some(pid), living) => {
                 Finding::ok(area, "run", format!("`{}` runs: launcher {pid}, {} processes", run.name, living.len()))
             }
-            (None, []) if run.segments.is_empty() => Finding::ok(
+            (None, None, []) if run.segments.is_empty() => Finding::ok(
                 area,
                 "leftovers",
                 format!("run `{}` was killed; its next start removes its remaining small files", run.name),
             ),
-            (None, []) => Finding::warning(
+            (None, None, []) => Finding::warning(
                 area,
                 "leftovers",
                 format!(
@@ -72,7 +86,7 @@ pub fn leftovers(runs: &[RunFiles], strays: &Strays) -> Vec<Finding> {
                 "they use memory until the next start of the run, which removes them",
                 format!("rm -r {}", removal(run)),
             ),
-            (None, living) => Finding::warning(
+            (None, None, living) => Finding::warning(
                 area,
                 "orphans",
                 format!("run `{}` has no launcher, but these processes: {}", run.name, list(living)),
@@ -82,13 +96,8 @@ pub fn leftovers(runs: &[RunFiles], strays: &Strays) -> Vec<Finding> {
         })
         .collect();
     if !strays.users.is_empty() {
-        findings.push(Finding::error(
-            area,
-            "lost folder",
-            format!("processes {} belong to a run whose folder is gone", list(&strays.users)),
-            "no probe sees the run, and none of its stages can restart: a cleaner of temporary files may have removed it",
-            format!("stop the run (kill -INT {}), start it again, and keep the cleaner from its folder", strays.users[0]),
-        ));
+        let found = format!("processes {} belong to a run whose folder is gone", list(&strays.users));
+        findings.push(lost(found, strays.users[0]));
     } else if !strays.files.is_empty() {
         findings.push(Finding::warning(
             area,
@@ -146,8 +155,8 @@ mod tests {
             segment_bytes: 3 * MIB,
             ..RunFiles::default()
         };
-        let small = RunFiles { name: "small".to_owned(), small: vec!["x.run".into()], ..RunFiles::default() };
-        assert_level(&leftovers(&[small], &Strays::default())[0], Level::Ok);
+        let small_run = || RunFiles { name: "small".to_owned(), small: vec!["x.run".into()], ..RunFiles::default() };
+        assert_level(&leftovers(&[small_run()], &Strays::default())[0], Level::Ok);
         let alive = RunFiles { name: "alive".to_owned(), launcher: Some(7), living: vec![7, 8], ..RunFiles::default() };
         let orphan = RunFiles { name: "orphan".to_owned(), living: vec![9, 10], ..RunFiles::default() };
         let strays = Strays { files: segments, users: Vec::new() };
@@ -155,6 +164,12 @@ mod tests {
         let lost = leftovers(&[], &Strays { users: vec![5, 6], ..strays.clone() });
         assert_eq!(levels(&lost), [("lost folder", Level::Error)]);
         assert!(lost[0].advice.contains("kill -INT 5"), "a living run is never removed: {lost:?}");
+        for launcher in [None, Some(7)] {
+            let run = RunFiles { lost: Some(7), launcher, living: vec![7, 8], ..small_run() };
+            let found = leftovers(&[run], &Strays::default());
+            assert_eq!(levels(&found), [("lost folder", Level::Error)]);
+            assert!(found[0].advice.contains("kill -INT 7") && found[0].found.contains("`small`"), "{found:?}");
+        }
         assert_eq!(
             levels(&findings),
             [

@@ -108,7 +108,7 @@ pub fn gallery(subject: &Subject, out: &Path, on_progress: &dyn Fn(&Progress)) -
         "Unknown objects",
         "Camera image with the boxes of what no known state explains, the known state that explains the image best, and \
          the residual: how far each pixel is from that state, in deviations of the image's noise. Images come from the \
-         first free pose of each object.",
+         first free pose that has each object in sight.",
     );
     tell(7, "");
     Ok(gallery)

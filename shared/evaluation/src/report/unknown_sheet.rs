@@ -23,7 +23,7 @@ pub fn unknown_objects(subject: &Subject, path: &Path) -> Result<bool, Evaluatio
     let (Some(known), Ok(probe)) = (&perception.known, &subject.probe) else { return Ok(false) };
     let mut rows = Vec::new();
     for novelty in &subject.novelties {
-        // The first pose, whatever its result.
+        // The first pose that has it in sight, whatever the result.
         let Some(look) = novelty.looks.first() else { continue };
         let Some(compared) = known.compare(&look.camera, &look.image) else { continue };
         let evidence = ImageEvidence::new(&compared.seen.ratios);
@@ -37,8 +37,8 @@ pub fn unknown_objects(subject: &Subject, path: &Path) -> Result<bool, Evaluatio
         let best = subject.state_name(compared.best);
         let cells = vec![
             image,
-            StripCell::new(rendered(&compared), &["best state".into(), best]),
-            StripCell::new(residual(&compared), &["residual".into(), format!("{boxes} boxes")]),
+            StripCell::new(enlarged(&rendered(&compared), &look.image), &["best state".into(), best]),
+            StripCell::new(enlarged(&residual(&compared), &look.image), &["residual".into(), format!("{boxes} boxes")]),
         ];
         rows.push(StripRow { caption: vec![novelty.name.clone(), place.to_owned()], cells });
     }
@@ -100,6 +100,19 @@ fn residual(compared: &Compared) -> Image {
     of_size(compared, grey.collect())
 }
 
+/// Repeats pixels up to the size of another image.
+fn enlarged(image: &Image, other: &Image) -> Image {
+    let (width, height) = (other.width_px as usize, other.height_px as usize);
+    let at = |i: usize, n: usize, of: u32| i * of as usize / n.max(1);
+    let pixel = |i: usize| {
+        let (x, y) = (at(i % width, width, image.width_px), at(i / width, height, image.height_px));
+        let from = 3 * (y * image.width_px as usize + x);
+        [image.rgb[from], image.rgb[from + 1], image.rgb[from + 2]]
+    };
+    let rgb = (0..width * height).flat_map(pixel).collect();
+    Image { width_px: other.width_px, height_px: other.height_px, rgb }
+}
+
 fn of_size(compared: &Compared, rgb: Vec<u8>) -> Image {
     let camera = &compared.comparison.camera;
     Image { width_px: camera.width_px, height_px: camera.height_px, rgb }
@@ -109,6 +122,14 @@ fn of_size(compared: &Compared, rgb: Vec<u8>) -> Image {
 mod tests {
     use super::*;
 
+    /// Each pixel of a smaller image becomes a block.
+    #[test]
+    fn pixels_become_blocks() {
+        let small = Image { width_px: 2, height_px: 1, rgb: vec![1, 2, 3, 4, 5, 6] };
+        let large = enlarged(&small, &Image::filled(4, 2, [0; 3]));
+        assert_eq!(large.rgb, [1, 2, 3, 1, 2, 3, 4, 5, 6, 4, 5, 6].repeat(2));
+    }
+
     /// A line marks the pixels between its ends, and parts outside the image are left out.
     #[test]
     fn lines_are_clipped() {
@@ -116,7 +137,8 @@ mod tests {
         line(&mut image, [[2.5, 1.5], [1e4, 1.5]]);
         let marked: Vec<usize> = (0..32).filter(|i| image.rgb[3 * i..3 * i + 3] == BOX).collect();
         assert_eq!(marked, [10, 11, 12, 13, 14, 15]);
+        let before = image.clone();
         line(&mut image, [[-5.0, -5.0], [f64::NAN, 3.0]]);
-        assert_eq!(image.rgb.iter().filter(|v| **v == BOX[0]).count(), 12);
+        assert_eq!(image, before);
     }
 }

@@ -184,6 +184,13 @@ fn foreign_files_are_refused() {
     writer.write_metadata(&Metadata { name: "carff".to_owned(), metadata }).unwrap();
     writer.finish().unwrap();
     assert!(matches!(Reader::open(&path), Err(RecordingError::Format { .. })));
+
+    // Nothing, or less than the first bytes of the format.
+    for bytes in [&mcap::MAGIC[..0], &mcap::MAGIC[..3], b"{}"] {
+        std::fs::write(&path, bytes).unwrap();
+        let error = Reader::open(&path).unwrap_err().to_string();
+        assert!(error.contains("foreign.mcap is damaged, or is not an MCAP file"), "{error}");
+    }
 }
 
 /// A recording with one channel for all views, as older versions wrote it, is read.
