@@ -26,8 +26,6 @@ impl Encoder {
             .with_optimization_level(GraphOptimizationLevel::All)?
             .with_intra_threads(threads.max(1))?
             .with_deterministic_compute(true)?
-            // A plan of memory for each size of image would keep another 2 MB.
-            .with_memory_pattern(false)?
             // Threads wait by spinning during an image, and sleep until the next one.
             .with_config_entry("session.force_spinning_stop", "1")?
             .commit_from_memory(&model)?;
