@@ -1,5 +1,6 @@
 //! Images of unknown objects: the input, the best known state, the residual, and the boxes.
 
+use crate::tables::spread;
 use crate::{EvaluationError, Subject};
 use carff_base::geometry::{OrientedBox, PinholeCamera};
 use carff_dataset::Image;
@@ -8,6 +9,8 @@ use carff_plots::{StripCell, StripRow};
 use carff_trials::Compared;
 use std::path::Path;
 
+/// Largest number of objects.
+const ROWS: usize = 8;
 /// Residual that is drawn white, in deviations of the image's noise.
 const WHITE_DEVIATIONS: f32 = 12.0;
 /// Colour of the boxes.
@@ -17,13 +20,16 @@ const UNKNOWN: [u8; 3] = [236, 140, 20];
 /// Steps along a drawn line for each pixel of its length.
 const STEPS_PER_PX: f64 = 2.0;
 
-/// Draws one row for each object; returns false if nothing is compared.
+/// Draws one row for each of at most eight objects; returns false if nothing is compared.
 pub fn unknown_objects(subject: &Subject, path: &Path) -> Result<bool, EvaluationError> {
     let perception = subject.perception();
     let (Some(known), Ok(probe)) = (&perception.known, &subject.probe) else { return Ok(false) };
     let mut rows = Vec::new();
-    for novelty in &subject.novelties {
-        // The first pose that has it in sight, whatever the result.
+    // The first pose that has each in sight, whatever the result.
+    let in_sight: Vec<usize> =
+        (0..subject.novelties.len()).filter(|&i| !subject.novelties[i].looks.is_empty()).collect();
+    for index in spread(&in_sight, ROWS) {
+        let novelty = &subject.novelties[index];
         let Some(look) = novelty.looks.first() else { continue };
         let Some(compared) = known.compare(&look.camera, &look.image) else { continue };
         let evidence = ImageEvidence::new(&compared.seen.ratios);
