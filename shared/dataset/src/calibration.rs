@@ -160,7 +160,7 @@ impl Calibration {
         };
         let zero = |values: &[f64]| values.iter().all(|v| v.abs() <= 1e-12);
         let (model, used) = match model {
-            // An equidistant lens has zeros too, and is no pinhole.
+            // An equidistant lens may have zeros too, and differs from a pinhole.
             "equidistant" | "fisheye" => (DistortionModel::Fisheye, 4),
             "" | "none" | "plumb_bob" | "rational_polynomial" | "thin_prism_model" if zero(d) => {
                 (DistortionModel::Pinhole, 0)
