@@ -58,7 +58,7 @@ impl<L: Localiser> SceneProbe<L> {
         &self.layout
     }
 
-    /// The localiser; a field's densities are one.
+    /// The method that finds out which places are taken: for density probing, the field.
     pub fn field(&self) -> &L {
         &self.localiser
     }
