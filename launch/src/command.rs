@@ -2,6 +2,7 @@
 
 use crate::dataset::DatasetCommand;
 use crate::doctor::DoctorArgs;
+use crate::drive::DriveArgs;
 use crate::lab::LabCommand;
 use crate::launch::LaunchArgs;
 #[cfg(feature = "recording")]
@@ -47,6 +48,11 @@ pub enum Command {
     #[command(after_help = "Example: two drives, with a report
   carff launch configs/graphs/approaching-intersection.toml --drives 2 --report reports/run.json")]
     Launch(LaunchArgs),
+    /// Drive through a scenario in closed loop: the ego moves by its controller's actions.
+    #[command(after_help = "Example: 20 episodes with the rule that looks, and the same with one that stops and creeps
+  carff drive approaching-intersection --checkpoint configs/checkpoints/approaching-intersection --episodes 20
+  carff drive approaching-intersection --checkpoint configs/checkpoints/approaching-intersection --rule peek")]
+    Drive(DriveArgs),
     /// Commands that observe a run.
     #[command(flatten)]
     Attach(Attach),

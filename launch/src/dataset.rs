@@ -170,7 +170,7 @@ fn corners(text: &str) -> Result<[[f64; 3]; 2], String> {
 
 /// Returns the path of a scenario file, or of the scenario of that name: in configs/scenarios of this folder, of a
 /// folder above it, or of the folder in which this program was built or installed.
-fn find_scenario(scenario: &Path) -> anyhow::Result<PathBuf> {
+pub(crate) fn find_scenario(scenario: &Path) -> anyhow::Result<PathBuf> {
     if scenario.is_file() {
         return Ok(scenario.to_owned());
     }

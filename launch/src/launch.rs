@@ -68,6 +68,9 @@ pub struct LaunchArgs {
     /// Folder of the stages' programs; default: this program's folder.
     #[arg(long, hide = true)]
     pub stages: Option<PathBuf>,
+    /// Prints no decisions: the feed shows its own progress.
+    #[arg(skip)]
+    pub quiet: bool,
 }
 
 /// Launches a graph. Ends when the camera is done (exit code 0), on Ctrl-C (130), or with an error when a stage is
@@ -185,7 +188,12 @@ pub(crate) fn run_graph(
 
     let result = {
         let node = Node::open(&run, "launcher")?;
-        let mut decided = |frame: &FrameRecord| decisions.take(frame);
+        let quiet = args.quiet;
+        let mut decided = |frame: &FrameRecord| {
+            if !quiet {
+                decisions.take(frame)
+            }
+        };
         let mut supervisor = Supervisor::new(&node, &graph, (folder, stage_args), &stop, terminal, &mut decided)?;
         let result = supervisor.drive(&run, &stop, feed);
         terminal.status(String::new());

@@ -11,6 +11,7 @@ pub mod command;
 pub mod dataset;
 mod decisions;
 pub mod doctor;
+pub mod drive;
 pub mod lab;
 pub mod launch;
 pub mod planning;

@@ -18,6 +18,7 @@ fn run() -> anyhow::Result<ExitCode> {
     carff_launch::shell::answer_shell(Cli::command);
     match Cli::parse().command {
         Command::Launch(args) => carff_launch::launch::run(&args),
+        Command::Drive(args) => carff_launch::drive::run(&args),
         Command::Attach(command) => command.run(),
         #[cfg(feature = "recording")]
         Command::Replay(args) => carff_launch::replay::run(&args),

@@ -3,8 +3,9 @@
 //! `carff-decision` contains the decision rules; this crate decides when a rule is applied, and which action is valid
 //! in between.
 
-use carff_decision::{Decision, Evidence, Policy};
+use carff_decision::{Approach, Decision, Evidence, Motion, Policy, Speeds};
 use carff_messages::{Action, ActionCode, Belief, Header, ImageCheck, MAX_HORIZON, Message, Reason};
+use carff_runtime::{EgoMotion, Look};
 
 /// Settings of a controller.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -19,6 +20,10 @@ pub struct Settings {
     pub seed: u64,
     /// True to decide as if nothing unknown could be there.
     pub ignores_unknown: bool,
+    /// What the vehicle does while the rule does not let it advance, and its speeds.
+    pub approach: Approach,
+    /// Speeds of the vehicle.
+    pub speeds: Speeds,
 }
 
 /// Content of one step of a frame's belief. A repeated step must be equal.
@@ -78,12 +83,35 @@ pub struct Controller {
     checked_ns: u64,
     /// Reason why the newest image is not usable.
     unusable: Option<Reason>,
+    /// The newest motion of the vehicle, and the newest look from further on.
+    motion: Option<EgoMotion>,
+    look: Option<Look>,
 }
 
 impl Controller {
     /// Creates a controller without beliefs: its ticks return halt.
     pub fn new(settings: Settings) -> Self {
-        Self { settings, pending: None, standing: None, settled: None, refused: None, checked_ns: 0, unusable: None }
+        Self {
+            settings,
+            pending: None,
+            standing: None,
+            settled: None,
+            refused: None,
+            checked_ns: 0,
+            unusable: None,
+            motion: None,
+            look: None,
+        }
+    }
+
+    /// Records the motion of the vehicle. Decisions use it while it is not older than the deadline.
+    pub fn on_motion(&mut self, motion: &EgoMotion) {
+        self.motion = Some(*motion);
+    }
+
+    /// Records what a look from further on would tell. Only decisions on its frame use it.
+    pub fn on_look(&mut self, look: &Look) {
+        self.look = Some(*look);
     }
 
     /// Processes a belief. The frame's last belief causes an action at once: by the rule if all steps are present and
@@ -193,7 +221,14 @@ impl Controller {
     }
 
     fn act(&self, pending: &Pending, decision: Decision, now_ns: u64) -> Action {
-        let code = if decision.halt { ActionCode::Halt } else { ActionCode::Advance };
+        let deadline_ns = self.settings.deadline_ns;
+        let is_fresh = |motion: &&EgoMotion| now_ns.saturating_sub(motion.header.capture_time_ns) <= deadline_ns;
+        let motion = self.motion.as_ref().filter(is_fresh);
+        let motion = motion.map(|m| Motion { speed_mps: m.speed_mps, to_conflict_m: m.to_conflict_m });
+        let is_of_frame = |look: &&Look| look.header.capture_time_ns == pending.header.capture_time_ns;
+        let look_gain_bits = self.look.as_ref().filter(is_of_frame).map_or(0.0, |look| look.gain_bits);
+        let Settings { approach, speeds, .. } = self.settings;
+        let (code, target_mps) = approach.drive(decision.halt, look_gain_bits.into(), motion, speeds);
         Action {
             header: pending.header.at_step(0),
             action: code.code(),
@@ -207,6 +242,8 @@ impl Controller {
             valid_until_ns: now_ns.saturating_add(self.settings.deadline_ns),
             based_on_frame: pending.header.frame_id,
             latency_ns: now_ns.saturating_sub(pending.header.capture_time_ns),
+            target_speed_mps: target_mps as f32,
+            look_gain_bits,
         }
     }
 
@@ -224,6 +261,8 @@ impl Controller {
             valid_until_ns: now_ns.saturating_add(2 * self.settings.period_ns),
             based_on_frame: u64::MAX,
             latency_ns: 0,
+            target_speed_mps: 0.0,
+            look_gain_bits: 0.0,
         }
     }
 }

@@ -4,9 +4,10 @@ use anyhow::Context;
 use carff_checkpoint::load_policy;
 use carff_config::UnknownIs;
 use carff_controller::{Controller, Settings};
+use carff_decision::Approach;
 use carff_messages::Stage;
-use carff_runtime::{StageContext, frame_span};
-use carff_transport::{Woken, monotonic_now_ns, topics};
+use carff_runtime::{EGO_MOTION, LOOK, StageContext, frame_span};
+use carff_transport::{Receiver, Woken, monotonic_now_ns, topics};
 
 /// Maximum number of beliefs between two reads of the clock, so that a flood of them delays no tick.
 const MOST_AT_ONCE: usize = 16;
@@ -20,6 +21,10 @@ fn run(stage: &mut StageContext) -> anyhow::Result<()> {
     let mut checks = stage.input(&topics::CHECK)?;
     let mut actions = stage.output(&topics::ACTION)?;
     let settings = settings(stage)?;
+    let moves = settings.approach != Approach::Stop;
+    let mut motions = moves.then(|| stage.input(&EGO_MOTION)).transpose()?.map(Receiver::polled);
+    let looks = (settings.approach == Approach::Look).then(|| stage.input(&LOOK)).transpose()?;
+    let mut looks = looks.map(Receiver::polled);
     let mut controller = Controller::new(settings);
     stage.ready();
 
@@ -42,6 +47,13 @@ fn run(stage: &mut StageContext) -> anyhow::Result<()> {
             let Some(belief) = beliefs.next()? else { break };
             let started_ns = monotonic_now_ns();
             let _span = frame_span(&belief.header);
+            // Both are published before the belief that they belong to.
+            while let Some(motion) = motions.as_mut().map_or(Ok(None), |motions| motions.next())? {
+                controller.on_motion(&motion);
+            }
+            while let Some(look) = looks.as_mut().map_or(Ok(None), |looks| looks.next())? {
+                controller.on_look(&look);
+            }
             if let Some(action) = controller.on_belief(&belief, started_ns) {
                 actions.send(action)?;
                 stage.worked(&action.header, started_ns);
@@ -73,5 +85,7 @@ fn settings(stage: &StageContext) -> anyhow::Result<Settings> {
         period_ns: (1e9 / config.rate_hz) as u64,
         seed: stage.seed(),
         ignores_unknown: stage.graph.checks.unknown == UnknownIs::Ignored,
+        approach: config.approach,
+        speeds: config.speeds(),
     })
 }

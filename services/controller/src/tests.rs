@@ -6,7 +6,13 @@ const HORIZON: u32 = 2;
 
 fn controller(rule: Rule) -> Controller {
     let policy = Policy { rule, threshold: 0.3 };
-    Controller::new(Settings { policy, deadline_ns: 150 * MS, period_ns: 50 * MS, seed: 1, ignores_unknown: false })
+    Controller::new(settings(policy))
+}
+
+fn settings(policy: Policy) -> Settings {
+    let (deadline_ns, period_ns) = (150 * MS, 50 * MS);
+    let speeds = Speeds { advance_mps: 5.0, creep_mps: 1.5 };
+    Settings { policy, deadline_ns, period_ns, seed: 1, ignores_unknown: false, approach: Approach::Stop, speeds }
 }
 
 fn calibrated() -> Controller {

@@ -1,11 +1,13 @@
 //! The camera's frames, each compared with the known states before its belief.
 
 use crate::Images;
+use carff_base::geometry::PinholeCamera;
 use carff_checkpoint::FieldProbe;
 use carff_decision::ImageEvidence;
 use carff_messages::{FrameMeta, Header, Unknowns};
 use carff_runtime::StageContext;
 use carff_transport::{Image, Input, Publisher, Receiver, monotonic_now_ns, topics};
+use carff_unknown::Lanes;
 
 /// Compares the frames of the camera, in order, and publishes the comparisons.
 ///
@@ -17,6 +19,8 @@ pub struct Frames {
     images: Images,
     input: Receiver<Image<FrameMeta>>,
     output: Publisher<Unknowns>,
+    /// Capture time and camera of the last frame.
+    camera: Option<(u64, PinholeCamera)>,
 }
 
 impl Frames {
@@ -28,7 +32,7 @@ impl Frames {
         }
         let Some(images) = Images::load(&stage.checkpoint, probe, stage.graph.remembers())? else { return Ok(None) };
         let (input, output) = (stage.input(&topics::FRAME)?, stage.output(&topics::UNKNOWN)?);
-        Ok(Some(Self { images, input, output }))
+        Ok(Some(Self { images, input, output, camera: None }))
     }
 
     /// The input to wait for.
@@ -46,6 +50,8 @@ impl Frames {
                 continue;
             }
             let started_ns = monotonic_now_ns();
+            let camera = frame.camera();
+            self.camera = camera.validate().is_ok().then_some((frame.header.capture_time_ns, camera));
             if let Some(mut unknowns) = self.images.compare(probe, &frame, frame.image(), threads) {
                 unknowns.stage_latency_ns = monotonic_now_ns() - started_ns;
                 self.output.send(unknowns)?;
@@ -53,6 +59,16 @@ impl Frames {
             break;
         }
         Ok(())
+    }
+
+    /// The camera of a frame, if it was the last one, with a valid pose.
+    pub fn camera_of(&self, header: &Header) -> Option<PinholeCamera> {
+        self.camera.filter(|(at_ns, _)| *at_ns == header.capture_time_ns).map(|(_, camera)| camera)
+    }
+
+    /// The ground on which something counts.
+    pub fn lanes(&self) -> &Lanes {
+        self.images.lanes()
     }
 
     /// The evidence of a forecast's frame, if it shows something to compare.

@@ -3,7 +3,7 @@
 use carff_checkpoint::{CheckpointPlanning, FieldProbe};
 use carff_decision::{ImageEvidence, ImageMemory, Place};
 use carff_messages::{FrameMeta, Header, LATENT_DIM, MAX_STATES, Unknowns};
-use carff_unknown::{Comparer, Known, Seen};
+use carff_unknown::{Comparer, Known, Lanes, Seen};
 use ndarray::ArrayView3;
 use std::collections::VecDeque;
 use std::path::Path;
@@ -88,6 +88,11 @@ impl Images {
             *take = take_start;
         }
         memory.see(evidence)
+    }
+
+    /// The ground on which something counts.
+    pub fn lanes(&self) -> &Lanes {
+        &self.known.lanes
     }
 
     /// Reports whether a frame has been compared, or tried without a result.

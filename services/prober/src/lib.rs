@@ -2,9 +2,11 @@
 
 mod frames;
 mod images;
+mod outlook;
 
 pub use frames::Frames;
 pub use images::Images;
+pub use outlook::Outlook;
 
 use carff_checkpoint::{FieldProbe, Manifest, load_field_probe};
 use carff_decision::{ImageEvidence, mixture_and_draws};

@@ -1,7 +1,7 @@
 //! The prober stage: forecasts and camera images in, beliefs and comparisons out.
 
 use carff_messages::Stage;
-use carff_prober::{Frames, believe, load};
+use carff_prober::{Frames, Outlook, believe, load};
 use carff_runtime::{StageContext, frame_span};
 use carff_transport::{Input, monotonic_now_ns, topics};
 
@@ -14,6 +14,7 @@ fn run(stage: &mut StageContext) -> anyhow::Result<()> {
     let mut beliefs = stage.output(&topics::BELIEF)?;
     let mut probe = load(&stage.checkpoint)?;
     let mut frames = Frames::open(stage, &probe)?;
+    let mut outlook = Outlook::open(stage, &probe)?;
     stage.ready();
     loop {
         let cameras = frames.iter().map(Frames::input);
@@ -32,6 +33,9 @@ fn run(stage: &mut StageContext) -> anyhow::Result<()> {
         match evidence {
             Ok(evidence) => {
                 let mut belief = believe(&mut probe, &forecast, evidence);
+                if let (Some(outlook), Some(frames), 1) = (&mut outlook, &frames, belief.header.step) {
+                    outlook.publish(&probe, frames, &belief, stage.threads)?;
+                }
                 belief.stage_latency_ns = stage.worked(&belief.header, started_ns);
                 beliefs.send(belief)?;
             }

@@ -281,6 +281,31 @@ impl OrientedBox {
         let l = [c * d[0] + s * d[1], -s * d[0] + c * d[1], d[2]];
         (0..3).all(|i| l[i].abs() <= self.half_size[i])
     }
+
+    /// Returns the gap between the footprints of two boxes on the ground, metres, along the axis of either box that
+    /// separates them best: at most their distance, and negative if they overlap.
+    ///
+    /// ```
+    /// use carff_base::geometry::OrientedBox;
+    /// let car = |x: f64, yaw: f64| OrientedBox { center: [x, 0.0, 0.8], half_size: [2.0, 1.0, 0.8], yaw };
+    /// assert_eq!(car(0.0, 0.0).gap_m(&car(5.0, 0.0)), 1.0);
+    /// assert!(car(0.0, 0.0).gap_m(&car(3.5, 0.0)) < 0.0);
+    /// ```
+    pub fn gap_m(&self, other: &Self) -> f64 {
+        let axes = |b: &Self| {
+            let (s, c) = b.yaw.sin_cos();
+            [[c, s], [-s, c]]
+        };
+        let reach = |b: &Self, axis: [f64; 2]| {
+            let of = |i: usize| (axes(b)[i][0] * axis[0] + axes(b)[i][1] * axis[1]).abs() * b.half_size[i];
+            of(0) + of(1)
+        };
+        let between = sub(other.center, self.center);
+        let gap = |axis: [f64; 2]| {
+            (between[0] * axis[0] + between[1] * axis[1]).abs() - reach(self, axis) - reach(other, axis)
+        };
+        axes(self).into_iter().chain(axes(other)).map(gap).fold(f64::NEG_INFINITY, f64::max)
+    }
 }
 
 fn sub(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {

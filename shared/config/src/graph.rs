@@ -9,7 +9,7 @@ use crate::error::{Source, read};
 use crate::ranges;
 use crate::stages::{LogFormat, StageConfig, StagesConfig};
 use carff_dataset::{Calibration, CalibrationError};
-use carff_decision::{Sampling, StepLength};
+use carff_decision::{Approach, Sampling, Speeds, StepLength};
 use carff_messages::{Rule, Stage};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -183,11 +183,35 @@ pub struct ControllerConfig {
     /// Threshold on the hazard probability for the calibrated rule, 0 to 1. Default: the checkpoint's threshold.
     #[schemars(range(min = 0.0, max = 1.0))]
     pub threshold: Option<f64>,
+    /// What the vehicle does while the rule does not let it advance: `stop`, or, where the topic `ego/motion` is
+    /// published, `phantom`, `peek` or `look`. Default `stop`.
+    pub approach: Approach,
+    /// Target speed of `advance`, m/s, 0.1 to 60. Default 5.
+    #[schemars(range(min = 0.1, max = 60.0))]
+    pub advance_mps: f64,
+    /// Highest target speed of `creep` where nothing can be learned from further on, m/s, 0.1 to 10. Default 1.5.
+    #[schemars(range(min = 0.1, max = 10.0))]
+    pub creep_mps: f64,
 }
 
 impl Default for ControllerConfig {
     fn default() -> Self {
-        Self { rule: Rule::Calibrated, rate_hz: 20.0, deadline_ms: 150, threshold: None }
+        Self {
+            rule: Rule::Calibrated,
+            rate_hz: 20.0,
+            deadline_ms: 150,
+            threshold: None,
+            approach: Approach::Stop,
+            advance_mps: 5.0,
+            creep_mps: 1.5,
+        }
+    }
+}
+
+impl ControllerConfig {
+    /// Returns the speeds of the vehicle.
+    pub fn speeds(&self) -> Speeds {
+        Speeds { advance_mps: self.advance_mps, creep_mps: self.creep_mps }
     }
 }
 

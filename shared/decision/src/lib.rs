@@ -12,13 +12,16 @@
 //! | `memory`, `take` | the belief over the frames of a take |
 //! | `image_evidence` | the known states weighed by how well they explain the image |
 //! | `evidence`, `rule`, `threshold` | from the steps of a frame to an action |
+//! | `approach`, `look` | from an action to the speed of a vehicle that moves by it, and what it can see from further on |
 //! | `convert` | the same steps as messages, and back |
 
+mod approach;
 mod calibration;
 mod convert;
 mod evidence;
 mod image_evidence;
 mod layout;
+mod look;
 mod look_ahead;
 mod memory;
 mod mixture;
@@ -26,11 +29,13 @@ mod rule;
 mod take;
 mod threshold;
 
+pub use approach::{Approach, Drive, Motion, Speeds};
 pub use calibration::{Calibration, Reading, Resolved, resolve};
 pub use convert::{mixture_and_draws, set_mixture_and_draws};
 pub use evidence::{Evidence, SampleEvidence};
 pub use image_evidence::{ImageEvidence, ImageMemory};
 pub use layout::{Place, ProbeLayout, ProbingError};
+pub use look::look_gain_bits;
 pub use look_ahead::{Localiser, Plan, Probed, SceneProbe, Step, look_ahead, path_probability};
 pub use memory::{Memory, MemorySettings};
 pub use mixture::{Draw, Mixture, Sampling};

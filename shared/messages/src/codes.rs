@@ -78,6 +78,8 @@ codes! {
         Halt = 0 "halt",
         /// Drive on the planned path.
         Advance = 1 "advance",
+        /// Drive on slowly enough to stop before the place where others drive.
+        Creep = 2 "creep",
     }
 }
 

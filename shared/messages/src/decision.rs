@@ -1,8 +1,11 @@
 //! The controller's action.
 
-use crate::check::{at_most, probability};
+use crate::check::{at_most, probability, within};
 use crate::{ActionCode, Header, Invalid, MAX_SAMPLES, Reason, Rule, message};
 use iceoryx2::prelude::ZeroCopySend;
+
+/// Largest target speed of an action, m/s.
+const MAX_SPEED_MPS: f32 = 100.0;
 
 /// The vehicle's action until the next one, and its reason.
 ///
@@ -21,13 +24,15 @@ use iceoryx2::prelude::ZeroCopySend;
 ///     valid_until_ns: 100_001_000,
 ///     based_on_frame: 7,
 ///     latency_ns: 20_000,
+///     target_speed_mps: 0.0,
+///     look_gain_bits: 0.0,
 /// };
 /// assert!(action.validate().is_ok() && action.is_decision());
 /// assert_eq!(action.code(), Ok(ActionCode::Halt));
 /// ```
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, ZeroCopySend)]
-#[type_name("carff.Action.v2")]
+#[type_name("carff.Action.v3")]
 pub struct Action {
     /// Header of the frame that it is based on.
     pub header: Header,
@@ -53,6 +58,10 @@ pub struct Action {
     pub based_on_frame: u64,
     /// Time from capture to the decision, nanoseconds; 0 without a frame.
     pub latency_ns: u64,
+    /// Speed to reach and hold until [`Self::valid_until_ns`], m/s, 0..=100; 0 for [`ActionCode::Halt`].
+    pub target_speed_mps: f32,
+    /// Expected drop of the uncertainty about the hazard by a look from further on, bits, 0..=1; 0 if not computed.
+    pub look_gain_bits: f32,
 }
 
 impl Action {
@@ -80,6 +89,9 @@ impl Action {
         at_most("is_decision", self.is_decision.into(), 1)?;
         probability("confidence", self.confidence)?;
         probability("unknown_probability", self.unknown_probability)?;
+        probability("look_gain_bits", self.look_gain_bits)?;
+        let limit = if self.action == ActionCode::Halt.code() { 0.0 } else { MAX_SPEED_MPS };
+        within("target_speed_mps", [&self.target_speed_mps], 0.0, limit)?;
         probability("hazard_probability", self.hazard_probability)
     }
 }

@@ -206,7 +206,9 @@ described!(Action {
     unknown_probability,
     valid_until_ns,
     based_on_frame,
-    latency_ns
+    latency_ns,
+    target_speed_mps,
+    look_gain_bits
 });
 described!(Health {
     header,

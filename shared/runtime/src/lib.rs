@@ -38,6 +38,7 @@ mod camera;
 mod context;
 mod ego;
 mod health;
+mod motion;
 mod overload;
 mod realtime;
 
@@ -45,4 +46,5 @@ pub use args::StageArgs;
 pub use camera::{FrameOutput, rectifier};
 pub use context::{StageContext, frame_span, main, run_with};
 pub use ego::{EGO_POSE, EgoPose};
+pub use motion::{EGO_MOTION, EgoMotion, LOOK, Look};
 pub use overload::{Overload, Quality};

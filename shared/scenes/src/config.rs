@@ -1,8 +1,10 @@
 //! The scenario file: static objects, moving actors per branch, and cameras. All lengths are metres, all angles
 //! degrees, +Z is up, and the ground is z = 0. Unknown keys and values out of range are errors.
 
+mod closed_loop;
 mod variations;
 
+pub use closed_loop::ClosedLoopConfig;
 pub use variations::{AppearanceConfig, BystanderConfig, BystanderKind, BystanderPlace, VariationRole};
 
 use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
@@ -83,6 +85,8 @@ pub struct ScenarioConfig {
     /// added.
     #[serde(default)]
     pub bystander: Vec<BystanderConfig>,
+    /// Drives in which the ego moves by its controller's actions (`carff drive`).
+    pub closed_loop: Option<ClosedLoopConfig>,
     /// Minimum distance of cameras from static things, 0.001 to 100.
     #[serde(default = "default_clearance", deserialize_with = "clearance")]
     pub clearance_m: f64,

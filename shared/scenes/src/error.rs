@@ -50,6 +50,14 @@ pub enum ScenarioError {
     /// The camera cannot take images.
     #[error("the camera is not usable: {0}")]
     Camera(#[from] carff_base::geometry::CameraError),
+    /// The scenario cannot be driven through.
+    #[error("{}: no closed-loop drives: {problem}", path.display())]
+    NoClosedLoop {
+        /// Path of the scenario file.
+        path: PathBuf,
+        /// What is missing.
+        problem: &'static str,
+    },
     /// No position was found for a random camera.
     #[error("{}: key `{key}`: no position in these ranges is free of obstacles; widen them", path.display())]
     NoRoom {

@@ -16,6 +16,7 @@
 
 mod bystanders;
 mod cameras;
+mod closed_loop;
 pub mod config;
 mod error;
 mod free_drives;
@@ -23,6 +24,7 @@ mod free_looks;
 mod lanes;
 mod materials;
 mod movers;
+mod path;
 mod scenario;
 mod scenery;
 mod shapes;
@@ -32,6 +34,7 @@ mod variations;
 mod watches;
 
 pub use cameras::ScenarioCamera;
+pub use closed_loop::{ClosedLoop, Episode};
 pub use error::ScenarioError;
 pub use free_drives::{FreeDrive, FreeFrame};
 pub use free_looks::{FreeLook, FreePose};

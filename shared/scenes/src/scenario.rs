@@ -308,6 +308,20 @@ impl Scenario {
         self.scene(placement).image(&self.setting, camera)
     }
 
+    /// Returns the image of a placement with further movers.
+    pub(crate) fn picture_with(
+        &self,
+        placement: &Placement,
+        added: &[(Mover<'_>, &[Pose])],
+        camera: &PinholeCamera,
+    ) -> Image {
+        let (still, moving) = placed(&self.config, &self.scenery, placement);
+        let object = self.scenery.next_object + movers(&self.config).count() as u16;
+        let added = added.iter().flat_map(|(mover, poses)| poses.iter().map(move |pose| mover.bodies(*pose, object)));
+        let bodies = self.scenery.bodies.iter().cloned().chain(still).chain(moving).chain(added.flatten());
+        Scene::new(bodies.collect()).image(&self.setting, camera)
+    }
+
     /// Returns the visibility of the actor in a placement whose other movers differ from the state's.
     pub(crate) fn observability_of(
         &self,

@@ -6,6 +6,7 @@
 //! | `lanes` | the ground on which something unknown counts |
 //! | `blobs` | connected residuals: their size, and the place on the ground where they stand |
 //! | `known` | the limits of the known, calibrated on images without anything unknown, and their file |
+//! | `sight` | which of the known states would look the same from a pose ahead |
 //! | `camera` | the condition of a camera, from its images |
 
 mod blobs;
@@ -13,9 +14,11 @@ mod camera;
 mod compare;
 mod known;
 mod lanes;
+mod sight;
 
 pub use blobs::Blob;
 pub use camera::{CameraCheck, CameraLimits, Measured, Measurement};
 pub use compare::{Comparer, Comparison, Fit};
 pub use known::{Known, KnownError, Limits, Seen};
 pub use lanes::{ErrorMap, Ground, Lanes, OwnBox};
+pub use sight::Sight;

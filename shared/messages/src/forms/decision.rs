@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 pub struct ActionForm {
     /// Header of the frame that it is based on.
     pub header: Header,
-    /// `halt` or `advance`.
+    /// `halt`, `creep` or `advance`.
     pub action: String,
     /// Reason of the action.
     pub reason: String,
@@ -34,6 +34,12 @@ pub struct ActionForm {
     pub based_on_frame: Option<u64>,
     /// Time from capture to the decision, nanoseconds; 0 without a frame.
     pub latency_ns: u64,
+    /// Speed to reach and hold, m/s; recordings before it have 0.
+    #[serde(default)]
+    pub target_speed_mps: f32,
+    /// Expected drop of the uncertainty by a look from further on, bits; recordings before it have 0.
+    #[serde(default)]
+    pub look_gain_bits: f32,
 }
 
 impl From<&Action> for ActionForm {
@@ -51,6 +57,8 @@ impl From<&Action> for ActionForm {
             valid_until_ns: action.valid_until_ns,
             based_on_frame: (action.based_on_frame != u64::MAX).then_some(action.based_on_frame),
             latency_ns: action.latency_ns,
+            target_speed_mps: action.target_speed_mps,
+            look_gain_bits: action.look_gain_bits,
         }
     }
 }
@@ -72,6 +80,8 @@ impl TryFrom<&ActionForm> for Action {
             valid_until_ns: form.valid_until_ns,
             based_on_frame: form.based_on_frame.unwrap_or(u64::MAX),
             latency_ns: form.latency_ns,
+            target_speed_mps: form.target_speed_mps,
+            look_gain_bits: form.look_gain_bits,
         };
         action.validate()?;
         Ok(action)

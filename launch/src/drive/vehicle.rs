@@ -1,0 +1,67 @@
+//! The motion of the ego along its way: speed, with limits of acceleration, braking and jerk.
+
+/// Largest acceleration and braking, m/s².
+const ACCELERATION_MPS2: f64 = 2.5;
+const BRAKING_MPS2: f64 = 6.0;
+/// Largest change of the acceleration, m/s³.
+const JERK_MPS3: f64 = 20.0;
+/// Time in which the vehicle aims to reach its target speed, seconds.
+const RESPONSE_S: f64 = 0.3;
+/// Time over which the acceleration is constant, seconds.
+pub(super) const SUBSTEP_S: f64 = 0.02;
+
+/// A vehicle on its way.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Vehicle {
+    /// Distance of its centre from the start of the way, metres.
+    pub(super) at_m: f64,
+    /// Speed, m/s, not negative.
+    pub(super) speed_mps: f64,
+    acceleration_mps2: f64,
+}
+
+impl Vehicle {
+    /// A vehicle at the start, at a steady speed.
+    pub(super) fn at_start(speed_mps: f64) -> Self {
+        Self { at_m: 0.0, speed_mps, acceleration_mps2: 0.0 }
+    }
+
+    /// Moves for [`SUBSTEP_S`] towards a target speed.
+    pub(super) fn substep(&mut self, target_mps: f64) {
+        let wanted = ((target_mps - self.speed_mps) / RESPONSE_S).clamp(-BRAKING_MPS2, ACCELERATION_MPS2);
+        let change = JERK_MPS3 * SUBSTEP_S;
+        self.acceleration_mps2 += (wanted - self.acceleration_mps2).clamp(-change, change);
+        let before_mps = self.speed_mps;
+        self.speed_mps = (before_mps + self.acceleration_mps2 * SUBSTEP_S).max(0.0);
+        if self.speed_mps == 0.0 {
+            self.acceleration_mps2 = self.acceleration_mps2.max(0.0);
+        }
+        self.at_m += f64::midpoint(before_mps, self.speed_mps) * SUBSTEP_S;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A vehicle that brakes hard from 5 m/s stands within the limits of braking and jerk, and stays; one that starts
+    /// keeps the limit of acceleration and reaches its target.
+    #[test]
+    fn limits_hold() {
+        let mut vehicle = Vehicle::at_start(5.0);
+        for target_mps in [0.0, 8.0] {
+            let mut last = vehicle;
+            for _ in 0..400 {
+                vehicle.substep(target_mps);
+                let acceleration = (vehicle.speed_mps - last.speed_mps) / SUBSTEP_S;
+                assert!((-BRAKING_MPS2 - 1e-9..=ACCELERATION_MPS2 + 1e-9).contains(&acceleration), "{acceleration}");
+                assert!(vehicle.at_m >= last.at_m && vehicle.speed_mps <= 8.0 + 1e-9);
+                last = vehicle;
+            }
+            assert!((vehicle.speed_mps - target_mps).abs() < 0.01);
+            if target_mps == 0.0 {
+                assert!((5.0_f64.powi(2) / (2.0 * BRAKING_MPS2)..4.5).contains(&vehicle.at_m), "{}", vehicle.at_m);
+            }
+        }
+    }
+}

@@ -1,0 +1,75 @@
+//! The value of a look from further on: what images from poses ahead of the vehicle are expected to tell.
+
+use crate::Frames;
+use carff_checkpoint::FieldProbe;
+use carff_config::GraphConfig;
+use carff_decision::{Approach, look_gain_bits};
+use carff_messages::{Belief, LATENT_DIM};
+use carff_runtime::{EGO_MOTION, EgoMotion, LOOK, Look, StageContext};
+use carff_transport::{Publisher, Receiver};
+use carff_unknown::{Lanes, Sight};
+
+/// Ways ahead of the vehicle from where a look is judged, metres.
+const AHEAD_M: [f64; 4] = [1.5, 3.0, 4.5, 6.0];
+
+/// Publishes the value of a look from further on with each belief about the next step.
+#[derive(Debug)]
+pub struct Outlook {
+    sight: Sight,
+    states: Vec<[f32; LATENT_DIM]>,
+    hazards: Vec<bool>,
+    input: Receiver<EgoMotion>,
+    output: Publisher<Look>,
+    motion: Option<EgoMotion>,
+}
+
+impl Outlook {
+    /// Opens the topics; `None` where the controller does not ask.
+    pub fn open(stage: &StageContext, probe: &FieldProbe) -> anyhow::Result<Option<Self>> {
+        if !is_asked(&stage.graph) {
+            return Ok(None);
+        }
+        let (input, output) = (stage.input(&EGO_MOTION)?.polled(), stage.output(&LOOK)?);
+        let states = probe.states().iter().map(|state| state.mean).collect();
+        let hazards = probe.layout().hazard_states().to_vec();
+        Ok(Some(Self { sight: Sight::default(), states, hazards, input, output, motion: None }))
+    }
+
+    /// Publishes the value of a look for the vehicle's motion and the camera of the belief's frame. Without one of them
+    /// there is none.
+    pub fn publish(
+        &mut self,
+        probe: &FieldProbe,
+        frames: &Frames,
+        belief: &Belief,
+        threads: usize,
+    ) -> anyhow::Result<()> {
+        while let Some(motion) = self.input.next()? {
+            self.motion = Some(*motion);
+        }
+        let Some((camera, motion)) = frames.camera_of(&belief.header).zip(self.motion) else { return Ok(()) };
+        let probabilities = &belief.state_probability[..self.states.len().min(belief.state_probability.len())];
+        // More than all that is uncertain cannot be gained, and nothing needs to be rendered for nothing.
+        let most = look_gain_bits(probabilities, &self.hazards, |a, b| a == b);
+        let (mut gain_bits, mut ahead_m) = (0.0, 0.0);
+        for at_m in AHEAD_M.into_iter().filter(|at_m| most > 0.0 && *at_m < motion.to_conflict_m) {
+            let mut ahead = camera;
+            ahead.world_from_camera[0][3] += at_m * motion.heading.cos();
+            ahead.world_from_camera[1][3] += at_m * motion.heading.sin();
+            let lanes: &Lanes = frames.lanes();
+            if !self.sight.look(probe.field(), &self.states, lanes, &ahead, threads) {
+                continue;
+            }
+            let gain = look_gain_bits(probabilities, &self.hazards, |a, b| self.sight.alike(a, b));
+            if gain > gain_bits {
+                (gain_bits, ahead_m) = (gain, at_m);
+            }
+        }
+        let look = Look { header: belief.header, gain_bits: gain_bits as f32, ahead_m: ahead_m as f32 };
+        Ok(self.output.send(look)?)
+    }
+}
+
+fn is_asked(graph: &GraphConfig) -> bool {
+    graph.controller.approach == Approach::Look
+}

@@ -1,0 +1,147 @@
+//! How a vehicle approaches a place where others drive: from a rule's decision to an action with a target speed.
+//!
+//! A rule says whether the place must be assumed taken. The approach says how fast the vehicle drives on until then. It
+//! never drives faster than it can stop before that place, and it leaves the place once it can no longer stop.
+
+use carff_messages::ActionCode;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+/// Braking that a planned stop uses, and the hardest braking, m/s².
+const BRAKING_MPS2: f64 = 2.5;
+const HARDEST_MPS2: f64 = 6.0;
+/// Space between a stopped vehicle and the place where others drive, metres.
+const SPACE_M: f64 = 0.6;
+/// Distance of the first stop of [`Approach::Peek`] from that place, metres.
+const STOP_LINE_M: f64 = 3.0;
+/// A look that is expected to tell less than this, in bits, is not worth driving on for.
+const LEAST_GAIN_BITS: f64 = 0.1;
+/// Slowest speed at which a vehicle creeps, m/s; below, it halts.
+const SLOWEST_MPS: f64 = 0.05;
+
+/// What the vehicle does while its rule does not let it advance.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+pub enum Approach {
+    /// It halts where it is.
+    #[default]
+    Stop,
+    /// It assumes that somebody is coming: it creeps up to the place, and waits there.
+    Phantom,
+    /// It stops ahead of the place, then creeps up to it, as Autoware's module for occluded intersections does.
+    Peek,
+    /// It drives on while a look from further on is expected to tell more, as fast as it can still stop; else it creeps.
+    Look,
+}
+
+/// Motion of the vehicle with respect to the place where others drive.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Motion {
+    /// Speed, m/s.
+    pub speed_mps: f64,
+    /// Way until the vehicle would be in the way of others, metres; negative within and behind the place.
+    pub to_conflict_m: f64,
+}
+
+/// Speeds of a vehicle, m/s.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Speeds {
+    /// Speed of [`ActionCode::Advance`].
+    pub advance_mps: f64,
+    /// Highest speed of a creeping vehicle.
+    pub creep_mps: f64,
+}
+
+/// An action with its target speed, m/s.
+pub type Drive = (ActionCode, f64);
+
+impl Approach {
+    /// Returns the action of a vehicle whose rule says to halt or not.
+    ///
+    /// `look_gain_bits` is the expected drop of the uncertainty by a look from further on. Without a known motion, the
+    /// vehicle halts or advances as the rule says.
+    ///
+    /// ```
+    /// use carff_decision::{Approach, Motion, Speeds};
+    /// use carff_messages::ActionCode;
+    /// let speeds = Speeds { advance_mps: 5.0, creep_mps: 1.5 };
+    /// let far = Some(Motion { speed_mps: 5.0, to_conflict_m: 8.0 });
+    /// assert_eq!(Approach::Stop.drive(true, 0.0, far, speeds), (ActionCode::Halt, 0.0));
+    /// assert_eq!(Approach::Phantom.drive(true, 0.0, far, speeds), (ActionCode::Creep, 1.5));
+    /// assert_eq!(Approach::Look.drive(true, 0.8, far, speeds), (ActionCode::Creep, 5.0));
+    /// ```
+    pub fn drive(self, halt: bool, look_gain_bits: f64, motion: Option<Motion>, speeds: Speeds) -> Drive {
+        if !halt || motion.is_some_and(|motion| motion.is_committed()) {
+            return (ActionCode::Advance, speeds.advance_mps);
+        }
+        let Some(motion) = motion else { return (ActionCode::Halt, 0.0) };
+        let within = |limit_mps: f64, stop_m: f64| limit_mps.min(motion.stopping_mps(stop_m));
+        let speed_mps = match self {
+            Self::Stop => 0.0,
+            Self::Phantom => within(speeds.creep_mps, SPACE_M),
+            Self::Peek if motion.to_conflict_m > STOP_LINE_M + SPACE_M => within(speeds.advance_mps, STOP_LINE_M),
+            Self::Look if look_gain_bits >= LEAST_GAIN_BITS => within(speeds.advance_mps, SPACE_M),
+            Self::Peek | Self::Look => within(speeds.creep_mps, SPACE_M),
+        };
+        if speed_mps < SLOWEST_MPS { (ActionCode::Halt, 0.0) } else { (ActionCode::Creep, speed_mps) }
+    }
+}
+
+impl Motion {
+    /// Reports whether the vehicle is in the way of others, or cannot stop before it is.
+    fn is_committed(self) -> bool {
+        self.to_conflict_m <= 0.0 || self.speed_mps.powi(2) / (2.0 * HARDEST_MPS2) > self.to_conflict_m
+    }
+
+    /// Highest speed from which the vehicle stops a distance ahead of the place.
+    fn stopping_mps(self, ahead_m: f64) -> f64 {
+        (2.0 * BRAKING_MPS2 * (self.to_conflict_m - ahead_m).max(0.0)).sqrt()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SPEEDS: Speeds = Speeds { advance_mps: 5.0, creep_mps: 1.5 };
+
+    fn at(to_conflict_m: f64, speed_mps: f64) -> Option<Motion> {
+        Some(Motion { speed_mps, to_conflict_m })
+    }
+
+    /// No approach lets a vehicle be faster than it can stop before the place, wherever it is; at the place it halts.
+    #[test]
+    fn every_approach_can_stop() {
+        for approach in [Approach::Stop, Approach::Phantom, Approach::Peek, Approach::Look] {
+            for gain in [0.0, 1.0] {
+                for tenths in 0..200 {
+                    let to_conflict_m = f64::from(tenths) / 10.0 + 0.05;
+                    let (code, speed_mps) = approach.drive(true, gain, at(to_conflict_m, 0.0), SPEEDS);
+                    assert_ne!(code, ActionCode::Advance);
+                    assert!(speed_mps.powi(2) / (2.0 * BRAKING_MPS2) <= to_conflict_m, "{approach:?} {to_conflict_m}");
+                    assert_eq!(code == ActionCode::Halt, speed_mps == 0.0);
+                }
+                assert_eq!(approach.drive(true, gain, at(SPACE_M, 0.0), SPEEDS), (ActionCode::Halt, 0.0));
+            }
+        }
+    }
+
+    /// Where a vehicle can no longer stop, or already is in the way, it drives on.
+    #[test]
+    fn a_committed_vehicle_leaves() {
+        let advance = (ActionCode::Advance, 5.0);
+        assert_eq!(Approach::Look.drive(true, 0.0, at(-1.0, 0.0), SPEEDS), advance);
+        assert_eq!(Approach::Stop.drive(true, 0.0, at(1.0, 4.0), SPEEDS), advance);
+        assert_eq!(Approach::Stop.drive(true, 0.0, at(3.0, 4.0), SPEEDS).0, ActionCode::Halt);
+        assert_eq!(Approach::Look.drive(false, 0.0, None, SPEEDS), advance);
+    }
+
+    /// Without anything to learn from further on, a vehicle that looks creeps; peeking stops first.
+    #[test]
+    fn approaches_differ() {
+        assert_eq!(Approach::Look.drive(true, 0.01, at(10.0, 3.0), SPEEDS).1, SPEEDS.creep_mps);
+        assert!(Approach::Peek.drive(true, 0.0, at(STOP_LINE_M + SPACE_M + 0.1, 3.0), SPEEDS).1 < 2.0);
+        assert_eq!(Approach::Peek.drive(true, 0.0, at(STOP_LINE_M, 0.0), SPEEDS).1, SPEEDS.creep_mps);
+        assert_eq!(Approach::Look.drive(true, 1.0, None, SPEEDS), (ActionCode::Halt, 0.0));
+    }
+}
