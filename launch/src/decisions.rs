@@ -16,10 +16,21 @@ use std::io::{LineWriter, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+/// The lines that a run prints.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Shown {
+    /// None.
+    Nothing,
+    /// One for each drive, or for each change of the action of a source without drives.
+    Drives,
+    /// One for each frame.
+    Frames,
+}
+
 /// The decisions of a run: one result line for each drive, or, where asked for, one line for each frame.
 pub(crate) struct Decisions {
     terminal: Arc<Terminal>,
-    verbose: bool,
+    shown: Shown,
     drives: u32,
     frames_per_timestamp: u32,
     scenario: Option<ScenarioInfo>,
@@ -38,7 +49,7 @@ impl Decisions {
     pub(crate) fn new(
         graph: &GraphConfig,
         drives: u32,
-        verbose: bool,
+        shown: Shown,
         path: Option<&Path>,
         scenario: Option<ScenarioInfo>,
         terminal: &Arc<Terminal>,
@@ -55,7 +66,7 @@ impl Decisions {
         };
         Ok(Self {
             terminal: terminal.clone(),
-            verbose,
+            shown,
             drives,
             frames_per_timestamp: graph.camera.frames_per_timestamp,
             scenario,
@@ -78,7 +89,7 @@ impl Decisions {
         }
         let is_change =
             frame.drive < 0 && self.action.replace(frame.action.unwrap_or(ActionCode::Halt)) != frame.action;
-        if self.verbose || is_change {
+        if self.shown == Shown::Frames || is_change && self.shown == Shown::Drives {
             self.terminal.line(&self.frame_line(frame));
         }
         if frame.drive >= 0 {
@@ -97,7 +108,7 @@ impl Decisions {
 
     fn end_drive(&mut self) {
         let frames = std::mem::take(&mut self.drive);
-        if let Some(last) = frames.last().filter(|_| !self.verbose) {
+        if let Some(last) = frames.last().filter(|_| self.shown == Shown::Drives) {
             self.terminal.line(&self.drive_line(last.drive, &frames));
         }
     }

@@ -1,6 +1,6 @@
 //! `carff launch`: starts a graph, watches it, prints its decisions, ends it, and writes a report.
 
-use crate::decisions::Decisions;
+use crate::decisions::{Decisions, Shown};
 use crate::planning::{Planning, RunOutcome};
 use crate::report::{self, ReportFiles};
 use crate::supervision::monitor::FrameRecord;
@@ -170,7 +170,12 @@ pub(crate) fn run_graph(
     };
     let drives = args.drives.unwrap_or(graph.camera.drives);
     let decisions = args.decisions.as_deref();
-    let mut decisions = Decisions::new(&graph, drives, args.verbose, decisions, scenario.clone(), terminal)?;
+    let shown = match (args.quiet, args.verbose) {
+        (true, _) => Shown::Nothing,
+        (_, true) => Shown::Frames,
+        _ => Shown::Drives,
+    };
+    let mut decisions = Decisions::new(&graph, drives, shown, decisions, scenario.clone(), terminal)?;
     // From here on Ctrl-C ends the run in order. Before, no stage runs, and the process may simply end.
     let stop = Stop::on_signals().context("cannot handle signals")?;
     let view_bytes = carff_messages::rgb_bytes(graph.renderer.width_px, graph.renderer.height_px);
@@ -188,12 +193,7 @@ pub(crate) fn run_graph(
 
     let result = {
         let node = Node::open(&run, "launcher")?;
-        let quiet = args.quiet;
-        let mut decided = |frame: &FrameRecord| {
-            if !quiet {
-                decisions.take(frame)
-            }
-        };
+        let mut decided = |frame: &FrameRecord| decisions.take(frame);
         let mut supervisor = Supervisor::new(&node, &graph, (folder, stage_args), &stop, terminal, &mut decided)?;
         let result = supervisor.drive(&run, &stop, feed);
         terminal.status(String::new());

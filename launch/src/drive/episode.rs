@@ -6,9 +6,7 @@ use carff_scenes::{ClosedLoop, Episode};
 
 /// Speed below which the ego stands, m/s.
 const STANDS_MPS: f64 = 0.05;
-/// Braking of the planner that knows the truth, m/s², and the space that it keeps to the place where others drive and to
-/// each of them, metres.
-const ORACLE_BRAKING_MPS2: f64 = 2.5;
+/// Space that the planner that knows the truth keeps to the place where others drive, and to each of them, metres.
 const ORACLE_SPACE_M: f64 = 0.6;
 const ORACLE_GAP_M: f64 = 0.6;
 
@@ -75,7 +73,7 @@ impl<'a> Drive<'a> {
         let mut ahead = Self { least_gap_m: f64::INFINITY, ..self.clone() };
         while ahead.substep(fast_mps).is_none() {}
         let passes = ahead.least_gap_m >= ORACLE_GAP_M;
-        let stop_mps = (2.0 * ORACLE_BRAKING_MPS2 * (to_conflict_m - ORACLE_SPACE_M).max(0.0)).sqrt();
+        let stop_mps = carff_decision::stopping_mps(to_conflict_m - ORACLE_SPACE_M);
         if passes || to_conflict_m <= 0.0 { fast_mps } else { fast_mps.min(stop_mps) }
     }
 

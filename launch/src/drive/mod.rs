@@ -63,6 +63,9 @@ pub struct DriveArgs {
     /// Write the results here, as JSON.
     #[arg(long, value_name = "FILE")]
     pub json: Option<PathBuf>,
+    /// Write each decision here as one JSON line.
+    #[arg(long, value_name = "FILE")]
+    pub decisions: Option<PathBuf>,
     /// Set a key of the graph's configuration, for example `run.samples=35`; may be given several times.
     #[arg(long, value_name = "KEY=VALUE")]
     pub set: Vec<String>,
@@ -120,6 +123,7 @@ fn rate(text: &str) -> Result<f64, String> {
 /// Drives all episodes, prints their figures and writes them.
 pub fn run(args: &DriveArgs) -> anyhow::Result<ExitCode> {
     args.json.as_deref().map_or(Ok(()), check_writable)?;
+    args.decisions.as_deref().map_or(Ok(()), check_writable)?;
     let file = find_scenario(&args.scenario)?;
     let drives = ClosedLoop::new(Scenario::load(&file)?)?;
     let manifest = Manifest::load(&args.checkpoint)?;
@@ -156,6 +160,7 @@ pub fn run(args: &DriveArgs) -> anyhow::Result<ExitCode> {
         set: args.set.clone(),
         run: Some(args.run.clone()),
         stages: args.stages.clone(),
+        decisions: args.decisions.clone(),
         quiet: true,
         ..LaunchArgs::default()
     };

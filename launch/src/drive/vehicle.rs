@@ -1,7 +1,7 @@
 //! The motion of the ego along its way: speed, with limits of acceleration, braking and jerk.
 
 /// Largest acceleration and braking, m/s².
-const ACCELERATION_MPS2: f64 = 2.5;
+const ACCELERATION_MPS2: f64 = 3.0;
 const BRAKING_MPS2: f64 = 6.0;
 /// Largest change of the acceleration, m/s³.
 const JERK_MPS3: f64 = 20.0;

@@ -10,6 +10,8 @@ use serde::{Deserialize, Serialize};
 /// Braking that a planned stop uses, and the hardest braking, m/s².
 const BRAKING_MPS2: f64 = 2.5;
 const HARDEST_MPS2: f64 = 6.0;
+/// Time until a vehicle brakes as planned, seconds.
+const REACTION_S: f64 = 0.5;
 /// Space between a stopped vehicle and the place where others drive, metres.
 const SPACE_M: f64 = 0.6;
 /// Distance of the first stop of [`Approach::Peek`] from that place, metres.
@@ -95,8 +97,20 @@ impl Motion {
 
     /// Highest speed from which the vehicle stops a distance ahead of the place.
     fn stopping_mps(self, ahead_m: f64) -> f64 {
-        (2.0 * BRAKING_MPS2 * (self.to_conflict_m - ahead_m).max(0.0)).sqrt()
+        stopping_mps(self.to_conflict_m - ahead_m)
     }
+}
+
+/// Returns the highest speed from which a vehicle stops within a distance, m/s, with planned braking after its reaction
+/// time; 0 for a negative distance.
+///
+/// ```
+/// assert_eq!(carff_decision::stopping_mps(0.0), 0.0);
+/// assert!((carff_decision::stopping_mps(5.0) - 3.9).abs() < 0.1);
+/// ```
+pub fn stopping_mps(distance_m: f64) -> f64 {
+    let reaction_mps = BRAKING_MPS2 * REACTION_S;
+    (reaction_mps.powi(2) + 2.0 * BRAKING_MPS2 * distance_m.max(0.0)).sqrt() - reaction_mps
 }
 
 #[cfg(test)]

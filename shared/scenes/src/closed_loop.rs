@@ -17,8 +17,6 @@ use rand::Rng;
 
 /// Name of the random stream.
 const STREAM: u32 = Key::named("loop", 0, 0).step;
-/// Space that the ego keeps around itself where its way meets a lane, metres.
-const MARGIN_M: f64 = 0.3;
 /// Length by which the line of the others' course is extended in both directions, metres.
 const EXTENDED_M: f64 = 80.0;
 /// Step of the search for the place where the ways meet, metres.
@@ -189,7 +187,7 @@ impl ClosedLoop {
     fn find_conflict(&self) -> Option<[f64; 2]> {
         let width_m = self.scenario.config().vehicle[self.actor].size_m[1];
         let strips = self.lane.strips(width_m);
-        let meets = |at_m: f64| strips.iter().any(|strip| self.ego_box(at_m).gap_m(strip) < MARGIN_M);
+        let meets = |at_m: f64| strips.iter().any(|strip| self.ego_box(at_m).gap_m(strip) < self.config.space_m);
         let places = (0..=(self.length_m() / SEARCH_M) as usize).map(|i| i as f64 * SEARCH_M);
         let met: Vec<f64> = places.filter(|&at_m| meets(at_m)).collect();
         Some([*met.first()?, *met.last()?])

@@ -1,6 +1,6 @@
 //! Closed-loop drives: the ego's way, its camera, and the vehicles that may come.
 
-use super::{in_range, range, vector, whole};
+use super::{clearance, in_range, range, vector, whole};
 use schemars::JsonSchema;
 use serde::de::Error as _;
 use serde::{Deserialize, Deserializer};
@@ -35,10 +35,18 @@ pub struct ClosedLoopConfig {
     /// Direction of the camera on the ego's roof, degrees to the left.
     #[serde(deserialize_with = "range")]
     pub camera_left_deg: [f64; 2],
+    /// Space that the ego keeps to the lane of the others while it waits, metres, 0.001 to 100. Default 0.3.
+    #[serde(default = "default_space", deserialize_with = "clearance")]
+    #[schemars(range(min = 0.001, max = 100.0))]
+    pub space_m: f64,
     /// Time after which a drive that has not arrived ends, seconds, 1 to 600. Default 40.
     #[serde(default = "default_limit", deserialize_with = "limit")]
     #[schemars(range(min = 1.0, max = 600.0))]
     pub limit_s: f64,
+}
+
+fn default_space() -> f64 {
+    0.3
 }
 
 fn default_limit() -> f64 {
