@@ -28,6 +28,7 @@ enum {
 enum {
     CARFF_ACTION_CODE_HALT = 0,
     CARFF_ACTION_CODE_ADVANCE = 1,
+    CARFF_ACTION_CODE_CREEP = 2,
 };
 
 enum {
@@ -374,7 +375,7 @@ static_assert(offsetof(CarffViewMeta, intrinsics) == 112, "CarffViewMeta.intrins
 static_assert(offsetof(CarffViewMeta, world_from_camera) == 144, "CarffViewMeta.world_from_camera");
 static_assert(offsetof(CarffViewMeta, stage_latency_ns) == 272, "CarffViewMeta.stage_latency_ns");
 
-#define CARFF_ACTION_TYPE_NAME "carff.Action.v2"
+#define CARFF_ACTION_TYPE_NAME "carff.Action.v3"
 typedef struct CarffAction {
     CarffHeader header;
     uint32_t action;
@@ -388,9 +389,11 @@ typedef struct CarffAction {
     uint64_t valid_until_ns;
     uint64_t based_on_frame;
     uint64_t latency_ns;
+    float target_speed_mps;
+    float look_gain_bits;
 } CarffAction;
 
-static_assert(sizeof(CarffAction) == 112, "CarffAction");
+static_assert(sizeof(CarffAction) == 120, "CarffAction");
 static_assert(offsetof(CarffAction, header) == 0, "CarffAction.header");
 static_assert(offsetof(CarffAction, action) == 56, "CarffAction.action");
 static_assert(offsetof(CarffAction, reason) == 60, "CarffAction.reason");
@@ -403,6 +406,8 @@ static_assert(offsetof(CarffAction, unknown_probability) == 84, "CarffAction.unk
 static_assert(offsetof(CarffAction, valid_until_ns) == 88, "CarffAction.valid_until_ns");
 static_assert(offsetof(CarffAction, based_on_frame) == 96, "CarffAction.based_on_frame");
 static_assert(offsetof(CarffAction, latency_ns) == 104, "CarffAction.latency_ns");
+static_assert(offsetof(CarffAction, target_speed_mps) == 112, "CarffAction.target_speed_mps");
+static_assert(offsetof(CarffAction, look_gain_bits) == 116, "CarffAction.look_gain_bits");
 
 #define CARFF_HEALTH_TYPE_NAME "carff.Health.v1"
 typedef struct CarffHealth {

@@ -135,8 +135,9 @@ impl Decisions {
     }
 
     fn frame_line(&self, frame: &FrameRecord) -> String {
-        let halted = frame.action != Some(ActionCode::Advance);
-        let action = self.terminal.alarm(action_name(halted), halted);
+        let halted = !matches!(frame.action, Some(ActionCode::Advance | ActionCode::Creep));
+        let name = if frame.action == Some(ActionCode::Creep) { "creep  " } else { action_name(halted) };
+        let action = self.terminal.alarm(name, halted);
         format!(
             "{}  hazard {:.2}  {action}  {:>6.1} ms",
             self.place(frame),

@@ -145,6 +145,8 @@ fn controller(stage: &mut StageContext) -> anyhow::Result<()> {
                 valid_until_ns: monotonic_now_ns(),
                 based_on_frame: belief.header.frame_id,
                 latency_ns: 1,
+                target_speed_mps: 0.0,
+                look_gain_bits: 0.0,
             })?;
         }
     }

@@ -27,6 +27,7 @@ class Stage(IntEnum):
 class ActionCode(IntEnum):
     HALT = 0
     ADVANCE = 1
+    CREEP = 2
 
 
 class Reason(IntEnum):
@@ -320,11 +321,13 @@ class Action(ctypes.Structure):
         ("valid_until_ns", ctypes.c_uint64),
         ("based_on_frame", ctypes.c_uint64),
         ("latency_ns", ctypes.c_uint64),
+        ("target_speed_mps", ctypes.c_float),
+        ("look_gain_bits", ctypes.c_float),
     ]
 
     @staticmethod
     def type_name() -> str:
-        return "carff.Action.v2"
+        return "carff.Action.v3"
 
 
 class Health(ctypes.Structure):
@@ -364,7 +367,7 @@ LAYOUTS = {
     UnknownBox: (56, 8, {"center": 0, "half_size": 24, "probability": 48, "place": 52}),
     Unknowns: (824, 8, {"header": 0, "box_count": 56, "state_count": 60, "probability": 64, "residual": 68, "noise": 72, "gain": 76, "offset": 88, "explained": 100, "ratios": 104, "prior": 360, "boxes": 368, "stage_latency_ns": 816}),
     ViewMeta: (280, 8, {"header": 0, "hypothesis": 56, "kind": 60, "state": 64, "width_px": 68, "height_px": 72, "probability": 76, "latent": 80, "intrinsics": 112, "world_from_camera": 144, "stage_latency_ns": 272}),
-    Action: (112, 8, {"header": 0, "action": 56, "reason": 60, "rule": 64, "sample_count": 68, "confidence": 72, "hazard_probability": 76, "is_decision": 80, "unknown_probability": 84, "valid_until_ns": 88, "based_on_frame": 96, "latency_ns": 104}),
+    Action: (120, 8, {"header": 0, "action": 56, "reason": 60, "rule": 64, "sample_count": 68, "confidence": 72, "hazard_probability": 76, "is_decision": 80, "unknown_probability": 84, "valid_until_ns": 88, "based_on_frame": 96, "latency_ns": 104, "target_speed_mps": 112, "look_gain_bits": 116}),
     Health: (144, 8, {"header": 0, "stage": 56, "state": 60, "pid": 64, "received": 72, "published": 80, "skipped": 88, "invalid": 96, "errors": 104, "last_latency_ns": 112, "max_latency_ns": 120, "last_progress_ns": 128, "rss_bytes": 136}),
 }
 

@@ -61,6 +61,8 @@ mod tests {
             valid_until_ns: 0,
             based_on_frame: 7,
             latency_ns: 0,
+            target_speed_mps: 0.0,
+            look_gain_bits: 0.0,
         }
     }
 

@@ -331,9 +331,13 @@ impl Scene {
         });
         let action = self.action.filter(|action| action.based_on_frame == frame);
         let belief = self.belief.filter(|belief| belief.header.frame_id == frame);
-        let halts = action.is_some_and(|action| action.code() != Ok(ActionCode::Advance));
-        let decision =
-            action.map_or("no decision", |a| if a.code() == Ok(ActionCode::Advance) { "advance" } else { "HALT" });
+        let code = action.map(|action| action.code().unwrap_or(ActionCode::Halt));
+        let halts = code == Some(ActionCode::Halt);
+        let decision = match code {
+            None => "no decision",
+            Some(ActionCode::Halt) => "HALT",
+            Some(other) => other.name(),
+        };
         let reason = action.and_then(|action| action.reason().ok()).map_or("-", Reason::name);
         let hazard = belief.map_or("-".to_owned(), |b| format!("{:.2}", b.hazard_probability));
         Board {

@@ -354,6 +354,8 @@ mod tests {
             valid_until_ns: 1,
             based_on_frame: 7,
             latency_ns,
+            target_speed_mps: 0.0,
+            look_gain_bits: 0.0,
         }
     }
 

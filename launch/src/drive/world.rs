@@ -15,6 +15,8 @@ use std::sync::{Arc, Mutex};
 
 /// Longest wait for a frame's decision in lock-step, nanoseconds. The ego is then to halt.
 const PATIENCE_NS: u64 = 5_000_000_000;
+/// Frame numbers of an episode: its random draws then do not depend on the episodes before it.
+const FRAMES_PER_EPISODE: u64 = 100_000;
 /// Wait after the last frame, nanoseconds: its decision is still recorded.
 const LINGER_NS: u64 = 200_000_000;
 
@@ -58,10 +60,10 @@ impl World {
             action: None,
             waiter: Waiter::new(stop.clone()),
         };
-        let (mut frame_id, mut collided) = (0, 0);
+        let mut collided = 0;
         for number in self.episodes.clone() {
             let episode = self.drives.episode(number, self.seed, self.actors);
-            let Some(result) = self.drive(&mut topics, number, episode, &mut frame_id)? else { return Ok(()) };
+            let Some(result) = self.drive(&mut topics, number, episode)? else { return Ok(()) };
             collided += u64::from(result.outcome == super::results::Outcome::Collided);
             let done = number + 1 - self.episodes.start;
             let all = self.episodes.end - self.episodes.start;
@@ -73,31 +75,26 @@ impl World {
     }
 
     /// Drives one episode; `None` if it is stopped.
-    fn drive(
-        &self,
-        topics: &mut Topics,
-        number: u64,
-        episode: Episode,
-        frame_id: &mut u64,
-    ) -> anyhow::Result<Option<EpisodeResult>> {
-        let (take_start, frame_s) = (*frame_id, 1.0 / self.frame_rate_hz);
+    fn drive(&self, topics: &mut Topics, number: u64, episode: Episode) -> anyhow::Result<Option<EpisodeResult>> {
+        let (take_start, frame_s) = (number * FRAMES_PER_EPISODE, 1.0 / self.frame_rate_hz);
+        let mut frame_id = take_start;
         let mut drive = Drive::begin(&self.drives, number, episode);
         topics.action = None;
         let mut next_ns = monotonic_now_ns();
         loop {
-            let header = Header::of_frame(*frame_id, monotonic_now_ns(), self.seed);
+            let header = Header::of_frame(frame_id, monotonic_now_ns(), self.seed);
             self.publish(topics, &drive, header, (number, take_start))?;
             next_ns += (frame_s * 1e9) as u64;
             let action = if self.is_real_time {
                 topics.newest_at(next_ns)?
             } else {
-                topics.decision_on(*frame_id, monotonic_now_ns() + PATIENCE_NS)?
+                topics.decision_on(frame_id, monotonic_now_ns() + PATIENCE_NS)?
             };
             let Ok(action) = action else { return Ok(None) };
             drive.missed += u64::from(action.is_none());
             let told_mps = action.map_or(0.0, |action| f64::from(action.target_speed_mps));
             let target_mps = if self.is_oracle { drive.oracle_mps() } else { told_mps };
-            *frame_id += 1;
+            frame_id += 1;
             if let Some(result) = drive.step(target_mps, frame_s) {
                 return Ok(Some(result));
             }

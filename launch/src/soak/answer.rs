@@ -102,6 +102,8 @@ mod tests {
             valid_until_ns: 1,
             based_on_frame: frame_id,
             latency_ns: 0,
+            target_speed_mps: 0.0,
+            look_gain_bits: 0.0,
         }
     }
 

@@ -379,6 +379,8 @@ mod tests {
             valid_until_ns: (at_ms + 150) * MS,
             based_on_frame: frame_id,
             latency_ns: (at_ms - frame_id * 100) * MS,
+            target_speed_mps: 0.0,
+            look_gain_bits: 0.0,
         }
     }
 

@@ -6,7 +6,7 @@ use carff_base::geometry::OrientedBox;
 use carff_base::random::{Key, uniform};
 use carff_controller::{Controller, Settings};
 use carff_decision::{
-    Draw, Evidence, Mixture, Place, Policy, ProbeLayout, Probed, Reading, Resolved, Sampling, Step,
+    Approach, Draw, Evidence, Mixture, Place, Policy, ProbeLayout, Probed, Reading, Resolved, Sampling, Speeds, Step,
     set_mixture_and_draws,
 };
 use carff_messages::{
@@ -84,6 +84,8 @@ fn act(policy: Policy, layout: &ProbeLayout, steps: &[Step]) -> Action {
         period_ns: 50 * MS,
         seed: 1,
         ignores_unknown: false,
+        approach: Approach::Stop,
+        speeds: Speeds { advance_mps: 5.0, creep_mps: 1.5 },
     });
     let mut action = None;
     for (k, step) in steps.iter().enumerate() {

@@ -123,6 +123,8 @@ mod tests {
             valid_until_ns: 9_000,
             based_on_frame: 7,
             latency_ns: 1_000,
+            target_speed_mps: 0.0,
+            look_gain_bits: 0.0,
         }
     }
 

@@ -509,6 +509,8 @@ mod tests {
             valid_until_ns: 0,
             based_on_frame: 4,
             latency_ns: 2_500_000,
+            target_speed_mps: 0.0,
+            look_gain_bits: 0.0,
         };
         let mut last = None;
         let stream = [

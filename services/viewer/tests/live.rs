@@ -106,6 +106,8 @@ fn watches_a_run_from_frame_to_decision() {
         valid_until_ns: 0,
         based_on_frame: 4,
         latency_ns: 8_000_000,
+        target_speed_mps: 0.0,
+        look_gain_bits: 0.0,
     };
     actions.send(action).unwrap();
     let decision = wait_for(|| feed.watched().journal.decisions().next().cloned());

@@ -79,6 +79,8 @@ fn messages(frame_id: u64) -> Vec<(TopicId, OwnedMessage)> {
         valid_until_ns: 77,
         based_on_frame: frame_id,
         latency_ns: 20,
+        target_speed_mps: 0.0,
+        look_gain_bits: 0.0,
     };
     vec![
         (TopicId::FRAME, OwnedMessage::new(Box::new(meta), pixels)),

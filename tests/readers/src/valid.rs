@@ -46,6 +46,8 @@ pub(crate) fn action() -> Action {
         valid_until_ns: 77,
         based_on_frame: 1,
         latency_ns: 20,
+        target_speed_mps: 0.0,
+        look_gain_bits: 0.0,
     }
 }
 

@@ -34,7 +34,7 @@ pub(super) fn run(args: &BeliefArgs) -> anyhow::Result<()> {
             let message = message.message();
             if let Some(action) = message.get::<Action>() {
                 decided = match action.code() {
-                    Ok(ActionCode::Advance) => "advance".to_owned(),
+                    Ok(code @ (ActionCode::Advance | ActionCode::Creep)) => code.name().to_owned(),
                     _ => format!("HALT ({})", action.reason().map_or("unknown", carff_messages::Reason::name)),
                 };
             } else if let Some(belief) = message.get::<Belief>() {

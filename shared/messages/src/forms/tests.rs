@@ -142,6 +142,8 @@ fn messages_survive_their_forms() {
             valid_until_ns: 99,
             based_on_frame: u64::MAX,
             latency_ns: 0,
+            target_speed_mps: 0.0,
+            look_gain_bits: 0.0,
         };
         assert_eq!(there_and_back(&action), action);
     }
