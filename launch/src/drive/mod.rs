@@ -38,7 +38,7 @@ pub struct DriveArgs {
     /// Checkpoint folder, trained for the scenario.
     #[arg(long)]
     pub checkpoint: PathBuf,
-    /// What the ego drives by.
+    /// The rule that the ego drives by.
     #[arg(long, value_enum, default_value_t = DriveRule::Look)]
     pub rule: DriveRule,
     /// Number of episodes.
@@ -77,7 +77,7 @@ pub struct DriveArgs {
     pub stages: Option<PathBuf>,
 }
 
-/// What the ego drives by.
+/// The rule that the ego drives by.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub enum DriveRule {
     /// Never drives on.
@@ -92,7 +92,7 @@ pub enum DriveRule {
     Phantom,
     /// The same threshold; stops ahead of that place, then creeps.
     Peek,
-    /// The same threshold; drives on while a look from further on tells more.
+    /// The same threshold; drives on while a look from further on shows more.
     Look,
     /// A planner that knows the truth.
     Oracle,

@@ -6,7 +6,7 @@ use carff_transport::{Topic, topics};
 /// Largest number of other vehicles.
 pub(super) const MAX_ACTORS: usize = 3;
 
-/// Where everyone is when a frame is taken.
+/// Poses of everyone when a frame is taken.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Default, PartialEq, ZeroCopySend)]
 #[type_name("carff.WorldTruth.v1")]

@@ -20,7 +20,7 @@ pub struct Settings {
     pub seed: u64,
     /// True to decide as if nothing unknown could be there.
     pub ignores_unknown: bool,
-    /// What the vehicle does while the rule does not let it advance, and its speeds.
+    /// Behaviour of the vehicle while the rule does not let it advance.
     pub approach: Approach,
     /// Speeds of the vehicle.
     pub speeds: Speeds,
@@ -109,7 +109,7 @@ impl Controller {
         self.motion = Some(*motion);
     }
 
-    /// Records what a look from further on would tell. Only decisions on its frame use it.
+    /// Records the value of a look from further on. Only decisions on its frame use it.
     pub fn on_look(&mut self, look: &Look) {
         self.look = Some(*look);
     }

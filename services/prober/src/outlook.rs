@@ -1,4 +1,4 @@
-//! The value of a look from further on: what images from poses ahead of the vehicle are expected to tell.
+//! The value of a look from further on: the expected information of images from poses ahead of the vehicle.
 
 use crate::Frames;
 use carff_checkpoint::FieldProbe;

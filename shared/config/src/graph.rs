@@ -183,7 +183,7 @@ pub struct ControllerConfig {
     /// Threshold on the hazard probability for the calibrated rule, 0 to 1. Default: the checkpoint's threshold.
     #[schemars(range(min = 0.0, max = 1.0))]
     pub threshold: Option<f64>,
-    /// What the vehicle does while the rule does not let it advance: `stop`, or, where the topic `ego/motion` is
+    /// Behaviour of the vehicle while the rule does not let it advance: `stop`, or, where the topic `ego/motion` is
     /// published, `phantom`, `peek` or `look`. Default `stop`.
     pub approach: Approach,
     /// Target speed of `advance`, m/s, 0.1 to 60. Default 5.

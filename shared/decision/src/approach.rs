@@ -1,6 +1,6 @@
 //! How a vehicle approaches a place where others drive: from a rule's decision to an action with a target speed.
 //!
-//! A rule says whether the place must be assumed taken. The approach says how fast the vehicle drives on until then. It
+//! A rule decides whether the place must be assumed taken. The approach decides how fast the vehicle drives on until then. It
 //! never drives faster than it can stop before that place, and it leaves the place once it can no longer stop.
 
 use carff_messages::ActionCode;
@@ -16,12 +16,12 @@ const REACTION_S: f64 = 0.5;
 const SPACE_M: f64 = 0.6;
 /// Distance of the first stop of [`Approach::Peek`] from that place, metres.
 const STOP_LINE_M: f64 = 3.0;
-/// A look that is expected to tell less than this, in bits, is not worth driving on for.
+/// A look that is expected to show less than this, in bits, is not worth driving on for.
 const LEAST_GAIN_BITS: f64 = 0.1;
 /// Slowest speed at which a vehicle creeps, m/s; below, it halts.
 const SLOWEST_MPS: f64 = 0.05;
 
-/// What the vehicle does while its rule does not let it advance.
+/// Behaviour of a vehicle while its rule does not let it advance.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum Approach {
@@ -32,7 +32,7 @@ pub enum Approach {
     Phantom,
     /// It stops ahead of the place, then creeps up to it, as Autoware's module for occluded intersections does.
     Peek,
-    /// It drives on while a look from further on is expected to tell more, as fast as it can still stop; else it creeps.
+    /// It drives on while a look from further on is expected to show more, as fast as it can still stop; else it creeps.
     Look,
 }
 
@@ -58,10 +58,10 @@ pub struct Speeds {
 pub type Drive = (ActionCode, f64);
 
 impl Approach {
-    /// Returns the action of a vehicle whose rule says to halt or not.
+    /// Returns the action of a vehicle by its rule's decision to halt or not.
     ///
     /// `look_gain_bits` is the expected drop of the uncertainty by a look from further on. Without a known motion, the
-    /// vehicle halts or advances as the rule says.
+    /// vehicle halts or advances by the rule.
     ///
     /// ```
     /// use carff_decision::{Approach, Motion, Speeds};

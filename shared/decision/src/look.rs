@@ -2,13 +2,13 @@
 
 /// Returns the expected drop of the uncertainty about the hazard by one more image, bits, 0..=1.
 ///
-/// `probabilities` are those of the known states; they need not add up to 1. `alike` says for each pair of states whether
-/// they look the same in the image, which then cannot tell them apart.
+/// `probabilities` are those of the known states; they need not add up to 1. `alike` reports for each pair of states whether
+/// they look the same in the image, which then cannot separate them.
 ///
 /// ```
 /// use carff_decision::look_gain_bits;
 /// let (even, hazards) = ([0.5, 0.5], [true, false]);
-/// // An image that tells the two states apart gains the whole bit; one that shows neither gains nothing.
+/// // An image that separates the two states gains the whole bit; one that shows neither gains nothing.
 /// assert_eq!(look_gain_bits(&even, &hazards, |a, b| a == b), 1.0);
 /// assert_eq!(look_gain_bits(&even, &hazards, |_, _| true), 0.0);
 /// ```
@@ -40,7 +40,7 @@ fn entropy_bits(a: f64, b: f64) -> f64 {
 mod tests {
     use super::*;
 
-    /// Nothing can be gained where the hazard is certain, and by an image that tells only harmless states apart.
+    /// Nothing can be gained where the hazard is certain, and by an image that separates only harmless states.
     #[test]
     fn certainty_gains_nothing() {
         let hazards = [true, true, false, false];

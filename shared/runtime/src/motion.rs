@@ -42,7 +42,7 @@ pub struct Look {
     pub header: Header,
     /// Expected drop of the uncertainty about the hazard, bits, 0..=1.
     pub gain_bits: f32,
-    /// Way to the place from where the look tells most, metres, 0..=100.
+    /// Way to the place from where the look shows most, metres, 0..=100.
     pub ahead_m: f32,
 }
 

@@ -37,7 +37,7 @@ pub struct ClosedLoop {
     conflict_m: [f64; 2],
 }
 
-/// What is drawn for one drive.
+/// The random part of one drive.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Episode {
     actors: Vec<Actor>,

@@ -55,7 +55,7 @@ pub enum ScenarioError {
     NoClosedLoop {
         /// Path of the scenario file.
         path: PathBuf,
-        /// What is missing.
+        /// The missing part.
         problem: &'static str,
     },
     /// No position was found for a random camera.
