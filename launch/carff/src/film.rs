@@ -3,7 +3,7 @@
 use anyhow::{Context, ensure};
 use carff_checkpoint::Manifest;
 use carff_dataset::Image;
-use carff_messages::{Action, ActionCode, Belief, FrameMeta, ImageMeta, Reason, ViewKind, ViewMeta};
+use carff_messages::{Action, ActionCode, Belief, FrameMeta, ImageMeta, Occupancy, Reason, ViewKind, ViewMeta};
 use carff_plots::{Bar, Board};
 use carff_recording::Reader;
 use carff_transport::TopicId;
@@ -33,6 +33,8 @@ const MIN_SIDE_PX: u32 = 16;
 /// Frame rates that the encoder accepts, hertz.
 const RATES_HZ: std::ops::RangeInclusive<f64> = 1.0..=60.0;
 
+/// Size of the occupancy grid's picture.
+const GRID_PX: [u32; 2] = [64, 64];
 /// Rate of a film from a recording with only one frame, frames per second.
 const LONE_FRAME_HZ: f64 = 10.0;
 
@@ -238,14 +240,16 @@ pub(crate) fn export(recording: &Path, file: &Path) -> anyhow::Result<u64> {
     let mut reader = Reader::open(recording)?;
     ensure!(reader.has(TopicId::FRAME), "{} contains no camera frame", recording.display());
     let states = reader.about().map_or_else(Vec::new, |about| about.states.clone());
-    let wanted = [TopicId::FRAME, TopicId::BELIEF, TopicId::ACTION, TopicId::VIEW];
+    let wanted = [TopicId::FRAME, TopicId::BELIEF, TopicId::OCCUPANCY, TopicId::ACTION, TopicId::VIEW];
     let present: Vec<TopicId> = wanted.into_iter().filter(|topic| reader.has(*topic)).collect();
+    let grid_px = present.contains(&TopicId::OCCUPANCY).then_some(GRID_PX);
     reader.select(present)?;
     let checkpoint = reader.about().map(|about| PathBuf::from(&about.checkpoint));
     let manifest = checkpoint.and_then(|folder| Manifest::load(&folder).ok());
     let hazards = manifest.map_or_else(Vec::new, |manifest| manifest.scenario.hazard_states());
     let view_px = first_view_px(recording)?;
-    let mut scene = Scene { states, hazards, view_px, frame: None, belief: None, action: None, view: None };
+    let mut scene =
+        Scene { states, hazards, view_px, grid_px, frame: None, belief: None, grid: None, action: None, view: None };
     let mut film = None;
     while let Some(entry) = reader.next()? {
         let message = entry.message.as_message();
@@ -254,8 +258,11 @@ pub(crate) fn export(recording: &Path, file: &Path) -> anyhow::Result<u64> {
             let [width_px, height_px] = meta.size_px();
             let image = Image { width_px, height_px, rgb: message.bytes().to_vec() };
             (scene.frame, scene.belief, scene.action) = (Some((*meta, image)), None, None);
+            scene.grid = None;
         } else if let Some(belief) = message.get::<Belief>().filter(|belief| belief.header.step == 1) {
             scene.belief = Some(*belief);
+        } else if let Some(grid) = message.get::<Occupancy>().filter(|grid| grid.header.step == 1) {
+            scene.grid = Some(*grid);
         } else if let Some(action) = message.get::<Action>().filter(|action| action.is_decision()) {
             scene.action = Some(*action);
         } else if let Some(view) = message.get::<ViewMeta>().filter(|view| view.kind == ViewKind::BirdsEye.code()) {
@@ -279,6 +286,14 @@ fn first_view_px(recording: &Path) -> anyhow::Result<Option<[u32; 2]>> {
     Ok(None)
 }
 
+/// Draws a grid from above, +y up: from white for a free cell to red for a taken one.
+fn grid_image(grid: &Occupancy) -> Image {
+    let colour = |p: f32| [1.0, 1.0 - 0.85 * p, 1.0 - 0.9 * p].map(|v| (255.0 * v.clamp(0.0, 1.0)) as u8);
+    let rows = grid.cells().chunks_exact((grid.columns as usize).max(1)).rev();
+    let rgb = rows.flat_map(|row| row.iter().flat_map(move |p| colour(*p))).collect();
+    Image { width_px: grid.columns, height_px: grid.rows, rgb }
+}
+
 /// Returns an image at another size, each pixel from the nearest one.
 fn resized(image: &Image, [width_px, height_px]: [u32; 2]) -> Image {
     let pixel = |x: u32, y: u32| {
@@ -297,8 +312,11 @@ struct Scene {
     hazards: Vec<bool>,
     /// Size of rendered hypotheses; overload makes some of them smaller.
     view_px: Option<[u32; 2]>,
+    /// Size of the occupancy grid's picture, where the recording has grids.
+    grid_px: Option<[u32; 2]>,
     frame: Option<(FrameMeta, Image)>,
     belief: Option<Belief>,
+    grid: Option<Occupancy>,
     action: Option<Action>,
     view: Option<(ViewMeta, Image)>,
 }
@@ -329,6 +347,12 @@ impl Scene {
             }
             None => ("no rendered hypothesis yet".to_owned(), Image::filled(size_px[0], size_px[1], [228, 230, 234])),
         });
+        let taken = self.grid_px.map(|size_px| match self.grid.filter(|grid| grid.header.frame_id == frame) {
+            Some(grid) if !grid.cells().is_empty() => {
+                ("taken, next step".to_owned(), resized(&grid_image(&grid), size_px))
+            }
+            _ => ("no occupancy yet".to_owned(), Image::filled(size_px[0], size_px[1], [228, 230, 234])),
+        });
         let action = self.action.filter(|action| action.based_on_frame == frame);
         let belief = self.belief.filter(|belief| belief.header.frame_id == frame);
         let code = action.map(|action| action.code().unwrap_or(ActionCode::Halt));
@@ -341,7 +365,7 @@ impl Scene {
         let reason = action.and_then(|action| action.reason().ok()).map_or("-", Reason::name);
         let hazard = belief.map_or("-".to_owned(), |b| format!("{:.2}", b.hazard_probability));
         Board {
-            images: [Some((format!("camera, frame {frame}"), image)), above].into_iter().flatten().collect(),
+            images: [Some((format!("camera, frame {frame}"), image)), above, taken].into_iter().flatten().collect(),
             decision: decision.to_owned(),
             alarm: halts,
             lines: vec![

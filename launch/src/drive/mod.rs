@@ -48,7 +48,7 @@ pub struct DriveArgs {
     #[arg(long, default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=1_000_000_000))]
     pub first: u64,
     /// Seed of episodes, sensor noise and draws.
-    #[arg(long, default_value_t = 1)]
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(..=i64::MAX as u64))]
     pub seed: u64,
     /// Number of other vehicles in every episode, 0 to 3. Default: drawn from the scenario's range.
     #[arg(long, value_parser = clap::value_parser!(u32).range(..=3))]
@@ -81,14 +81,17 @@ pub struct DriveArgs {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub enum DriveRule {
     /// Never drives on.
+    #[value(alias = "underconfident")]
     AlwaysHalt,
     /// Never stops.
+    #[value(alias = "overconfident")]
     AlwaysAdvance,
     /// The paper's rule: halts where the samples disagree.
     Paper,
     /// Halts where it is while the hazard is too probable.
     Calibrated,
     /// The same threshold; assumes that somebody comes: creeps to the place where others drive.
+    #[value(alias = "phantom-car")]
     Phantom,
     /// The same threshold; stops ahead of that place, then creeps.
     Peek,

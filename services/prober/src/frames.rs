@@ -4,7 +4,7 @@ use crate::Images;
 use carff_base::geometry::PinholeCamera;
 use carff_checkpoint::FieldProbe;
 use carff_decision::ImageEvidence;
-use carff_messages::{FrameMeta, Header, Unknowns};
+use carff_messages::{FrameMeta, Header, UnknownBox, Unknowns};
 use carff_runtime::StageContext;
 use carff_transport::{Image, Input, Publisher, Receiver, monotonic_now_ns, topics};
 use carff_unknown::Lanes;
@@ -19,8 +19,8 @@ pub struct Frames {
     images: Images,
     input: Receiver<Image<FrameMeta>>,
     output: Publisher<Unknowns>,
-    /// Capture time and camera of the last frame.
-    camera: Option<(u64, PinholeCamera)>,
+    /// The last frame: capture time, camera, and boxes of something unknown.
+    last: Option<(u64, PinholeCamera, Vec<UnknownBox>)>,
 }
 
 impl Frames {
@@ -32,7 +32,7 @@ impl Frames {
         }
         let Some(images) = Images::load(&stage.checkpoint, probe, stage.graph.remembers())? else { return Ok(None) };
         let (input, output) = (stage.input(&topics::FRAME)?, stage.output(&topics::UNKNOWN)?);
-        Ok(Some(Self { images, input, output, camera: None }))
+        Ok(Some(Self { images, input, output, last: None }))
     }
 
     /// The input to wait for.
@@ -51,8 +51,11 @@ impl Frames {
             }
             let started_ns = monotonic_now_ns();
             let camera = frame.camera();
-            self.camera = camera.validate().is_ok().then_some((frame.header.capture_time_ns, camera));
+            self.last = camera.validate().is_ok().then_some((frame.header.capture_time_ns, camera, Vec::new()));
             if let Some(mut unknowns) = self.images.compare(probe, &frame, frame.image(), threads) {
+                if let Some((_, _, boxes)) = &mut self.last {
+                    boxes.extend_from_slice(unknowns.boxes());
+                }
                 unknowns.stage_latency_ns = monotonic_now_ns() - started_ns;
                 self.output.send(unknowns)?;
             }
@@ -63,7 +66,16 @@ impl Frames {
 
     /// The camera of a frame, if it was the last one, with a valid pose.
     pub fn camera_of(&self, header: &Header) -> Option<PinholeCamera> {
-        self.camera.filter(|(at_ns, _)| *at_ns == header.capture_time_ns).map(|(_, camera)| camera)
+        self.last_of(header).map(|(_, camera, _)| *camera)
+    }
+
+    /// The boxes of something unknown in a frame, if it was the last one.
+    pub fn unknown_boxes(&self, header: &Header) -> &[UnknownBox] {
+        self.last_of(header).map_or(&[], |(_, _, boxes)| boxes)
+    }
+
+    fn last_of(&self, header: &Header) -> Option<&(u64, PinholeCamera, Vec<UnknownBox>)> {
+        self.last.as_ref().filter(|(at_ns, ..)| *at_ns == header.capture_time_ns)
     }
 
     /// The ground on which something counts.

@@ -1,10 +1,12 @@
 //! The prober stage's arithmetic: from a forecast, and the comparison of its image, to a belief over the known states.
 
 mod frames;
+mod grid;
 mod images;
 mod outlook;
 
 pub use frames::Frames;
+pub use grid::Grid;
 pub use images::Images;
 pub use outlook::Outlook;
 
@@ -13,15 +15,16 @@ use carff_decision::{ImageEvidence, mixture_and_draws};
 use carff_messages::{Belief, Forecast};
 use std::path::Path;
 
-/// Loads the field and its calibration, and probes each known state once, so that the first forecast is as fast as
+/// Loads the field and its calibration with the grid of the known states, and probes each known state once, so that the first forecast is as fast as
 /// later ones.
-pub fn load(checkpoint: &Path) -> anyhow::Result<FieldProbe> {
+pub fn load(checkpoint: &Path) -> anyhow::Result<(FieldProbe, Grid)> {
     let manifest = Manifest::load(checkpoint)?;
     let mut probe = load_field_probe(checkpoint, &manifest)?;
     for state in &manifest.states {
         probe.probe(&state.mean);
     }
-    Ok(probe)
+    let grid = Grid::probe(&probe);
+    Ok((probe, grid))
 }
 
 /// Probes the mixture and the samples of a valid forecast. `image` is the evidence of the frame's image, if it was

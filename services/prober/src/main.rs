@@ -12,7 +12,8 @@ fn main() -> std::process::ExitCode {
 fn run(stage: &mut StageContext) -> anyhow::Result<()> {
     let mut forecasts = stage.input(&topics::FORECAST)?;
     let mut beliefs = stage.output(&topics::BELIEF)?;
-    let mut probe = load(&stage.checkpoint)?;
+    let mut occupancies = stage.output(&topics::OCCUPANCY)?;
+    let (mut probe, grid) = load(&stage.checkpoint)?;
     let mut frames = Frames::open(stage, &probe)?;
     let mut outlook = Outlook::open(stage, &probe)?;
     stage.ready();
@@ -37,7 +38,13 @@ fn run(stage: &mut StageContext) -> anyhow::Result<()> {
                     outlook.publish(&probe, frames, &belief, stage.threads)?;
                 }
                 belief.stage_latency_ns = stage.worked(&belief.header, started_ns);
+                let believed_ns = monotonic_now_ns();
                 beliefs.send(belief)?;
+                // After the belief, which a decision waits for.
+                let boxes = frames.as_ref().map_or(&[][..], |frames| frames.unknown_boxes(&belief.header));
+                let mut occupancy = grid.occupancy(&belief, boxes);
+                occupancy.stage_latency_ns = monotonic_now_ns() - believed_ns;
+                occupancies.send(occupancy)?;
             }
             Err(error) => stage.refuse(&error),
         }

@@ -27,7 +27,7 @@ fn frame(id: u64, at_ms: u64) -> FrameMeta {
 /// is. A belief only uses the comparison of its own image.
 #[test]
 fn a_patch_on_the_lane_is_unknown() {
-    let probe = load(&checkpoint()).unwrap();
+    let (probe, _) = load(&checkpoint()).unwrap();
     let clear = probe.states().last().unwrap().mean;
     let mut rendered = RenderBuffer::new();
     probe.field().render(&frame(1, 0).camera(), &clear, &RenderOptions::default(), &mut rendered);

@@ -1,6 +1,7 @@
 //! The journal for the window's lists and plots: decisions and durations.
 
 use carff_base::statistics::Spread;
+use carff_messages::ActionCode;
 use std::collections::VecDeque;
 
 /// Maximum number of stored decisions.
@@ -13,8 +14,8 @@ const MOST_TIMES: usize = 600;
 pub struct Decision {
     /// Basis of the decision: an image or a frame, and the number of steps.
     pub rests_on: String,
-    /// True for halt, false for advance.
-    pub halt: bool,
+    /// The action.
+    pub action: ActionCode,
     /// Confidence of the rule, 0..=1.
     pub confidence: f32,
     /// Probability of the hazard at any step looked at, 0..=1.
@@ -101,7 +102,7 @@ mod tests {
             let (reason, hazard_probability) = (String::new(), 0.5);
             journal.decided(Decision {
                 rests_on,
-                halt: true,
+                action: ActionCode::Halt,
                 confidence: 0.5,
                 hazard_probability,
                 reason,

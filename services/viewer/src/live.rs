@@ -264,7 +264,7 @@ fn decision(action: &Action, last_safe: &mut Option<(ActionCode, Reason)>) -> Op
     };
     Some(Decision {
         rests_on,
-        halt: code == ActionCode::Halt,
+        action: code,
         confidence: action.confidence,
         hazard_probability: action.hazard_probability,
         reason: if reason == Reason::Belief { rule.name() } else { reason.name() }.to_owned(),
@@ -525,6 +525,6 @@ mod tests {
             assert_eq!(decision(&action(reason, is_decision), &mut last).is_some(), written, "{reason}");
         }
         let decided = decision(&action(Reason::Belief, 1), &mut last).unwrap();
-        assert_eq!((decided.latency_ms, decided.reason.as_str(), decided.halt), (Some(2.5), "calibrated", true));
+        assert_eq!((decided.latency_ms, decided.reason.as_str(), decided.action), (Some(2.5), "calibrated", ActionCode::Halt));
     }
 }

@@ -12,7 +12,7 @@ use crate::input::Input;
 use crate::journal::{Decision, Journal};
 use crate::models::Models;
 use carff_decision::{Draw, Evidence, Mixture, Probed, Resolved, Sampling, Step, path_probability};
-use carff_messages::{Gaussian, LATENT_DIM, MAX_HORIZON, MAX_SAMPLES, UnknownBox};
+use carff_messages::{ActionCode, Gaussian, LATENT_DIM, MAX_HORIZON, MAX_SAMPLES, UnknownBox};
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -300,7 +300,7 @@ impl Session {
             let decided = self.models.policy.decide(&evidence);
             self.journal.decided(Decision {
                 rests_on: format!("{}, {}", moment.input.title, steps_ahead(moment.step)),
-                halt: decided.halt,
+                action: if decided.halt { ActionCode::Halt } else { ActionCode::Advance },
                 confidence: decided.confidence as f32,
                 hazard_probability: evidence.hazard_probability() as f32,
                 reason: self.models.policy.rule.name().to_owned(),

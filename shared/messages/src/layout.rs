@@ -11,8 +11,8 @@
 //! ```
 
 use crate::{
-    Action, Belief, DatasetView, Forecast, FrameMeta, Gaussian, Header, Health, ImageCheck, Intrinsics, Posterior,
-    ProbeResult, UnknownBox, Unknowns, ViewMeta,
+    Action, Belief, DatasetView, Forecast, FrameMeta, Gaussian, Header, Health, ImageCheck, Intrinsics, Occupancy,
+    Posterior, ProbeResult, UnknownBox, Unknowns, ViewMeta,
 };
 use iceoryx2::prelude::ZeroCopySend;
 use iceoryx2::service::static_config::message_type_details::{TypeDetail, TypeVariant};
@@ -152,6 +152,16 @@ described!(Unknowns {
     ratios,
     prior,
     boxes,
+    stage_latency_ns
+});
+described!(Occupancy {
+    header,
+    columns,
+    rows,
+    cell_m,
+    low_corner_m,
+    unknown_probability,
+    probability,
     stage_latency_ns
 });
 described!(Posterior { header, gaussian, take_start, stage_latency_ns });

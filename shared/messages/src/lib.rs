@@ -26,6 +26,7 @@ mod health;
 mod latent;
 pub mod layout;
 mod novelty;
+mod occupancy;
 
 pub use check::Invalid;
 pub use codes::{
@@ -37,6 +38,7 @@ pub use frame::{DatasetView, FrameMeta, Intrinsics, ViewMeta};
 pub use health::Health;
 pub use latent::{Belief, Forecast, Gaussian, Posterior, ProbeResult};
 pub use novelty::{ImageCheck, MAX_UNKNOWNS, UnknownBox, Unknowns};
+pub use occupancy::{MAX_CELLS, Occupancy};
 
 /// Marks a type as suitable for shared memory, with a name. Derive it with `#[repr(C)]` and `#[type_name(..)]`.
 pub use iceoryx2::prelude::ZeroCopySend;

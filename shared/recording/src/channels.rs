@@ -4,7 +4,7 @@ use crate::standard;
 use crate::standard::{Events, LogLine};
 use carff_decision::Place;
 use carff_messages::forms::AnyMessage;
-use carff_messages::{Belief, FrameMeta, ImageMeta, Unknowns, ViewKind, ViewMeta};
+use carff_messages::{Belief, FrameMeta, ImageMeta, Occupancy, Unknowns, ViewKind, ViewMeta};
 use carff_transport::TopicId;
 use foxglove::messages::RawImage;
 use foxglove::{Encode, Schema};
@@ -115,6 +115,10 @@ impl Encoder {
             encoded.push(Encoded::protobuf(format!("prober/boxes/step{}", header.step), &boxes));
         } else if let Some(unknowns) = message.get::<Unknowns>() {
             encoded.push(Encoded::protobuf("prober/boxes/unknown", &standard::unknown_boxes(captured, unknowns)));
+        }
+        if let Some(occupancy) = message.get::<Occupancy>() {
+            let grid = standard::grid(captured, occupancy);
+            encoded.push(Encoded::protobuf(format!("prober/grid/step{}", header.step), &grid));
         }
         let published = standard::timestamp(self.wall_ns(header.publish_time_ns));
         encoded.extend(self.events.log(published, message).map(|log| Encoded::protobuf("log", &log)));

@@ -4,13 +4,14 @@ use carff_base::geometry::OrientedBox;
 use carff_decision::Place;
 use carff_messages::forms::AnyMessage;
 use carff_messages::{
-    Action, ActionCode, Belief, Header, Health, HealthState, Intrinsics, Reason, Stage, UnknownBox, Unknowns,
+    Action, ActionCode, Belief, Header, Health, HealthState, Intrinsics, Occupancy, Reason, Stage, UnknownBox, Unknowns,
 };
 use foxglove::messages::log::Level;
+use foxglove::messages::packed_element_field::NumericType;
 use foxglove::messages::scene_entity_deletion::Type as Deleted;
 use foxglove::messages::{
-    CameraCalibration, Color, CubePrimitive, Duration, FrameTransform, Log, Pose, Quaternion, RawImage, SceneEntity,
-    SceneEntityDeletion, SceneUpdate, TextPrimitive, Timestamp, Vector3,
+    CameraCalibration, Color, CubePrimitive, Duration, FrameTransform, Grid, Log, PackedElementField, Pose, Quaternion,
+    RawImage, SceneEntity, SceneEntityDeletion, SceneUpdate, TextPrimitive, Timestamp, Vector2, Vector3,
 };
 use std::collections::BTreeMap;
 
@@ -44,6 +45,27 @@ pub(crate) fn boxes(captured: Timestamp, belief: &Belief, places: &[Place]) -> S
         }
     });
     SceneUpdate { deletions: Vec::new(), entities: entities.collect() }
+}
+
+/// Returns an occupancy grid, with one byte for each cell: 0 free, 255 taken.
+pub(crate) fn grid(captured: Timestamp, occupancy: &Occupancy) -> Grid {
+    let [x, y] = occupancy.low_corner_m.map(f64::from);
+    let side = f64::from(occupancy.cell_m);
+    let field = PackedElementField { name: "occupancy".to_owned(), offset: 0, r#type: NumericType::Uint8 as i32 };
+    Grid {
+        timestamp: Some(captured),
+        frame_id: WORLD.to_owned(),
+        pose: Some(Pose {
+            position: Some(Vector3 { x, y, z: 0.0 }),
+            orientation: Some(Quaternion { x: 0.0, y: 0.0, z: 0.0, w: 1.0 }),
+        }),
+        column_count: occupancy.columns,
+        cell_size: Some(Vector2 { x: side, y: side }),
+        row_stride: occupancy.columns,
+        cell_stride: 1,
+        fields: vec![field],
+        data: occupancy.cells().iter().map(|p| (255.0 * p).round() as u8).collect::<Vec<u8>>().into(),
+    }
 }
 
 /// Returns the boxes in which something stands that no known state explains. They replace those of earlier images.

@@ -215,18 +215,21 @@ impl TopicId {
     pub const BELIEF: Self = Self { index: 4, topic: &topics::BELIEF };
     /// `prober/unknown`.
     pub const UNKNOWN: Self = Self { index: 5, topic: &topics::UNKNOWN };
+    /// `prober/occupancy`.
+    pub const OCCUPANCY: Self = Self { index: 6, topic: &topics::OCCUPANCY };
     /// `renderer/view`.
-    pub const VIEW: Self = Self { index: 6, topic: &topics::VIEW };
+    pub const VIEW: Self = Self { index: 7, topic: &topics::VIEW };
     /// `controller/action`.
-    pub const ACTION: Self = Self { index: 7, topic: &topics::ACTION };
+    pub const ACTION: Self = Self { index: 8, topic: &topics::ACTION };
     /// The topics from the camera to the action, in the order of the data flow.
-    pub const FLOW: [Self; 8] = [
+    pub const FLOW: [Self; 9] = [
         Self::FRAME,
         Self::POSTERIOR,
         Self::CHECK,
         Self::FORECAST,
         Self::BELIEF,
         Self::UNKNOWN,
+        Self::OCCUPANCY,
         Self::VIEW,
         Self::ACTION,
     ];

@@ -14,7 +14,9 @@
 
 use crate::payload::Image;
 use crate::topic::{Limits, Topic};
-use carff_messages::{Action, Belief, Forecast, FrameMeta, Health, ImageCheck, Posterior, Stage, Unknowns, ViewMeta};
+use carff_messages::{
+    Action, Belief, Forecast, FrameMeta, Health, ImageCheck, Occupancy, Posterior, Stage, Unknowns, ViewMeta,
+};
 
 /// Limits of small messages; some receivers need every message.
 pub const MESSAGES: Limits =
@@ -45,6 +47,8 @@ pub const FORECAST: Topic<Forecast> = Topic::new("forecaster/forecast", MESSAGES
 pub const BELIEF: Topic<Belief> = Topic::new("prober/belief", MESSAGES, 500);
 /// Comparisons of images with the known states, from prober to observers.
 pub const UNKNOWN: Topic<Unknowns> = Topic::new("prober/unknown", MESSAGES, 500);
+/// Occupancy grids of beliefs, from prober to observers and planners.
+pub const OCCUPANCY: Topic<Occupancy> = Topic::new("prober/occupancy", MESSAGES, 500);
 /// Views from renderer to viewers, recorder and probes.
 pub const VIEW: Topic<Image<ViewMeta>> = Topic::new("renderer/view", IMAGES, 5000);
 /// Actions from controller to vehicle.

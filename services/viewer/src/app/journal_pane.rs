@@ -2,6 +2,7 @@
 
 use super::{Viewer, theme};
 use crate::journal::{Decision, Journal};
+use carff_messages::ActionCode;
 use eframe::egui::{Align, Color32, Grid, Layout, ScrollArea, Ui, vec2};
 use egui_plot::{GridMark, Line, Plot, PlotPoints};
 
@@ -56,10 +57,11 @@ fn decisions(ui: &mut Ui, journal: &Journal) {
                 ui.label(theme::small(name).color(palette.weak));
             }
             ui.end_row();
-            for Decision { rests_on, halt, confidence, hazard_probability, reason, latency_ms } in
+            for Decision { rests_on, action, confidence, hazard_probability, reason, latency_ms } in
                 journal.decisions().rev()
             {
-                let (name, color) = if *halt { ("halt", palette.hazard) } else { ("advance", palette.clear) };
+                let halts = *action == ActionCode::Halt;
+                let (name, color) = (action.name(), if halts { palette.hazard } else { palette.clear });
                 let sure = format!("{:.0} % sure", 100.0 * confidence);
                 ui.label(theme::strong(name).color(color)).on_hover_text(sure);
                 ui.monospace(format!("{:>5.1} %", 100.0 * hazard_probability));

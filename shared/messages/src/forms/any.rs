@@ -1,8 +1,10 @@
 //! Messages with a type that is only known at run time.
 
-use super::{ActionForm, BeliefForm, ForecastForm, FormError, FrameForm, UnknownsForm, ViewForm};
+use super::{ActionForm, BeliefForm, ForecastForm, FormError, FrameForm, OccupancyForm, UnknownsForm, ViewForm};
 use crate::layout::Described;
-use crate::{Action, Belief, Forecast, FrameMeta, Header, Health, ImageCheck, Message, Posterior, Unknowns, ViewMeta};
+use crate::{
+    Action, Belief, Forecast, FrameMeta, Header, Health, ImageCheck, Message, Occupancy, Posterior, Unknowns, ViewMeta,
+};
 use schemars::JsonSchema;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
@@ -71,6 +73,7 @@ readable! {
     Forecast: ForecastForm = "carff.Forecast";
     Belief: BeliefForm = "carff.Belief";
     Unknowns: UnknownsForm = "carff.Unknowns";
+    Occupancy: OccupancyForm = "carff.Occupancy";
     ViewMeta: ViewForm = "carff.View";
     Action: ActionForm = "carff.Action";
 }

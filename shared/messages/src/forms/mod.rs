@@ -21,6 +21,7 @@ mod decision;
 mod frame;
 mod latent;
 mod novelty;
+mod occupancy;
 mod text;
 
 pub use any::{AnyMessage, DynMessage, OwnedMessage, Readable, read};
@@ -28,6 +29,7 @@ pub use decision::ActionForm;
 pub use frame::{DatasetViewForm, FrameForm, ViewForm};
 pub use latent::{BeliefForm, ComponentForm, DrawForm, ForecastForm, ProbeForm};
 pub use novelty::UnknownsForm;
+pub use occupancy::OccupancyForm;
 pub use text::as_text;
 
 use crate::Invalid;

@@ -1,7 +1,7 @@
 use super::*;
 use crate::{
-    Action, Belief, DatasetView, Forecast, ForecastSource, FrameMeta, Gaussian, Header, Health, Intrinsics, Posterior,
-    ProbeResult, ViewMeta,
+    Action, Belief, DatasetView, Forecast, ForecastSource, FrameMeta, Gaussian, Header, Health, Intrinsics, Occupancy,
+    Posterior, ProbeResult, ViewMeta,
 };
 
 /// Returns deterministic numbers with bit patterns over the range of finite numbers.
@@ -142,12 +142,31 @@ fn messages_survive_their_forms() {
             valid_until_ns: 99,
             based_on_frame: u64::MAX,
             latency_ns: 0,
-            target_speed_mps: 0.0,
-            look_gain_bits: 0.0,
+            target_speed_mps: 1.0 / 3.0,
+            look_gain_bits: probability(&mut next),
         };
         assert_eq!(there_and_back(&action), action);
+
+        let mut occupancy = Occupancy::empty(header().at_step(2));
+        (occupancy.columns, occupancy.rows, occupancy.cell_m) = (7, 5, 0.7);
+        occupancy.low_corner_m = [-17.3, next()];
+        occupancy.unknown_probability = probability(&mut next);
+        occupancy.probability[..35].fill_with(|| probability(&mut next));
+        assert_eq!(there_and_back(&occupancy), occupancy);
     }
     assert_eq!(there_and_back(&health()), health());
+}
+
+/// A grid with more cells than fit, or with a cell above 1, is refused.
+#[test]
+fn grids_are_checked() {
+    let mut form = OccupancyForm::from(&Occupancy::empty(header().at_step(1)));
+    (form.columns, form.rows) = (33, 32);
+    assert!(Occupancy::try_from(&form).unwrap_err().to_string().contains("columns x rows"));
+    (form.columns, form.rows, form.probability) = (2, 1, vec![0.5, 1.5]);
+    assert!(Occupancy::try_from(&form).unwrap_err().to_string().contains("probability"));
+    form.probability = vec![0.0; 1025];
+    assert!(Occupancy::try_from(&form).unwrap_err().to_string().contains("probability"));
 }
 
 /// An invalid form is refused with its field's name: unknown names, lists that are too long, invalid numbers.

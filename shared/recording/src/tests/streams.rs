@@ -1,10 +1,10 @@
 //! The channels for other tools, as these read them.
 
 use super::*;
-use carff_messages::{UnknownBox, Unknowns};
+use carff_messages::{Occupancy, UnknownBox, Unknowns};
 use foxglove::Decode;
 use foxglove::messages::log::Level;
-use foxglove::messages::{CameraCalibration, FrameTransform, Log, RawImage, SceneUpdate, Timestamp};
+use foxglove::messages::{CameraCalibration, FrameTransform, Grid, Log, RawImage, SceneUpdate, Timestamp};
 use std::collections::{BTreeMap, BTreeSet};
 
 const LATE_NS: u64 = 900_000_000;
@@ -148,6 +148,26 @@ fn unknown_boxes_replace_the_earlier_ones() {
     assert_eq!([first, second].map(|e| e.texts[0].text.as_str()), ["unknown: 90 %", "unknown: 25 %"]);
     assert_ne!(first.id, second.id);
     assert_eq!(first.cubes[0].size, Some(foxglove::messages::Vector3 { x: 2.0, y: 2.0, z: 2.0 }));
+}
+
+/// An occupancy grid is a Foxglove grid: one byte a cell, along x, then along y, at its place in the world; each step has
+/// its own channel.
+#[test]
+fn grids_are_grids() {
+    let mut occupancy = Occupancy::empty(late(0, 2));
+    (occupancy.columns, occupancy.rows, occupancy.cell_m, occupancy.low_corner_m) = (3, 2, 0.5, [-17.0, -19.0]);
+    occupancy.probability[..6].copy_from_slice(&[0.0, 1.0, 0.5, 0.2, 0.0, 0.0]);
+    let sent = [(TopicId::OCCUPANCY, OwnedMessage::new(Box::new(occupancy), Vec::new()))];
+    let grids: Vec<Grid> = recorded(&sent, &[])
+        .into_iter()
+        .filter(|(channel, ..)| channel == "prober/grid/step2")
+        .map(|(_, _, data)| Grid::decode(&data[..]).unwrap())
+        .collect();
+    let [grid] = &grids[..] else { panic!("one grid") };
+    assert_eq!((grid.column_count, grid.row_stride, grid.cell_stride), (3, 3, 1));
+    assert_eq!(grid.data[..], [0, 255, 128, 51, 0, 0]);
+    let corner = grid.pose.as_ref().and_then(|pose| pose.position).unwrap();
+    assert_eq!((corner.x, corner.y, grid.cell_size.unwrap().x), (-17.0, -19.0, 0.5));
 }
 
 /// The log has an entry for each change of the action and of a stage's health, with its source and level.
