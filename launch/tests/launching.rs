@@ -463,7 +463,15 @@ fn a_full_output_is_an_error_at_the_end() {
     assert!(text(&output).contains("No space left on device"), "{}", text(&output));
     assert!(!text(&output).contains("panicked"), "{}", text(&output));
     assert_eq!(graph.report()["frames"], 20);
-    for command in [&["schema", "graph"][..], &["completions", "bash"], &["doctor"]] {
+    for command in [
+        &["schema", "graph"][..],
+        &["completions", "bash"],
+        &["doctor"],
+        &["--help"],
+        &["--version"],
+        &["help", "launch"],
+        &["probe", "echo", "-h"],
+    ] {
         let full = std::fs::OpenOptions::new().write(true).open("/dev/full").unwrap();
         let output = Command::new(env!("CARGO_BIN_EXE_carff-launch")).args(command).stdout(full).output().unwrap();
         assert_eq!(output.status.code(), Some(1), "{command:?}: {}", text(&output));
