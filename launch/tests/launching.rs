@@ -366,6 +366,40 @@ fn an_interrupt_ends_everything() {
     }
 }
 
+/// A benchmark of processes that is interrupted leaves neither folders nor files in shared memory.
+#[test]
+fn an_interrupted_benchmark_leaves_nothing() {
+    let files = |dir: &Path| std::fs::read_dir(dir).into_iter().flatten().flatten().map(|e| e.path());
+    for kind in [Signal::INT, Signal::TERM] {
+        let folder = tempfile::Builder::new().prefix("b").tempdir_in("/tmp").unwrap();
+        let mut command = Command::new(env!("CARGO_BIN_EXE_carff-launch"));
+        command.args(["bench", "ipc", "--messages", "1000000"]).env("TMPDIR", folder.path());
+        command.env_remove("XDG_RUNTIME_DIR").env_remove("RUNTIME_DIRECTORY").stdout(Stdio::null());
+        let mut child = command.stderr(Stdio::null()).spawn().unwrap();
+        // The run of the typed topics, in the folder of this user's runs.
+        let run = || {
+            let mut runs = files(folder.path()).flat_map(|dir| files(&dir).collect::<Vec<_>>());
+            runs.find_map(|path| {
+                let name = path.file_name()?.to_str()?.to_owned();
+                name.starts_with("bench-").then(|| Run::within(path.parent()?, &name, 1).ok())?
+            })
+        };
+        let shared = |run: &Run| {
+            let bare = format!("carff-{}_", run.name());
+            let is_bare = |path: &PathBuf| path.file_name().is_some_and(|n| n.to_string_lossy().starts_with(&bare));
+            let bare = files(Path::new("/dev/shm")).filter(is_bare).count();
+            [bare, run.shared_memory_files().unwrap().len()]
+        };
+        assert!(eventually(|| run().is_some_and(|run| shared(&run).iter().all(|&count| count > 0))));
+        let run = run().unwrap();
+        signal(&child, kind);
+        assert_eq!(child.wait().unwrap().code(), Some(130), "{kind:?}");
+        assert_eq!((shared(&run), run.folder().exists()), ([0, 0], false), "{kind:?}");
+        let left: Vec<PathBuf> = files(folder.path()).filter(|path| path != run.dir()).collect();
+        assert_eq!(left, Vec::<PathBuf>::new(), "{kind:?}");
+    }
+}
+
 /// A launcher that is stopped (Ctrl-Z) while its stages continue counts what it could not read, so that the figures of the
 /// report agree.
 #[test]
