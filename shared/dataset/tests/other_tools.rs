@@ -333,6 +333,37 @@ fn images_of_another_size() {
     assert_eq!((camera.width_px, camera.cx_px, camera.fl_x_px), (16, 8.0, cameras()[0].fl_x_px / 2.0));
 }
 
+/// A JPEG file whose data ends too early is an error, although it has an end marker: with one scan, with restart markers,
+/// and with the scans of a progressive file. A whole file, also with more after its end, has its image.
+#[test]
+fn cut_off_images_with_an_end() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("a.jpg");
+    let shipped = |name: &str| {
+        std::fs::read(Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data").join(name)).unwrap()
+    };
+    let files =
+        [jpeg(&image(0)), jpeg(&image(3)), shipped("restarts.jpg"), shipped("progressive.jpg"), shipped("grey.jpg")];
+    for (file, bytes) in files.iter().enumerate() {
+        std::fs::write(&path, [&bytes[..], b"\xFF\xD8 more"].concat()).unwrap();
+        let whole = Image::load(&path).unwrap();
+        std::fs::write(&path, bytes).unwrap();
+        assert_eq!(Image::load(&path).unwrap(), whole);
+        assert_eq!(Image::decode(bytes, &path).unwrap(), whole, "file {file}");
+        for length in 2..bytes.len() - 2 {
+            std::fs::write(&path, [&bytes[..length], b"\xFF\xD9"].concat()).unwrap();
+            match Image::load(&path) {
+                // The last byte may have no bit of the image that shows.
+                Ok(image) => assert_eq!(image, whole, "file {file}, {length} of {} bytes", bytes.len()),
+                Err(error) => assert!(error.to_string().contains("a.jpg: not a readable"), "{error}"),
+            }
+        }
+        std::fs::write(&path, [&bytes[..bytes.len() - 20], b"\xFF\xD9"].concat()).unwrap();
+        let error = Image::load(&path).unwrap_err().to_string();
+        assert!(error.contains("image data is missing before its end marker"), "{error}");
+    }
+}
+
 /// A cut-off file is an error that names it, or has all of its pixels.
 #[test]
 fn cut_off_images() {
