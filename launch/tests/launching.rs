@@ -463,6 +463,16 @@ fn an_unwritable_report_is_refused_first() {
         }
     }
     refused("--report", "report.txt", "--report report.txt: this is the JSON file; its text");
+    // Nor does the report overwrite the decisions, or one of them the graph file.
+    let report = graph.path("report.json").display().to_string();
+    for name in ["report.json", "report.txt", "report.png", "graph.toml"] {
+        let decisions = graph.path(name).display().to_string();
+        let mut command = graph.command(10);
+        let output = command.args(["--decisions", &decisions]).output().unwrap();
+        assert_eq!(output.status.code(), Some(1), "{}", text(&output));
+        assert!(text(&output).contains(&format!("error: {decisions} would overwrite")), "{}", text(&output));
+    }
+    assert!(!Path::new(&report).exists());
 }
 
 /// Each decision is one line of the JSON file, with its source and without the truth; without `--verbose`, a source

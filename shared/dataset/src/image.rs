@@ -5,7 +5,8 @@ use std::io::{BufReader, BufWriter, Cursor};
 use std::path::Path;
 
 use image::codecs::png::PngEncoder;
-use image::{ColorType, DynamicImage, ExtendedColorType, ImageEncoder, ImageFormat, ImageReader, Limits};
+use image::metadata::Orientation;
+use image::{ColorType, DynamicImage, ExtendedColorType, ImageDecoder, ImageEncoder, ImageFormat, ImageReader, Limits};
 
 use ndarray::{ArrayView3, ArrayViewMut3, s};
 
@@ -136,6 +137,13 @@ pub(crate) fn dimensions(path: &Path) -> Result<(u32, u32), DatasetError> {
     let io = |source| DatasetError::Io { path: path.to_owned(), source };
     let reader = ImageReader::new(BufReader::new(File::open(path).map_err(io)?)).with_guessed_format().map_err(io)?;
     reader.into_dimensions().map_err(|error| unreadable(path, &error.to_string()))
+}
+
+/// Returns true if the file asks viewers to turn or mirror the image (EXIF orientation). The pixels are used as stored.
+pub(crate) fn is_turned(path: &Path) -> bool {
+    let reader = ImageReader::open(path).and_then(ImageReader::with_guessed_format);
+    let decoder = reader.ok().and_then(|reader| reader.into_decoder().ok());
+    decoder.is_some_and(|mut decoder| decoder.orientation().is_ok_and(|found| found != Orientation::NoTransforms))
 }
 
 /// Reads a PNG or JPEG file of any pixel type as RGB, over `background` where it is transparent.

@@ -63,7 +63,7 @@ fn opened_and_imported(dir: &Path) -> Dataset {
     let opened = Dataset::open(dir).unwrap();
     let out = tempfile::tempdir().unwrap();
     let out = out.path().join("imported");
-    import(dir, &out, &ImportOptions::default()).unwrap();
+    assert_eq!(import(dir, &out, &ImportOptions::default()).unwrap().warnings, opened.warnings());
     let imported = Dataset::open(&out).unwrap();
     assert_eq!(opened.load_all_images().unwrap(), imported.load_all_images().unwrap());
     for i in 0..opened.frames().len() {
@@ -331,6 +331,36 @@ fn images_of_another_size() {
     import(dir.path(), &out, &ImportOptions::default()).unwrap();
     let camera = Dataset::open(&out).unwrap().frames()[0].camera;
     assert_eq!((camera.width_px, camera.cx_px, camera.fl_x_px), (16, 8.0, cameras()[0].fl_x_px / 2.0));
+}
+
+/// An EXIF orientation, which viewers obey and which the pixels are not turned by, is warned of.
+#[test]
+fn turned_images() {
+    let dir = tempfile::tempdir().unwrap();
+    put(dir.path(), &set(|i| format!("images/{i}.jpg")));
+    for orientation in [None, Some(1), Some(3), Some(6)] {
+        for i in 0..4 {
+            let mut bytes = jpeg(&image(i));
+            if let Some(orientation) = orientation {
+                // A TIFF header, and one directory with one entry: tag 0x0112, type SHORT, count 1.
+                let exif = [
+                    &b"\xFF\xE1\0\x22Exif\0\0MM\0\x2A\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0"[..],
+                    &[orientation, 0, 0, 0, 0, 0, 0],
+                ];
+                bytes.splice(2..2, exif.concat());
+            }
+            std::fs::write(dir.path().join(format!("images/{i}.jpg")), bytes).unwrap();
+        }
+        let opened = Dataset::open(dir.path()).unwrap();
+        let images = opened.load_all_images().unwrap();
+        let checked = DatasetReport::of(&opened, &images).warnings;
+        let imported = import(dir.path(), &dir.path().join("out"), &ImportOptions::default()).unwrap().warnings;
+        for warnings in [checked, imported] {
+            let warned = warnings.iter().any(|w| w.contains("4 of 4 images have an EXIF orientation"));
+            assert_eq!(warned, orientation.is_some_and(|o| o != 1), "{orientation:?}: {warnings:?}");
+        }
+        assert!(images[2].psnr_db(&image(2)).unwrap() > 30.0, "the pixels are as stored");
+    }
 }
 
 /// A JPEG file whose data ends too early is an error, although it has an end marker: with one scan, with restart markers,
