@@ -571,6 +571,29 @@ fn a_second_launch_of_a_run_is_refused() {
     graph.assert_nothing_left();
 }
 
+/// A living run is listed, its log is printed while it lives and after its end, and `stop` ends it as Ctrl-C does.
+#[test]
+fn a_run_is_listed_logged_and_stopped() {
+    let graph = Graph::new("none");
+    let mut launcher = deciding(&graph);
+    let carff = |args: &[&str]| Command::new(env!("CARGO_BIN_EXE_carff-launch")).args(args).output().unwrap();
+    let listed = || -> Option<Value> {
+        let runs: Vec<Value> = serde_json::from_slice(&carff(&["ps", "--json"]).stdout).unwrap();
+        runs.into_iter().find(|run| run["run"] == graph.name.as_str())
+    };
+    let run = listed().unwrap();
+    assert_eq!((&run["pid"], &run["graph"]), (&launcher.id().into(), &graph.path("graph.toml").to_str().unwrap().into()));
+    let logged = || text(&carff(&["logs", &graph.name]));
+    assert!(logged().contains("[encoder] INFO ready"), "{}", logged());
+    let stopped = carff(&["stop", &graph.name]);
+    assert!(stopped.status.success(), "{}", text(&stopped));
+    assert_eq!((launcher.wait().unwrap().code(), listed()), (Some(130), None));
+    assert!(logged().contains("[launcher] INFO interrupted"), "{}", logged());
+    assert_eq!(carff(&["stop", &graph.name]).status.code(), Some(1));
+    assert_eq!(graph.report()["interrupted"], true);
+    graph.assert_nothing_left();
+}
+
 /// If the launcher is killed, its stages end by themselves, and the next launch of that run works.
 #[test]
 fn a_killed_launcher_leaves_no_stage_and_no_obstacle() {
