@@ -582,7 +582,10 @@ fn a_run_is_listed_logged_and_stopped() {
         runs.into_iter().find(|run| run["run"] == graph.name.as_str())
     };
     let run = listed().unwrap();
-    assert_eq!((&run["pid"], &run["graph"]), (&launcher.id().into(), &graph.path("graph.toml").to_str().unwrap().into()));
+    assert_eq!(
+        (&run["pid"], &run["graph"]),
+        (&launcher.id().into(), &graph.path("graph.toml").to_str().unwrap().into())
+    );
     let logged = || text(&carff(&["logs", &graph.name]));
     assert!(logged().contains("[encoder] INFO ready"), "{}", logged());
     let stopped = carff(&["stop", &graph.name]);

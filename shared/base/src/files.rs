@@ -53,13 +53,11 @@ pub fn check_distinct<'a>(
 
 /// Returns the path of a file without links, also if the file does not exist; `None` for anything but a file.
 fn identity(path: &Path) -> Option<PathBuf> {
-    match metadata(path) {
-        Ok(found) => found.is_file().then(|| canonicalize(path).ok())?,
-        Err(_) => {
-            let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
-            Some(canonicalize(folder).ok()?.join(path.file_name()?))
-        }
+    if let Ok(found) = metadata(path) {
+        return found.is_file().then(|| canonicalize(path).ok())?;
     }
+    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    Some(canonicalize(folder).ok()?.join(path.file_name()?))
 }
 
 #[cfg(test)]

@@ -369,9 +369,8 @@ fn turned_images() {
 fn cut_off_images_with_an_end() {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("a.jpg");
-    let shipped = |name: &str| {
-        std::fs::read(Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data").join(name)).unwrap()
-    };
+    let shipped =
+        |name: &str| std::fs::read(Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data").join(name)).unwrap();
     let files =
         [jpeg(&image(0)), jpeg(&image(3)), shipped("restarts.jpg"), shipped("progressive.jpg"), shipped("grey.jpg")];
     for (file, bytes) in files.iter().enumerate() {
