@@ -60,7 +60,7 @@ struct Component {
     coded: [bool; 64],
 }
 
-/// What the segments of a file say about the image data that follows.
+/// Description of the image data, from the segments of a file.
 #[derive(Debug, Default)]
 struct Layout {
     /// Width and height, pixels.
