@@ -214,7 +214,8 @@ mod tests {
         let commands = completed(&["carff", ""]);
         assert!(commands.contains(&"probe".to_owned()) && !commands.iter().any(|c| c == "soak-inject"), "{commands:?}");
         for words in [&["carff", "probe", "echo", "pro"][..], &["carff", "record", "-o", "x.mcap", "pro"]] {
-            assert_eq!(completed(words), ["prober/belief", "prober/unknown"], "{words:?}");
+            // Topics of living runs follow, on the machine of the test.
+            assert_eq!(completed(words)[..2], ["prober/belief", "prober/unknown"], "{words:?}");
         }
         assert!(completed(&["carff", "view", "--scr"]).contains(&"--screenshot".to_owned()));
         let folder = tempfile::tempdir().unwrap();

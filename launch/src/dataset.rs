@@ -134,6 +134,7 @@ pub fn run(command: DatasetCommand) -> anyhow::Result<()> {
             );
             let [low, high] = imported.bounds.map(|corner| corner.map(|v| (v * 1000.0).round() / 1000.0));
             println!("Bounds {low:?} to {high:?}; outside is background. Pass --bounds to change it");
+            imported.warnings.iter().for_each(|warning| println!("warning: {warning}"));
             Ok(())
         }
         DatasetCommand::Degrade { dir, out, read_noise, gain, white_balance, pose_jitter_px, seed } => {

@@ -9,7 +9,7 @@ use anyhow::{Context, bail, ensure};
 use carff::provenance;
 use carff::runs::log_path;
 use carff::terminal::Terminal;
-use carff_base::files::check_writable;
+use carff_base::files::{check_distinct, check_writable};
 use carff_checkpoint::{Manifest, ScenarioIdentity};
 use carff_config::{CameraSource, GraphConfig, is_stream};
 use carff_dataset::{Dataset, ScenarioInfo};
@@ -82,6 +82,8 @@ pub fn run(args: &LaunchArgs) -> anyhow::Result<ExitCode> {
     }
     let files = args.report.as_deref().map(ReportFiles::checked).transpose()?;
     args.decisions.as_deref().map_or(Ok(()), check_writable)?;
+    let of_report = files.iter().flat_map(|files| [&*files.json, &*files.text, &*files.strip]);
+    check_distinct([args.graph.as_path()], of_report.chain(args.decisions.as_deref()))?;
     let terminal = Arc::new(Terminal::new());
     let (ended, outcome) = run_graph(args, None, &terminal)?;
     report(args, files.as_ref(), ended, &outcome, &terminal)?;

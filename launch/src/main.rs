@@ -1,13 +1,13 @@
 //! The commands that start graphs, and those that need neither a graph nor libtorch. It executes `carff-lab` for commands
 //! that compute with libtorch.
 
-use carff::run_program;
+use carff::{parse, run_program};
 #[cfg(feature = "bench")]
 use carff_bench::BenchCommand;
 use carff_launch::command::{Cli, Command};
 use carff_launch::lab::{self, CheckpointCommand, LabCommand};
 use carff_launch::schema::{FileKind, SchemaArgs};
-use clap::{CommandFactory, Parser};
+use clap::CommandFactory;
 use std::process::ExitCode;
 
 fn main() -> ExitCode {
@@ -16,7 +16,7 @@ fn main() -> ExitCode {
 
 fn run() -> anyhow::Result<ExitCode> {
     carff_launch::shell::answer_shell(Cli::command);
-    match Cli::parse().command {
+    match parse::<Cli>()?.command {
         Command::Launch(args) => carff_launch::launch::run(&args),
         Command::Drive(args) => carff_launch::drive::run(&args),
         Command::Attach(command) => command.run(),

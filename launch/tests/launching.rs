@@ -368,6 +368,40 @@ fn an_interrupt_ends_everything() {
     }
 }
 
+/// A benchmark of processes that is interrupted leaves neither folders nor files in shared memory.
+#[test]
+fn an_interrupted_benchmark_leaves_nothing() {
+    let files = |dir: &Path| std::fs::read_dir(dir).into_iter().flatten().flatten().map(|e| e.path());
+    for kind in [Signal::INT, Signal::TERM] {
+        let folder = tempfile::Builder::new().prefix("b").tempdir_in("/tmp").unwrap();
+        let mut command = Command::new(env!("CARGO_BIN_EXE_carff-launch"));
+        command.args(["bench", "ipc", "--messages", "1000000"]).env("TMPDIR", folder.path());
+        command.env_remove("XDG_RUNTIME_DIR").env_remove("RUNTIME_DIRECTORY").stdout(Stdio::null());
+        let mut child = command.stderr(Stdio::null()).spawn().unwrap();
+        // The run of the typed topics, in the folder of this user's runs.
+        let run = || {
+            let mut runs = files(folder.path()).flat_map(|dir| files(&dir).collect::<Vec<_>>());
+            runs.find_map(|path| {
+                let name = path.file_name()?.to_str()?.to_owned();
+                name.starts_with("bench-").then(|| Run::within(path.parent()?, &name, 1).ok())?
+            })
+        };
+        let shared = |run: &Run| {
+            let bare = format!("carff-{}_", run.name());
+            let is_bare = |path: &PathBuf| path.file_name().is_some_and(|n| n.to_string_lossy().starts_with(&bare));
+            let bare = files(Path::new("/dev/shm")).filter(is_bare).count();
+            [bare, run.shared_memory_files().unwrap().len()]
+        };
+        assert!(eventually(|| run().is_some_and(|run| shared(&run).iter().all(|&count| count > 0))));
+        let run = run().unwrap();
+        signal(&child, kind);
+        assert_eq!(child.wait().unwrap().code(), Some(130), "{kind:?}");
+        assert_eq!((shared(&run), run.folder().exists()), ([0, 0], false), "{kind:?}");
+        let left: Vec<PathBuf> = files(folder.path()).filter(|path| path != run.dir()).collect();
+        assert_eq!(left, Vec::<PathBuf>::new(), "{kind:?}");
+    }
+}
+
 /// A launcher that is stopped (Ctrl-Z) while its stages continue counts what it could not read, so that the figures of the
 /// report agree.
 #[test]
@@ -431,6 +465,16 @@ fn an_unwritable_report_is_refused_first() {
         }
     }
     refused("--report", "report.txt", "--report report.txt: this is the JSON file; its text");
+    // Nor does the report overwrite the decisions, or one of them the graph file.
+    let report = graph.path("report.json").display().to_string();
+    for name in ["report.json", "report.txt", "report.png", "graph.toml"] {
+        let decisions = graph.path(name).display().to_string();
+        let mut command = graph.command(10);
+        let output = command.args(["--decisions", &decisions]).output().unwrap();
+        assert_eq!(output.status.code(), Some(1), "{}", text(&output));
+        assert!(text(&output).contains(&format!("error: {decisions} would overwrite")), "{}", text(&output));
+    }
+    assert!(!Path::new(&report).exists());
 }
 
 /// Each decision is one line of the JSON file, with its source and without the truth; without `--verbose`, a source
@@ -465,7 +509,15 @@ fn a_full_output_is_an_error_at_the_end() {
     assert!(text(&output).contains("No space left on device"), "{}", text(&output));
     assert!(!text(&output).contains("panicked"), "{}", text(&output));
     assert_eq!(graph.report()["frames"], 20);
-    for command in [&["schema", "graph"][..], &["completions", "bash"], &["doctor"]] {
+    for command in [
+        &["schema", "graph"][..],
+        &["completions", "bash"],
+        &["doctor"],
+        &["--help"],
+        &["--version"],
+        &["help", "launch"],
+        &["probe", "echo", "-h"],
+    ] {
         let full = std::fs::OpenOptions::new().write(true).open("/dev/full").unwrap();
         let output = Command::new(env!("CARGO_BIN_EXE_carff-launch")).args(command).stdout(full).output().unwrap();
         assert_eq!(output.status.code(), Some(1), "{command:?}: {}", text(&output));
@@ -518,6 +570,32 @@ fn a_second_launch_of_a_run_is_refused() {
     other.assert_nothing_left();
     signal(&first, Signal::TERM);
     first.wait().unwrap();
+    graph.assert_nothing_left();
+}
+
+/// A living run is listed, its log is printed while it lives and after its end, and `stop` ends it as Ctrl-C does.
+#[test]
+fn a_run_is_listed_logged_and_stopped() {
+    let graph = Graph::new("none");
+    let mut launcher = deciding(&graph);
+    let carff = |args: &[&str]| Command::new(env!("CARGO_BIN_EXE_carff-launch")).args(args).output().unwrap();
+    let listed = || -> Option<Value> {
+        let runs: Vec<Value> = serde_json::from_slice(&carff(&["ps", "--json"]).stdout).unwrap();
+        runs.into_iter().find(|run| run["run"] == graph.name.as_str())
+    };
+    let run = listed().unwrap();
+    assert_eq!(
+        (&run["pid"], &run["graph"]),
+        (&launcher.id().into(), &graph.path("graph.toml").to_str().unwrap().into())
+    );
+    let logged = || text(&carff(&["logs", &graph.name]));
+    assert!(logged().contains("[encoder] INFO ready"), "{}", logged());
+    let stopped = carff(&["stop", &graph.name]);
+    assert!(stopped.status.success(), "{}", text(&stopped));
+    assert_eq!((launcher.wait().unwrap().code(), listed()), (Some(130), None));
+    assert!(logged().contains("[launcher] INFO interrupted"), "{}", logged());
+    assert_eq!(carff(&["stop", &graph.name]).status.code(), Some(1));
+    assert_eq!(graph.report()["interrupted"], true);
     graph.assert_nothing_left();
 }
 

@@ -4,7 +4,9 @@
 
 use carff_messages::Stage;
 use carff_observe::{LockError, RunLock, RunRecord};
-use carff_tests::{PATIENT_AND_ENDLESS, Process, TestGraph, eventually, program, scenario_set, shipped_checkpoint};
+use carff_tests::{
+    PATIENT_AND_ENDLESS, Process, TestGraph, eventually, program, scenario_set, shipped_checkpoint, skipped,
+};
 use rustix::process::{Pid, Signal, kill_process};
 use std::path::Path;
 use std::process::{Command, Stdio};
@@ -149,6 +151,21 @@ fn the_folder_of_runs_is_chosen() {
         !examine("TMPDIR", &"/var/tmp/long".repeat(9)).contains("/var/tmp/long"),
         "sockets would have too long a path"
     );
+
+    // Inside, switch back to this user: the folder is named after the user.
+    let uid = rustix::process::getuid().as_raw();
+    let mut command = Command::new("unshare");
+    command.args(["--user", "--map-root-user", "--mount", "sh", "-c"]).arg(format!(
+        "mount --bind /tmp /tmp && mount -o remount,ro,bind /tmp && echo mounted && exec unshare --user --map-user={uid} \"$0\" doctor"
+    ));
+    command.arg(program("carff")).env_remove("XDG_RUNTIME_DIR").env_remove("RUNTIME_DIRECTORY").env_remove("TMPDIR");
+    let finished = Process::start(&mut command).end();
+    if !finished.text.contains("mounted") {
+        skipped("this system does not let users mount");
+    } else if !Path::new("/run/carff").exists() {
+        assert_eq!(finished.status.code(), Some(1), "{}", finished.text);
+        assert!(finished.text.contains(&format!("/tmp/carff-{uid} cannot be written")), "{}", finished.text);
+    }
 }
 
 /// A low limit of open files is raised or named.

@@ -5,7 +5,7 @@ use crate::film;
 use crate::probe::image::named_image;
 use crate::spans::{recorded_spans, trace_events};
 use anyhow::{Context, ensure};
-use carff_base::files::check_writable;
+use carff_base::files::{check_distinct, check_writable};
 use carff_checkpoint::Manifest;
 use carff_recording::{About, Entry, Reader};
 use carff_transport::TopicId;
@@ -48,9 +48,9 @@ pub struct ExportArgs {
 pub fn run(args: &ExportArgs) -> anyhow::Result<ExitCode> {
     let Outputs { png, csv, mp4, trace } = &args.outputs;
     let path = &args.recording;
-    for file in mp4.iter().chain(trace) {
-        check_writable(file)?;
-    }
+    let files = || mp4.iter().chain(trace).map(PathBuf::as_path);
+    check_distinct([path.as_path()], files())?;
+    files().try_for_each(check_writable)?;
     if let Some(folder) = png {
         println!("{}: {} images", folder.display(), pictures(path, folder)?);
     }
@@ -274,6 +274,12 @@ mod tests {
         assert_eq!(film::export(&path, &folder.path().join("film.mp4")).unwrap(), 3);
         assert_eq!(spans(&path, &folder.path().join("trace.json")).unwrap(), 6);
         assert!((film::frame_rate_hz(&path).unwrap() - 20.0).abs() < 1e-9);
+
+        // The recording is not overwritten by what it is exported to.
+        let outputs = Outputs { png: None, csv: None, mp4: None, trace: Some(folder.path().join("./r.mcap")) };
+        let error = run(&ExportArgs { recording: path.clone(), outputs }).unwrap_err().to_string();
+        assert!(error.contains("r.mcap would overwrite"), "{error}");
+        assert_eq!(spans(&path, &folder.path().join("trace.json")).unwrap(), 6);
 
         let empty = folder.path().join("empty.mcap");
         Writer::create(&empty, &About::default(), &[]).unwrap().finish().unwrap();

@@ -33,6 +33,7 @@ pub mod terminal;
 pub mod view;
 mod vitals;
 
+pub use carff_runtime::parse;
 pub use not_built::NotBuilt;
 pub use programs::become_program;
 

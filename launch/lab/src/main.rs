@@ -1,14 +1,13 @@
 //! The commands of `carff` that compute with libtorch.
 
 use anyhow::bail;
-use carff::run_program;
+use carff::{parse, run_program};
 use carff_bench::BenchCommand;
 use carff_lab::{ablate, backbone, bench, checkpoint, eval, train};
 use carff_launch::command::{Cli, Command};
 use carff_launch::lab::LabCommand;
 use carff_launch::schema::{self, FileKind};
 use carff_training::TrainingConfig;
-use clap::Parser;
 use std::process::ExitCode;
 
 fn main() -> ExitCode {
@@ -16,7 +15,7 @@ fn main() -> ExitCode {
 }
 
 fn run() -> anyhow::Result<ExitCode> {
-    match Cli::parse().command {
+    match parse::<Cli>()?.command {
         Command::Lab(LabCommand::Train(args)) => train::run(&args),
         Command::Lab(LabCommand::Eval(args)) => eval::run(&args),
         Command::Lab(LabCommand::Ablate(args)) => ablate::run(&args),

@@ -9,6 +9,7 @@ use carff_viewer::models::Models;
 use carff_viewer::session::Session;
 use clap::Parser;
 use eframe::egui::{ThemePreference, ViewportBuilder};
+use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::Duration;
@@ -43,10 +44,11 @@ fn main() -> ExitCode {
         .with_target(false)
         .without_time()
         .try_init();
-    match run(Cli::parse().args) {
+    match carff_runtime::parse::<Cli>().map_err(Into::into).and_then(|cli| run(cli.args)) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("error: {}", carff_base::errors::sentence(&*error));
+            // Standard error may be full or closed.
+            let _ = writeln!(std::io::stderr(), "error: {}", carff_base::errors::sentence(&*error));
             ExitCode::FAILURE
         }
     }

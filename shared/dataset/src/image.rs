@@ -5,11 +5,13 @@ use std::io::{BufReader, BufWriter, Cursor};
 use std::path::Path;
 
 use image::codecs::png::PngEncoder;
-use image::{ColorType, DynamicImage, ExtendedColorType, ImageEncoder, ImageFormat, ImageReader, Limits};
+use image::metadata::Orientation;
+use image::{ColorType, DynamicImage, ExtendedColorType, ImageDecoder, ImageEncoder, ImageFormat, ImageReader, Limits};
 
 use ndarray::{ArrayView3, ArrayViewMut3, s};
 
 use crate::error::DatasetError;
+use crate::jpeg;
 
 /// Maximum width or height of an image, pixels.
 pub const MAX_IMAGE_SIDE_PX: u32 = 8192;
@@ -137,6 +139,13 @@ pub(crate) fn dimensions(path: &Path) -> Result<(u32, u32), DatasetError> {
     reader.into_dimensions().map_err(|error| unreadable(path, &error.to_string()))
 }
 
+/// Returns true if the file asks viewers to turn or mirror the image (EXIF orientation). The pixels are used as stored.
+pub(crate) fn is_turned(path: &Path) -> bool {
+    let reader = ImageReader::open(path).and_then(ImageReader::with_guessed_format);
+    let decoder = reader.ok().and_then(|reader| reader.into_decoder().ok());
+    decoder.is_some_and(|mut decoder| decoder.orientation().is_ok_and(|found| found != Orientation::NoTransforms))
+}
+
 /// Reads a PNG or JPEG file of any pixel type as RGB, over `background` where it is transparent.
 pub(crate) fn load_any(path: &Path, background: [u8; 3]) -> Result<Image, DatasetError> {
     let rgba = decode(path)?.into_rgba8();
@@ -158,10 +167,19 @@ pub(crate) fn load_mask(path: &Path, (width_px, height_px): (u32, u32)) -> Resul
     Ok(mask.pixels().map(|p| p.0 != [0; 3]).collect())
 }
 
-/// Decodes a PNG or JPEG file by its content.
+/// Decodes a PNG or JPEG file by its content. A JPEG file is decoded twice: the image of a file without some of its data
+/// changes with the bytes after the data.
 fn decode(path: &Path) -> Result<DynamicImage, DatasetError> {
     let bytes = std::fs::read(path).map_err(|source| DatasetError::Io { path: path.to_owned(), source })?;
-    decode_bytes(path, &bytes)
+    if !image::guess_format(&bytes).is_ok_and(|format| format == ImageFormat::Jpeg) {
+        return decode_bytes(path, &bytes);
+    }
+    let end = jpeg::end_of_whole(&bytes).map_err(|why| unreadable(path, why))?;
+    let [image, other] = jpeg::filled(&bytes, end).map(|filled| decode_bytes(path, &filled));
+    match (image?, other?) {
+        (image, other) if image == other => Ok(image),
+        _ => Err(unreadable(path, jpeg::NO_DATA)),
+    }
 }
 
 /// Decodes PNG or JPEG bytes; errors name `path`.
@@ -174,8 +192,8 @@ fn decode_bytes(path: &Path, bytes: &[u8]) -> Result<DynamicImage, DatasetError>
             return Err(unreadable(path, carff_base::errors::stand_in(bytes).unwrap_or("it starts like neither")));
         }
     };
-    if format == ImageFormat::Jpeg && !has_end_marker(bytes) {
-        return Err(unreadable(path, "the file is cut off: it has no end marker; copy or export it again"));
+    if format == ImageFormat::Jpeg {
+        jpeg::end_of_whole(bytes).map_err(|why| unreadable(path, why))?;
     }
     let mut limits = Limits::default();
     limits.max_image_width = Some(MAX_IMAGE_SIDE_PX);
@@ -187,25 +205,6 @@ fn decode_bytes(path: &Path, bytes: &[u8]) -> Result<DynamicImage, DatasetError>
 
 fn unreadable(path: &Path, why: &str) -> DatasetError {
     DatasetError::Image { path: path.to_owned(), problem: format!("not a readable PNG or JPEG image: {why}") }
-}
-
-/// Returns true if a JPEG file has its end marker. Decoders fill the missing part of a cut-off file with grey.
-fn has_end_marker(bytes: &[u8]) -> bool {
-    let mut at = 2;
-    while let Some(&[marker, code]) = bytes.get(at..at + 2) {
-        at += match (marker, code) {
-            (0xFF, 0xD9) => return true,
-            // Image data: bytes, stuffed bytes, restart markers, fill bytes.
-            (..0xFF, _) | (0xFF, 0xFF) => 1,
-            (0xFF, 0x00 | 0x01 | 0xD0..=0xD8) => 2,
-            // Segments have a length, and may contain a preview with an end marker of its own.
-            (0xFF, _) => match bytes.get(at + 2..at + 4) {
-                Some(&[high, low]) => 2 + usize::from(u16::from_be_bytes([high, low])),
-                _ => return false,
-            },
-        };
-    }
-    false
 }
 
 /// Writes bytes of the given type as a PNG file.

@@ -14,7 +14,7 @@ use crate::error::DatasetError;
 use crate::image::{Image, load_any, load_mask};
 use crate::lens::Lens;
 use crate::scenario::{Frame, ScenarioInfo, StateInfo};
-use crate::transforms::read;
+use crate::transforms::{read, warning_of_turned};
 use crate::writer::{DatasetWriter, FrameRecord};
 
 /// Options of an import.
@@ -48,6 +48,8 @@ pub struct Imported {
     pub scaled: usize,
     /// Number of images with a mask: from the source, or of pixels that the lens does not show.
     pub masked: usize,
+    /// Warnings about accepted but unusual values.
+    pub warnings: Vec<String>,
 }
 
 /// Reads a dataset from `from` and writes a dataset of one state to `out`, which must be new, empty, or a dataset that
@@ -85,7 +87,8 @@ pub fn import(from: &Path, out: &Path, options: &ImportOptions) -> Result<Import
         clear_action: "none".to_owned(),
     };
     writer.finish(&records, Some(&scenario))?;
-    Ok(Imported { frames: records.len(), bounds, undistorted, scaled, masked })
+    let warnings = set.warnings.into_iter().chain(warning_of_turned(from, &set.frames)).collect();
+    Ok(Imported { frames: records.len(), bounds, undistorted, scaled, masked, warnings })
 }
 
 /// Returns the record, and whether the image was too large.

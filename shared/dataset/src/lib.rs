@@ -26,6 +26,7 @@ mod error;
 mod folder;
 mod image;
 mod import;
+mod jpeg;
 mod lens;
 mod place;
 mod raw;

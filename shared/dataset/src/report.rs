@@ -7,6 +7,7 @@ use crate::dataset::Dataset;
 use crate::equivalence::Equivalence;
 use crate::image::Image;
 use crate::scenario::ScenarioInfo;
+use crate::transforms::warning_of_turned;
 use carff_messages::Observability;
 
 /// Images that should look the same leak their state if their mean difference exceeds this limit, of 255. People cannot
@@ -94,6 +95,7 @@ impl DatasetReport {
         };
         let hidden_pairs = hidden_pairs(dataset, images);
         let mut warnings = dataset.warnings().to_vec();
+        warnings.extend(warning_of_turned(dataset.dir(), dataset.frames()));
         for pair in hidden_pairs.iter().filter(|p| p.mean_difference > LEAK_LIMIT) {
             warnings.push(format!(
                 "view {} at timestamp {}: the actor is hidden, yet branches {} and {} differ by a mean of {:.3} of 255; \

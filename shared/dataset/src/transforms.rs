@@ -3,12 +3,13 @@
 use std::path::{Path, PathBuf};
 
 use carff_messages::Observability;
+use rayon::prelude::*;
 use serde::de::Error;
 use serde_json::{Map, Value};
 
 use crate::camera::{Keys, read_path};
 use crate::error::DatasetError;
-use crate::image::dimensions;
+use crate::image::{dimensions, is_turned};
 use crate::lens::Lens;
 use crate::place::{Place, present};
 use crate::scenario::MAX_FRAMES;
@@ -202,6 +203,19 @@ fn warn(path: &Path, frames: &[Frame], rounded: usize, warnings: &mut Vec<String
             frames.len()
         ));
     }
+}
+
+/// Returns a warning about images that viewers turn or mirror; `None` if there are none.
+pub(crate) fn warning_of_turned(dir: &Path, frames: &[Frame]) -> Option<String> {
+    let turned = frames.par_iter().filter(|frame| is_turned(&frame.image_path)).count();
+    (turned > 0).then(|| {
+        format!(
+            "{}: {turned} of {} images have an EXIF orientation, which is not used; if the poses are those of the turned \
+             images, turn the pixels and remove it",
+            dir.display(),
+            frames.len()
+        )
+    })
 }
 
 /// Returns the frame, whether its rotation was rounded, and the error of its image or mask.

@@ -63,7 +63,7 @@ fn opened_and_imported(dir: &Path) -> Dataset {
     let opened = Dataset::open(dir).unwrap();
     let out = tempfile::tempdir().unwrap();
     let out = out.path().join("imported");
-    import(dir, &out, &ImportOptions::default()).unwrap();
+    assert_eq!(import(dir, &out, &ImportOptions::default()).unwrap().warnings, opened.warnings());
     let imported = Dataset::open(&out).unwrap();
     assert_eq!(opened.load_all_images().unwrap(), imported.load_all_images().unwrap());
     for i in 0..opened.frames().len() {
@@ -331,6 +331,66 @@ fn images_of_another_size() {
     import(dir.path(), &out, &ImportOptions::default()).unwrap();
     let camera = Dataset::open(&out).unwrap().frames()[0].camera;
     assert_eq!((camera.width_px, camera.cx_px, camera.fl_x_px), (16, 8.0, cameras()[0].fl_x_px / 2.0));
+}
+
+/// An EXIF orientation, which viewers obey and which the pixels are not turned by, is warned of.
+#[test]
+fn turned_images() {
+    let dir = tempfile::tempdir().unwrap();
+    put(dir.path(), &set(|i| format!("images/{i}.jpg")));
+    for orientation in [None, Some(1), Some(3), Some(6)] {
+        for i in 0..4 {
+            let mut bytes = jpeg(&image(i));
+            if let Some(orientation) = orientation {
+                // A TIFF header, and one directory with one entry: tag 0x0112, type SHORT, count 1.
+                let exif = [
+                    &b"\xFF\xE1\0\x22Exif\0\0MM\0\x2A\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0"[..],
+                    &[orientation, 0, 0, 0, 0, 0, 0],
+                ];
+                bytes.splice(2..2, exif.concat());
+            }
+            std::fs::write(dir.path().join(format!("images/{i}.jpg")), bytes).unwrap();
+        }
+        let opened = Dataset::open(dir.path()).unwrap();
+        let images = opened.load_all_images().unwrap();
+        let checked = DatasetReport::of(&opened, &images).warnings;
+        let imported = import(dir.path(), &dir.path().join("out"), &ImportOptions::default()).unwrap().warnings;
+        for warnings in [checked, imported] {
+            let warned = warnings.iter().any(|w| w.contains("4 of 4 images have an EXIF orientation"));
+            assert_eq!(warned, orientation.is_some_and(|o| o != 1), "{orientation:?}: {warnings:?}");
+        }
+        assert!(images[2].psnr_db(&image(2)).unwrap() > 30.0, "the pixels are as stored");
+    }
+}
+
+/// A JPEG file whose data ends too early is an error, although it has an end marker: with one scan, with restart markers,
+/// and with the scans of a progressive file. A whole file, also with more after its end, has its image.
+#[test]
+fn cut_off_images_with_an_end() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("a.jpg");
+    let shipped =
+        |name: &str| std::fs::read(Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data").join(name)).unwrap();
+    let files =
+        [jpeg(&image(0)), jpeg(&image(3)), shipped("restarts.jpg"), shipped("progressive.jpg"), shipped("grey.jpg")];
+    for (file, bytes) in files.iter().enumerate() {
+        std::fs::write(&path, [&bytes[..], b"\xFF\xD8 more"].concat()).unwrap();
+        let whole = Image::load(&path).unwrap();
+        std::fs::write(&path, bytes).unwrap();
+        assert_eq!(Image::load(&path).unwrap(), whole);
+        assert_eq!(Image::decode(bytes, &path).unwrap(), whole, "file {file}");
+        for length in 2..bytes.len() - 2 {
+            std::fs::write(&path, [&bytes[..length], b"\xFF\xD9"].concat()).unwrap();
+            match Image::load(&path) {
+                // The last byte may have no bit of the image that shows.
+                Ok(image) => assert_eq!(image, whole, "file {file}, {length} of {} bytes", bytes.len()),
+                Err(error) => assert!(error.to_string().contains("a.jpg: not a readable"), "{error}"),
+            }
+        }
+        std::fs::write(&path, [&bytes[..bytes.len() - 20], b"\xFF\xD9"].concat()).unwrap();
+        let error = Image::load(&path).unwrap_err().to_string();
+        assert!(error.contains("image data is missing before its end marker"), "{error}");
+    }
 }
 
 /// A cut-off file is an error that names it, or has all of its pixels.

@@ -74,6 +74,14 @@ pub enum RecordingError {
         /// Path of the file.
         path: PathBuf,
     },
+    /// The file has messages of several runs, whose frames have the same numbers.
+    #[error("{path} has messages of two runs ({:016x} and {:016x}): use their recordings from before the merge", run_ids[0], run_ids[1])]
+    Runs {
+        /// Path of the file.
+        path: PathBuf,
+        /// Ids of the first run, and of the other one.
+        run_ids: [u64; 2],
+    },
     /// Topics are missing.
     #[error("{path} has no messages on `{missing}`; its topics: {present}")]
     Missing {

@@ -77,6 +77,8 @@ pub struct Reader {
     /// Messages of the segments in use.
     loaded: BTreeMap<usize, Vec<Option<Vec<u8>>>>,
     first_ns: u64,
+    /// Run of the first message.
+    run_id: Option<u64>,
     without_images: bool,
     is_cut_off: bool,
     /// Reason why the rest of the file cannot be read.
@@ -108,6 +110,7 @@ impl Reader {
             images: BTreeMap::new(),
             loaded: BTreeMap::new(),
             first_ns: 0,
+            run_id: None,
             without_images: false,
             is_cut_off: false,
             failure: None,
@@ -179,6 +182,11 @@ impl Reader {
             sequence: located.sequence,
             cause,
         })?;
+        let run_id = message.as_message().header().run_id;
+        let first = *self.run_id.get_or_insert(run_id);
+        if run_id != first {
+            return Err(RecordingError::Runs { path: self.path.clone(), run_ids: [first, run_id] });
+        }
         Ok(Some(Entry { topic: located.topic, wall_time_ns: located.published_ns, message }))
     }
 

@@ -1,8 +1,27 @@
-//! Arguments of all stages.
+//! Arguments of all stages, and how each program reads its arguments.
 
 use clap::Parser;
 use std::ffi::{OsStr, OsString};
+use std::io::{Error, Result, Write};
 use std::path::{Path, PathBuf};
+
+/// Reads the arguments of this program. A request for help or the version is answered, and ends the process with exit
+/// code 0; wrong arguments end it with 2.
+///
+/// # Errors
+///
+/// Help or version cannot be written, because standard output is full or closed.
+pub fn parse<T: Parser>() -> Result<T> {
+    let answer = match T::try_parse() {
+        Ok(args) => return Ok(args),
+        Err(answer) => answer,
+    };
+    let printed = answer.print().and_then(|()| std::io::stdout().flush());
+    if !answer.use_stderr() {
+        printed.map_err(|e| Error::new(e.kind(), format!("cannot write to standard output: {e}")))?;
+    }
+    std::process::exit(answer.exit_code())
+}
 
 /// Run one stage of a CARFF graph. `carff launch` starts all stages; if you start them yourself, use the same run name
 /// and id.

@@ -1,6 +1,6 @@
 //! A stage's environment: configuration, topics, waiting, and health.
 
-use crate::StageArgs;
+use crate::args::{StageArgs, parse};
 use crate::health::{Heartbeat, Vitals};
 use crate::realtime;
 use anyhow::Context;
@@ -10,7 +10,6 @@ use carff_messages::{Header, Health, HealthState, ImageMeta, Message, Stage};
 use carff_transport::{
     Image, Input, Node, Payload, Publisher, Receiver, Run, Stop, Topic, Waiter, Woken, monotonic_now_ns, topics,
 };
-use clap::Parser;
 use rustix::process::{Signal, getppid, set_parent_process_death_signal};
 use std::io::Write;
 use std::path::PathBuf;
@@ -20,19 +19,22 @@ use std::time::Duration;
 
 /// Runs a stage: everything around `run`, which opens topics, calls [`StageContext::ready`] and loops.
 pub fn main(stage: Stage, run: impl FnOnce(&mut StageContext) -> anyhow::Result<()>) -> ExitCode {
-    run_with(stage, StageArgs::parse(), run)
+    parse().map_or_else(|error| failed(&error), |args| run_with(stage, args, run))
 }
 
 /// Runs a stage as [`main`] does, with given arguments.
 pub fn run_with(stage: Stage, args: StageArgs, run: impl FnOnce(&mut StageContext) -> anyhow::Result<()>) -> ExitCode {
     match start(stage, args).and_then(|mut context| context.finish(run)) {
         Ok(()) => ExitCode::SUCCESS,
-        Err(error) => {
-            // Standard error may be closed.
-            let _ = writeln!(std::io::stderr(), "ERROR {}", sentence(&*error));
-            ExitCode::FAILURE
-        }
+        Err(error) => failed(&*error),
     }
+}
+
+/// Reports an error that ends the stage.
+fn failed(error: &(dyn std::error::Error + 'static)) -> ExitCode {
+    // Standard error may be closed.
+    let _ = writeln!(std::io::stderr(), "ERROR {}", sentence(error));
+    ExitCode::FAILURE
 }
 
 /// Returns a span for the work on a frame: log lines contain frame and step until it is dropped. It exists at the level

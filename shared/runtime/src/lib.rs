@@ -42,7 +42,7 @@ mod motion;
 mod overload;
 mod realtime;
 
-pub use args::StageArgs;
+pub use args::{StageArgs, parse};
 pub use camera::{FrameOutput, rectifier};
 pub use context::{StageContext, frame_span, main, run_with};
 pub use ego::{EGO_POSE, EgoPose};

@@ -55,15 +55,21 @@ pub fn trial_frame(image: usize, repeat: usize) -> u64 {
 /// [true, true, false].into_iter().for_each(|right| count.add(right));
 /// assert_eq!((count.success, count.trials), (2, 3));
 /// ```
-#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Count {
     /// Correct actions.
     pub success: usize,
     /// Trials.
     pub trials: usize,
-    /// 95 % interval of the success rate, `[low, high]`.
+    /// 95 % interval of the success rate, `[low, high]`; `[0, 1]` for no trials.
     pub interval: [f64; 2],
+}
+
+impl Default for Count {
+    fn default() -> Self {
+        Self { success: 0, trials: 0, interval: wilson_interval(0, 0) }
+    }
 }
 
 impl Count {

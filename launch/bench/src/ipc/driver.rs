@@ -2,8 +2,8 @@
 
 use super::{Pair, Sender, Size, Transport, Waiting, times_us};
 use crate::helper::{PATIENCE, end_by};
-use anyhow::{Context, bail};
-use carff_transport::monotonic_now_ns;
+use anyhow::{Context, bail, ensure};
+use carff_transport::{Stop, monotonic_now_ns};
 use rustix::event::{PollFd, PollFlags, poll};
 use rustix::fs::{OFlags, fcntl_setfl};
 use std::io::{ErrorKind, Read, Write};
@@ -21,10 +21,11 @@ pub(crate) struct Driver {
     child: Child,
     commands: ChildStdin,
     answers: ChildStdout,
+    stop: Stop,
 }
 
 impl Driver {
-    pub(crate) fn start(transport: Transport, folder: &Path) -> anyhow::Result<Self> {
+    pub(crate) fn start(transport: Transport, folder: &Path, stop: &Stop) -> anyhow::Result<Self> {
         let program = std::env::current_exe().context("cannot find this program")?;
         let mut child = Command::new(&program)
             .args(["bench", "ipc-peer", transport.name()])
@@ -36,7 +37,16 @@ impl Driver {
         let commands = child.stdin.take().context("the peer has no standard input")?;
         let answers = child.stdout.take().context("the peer has no standard output")?;
         fcntl_setfl(&answers, OFlags::NONBLOCK).context("cannot watch the peer")?;
-        Ok(Self { transport, folder: folder.to_owned(), sender: None, payload: Vec::new(), child, commands, answers })
+        Ok(Self {
+            transport,
+            folder: folder.to_owned(),
+            sender: None,
+            payload: Vec::new(),
+            child,
+            commands,
+            answers,
+            stop: stop.clone(),
+        })
     }
 
     /// Fills `bytes` with the peer's answer.
@@ -83,6 +93,7 @@ impl Pair for Driver {
         writeln!(self.commands, "run {count} {}", waiting.name())?;
         self.answer(&mut [0], waiting)?;
         for _ in 0..count {
+            ensure!(!self.stop.is_stopped(), "interrupted");
             if pause_us > 0 {
                 std::thread::sleep(Duration::from_micros(pause_us));
             }
@@ -101,6 +112,8 @@ impl Drop for Driver {
     fn drop(&mut self) {
         self.sender = None;
         let _ = writeln!(self.commands, "end");
-        end_by(&mut self.child, Instant::now() + PATIENCE);
+        // After an interrupt it waits for a payload, and reads no command.
+        let patience = if self.stop.is_stopped() { Duration::ZERO } else { PATIENCE };
+        end_by(&mut self.child, Instant::now() + patience);
     }
 }

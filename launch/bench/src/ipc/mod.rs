@@ -15,6 +15,8 @@ mod zenoh;
 use crate::OutputArgs;
 use crate::report::{Report, number, table};
 use crate::stats::{Ratio, Times};
+use anyhow::ensure;
+use carff_transport::Stop;
 use driver::Driver;
 pub(crate) use peer::peer;
 use std::path::{Path, PathBuf};
@@ -187,15 +189,34 @@ fn times_us(bytes: &[u8]) -> Vec<f64> {
 pub(crate) fn run(args: &IpcArgs) -> anyhow::Result<Report> {
     let zenoh = zenoh::program(args.zenoh.as_deref())?;
     let folder = tempfile::tempdir()?;
+    let stop = Stop::on_signals()?;
+    let measured = measure(args, zenoh.as_deref(), folder.path(), &stop);
+    // All processes have ended, also after an error or a signal.
+    typed::clean_up(folder.path())?;
+    bare::clean_up(folder.path())?;
+    // Ctrl-C in a terminal ends the other processes too, which is then the first error.
+    ensure!(!stop.is_stopped(), "interrupted");
+    let (labels, cells) = measured?;
+    Ok(reported(&labels, &cells))
+}
+
+/// Name in keys of figures and name in tables of a transport.
+type Label = (&'static str, &'static str);
+
+/// Measures all transports by turns.
+fn measure(
+    args: &IpcArgs,
+    zenoh: Option<&Path>,
+    folder: &Path,
+    stop: &Stop,
+) -> anyhow::Result<(Vec<Label>, Vec<Cell>)> {
     let mut pairs: Vec<Box<dyn Pair>> = Vec::new();
     for transport in Transport::ALL {
-        pairs.push(Box::new(Driver::start(transport, folder.path())?));
+        pairs.push(Box::new(Driver::start(transport, folder, stop)?));
     }
     if let Some(program) = zenoh {
-        pairs.push(Box::new(ZenohPair::start(&program, folder.path())?));
+        pairs.push(Box::new(ZenohPair::start(program, folder)?));
     }
-    let labels: Vec<_> = pairs.iter().map(|pair| (pair.name(), pair.title())).collect();
-    let mut report = Report::default();
     let mut cells = Vec::new();
     for size in SIZES.map(Size::near) {
         let messages = args.messages / if args.quick { 10 } else { 1 } / if size.bytes() > 200_000 { 10 } else { 1 };
@@ -217,10 +238,12 @@ pub(crate) fn run(args: &IpcArgs) -> anyhow::Result<Report> {
             cells.push(Cell { size, waiting, turns });
         }
     }
-    drop(pairs);
-    typed::clean_up(folder.path())?;
-    bare::clean_up(folder.path())?;
+    Ok((pairs.iter().map(|pair| (pair.name(), pair.title())).collect(), cells))
+}
 
+/// Prints the tables, and returns the figures.
+fn reported(labels: &[Label], cells: &[Cell]) -> Report {
+    let mut report = Report::default();
     for waiting in Waiting::ALL {
         let mut rows = vec![
             [&format!("{}, write to read (us)", waiting.name()), "by", "p50", "p99", "p99.9", "max", "x bare (p50)"]
@@ -268,7 +291,7 @@ pub(crate) fn run(args: &IpcArgs) -> anyhow::Result<Report> {
     report.set("ipc.vs_bare_sleeping", mean(Some(Waiting::Sleeping)));
     report.set("ipc.vs_bare_busy", mean(Some(Waiting::Busy)));
     report.set("ipc.vs_bare_worst", worst);
-    Ok(report)
+    report
 }
 
 /// Times at one size and way of waiting, microseconds, by transport and turn.

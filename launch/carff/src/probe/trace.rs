@@ -3,13 +3,13 @@
 use super::structure::columns;
 use crate::session::{Session, SessionArgs};
 use crate::spans::{Span, trace_events};
-use anyhow::{Context, bail, ensure};
+use anyhow::{Context, ensure};
 use carff_base::files::check_writable;
 use carff_messages::Stage;
 use carff_transport::TopicId;
 use carff_transport::monotonic_now_ns;
 use clap::Args;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::str::FromStr;
 
 /// Time to wait for a frame's views after its decision, nanoseconds.
@@ -57,7 +57,7 @@ pub struct TraceArgs {
 
 /// Prints the way of a recorded frame; `next` is the first one.
 #[cfg(feature = "recording")]
-fn recorded(args: &TraceArgs, recording: &Path) -> anyhow::Result<()> {
+fn recorded(args: &TraceArgs, recording: &std::path::Path) -> anyhow::Result<()> {
     let (_, spans) = crate::spans::recorded_spans(recording)?;
     let frames = || spans.iter().filter(|s| s.stage == Stage::Camera).map(|s| s.frame_id);
     let (first, last) = (frames().min(), frames().max());
@@ -69,7 +69,7 @@ fn recorded(args: &TraceArgs, recording: &Path) -> anyhow::Result<()> {
     let spans: Vec<Span> = spans.iter().filter(|s| s.frame_id == frame).cloned().collect();
     if spans.is_empty() {
         let range = first.zip(last).map_or("no frames".to_owned(), |(first, last)| format!("frames {first} to {last}"));
-        bail!("{file} does not have frame {frame}; it has {range}");
+        anyhow::bail!("{file} does not have frame {frame}; it has {range}");
     }
     print_way(frame, spans);
     Ok(())

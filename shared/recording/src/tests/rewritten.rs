@@ -159,6 +159,41 @@ fn missing_topics_are_named() {
     assert_eq!(count(reader), FRAMES);
 }
 
+/// Recordings of two runs that a tool has merged are refused where the second run begins, because frames of both have the
+/// same numbers. Parts of one run may be merged.
+#[test]
+fn merged_runs_are_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let original = copied(&recording(folder.path()));
+    let path = folder.path().join("merged.mcap");
+    let half = original.len() / 2;
+    let parts = [&original[half..], &original[..half]].concat();
+    write(&path, &parts, WriteOptions::new(), Place::First);
+    assert_eq!(read(&path).0.len(), messages(0).len() * FRAMES as usize);
+
+    let other_run = |mut message: Copied| {
+        // Only the JSON forms have the id.
+        if let Ok(text) = std::str::from_utf8(&message.4) {
+            message.4 = text.replace("\"0000000000000005\"", "\"0000000000000006\"").into_bytes();
+        }
+        message.3.publish_time += 1_000_000_000_000;
+        message
+    };
+    let both: Vec<Copied> = original.iter().cloned().chain(original.iter().cloned().map(other_run)).collect();
+    write(&path, &both, WriteOptions::new(), Place::First);
+    let mut reader = Reader::open(&path).unwrap();
+    let mut entries = 0;
+    let error = loop {
+        match reader.next() {
+            Ok(entry) => entries += u64::from(entry.is_some()),
+            Err(error) => break error.to_string(),
+        }
+        assert!(entries <= 6 * FRAMES, "the second run was read");
+    };
+    assert_eq!(entries, messages(0).len() as u64 * FRAMES);
+    assert!(error.contains("merged.mcap has messages of two runs (0000000000000005 and 0000000000000006)"), "{error}");
+}
+
 /// A file without topics of a run is refused by its topics, also if one has a name of this program, but another
 /// encoding. A recording of another format is refused.
 #[test]

@@ -133,7 +133,7 @@ impl DriveCounts {
     /// ```
     /// use carff_trials::run::DriveCounts;
     /// let counts = DriveCounts::of(carff_messages::Rule::Calibrated, 10, &[]);
-    /// assert_eq!(counts.hazard.trials, 0);
+    /// assert_eq!((counts.hazard.trials, counts.hazard.interval), (0, [0.0, 1.0]));
     /// ```
     pub fn of(rule: Rule, samples: usize, decisive: &[(DecidedFrame, DriveKind)]) -> Self {
         let mut counts =
