@@ -347,6 +347,28 @@ static_assert(offsetof(CarffUnknowns, prior) == 360, "CarffUnknowns.prior");
 static_assert(offsetof(CarffUnknowns, boxes) == 368, "CarffUnknowns.boxes");
 static_assert(offsetof(CarffUnknowns, stage_latency_ns) == 816, "CarffUnknowns.stage_latency_ns");
 
+#define CARFF_OCCUPANCY_TYPE_NAME "carff.Occupancy.v1"
+typedef struct CarffOccupancy {
+    CarffHeader header;
+    uint32_t columns;
+    uint32_t rows;
+    float cell_m;
+    float low_corner_m[2];
+    float unknown_probability;
+    float probability[1024];
+    uint64_t stage_latency_ns;
+} CarffOccupancy;
+
+static_assert(sizeof(CarffOccupancy) == 4184, "CarffOccupancy");
+static_assert(offsetof(CarffOccupancy, header) == 0, "CarffOccupancy.header");
+static_assert(offsetof(CarffOccupancy, columns) == 56, "CarffOccupancy.columns");
+static_assert(offsetof(CarffOccupancy, rows) == 60, "CarffOccupancy.rows");
+static_assert(offsetof(CarffOccupancy, cell_m) == 64, "CarffOccupancy.cell_m");
+static_assert(offsetof(CarffOccupancy, low_corner_m) == 68, "CarffOccupancy.low_corner_m");
+static_assert(offsetof(CarffOccupancy, unknown_probability) == 76, "CarffOccupancy.unknown_probability");
+static_assert(offsetof(CarffOccupancy, probability) == 80, "CarffOccupancy.probability");
+static_assert(offsetof(CarffOccupancy, stage_latency_ns) == 4176, "CarffOccupancy.stage_latency_ns");
+
 #define CARFF_VIEW_META_TYPE_NAME "carff.ViewMeta.v1"
 typedef struct CarffViewMeta {
     CarffHeader header;
@@ -448,6 +470,7 @@ static_assert(offsetof(CarffHealth, rss_bytes) == 136, "CarffHealth.rss_bytes");
 #define CARFF_TOPIC_FORECASTER_FORECAST "forecaster/forecast" /* CarffForecast */
 #define CARFF_TOPIC_PROBER_BELIEF "prober/belief" /* CarffBelief */
 #define CARFF_TOPIC_PROBER_UNKNOWN "prober/unknown" /* CarffUnknowns */
+#define CARFF_TOPIC_PROBER_OCCUPANCY "prober/occupancy" /* CarffOccupancy */
 #define CARFF_TOPIC_RENDERER_VIEW "renderer/view" /* CarffViewMeta (user header of a slice of bytes) */
 #define CARFF_TOPIC_CONTROLLER_ACTION "controller/action" /* CarffAction */
 #define CARFF_TOPIC_HEALTH_CAMERA "health/camera" /* CarffHealth */

@@ -68,9 +68,6 @@ pub struct LaunchArgs {
     /// Folder of the stages' programs; default: this program's folder.
     #[arg(long, hide = true)]
     pub stages: Option<PathBuf>,
-    /// Prints no decisions: the feed shows its own progress.
-    #[arg(skip)]
-    pub quiet: bool,
 }
 
 /// Launches a graph. Ends when the camera is done (exit code 0), on Ctrl-C (130), or with an error when a stage is
@@ -172,7 +169,7 @@ pub(crate) fn run_graph(
     };
     let drives = args.drives.unwrap_or(graph.camera.drives);
     let decisions = args.decisions.as_deref();
-    let shown = match (args.quiet, args.verbose) {
+    let shown = match (feed.as_ref().is_some_and(|feed| feed.is_quiet), args.verbose) {
         (true, _) => Shown::Nothing,
         (_, true) => Shown::Frames,
         _ => Shown::Drives,

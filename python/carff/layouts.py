@@ -287,6 +287,23 @@ class Unknowns(ctypes.Structure):
         return "carff.Unknowns.v2"
 
 
+class Occupancy(ctypes.Structure):
+    _fields_ = [
+        ("header", Header),
+        ("columns", ctypes.c_uint32),
+        ("rows", ctypes.c_uint32),
+        ("cell_m", ctypes.c_float),
+        ("low_corner_m", (ctypes.c_float * 2)),
+        ("unknown_probability", ctypes.c_float),
+        ("probability", (ctypes.c_float * 1024)),
+        ("stage_latency_ns", ctypes.c_uint64),
+    ]
+
+    @staticmethod
+    def type_name() -> str:
+        return "carff.Occupancy.v1"
+
+
 class ViewMeta(ctypes.Structure):
     _fields_ = [
         ("header", Header),
@@ -366,6 +383,7 @@ LAYOUTS = {
     Belief: (15224, 8, {"header": 0, "horizon": 56, "state_count": 60, "place_count": 64, "component_count": 68, "sample_count": 72, "is_final": 76, "state_probability": 80, "hazard_probability": 336, "path_probability": 340, "component_weights": 344, "components": 376, "samples": 2008, "sample_component": 15064, "resolved_state": 15128, "unknown_probability": 15132, "resolved": 15136, "encoder_ns": 15200, "forecaster_ns": 15208, "stage_latency_ns": 15216}),
     UnknownBox: (56, 8, {"center": 0, "half_size": 24, "probability": 48, "place": 52}),
     Unknowns: (824, 8, {"header": 0, "box_count": 56, "state_count": 60, "probability": 64, "residual": 68, "noise": 72, "gain": 76, "offset": 88, "explained": 100, "ratios": 104, "prior": 360, "boxes": 368, "stage_latency_ns": 816}),
+    Occupancy: (4184, 8, {"header": 0, "columns": 56, "rows": 60, "cell_m": 64, "low_corner_m": 68, "unknown_probability": 76, "probability": 80, "stage_latency_ns": 4176}),
     ViewMeta: (280, 8, {"header": 0, "hypothesis": 56, "kind": 60, "state": 64, "width_px": 68, "height_px": 72, "probability": 76, "latent": 80, "intrinsics": 112, "world_from_camera": 144, "stage_latency_ns": 272}),
     Action: (120, 8, {"header": 0, "action": 56, "reason": 60, "rule": 64, "sample_count": 68, "confidence": 72, "hazard_probability": 76, "is_decision": 80, "unknown_probability": 84, "valid_until_ns": 88, "based_on_frame": 96, "latency_ns": 104, "target_speed_mps": 112, "look_gain_bits": 116}),
     Health: (144, 8, {"header": 0, "stage": 56, "state": 60, "pid": 64, "received": 72, "published": 80, "skipped": 88, "invalid": 96, "errors": 104, "last_latency_ns": 112, "max_latency_ns": 120, "last_progress_ns": 128, "rss_bytes": 136}),
@@ -400,6 +418,7 @@ TOPICS = [
     Topic("forecaster/forecast", Forecast, False, Limits(10, 2, 14, 0, 16, 3, 2)),
     Topic("prober/belief", Belief, False, Limits(10, 2, 14, 0, 16, 3, 2)),
     Topic("prober/unknown", Unknowns, False, Limits(10, 2, 14, 0, 16, 3, 2)),
+    Topic("prober/occupancy", Occupancy, False, Limits(10, 2, 14, 0, 16, 3, 2)),
     Topic("renderer/view", ViewMeta, True, Limits(8, 2, 12, 0, 8, 2, 2)),
     Topic("controller/action", Action, False, Limits(10, 2, 14, 1, 16, 3, 2)),
     Topic("health/camera", Health, False, Limits(10, 2, 14, 1, 16, 3, 2)),

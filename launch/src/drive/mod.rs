@@ -164,10 +164,10 @@ pub fn run(args: &DriveArgs) -> anyhow::Result<ExitCode> {
         run: Some(args.run.clone()),
         stages: args.stages.clone(),
         decisions: args.decisions.clone(),
-        quiet: true,
         ..LaunchArgs::default()
     };
-    let feed = Feed { without: [Stage::Camera].into(), run: Box::new(move |run, stop| world.run(run, stop)) };
+    let run = Box::new(move |run: &_, stop: &_| world.run(run, stop));
+    let feed = Feed { without: [Stage::Camera].into(), is_quiet: true, run };
     let (ended, outcome) = run_graph(&launch, Some(feed), &terminal)?;
     let results = std::mem::take(&mut *results.lock().unwrap_or_else(std::sync::PoisonError::into_inner));
     let frames = outcome.records.frames.values();

@@ -141,7 +141,8 @@ pub fn run(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
         terminal: terminal.clone(),
         replayed: args.verify.then(|| replayed.clone()),
     };
-    let feed = Feed { without: replaced(&topics), run: Box::new(move |run, stop| player.play(run, stop)) };
+    let run = Box::new(move |run: &_, stop: &_| player.play(run, stop));
+    let feed = Feed { without: replaced(&topics), is_quiet: false, run };
     let (ended, _) = run_graph(&launch, Some(feed), &terminal)?;
     if ended == Ended::Interrupted || !args.verify {
         return Ok(ExitCode::SUCCESS);

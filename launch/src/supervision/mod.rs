@@ -58,6 +58,8 @@ pub(crate) const LAUNCHER: &str = "launcher";
 pub(crate) struct Feed {
     /// Stages that are not started, including the camera: the feed sends their messages.
     pub(crate) without: BTreeSet<Stage>,
+    /// True if the feed shows its own progress, so that no decisions are printed.
+    pub(crate) is_quiet: bool,
     /// Function that runs on its own thread once all stages are ready; the run ends when it returns.
     pub(crate) run: FeedRun,
 }

@@ -48,10 +48,10 @@ fn run(stage: &mut StageContext) -> anyhow::Result<()> {
             let started_ns = monotonic_now_ns();
             let _span = frame_span(&belief.header);
             // Both are published before the belief that they belong to.
-            while let Some(motion) = motions.as_mut().map_or(Ok(None), |motions| motions.next())? {
+            while let Some(motion) = motions.as_mut().map_or(Ok(None), Receiver::next)? {
                 controller.on_motion(&motion);
             }
-            while let Some(look) = looks.as_mut().map_or(Ok(None), |looks| looks.next())? {
+            while let Some(look) = looks.as_mut().map_or(Ok(None), Receiver::next)? {
                 controller.on_look(&look);
             }
             if let Some(action) = controller.on_belief(&belief, started_ns) {

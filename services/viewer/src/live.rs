@@ -525,6 +525,9 @@ mod tests {
             assert_eq!(decision(&action(reason, is_decision), &mut last).is_some(), written, "{reason}");
         }
         let decided = decision(&action(Reason::Belief, 1), &mut last).unwrap();
-        assert_eq!((decided.latency_ms, decided.reason.as_str(), decided.action), (Some(2.5), "calibrated", ActionCode::Halt));
+        assert_eq!(
+            (decided.latency_ms, decided.reason.as_str(), decided.action),
+            (Some(2.5), "calibrated", ActionCode::Halt)
+        );
     }
 }

@@ -111,7 +111,10 @@ fn watches_a_run_from_frame_to_decision() {
     };
     actions.send(action).unwrap();
     let decision = wait_for(|| feed.watched().journal.decisions().next().cloned());
-    assert_eq!((decision.rests_on.as_str(), decision.halt, decision.latency_ms), ("frame 4", true, Some(8.0)));
+    assert_eq!(
+        (decision.rests_on.as_str(), decision.action, decision.latency_ms),
+        ("frame 4", ActionCode::Halt, Some(8.0))
+    );
     let encoder_ms = feed.watched().journal.times().iter().find(|t| t.name == "encoder").map(|t| t.values[0]);
     assert_eq!(encoder_ms, Some([4.0, 3.0]));
 

@@ -4,6 +4,7 @@ mod common;
 
 use carff_dataset::Image;
 use carff_decision::{Evidence, Plan, Sampling, Step, look_ahead};
+use carff_messages::ActionCode;
 use carff_scenes::{Extras, RenderOptions};
 use carff_viewer::input::{Album, Input};
 use carff_viewer::models::Models;
@@ -64,7 +65,7 @@ fn follows_the_stages_path() {
     let steps: Vec<Step> = session.moment().unwrap().steps().cloned().collect();
     assert_eq!(steps, wanted);
     let last = session.journal.decisions().next_back().unwrap();
-    assert_eq!(last.halt, session.models().policy.decide(&Evidence::of_steps(&wanted)).halt);
+    assert_eq!(last.action == ActionCode::Halt, session.models().policy.decide(&Evidence::of_steps(&wanted)).halt);
     assert_eq!(session.journal.decisions().len(), 3);
 }
 

@@ -73,17 +73,16 @@ impl Approach {
     /// assert_eq!(Approach::Look.drive(true, 0.8, far, speeds), (ActionCode::Creep, 5.0));
     /// ```
     pub fn drive(self, halt: bool, look_gain_bits: f64, motion: Option<Motion>, speeds: Speeds) -> Drive {
-        if !halt || motion.is_some_and(|motion| motion.is_committed()) {
+        if !halt || motion.is_some_and(Motion::is_committed) {
             return (ActionCode::Advance, speeds.advance_mps);
         }
         let Some(motion) = motion else { return (ActionCode::Halt, 0.0) };
         let within = |limit_mps: f64, stop_m: f64| limit_mps.min(motion.stopping_mps(stop_m));
         let speed_mps = match self {
             Self::Stop => 0.0,
-            Self::Phantom => within(speeds.creep_mps, SPACE_M),
             Self::Peek if motion.to_conflict_m > STOP_LINE_M + SPACE_M => within(speeds.advance_mps, STOP_LINE_M),
             Self::Look if look_gain_bits >= LEAST_GAIN_BITS => within(speeds.advance_mps, SPACE_M),
-            Self::Peek | Self::Look => within(speeds.creep_mps, SPACE_M),
+            Self::Phantom | Self::Peek | Self::Look => within(speeds.creep_mps, SPACE_M),
         };
         if speed_mps < SLOWEST_MPS { (ActionCode::Halt, 0.0) } else { (ActionCode::Creep, speed_mps) }
     }
@@ -119,8 +118,8 @@ mod tests {
 
     const SPEEDS: Speeds = Speeds { advance_mps: 5.0, creep_mps: 1.5 };
 
-    fn at(to_conflict_m: f64, speed_mps: f64) -> Option<Motion> {
-        Some(Motion { speed_mps, to_conflict_m })
+    fn at(to_conflict_m: f64, speed_mps: f64) -> Motion {
+        Motion { speed_mps, to_conflict_m }
     }
 
     /// No approach lets a vehicle be faster than it can stop before the place, wherever it is; at the place it halts.
@@ -130,12 +129,12 @@ mod tests {
             for gain in [0.0, 1.0] {
                 for tenths in 0..200 {
                     let to_conflict_m = f64::from(tenths) / 10.0 + 0.05;
-                    let (code, speed_mps) = approach.drive(true, gain, at(to_conflict_m, 0.0), SPEEDS);
+                    let (code, speed_mps) = approach.drive(true, gain, Some(at(to_conflict_m, 0.0)), SPEEDS);
                     assert_ne!(code, ActionCode::Advance);
                     assert!(speed_mps.powi(2) / (2.0 * BRAKING_MPS2) <= to_conflict_m, "{approach:?} {to_conflict_m}");
                     assert_eq!(code == ActionCode::Halt, speed_mps == 0.0);
                 }
-                assert_eq!(approach.drive(true, gain, at(SPACE_M, 0.0), SPEEDS), (ActionCode::Halt, 0.0));
+                assert_eq!(approach.drive(true, gain, Some(at(SPACE_M, 0.0)), SPEEDS), (ActionCode::Halt, 0.0));
             }
         }
     }
@@ -144,18 +143,18 @@ mod tests {
     #[test]
     fn a_committed_vehicle_leaves() {
         let advance = (ActionCode::Advance, 5.0);
-        assert_eq!(Approach::Look.drive(true, 0.0, at(-1.0, 0.0), SPEEDS), advance);
-        assert_eq!(Approach::Stop.drive(true, 0.0, at(1.0, 4.0), SPEEDS), advance);
-        assert_eq!(Approach::Stop.drive(true, 0.0, at(3.0, 4.0), SPEEDS).0, ActionCode::Halt);
+        assert_eq!(Approach::Look.drive(true, 0.0, Some(at(-1.0, 0.0)), SPEEDS), advance);
+        assert_eq!(Approach::Stop.drive(true, 0.0, Some(at(1.0, 4.0)), SPEEDS), advance);
+        assert_eq!(Approach::Stop.drive(true, 0.0, Some(at(3.0, 4.0)), SPEEDS).0, ActionCode::Halt);
         assert_eq!(Approach::Look.drive(false, 0.0, None, SPEEDS), advance);
     }
 
     /// Without anything to learn from further on, a vehicle that looks creeps; peeking stops first.
     #[test]
     fn approaches_differ() {
-        assert_eq!(Approach::Look.drive(true, 0.01, at(10.0, 3.0), SPEEDS).1, SPEEDS.creep_mps);
-        assert!(Approach::Peek.drive(true, 0.0, at(STOP_LINE_M + SPACE_M + 0.1, 3.0), SPEEDS).1 < 2.0);
-        assert_eq!(Approach::Peek.drive(true, 0.0, at(STOP_LINE_M, 0.0), SPEEDS).1, SPEEDS.creep_mps);
+        assert_eq!(Approach::Look.drive(true, 0.01, Some(at(10.0, 3.0)), SPEEDS).1, SPEEDS.creep_mps);
+        assert!(Approach::Peek.drive(true, 0.0, Some(at(STOP_LINE_M + SPACE_M + 0.1, 3.0)), SPEEDS).1 < 2.0);
+        assert_eq!(Approach::Peek.drive(true, 0.0, Some(at(STOP_LINE_M, 0.0)), SPEEDS).1, SPEEDS.creep_mps);
         assert_eq!(Approach::Look.drive(true, 1.0, None, SPEEDS), (ActionCode::Halt, 0.0));
     }
 }

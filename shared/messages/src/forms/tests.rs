@@ -149,7 +149,7 @@ fn messages_survive_their_forms() {
 
         let mut occupancy = Occupancy::empty(header().at_step(2));
         (occupancy.columns, occupancy.rows, occupancy.cell_m) = (7, 5, 0.7);
-        occupancy.low_corner_m = [-17.3, next()];
+        occupancy.low_corner_m = [-17.3, 1.0 / 3.0];
         occupancy.unknown_probability = probability(&mut next);
         occupancy.probability[..35].fill_with(|| probability(&mut next));
         assert_eq!(there_and_back(&occupancy), occupancy);
