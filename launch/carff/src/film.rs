@@ -33,7 +33,7 @@ const MIN_SIDE_PX: u32 = 16;
 /// Frame rates that the encoder accepts, hertz.
 const RATES_HZ: std::ops::RangeInclusive<f64> = 1.0..=60.0;
 
-/// Size of the occupancy grid's picture.
+/// Size of the occupancy grid's image.
 const GRID_PX: [u32; 2] = [64, 64];
 /// Rate of a film from a recording with only one frame, frames per second.
 const LONE_FRAME_HZ: f64 = 10.0;
@@ -312,7 +312,7 @@ struct Scene {
     hazards: Vec<bool>,
     /// Size of rendered hypotheses; overload makes some of them smaller.
     view_px: Option<[u32; 2]>,
-    /// Size of the occupancy grid's picture, where the recording has grids.
+    /// Size of the occupancy grid's image, where the recording has grids.
     grid_px: Option<[u32; 2]>,
     frame: Option<(FrameMeta, Image)>,
     belief: Option<Belief>,
