@@ -67,7 +67,7 @@ impl Approach {
     /// use carff_decision::{Approach, Motion, Speeds};
     /// use carff_messages::ActionCode;
     /// let speeds = Speeds { advance_mps: 5.0, creep_mps: 1.5 };
-    /// let far = Some(Motion { speed_mps: 5.0, to_conflict_m: 8.0 });
+    /// let far = Some(Motion { speed_mps: 5.0, to_conflict_m: 10.0 });
     /// assert_eq!(Approach::Stop.drive(true, 0.0, far, speeds), (ActionCode::Halt, 0.0));
     /// assert_eq!(Approach::Phantom.drive(true, 0.0, far, speeds), (ActionCode::Creep, 1.5));
     /// assert_eq!(Approach::Look.drive(true, 0.8, far, speeds), (ActionCode::Creep, 5.0));
