@@ -285,18 +285,32 @@ fn a_run_ends_with_a_report_and_leaves_nothing() {
     graph.assert_nothing_left();
 }
 
-/// In a terminal of 80 columns, each status line fits, is drawn in place, and shows only whole values.
-#[test]
-fn a_narrow_terminal() {
-    let graph = Graph::new("none");
+/// Returns what a run of 60 frames shows in a terminal of 80 columns.
+fn shown_in(graph: &Graph, terminal: &str) -> String {
     let inner = graph.command(60);
     let words = std::iter::once(inner.get_program()).chain(inner.get_args().filter(|arg| *arg != "--verbose"));
     let line = words.map(|word| format!("'{}'", word.to_str().unwrap())).collect::<Vec<_>>().join(" ");
     let mut command = Command::new("script");
-    command.args(["-qec", &format!("stty cols 80 rows 24; exec {line}"), "/dev/null"]).env("TERM", "xterm");
+    command.args(["-qec", &format!("stty cols 80 rows 24; exec {line}"), "/dev/null"]).env("TERM", terminal);
     let output = command.stdin(Stdio::null()).output().unwrap();
     assert!(output.status.success(), "{}", text(&output));
-    let shown = String::from_utf8_lossy(&output.stdout);
+    String::from_utf8_lossy(&output.stdout).into_owned()
+}
+
+/// A terminal without any control sequence gets none: neither colours nor lines that are drawn again.
+#[test]
+fn a_dumb_terminal() {
+    let graph = Graph::new("none");
+    let shown = shown_in(&graph, "dumb");
+    assert!(!shown.contains('\x1b') && shown.contains("frames"), "{shown}");
+    graph.assert_nothing_left();
+}
+
+/// In a terminal of 80 columns, each status line fits, is drawn in place, and shows only whole values.
+#[test]
+fn a_narrow_terminal() {
+    let graph = Graph::new("none");
+    let shown = shown_in(&graph, "xterm");
     let plain = without_escapes(&shown);
     let statuses: Vec<&str> = plain.split(['\r', '\n']).filter(|line| line.contains("skipped 0, restarts 0")).collect();
     assert!(!statuses.is_empty(), "{shown:?}");
