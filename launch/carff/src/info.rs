@@ -6,7 +6,7 @@ use carff_dataset::Dataset;
 use carff_messages::SCHEMA_VERSION;
 use carff_messages::layout::{Described, Layout};
 use carff_observe::LiveRun;
-use carff_runtime::{EGO_POSE, EgoPose};
+use carff_runtime::{EGO_MOTION, EGO_POSE, EgoMotion, EgoPose};
 use carff_transport::{Limits, Run, TRANSPORT_VERSION, TopicId};
 use clap_complete::engine::ArgValueCandidates;
 use serde_json::{Value, json};
@@ -50,9 +50,10 @@ pub fn run(command: &RunCommand) -> anyhow::Result<ExitCode> {
 pub fn info(live: &LiveRun) -> anyhow::Result<Value> {
     let run = Run::within(&live.dir, &live.name, live.run_id)?;
     let graph = TopicId::all().map(|id| topic(id.name(), id.is_image(), &id.layout(), id.limits()));
-    // A camera on a vehicle receives it.
-    let ego = topic(EGO_POSE.name, false, &EgoPose::layout(), EGO_POSE.limits);
-    let topics: Vec<Value> = graph.chain([ego]).collect();
+    // A camera on a vehicle receives its pose, and a controller with an approach its motion.
+    let pose = topic(EGO_POSE.name, false, &EgoPose::layout(), EGO_POSE.limits);
+    let motion = topic(EGO_MOTION.name, false, &EgoMotion::layout(), EGO_MOTION.limits);
+    let topics: Vec<Value> = graph.chain([pose, motion]).collect();
     Ok(json!({
         "run": live.name,
         "run_id": format!("{:016x}", live.run_id),

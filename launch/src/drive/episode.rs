@@ -1,9 +1,11 @@
 //! One closed-loop drive: the ego moves by target speeds, everyone else by themselves; collisions are judged by boxes.
 
 use super::results::{EpisodeResult, Outcome};
-use super::vehicle::{SUBSTEP_S, Vehicle};
+use super::vehicle::Vehicle;
 use carff_scenes::{ClosedLoop, Episode};
 
+/// Longest time over which accelerations are constant, seconds.
+const SUBSTEP_S: f64 = 0.02;
 /// Speed below which the ego stands, m/s.
 const STANDS_MPS: f64 = 0.05;
 /// Space that the planner that knows the truth keeps to the place where others drive, and to each of them, metres.
@@ -40,19 +42,20 @@ impl<'a> Drive<'a> {
     /// Moves everyone for a frame's time, the ego towards a target speed. Returns the result at the drive's end.
     pub(super) fn step(&mut self, target_mps: f64, frame_s: f64) -> Option<EpisodeResult> {
         self.frames += 1;
-        for _ in 0..(frame_s / SUBSTEP_S).round().max(1.0) as u64 {
-            if let Some(outcome) = self.substep(target_mps) {
+        let substeps = (frame_s / SUBSTEP_S - 1e-9).ceil().max(1.0);
+        for _ in 0..substeps as u64 {
+            if let Some(outcome) = self.substep(target_mps, frame_s / substeps) {
                 return Some(self.result(outcome));
             }
         }
         None
     }
 
-    fn substep(&mut self, target_mps: f64) -> Option<Outcome> {
-        self.vehicle.substep(target_mps.clamp(0.0, self.drives.config().speed_mps));
-        self.time_s += SUBSTEP_S;
+    fn substep(&mut self, target_mps: f64, time_s: f64) -> Option<Outcome> {
+        self.vehicle.substep(target_mps.clamp(0.0, self.drives.config().speed_mps), time_s);
+        self.time_s += time_s;
         if self.vehicle.speed_mps < STANDS_MPS {
-            self.halted_s += SUBSTEP_S;
+            self.halted_s += time_s;
         }
         self.least_gap_m = self.least_gap_m.min(self.drives.gap_m(&self.episode, self.vehicle.at_m, self.time_s));
         if self.least_gap_m <= 0.0 {
@@ -71,7 +74,7 @@ impl<'a> Drive<'a> {
     pub(super) fn oracle_mps(&self) -> f64 {
         let (fast_mps, to_conflict_m) = (self.drives.config().speed_mps, self.to_conflict_m());
         let mut ahead = Self { least_gap_m: f64::INFINITY, ..self.clone() };
-        while ahead.substep(fast_mps).is_none() {}
+        while ahead.substep(fast_mps, SUBSTEP_S).is_none() {}
         let passes = ahead.least_gap_m >= ORACLE_GAP_M;
         let stop_mps = carff_decision::stopping_mps(to_conflict_m - ORACLE_SPACE_M);
         if passes || to_conflict_m <= 0.0 { fast_mps } else { fast_mps.min(stop_mps) }
@@ -87,6 +90,46 @@ impl<'a> Drive<'a> {
             least_gap_m: self.least_gap_m.is_finite().then_some(self.least_gap_m),
             frames: self.frames,
             missed_frames: self.missed,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use carff_scenes::Scenario;
+    use std::path::Path;
+
+    /// Time passes as the frames show it, at any frame rate: a vehicle at its speed limit is as far after a second.
+    #[test]
+    fn time_passes_at_any_frame_rate() {
+        let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/scenarios/approaching-intersection.toml");
+        let drives = ClosedLoop::new(Scenario::load(&file).unwrap()).unwrap();
+        let speed_mps = drives.config().speed_mps;
+        for frame_rate_hz in [1.0, 7.0, 10.0, 30.0, 60.0, 100.0] {
+            let mut drive = Drive::begin(&drives, 0, drives.episode(0, 1, Some(0)));
+            for _ in 0..frame_rate_hz as u32 {
+                assert!(drive.step(speed_mps, 1.0 / frame_rate_hz).is_none());
+            }
+            assert!((drive.time_s - 1.0).abs() < 1e-9, "{frame_rate_hz}: {}", drive.time_s);
+            assert!((drive.vehicle.at_m - speed_mps).abs() < 1e-6, "{frame_rate_hz}: {}", drive.vehicle.at_m);
+        }
+    }
+
+    /// The planner that knows the truth never collides, and drives on at once where nobody comes.
+    #[test]
+    fn the_oracle_does_not_collide() {
+        let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/scenarios/approaching-intersection.toml");
+        let drives = ClosedLoop::new(Scenario::load(&file).unwrap()).unwrap();
+        for number in 0..40 {
+            let mut drive = Drive::begin(&drives, number, drives.episode(number, 9, None));
+            let result = loop {
+                if let Some(result) = drive.step(drive.oracle_mps(), 0.1) {
+                    break result;
+                }
+            };
+            assert_eq!(result.outcome, Outcome::Arrived, "{number}");
+            assert!(result.actors > 0 || result.time_s < 3.8, "{number}: {}", result.time_s);
         }
     }
 }

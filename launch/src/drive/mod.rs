@@ -14,7 +14,7 @@ use crate::launch::{LaunchArgs, run_graph};
 use crate::supervision::{Ended, Feed};
 use anyhow::{Context, ensure};
 use carff::terminal::Terminal;
-use carff_base::files::check_writable;
+use carff_base::files::{check_distinct, check_writable};
 use carff_checkpoint::{Manifest, ScenarioIdentity};
 use carff_config::{CameraSource, GraphConfig};
 use carff_decision::Approach;
@@ -128,6 +128,7 @@ pub fn run(args: &DriveArgs) -> anyhow::Result<ExitCode> {
     args.json.as_deref().map_or(Ok(()), check_writable)?;
     args.decisions.as_deref().map_or(Ok(()), check_writable)?;
     let file = find_scenario(&args.scenario)?;
+    check_distinct([file.as_path()], args.json.as_deref().into_iter().chain(args.decisions.as_deref()))?;
     let drives = ClosedLoop::new(Scenario::load(&file)?)?;
     let manifest = Manifest::load(&args.checkpoint)?;
     let scenario = drives.scenario();

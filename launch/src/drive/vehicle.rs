@@ -7,8 +7,6 @@ const BRAKING_MPS2: f64 = 6.0;
 const JERK_MPS3: f64 = 20.0;
 /// Time in which the vehicle aims to reach its target speed, seconds.
 const RESPONSE_S: f64 = 0.3;
-/// Time over which the acceleration is constant, seconds.
-pub(super) const SUBSTEP_S: f64 = 0.02;
 
 /// A vehicle on its way.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -26,23 +24,25 @@ impl Vehicle {
         Self { at_m: 0.0, speed_mps, acceleration_mps2: 0.0 }
     }
 
-    /// Moves for [`SUBSTEP_S`] towards a target speed.
-    pub(super) fn substep(&mut self, target_mps: f64) {
+    /// Moves towards a target speed, for a time over which the acceleration is constant.
+    pub(super) fn substep(&mut self, target_mps: f64, time_s: f64) {
         let wanted = ((target_mps - self.speed_mps) / RESPONSE_S).clamp(-BRAKING_MPS2, ACCELERATION_MPS2);
-        let change = JERK_MPS3 * SUBSTEP_S;
+        let change = JERK_MPS3 * time_s;
         self.acceleration_mps2 += (wanted - self.acceleration_mps2).clamp(-change, change);
         let before_mps = self.speed_mps;
-        self.speed_mps = (before_mps + self.acceleration_mps2 * SUBSTEP_S).max(0.0);
+        self.speed_mps = (before_mps + self.acceleration_mps2 * time_s).max(0.0);
         if self.speed_mps == 0.0 {
             self.acceleration_mps2 = self.acceleration_mps2.max(0.0);
         }
-        self.at_m += f64::midpoint(before_mps, self.speed_mps) * SUBSTEP_S;
+        self.at_m += f64::midpoint(before_mps, self.speed_mps) * time_s;
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    const SUBSTEP_S: f64 = 0.02;
 
     /// A vehicle that brakes hard from 5 m/s stands within the limits of braking and jerk, and stays; one that starts
     /// keeps the limit of acceleration and reaches its target.
@@ -52,7 +52,7 @@ mod tests {
         for target_mps in [0.0, 8.0] {
             let mut last = vehicle;
             for _ in 0..400 {
-                vehicle.substep(target_mps);
+                vehicle.substep(target_mps, SUBSTEP_S);
                 let acceleration = (vehicle.speed_mps - last.speed_mps) / SUBSTEP_S;
                 assert!((-BRAKING_MPS2 - 1e-9..=ACCELERATION_MPS2 + 1e-9).contains(&acceleration), "{acceleration}");
                 assert!(vehicle.at_m >= last.at_m && vehicle.speed_mps <= 8.0 + 1e-9);

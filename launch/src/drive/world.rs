@@ -84,7 +84,8 @@ impl World {
         loop {
             let header = Header::of_frame(frame_id, monotonic_now_ns(), self.seed);
             self.publish(topics, &drive, header, (number, take_start))?;
-            next_ns += (frame_s * 1e9) as u64;
+            // A late frame delays later ones, as with a camera.
+            next_ns = (next_ns + (frame_s * 1e9) as u64).max(header.capture_time_ns);
             let action = if self.is_real_time {
                 topics.newest_at(next_ns)?
             } else {
