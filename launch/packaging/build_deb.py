@@ -99,7 +99,7 @@ def fill(tree: Path, target: Path) -> None:
         print("the package has no bill of materials: cargo-cyclonedx is not installed (see `make sbom`)")
     debian = ROOT / "launch/packaging/debian"
     put(debian / "vehicle.toml", tree / "etc/carff/vehicle.toml")
-    for unit in ["carff.service", "carff-metrics.service", "carff-record.service", "carff.target"]:
+    for unit in ["carff.service", "carff-metrics.service", "carff-record.service", "carff-bridge.service", "carff.target"]:
         put(debian / unit, tree / "lib/systemd/system" / unit)
     for drop_in in ["camera-device.conf", "camera-network.conf"]:
         put(debian / drop_in, doc / "examples" / drop_in)

@@ -3,6 +3,8 @@
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
+#[cfg(feature = "recording")]
+use crate::bag::BagArgs;
 use anyhow::{Context, bail, ensure};
 use carff_dataset::{
     Dataset, DatasetReport, Degradation, ImportOptions, SheetOptions, contact_sheet, degrade, import,
@@ -45,10 +47,14 @@ Example: an actor that no shipped model knows
     },
     /// Convert a dataset in the format of nerfstudio or instant-ngp into a dataset of one state.
     #[command(after_help = "Example: a dataset with its region of interest
-  carff dataset import path/to/set --out data/mine --bounds -2,-2,0,2,2,2")]
+  carff dataset import path/to/set --out data/mine --bounds -2,-2,0,2,2,2
+
+Example: a ROS 2 bag with images, camera_info and transforms
+  carff dataset import bag/ --topic /front/image_raw --out data/mine")]
     Import {
         /// Folder of the dataset: one `transforms.json` or three (`transforms_train.json` and so on), PNG or JPEG images,
-        /// and masks (`mask_path`). Lens distortion (`OPENCV`, `OPENCV_FISHEYE`) is undone.
+        /// and masks (`mask_path`). Lens distortion (`OPENCV`, `OPENCV_FISHEYE`) is undone. Or a recording of another
+        /// tool with images, calibration and poses: an MCAP file, or a folder of them.
         dir: PathBuf,
         /// Folder to write; it must be new, empty, or a dataset that this program wrote.
         #[arg(long)]
@@ -60,6 +66,10 @@ Example: an actor that no shipped model knows
         /// look at.
         #[arg(long, value_parser = corners, allow_hyphen_values = true)]
         bounds: Option<[[f64; 3]; 2]>,
+        /// Options for recordings.
+        #[cfg(feature = "recording")]
+        #[command(flatten)]
+        recording: BagArgs,
     },
     /// Write a copy of a dataset as a camera gives it: noise, varying exposure and white balance, inexact poses.
     #[command(after_help = "Example: a hard copy
@@ -121,8 +131,17 @@ pub fn run(command: DatasetCommand) -> anyhow::Result<()> {
             println!("{images} images in {}", out.display());
             Ok(())
         }
-        DatasetCommand::Import { dir, out, max_side, bounds } => {
+        DatasetCommand::Import {
+            dir,
+            out,
+            max_side,
+            bounds,
+            #[cfg(feature = "recording")]
+            recording,
+        } => {
             let options = ImportOptions { max_side_px: max_side, bounds, ..ImportOptions::default() };
+            #[cfg(feature = "recording")]
+            let (dir, _extracted) = extracted(dir, &recording)?;
             let imported = import(&dir, &out, &options)?;
             println!(
                 "{} images in {} ({} undistorted, {} scaled down, {} with a mask)",
@@ -167,6 +186,27 @@ fn corners(text: &str) -> Result<[[f64; 3]; 2], String> {
         }
         _ => Err("six numbers are needed: x0,y0,z0,x1,y1,z1, the first three below the last three".to_owned()),
     }
+}
+
+/// Extracts a recording into a temporary folder. Returns the dataset's folder: that one, or the given folder if it is
+/// not a recording; and the temporary folder, which is removed when it is dropped.
+#[cfg(feature = "recording")]
+fn extracted(dir: PathBuf, args: &BagArgs) -> anyhow::Result<(PathBuf, Option<tempfile::TempDir>)> {
+    if !crate::bag::is_recording(&dir) {
+        return Ok((dir, None));
+    }
+    let folder = tempfile::tempdir().context("cannot create a temporary folder")?;
+    let set = folder.path().join(dir.file_stem().unwrap_or_default());
+    std::fs::create_dir(&set)?;
+    let found = crate::bag::extract(&dir, &set, args)?;
+    println!(
+        "{}: {} images, {} without a pose, {} used",
+        dir.display(),
+        found.images,
+        found.without_pose,
+        found.written
+    );
+    Ok((set, Some(folder)))
 }
 
 /// Returns the path of a scenario file, or of the scenario of that name: in configs/scenarios of this folder, of a

@@ -6,6 +6,8 @@
 
 #![warn(clippy::print_stderr, reason = "`eprintln!` panics where standard error is full: `carff::say` does not")]
 
+#[cfg(feature = "recording")]
+mod bag;
 pub mod checkpoint;
 pub mod command;
 pub mod dataset;

@@ -69,7 +69,7 @@ def main() -> None:
         uid = pwd.getpwnam("carff").pw_uid
         say(f"installed, user carff is {uid}")
         units = [f"/lib/systemd/system/{unit}"
-                 for unit in ["carff.service", "carff-metrics.service", "carff-record.service", "carff.target"]]
+                 for unit in ["carff.service", "carff-metrics.service", "carff-record.service", "carff-bridge.service", "carff.target"]]
         run("systemd-analyze", "verify", *units)
         exposure = run("systemd-analyze", "security", "--offline=true", units[0], check=False).stdout.strip()
         say(exposure.splitlines()[-1])

@@ -66,6 +66,36 @@ fn the_shipped_graph_drives() {
     assert!(trials("hazard") + trials("clear") >= 300.0, "{report:#}");
 }
 
+/// A run computes the tables of the rules only on request. A signal while it computes them ends it with exit code 130; the
+/// run's own report, JSON and filmstrip are then written.
+#[test]
+fn tables_are_computed_on_request() {
+    let drive = |more: &[&str]| {
+        let graph = TestGraph::new(&scenario_set(), &shipped_checkpoint(), PATIENT);
+        let args = [&["--drives", "1", "--report", "report.json"], more].concat();
+        let launcher = Process::start(&mut graph.launch(&graph.file(), &args));
+        (graph, launcher)
+    };
+    let (graph, launcher) = drive(&[]);
+    launcher.end().assert_success();
+    let report = graph.report();
+    assert!(report["decisions"].as_u64() > Some(0) && report.get("planning").is_none(), "{report:#}");
+
+    for kind in [Signal::INT, Signal::TERM, Signal::HUP] {
+        let (graph, mut launcher) = drive(&["--tables"]);
+        launcher.wait_for("own report", |text| text.contains("filmstrip: "));
+        launcher.signal(kind);
+        let finished = launcher.end();
+        assert_eq!(finished.status.code(), Some(130), "{kind:?}: {}", finished.text);
+        let report = graph.report();
+        assert!(report["decisions"].as_u64() > Some(0) && report.get("planning").is_none(), "{report:#}");
+        for written in ["report.txt", "report.png"] {
+            assert!(graph.path(written).metadata().unwrap().len() > 0, "{written}");
+        }
+        graph.assert_nothing_left();
+    }
+}
+
 /// Ctrl-C ends all processes of a working graph, with the shell's exit code for it, and leaves nothing behind.
 #[test]
 fn an_interrupt_leaves_nothing() {

@@ -109,6 +109,10 @@ fn probes_show_what_runs() {
     assert!(stages.iter().all(|stage| trace.lines().any(|line| line.starts_with(stage))), "{trace}");
     let events: Value = serde_json::from_str(&std::fs::read_to_string(graph.path("trace.json")).unwrap()).unwrap();
     assert!(events["traceEvents"].as_array().is_some_and(|e| e.iter().any(|e| e["cat"] == "encoder")), "{events}");
+    let traced = trace.split_once("frame ").and_then(|(_, rest)| rest.split(',').next()).unwrap().to_owned();
+    let way = |text: &str| text.lines().filter(|line| line.starts_with("controller")).collect::<Vec<_>>().join("");
+    let past = probe(&graph, &["trace", &traced], &[]);
+    assert!(!way(&past).is_empty() && way(&past) == way(&trace), "{past}\n{trace}");
     let top = probe(&graph, &["top", "--once"], &[]);
     assert!(stages.iter().all(|stage| top.contains(stage)) && top.contains(graph.run().name()), "{top}");
     let status = carff(&graph, &["metrics", "--once"], &[]).end();
@@ -119,6 +123,8 @@ fn probes_show_what_runs() {
     let unknown = carff(&graph, &["probe", "echo", "beleif"], &[]).end();
     assert!(unknown.text.contains("did you mean `prober/belief`"), "{}", unknown.text);
     stop(&graph, launcher);
+    let ended = probe(&graph, &["trace", &traced], &[]);
+    assert_eq!(way(&ended), way(&trace));
 }
 
 /// Probes that come, go and are killed leave the graph running and nothing behind. If all slots of a topic are in use,

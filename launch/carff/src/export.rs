@@ -302,7 +302,7 @@ mod tests {
     fn tables_name_states_and_times() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("r.mcap");
-        let states = ["nobody, t0", "nobody, t1", "truck, t0", "truck, t1"].map(str::to_owned).to_vec();
+        let states = ["no actor, t0", "no actor, t1", "truck, t0", "truck, t1"].map(str::to_owned).to_vec();
         let about = About { states, wall_offset_ns: 1_700_000_000_000_000_000, ..About::default() };
         let mut writer = Writer::create(&path, &about, &[]).unwrap();
         for frame in 0..2_u64 {
@@ -333,7 +333,7 @@ mod tests {
                 (cell("resolved_state"), cell("samples.0.state"), cell("samples.1.state")),
                 ("truck t1", "truck t0", "")
             );
-            assert_eq!((cell("state_probability.truck t1"), cell("state_probability.nobody t0")), ("0.5", "0.0"));
+            assert_eq!((cell("state_probability.truck t1"), cell("state_probability.no actor t0")), ("0.5", "0.0"));
         }
         let frames = rows("camera-frame.csv");
         let branch = frames[0].iter().position(|c| c == "dataset_view.branch").unwrap();

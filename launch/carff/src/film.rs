@@ -493,6 +493,96 @@ mod tests {
         }
     }
 
+    /// An exported film shows each frame next to its own decision, hazard probability and belief, and the latest hypothesis
+    /// from above.
+    #[test]
+    fn films_show_decision_and_belief() {
+        use carff_messages::forms::AnyMessage;
+        use carff_messages::{Header, Rule};
+        let folder = tempfile::tempdir().unwrap();
+        let (recording, file) = (folder.path().join("r.mcap"), folder.path().join("film.mp4"));
+        let states = ["actor, t0", "no actor"].map(str::to_owned).to_vec();
+        let about = carff_recording::About { states: states.clone(), ..carff_recording::About::default() };
+        let mut writer = carff_recording::Writer::create(&recording, &about, &[]).unwrap();
+        let [camera_px, view_px] = [[64, 48], [40, 40]];
+        let image = |[width_px, height_px]: [u32; 2], level: u8| Image::filled(width_px, height_px, [level, 60, 90]);
+        // Level of both images, shares of the states, action.
+        let frames = [(200, [0.75, 0.25], ActionCode::Halt), (40, [0.0, 1.0], ActionCode::Advance)];
+        for (frame, (level, shares, action)) in (0..).zip(frames) {
+            let at_ns = 100_000_000 * (frame + 1);
+            let header = Header { publish_time_ns: at_ns, ..Header::of_frame(frame, at_ns, 1) };
+            let mut meta = FrameMeta { header, width_px: 64, height_px: 48, ..FrameMeta::default() };
+            (meta.intrinsics.fl_x_px, meta.intrinsics.fl_y_px) = (50.0, 50.0);
+            let mut belief = Belief::empty(header.at_step(1), 1);
+            (belief.state_count, belief.place_count, belief.component_count, belief.sample_count) = (2, 1, 1, 1);
+            (belief.component_weights[0], belief.hazard_probability) = (1.0, shares[0]);
+            belief.state_probability[..2].copy_from_slice(&shares);
+            let view = ViewMeta {
+                header: header.at_step(1),
+                kind: ViewKind::BirdsEye.code(),
+                state: i32::from(shares[0] < 0.5),
+                probability: 0.5,
+                width_px: view_px[0],
+                height_px: view_px[1],
+                intrinsics: meta.intrinsics,
+                ..ViewMeta::default()
+            };
+            let action = Action {
+                header,
+                action: action.code(),
+                reason: Reason::Belief.code(),
+                rule: Rule::Calibrated.code(),
+                sample_count: 1,
+                confidence: 1.0,
+                hazard_probability: shares[0],
+                is_decision: 1,
+                unknown_probability: 0.0,
+                valid_until_ns: at_ns + 1,
+                based_on_frame: frame,
+                latency_ns: 0,
+                target_speed_mps: 0.0,
+                look_gain_bits: 0.0,
+            };
+            writer.write(TopicId::FRAME, AnyMessage::new(&meta, &image(camera_px, level).rgb)).unwrap();
+            writer.write(TopicId::BELIEF, AnyMessage::new(&belief, &[])).unwrap();
+            writer.write(TopicId::VIEW, AnyMessage::new(&view, &image(view_px, level).rgb)).unwrap();
+            writer.write(TopicId::ACTION, AnyMessage::new(&action, &[])).unwrap();
+        }
+        writer.finish().unwrap();
+        assert_eq!(export(&recording, &file).unwrap(), 2);
+
+        let boards = (0..).zip(frames).map(|(frame, (level, shares, action))| {
+            let named = |name: &str, share| Bar { name: name.to_owned(), share, hazard: None };
+            let state = &states[usize::from(shares[0] < 0.5)];
+            Board {
+                images: vec![
+                    (format!("camera, frame {frame}"), image(camera_px, level)),
+                    (format!("a hypothesis of frame {frame} (50 %): {state}"), image(view_px, level)),
+                ],
+                decision: if action == ActionCode::Halt { "HALT" } else { "advance" }.to_owned(),
+                alarm: action == ActionCode::Halt,
+                lines: vec![
+                    "reason: belief".to_owned(),
+                    format!("hazard probability: {:.2}", shares[0]),
+                    "belief, next step:".to_owned(),
+                ],
+                bars: vec![named(&states[0], shares[0]), named(&states[1], shares[1]), named("unknown", 0.0)],
+            }
+        });
+        let boards: Vec<Image> = boards.map(|board| board.draw().unwrap()).collect();
+        let played = play(&file);
+        assert_eq!(played.size_px, [boards[0].width_px, boards[0].height_px]);
+        let psnr_db = |shown: &[u8], board: &Image| {
+            let [shown, board] =
+                [shown, &board.rgb].map(|p| p.iter().map(|&b| f32::from(b) / 255.0).collect::<Vec<_>>());
+            carff_base::statistics::psnr_db(&shown, &board).unwrap()
+        };
+        for (shown, [own, other]) in played.pictures.iter().zip([[0, 1], [1, 0]]) {
+            let [own, other] = [own, other].map(|board| psnr_db(shown, &boards[board]));
+            assert!(own > 30.0 && other < 20.0, "own board {own} dB, the other frame's {other} dB");
+        }
+    }
+
     /// In images with odd or short sides the last column and row are repeated.
     #[test]
     fn films_have_fitting_sides() {

@@ -28,7 +28,7 @@ pub mod provenance;
 pub mod record;
 pub mod runs;
 pub mod session;
-mod spans;
+pub mod spans;
 pub mod terminal;
 pub mod view;
 mod vitals;

@@ -1,14 +1,21 @@
-//! The log file of a run: writing it with a limited size, where one earlier file is kept, and reading it as it grows.
+//! Files of lines that a run writes: with a limited size, where one earlier file is kept, and read as they grow.
 
 use std::fs::{File, OpenOptions};
-use std::io::{Read, Result, Seek, SeekFrom, Write};
+use std::io::{ErrorKind, Read, Result, Seek, SeekFrom, Write};
 use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 
 /// Size at which a new file begins, bytes.
 const LIMIT_BYTES: u64 = 4 << 20;
 
-/// The log file of a run.
+/// Returns the path of the earlier file.
+pub(crate) fn earlier(path: &Path) -> PathBuf {
+    let mut name = path.as_os_str().to_owned();
+    name.push(".1");
+    name.into()
+}
+
+/// A file of lines with a limited size, such as the log of a run.
 #[derive(Debug)]
 pub(crate) struct LogFile {
     path: PathBuf,
@@ -17,17 +24,24 @@ pub(crate) struct LogFile {
 }
 
 impl LogFile {
-    /// Creates the file; an earlier one is replaced.
+    /// Creates the file; those of an earlier run are replaced.
     pub(crate) fn create(path: &Path) -> Result<Self> {
+        match std::fs::remove_file(earlier(path)) {
+            Err(error) if error.kind() != ErrorKind::NotFound => return Err(error),
+            _ => Self::begin(path),
+        }
+    }
+
+    fn begin(path: &Path) -> Result<Self> {
         let file = OpenOptions::new().write(true).create(true).truncate(true).mode(0o600).open(path)?;
         Ok(Self { path: path.to_owned(), file, bytes: 0 })
     }
 
-    /// Adds a line.
+    /// Adds a line, or several at once.
     pub(crate) fn line(&mut self, text: &str) -> Result<()> {
         if self.bytes >= LIMIT_BYTES {
-            std::fs::rename(&self.path, self.path.with_extension("log.1"))?;
-            *self = Self::create(&self.path)?;
+            std::fs::rename(&self.path, earlier(&self.path))?;
+            *self = Self::begin(&self.path)?;
         }
         self.bytes += text.len() as u64 + 1;
         writeln!(self.file, "{text}")
@@ -77,7 +91,7 @@ impl LogTail {
 mod tests {
     use super::*;
 
-    /// Old lines go to one earlier file, so that a log of any length fits into twice the limit.
+    /// Old lines go to one earlier file, so that a log of any length fits into twice the limit. A new log has none.
     #[test]
     fn a_log_is_limited() {
         let dir = tempfile::tempdir().unwrap();
@@ -86,8 +100,10 @@ mod tests {
         let line = "x".repeat(1 << 20);
         (0..11).for_each(|_| log.line(&line).unwrap());
         let size = |path: &Path| path.metadata().unwrap().len();
-        assert!(size(&path) <= LIMIT_BYTES + (1 << 21) && size(&path.with_extension("log.1")) >= LIMIT_BYTES);
+        assert!(size(&path) <= LIMIT_BYTES + (1 << 21) && size(&earlier(&path)) >= LIMIT_BYTES);
         assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 2);
+        LogFile::create(&path).unwrap();
+        assert!(size(&path) == 0 && !earlier(&path).exists());
     }
 
     /// A reader gets every line once and whole, also across the start of the next file.

@@ -100,7 +100,10 @@ pub fn stop(args: &StopArgs) -> anyhow::Result<ExitCode> {
 pub fn logs(args: &LogsArgs) -> anyhow::Result<ExitCode> {
     let (live, path) = match (&args.run, carff_observe::find(args.run.as_deref())) {
         (_, Ok(live)) => (Some(live.clone()), log_path(&live.dir, &live.name)),
-        (Some(name), Err(_)) if Run::new(name, 0).is_ok() => (None, ended_log(name)?),
+        (Some(name), Err(_)) if Run::new(name, 0).is_ok() => {
+            let path = newest_file(name, log_path);
+            (None, path.with_context(|| format!("no run `{name}` is alive, and none has left a log"))?)
+        }
         (_, Err(error)) => return Err(error.into()),
     };
     let mut log = LogTail::open(&path).with_context(|| format!("cannot read {}", path.display()))?;
@@ -116,9 +119,8 @@ pub fn logs(args: &LogsArgs) -> anyhow::Result<ExitCode> {
     }
 }
 
-/// Returns the newest log of a run that has ended.
-fn ended_log(name: &str) -> anyhow::Result<PathBuf> {
-    let paths = runtime_dirs().into_iter().map(|dir| log_path(&dir, name));
-    let newest = paths.filter_map(|path| Some((path.metadata().ok()?.modified().ok()?, path))).max();
-    newest.map(|(_, path)| path).with_context(|| format!("no run `{name}` is alive, and none has left a log"))
+/// Returns the newest file that runs of a name have left in their folders.
+pub(crate) fn newest_file(name: &str, path: fn(&Path, &str) -> PathBuf) -> Option<PathBuf> {
+    let paths = runtime_dirs().into_iter().map(|dir| path(&dir, name));
+    paths.filter_map(|path| Some((path.metadata().ok()?.modified().ok()?, path))).max().map(|(_, path)| path)
 }

@@ -1,15 +1,16 @@
-//! The time that each stage spent on each frame, from its messages: as lines, and as a trace file for Perfetto and
-//! Chrome.
+//! The time that each stage spent on each frame, from its messages: as lines, as a trace file for Perfetto and Chrome,
+//! and as a file of the last minutes of a run.
 
+use crate::log_file::{LogFile, earlier};
 use crate::vitals::stage_latency_ns;
 use carff_messages::forms::AnyMessage;
 use carff_messages::{Action, ActionCode, Belief, Forecast, FrameMeta, Reason, Stage, ViewMeta};
+use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
-#[cfg(feature = "recording")]
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// A stage's work on a frame.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) struct Span {
     pub(crate) stage: Stage,
     pub(crate) frame_id: u64,
@@ -46,6 +47,54 @@ impl Span {
             what: what(message),
         })
     }
+}
+
+/// Returns the path of a run's kept spans.
+pub(crate) fn spans_path(dir: &Path, run: &str) -> PathBuf {
+    dir.join(format!("{run}.spans"))
+}
+
+/// The spans of the last minutes of a run: a file of JSON lines next to the run's log. At 10 frames per second and two
+/// steps it holds 5 to 10 minutes.
+#[derive(Debug)]
+pub struct KeptSpans {
+    file: LogFile,
+    /// Lines that are not written yet.
+    lines: String,
+}
+
+impl KeptSpans {
+    /// Creates the file of a run; one of an earlier run is replaced.
+    pub fn create(dir: &Path, run: &str) -> std::io::Result<Self> {
+        Ok(Self { file: LogFile::create(&spans_path(dir, run))?, lines: String::new() })
+    }
+
+    /// Adds the work behind a message, if it is a stage's work on a frame.
+    pub fn add(&mut self, message: AnyMessage<'_>) {
+        if let Some(Ok(line)) = Span::of(message).map(|span| serde_json::to_string(&span)) {
+            self.lines.push_str(&line);
+            self.lines.push('\n');
+        }
+    }
+
+    /// Writes what was added.
+    pub fn write(&mut self) {
+        if !self.lines.is_empty() {
+            // A full disk must not disturb the run.
+            let _ = self.file.line(self.lines.trim_end());
+            self.lines.clear();
+        }
+    }
+}
+
+/// Returns the kept spans of a run, in the order in which they were written; none where there is no such file.
+pub(crate) fn kept_spans(path: &Path) -> Vec<Span> {
+    let read = |path: &Path| std::fs::read(path).unwrap_or_default();
+    // In this order, nothing is lost if the next file begins in between: the newest lines are then in the earlier file.
+    let (newest, before) = (read(path), read(&earlier(path)));
+    let bytes = if before.starts_with(&newest) { before } else { [before, newest].concat() };
+    // The launcher writes the last line at this moment: it may be incomplete.
+    bytes.split(|&byte| byte == b'\n').filter_map(|line| serde_json::from_slice(line).ok()).collect()
 }
 
 /// Returns the run of a recording, and the work of its stages.
@@ -105,6 +154,30 @@ pub(crate) fn trace_events(run: &str, spans: &[Span]) -> Value {
 mod tests {
     use super::*;
     use carff_messages::{Gaussian, Header, Posterior};
+
+    /// Kept spans are read back as they were added, while the run continues. A line that is cut off is left out.
+    #[test]
+    fn kept_spans_are_read_back() {
+        use std::io::Write;
+        let dir = tempfile::tempdir().unwrap();
+        let path = spans_path(dir.path(), "r");
+        let mut kept = KeptSpans::create(dir.path(), "r").unwrap();
+        assert_eq!(kept_spans(&path), []);
+        let posterior = |frame| Posterior {
+            header: Header { publish_time_ns: frame + 9, ..Header::of_frame(frame, frame, 1) },
+            gaussian: Gaussian::standard(),
+            take_start: 0,
+            stage_latency_ns: 5,
+        };
+        for frame in 1..4 {
+            kept.add(AnyMessage::new(&posterior(frame), &[]));
+            kept.write();
+        }
+        let spans: Vec<_> = (1..4).filter_map(|f| Span::of(AnyMessage::new(&posterior(f), &[]))).collect();
+        assert_eq!(kept_spans(&path), spans);
+        std::fs::OpenOptions::new().append(true).open(&path).unwrap().write_all(b"{\"stage\":\"enc").unwrap();
+        assert_eq!(kept_spans(&path), spans);
+    }
 
     /// A span ends at its message's publish time and has the length that the stage reports. A trace has one event per
     /// span.

@@ -17,6 +17,7 @@ pub mod restart;
 mod service_manager;
 
 use anyhow::{Context, anyhow, bail, ensure};
+use carff::spans::KeptSpans;
 use carff::terminal::Terminal;
 use carff_config::{CameraSource, GraphConfig, WhenLost};
 use carff_messages::{HealthState, Stage};
@@ -125,8 +126,10 @@ impl<'a> Supervisor<'a> {
         decided: &'a mut dyn FnMut(&FrameRecord),
     ) -> anyhow::Result<Self> {
         let (folder, stage_args) = stages;
+        let run = node.run();
+        let spans = KeptSpans::create(run.dir(), run.name()).context("cannot write the run's times")?;
         Ok(Self {
-            monitor: Monitor::open(node, graph)?,
+            monitor: Monitor::open(node, graph, spans)?,
             waiter: Waiter::new(stop.clone()),
             node,
             graph,

@@ -1,10 +1,12 @@
 //! Subscribes to all topics of a run and records every frame.
 
 use carff::conditions::Conditions;
+use carff::spans::KeptSpans;
 use carff_config::GraphConfig;
 use carff_decision::ImageEvidence;
+use carff_messages::forms::AnyMessage;
 use carff_messages::{
-    Action, ActionCode, Belief, DatasetView, FrameMeta, Gaussian, Header, Health, HealthState, ImageCheck,
+    Action, ActionCode, Belief, DatasetView, Forecast, FrameMeta, Gaussian, Header, Health, HealthState, ImageCheck,
     Observability, Posterior, Reason, Stage, UnknownBox, Unknowns, ViewMeta,
 };
 use carff_transport::{Image, Node, OpenError, ReceiveError, Receiver, topics};
@@ -305,17 +307,20 @@ pub struct Monitor {
     posteriors: Receiver<Posterior>,
     checks: Receiver<ImageCheck>,
     unknowns: Receiver<Unknowns>,
+    forecasts: Receiver<Forecast>,
     beliefs: Receiver<Belief>,
     actions: Receiver<Action>,
     views: Receiver<Image<ViewMeta>>,
     healths: Vec<Receiver<Health>>,
+    spans: KeptSpans,
     /// Records of the run.
     pub records: Records,
 }
 
 impl Monitor {
-    /// Subscribes without being notified of messages: notifications would take a core from the stages.
-    pub fn open(node: &Node, graph: &GraphConfig) -> Result<Self, OpenError> {
+    /// Subscribes without being notified of messages: notifications would take a core from the stages. The stages' work
+    /// on each frame is kept in `spans`.
+    pub fn open(node: &Node, graph: &GraphConfig, spans: KeptSpans) -> Result<Self, OpenError> {
         let wanted = Wanted {
             keep: graph.launcher.keep_frames as usize,
             samples: graph.run.samples,
@@ -328,10 +333,12 @@ impl Monitor {
             posteriors: node.receiver(&topics::POSTERIOR)?.polled(),
             checks: node.receiver(&topics::CHECK)?.polled(),
             unknowns: node.receiver(&topics::UNKNOWN)?.polled(),
+            forecasts: node.receiver(&topics::FORECAST)?.polled(),
             beliefs: node.receiver(&topics::BELIEF)?.polled(),
             actions: node.receiver(&topics::ACTION)?.polled(),
             views: node.receiver(&topics::VIEW)?.polled(),
             healths: healths.collect::<Result<_, _>>()?,
+            spans,
             records: Records { wanted, ..Records::default() },
         })
     }
@@ -340,9 +347,11 @@ impl Monitor {
     pub fn drain(&mut self, mut decided: impl FnMut(&FrameRecord)) -> Result<(), ReceiveError> {
         // Topics are read in the order of the data flow, so that each message finds its frame.
         while let Some(frame) = self.frames.next()? {
+            self.spans.add(AnyMessage::new(&*frame, &[]));
             self.records.take_frame(&frame);
         }
         while let Some(posterior) = self.posteriors.next()? {
+            self.spans.add(AnyMessage::new(&*posterior, &[]));
             self.records.take_posterior(&posterior);
         }
         while let Some(check) = self.checks.next()? {
@@ -351,15 +360,21 @@ impl Monitor {
         while let Some(unknowns) = self.unknowns.next()? {
             self.records.take_unknowns(&unknowns);
         }
+        while let Some(forecast) = self.forecasts.next()? {
+            self.spans.add(AnyMessage::new(&*forecast, &[]));
+        }
         while let Some(belief) = self.beliefs.next()? {
+            self.spans.add(AnyMessage::new(&*belief, &[]));
             self.records.take_belief(&belief);
         }
         while let Some(action) = self.actions.next()? {
+            self.spans.add(AnyMessage::new(&*action, &[]));
             if let Some(frame) = self.records.take_action(&action).and_then(|id| self.records.frames.get(&id)) {
                 decided(frame);
             }
         }
         while let Some(view) = self.views.next()? {
+            self.spans.add(AnyMessage::new(&*view, &[]));
             self.records.take_view(&view);
         }
         for receiver in &mut self.healths {
@@ -369,6 +384,7 @@ impl Monitor {
                 }
             }
         }
+        self.spans.write();
         Ok(())
     }
 }

@@ -50,7 +50,7 @@ enum Command {
 }
 
 fn main() -> anyhow::Result<()> {
-    let cli = Cli::parse();
+    let cli: Cli = carff_runtime::parse()?;
     let stop = Stop::on_signals().context("cannot handle signals")?;
     match cli.command {
         Command::Send(args) => send::run(&args, &stop),

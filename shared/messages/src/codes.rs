@@ -55,6 +55,8 @@ macro_rules! codes {
 
 codes! {
     /// The stages of the graph, in start order: consumers before producers.
+    #[derive(Serialize, Deserialize)]
+    #[serde(rename_all = "lowercase")]
     Stage: u32, "stage" {
         /// Replays or takes images.
         Camera = 1 "camera",

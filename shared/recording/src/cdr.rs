@@ -69,11 +69,10 @@ impl<'a> Cdr<'a> {
         (0..count).map(|_| self.f64()).collect()
     }
 
-    /// Skips a time and the name of a coordinate frame, with which messages of sensors begin.
-    pub(crate) fn skip_header(&mut self) -> Result<(), MessageError> {
-        self.u32()?;
-        self.u32()?;
-        self.text().map(drop)
+    /// Returns the time, nanoseconds since 1970, and the coordinate frame with which messages of sensors begin.
+    pub(crate) fn header(&mut self) -> Result<(u64, &'a str), MessageError> {
+        let (seconds, nanoseconds) = (self.u32()?, self.u32()?);
+        Ok((u64::from(seconds) * 1_000_000_000 + u64::from(nanoseconds), self.text()?))
     }
 }
 

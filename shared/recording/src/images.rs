@@ -2,22 +2,16 @@
 //!
 //! The pixels are borrowed from the message; only JPEG and PNG are decoded.
 
+use crate::bag::{Bag, Channel};
 use crate::cdr::Cdr;
 use crate::{MessageError, RecordingError};
 use bytes::Bytes;
 use carff_dataset::{Calibration, CalibrationError, Image, PixelFormat, RawImage};
 use foxglove::Decode;
 use foxglove::messages;
-use mcap::records::{Record, op};
-use mcap::sans_io::linear_reader::{LinearReadEvent, LinearReader, LinearReaderOptions};
-use mcap::{McapError, McapResult};
 use std::collections::BTreeMap;
-use std::fs::File;
-use std::io::Read;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
-/// Maximum length of a record, bytes: an image of the largest size with four bytes a pixel.
-const MAX_RECORD_BYTES: usize = 1 << 28;
 /// Number of images before which a recording must contain its calibration.
 const IMAGES_BEFORE_CALIBRATION: usize = 64;
 
@@ -53,22 +47,9 @@ impl Kind {
     }
 }
 
-/// A channel of a file.
-#[derive(Clone, Debug)]
-struct Channel {
-    topic: String,
-    schema: String,
-    kind: Option<Kind>,
-}
-
 /// Reads the images of one channel, in the order of the file.
 pub struct ImageReader {
-    files: Vec<PathBuf>,
-    /// Number of the open file.
-    file: usize,
-    records: Records,
-    channels: BTreeMap<u16, Channel>,
-    schemas: BTreeMap<u16, String>,
+    bag: Bag,
     topic: String,
     kind: Kind,
     message: Bytes,
@@ -76,38 +57,34 @@ pub struct ImageReader {
 
 impl std::fmt::Debug for ImageReader {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("ImageReader").field("files", &self.files).field("topic", &self.topic).finish_non_exhaustive()
+        f.debug_struct("ImageReader")
+            .field("file", &self.bag.path())
+            .field("topic", &self.topic)
+            .finish_non_exhaustive()
     }
+}
+
+/// Time and coordinate frame in which an image was taken.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct ImageOrigin {
+    /// Capture time: nanoseconds since 1970.
+    pub captured_ns: u64,
+    /// Name of the camera's coordinate frame: x right, y down, z forward.
+    pub frame: String,
 }
 
 impl ImageReader {
     /// Opens a recording, or the recordings in a folder in the order of their names, and finds the channel of the
     /// images: the named one, or the only one.
     pub fn open(path: &Path, topic: Option<&str>) -> Result<Self, RecordingError> {
-        let files = files(path)?;
-        let mut found = BTreeMap::new();
-        for file in &files {
-            for channel in channels(file)? {
-                found.insert(channel.topic.clone(), channel);
-            }
-        }
-        let (topic, kind) = choose(path, &found, topic)?;
-        let records = Records::open(&files[0])?;
-        let (channels, schemas) = (BTreeMap::new(), BTreeMap::new());
-        Ok(Self { files, file: 0, records, channels, schemas, topic, kind, message: Bytes::new() })
+        let bag = Bag::open(path)?;
+        let (topic, kind) = choose(path, &bag.channels()?, topic)?;
+        Ok(Self { bag, topic, kind, message: Bytes::new() })
     }
 
     /// Starts again at the first image.
     pub fn rewind(&mut self) -> Result<(), RecordingError> {
-        self.file = 0;
-        self.open_file()
-    }
-
-    fn open_file(&mut self) -> Result<(), RecordingError> {
-        self.records = Records::open(&self.files[self.file])?;
-        self.channels.clear();
-        self.schemas.clear();
-        Ok(())
+        self.bag.rewind()
     }
 
     /// Returns the channel of the images.
@@ -122,34 +99,24 @@ impl ImageReader {
     /// If the file is damaged. What follows in it cannot be read.
     #[allow(clippy::should_implement_trait, reason = "errors do not end it: the next image may be valid")]
     pub fn next(&mut self) -> Result<Option<u64>, RecordingError> {
-        let topic = self.topic.clone();
-        self.next_of(|channel| channel.topic == topic)
+        let found = self.bag.next(|channel| channel.topic == self.topic)?;
+        Ok(found.map(|message| {
+            self.message = message.data;
+            message.log_time_ns
+        }))
     }
 
-    fn next_of(&mut self, wanted: impl Fn(&Channel) -> bool) -> Result<Option<u64>, RecordingError> {
-        loop {
-            let Self { records, channels, schemas, message, .. } = self;
-            let mut found = None;
-            let more = records.next(|record| {
-                note(&record, schemas, channels);
-                if let Record::Message { header, data } = record
-                    && channels.get(&header.channel_id).is_some_and(&wanted)
-                {
-                    *message = Bytes::copy_from_slice(&data);
-                    found = Some(header.log_time);
-                }
-            });
-            match more {
-                Ok(true) if found.is_some() => return Ok(found),
-                Ok(true) => {}
-                Ok(false) if self.file + 1 < self.files.len() => {
-                    self.file += 1;
-                    self.open_file()?;
-                }
-                Ok(false) => return Ok(None),
-                Err(error) => return Err(RecordingError::mcap(&self.files[self.file], error)),
-            }
-        }
+    /// Returns when and in which coordinate frame the current image was taken.
+    ///
+    /// # Errors
+    ///
+    /// If the message is damaged.
+    pub fn origin(&self) -> Result<ImageOrigin, ImageError> {
+        origin(self.kind, &self.message).map_err(|cause| self.error(cause))
+    }
+
+    fn error(&self, cause: MessageError) -> ImageError {
+        ImageError { topic: self.topic.clone(), cause: cause.0 }
     }
 
     /// Calls a function with the current image.
@@ -158,37 +125,31 @@ impl ImageReader {
     ///
     /// If the message is damaged, or its encoding is not supported.
     pub fn with_image<R>(&self, each: impl FnOnce(&RawImage<'_>) -> R) -> Result<R, ImageError> {
-        let wrong = |cause: MessageError| ImageError { topic: self.topic.clone(), cause: cause.0 };
-        with_image(self.kind, &self.message, Path::new(&self.topic), each).map_err(wrong)
+        with_image(self.kind, &self.message, Path::new(&self.topic), each).map_err(|cause| self.error(cause))
     }
 
     /// Returns the calibration that the recording contains for its images, and then starts again at the first image.
     pub fn calibration(&mut self) -> Result<Option<Calibration>, RecordingError> {
-        let namespace = namespace(&self.topic).to_owned();
+        let namespace = namespace(&self.topic);
+        let is_rectified = self.topic.rsplit('/').any(|part| part.starts_with("image_rect"));
+        let calibrates = |channel: &Channel| {
+            channel.kind(&KINDS).filter(|k| k.is_calibration() && self::namespace(&channel.topic) == namespace)
+        };
         let mut found = None;
-        let mut images = 0;
-        while found.is_none() && images < IMAGES_BEFORE_CALIBRATION {
-            let topic = self.topic.clone();
-            let wanted = |channel: &Channel| {
-                let calibrates = channel.kind.is_some_and(Kind::is_calibration);
-                channel.topic == topic || calibrates && self::namespace(&channel.topic) == namespace
-            };
-            let Some(_) = self.next_of(wanted)? else { break };
-            images += 1;
-            let is_rectified = self.topic.rsplit('/').any(|part| part.starts_with("image_rect"));
-            // An image does not parse as a calibration of the kind of its channel.
-            found = self.current_kind().filter(|kind| kind.is_calibration()).map(|kind| {
-                let wrong = |cause: String| RecordingError::Calibration { path: self.files[self.file].clone(), cause };
-                let parsed = calibration_of(kind, &self.message, is_rectified).map_err(|e| wrong(e.0))?;
-                parsed.map_err(|e| wrong(e.to_string()))
-            });
+        let mut messages = 0;
+        while found.is_none() && messages < IMAGES_BEFORE_CALIBRATION {
+            let wanted = |channel: &Channel| channel.topic == self.topic || calibrates(channel).is_some();
+            let Some(message) = self.bag.next(wanted)? else { break };
+            messages += 1;
+            if let Some(kind) = calibrates(&message.channel) {
+                let path = self.bag.path();
+                let wrong = |cause| RecordingError::Calibration { path: path.to_owned(), cause };
+                let parsed = calibration_of(kind, &message.data, is_rectified).map_err(|e| wrong(e.0))?;
+                found = Some(parsed.map_err(|e| wrong(e.to_string()))?);
+            }
         }
-        self.rewind()?;
-        found.transpose()
-    }
-
-    fn current_kind(&self) -> Option<Kind> {
-        self.channels.get(&self.records.channel_id).and_then(|channel| channel.kind)
+        self.bag.rewind()?;
+        Ok(found)
     }
 }
 
@@ -202,104 +163,6 @@ pub struct ImageError {
     cause: String,
 }
 
-/// The records of a file, one after the other.
-struct Records {
-    file: File,
-    reader: LinearReader,
-    /// Channel of the latest message.
-    channel_id: u16,
-}
-
-impl Records {
-    fn open(path: &Path) -> Result<Self, RecordingError> {
-        let file = File::open(path).map_err(|source| RecordingError::Io { path: path.to_owned(), source })?;
-        let options = LinearReaderOptions::default()
-            .with_record_length_limit(MAX_RECORD_BYTES)
-            .with_validate_chunk_crcs(true)
-            .with_skip_end_magic(true);
-        Ok(Self { file, reader: LinearReader::new_with_options(options), channel_id: 0 })
-    }
-
-    /// Passes the next record to `each`; returns false at the end. A file whose writer was killed ends early.
-    fn next(&mut self, each: impl FnOnce(Record<'_>)) -> McapResult<bool> {
-        loop {
-            match self.reader.next_event() {
-                None | Some(Err(McapError::UnexpectedEof)) => return Ok(false),
-                Some(Err(error)) => return Err(error),
-                Some(Ok(LinearReadEvent::ReadRequest(wanted))) => {
-                    let read = self.file.read(self.reader.insert(wanted.min(MAX_RECORD_BYTES)))?;
-                    self.reader.notify_read(read);
-                }
-                Some(Ok(LinearReadEvent::Record { data, opcode })) => {
-                    if opcode == op::FOOTER {
-                        return Ok(false);
-                    }
-                    let record = mcap::parse_record(opcode, data)?;
-                    if let Record::Message { header, .. } = &record {
-                        self.channel_id = header.channel_id;
-                    }
-                    each(record);
-                    return Ok(true);
-                }
-            }
-        }
-    }
-}
-
-/// Takes notice of schemas and channels.
-fn note(record: &Record<'_>, schemas: &mut BTreeMap<u16, String>, channels: &mut BTreeMap<u16, Channel>) {
-    match record {
-        Record::Schema { header, .. } => drop(schemas.insert(header.id, header.name.clone())),
-        Record::Channel(channel) => {
-            let schema = schemas.get(&channel.schema_id).cloned().unwrap_or_default();
-            let known =
-                KINDS.iter().find(|(name, encoding, _)| *name == schema && *encoding == channel.message_encoding);
-            let kind = known.map(|(.., kind)| *kind);
-            let schema = format!("{schema} in {}", channel.message_encoding);
-            channels.insert(channel.id, Channel { topic: channel.topic.clone(), schema, kind });
-        }
-        _ => {}
-    }
-}
-
-/// Returns the channels of a file: from its summary, or by reading it.
-fn channels(path: &Path) -> Result<Vec<Channel>, RecordingError> {
-    let (mut schemas, mut channels) = (BTreeMap::new(), BTreeMap::new());
-    let mut records = Records::open(path)?;
-    let wrong = |error| RecordingError::mcap(path, error);
-    let summary = crate::summary::range(&mut records.file).map_err(wrong)?;
-    if let Some(range) = summary {
-        let each = |record: Record<'_>| note(&record, &mut schemas, &mut channels);
-        crate::reader::records(&mut records.file, range, each).map_err(wrong)?;
-    }
-    if channels.is_empty() {
-        let mut records = Records::open(path)?;
-        while records.next(|record| note(&record, &mut schemas, &mut channels)).map_err(wrong)? {}
-    }
-    Ok(channels.into_values().collect())
-}
-
-/// Returns the files of a path, which may be a folder of recordings.
-fn files(path: &Path) -> Result<Vec<PathBuf>, RecordingError> {
-    if !path.is_dir() {
-        return Ok(vec![path.to_owned()]);
-    }
-    let io = |source| RecordingError::Io { path: path.to_owned(), source };
-    let mut files = Vec::new();
-    for entry in std::fs::read_dir(path).map_err(io)? {
-        let file = entry.map_err(io)?.path();
-        if file.extension().is_some_and(|extension| extension == "mcap") {
-            files.push(file);
-        }
-    }
-    // `bag_10.mcap` comes after `bag_9.mcap`.
-    files.sort_by_key(|file| (file.as_os_str().len(), file.clone()));
-    if files.is_empty() {
-        return Err(RecordingError::NoImages { path: path.to_owned(), channels: "no file *.mcap is in it".to_owned() });
-    }
-    Ok(files)
-}
-
 /// Chooses the channel of the images.
 fn choose(
     path: &Path,
@@ -308,12 +171,13 @@ fn choose(
 ) -> Result<(String, Kind), RecordingError> {
     let images: Vec<(&String, Kind)> = found
         .iter()
-        .filter_map(|(topic, channel)| Some((topic, channel.kind.filter(|kind| !kind.is_calibration())?)))
+        .filter_map(|(topic, channel)| Some((topic, channel.kind(&KINDS).filter(|kind| !kind.is_calibration())?)))
         .collect();
     let names = || images.iter().map(|(topic, _)| topic.as_str()).collect::<Vec<_>>().join("`, `");
     match (topic, &images[..]) {
         (_, []) => {
-            let channels = found.values().map(|c| format!("`{}` ({})", c.topic, c.schema)).collect::<Vec<_>>();
+            let named = |c: &Channel| format!("`{}` ({} in {})", c.topic, c.schema, c.encoding);
+            let channels = found.values().map(named).collect::<Vec<_>>();
             let channels = if channels.is_empty() { "none".to_owned() } else { channels.join(", ") };
             Err(RecordingError::NoImages { path: path.to_owned(), channels: format!("its channels: {channels}") })
         }
@@ -333,6 +197,25 @@ fn namespace(topic: &str) -> &str {
     topic.rsplit_once('/').map_or("", |(namespace, _)| namespace)
 }
 
+fn origin(kind: Kind, message: &Bytes) -> Result<ImageOrigin, MessageError> {
+    let (captured, frame) = match kind {
+        Kind::FoxgloveImage => {
+            let image = messages::RawImage::decode(message.clone()).map_err(|e| MessageError(e.to_string()))?;
+            (image.timestamp, image.frame_id)
+        }
+        Kind::FoxgloveCompressed => {
+            let image = messages::CompressedImage::decode(message.clone()).map_err(|e| MessageError(e.to_string()))?;
+            (image.timestamp, image.frame_id)
+        }
+        _ => {
+            let (captured_ns, frame) = Cdr::new(message)?.header()?;
+            return Ok(ImageOrigin { captured_ns, frame: frame.to_owned() });
+        }
+    };
+    let captured_ns = captured.map_or(0, |time| time.total_nanos());
+    Ok(ImageOrigin { captured_ns, frame })
+}
+
 fn with_image<R>(
     kind: Kind,
     message: &Bytes,
@@ -342,14 +225,14 @@ fn with_image<R>(
     let compressed = match kind {
         Kind::RosImage => {
             let mut cdr = Cdr::new(message)?;
-            cdr.skip_header()?;
+            cdr.header()?;
             let (height, width, encoding) = (cdr.u32()?, cdr.u32()?, cdr.text()?);
             cdr.u8()?;
             return raw([width, height], cdr.u32()?, encoding, cdr.bytes()?, each);
         }
         Kind::FoxgloveCdrImage => {
             let mut cdr = Cdr::new(message)?;
-            cdr.skip_header()?;
+            cdr.header()?;
             let (width, height, encoding) = (cdr.u32()?, cdr.u32()?, cdr.text()?);
             return raw([width, height], cdr.u32()?, encoding, cdr.bytes()?, each);
         }
@@ -359,13 +242,13 @@ fn with_image<R>(
         }
         Kind::RosCompressed => {
             let mut cdr = Cdr::new(message)?;
-            cdr.skip_header()?;
+            cdr.header()?;
             cdr.text()?;
             Bytes::copy_from_slice(cdr.bytes()?)
         }
         Kind::FoxgloveCdrCompressed => {
             let mut cdr = Cdr::new(message)?;
-            cdr.skip_header()?;
+            cdr.header()?;
             Bytes::copy_from_slice(cdr.bytes()?)
         }
         Kind::FoxgloveCompressed => {
@@ -398,7 +281,7 @@ fn calibration_of(
 ) -> Result<Result<Calibration, CalibrationError>, MessageError> {
     let (size_px, model, d, k, p) = if kind == Kind::RosCalibration {
         let mut cdr = Cdr::new(message)?;
-        cdr.skip_header()?;
+        cdr.header()?;
         let (height, width, model) = (cdr.u32()?, cdr.u32()?, cdr.text()?.to_owned());
         let count = cdr.u32()? as usize;
         let (d, k, _r, p) = (cdr.f64s(count)?, cdr.f64s(9)?, cdr.f64s(9)?, cdr.f64s(12)?);

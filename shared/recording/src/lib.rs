@@ -17,6 +17,7 @@
 //! contains the run, its graph file, its folders and its origin.
 
 mod about;
+mod bag;
 mod cdr;
 mod channels;
 mod images;
@@ -25,15 +26,17 @@ mod reader;
 mod rotation;
 mod standard;
 mod summary;
+mod transforms;
 mod writer;
 
 pub use about::About;
 pub use channels::{Encoded, Encoder, Format};
-pub use images::{ImageError, ImageReader};
+pub use images::{ImageError, ImageOrigin, ImageReader};
 pub use queue::{QueueCounts, RecordingQueue};
 pub use reader::{Entry, Reader};
 pub use rotation::{Limits, RotatingWriter};
 pub use standard::LogLine;
+pub use transforms::Transforms;
 pub use writer::Writer;
 
 use carff_messages::forms::FormError;
@@ -128,6 +131,16 @@ pub enum RecordingError {
         path: PathBuf,
         /// Description of the error.
         cause: String,
+    },
+    /// The file has no poses of the camera.
+    #[error("{path}: no pose of the camera frame `{frame}` is known; {found}")]
+    Poses {
+        /// Path of the file or folder.
+        path: PathBuf,
+        /// Coordinate frame of the images.
+        frame: String,
+        /// The poses and transforms that the file has.
+        found: String,
     },
     /// A message of the file cannot be read.
     #[error("{path}, channel `{channel}`, message {sequence}: {cause}")]

@@ -18,7 +18,7 @@ fn about() -> About {
         dataset: "d".into(),
         checkpoint: "c".into(),
         wall_offset_ns: 1_700_000_000_000_000_000,
-        states: vec!["truck, t0".into(), "nobody, t0".into()],
+        states: vec!["truck, t0".into(), "no actor, t0".into()],
         origin: [("commit".to_owned(), "abc".to_owned())].into(),
     }
 }

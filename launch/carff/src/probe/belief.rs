@@ -132,12 +132,12 @@ mod tests {
             *sample = ProbeResult { state, ..ProbeResult::NONE };
         }
         belief.resolved_state = 0;
-        let states = [("truck, t0", true), ("nobody, t0", false)]
+        let states = [("truck, t0", true), ("no actor, t0", false)]
             .map(|(name, is_hazard)| State { name: name.into(), is_hazard });
         let text = picture(&[belief], &states, "advance", false);
         let line = |name: &str| text.lines().find(|l| l.contains(name)).unwrap_or_default().to_owned();
         assert!(line("truck").starts_with("> truck, t0") && line("truck").ends_with("\u{2022}\u{2022}"), "{text}");
-        assert!(line("truck").contains(&"\u{2588}".repeat(20)) && line("nobody").contains("0.250"), "{text}");
+        assert!(line("truck").contains(&"\u{2588}".repeat(20)) && line("no actor").contains("0.250"), "{text}");
         assert!(line("unknown").contains("0.250") && line("frame 12").contains("advance"), "{text}");
     }
 
@@ -146,7 +146,7 @@ mod tests {
     fn colours_are_of_the_states() {
         let scenario = ScenarioIdentity {
             name: "s".into(),
-            branches: vec!["nobody".into(), "truck".into()],
+            branches: vec!["no actor".into(), "truck".into()],
             timestamps: 2,
             hazard_branches: vec![1],
             poses: 1,
@@ -158,7 +158,8 @@ mod tests {
         belief.samples[0] = ProbeResult { state: 0, hazard_likelihood: 0.9, ..ProbeResult::NONE };
         let text = picture(&[belief], &states(&scenario), "advance", true);
         let line = |text: &str, name: &str| text.lines().find(|l| l.contains(name)).unwrap_or_default().to_owned();
-        for (name, colour) in [("nobody, t0", "32"), ("nobody, t1", "32"), ("truck, t0", "31"), ("truck, t1", "31")] {
+        for (name, colour) in [("no actor, t0", "32"), ("no actor, t1", "32"), ("truck, t0", "31"), ("truck, t1", "31")]
+        {
             assert!(line(&text, name).contains(&format!("\x1b[{colour}m")), "{name}: {text:?}");
         }
         assert!(!line(&text, "unknown").contains('\x1b'), "{text:?}");

@@ -1,15 +1,15 @@
 //! `carff probe trace`: follows one frame through the stages.
 
 use super::structure::columns;
+use crate::runs::newest_file;
 use crate::session::{Session, SessionArgs};
-use crate::spans::{Span, trace_events};
+use crate::spans::{Span, kept_spans, spans_path, trace_events};
 use anyhow::{Context, ensure};
 use carff_base::files::check_writable;
 use carff_messages::Stage;
-use carff_transport::TopicId;
-use carff_transport::monotonic_now_ns;
+use carff_transport::{Run, TopicId, monotonic_now_ns};
 use clap::Args;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
 /// Time to wait for a frame's views after its decision, nanoseconds.
@@ -55,24 +55,66 @@ pub struct TraceArgs {
     pub session: SessionArgs,
 }
 
+/// Returns the first and last frame of the camera among spans.
+fn range(spans: &[Span]) -> Option<(u64, u64)> {
+    let frames = || spans.iter().filter(|s| s.stage == Stage::Camera).map(|s| s.frame_id);
+    frames().min().zip(frames().max())
+}
+
+/// Returns a frame's spans.
+fn of_frame(spans: &[Span], frame: u64) -> Vec<Span> {
+    spans.iter().filter(|s| s.frame_id == frame).cloned().collect()
+}
+
 /// Prints the way of a recorded frame; `next` is the first one.
 #[cfg(feature = "recording")]
 fn recorded(args: &TraceArgs, recording: &std::path::Path) -> anyhow::Result<()> {
     let (_, spans) = crate::spans::recorded_spans(recording)?;
-    let frames = || spans.iter().filter(|s| s.stage == Stage::Camera).map(|s| s.frame_id);
-    let (first, last) = (frames().min(), frames().max());
+    let range = range(&spans);
     let file = recording.display();
     let frame = match args.frame {
         Frame::Number(number) => number,
-        Frame::Next => first.with_context(|| format!("{file} has no frame of the camera"))?,
+        Frame::Next => range.with_context(|| format!("{file} has no frame of the camera"))?.0,
     };
-    let spans: Vec<Span> = spans.iter().filter(|s| s.frame_id == frame).cloned().collect();
+    let spans = of_frame(&spans, frame);
     if spans.is_empty() {
-        let range = first.zip(last).map_or("no frames".to_owned(), |(first, last)| format!("frames {first} to {last}"));
+        let range = range.map_or("no frames".to_owned(), |(first, last)| format!("frames {first} to {last}"));
         anyhow::bail!("{file} does not have frame {frame}; it has {range}");
     }
     print_way(frame, spans);
     Ok(())
+}
+
+/// Returns the kept spans of a frame of a living run, or of the last run of this name.
+fn kept_of_run(run: Option<&str>, frame: u64) -> anyhow::Result<Vec<Span>> {
+    let path = match (run, carff_observe::find(run)) {
+        (_, Ok(live)) => spans_path(&live.dir, &live.name),
+        (Some(name), Err(error)) if Run::new(name, 0).is_ok() => newest_file(name, spans_path).ok_or(error)?,
+        (_, Err(error)) => return Err(error.into()),
+    };
+    kept(&path, frame)
+}
+
+/// Returns the kept spans of a frame that the whole graph has processed or skipped by now; none for a later frame.
+///
+/// # Errors
+///
+/// Fails for a frame that the run does not keep any more.
+fn kept(path: &Path, frame: u64) -> anyhow::Result<Vec<Span>> {
+    let all = kept_spans(path);
+    let Some((first, last)) = range(&all) else { return Ok(Vec::new()) };
+    let end_ns = all.iter().map(|s| s.end_ns).max().unwrap_or(0);
+    if frame > last || frame == last && monotonic_now_ns() < end_ns + AFTER_DECISION_NS {
+        return Ok(Vec::new());
+    }
+    let spans = of_frame(&all, frame);
+    ensure!(
+        !spans.is_empty(),
+        "frame {frame} has passed, and is not among the frames that the run keeps ({first} to {last}): trace it in a \
+         recording (`carff record -o run.mcap`, then `carff probe trace {frame} --recording run.mcap`), or name one of \
+         these, a later one, or `next`"
+    );
+    Ok(spans)
 }
 
 pub(super) fn run(args: &TraceArgs) -> anyhow::Result<()> {
@@ -81,6 +123,13 @@ pub(super) fn run(args: &TraceArgs) -> anyhow::Result<()> {
         return recorded(args, recording);
     }
     args.perfetto.as_deref().map_or(Ok(()), check_writable)?;
+    if let (Frame::Number(frame), None) = (args.frame, &args.perfetto) {
+        let spans = kept_of_run(args.session.run.as_deref(), frame)?;
+        if !spans.is_empty() {
+            print_way(frame, spans);
+            return Ok(());
+        }
+    }
     let mut session = Session::open(&args.session, "probe-trace")?;
     session.listen(TopicId::FLOW)?;
     session.take(|_, _| Ok(()))?;
@@ -130,9 +179,8 @@ pub(super) fn run(args: &TraceArgs) -> anyhow::Result<()> {
     if let (Some(later), true) = (missed, spans.is_empty()) {
         ensure!(
             to_file,
-            "frame {frame} has passed, and a running graph keeps no past frames (the camera is at {later}): trace it in a \
-             recording (`carff record -o run.mcap`, then `carff probe trace {frame} --recording run.mcap`), or name a \
-             later frame, or `next`"
+            "frame {frame} did not arrive before frame {later}: this probe was too slow. Repeat the command: the run keeps \
+             its last minutes"
         );
     }
     ensure!(!spans.is_empty(), "frame {frame} did not arrive");
@@ -198,6 +246,35 @@ mod tests {
             "{text}"
         );
         assert!(line("controller").ends_with("halt"), "{text}");
+    }
+
+    /// A past frame is found among the kept ones. An earlier one is an error that names the kept ones, and a later one, or
+    /// one that the stages may still work on, is waited for.
+    #[test]
+    fn past_frames_are_traced() {
+        use crate::spans::KeptSpans;
+        use carff_messages::forms::AnyMessage;
+        use carff_messages::{FrameMeta, Header};
+        let dir = tempfile::tempdir().unwrap();
+        let path = spans_path(dir.path(), "r");
+        let mut file = KeptSpans::create(dir.path(), "r").unwrap();
+        assert_eq!(kept(&path, 6).unwrap(), []);
+        let now_ns = monotonic_now_ns();
+        for (frame, published_ns) in [(5, 1), (6, 2), (8, now_ns)] {
+            let header = Header { publish_time_ns: published_ns, ..Header::of_frame(frame, 0, 1) };
+            file.add(AnyMessage::new(&FrameMeta { header, width_px: 2, height_px: 1, ..FrameMeta::default() }, &[]));
+        }
+        file.write();
+        assert_eq!(kept(&path, 6).unwrap().iter().map(|s| (s.frame_id, s.end_ns)).collect::<Vec<_>>(), [(6, 2)]);
+        for frame in [4, 7] {
+            let error = kept(&path, frame).unwrap_err().to_string();
+            assert!(error.contains(&format!("frame {frame}")) && error.contains("5 to 8"), "{error}");
+        }
+        assert_eq!(kept(&path, 9).unwrap(), []);
+        while monotonic_now_ns() < now_ns + AFTER_DECISION_NS {
+            std::thread::yield_now();
+        }
+        assert_eq!(kept(&path, 8).unwrap().len(), 1);
     }
 
     /// A frame of a recording is found by its number, `next` is the first one, and an error names the recorded frames.
