@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Checks the book and the other pages without network.
 
-Links and images resolve, linked headings exist, every page of the book is in its summary, the built book has no dead
+The README has its length and its images. Links and images resolve, linked headings exist, every page of the book is in its summary, the built book has no dead
 link, and included line ranges begin and end where a block does. Tests parse the commands in the pages
 (launch/src/main.rs).
 
@@ -22,6 +22,9 @@ HEADING = re.compile(r"^#+\s+(.*?)\s*$", re.MULTILINE)
 INCLUDE = re.compile(r"\{\{#include ([^:}\s]+)(?::(\d+):(\d*))?\}\}")
 FENCE = re.compile(r"^```.*?^```", re.MULTILINE | re.DOTALL)
 
+# The README is read in one go.
+README_LINES, README_IMAGES = 150, 3
+
 findings: list[str] = []
 
 
@@ -33,6 +36,14 @@ def anchors(text: str) -> set[str]:
     """Returns the anchors of a page's headings, as GitHub and mdBook make them."""
     headings = HEADING.findall(FENCE.sub("", text))
     return {re.sub(r"[^\w\- ]", "", h.lower()).replace(" ", "-") for h in headings}
+
+
+def check_readme(text: str) -> None:
+    lines, images = text.count("\n"), len(re.findall(r"!\[", text))
+    if lines > README_LINES:
+        find(f"README.md: {lines} lines; at most {README_LINES}")
+    if images != README_IMAGES:
+        find(f"README.md: {images} images; it has {README_IMAGES}")
 
 
 def check_links(page: Path, text: str) -> None:
@@ -91,6 +102,7 @@ def main() -> None:
         cwd=ROOT, capture_output=True, text=True, check=True,
     )
     pages = [ROOT / p for p in listed.stdout.splitlines() if (ROOT / p).is_file()]
+    check_readme((ROOT / "README.md").read_text(encoding="utf-8"))
     for page in pages:
         text = page.read_text(encoding="utf-8")
         check_links(page, text)

@@ -35,6 +35,7 @@ BANNED = {
     "stands": (r"\b(?:stands?|stood) (?:beside|above|below|around|there)\b", "is"),
     "goes on": (r"\b(?:go|goes|went|going|gone) on\b", "continues"),
     "says": (r"\b(?:says?|said)\b", "reports, states, contains"),
+    "the same": (r"\|\sthe\ssame\b", "a row or cell that names its subject"),
     "tells": (r"\b(?:tells?|told)\b(?!(?: \w+){0,4} apart\b)", "shows, reports"),
 }
 TERMS = {

@@ -115,7 +115,7 @@ impl Decisions {
 
     /// Number of a drive, its actions, and its decisive frame where it has one.
     fn drive_line(&self, drive: i32, frames: &[FrameRecord]) -> String {
-        let halts = frames.iter().filter(|f| f.action != Some(ActionCode::Advance)).count();
+        let halts = frames.iter().filter(|f| f.action.is_none_or(ActionCode::is_safe)).count();
         let mut line = format!("drive {:>3}/{}  {:>3} frames, {halts:>3} halts", drive + 1, self.drives, frames.len());
         let decisive = self.scenario.as_ref().map(|s| decisive_frames(frames.iter().filter_map(decided), s));
         if let Some((frame, kind)) = decisive.and_then(|found| found.into_iter().next()) {
@@ -135,7 +135,7 @@ impl Decisions {
     }
 
     fn frame_line(&self, frame: &FrameRecord) -> String {
-        let halted = !matches!(frame.action, Some(ActionCode::Advance | ActionCode::Creep));
+        let halted = frame.action.is_none_or(ActionCode::is_safe);
         let name = if frame.action == Some(ActionCode::Creep) { "creep  " } else { action_name(halted) };
         let action = self.terminal.alarm(name, halted);
         format!(

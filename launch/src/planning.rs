@@ -100,6 +100,7 @@ fn settings(outcome: &RunOutcome) -> anyhow::Result<RunSettings> {
         sampling: graph.run.sampling,
         horizon: graph.run.horizon,
         compares: graph.checks.compare,
+        ignores_unknown: graph.checks.ignores_unknown(),
         remembers: graph.step_length(None).filter(|_| graph.remembers()),
         noise: graph.camera.noise,
         split_seed: graph.camera.split_seed.unwrap_or(known.split_seed),

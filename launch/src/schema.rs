@@ -149,4 +149,44 @@ mod tests {
         assert_eq!((&ground["type"], &ground["default"]), (&"string".into(), &"#5d8a3c".into()), "{ground}");
         assert!(scenario["properties"]["branches"]["items"]["type"] == "string", "{scenario}");
     }
+
+    /// Returns the numbers before and after the first "to" of a description, such as 1 and 60000 of "1 to 60000".
+    fn documented_range(description: &str) -> Option<[f64; 2]> {
+        let words: Vec<&str> = description.split_whitespace().collect();
+        let number = |word: &str| word.trim_matches([',', '.', ';', '(', ')']).replace('_', "").parse::<f64>().ok();
+        words.windows(3).filter(|w| w[1] == "to").find_map(|w| Some([number(w[0])?, number(w[2])?]))
+    }
+
+    /// Collects the numbers of a schema whose descriptions promise another range than the schema has.
+    fn contradictions(schema: &Value, found: &mut Vec<String>) {
+        let Some(map) = schema.as_object() else { return };
+        for (key, property) in map.get("properties").and_then(Value::as_object).into_iter().flatten() {
+            let is_number = property["type"] == "integer" || property["type"] == "number";
+            let range = property["description"].as_str().and_then(documented_range).filter(|_| is_number);
+            let bound = |names: [&str; 2]| names.iter().find_map(|name| property[name].as_f64());
+            let held = [bound(["minimum", "exclusiveMinimum"]), bound(["maximum", "exclusiveMaximum"])];
+            if range.is_some_and(|range| range.map(Some) != held) {
+                found.push(format!("{key}: {held:?}, documented: {range:?}"));
+            }
+        }
+        map.get("definitions")
+            .and_then(Value::as_object)
+            .into_iter()
+            .flatten()
+            .for_each(|(_, of)| contradictions(of, found));
+    }
+
+    /// The documented range of each number of a file is the range in its schema.
+    #[test]
+    fn documented_ranges_hold() {
+        assert_eq!(documented_range("Age, milliseconds, 1 to 60000. Default 150."), Some([1.0, 60_000.0]));
+        assert_eq!(documented_range("from here to there"), None);
+        let folder = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/schemas");
+        for kind in FileKind::ALL {
+            let text = std::fs::read_to_string(folder.join(kind.file())).unwrap();
+            let mut found = Vec::new();
+            contradictions(&serde_json::from_str(&text).unwrap(), &mut found);
+            assert_eq!(found, Vec::<String>::new(), "{}", kind.file());
+        }
+    }
 }

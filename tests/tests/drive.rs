@@ -42,6 +42,15 @@ fn drives_repeat() {
     assert_eq!((&both["episodes"], &both["missed_frames"], &both["rule"]), (&2.into(), &0.into(), &"look".into()));
     let ends = ["arrived", "collisions", "stuck"].map(|key| both[key].as_u64().unwrap());
     assert_eq!(ends.iter().sum::<u64>(), 2);
+    // The grids of every frame are compared with the truth, at both steps.
+    for of in [&both, &second] {
+        for step in ["1", "2"] {
+            let found = &of["occupancy"][step];
+            assert_eq!(found["grids"], of["frames"], "{found:#}");
+            let error = found["reliability"]["expected_calibration_error"].as_f64().unwrap();
+            assert!((0.0..=1.0).contains(&error) && found["reliability"]["trials"].as_u64() > Some(0), "{found:#}");
+        }
+    }
 }
 
 /// An ego that never stops is as fast as its speed limit; one that never drives on is stuck and is not hit; the planner

@@ -27,9 +27,9 @@ fn probes_take_what_list_shows(graph: &TestGraph) {
     assert!(own["type"] == "speed-gate.SpeedLimit.v1" && own["publishers"][0] == "speed-gate", "{own}");
     assert!(own["rate_hz"].as_f64().unwrap() > 0.0, "{own}");
     for (words, shown) in [
-        (["hz", SPEED_LIMIT.name, "--seconds", "2"], "Hz"),
-        (["bw", SPEED_LIMIT.name, "--seconds", "2"], "per second"),
-        (["delay", "limit", "--seconds", "2"], "age on arrival"),
+        (["hz", SPEED_LIMIT.name, "--count", "4"], "Hz"),
+        (["bw", SPEED_LIMIT.name, "--count", "4"], "per second"),
+        (["delay", "limit", "--count", "4"], "age on arrival"),
         (["echo", "limit", "--count", "2"], "frame_id"),
     ] {
         let text = probe(&words);

@@ -356,7 +356,7 @@ impl Scene {
         let action = self.action.filter(|action| action.based_on_frame == frame);
         let belief = self.belief.filter(|belief| belief.header.frame_id == frame);
         let code = action.map(|action| action.code().unwrap_or(ActionCode::Halt));
-        let halts = code == Some(ActionCode::Halt);
+        let halts = code.is_some_and(ActionCode::is_safe);
         let decision = match code {
             None => "no decision",
             Some(ActionCode::Halt) => "HALT",

@@ -4,6 +4,7 @@
 //! collisions. The stages run as in `carff launch`. Truth is published on the topic `world/truth`, for observers only.
 
 mod episode;
+mod occupancy;
 mod results;
 mod truth;
 mod vehicle;
@@ -21,6 +22,8 @@ use carff_decision::Approach;
 use carff_messages::{Rule, Stage};
 use carff_scenes::{ClosedLoop, Scenario};
 use clap::Args;
+use occupancy::OccupancyCheck;
+use results::{DriveFigures, DriveReport};
 use serde_json::json;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -145,6 +148,7 @@ pub fn run(args: &DriveArgs) -> anyhow::Result<ExitCode> {
 
     let terminal = Arc::new(Terminal::new());
     let results = Arc::new(Mutex::new(Vec::new()));
+    let occupancy = Arc::new(Mutex::new(OccupancyCheck::new(drives.scenario().info().step_s)));
     let identity = drives.scenario().info().name.clone();
     let world = World {
         episodes: args.first..args.first + args.episodes,
@@ -152,9 +156,11 @@ pub fn run(args: &DriveArgs) -> anyhow::Result<ExitCode> {
         actors: args.actors,
         frame_rate_hz: args.frame_rate_hz,
         is_real_time: args.real_time,
+        horizon: graph.run.horizon,
         is_oracle: args.rule == DriveRule::Oracle,
         noise: graph.camera.noise,
         results: results.clone(),
+        occupancy: occupancy.clone(),
         terminal: terminal.clone(),
         drives,
     };
@@ -173,20 +179,24 @@ pub fn run(args: &DriveArgs) -> anyhow::Result<ExitCode> {
     let results = std::mem::take(&mut *results.lock().unwrap_or_else(std::sync::PoisonError::into_inner));
     let frames = outcome.records.frames.values();
     let latencies_ns: Vec<u64> = frames.filter(|f| f.action.is_some()).map(|f| f.latency_ns).collect();
-    let mut figures = results::summary(&results, &latencies_ns);
-    terminal.line(&results::text(&figures));
+    let figures = DriveFigures::of(&results, &latencies_ns);
+    terminal.line(&figures.to_string());
     if let Some(path) = &args.json {
-        figures["scenario"] = json!(identity);
-        figures["rule"] =
-            json!(clap::ValueEnum::to_possible_value(&args.rule).map(|value| value.get_name().to_owned()));
-        figures["seed"] = json!(args.seed);
-        figures["actors"] = json!(args.actors);
-        figures["frame_rate_hz"] = json!(args.frame_rate_hz);
-        figures["real_time"] = json!(args.real_time);
-        figures["interrupted"] = json!(ended == Ended::Interrupted);
-        figures["origin"] = json!(outcome.origin);
-        figures["drives"] = json!(results);
-        let text = serde_json::to_string_pretty(&figures)? + "\n";
+        let rule = clap::ValueEnum::to_possible_value(&args.rule);
+        let report = DriveReport {
+            figures,
+            scenario: identity,
+            rule: rule.map(|value| value.get_name().to_owned()),
+            seed: args.seed,
+            actors: args.actors,
+            frame_rate_hz: args.frame_rate_hz,
+            real_time: args.real_time,
+            interrupted: ended == Ended::Interrupted,
+            origin: outcome.origin,
+            occupancy: occupancy.lock().unwrap_or_else(std::sync::PoisonError::into_inner).figures(),
+            drives: results,
+        };
+        let text = serde_json::to_string_pretty(&report)? + "\n";
         std::fs::write(path, text).with_context(|| format!("cannot write {}", path.display()))?;
         terminal.line(&format!("JSON: {}", path.display()));
     }

@@ -1,8 +1,11 @@
 //! The results of closed-loop drives.
 
+use super::occupancy::StepOccupancy;
+use carff::provenance::Origin;
 use carff_base::statistics::{mean, percentile, wilson_interval};
 use serde::Serialize;
-use serde_json::{Value, json};
+use std::collections::BTreeMap;
+use std::fmt;
 
 /// Gap below which a drive without a collision is a near miss, metres.
 const NEAR_M: f64 = 0.5;
@@ -38,56 +41,110 @@ pub(super) struct EpisodeResult {
     pub(super) missed_frames: u64,
 }
 
-/// Returns the figures of all drives; `latencies_ns` are those of all decisions.
-pub(super) fn summary(results: &[EpisodeResult], latencies_ns: &[u64]) -> Value {
-    let count = |outcome: Outcome| results.iter().filter(|r| r.outcome == outcome).count();
-    let is_near = |r: &&EpisodeResult| r.outcome != Outcome::Collided && r.least_gap_m.is_some_and(|gap| gap < NEAR_M);
-    let times: Vec<f64> = results.iter().filter(|r| r.outcome == Outcome::Arrived).map(|r| r.time_s).collect();
-    let halted: Vec<f64> = results.iter().map(|r| r.halted_s).collect();
-    let latencies: Vec<f64> = latencies_ns.iter().map(|ns| *ns as f64 / 1e6).collect();
-    let collisions = count(Outcome::Collided);
-    let interval = (!results.is_empty()).then(|| wilson_interval(collisions, results.len()));
-    json!({
-        "episodes": results.len(),
-        "collisions": collisions,
-        "collision_share_interval": interval,
-        "arrived": count(Outcome::Arrived),
-        "stuck": count(Outcome::Stuck),
-        "near_misses": results.iter().filter(is_near).count(),
-        "time_to_goal_s": {
-            "mean": mean(&times),
-            "p50": percentile(&times, 0.5),
-            "p95": percentile(&times, 0.95),
-        },
-        "halted_s": { "mean": mean(&halted) },
-        "latency_ms": { "p50": percentile(&latencies, 0.5), "p99": percentile(&latencies, 0.99) },
-        "frames": results.iter().map(|r| r.frames).sum::<u64>(),
-        "missed_frames": results.iter().map(|r| r.missed_frames).sum::<u64>(),
-    })
+/// Mean and quantiles of some durations; null without any.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub(super) struct Durations {
+    mean: Option<f64>,
+    p50: Option<f64>,
+    p95: Option<f64>,
+    p99: Option<f64>,
 }
 
-/// Returns the figures as lines of text.
-pub(super) fn text(summary: &Value) -> String {
-    let number = |value: &Value, digits: usize| value.as_f64().map_or("-".to_owned(), |v| format!("{v:.digits$}"));
-    let [time, latency] = [&summary["time_to_goal_s"], &summary["latency_ms"]];
-    format!(
-        "episodes {}: {} arrived, {} collided, {} stuck, {} near misses\n\
-         time to goal: mean {} s, p50 {} s, p95 {} s; at a standstill: mean {} s\n\
-         camera to action: p50 {} ms, p99 {} ms; {} of {} frames without a decision",
-        summary["episodes"],
-        summary["arrived"],
-        summary["collisions"],
-        summary["stuck"],
-        summary["near_misses"],
-        number(&time["mean"], 2),
-        number(&time["p50"], 2),
-        number(&time["p95"], 2),
-        number(&summary["halted_s"]["mean"], 2),
-        number(&latency["p50"], 1),
-        number(&latency["p99"], 1),
-        summary["missed_frames"],
-        summary["frames"],
-    )
+impl Durations {
+    fn of(values: &[f64]) -> Self {
+        let quantile = |q| percentile(values, q);
+        Self { mean: mean(values), p50: quantile(0.5), p95: quantile(0.95), p99: quantile(0.99) }
+    }
+}
+
+/// Figures of all drives.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub(super) struct DriveFigures {
+    episodes: usize,
+    collisions: usize,
+    /// 95 % Wilson interval of the share of collisions; null without drives.
+    collision_share_interval: Option<[f64; 2]>,
+    arrived: usize,
+    stuck: usize,
+    near_misses: usize,
+    /// Of the drives that arrived.
+    time_to_goal_s: Durations,
+    /// Time at a standstill.
+    halted_s: Durations,
+    /// From camera to action, of every decision.
+    latency_ms: Durations,
+    frames: u64,
+    missed_frames: u64,
+}
+
+/// Everything about the drives of one command.
+#[derive(Clone, Debug, Serialize)]
+pub(super) struct DriveReport {
+    #[serde(flatten)]
+    pub(super) figures: DriveFigures,
+    pub(super) scenario: String,
+    pub(super) rule: Option<String>,
+    pub(super) seed: u64,
+    pub(super) actors: Option<u32>,
+    pub(super) frame_rate_hz: f64,
+    pub(super) real_time: bool,
+    pub(super) interrupted: bool,
+    pub(super) origin: Origin,
+    /// Calibration of the occupancy grids, by step.
+    pub(super) occupancy: BTreeMap<u32, StepOccupancy>,
+    pub(super) drives: Vec<EpisodeResult>,
+}
+
+impl DriveFigures {
+    /// Returns the figures of all drives; `latencies_ns` are those of all decisions.
+    pub(super) fn of(results: &[EpisodeResult], latencies_ns: &[u64]) -> Self {
+        let count = |outcome: Outcome| results.iter().filter(|r| r.outcome == outcome).count();
+        let is_near =
+            |r: &&EpisodeResult| r.outcome != Outcome::Collided && r.least_gap_m.is_some_and(|gap| gap < NEAR_M);
+        let arrived = results.iter().filter(|r| r.outcome == Outcome::Arrived);
+        let collisions = count(Outcome::Collided);
+        Self {
+            episodes: results.len(),
+            collisions,
+            collision_share_interval: (!results.is_empty()).then(|| wilson_interval(collisions, results.len())),
+            arrived: count(Outcome::Arrived),
+            stuck: count(Outcome::Stuck),
+            near_misses: results.iter().filter(is_near).count(),
+            time_to_goal_s: Durations::of(&arrived.map(|r| r.time_s).collect::<Vec<_>>()),
+            halted_s: Durations::of(&results.iter().map(|r| r.halted_s).collect::<Vec<_>>()),
+            latency_ms: Durations::of(&latencies_ns.iter().map(|ns| *ns as f64 / 1e6).collect::<Vec<_>>()),
+            frames: results.iter().map(|r| r.frames).sum(),
+            missed_frames: results.iter().map(|r| r.missed_frames).sum(),
+        }
+    }
+}
+
+impl fmt::Display for DriveFigures {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let number = |value: Option<f64>, digits: usize| value.map_or("-".to_owned(), |v| format!("{v:.digits$}"));
+        let (time, latency) = (&self.time_to_goal_s, &self.latency_ms);
+        writeln!(
+            f,
+            "episodes {}: {} arrived, {} collided, {} stuck, {} near misses",
+            self.episodes, self.arrived, self.collisions, self.stuck, self.near_misses
+        )?;
+        writeln!(
+            f,
+            "time to goal: mean {} s, p50 {} s, p95 {} s; at a standstill: mean {} s",
+            number(time.mean, 2),
+            number(time.p50, 2),
+            number(time.p95, 2),
+            number(self.halted_s.mean, 2)
+        )?;
+        write!(
+            f,
+            "camera to action: p50 {} ms, p99 {} ms; {} of {} frames without a decision",
+            number(latency.p50, 1),
+            number(latency.p99, 1),
+            self.missed_frames,
+            self.frames
+        )
+    }
 }
 
 #[cfg(test)]
@@ -113,12 +170,12 @@ mod tests {
             result(Outcome::Collided, 3.0, Some(-0.1)),
             result(Outcome::Stuck, 40.0, Some(7.0)),
         ];
-        let summary = summary(&results, &[10_000_000]);
-        let counts = ["episodes", "arrived", "collisions", "stuck", "near_misses"].map(|key| summary[key].as_u64());
-        assert_eq!(counts, [Some(4), Some(2), Some(1), Some(1), Some(1)]);
-        assert_eq!(summary["time_to_goal_s"]["mean"], 5.0);
-        assert_eq!(summary["latency_ms"]["p99"], 10.0);
-        let none = super::summary(&[], &[]);
-        assert!(none["time_to_goal_s"]["mean"].is_null() && none["collision_share_interval"].is_null());
+        let figures = DriveFigures::of(&results, &[10_000_000]);
+        let counts = [figures.episodes, figures.arrived, figures.collisions, figures.stuck, figures.near_misses];
+        assert_eq!(counts, [4, 2, 1, 1, 1]);
+        assert_eq!((figures.time_to_goal_s.mean, figures.latency_ms.p99), (Some(5.0), Some(10.0)));
+        let none = DriveFigures::of(&[], &[]);
+        assert_eq!((none.time_to_goal_s.mean, none.collision_share_interval), (None, None));
+        assert!(none.to_string().contains("mean - s"), "{none}");
     }
 }

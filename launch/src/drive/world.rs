@@ -1,22 +1,25 @@
 //! The world of closed-loop drives: it publishes the ego's camera and motion, and moves the ego by the actions.
 
 use super::episode::Drive;
+use super::occupancy::OccupancyCheck;
 use super::results::EpisodeResult;
 use super::truth::{MAX_ACTORS, TRUTH, WorldTruth};
 use anyhow::Context;
 use carff::terminal::Terminal;
 use carff_base::random::Key;
 use carff_dataset::sensor::{SensorNoise, apply_noise_into};
-use carff_messages::{Action, DatasetView, FrameMeta, Header, ImageMeta};
+use carff_messages::{Action, DatasetView, FrameMeta, Header, ImageMeta, Occupancy, Reason};
 use carff_runtime::{EGO_MOTION, EgoMotion};
 use carff_scenes::{ClosedLoop, Episode};
 use carff_transport::{Image, Node, Publisher, Receiver, Run, Stop, Waiter, Woken, monotonic_now_ns, topics};
-use std::sync::{Arc, Mutex};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 /// Longest wait for a frame's decision in lock-step, nanoseconds. The ego is then to halt.
 const PATIENCE_NS: u64 = 5_000_000_000;
 /// Frame numbers of an episode: its random draws then do not depend on the episodes before it.
 const FRAMES_PER_EPISODE: u64 = 100_000;
+/// Longest wait for the grids of a decided frame in lock-step, nanoseconds.
+const GRID_PATIENCE_NS: u64 = 1_000_000_000;
 /// Wait after the last frame, nanoseconds: its decision is still recorded.
 const LINGER_NS: u64 = 200_000_000;
 
@@ -28,10 +31,13 @@ pub(super) struct World {
     pub(super) actors: Option<u32>,
     pub(super) frame_rate_hz: f64,
     pub(super) is_real_time: bool,
+    /// Steps of the look-ahead.
+    pub(super) horizon: u32,
     /// True where a planner that knows the truth drives.
     pub(super) is_oracle: bool,
     pub(super) noise: SensorNoise,
     pub(super) results: Arc<Mutex<Vec<EpisodeResult>>>,
+    pub(super) occupancy: Arc<Mutex<OccupancyCheck>>,
     pub(super) terminal: Arc<Terminal>,
 }
 
@@ -41,6 +47,7 @@ struct Topics {
     motions: Publisher<EgoMotion>,
     truths: Publisher<WorldTruth>,
     actions: Receiver<Action>,
+    grids: Receiver<Occupancy>,
     /// The newest action.
     action: Option<Action>,
     waiter: Waiter,
@@ -57,6 +64,7 @@ impl World {
             motions: node.publisher(&EGO_MOTION)?,
             truths: node.publisher(&TRUTH)?,
             actions: node.receiver(&topics::ACTION)?,
+            grids: node.receiver(&topics::OCCUPANCY)?,
             action: None,
             waiter: Waiter::new(stop.clone()),
         };
@@ -68,7 +76,7 @@ impl World {
             let done = number + 1 - self.episodes.start;
             let all = self.episodes.end - self.episodes.start;
             self.terminal.status(format!("episode {done} of {all}: {collided} collisions"));
-            self.results.lock().unwrap_or_else(std::sync::PoisonError::into_inner).push(result);
+            self.results.lock().unwrap_or_else(PoisonError::into_inner).push(result);
         }
         topics.waiter.wait_until(&[], monotonic_now_ns() + LINGER_NS)?;
         Ok(())
@@ -80,10 +88,12 @@ impl World {
         let mut frame_id = take_start;
         let mut drive = Drive::begin(&self.drives, number, episode);
         topics.action = None;
+        self.check().begin();
         let mut next_ns = monotonic_now_ns();
         loop {
             let header = Header::of_frame(frame_id, monotonic_now_ns(), self.seed);
             self.publish(topics, &drive, header, (number, take_start))?;
+            self.check().publish(frame_id, drive.time_s);
             // A late frame delays later ones, as with a camera.
             next_ns = (next_ns + (frame_s * 1e9) as u64).max(header.capture_time_ns);
             let action = if self.is_real_time {
@@ -92,12 +102,37 @@ impl World {
                 topics.decision_on(frame_id, monotonic_now_ns() + PATIENCE_NS)?
             };
             let Ok(action) = action else { return Ok(None) };
+            self.take_grids(topics, &drive.episode, action.filter(|_| !self.is_real_time))?;
             drive.missed += u64::from(action.is_none());
             let told_mps = action.map_or(0.0, |action| f64::from(action.target_speed_mps));
             let target_mps = if self.is_oracle { drive.oracle_mps() } else { told_mps };
             frame_id += 1;
             if let Some(result) = drive.step(target_mps, frame_s) {
                 return Ok(Some(result));
+            }
+        }
+    }
+
+    fn check(&self) -> MutexGuard<'_, OccupancyCheck> {
+        self.occupancy.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Takes the grids that have arrived. In lock-step it waits for those of the frame of `decision`, so that the figures
+    /// do not depend on the machine's speed.
+    fn take_grids(&self, topics: &mut Topics, episode: &Episode, decision: Option<Action>) -> anyhow::Result<()> {
+        let believed = decision.filter(|action| action.reason() == Ok(Reason::Belief));
+        let until_ns = monotonic_now_ns() + GRID_PATIENCE_NS;
+        let mut is_waiting = believed.is_some();
+        loop {
+            while let Some(grid) = topics.grids.next()? {
+                let is_last =
+                    |action: Action| (action.based_on_frame, self.horizon) == (grid.header.frame_id, grid.header.step);
+                is_waiting &= !believed.is_some_and(is_last);
+                self.check().take(&self.drives, episode, &grid);
+            }
+            let is_over = monotonic_now_ns() >= until_ns;
+            if !is_waiting || is_over || topics.waiter.wait_until(&[&topics.grids], until_ns)? == Woken::Stopped {
+                return Ok(());
             }
         }
     }

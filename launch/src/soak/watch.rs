@@ -7,7 +7,7 @@ use anyhow::Context;
 use carff_checkpoint::load_policy;
 use carff_config::Contract;
 use carff_config::GraphConfig;
-use carff_decision::{Evidence, Policy};
+use carff_decision::{Approach, Evidence, Policy};
 use carff_messages::{Action, ActionCode, Belief, Health, HealthState, ImageCheck, Message, Reason, Stage};
 use carff_transport::{Input, Node, Receiver, Waiter, monotonic_now_ns, topics};
 use std::collections::{BTreeMap, VecDeque};
@@ -27,6 +27,7 @@ const NS_PER_MS: f64 = 1e6;
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Terms {
     pub(super) policy: Policy,
+    approach: Approach,
     deadline_ns: u64,
     period_ns: u64,
     slack_ns: u64,
@@ -35,8 +36,10 @@ pub(super) struct Terms {
 impl Terms {
     pub(super) fn new(graph: &GraphConfig, checkpoint: &Path, contract: &Contract) -> anyhow::Result<Self> {
         let controller = &graph.controller;
+        let policy = load_policy(controller.rule, controller.threshold, checkpoint, graph.remembers())?;
         Ok(Self {
-            policy: load_policy(controller.rule, controller.threshold, checkpoint, graph.remembers())?,
+            policy: Policy { ignores_unknown: graph.checks.ignores_unknown(), ..policy },
+            approach: controller.approach,
             deadline_ns: controller.deadline_ms * 1_000_000,
             period_ns: (1e9 / controller.rate_hz) as u64,
             slack_ns: contract.slack_ms * 1_000_000,
@@ -120,15 +123,15 @@ impl Judge {
                 return wrong(format!("no action for {:.1} ms", gap_ns as f64 / NS_PER_MS));
             }
         }
-        let advances = action.code() == Ok(ActionCode::Advance);
+        let moves = |action: &Action| action.code().is_ok_and(|code| !code.is_safe());
         if action.reason() != Ok(Reason::Belief) {
-            if advances {
-                return wrong("it advances without a belief".to_owned());
+            if moves(action) {
+                return wrong("it moves without a belief".to_owned());
             }
             // The safe action must follow soon after the last decision expired.
             if let Some(decision) = self.decision.take()
                 && decision.valid_until_ns >= excused_ns
-                && decision.code() == Ok(ActionCode::Advance)
+                && moves(&decision)
             {
                 let late_ns = published_ns.saturating_sub(decision.valid_until_ns);
                 self.worst_safe_action_ns = self.worst_safe_action_ns.max(late_ns);
@@ -181,7 +184,13 @@ impl Judge {
             evidence.add_belief(belief);
         }
         let halts = self.terms.policy.decide(&evidence).halt;
-        if halts == (action.code() == Ok(ActionCode::Advance)) {
+        // Where the rule halts, only an approach lets the vehicle creep.
+        let is_right = match action.code() {
+            Ok(ActionCode::Advance) => !halts,
+            Ok(ActionCode::Creep) => halts && self.terms.approach != Approach::Stop,
+            _ => halts,
+        };
+        if !is_right {
             return wrong(format!("a wrong action: its beliefs require {}", if halts { "halt" } else { "advance" }));
         }
         Ok(())
@@ -347,12 +356,11 @@ mod tests {
     const MS: u64 = 1_000_000;
 
     fn judge() -> Judge {
-        Judge::new(Terms {
-            policy: Policy { rule: Rule::Calibrated, threshold: 0.3 },
-            deadline_ns: 150 * MS,
-            period_ns: 50 * MS,
-            slack_ns: 50 * MS,
-        })
+        judge_of(Policy::new(Rule::Calibrated, 0.3), Approach::Stop)
+    }
+
+    fn judge_of(policy: Policy, approach: Approach) -> Judge {
+        Judge::new(Terms { policy, approach, deadline_ns: 150 * MS, period_ns: 50 * MS, slack_ns: 50 * MS })
     }
 
     fn belief(frame_id: u64, step: u32, hazard_probability: f32) -> Belief {
@@ -397,6 +405,25 @@ mod tests {
         Action { reason: Reason::StaleBelief.code(), is_decision: 0, ..action(0, ActionCode::Halt, at_ms) }
     }
 
+    /// Where the rule halts, the vehicle creeps only by an approach. Something unknown halts unless it is ignored.
+    #[test]
+    fn approach_and_unknown_are_known() {
+        let said = |approach, ignores_unknown, unknown_probability, code| {
+            let mut judge = judge_of(Policy { ignores_unknown, ..Policy::new(Rule::Calibrated, 0.3) }, approach);
+            for step in 1..=2 {
+                judge.given(&Belief { unknown_probability, ..belief(1, step, 0.1) });
+            }
+            judge.next(action(1, code, 120)).is_ok()
+        };
+        use ActionCode::{Advance, Creep, Halt};
+        for approach in [Approach::Stop, Approach::Look] {
+            assert_eq!([Advance, Creep, Halt].map(|code| said(approach, false, 0.0, code)), [true, false, false]);
+            assert_eq!([Advance, Creep, Halt].map(|code| said(approach, true, 0.9, code)), [true, false, false]);
+            let creeps = approach == Approach::Look;
+            assert_eq!([Advance, Creep, Halt].map(|code| said(approach, false, 0.9, code)), [false, creeps, true]);
+        }
+    }
+
     /// Decisions that follow the rule pass and are counted, repeated or not; others are violations, for both actions.
     #[test]
     fn decisions_are_held_against_the_beliefs() {
@@ -436,8 +463,10 @@ mod tests {
         assert!(judge().next(stale).unwrap_err().contains("stale"));
         let long = Action { valid_until_ns: 999 * MS, ..action(3, ActionCode::Advance, 310) };
         assert!(judge().next(long).unwrap_err().contains("deadline"));
-        let blind = Action { action: ActionCode::Advance.code(), ..halt(220) };
-        assert!(decided().next(blind).unwrap_err().contains("without a belief"));
+        for moving in [ActionCode::Advance, ActionCode::Creep] {
+            let blind = Action { action: moving.code(), ..halt(220) };
+            assert!(decided().next(blind).unwrap_err().contains("without a belief"));
+        }
         let other = Action { is_decision: 0, ..action(1, ActionCode::Advance, 220) };
         assert!(decided().next(other).unwrap_err().contains("repeats"));
     }

@@ -125,7 +125,7 @@ pub struct UnknownImages {
 
 impl UnknownImages {
     fn take(&mut self, unknowns: &Unknowns) {
-        self.images += u64::from(unknowns.probability >= 0.5);
+        self.images += u64::from(carff_decision::is_likely(f64::from(unknowns.probability)));
         // Boxes begin with the most probable one.
         if let Some(first) = unknowns.boxes().first()
             && self.surest.is_none_or(|(_, known)| first.probability > known.probability)

@@ -18,8 +18,6 @@ pub struct Settings {
     pub period_ns: u64,
     /// Seed of the run, for headers.
     pub seed: u64,
-    /// True to decide as if nothing unknown could be there.
-    pub ignores_unknown: bool,
     /// Behaviour of the vehicle while the rule does not let it advance.
     pub approach: Approach,
     /// Speeds of the vehicle.
@@ -139,7 +137,7 @@ impl Controller {
             Some(pending) if pending.header.capture_time_ns == captured_ns => pending,
             slot => slot.insert(Pending::begin(belief)),
         };
-        if !pending.take(belief, self.settings.ignores_unknown) {
+        if !pending.take(belief) {
             return Some(self.refuse(&belief.header, Reason::ContradictoryBelief, now_ns));
         }
         if !belief.is_final() {
@@ -278,7 +276,7 @@ impl Pending {
     }
 
     /// Records a step. Returns false if it contradicts the frame's other messages.
-    fn take(&mut self, belief: &Belief, ignores_unknown: bool) -> bool {
+    fn take(&mut self, belief: &Belief) -> bool {
         let index = belief.header.step as usize - 1;
         let (own, step) = (&self.header, Step::of(belief));
         let same_frame = own.frame_id == belief.header.frame_id
@@ -289,11 +287,7 @@ impl Pending {
             return false;
         }
         self.steps[index] = Some(step);
-        if ignores_unknown {
-            self.evidence.add_belief(&Belief { unknown_probability: 0.0, ..*belief });
-        } else {
-            self.evidence.add_belief(belief);
-        }
+        self.evidence.add_belief(belief);
         true
     }
 }

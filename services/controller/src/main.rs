@@ -2,9 +2,9 @@
 
 use anyhow::Context;
 use carff_checkpoint::load_policy;
-use carff_config::UnknownIs;
 use carff_controller::{Controller, Settings};
 use carff_decision::Approach;
+use carff_decision::Policy;
 use carff_messages::Stage;
 use carff_runtime::{EGO_MOTION, LOOK, StageContext, frame_span};
 use carff_transport::{Receiver, Woken, monotonic_now_ns, topics};
@@ -80,11 +80,10 @@ fn settings(stage: &StageContext) -> anyhow::Result<Settings> {
     let policy = load_policy(config.rule, config.threshold, &stage.checkpoint, stage.graph.remembers())
         .context("no threshold for the calibrated rule: set `controller.threshold`, or use a checkpoint")?;
     Ok(Settings {
-        policy,
+        policy: Policy { ignores_unknown: stage.graph.checks.ignores_unknown(), ..policy },
         deadline_ns: config.deadline_ms * 1_000_000,
         period_ns: (1e9 / config.rate_hz) as u64,
         seed: stage.seed(),
-        ignores_unknown: stage.graph.checks.unknown == UnknownIs::Ignored,
         approach: config.approach,
         speeds: config.speeds(),
     })

@@ -5,14 +5,14 @@ const MS: u64 = 1_000_000;
 const HORIZON: u32 = 2;
 
 fn controller(rule: Rule) -> Controller {
-    let policy = Policy { rule, threshold: 0.3 };
+    let policy = Policy::new(rule, 0.3);
     Controller::new(settings(policy))
 }
 
 fn settings(policy: Policy) -> Settings {
     let (deadline_ns, period_ns) = (150 * MS, 50 * MS);
     let speeds = Speeds { advance_mps: 5.0, creep_mps: 1.5 };
-    Settings { policy, deadline_ns, period_ns, seed: 1, ignores_unknown: false, approach: Approach::Stop, speeds }
+    Settings { policy, deadline_ns, period_ns, seed: 1, approach: Approach::Stop, speeds }
 }
 
 fn calibrated() -> Controller {
@@ -257,8 +257,8 @@ fn unusable_images_halt_until_a_usable_one() {
 #[test]
 fn the_unknown_halts_unless_ignored() {
     for ignores_unknown in [false, true] {
-        let settings = Settings { ignores_unknown, ..calibrated().settings };
-        let mut controller = Controller::new(settings);
+        let policy = Policy { ignores_unknown, ..Policy::new(Rule::Calibrated, 0.3) };
+        let mut controller = Controller::new(settings(policy));
         let mut last = None;
         for step in 1..=2 {
             let belief = Belief { unknown_probability: 0.9, ..belief(1, step, 0.0, 0) };
@@ -266,7 +266,8 @@ fn the_unknown_halts_unless_ignored() {
             last = controller.on_belief(&belief, 110 * MS);
         }
         let wanted = if ignores_unknown { ActionCode::Advance } else { ActionCode::Halt };
-        assert_eq!(last.unwrap().code(), Ok(wanted));
+        let action = last.unwrap();
+        assert_eq!((action.code(), action.unknown_probability), (Ok(wanted), 0.9));
     }
 }
 
@@ -274,7 +275,7 @@ fn the_unknown_halts_unless_ignored() {
 /// frame, do not count.
 #[test]
 fn approaches_use_what_is_fresh() {
-    let policy = Policy { rule: Rule::Calibrated, threshold: 0.3 };
+    let policy = Policy::new(Rule::Calibrated, 0.3);
     let mut controller = Controller::new(Settings { approach: Approach::Look, ..settings(policy) });
     let mut decide = |frame: u64, moved_at: u64, looked_at: u64| {
         let header = |frame: u64| Header::of_frame(frame, frame * 100 * MS, 1);

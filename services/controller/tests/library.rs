@@ -83,7 +83,6 @@ fn act(policy: Policy, layout: &ProbeLayout, steps: &[Step]) -> Action {
         deadline_ns: 150 * MS,
         period_ns: 50 * MS,
         seed: 1,
-        ignores_unknown: false,
         approach: Approach::Stop,
         speeds: Speeds { advance_mps: 5.0, creep_mps: 1.5 },
     });
@@ -109,7 +108,9 @@ fn controller_and_library_agree() {
     for trial in 0..2000 {
         let steps = steps(&mut draws(trial));
         let evidence = Evidence::of_steps(&steps);
+        let ignores_unknown = trial % 4 == 0;
         for (policy, halts) in Policy::all(0.3).into_iter().zip(&mut halts) {
+            let policy = Policy { ignores_unknown, ..policy };
             let decision = policy.decide(&evidence);
             let action = act(policy, &layout, &steps);
             let code = if decision.halt { ActionCode::Halt } else { ActionCode::Advance };

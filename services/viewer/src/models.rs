@@ -41,8 +41,7 @@ impl Models {
             Err(error @ CheckpointError::Missing { .. }) => Err(error.to_string()),
             other => Ok(other?),
         };
-        let policy =
-            load_policy(Rule::Calibrated, None, dir, false).unwrap_or(Policy { rule: Rule::Paper, threshold: 1.0 });
+        let policy = load_policy(Rule::Calibrated, None, dir, false).unwrap_or(Policy::new(Rule::Paper, 1.0));
         let scenario = &manifest.scenario;
         let steps = scenario.timestamps.max(1);
         let name = |state: usize| format!("{} t{}", scenario.branches[state / steps], state % steps);

@@ -69,7 +69,7 @@ pub fn load_policy(
         (Rule::Calibrated, None) => CheckpointPlanning::load(checkpoint)?.threshold(remembers),
         (_, None) => 1.0,
     };
-    Ok(Policy { rule, threshold })
+    Ok(Policy::new(rule, threshold))
 }
 
 /// Reason why the file cannot be used.

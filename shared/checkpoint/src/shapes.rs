@@ -132,6 +132,7 @@ impl Default for DecoderConfig {
 #[serde(deny_unknown_fields, default)]
 pub struct MixtureConfig {
     /// Number of mixture components K, 1 to 4 (paper: 2).
+    #[schemars(range(min = 1, max = 4))]
     pub components: i64,
     /// Width of the two hidden layers (paper: 512).
     pub hidden: i64,

@@ -114,6 +114,13 @@ impl Default for ChecksConfig {
     }
 }
 
+impl ChecksConfig {
+    /// Returns true if something unknown means nothing to the decision rules.
+    pub fn ignores_unknown(&self) -> bool {
+        self.unknown == UnknownIs::Ignored
+    }
+}
+
 /// Meaning of something unknown for the decision rules.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
@@ -176,9 +183,9 @@ pub struct ControllerConfig {
     /// Rate of actions, in addition to the one that follows each belief, 1 to 1000 per second. Default 20.
     #[schemars(range(min = 1.0, max = 1000.0))]
     pub rate_hz: f64,
-    /// Largest age of a belief since capture, and longest validity of a decision; the car then halts. Milliseconds, 1
-    /// to
+    /// Largest age of a belief since capture, and longest validity of a decision; the car then halts. Milliseconds, 1 to
     /// 60000. Default 150.
+    #[schemars(range(min = 1, max = 60_000))]
     pub deadline_ms: u64,
     /// Threshold on the hazard probability for the calibrated rule, 0 to 1. Default: the checkpoint's threshold.
     #[schemars(range(min = 0.0, max = 1.0))]

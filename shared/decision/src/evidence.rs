@@ -17,8 +17,8 @@ const SHOWS_HAZARD: f32 = 0.5;
 /// let sample = |hazard_likelihood| SampleEvidence { is_known: true, hazard_likelihood };
 /// let mut evidence = Evidence::NONE;
 /// evidence.add_step(1, 0.5, 1.0, [sample(0.99), sample(0.01)]);
-/// assert!(Policy { rule: Rule::Paper, threshold: 0.5 }.decide(&evidence).halt);
-/// assert!(!Policy { rule: Rule::Overconfident, threshold: 0.5 }.decide(&evidence).halt);
+/// assert!(Policy::new(Rule::Paper, 0.5).decide(&evidence).halt);
+/// assert!(!Policy::new(Rule::Overconfident, 0.5).decide(&evidence).halt);
 /// ```
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Evidence {
@@ -38,9 +38,23 @@ pub struct SampleEvidence {
     pub hazard_likelihood: f32,
 }
 
+impl SampleEvidence {
+    /// Reports whether the sample shows a hazard rather than none.
+    fn shows_hazard(&self) -> bool {
+        self.hazard_likelihood >= SHOWS_HAZARD
+    }
+}
+
 impl From<&ProbeResult> for SampleEvidence {
     fn from(result: &ProbeResult) -> Self {
         Self { is_known: result.state().is_some(), hazard_likelihood: result.hazard_likelihood }
+    }
+}
+
+impl Probed {
+    /// Reports whether the sample shows a hazard rather than none, as the paper's rule counts it.
+    pub fn shows_hazard(&self) -> bool {
+        SampleEvidence::from(self).shows_hazard()
     }
 }
 
@@ -107,7 +121,7 @@ impl Evidence {
         let flags = self.is_unknown.iter_mut().zip(&mut self.shows_hazard);
         let mut count = 0;
         for (sample, (is_unknown, shows_hazard)) in samples.into_iter().zip(flags) {
-            *shows_hazard |= sample.hazard_likelihood >= SHOWS_HAZARD;
+            *shows_hazard |= sample.shows_hazard();
             *is_unknown |= step == 1 && !sample.is_known;
             count += 1;
         }

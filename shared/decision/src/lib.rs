@@ -13,7 +13,7 @@
 //! | `image_evidence` | the known states weighed by how well they explain the image |
 //! | `evidence`, `rule`, `threshold` | from the steps of a frame to an action |
 //! | `approach`, `look` | from an action to the speed of a vehicle that moves by it, and what it can see from further on |
-//! | `convert` | the same steps as messages, and back |
+//! | `convert` | steps as messages, and back |
 
 mod approach;
 mod calibration;
@@ -39,6 +39,6 @@ pub use look::look_gain_bits;
 pub use look_ahead::{Localiser, Plan, Probed, SceneProbe, Step, look_ahead, path_probability};
 pub use memory::{Memory, MemorySettings};
 pub use mixture::{Draw, Mixture, Sampling};
-pub use rule::{Decision, Policy};
+pub use rule::{Decision, Policy, is_likely};
 pub use take::{Progress, StepLength, TakeFrame, TakeMemory};
 pub use threshold::{CalibrationTrial, bounded_threshold, choose_threshold, unchosen_threshold};

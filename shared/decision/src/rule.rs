@@ -3,8 +3,17 @@
 use crate::Evidence;
 use carff_messages::Rule;
 
-/// The paper's rule halts for something unknown from this probability on.
+/// Probability from which on something is likely: the paper's rule then halts for something unknown.
 const LIKELY: f64 = 0.5;
+
+/// Reports whether something of a probability is likely, as the paper's rule takes it.
+///
+/// ```
+/// assert!(carff_decision::is_likely(0.5) && !carff_decision::is_likely(0.4));
+/// ```
+pub fn is_likely(probability: f64) -> bool {
+    probability >= LIKELY
+}
 
 /// A rule with the threshold that it uses.
 ///
@@ -12,7 +21,7 @@ const LIKELY: f64 = 0.5;
 /// use carff_decision::{Evidence, Policy};
 /// use carff_messages::Rule;
 /// // Without evidence, every rule halts.
-/// assert!(Policy { rule: Rule::Calibrated, threshold: 0.25 }.decide(&Evidence::NONE).halt);
+/// assert!(Policy::new(Rule::Calibrated, 0.25).decide(&Evidence::NONE).halt);
 /// ```
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Policy {
@@ -20,6 +29,8 @@ pub struct Policy {
     pub rule: Rule,
     /// The hazard probability from which on [`Rule::Calibrated`] halts, 0..=1; the other rules ignore it.
     pub threshold: f64,
+    /// True if the probability of something unknown is left out.
+    pub ignores_unknown: bool,
 }
 
 /// The outcome of a rule.
@@ -32,13 +43,18 @@ pub struct Decision {
 }
 
 impl Policy {
-    /// Returns every rule with one threshold, in the order of [`Rule::ALL`].
-    pub fn all(threshold: f64) -> [Self; Rule::ALL.len()] {
-        Rule::ALL.map(|rule| Self { rule, threshold })
+    /// Returns a rule that counts something unknown as a hazard.
+    pub const fn new(rule: Rule, threshold: f64) -> Self {
+        Self { rule, threshold, ignores_unknown: false }
     }
 
-    /// Applies the rule (paper section 4.3). Something unknown counts as a hazard: the calibrated rule adds its
-    /// probability, and under the paper's rule it disagrees with every sample once it is likely. Evidence without
+    /// Returns every rule with one threshold, in the order of [`Rule::ALL`].
+    pub fn all(threshold: f64) -> [Self; Rule::ALL.len()] {
+        Rule::ALL.map(|rule| Self::new(rule, threshold))
+    }
+
+    /// Applies the rule (paper section 4.3). Something unknown counts as a hazard, unless it is ignored: the calibrated
+    /// rule adds its probability, and under the paper's rule it disagrees with every sample once it is likely. Evidence without
     /// samples, or with a probability outside 0..=1, always halts with confidence 0.
     pub fn decide(self, evidence: &Evidence) -> Decision {
         let (hazard, unknown) = (evidence.hazard_probability(), evidence.unknown_probability());
@@ -46,6 +62,7 @@ impl Policy {
         if !valid(hazard) || !valid(unknown) || evidence.sample_count() == 0 {
             return Decision { halt: true, confidence: 0.0 };
         }
+        let unknown = if self.ignores_unknown { 0.0 } else { unknown };
         match self.rule {
             Rule::Underconfident => Decision { halt: true, confidence: 1.0 },
             Rule::Overconfident => Decision { halt: false, confidence: 1.0 },
@@ -53,11 +70,11 @@ impl Policy {
                 // Samples disagree when some show the hazard and some do not. A sample that shows no known state
                 // disagrees with every other.
                 let share = evidence.hazard_share();
-                let halt = share > 0.0 || evidence.has_unknown() || unknown >= LIKELY;
+                let halt = share > 0.0 || evidence.has_unknown() || is_likely(unknown);
                 Decision { halt, confidence: if halt { share.max(1.0 - share) } else { 1.0 - share } }
             }
             Rule::Calibrated => {
-                let p = evidence.hazard_or_unknown_probability();
+                let p = (hazard + unknown).min(1.0);
                 let halt = p >= self.threshold;
                 Decision { halt, confidence: if halt { p } else { 1.0 - p } }
             }
@@ -81,7 +98,7 @@ mod tests {
     /// The paper's rule advances only when no sample shows the hazard and none is unknown.
     #[test]
     fn paper_rule_halts_on_any_hazard() {
-        let paper = Policy { rule: Rule::Paper, threshold: 0.5 };
+        let paper = Policy::new(Rule::Paper, 0.5);
         assert!(!paper.decide(&evidence(&[Some(0.0), Some(0.49)], 0.0)).halt);
         assert!(paper.decide(&evidence(&[Some(0.0), Some(0.5)], 0.1)).halt);
         assert!(paper.decide(&evidence(&[Some(0.0), None], 0.0)).halt);
@@ -105,7 +122,7 @@ mod tests {
     /// The calibrated rule halts at its threshold and above.
     #[test]
     fn calibrated_rule_uses_the_threshold() {
-        let calibrated = Policy { rule: Rule::Calibrated, threshold: 0.25 };
+        let calibrated = Policy::new(Rule::Calibrated, 0.25);
         assert!(calibrated.decide(&evidence(&[Some(1.0)], 0.25)).halt);
         assert!(!calibrated.decide(&evidence(&[Some(1.0)], 0.24)).halt);
     }

@@ -9,7 +9,7 @@
 //! | `posed`, `accuracy`, `decoded` | the labelled images, and what the models make of them |
 //! | `segmentation` | localisation by segmentation of rendered views |
 //! | `trials` | images with known answers, baselines, watches |
-//! | `stats` | arithmetic on trials: recall curves, frequencies, reliability, support vector machine, SSIM |
+//! | `stats` | arithmetic on trials: recall curves, frequencies, support vector machine, SSIM |
 //! | `tables`, `report` | the tables of `carff eval`, `results.json` and its page |
 
 mod accuracy;
@@ -38,7 +38,6 @@ pub use segmentation::{MaskedView, occupants, view_camera};
 pub use stats::{
     draws::{Curve, Frequencies, Frequency, expected_recall},
     pairs::PairMeans,
-    reliability::{Reliability, ReliabilityBin, reliability},
     ssim::ssim,
 };
 pub use subject::{About, DecisiveImage, EvalOptions, Novelty, OtherPlace, Subject};

@@ -85,6 +85,13 @@ codes! {
     }
 }
 
+impl ActionCode {
+    /// Returns true for the safe action, `halt`: the vehicle stops, or stays where it is.
+    pub fn is_safe(self) -> bool {
+        self == Self::Halt
+    }
+}
+
 codes! {
     /// Reason of an action.
     Reason: u32, "reason" {

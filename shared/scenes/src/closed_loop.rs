@@ -34,6 +34,8 @@ pub struct ClosedLoop {
     actor: usize,
     path: Path,
     lane: Path,
+    /// Boxes that the others cover along their lane.
+    strips: Vec<OrientedBox>,
     conflict_m: [f64; 2],
 }
 
@@ -76,7 +78,8 @@ impl ClosedLoop {
             .find(|course| course.len() > 1)
             .ok_or_else(|| error("no hazard branch moves the dynamic vehicle"))?;
         let (path, lane) = (Path::new(config.path.clone()), Path::new(course).extended(EXTENDED_M));
-        let mut drives = Self { scenario, config, mounting, ego, actor, path, lane, conflict_m: [0.0; 2] };
+        let strips = lane.strips(vehicles[actor].size_m[1]);
+        let mut drives = Self { scenario, config, mounting, ego, actor, path, lane, strips, conflict_m: [0.0; 2] };
         drives.conflict_m = drives.find_conflict().ok_or(ScenarioError::NoClosedLoop {
             path: drives.scenario.path().to_owned(),
             problem: "the ego's path never meets the dynamic vehicle's course",
@@ -103,6 +106,11 @@ impl ClosedLoop {
     /// the start, metres.
     pub fn conflict_m(&self) -> [f64; 2] {
         self.conflict_m
+    }
+
+    /// Returns the boxes that the other vehicles cover along their lane.
+    pub fn lane_boxes(&self) -> &[OrientedBox] {
+        &self.strips
     }
 
     /// Draws episode `number`; `actors` replaces the scenario's number of other vehicles. The same arguments give the
@@ -185,9 +193,7 @@ impl ClosedLoop {
 
     /// First and last place on the ego's way at which it would be in the way of the others.
     fn find_conflict(&self) -> Option<[f64; 2]> {
-        let width_m = self.scenario.config().vehicle[self.actor].size_m[1];
-        let strips = self.lane.strips(width_m);
-        let meets = |at_m: f64| strips.iter().any(|strip| self.ego_box(at_m).gap_m(strip) < self.config.space_m);
+        let meets = |at_m: f64| self.strips.iter().any(|strip| self.ego_box(at_m).gap_m(strip) < self.config.space_m);
         let places = (0..=(self.length_m() / SEARCH_M) as usize).map(|i| i as f64 * SEARCH_M);
         let met: Vec<f64> = places.filter(|&at_m| meets(at_m)).collect();
         Some([*met.first()?, *met.last()?])

@@ -24,6 +24,7 @@ pub struct ScenarioConfig {
     pub bounds_m: [[f64; 3]; 2],
     /// Number of time steps of each branch, 1 to 64.
     #[serde(deserialize_with = "count")]
+    #[schemars(range(min = 1, max = 64))]
     pub timestamps: usize,
     /// Duration of a time step, seconds: how long the belief of a real camera's images stays at a state.
     #[serde(default, deserialize_with = "duration")]
@@ -89,10 +90,12 @@ pub struct ScenarioConfig {
     pub closed_loop: Option<ClosedLoopConfig>,
     /// Minimum distance of cameras from static things, 0.001 to 100.
     #[serde(default = "default_clearance", deserialize_with = "clearance")]
+    #[schemars(range(min = 0.001, max = 100.0))]
     pub clearance_m: f64,
     /// Range of ambient occlusion: things within this distance block light from the sky. About the size of objects that
     /// cast soft shadows, 0.001 to 100.
     #[serde(default = "default_shade_reach", deserialize_with = "clearance")]
+    #[schemars(range(min = 0.001, max = 100.0))]
     pub shade_reach_m: f64,
     /// Cameras on a dome that look inwards. Views are numbered in the order orbit, overhead, dash, street.
     #[serde(default)]
@@ -130,12 +133,15 @@ impl Default for ActionsConfig {
 pub struct PictureConfig {
     /// Width, pixels, 8 to 4096.
     #[serde(deserialize_with = "side")]
+    #[schemars(range(min = 8, max = 4096))]
     pub width_px: u32,
     /// Height, pixels, 8 to 4096.
     #[serde(deserialize_with = "side")]
+    #[schemars(range(min = 8, max = 4096))]
     pub height_px: u32,
     /// Horizontal field of view, degrees, 5 to 150.
     #[serde(deserialize_with = "field_of_view")]
+    #[schemars(range(min = 5.0, max = 150.0))]
     pub fov_deg: f64,
 }
 
@@ -154,9 +160,11 @@ pub struct SunConfig {
     pub azimuth_deg: f64,
     /// Elevation above the horizon, 5 to 90.
     #[serde(deserialize_with = "elevation")]
+    #[schemars(range(min = 5.0, max = 90.0))]
     pub elevation_deg: f64,
     /// Apparent radius: a larger radius makes softer shadows. 0 to 10 (the real radius is 0.27).
     #[serde(deserialize_with = "softness")]
+    #[schemars(range(min = 0.0, max = 10.0))]
     pub radius_deg: f64,
 }
 
@@ -295,6 +303,7 @@ pub struct BuildingConfig {
     pub height_m: f64,
     /// Number of rows of windows, 1 to 64.
     #[serde(default = "one", deserialize_with = "count")]
+    #[schemars(range(min = 1, max = 64))]
     pub storeys: usize,
     /// `brick` or `plaster`.
     pub walls: Walls,
@@ -508,6 +517,7 @@ pub struct FacesConfig {
     pub colours: [[f32; 3]; 6],
     /// Number of squares along each edge, 1 to 64.
     #[serde(default = "one", deserialize_with = "count")]
+    #[schemars(range(min = 1, max = 64))]
     pub tiles: usize,
 }
 
@@ -578,6 +588,7 @@ pub struct OrbitConfig {
     pub view_kind: String,
     /// Number of cameras, 1 to 10000.
     #[serde(deserialize_with = "many")]
+    #[schemars(range(min = 1, max = 10_000))]
     pub count: usize,
     /// Target point of the cameras.
     #[serde(deserialize_with = "point3")]
@@ -598,6 +609,7 @@ pub struct OverheadConfig {
     pub view_kind: String,
     /// Number of cameras, 1 to 10000.
     #[serde(deserialize_with = "many")]
+    #[schemars(range(min = 1, max = 10_000))]
     pub count: usize,
     /// Point on the ground below the first camera (x, y).
     #[serde(deserialize_with = "point2")]
@@ -621,6 +633,7 @@ pub struct DashConfig {
     pub vehicle: Spanned<String>,
     /// Number of cameras at each of its positions, 1 to 10000.
     #[serde(deserialize_with = "many")]
+    #[schemars(range(min = 1, max = 10_000))]
     pub count_per_place: usize,
     /// Distance ahead of the vehicle's centre, lowest and highest.
     #[serde(deserialize_with = "range")]
@@ -644,6 +657,7 @@ pub struct StreetConfig {
     pub view_kind: String,
     /// Number of cameras, 1 to 10000.
     #[serde(deserialize_with = "many")]
+    #[schemars(range(min = 1, max = 10_000))]
     pub count: usize,
     /// Region of the cameras: lower and upper corner.
     #[serde(deserialize_with = "box3")]

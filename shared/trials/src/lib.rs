@@ -8,6 +8,7 @@
 //! | `planning` | trials of decision rules, and their table |
 //! | `samples` | state accuracy of probed samples |
 //! | `accuracy`, `birds_eye`, `render` | counts of correct answers, and images of the field |
+//! | `reliability` | agreement of forecast probabilities with events |
 //! | `hypotheses`, `places` | names of states and groups of samples, and the places that are probed |
 //! | `run` | planning tables and the filmstrip of a run of the graph |
 //! | `figures` | the figures in a checkpoint's manifest |
@@ -20,6 +21,7 @@ pub mod hypotheses;
 mod onnx;
 mod places;
 mod planning;
+mod reliability;
 pub mod render;
 pub mod run;
 mod samples;
@@ -36,5 +38,6 @@ pub use planning::{
     ByKind, BySamples, Compared, Count, KnownStates, Perception, Planner, PlanningTable, SAMPLE_COUNTS, TakeMemories,
     Trial, TrialOutcome, trial_frame,
 };
+pub use reliability::{Reliability, ReliabilityBin, ReliabilitySums, reliability};
 pub use render::{FieldRenderer, to_bytes, to_unit};
 pub use samples::{Input, SampleAccuracy, SampleTrials};

@@ -140,8 +140,9 @@ pub(super) fn run(args: &TopicArgs, quantity: Quantity) -> anyhow::Result<()> {
             let header = message.header();
             let age_ms = now_ns.saturating_sub(header.publish_time_ns) as f64 / 1e6;
             let capture_ms = since_capture_ms(header, now_ns);
-            series.borrow_mut().add(header.publish_time_ns, message.size_bytes(), age_ms, capture_ms);
-            Ok(true)
+            let mut series = series.borrow_mut();
+            series.add(header.publish_time_ns, message.size_bytes(), age_ms, capture_ms);
+            Ok(args.count.is_none_or(|count| series.messages < count))
         },
         || {
             let now_ns = monotonic_now_ns();
@@ -153,6 +154,10 @@ pub(super) fn run(args: &TopicArgs, quantity: Quantity) -> anyhow::Result<()> {
             Ok(())
         },
     )?;
+    if series.borrow().messages > last.messages {
+        let seconds = monotonic_now_ns().saturating_sub(line_ns).max(1) as f64 / 1e9;
+        terminal.line(&series.borrow().line(quantity, &last, seconds));
+    }
     print!("{topic} of {}\n{}", session.attached.live.name, series.borrow().summary(quantity));
     session.say_end(going);
     Ok(())

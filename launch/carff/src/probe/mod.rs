@@ -84,6 +84,9 @@ pub struct TopicArgs {
     /// Topic that `carff probe list` shows: `prober/belief`, or `belief` for short.
     #[arg(add = ArgValueCandidates::new(complete::topics))]
     pub topic: String,
+    /// Stop after this number of messages.
+    #[arg(long, value_parser = clap::value_parser!(u64).range(1..))]
+    pub count: Option<u64>,
     /// The run, and the time limit.
     #[command(flatten)]
     pub session: SessionArgs,

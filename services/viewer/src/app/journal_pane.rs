@@ -2,7 +2,6 @@
 
 use super::{Viewer, theme};
 use crate::journal::{Decision, Journal};
-use carff_messages::ActionCode;
 use eframe::egui::{Align, Color32, Grid, Layout, ScrollArea, Ui, vec2};
 use egui_plot::{GridMark, Line, Plot, PlotPoints};
 
@@ -60,7 +59,7 @@ fn decisions(ui: &mut Ui, journal: &Journal) {
             for Decision { rests_on, action, confidence, hazard_probability, reason, latency_ms } in
                 journal.decisions().rev()
             {
-                let halts = *action == ActionCode::Halt;
+                let halts = action.is_safe();
                 let (name, color) = (action.name(), if halts { palette.hazard } else { palette.clear });
                 let sure = format!("{:.0} % sure", 100.0 * confidence);
                 ui.label(theme::strong(name).color(color)).on_hover_text(sure);

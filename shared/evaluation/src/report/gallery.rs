@@ -229,7 +229,7 @@ fn beliefs(subject: &Subject, path: &Path) -> Result<bool, EvaluationError> {
             ));
         }
         for group in groups.into_iter().take(HYPOTHESES) {
-            let hazard = probed[group.sample].reading.hazard_likelihood > 0.5;
+            let hazard = probed[group.sample].shows_hazard();
             cells.push(StripCell {
                 image: renderer.image(probe.field(), &camera, &latents[group.sample]),
                 caption: vec![format!("{} of {SAMPLES}", group.count), group.name],

@@ -20,7 +20,7 @@ use crate::tables::{
     robustness::{self, Robustness},
     trials::{self, Baseline, ByPart},
 };
-use crate::{About, ByRole, EvaluationError, Progress, Reliability, Subject};
+use crate::{About, ByRole, EvaluationError, Progress, Subject};
 pub use gallery::Gallery;
 pub use page::encoder_rows;
 use serde::{Deserialize, Serialize};
@@ -108,7 +108,7 @@ pub struct Results {
     pub planning: Option<PlanningResults>,
     /// Reliability of the hazard probability.
     #[serde(skip_serializing_if = "ByRole::is_empty", default)]
-    pub hazard_reliability: ByRole<Reliability>,
+    pub hazard_reliability: ByRole<carff_trials::Reliability>,
     /// Six kinds of trial: figures by part and kind.
     #[serde(skip_serializing_if = "BTreeMap::is_empty", default)]
     pub trials: ByPart,

@@ -11,8 +11,7 @@ use super::{
 use crate::stats::draws::Frequencies;
 use crate::tables::planning::{PlanningResults, ViewCounts};
 use crate::{
-    ByRole, EncoderTable, FieldPictures, FrequencyTable, PairMeans, PictureTable, ReliabilityBin, SAMPLE_COUNTS, Share,
-    SvmScore,
+    ByRole, EncoderTable, FieldPictures, FrequencyTable, PairMeans, PictureTable, SAMPLE_COUNTS, Share, SvmScore,
 };
 use carff_trials::{Count, PlanningTable};
 use std::fmt::Write;
@@ -419,7 +418,7 @@ fn reliability(page: &mut String, results: &Results) {
     );
     head(page, &["poses", "images", "expected calibration error", "bins: forecast, measured share, images"]);
     for (part, r) in results.hazard_reliability.iter() {
-        let bin = |b: &ReliabilityBin| format!("{:.2}: {:.2} of {}", b.forecast, b.happened, b.trials);
+        let bin = |b: &carff_trials::ReliabilityBin| format!("{:.2}: {:.2} of {}", b.forecast, b.happened, b.trials);
         let bins: Vec<String> = r.bins.iter().map(bin).collect();
         let error = format!("{:.3}", r.expected_calibration_error);
         row(page, &[part.into(), r.trials.to_string(), error, bins.join("; ")]);

@@ -2,6 +2,5 @@
 
 pub mod draws;
 pub mod pairs;
-pub mod reliability;
 pub mod ssim;
 pub mod svm;

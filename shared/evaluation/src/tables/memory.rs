@@ -1,13 +1,13 @@
 //! The belief with and without memory, on drives whose camera pans.
 
-use crate::stats::reliability::reliability;
 use crate::trials::{
     looks::SUREST,
     watches::{Watch, Watched},
 };
 use crate::{Progress, Subject};
 use carff_checkpoint::FieldProbe;
-use carff_decision::{Memory, MemorySettings, Mixture, Sampling};
+use carff_decision::{Evidence, Memory, MemorySettings, Mixture, Sampling};
+use carff_trials::reliability;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
@@ -122,7 +122,7 @@ pub fn with_memory(memory: &Memory, watch: &Watch) -> Vec<Mixture> {
 fn hazard(probe: &mut FieldProbe, mixture: &Mixture, frame: &Watched, seed: u64) -> f64 {
     let draws = mixture.draw(SAMPLES, Sampling::Stratified, seed, frame.frame, 1);
     let step = probe.step(mixture.clone(), draws, 1.0, frame.image.as_ref());
-    f64::from(step.resolved.hazard_probability) + f64::from(step.resolved.unknown_probability)
+    Evidence::of_steps(&[step]).hazard_or_unknown_probability()
 }
 
 /// Figures of the probabilities `[watch][frame]` of an observer.

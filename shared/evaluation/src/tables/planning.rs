@@ -1,7 +1,7 @@
 //! Planning table: every decision rule, by the paper's protocol and over all views; and the reliability of the hazard
 //! probability (table 4).
 
-use crate::{ByRole, EvaluationError, Progress, ROLES, Reliability, Subject, reliability, role_name};
+use crate::{ByRole, EvaluationError, Progress, ROLES, Subject, role_name};
 use carff_base::random::{Key, tag};
 use carff_dataset::{
     PoseRole,
@@ -11,6 +11,7 @@ use carff_decision::{Policy, Sampling};
 use carff_messages::Rule;
 use carff_plots::{Panel, Series};
 use carff_trials::{ByKind, PlanningTable, Trial};
+use carff_trials::{Reliability, reliability};
 use rand::Rng;
 use serde::{Deserialize, Serialize};
 use std::path::Path;

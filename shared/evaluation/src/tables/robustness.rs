@@ -126,7 +126,7 @@ pub fn robustness(subject: &Subject, on_progress: &dyn Fn(&Progress)) -> Result<
     }
     let known = subject.known.as_ref().ok_or("the checkpoint has no known.json (`carff checkpoint known` makes it)")?;
     let threshold = subject.threshold.ok_or("the checkpoint has no threshold")?;
-    let judge = Judge { subject, known, policy: Policy { rule: Rule::Calibrated, threshold } };
+    let judge = Judge { subject, known, policy: Policy::new(Rule::Calibrated, threshold) };
     let mut table = Robustness::default();
     for novelty in &subject.novelties {
         let shots = novelty.looks.iter().enumerate().map(|(i, look)| Shot {

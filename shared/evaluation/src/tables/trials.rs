@@ -62,7 +62,7 @@ pub fn trials(subject: &Subject, on_progress: &dyn Fn(&Progress)) -> Result<Tria
         on_progress(&Progress { phase: "trials", done, total, line: part.to_owned() });
         let taken = taken(&subject.perception(), &looks);
         let evidence = planner.evidence(&taken, SAMPLES);
-        let by_rule = |rule| by_rule(&evidence, Policy { rule, threshold });
+        let by_rule = |rule| by_rule(&evidence, Policy::new(rule, threshold));
         own.insert(part.to_owned(), figures(&looks, &by_rule(Rule::Calibrated)));
         let constant = |p: f64| looks.iter().map(|_| Answer::at(p, 0.5)).collect::<Vec<_>>();
         let at = |threshold: f64, p: Vec<f64>| p.into_iter().map(|p| Answer::at(p, threshold)).collect::<Vec<_>>();

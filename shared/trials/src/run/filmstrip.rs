@@ -155,7 +155,7 @@ impl Artist<'_> {
         for group in groups.into_iter().take(HYPOTHESES) {
             let share = 100.0 * group.count as f64 / step.samples.len() as f64;
             let sample = &step.samples[group.sample];
-            let hazard = sample.reading.hazard_likelihood > 0.5;
+            let hazard = sample.shows_hazard();
             let mut caption = vec![
                 format!("{share:.0} %: {}", group.name),
                 format!("{} of {} samples, one rendered", group.count, step.samples.len()),

@@ -55,6 +55,8 @@ pub struct RunSettings {
     pub horizon: u32,
     /// True if images were compared with the known states.
     pub compares: bool,
+    /// True if something unknown means nothing to the rules.
+    pub ignores_unknown: bool,
     /// Length of a time step, if the forecaster has a memory.
     pub remembers: Option<StepLength>,
     /// Noise of the camera.
@@ -308,6 +310,12 @@ impl JudgedRun {
         Some(look_ahead(forecast, probe, &frame.posterior?, frame.image.as_ref(), plan))
     }
 
+    /// Every rule with the run's settings.
+    fn policies(&self) -> [Policy; Rule::ALL.len()] {
+        let RunSettings { threshold, ignores_unknown, .. } = self.settings;
+        Policy::all(threshold).map(|policy| Policy { ignores_unknown, ..policy })
+    }
+
     /// Every rule over the drives of the run, and the agreement of the run with the library.
     fn drives_table(&self, decisive: &[(DecidedFrame, DriveKind)]) -> (PlanningTable, LiveAgreement) {
         let mut probe = self.probe.clone();
@@ -321,7 +329,7 @@ impl JudgedRun {
             for samples in SAMPLE_COUNTS {
                 let Some(steps) = self.look_ahead(&mut probe, frame, samples) else { continue };
                 let evidence = Evidence::of_steps(&steps);
-                for policy in Policy::all(self.settings.threshold) {
+                for policy in self.policies() {
                     let mut halted = policy.decide(&evidence).halt;
                     if policy.rule == self.settings.rule && samples == live.samples {
                         // The table counts the action of the graph, not the action of the library.
@@ -353,8 +361,7 @@ impl JudgedRun {
         let (probe, net) = (&self.probe, &self.forecaster);
         let known = self.known.as_ref().map(|known| KnownStates::new(known, probe, 1));
         let trials = Perception { encoder, noise, seed, known }.trials(&self.dataset, &inputs, counts.repeats)?;
-        let (table, _) =
-            Planner { net, probe, sampling, horizon }.table(&trials, &Policy::all(self.settings.threshold));
+        let (table, _) = Planner { net, probe, sampling, horizon }.table(&trials, &self.policies());
         Ok((table, counts))
     }
 }

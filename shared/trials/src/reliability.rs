@@ -29,34 +29,62 @@ pub struct Reliability {
     pub bins: Vec<ReliabilityBin>,
 }
 
-/// Reliability of forecasts: pairs of a probability in 0..=1 and whether the event happened.
+/// Sums over forecasts, from which their reliability follows.
 ///
 /// ```
-/// let forecasts: Vec<(f64, bool)> = (0..100).map(|i| (0.25, i % 4 == 0)).collect();
-/// assert!(carff_evaluation::reliability(&forecasts, 10).expected_calibration_error < 1e-12);
+/// let mut sums = carff_trials::ReliabilitySums::new(10);
+/// for trial in 0..100 {
+///     sums.add(0.25, trial % 4 == 0);
+/// }
+/// assert!(sums.reliability().expected_calibration_error < 1e-12);
 /// ```
-pub fn reliability(forecasts: &[(f64, bool)], bins: usize) -> Reliability {
-    let mut sums = vec![(0_usize, 0.0_f64, 0_usize); bins.max(1)];
-    for &(probability, happened) in forecasts {
-        let last = sums.len() - 1;
-        let bin = &mut sums[((probability.clamp(0.0, 1.0) * bins as f64) as usize).min(last)];
+#[derive(Clone, Debug, PartialEq)]
+pub struct ReliabilitySums {
+    /// For each bin: forecasts, their sum, and events.
+    bins: Vec<(usize, f64, usize)>,
+}
+
+impl ReliabilitySums {
+    /// Returns sums of no forecasts, with bins of equal width from 0 to 1.
+    pub fn new(bins: usize) -> Self {
+        Self { bins: vec![(0, 0.0, 0); bins.max(1)] }
+    }
+
+    /// Adds a forecast of 0..=1, and whether the event happened.
+    pub fn add(&mut self, probability: f64, happened: bool) {
+        let count = self.bins.len();
+        let bin = &mut self.bins[((probability.clamp(0.0, 1.0) * count as f64) as usize).min(count - 1)];
         bin.0 += 1;
         bin.1 += probability;
         bin.2 += usize::from(happened);
     }
-    let bins: Vec<ReliabilityBin> = sums
-        .into_iter()
-        .filter(|(trials, _, _)| *trials > 0)
-        .map(|(trials, sum, happened)| ReliabilityBin {
+
+    /// Returns the reliability of the added forecasts.
+    pub fn reliability(&self) -> Reliability {
+        let of_bin = |&(trials, sum, happened): &(usize, f64, usize)| ReliabilityBin {
             trials,
             forecast: sum / trials as f64,
             happened: happened as f64 / trials as f64,
             interval: wilson_interval(happened, trials),
-        })
-        .collect();
-    let distance = |b: &ReliabilityBin| b.trials as f64 * (b.forecast - b.happened).abs();
-    let expected_calibration_error = bins.iter().map(distance).sum::<f64>() / forecasts.len().max(1) as f64;
-    Reliability { expected_calibration_error, trials: forecasts.len(), bins }
+        };
+        let bins: Vec<ReliabilityBin> = self.bins.iter().filter(|(trials, ..)| *trials > 0).map(of_bin).collect();
+        let trials = bins.iter().map(|bin| bin.trials).sum::<usize>();
+        let distance = |b: &ReliabilityBin| b.trials as f64 * (b.forecast - b.happened).abs();
+        let expected_calibration_error = bins.iter().map(distance).sum::<f64>() / trials.max(1) as f64;
+        Reliability { expected_calibration_error, trials, bins }
+    }
+}
+
+/// Returns the reliability of forecasts: pairs of a probability in 0..=1 and whether the event happened.
+///
+/// ```
+/// let forecasts: Vec<(f64, bool)> = (0..100).map(|i| (0.25, i % 4 == 0)).collect();
+/// assert!(carff_trials::reliability(&forecasts, 10).expected_calibration_error < 1e-12);
+/// ```
+pub fn reliability(forecasts: &[(f64, bool)], bins: usize) -> Reliability {
+    let mut sums = ReliabilitySums::new(bins);
+    forecasts.iter().for_each(|&(probability, happened)| sums.add(probability, happened));
+    sums.reliability()
 }
 
 #[cfg(test)]
