@@ -9,10 +9,12 @@ Requirements:
 - The tests of the named crates pass.
 - A drive of the shipped graph with emulated processes ends with exit code 0, and has a decision for every frame.
 - Every hazard drive halts and every clear drive advances.
+- The doctor finds no error, and knows the processor.
 - Each decision is that of this machine's own programs, with the same hazard probability up to rounding.
 
 The processes run in their own user namespace. There the kernel starts Arm programs with the emulator, also the ones that
-an Arm program starts itself. If that needs more rights or a later kernel, the system's own registration is used.
+an Arm program starts itself, and /proc/cpuinfo describes an Arm processor: ONNX Runtime reads it, and QEMU before version
+8.2 shows this machine's. If such a namespace needs more rights or a later kernel, the system's own registration is used.
 """
 
 import json
@@ -29,21 +31,33 @@ ARM64 = "aarch64-unknown-linux-gnu"
 EMULATOR = "qemu-aarch64-static"
 # A processor of boards with 64-bit Arm, and the libraries of Debian's cross compiler.
 ENVIRONMENT = {"QEMU_CPU": "cortex-a76", "QEMU_LD_PREFIX": "/usr/aarch64-linux-gnu"}
+# The same processor as the kernel describes it, once for each core.
+PROCESSOR = """processor\t: {}
+BogoMIPS\t: 50.00
+Features\t: fp asimd evtstrm aes pmull sha1 sha2 crc32 atomics fphp asimdhp cpuid asimdrdm lrcpc dcpop asimddp
+CPU implementer\t: 0x41
+CPU architecture: 8
+CPU variant\t: 0x4
+CPU part\t: 0xd0b
+CPU revision\t: 1
+
+"""
 # Registers the emulator ($1) for the first 20 bytes of an Arm program, which only root of a namespace can do. Executes the
-# rest of the command as user $2 and group $3, in a second namespace below.
+# rest of the command as user $2 and group $3, in a second namespace below. File $4 describes the processor.
 REGISTER = r"""
+mount --bind "$4" /proc/cpuinfo || exit 125
 mount -t binfmt_misc none /proc/sys/fs/binfmt_misc || exit 125
 magic='\x7fELF\x02\x01\x01\x00\x00\x00\x00\x00\x00\x00\x00\x00\x02\x00\xb7\x00'
 mask='\xff\xff\xff\xff\xff\xff\xff\x00\xff\xff\xff\xff\xff\xff\xff\xff\xfe\xff\xff\xff'
 printf '%s' ":carff-arm64:M::$magic:$mask:$1:F" > /proc/sys/fs/binfmt_misc/register || exit 125
 user=$2 group=$3
-shift 3
+shift 4
 exec unshare --user --map-user="$user" --map-group="$group" -- "$@"
 """
 SYSTEM_REGISTRATION = Path("/proc/sys/fs/binfmt_misc/qemu-aarch64")
-# Four drives of three frames. An emulated frame takes seconds, so nothing may count as late.
-DRIVES, FRAMES = 4, 12
-SETTINGS = ["run.frame_rate_hz=0.2", "camera.frames_per_timestamp=1", "camera.linger_ms=30000", "checks.frozen_ms=60000",
+# Two drives of three frames. An emulated frame takes seconds, so nothing may count as late.
+DRIVES, FRAMES = 2, 6
+SETTINGS = ["run.frame_rate_hz=0.1", "camera.frames_per_timestamp=1", "camera.linger_ms=30000", "checks.frozen_ms=60000",
             "controller.deadline_ms=60000", "controller.rate_hz=1", "renderer.max_rate_hz=0.1",
             "launcher.start_timeout_ms=600000", "launcher.stop_timeout_ms=60000", "launcher.hang_timeout_ms=600000",
             *[f"stages.{stage}.deadline_ms=60000" for stage in ["encoder", "forecaster", "prober", "renderer", "controller"]]]
@@ -55,15 +69,17 @@ def say(text: str) -> None:
     print(f"check: {text}", flush=True)
 
 
-def emulated() -> list[str]:
-    """Returns the start of a command line whose programs may be Arm programs."""
+def emulated(folder: Path) -> list[str]:
+    """Returns the start of a command line whose programs may be Arm programs. The folder must exist as long as they run."""
     emulator = shutil.which(EMULATOR)
     if emulator is None:
         sys.exit(f"{EMULATOR} is missing: sudo apt-get install qemu-user-static")
     if not (Path(ENVIRONMENT["QEMU_LD_PREFIX"]) / "lib/ld-linux-aarch64.so.1").exists():
         sys.exit("the libraries for Arm are missing: sudo apt-get install libc6-dev-arm64-cross libstdc++6-arm64-cross")
+    processors = folder / "cpuinfo"
+    processors.write_text("".join(PROCESSOR.format(core) for core in range(os.cpu_count() or 1)), encoding="utf-8")
     own = ["unshare", "--user", "--map-root-user", "--mount", "sh", "-c", REGISTER, "sh", emulator,
-           str(os.geteuid()), str(os.getegid())]
+           str(os.geteuid()), str(os.getegid()), str(processors)]
     done = subprocess.run([*own, "true"], capture_output=True, text=True)
     if done.returncode == 0:
         return own
@@ -110,26 +126,42 @@ def compare(arm: list[dict], native: list[dict]) -> float:
     return largest
 
 
-def main() -> None:
-    start = emulated()
-    if sys.argv[1:] == ["--requirements"]:
-        return
-    if len(sys.argv) < 2:
-        sys.exit(__doc__)
-    target, crates = Path(sys.argv[1]).resolve(), sys.argv[2:]
+def examine(start: list[str], programs: Path, **environment: str) -> None:
+    """Checks what the doctor finds on an Arm processor."""
+    done = subprocess.run([*start, str(programs / "carff"), "doctor", GRAPH, "--json"], cwd=ROOT, stdout=subprocess.PIPE, text=True,
+                          env={**os.environ, **ENVIRONMENT, **environment})
+    processor = [finding for finding in json.loads(done.stdout)["findings"] if finding["subject"] == "processor"]
+    if done.returncode != 0 or not processor or "NEON" not in processor[0]["found"]:
+        sys.exit(f"the doctor, exit code {done.returncode}: {done.stdout}")
+
+
+def check(folder: Path, target: Path, crates: list[str]) -> None:
+    start = emulated(folder)
     run(*start, "cargo", "test", "--release", "--locked", "--target", ARM64, "--target-dir", str(target / "arm64"),
         "--lib", "--tests", "--no-fail-fast", *[word for crate in crates for word in ("-p", crate)])
     say(f"the tests of {', '.join(crates)} pass as Arm programs")
-    library = ROOT / ".onnxruntime-aarch64/lib/libonnxruntime.so.1"
-    with tempfile.TemporaryDirectory() as folder:
-        native = drive([], target / "release", Path(folder))
-        check_drive(*native)
-        report, decisions = drive(start, target / "arm64" / ARM64 / "release", Path(folder), ORT_DYLIB_PATH=str(library))
-        check_drive(report, decisions)
-        largest = compare(decisions, native[1])
+    programs = target / "arm64" / ARM64 / "release"
+    library = str(ROOT / ".onnxruntime-aarch64/lib/libonnxruntime.so.1")
+    examine(start, programs, ORT_DYLIB_PATH=library)
+    say("the doctor finds no error on an Arm processor")
+    native = drive([], target / "release", folder)
+    check_drive(*native)
+    report, decisions = drive(start, programs, folder, ORT_DYLIB_PATH=library)
+    check_drive(report, decisions)
+    largest = compare(decisions, native[1])
     p50_ms = report["latency_ms"]["camera_to_action"]["p50"]
     say(f"{FRAMES} frames of {DRIVES} drives decided by Arm programs as by this machine's; hazard probabilities differ by at "
         f"most {largest:.1e}; emulated camera to action p50 {p50_ms / 1000:.1f} s")
+
+
+def main() -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        if sys.argv[1:] == ["--requirements"]:
+            emulated(Path(folder))
+        elif len(sys.argv) > 2:
+            check(Path(folder), Path(sys.argv[1]).resolve(), sys.argv[2:])
+        else:
+            sys.exit(__doc__)
 
 
 if __name__ == "__main__":
