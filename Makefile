@@ -56,12 +56,12 @@ ARM64_BUILD := --target $(ARM64) --target-dir $(TARGET)/arm64
 ARM64_TESTED := carff-messages carff-field carff-transport carff-decision
 
 arm64-tools:
-	@command -v $(ARM64_CC) $(ARM64_CXX) > /dev/null || { \
+	@command -v $(ARM64_CC) > /dev/null && command -v $(ARM64_CXX) > /dev/null || { \
 		echo "no compiler for 64-bit Arm: sudo apt-get install g++-aarch64-linux-gnu libc6-dev-arm64-cross" >&2; exit 1; }
 	rustup target add $(ARM64)
 	@$(PYTHON) launch/packaging/fetch_libraries.py onnxruntime --machine aarch64
 
-# Part of .ci/run; needs no C compiler for the target. Of the tests, only the field's know the processor.
+# A part of .ci/run that needs no C compiler for the target. Only the field's tests depend on the processor.
 type-check-arm64:
 	cargo check --release --locked $(ARM64_BUILD) --no-default-features $(addprefix -p ,$(RUNNING))
 	cargo check --release --locked $(ARM64_BUILD) --lib --tests -p carff-field
