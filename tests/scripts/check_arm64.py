@@ -62,7 +62,7 @@ SETTINGS = ["run.frame_rate_hz=0.1", "camera.frames_per_timestamp=1", "camera.li
             "launcher.start_timeout_ms=600000", "launcher.stop_timeout_ms=60000", "launcher.hang_timeout_ms=600000",
             *[f"stages.{stage}.deadline_ms=60000" for stage in ["encoder", "forecaster", "prober", "renderer", "controller"]]]
 # Largest difference of a hazard probability between both machines.
-TOLERANCE = 0.01
+TOLERANCE = 0.001
 
 
 def say(text: str) -> None:
