@@ -46,8 +46,10 @@ LAB_PROGRAMS = ["carff-lab", "carff-encoder-tch", "carff-viewer"]
 # The run path of a program built in the project, and its replacement in the package.
 BUILT_RUNPATH = b"$ORIGIN/../../.libtorch/lib:$ORIGIN/../../../.libtorch/lib"
 INSTALLED_RUNPATH = b"$ORIGIN/../lib"
-DEPENDS = "libc6 (>= 2.34), libgcc-s1, libstdc++6, passwd"
-LAB_DEPENDS = "libc6 (>= 2.34), libgcc-s1, libstdc++6, libgomp1"
+# The newest version 2.x of the C library whose functions a program uses.
+LIBC = 35
+DEPENDS = f"libc6 (>= 2.{LIBC}), libgcc-s1, libstdc++6, passwd"
+LAB_DEPENDS = f"libc6 (>= 2.{LIBC}), libgcc-s1, libstdc++6, libgomp1"
 # Only the window needs the libraries of a display.
 LAB_SUGGESTS = "libgl1, libxkbcommon0, libwayland-client0"
 
@@ -66,6 +68,9 @@ def put_program(source: Path, target: Path, machine: str) -> None:
     data = source.read_bytes()
     if int.from_bytes(data[18:20], "little") != MACHINES[machine][1]:
         sys.exit(f"{source} is no program for {machine}")
+    libc = max(map(int, re.findall(rb"\0GLIBC_2\.(\d+)(?=\0)", data)), default=0)
+    if libc > LIBC:
+        sys.exit(f"{source} needs version 2.{libc} of the C library, and the package depends on 2.{LIBC}")
     if data.count(BUILT_RUNPATH) != 1:
         sys.exit(f"{source}: its run path is not that of .cargo/config.toml: build it with `make build`")
     # Shorter, and padded with zeros: a string of the dynamic section ends at the first zero.
