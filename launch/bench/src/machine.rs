@@ -15,6 +15,7 @@ pub(crate) fn describe() -> Value {
         let line = cpuinfo.lines().find(|l| l.split(':').next().is_some_and(|key| key.trim() == name))?;
         Some(line.split_once(':')?.1.trim().to_owned())
     };
+    let family = field("cpu family").zip(field("model")).or_else(|| field("CPU implementer").zip(field("CPU part")));
     let flags = field("flags").or(field("Features")).unwrap_or_default();
     let flags: Vec<&str> = flags.split_whitespace().collect();
     let meminfo = std::fs::read_to_string("/proc/meminfo").unwrap_or_default();
@@ -23,7 +24,7 @@ pub(crate) fn describe() -> Value {
     });
     json!({
         "cpu": field("model name"),
-        "cpu_family_and_model": field("cpu family").zip(field("model")).map(|(f, m)| format!("{f}/{m}")),
+        "cpu_family_and_model": family.map(|(f, m)| format!("{f}/{m}")),
         "features": FEATURES.iter().filter(|f| flags.contains(f)).collect::<Vec<_>>(),
         "cores": std::thread::available_parallelism().map(usize::from).ok(),
         "memory_gb": memory_kb.map(|kb| (kb / 1e6 * 10.0).round() / 10.0),

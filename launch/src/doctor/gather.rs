@@ -35,7 +35,9 @@ pub fn processor() -> (String, Vec<String>) {
             .find_map(|line| line.split_once(':').filter(|(key, _)| key.trim() == wanted).map(|(_, v)| v.trim()))
     };
     let features = field("flags").or_else(|| field("Features")).unwrap_or_default();
-    let name = field("model name").unwrap_or("unknown processor").to_owned();
+    // Arm has no name of the processor; its boards have one, which ends with a zero.
+    let board = || read("/proc/device-tree/model").map(|name| name.trim_end_matches('\0').to_owned());
+    let name = field("model name").map(str::to_owned).or_else(board).unwrap_or_else(|| "unknown processor".to_owned());
     (name, features.split_whitespace().map(str::to_owned).collect())
 }
 

@@ -17,14 +17,17 @@ const DISK_BYTES: (u64, u64) = (2 << 30, 64 << 20);
 /// Checks the processor's features, named as the system names them.
 pub fn processor(name: &str, features: &[&str]) -> Finding {
     let has = |all: &[&str]| all.iter().all(|f| features.contains(f));
+    if has(&["asimd"]) {
+        return Finding::ok(Area::Machine, "processor", format!("{name}, 64-bit Arm with NEON"));
+    }
     if !has(&["avx2", "fma"]) {
         return Finding::warning(
             Area::Machine,
             "processor",
             format!("{name}, without AVX2 and FMA"),
             "the field uses portable kernels, which are several times slower",
-            "use an x86-64 processor of 2013 or later; in a virtual machine, pass the host's processor through \
-             (QEMU: -cpu host)",
+            "use an x86-64 processor of 2013 or later, or a 64-bit Arm processor; in a virtual machine, pass the host's \
+             processor through (QEMU: -cpu host)",
         );
     }
     let wide = if has(&["avx512f", "avx512vl"]) { ", AVX-512" } else { "" };
@@ -142,12 +145,13 @@ mod tests {
     use super::*;
     use crate::doctor::finding::Level;
 
-    /// Kernels need AVX2 and FMA; AVX-512 is mentioned if present.
+    /// Kernels need AVX2 and FMA, or NEON (which Linux calls asimd); AVX-512 is mentioned if present.
     #[test]
     fn processors() {
         assert_level(&processor("old", &["sse4_2"]), Level::Warning);
         assert_level(&processor("half", &["avx2"]), Level::Warning);
         assert_level(&processor("new", &["avx2", "fma"]), Level::Ok);
+        assert_level(&processor("arm", &["fp", "asimd"]), Level::Ok);
         assert!(processor("newer", &["avx2", "fma", "avx512f", "avx512vl"]).found.ends_with("AVX-512"));
     }
 

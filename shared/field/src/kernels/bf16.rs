@@ -25,6 +25,7 @@ const TILE: usize = 4;
 
 /// The weights of a layer as [`pack`] leaves them, and its biases.
 #[derive(Clone, Copy, Debug)]
+#[cfg_attr(not(target_arch = "x86_64"), allow(dead_code, reason = "only the kernel for x86-64 reads them"))]
 pub(crate) struct PackedAffine<'a> {
     pub pairs: &'a [u32],
     pub inputs: usize,

@@ -352,7 +352,7 @@ mod tests {
             let (weights, bias) = (numbers(inputs * outputs, 1), numbers(outputs, 2));
             let x = numbers(blocks * x_apart, 3);
             let mut pairs = vec![0; inputs.div_ceil(2) * outputs];
-            bf16::pack(&weights, outputs, &mut pairs);
+            crate::kernels::bf16::pack(&weights, outputs, &mut pairs);
             let mut y = vec![0.0; blocks * y_apart];
             let layer = PackedAffine { pairs: &pairs, inputs, bias: &bias };
             let activation = if relu { Activation::Relu } else { Activation::Identity };
