@@ -67,7 +67,7 @@ pub(super) struct DriveFigures {
     arrived: usize,
     stuck: usize,
     near_misses: usize,
-    /// Of the drives that arrived.
+    /// Durations of the drives that arrived.
     time_to_goal_s: Durations,
     /// Time at a standstill.
     halted_s: Durations,
