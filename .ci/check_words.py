@@ -62,11 +62,10 @@ FENCE = re.compile(r"^```.*?^```|<!--.*?-->", re.MULTILINE | re.DOTALL)
 INLINE = re.compile(r"`[^`\n]*(?:\n[^`\n]*)?`|\]\([^)]*\)|https?://\S+")
 HEADING = re.compile(r"^#.*$", re.MULTILINE)
 TOKEN = re.compile(
-    r"""(?P<doc>//[/!](?!/)[^\n]*)|//[^\n]*|/\*.*?\*/|(?P<raw>r(?P<hash>\#*)".*?"(?P=hash))"""
+    r"""(?P<doc>//[/!](?!/)[^\n]*)|(?P<comment>//[^\n]*)|/\*.*?\*/|(?P<raw>r(?P<hash>\#*)".*?"(?P=hash))"""
     r"""|(?P<text>"(?:[^"\\]|\\.)*")|'(?:\\.[^']*|[^'\\])'""",
     re.DOTALL,
 )
-PRIVATE = re.compile(r"(?:async |unsafe |const |extern )*(?:fn|struct|enum|const|static|type|trait|mod|impl|use|let)\b|macro_rules!")
 GAP = "\x00"
 
 PATTERNS = {
@@ -108,13 +107,15 @@ def prose_of_python(text: str) -> str:
 
 
 def prose_of_rust(text: str) -> str:
-    """Returns docs, and strings of three words or more; everything else is blank."""
+    """Returns docs, comments, and strings of three words or more; everything else is blank."""
     parts, end = [], 0
     for token in TOKEN.finditer(text):
         parts.append(re.sub(r"[^\n]", GAP, text[end:token.start()]))
         end = token.end()
         if token["doc"]:
             parts.append("   " + token["doc"][3:])
+        elif token["comment"]:
+            parts.append("  " + GAP + token["comment"][3:])
         elif (token["text"] or token["raw"]) and len(re.findall(r"[A-Za-z]+ ", token[0])) >= 2:
             parts.append(re.sub(r"\\\n", " \n", token[0]).replace('"', GAP, 1))
         else:
@@ -126,7 +127,7 @@ def prose_of_rust(text: str) -> str:
 
 
 def first_lines(text: str) -> list[tuple[int, str]]:
-    """Returns number and text of the first doc line of each public item, field and variant."""
+    """Returns number and text of the first doc line of each item, field and variant."""
     lines, found, number = text.splitlines(), [], 0
     while number < len(lines):
         if not re.match(r"\s*///(?!/)", lines[number]):
@@ -135,9 +136,7 @@ def first_lines(text: str) -> list[tuple[int, str]]:
         first = number
         while number < len(lines) and re.match(r"\s*(?:///|#\[|#!\[)", lines[number]):
             number += 1
-        item = lines[number].strip() if number < len(lines) else ""
-        if not PRIVATE.match(item):
-            found.append((first + 1, re.sub(r"^\s*/// ?", "", lines[first])))
+        found.append((first + 1, re.sub(r"^\s*/// ?", "", lines[first])))
     return found
 
 

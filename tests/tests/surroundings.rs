@@ -23,7 +23,7 @@ fn carff(graph: &TestGraph, words: &[&str]) -> Process {
     Process::start(command.args(words).args(["--run", graph.run().name()]))
 }
 
-/// When a cleaner removes the files of a run, or some of them, the launcher and a probe that has joined report it,
+/// A cleaner may remove the files of a run, or some of them: the launcher and a probe that has joined report it,
 /// `doctor` finds it and does not advise to remove the living run's memory, a second launch is refused, and a stage that
 /// dies ends the run with the cause.
 #[test]

@@ -37,7 +37,7 @@ pub enum BenchCommand {
 /// Benchmarks of processes and topics, which need no libtorch.
 #[derive(Debug, clap::Subcommand)]
 pub enum GraphBench {
-    /// Measure payloads between processes: this program's topics, bare iceoryx2, Unix sockets, zenoh.
+    /// Measure payloads between processes: this program's topics, bare iceoryx2, Unix sockets, zenoh, dora.
     #[command(after_help = "Example: with the figures as JSON
   carff bench ipc --json reports/performance.json")]
     Ipc(ipc::IpcArgs),

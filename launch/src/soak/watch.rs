@@ -405,7 +405,7 @@ mod tests {
         Action { reason: Reason::StaleBelief.code(), is_decision: 0, ..action(0, ActionCode::Halt, at_ms) }
     }
 
-    /// Where the rule halts, the vehicle creeps only by an approach. Something unknown halts unless it is ignored.
+    /// The vehicle creeps only by an approach, and only where the rule halts. Something unknown halts unless it is ignored.
     #[test]
     fn approach_and_unknown_are_known() {
         let said = |approach, ignores_unknown, unknown_probability, code| {

@@ -39,7 +39,7 @@ impl ExternalCamera {
         let new = frames.saturating_sub(std::mem::replace(&mut self.seen, frames));
         let quiet = |last_ns: &u64| now_ns.saturating_sub(*last_ns) > self.quiet_ns;
         if new > 0 && self.recent_ns.back().is_some_and(quiet) {
-            // Older frames say nothing about the rate after the gap.
+            // Older frames do not show the rate after the gap.
             self.recent_ns.clear();
         }
         for _ in 0..new.min(RECENT as u64) {

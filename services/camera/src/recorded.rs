@@ -77,7 +77,7 @@ pub fn run(stage: &mut StageContext, source: &mut dyn Recorded) -> anyhow::Resul
                 if let Err(error) = end {
                     stage.error(&error.context("the rest of the recording is left out"));
                 }
-                // A recording whose first image is damaged by now would repeat for ever.
+                // A recording whose first image is damaged by now would repeat indefinitely.
                 if !stage.graph.camera.repeat || std::mem::replace(&mut is_empty, true) {
                     break;
                 }

@@ -139,7 +139,7 @@ mod tests {
         }
     }
 
-    /// Where a vehicle can no longer stop, or already is in the way, it drives on.
+    /// A vehicle that can no longer stop, or already is in the way, drives on.
     #[test]
     fn a_committed_vehicle_leaves() {
         let advance = (ActionCode::Advance, 5.0);

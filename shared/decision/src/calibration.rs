@@ -327,7 +327,7 @@ mod tests {
         assert_eq!(r.state, 2);
     }
 
-    /// Of equally probable states a hazard state is resolved.
+    /// A hazard state is resolved among equally probable states.
     #[test]
     fn ties_go_to_the_hazard() {
         let p = layout();

@@ -178,7 +178,7 @@ mod tests {
 
     const STATES: [bool; 4] = [true, true, false, false];
 
-    /// Where every state explains the image alike, an even encoder's answer is kept, and nothing is unknown.
+    /// An even encoder's answer is kept, and nothing is unknown, where every state explains the image alike.
     #[test]
     fn hidden_views_stay_even() {
         let (hazard, unknown) = ImageEvidence::new(&[50.0; 4]).weigh(0.5, &STATES);
@@ -199,8 +199,8 @@ mod tests {
         assert!((hazard - 0.3).abs() < 0.01 && unknown < 0.01, "{hazard} {unknown}");
     }
 
-    /// Where the image shows no difference, an encoder that is wrongly sure leaves a quarter of the probability to the
-    /// hazard.
+    /// An encoder that is wrongly sure leaves a quarter of the probability to the hazard, where the image shows no
+    /// difference.
     #[test]
     fn what_cannot_be_seen_stays_possible() {
         let (hazard, _) = ImageEvidence::new(&[50.0; 4]).weigh(0.0, &STATES);

@@ -129,7 +129,7 @@ mod tests {
         TakeFrame { take_start, frame, capture_time_ns: 100 * frame }
     }
 
-    /// What one image showed holds over later images that show nothing, over time steps, until the take ends.
+    /// The content of one image holds over later images that show nothing, over time steps, until the take ends.
     #[test]
     fn a_take_is_remembered() {
         for step in [StepLength::Frames(3), StepLength::TimeNs(300)] {

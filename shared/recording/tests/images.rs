@@ -128,7 +128,7 @@ fn foxgloves_images_are_read() {
     assert_eq!(told[4], Ok([1, 2, 3]));
 }
 
-/// Of a damaged or cut-off file, what comes before the damage is read; no byte makes the reader panic.
+/// A damaged or cut-off file is read up to the damage; no byte makes the reader panic.
 #[test]
 fn damaged_files_end_early() {
     let folder = tempfile::tempdir().unwrap();

@@ -57,7 +57,7 @@ fn heartbeat(
     panic!("no such heartbeat");
 }
 
-/// When `ready` returns, its heartbeat has been sent: a stage that dies in its first frame has been ready.
+/// The heartbeat of `ready` has been sent when it returns: a stage that dies in its first frame has been ready.
 #[test]
 fn ready_is_said_before_work_begins() {
     let fixture = Fixture::new("ready");

@@ -173,7 +173,7 @@ fn camera_limits(posed: &PosedImages, seed: u64) -> CameraLimits {
         .collect();
     let fields: Vec<[f64; 2]> = posed.dataset.frames().iter().map(|f| f.camera.field_of_view_deg()).collect();
     let alike = fields.iter().all(|f| (0..2).all(|i| (f[i] - fields[0][i]).abs() < 0.01 * fields[0][i]));
-    // A dataset of several lenses says nothing about the right one.
+    // A dataset of several lenses does not determine the right one.
     let field_of_view_deg = fields.first().copied().filter(|_| alike).unwrap_or([0.0; 2]);
     CameraLimits::fit(&measured, field_of_view_deg)
 }

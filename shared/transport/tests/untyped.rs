@@ -61,7 +61,7 @@ fn found(node: &Node, name: &str) -> (TopicId, OpenTopic) {
     (topic.id(), topic)
 }
 
-/// Of an unknown type, the header and the size are received, whether it is a message or describes an image.
+/// The header and the size of an unknown type are received, whether it is a message or describes an image.
 #[test]
 fn headers_of_unknown_types_are_received() {
     let run = TestRun::new();

@@ -237,7 +237,7 @@ mod tests {
         }
     }
 
-    /// What is written is read; a missing file is not an error; another version and damaged limits are refused.
+    /// A written file is read back; a missing file is not an error; another version and damaged limits are refused.
     #[test]
     fn the_file_is_checked() {
         let folder = tempfile::tempdir().unwrap();

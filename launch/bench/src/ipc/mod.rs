@@ -1,16 +1,16 @@
-//! Measures payloads from one process to another: this program's topics, bare iceoryx2, Unix sockets, zenoh.
+//! Measures payloads from one process to another: this program's topics, bare iceoryx2, Unix sockets, zenoh, dora.
 //!
 //! One process writes a payload, and another reads it. The time starts before the sender requests memory. It ends after
 //! the receiver has read the last byte, on the same monotonic clock. The receiver then acknowledges through a pipe,
-//! which is not part of the time, and the next payload follows. zenoh's two processes belong to a separate program,
+//! which is not part of the time, and the next payload follows. zenoh's and dora's two processes belong to separate programs,
 //! during whose work this process sleeps.
 
 mod bare;
 mod driver;
 mod peer;
+mod program;
 mod typed;
 mod unix;
-mod zenoh;
 
 use crate::OutputArgs;
 use crate::report::{Report, number, table};
@@ -19,15 +19,15 @@ use anyhow::ensure;
 use carff_transport::Stop;
 use driver::Driver;
 pub(crate) use peer::peer;
+use program::ProgramPair;
 use std::path::{Path, PathBuf};
-use zenoh::ZenohPair;
 
 /// Sizes of the payloads, bytes: powers of two, rounded to whole pixels.
 const SIZES: [usize; 5] = [64, 1 << 10, 1 << 14, 1 << 18, 1 << 22];
 /// Number of turns of each transport at each size.
 const TURNS: usize = 10;
 
-/// Measure payloads between processes: this program's topics, bare iceoryx2, Unix sockets, zenoh.
+/// Measure payloads between processes: this program's topics, bare iceoryx2, Unix sockets, zenoh, dora.
 #[derive(Clone, Debug, clap::Args)]
 pub struct IpcArgs {
     /// Number of payloads for each transport, size and way of waiting; a tenth of it from 256 KiB on.
@@ -43,6 +43,10 @@ pub struct IpcArgs {
     /// If the default does not exist, zenoh is left out.
     #[arg(long)]
     zenoh: Option<PathBuf>,
+    /// Python with the packages dora-rs, dora-rs-cli and pyarrow, and the script with dora's two ends
+    /// (tests/dora-peer/carff_dora_peer.py). Without them, dora is left out.
+    #[arg(long, num_args = 2, value_names = ["PYTHON", "SCRIPT"])]
+    dora: Vec<PathBuf>,
     #[command(flatten)]
     pub(crate) output: OutputArgs,
 }
@@ -187,7 +191,7 @@ fn times_us(bytes: &[u8]) -> Vec<f64> {
 }
 
 pub(crate) fn run(args: &IpcArgs) -> anyhow::Result<Report> {
-    let zenoh = zenoh::program(args.zenoh.as_deref())?;
+    let zenoh = program::zenoh(args.zenoh.as_deref())?;
     let folder = tempfile::tempdir()?;
     let stop = Stop::on_signals()?;
     let measured = measure(args, zenoh.as_deref(), folder.path(), &stop);
@@ -215,7 +219,10 @@ fn measure(
         pairs.push(Box::new(Driver::start(transport, folder, stop)?));
     }
     if let Some(program) = zenoh {
-        pairs.push(Box::new(ZenohPair::start(program, folder)?));
+        pairs.push(Box::new(ProgramPair::start(program::ZENOH, &[program], folder)?));
+    }
+    if !args.dora.is_empty() {
+        pairs.push(Box::new(ProgramPair::start(program::DORA, &args.dora, folder)?));
     }
     let mut cells = Vec::new();
     for size in SIZES.map(Size::near) {

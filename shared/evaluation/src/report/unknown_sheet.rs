@@ -25,7 +25,7 @@ pub fn unknown_objects(subject: &Subject, path: &Path) -> Result<bool, Evaluatio
     let perception = subject.perception();
     let (Some(known), Ok(probe)) = (&perception.known, &subject.probe) else { return Ok(false) };
     let mut rows = Vec::new();
-    // The first pose that has each in sight, whatever the result.
+    // The first pose that has each in sight, with any result.
     let in_sight: Vec<usize> =
         (0..subject.novelties.len()).filter(|&i| !subject.novelties[i].looks.is_empty()).collect();
     for index in spread(&in_sight, ROWS) {

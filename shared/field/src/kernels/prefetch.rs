@@ -6,7 +6,7 @@
 #[inline(always)]
 pub(super) fn prefetch<T>(table: &[T], index: usize) {
     #[cfg(target_arch = "x86_64")]
-    // SAFETY: prefetching reads nothing and cannot fault, whatever the address; the instruction is part of every x86-64
+    // SAFETY: prefetching reads nothing and cannot fault, at any address; the instruction is part of every x86-64
     // processor (SSE).
     unsafe {
         use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};

@@ -168,7 +168,7 @@ mod tests {
         a.into_iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max)
     }
 
-    /// When states may differ in all cells, each of several images equals the one that its latent gives by itself. When
+    /// Each of several images equals the one that its latent gives by itself, if states may differ in all cells. When
     /// they differ in none, all images equal the first; so do the pixels of rays that meet no such cell.
     #[test]
     fn hypotheses_share_what_does_not_change() {
