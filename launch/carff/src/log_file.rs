@@ -27,7 +27,7 @@ impl LogFile {
     /// Creates the file; those of an earlier run are replaced.
     pub(crate) fn create(path: &Path) -> Result<Self> {
         match std::fs::remove_file(earlier(path)) {
-            Err(error) if error.kind() != ErrorKind::NotFound => return Err(error),
+            Err(error) if error.kind() != ErrorKind::NotFound => Err(error),
             _ => Self::begin(path),
         }
     }

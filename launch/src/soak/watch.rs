@@ -408,6 +408,7 @@ mod tests {
     /// The vehicle creeps only by an approach, and only where the rule halts. Something unknown halts unless it is ignored.
     #[test]
     fn approach_and_unknown_are_known() {
+        use ActionCode::{Advance, Creep, Halt};
         let said = |approach, ignores_unknown, unknown_probability, code| {
             let mut judge = judge_of(Policy { ignores_unknown, ..Policy::new(Rule::Calibrated, 0.3) }, approach);
             for step in 1..=2 {
@@ -415,7 +416,6 @@ mod tests {
             }
             judge.next(action(1, code, 120)).is_ok()
         };
-        use ActionCode::{Advance, Creep, Halt};
         for approach in [Approach::Stop, Approach::Look] {
             assert_eq!([Advance, Creep, Halt].map(|code| said(approach, false, 0.0, code)), [true, false, false]);
             assert_eq!([Advance, Creep, Halt].map(|code| said(approach, true, 0.9, code)), [true, false, false]);

@@ -40,7 +40,7 @@ pub struct SampleEvidence {
 
 impl SampleEvidence {
     /// Reports whether the sample shows a hazard rather than none.
-    fn shows_hazard(&self) -> bool {
+    fn shows_hazard(self) -> bool {
         self.hazard_likelihood >= SHOWS_HAZARD
     }
 }

@@ -83,7 +83,9 @@ impl ReliabilitySums {
 /// ```
 pub fn reliability(forecasts: &[(f64, bool)], bins: usize) -> Reliability {
     let mut sums = ReliabilitySums::new(bins);
-    forecasts.iter().for_each(|&(probability, happened)| sums.add(probability, happened));
+    for &(probability, happened) in forecasts {
+        sums.add(probability, happened);
+    }
     sums.reliability()
 }
 

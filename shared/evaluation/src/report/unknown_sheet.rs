@@ -37,7 +37,7 @@ pub fn unknown_objects(subject: &Subject, path: &Path) -> Result<bool, Evaluatio
         let place = if novelty.beside { "next to the road" } else { "on the road" };
         let boxes = compared.seen.boxes.len();
         let image = StripCell {
-            emphasis: carff_decision::is_likely(f64::from(unknown)).then_some(UNKNOWN),
+            emphasis: carff_decision::is_likely(unknown).then_some(UNKNOWN),
             ..StripCell::new(with_boxes(&look.image, &look.camera, &compared), &[format!("unknown {unknown:.2}")])
         };
         let best = subject.state_name(compared.best);
