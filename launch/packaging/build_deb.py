@@ -4,7 +4,7 @@
 Usage: python3 launch/packaging/build_deb.py [TARGET] [OUT] [--machine MACHINE]     (default: target, TARGET, this one)
 
 OUT is the folder of carff_VERSION_ARCH.deb and carff-lab_VERSION_ARCH.deb. For another machine than this one, only the first is
-built, from the programs that `make build-arm64` cross-builds. Content of the first:
+built, from the programs that `make deb-arm64` cross-builds. Content of the first:
 
 | content | path |
 |---|---|
@@ -67,7 +67,7 @@ def put(source: Path, target: Path, mode: int = 0o644) -> None:
 def put_program(source: Path, target: Path, machine: str) -> None:
     data = source.read_bytes()
     if int.from_bytes(data[18:20], "little") != MACHINES[machine][1]:
-        sys.exit(f"{source} is no program for {machine}")
+        sys.exit(f"{source} is not a program for {machine}")
     libc = max(map(int, re.findall(rb"\0GLIBC_2\.(\d+)(?=\0)", data)), default=0)
     if libc > LIBC:
         sys.exit(f"{source} needs version 2.{libc} of the C library, and the package depends on 2.{LIBC}")

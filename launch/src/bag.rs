@@ -1,9 +1,9 @@
 //! Images with poses in a recording of another tool (a ROS 2 bag, a Foxglove recording), as a dataset that can be
 //! imported.
 
-use anyhow::{Context, bail, ensure};
+use anyhow::{Context, anyhow, bail, ensure};
 use carff_dataset::{Calibration, DistortionModel, Image};
-use carff_recording::{ImageReader, Transforms};
+use carff_recording::{ImageReader, RecordingError, Transforms};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 
@@ -45,16 +45,17 @@ pub(crate) fn is_recording(path: &Path) -> bool {
 
 /// Writes images of a recording with their cameras to a folder, in nerfstudio's format.
 pub(crate) fn extract(recording: &Path, out: &Path, args: &BagArgs) -> anyhow::Result<Extracted> {
-    let mut reader = ImageReader::open(recording, args.topic.as_deref()).map_err(|e| named_here(&e))?;
+    let mut reader = ImageReader::open(recording, args.topic.as_deref()).map_err(named_here)?;
     let calibration = match &args.calibration {
         Some(path) => Some(Calibration::load(path)?),
-        None => reader.calibration()?,
+        None => reader.calibration().map_err(named_here)?,
     };
     let calibration = calibration.with_context(|| {
         format!("{} has no calibration of `{}`: pass --calibration FILE", recording.display(), reader.topic())
     })?;
     calibration.check()?;
-    let transforms = Transforms::read(recording, args.pose_topic.as_deref()).context("--pose-topic names a topic")?;
+    let transforms = Transforms::read(recording, args.pose_topic.as_deref())
+        .context("cannot read the poses; --pose-topic chooses among several topics")?;
     let (mut poses, mut extracted) = (Vec::new(), Extracted::default());
     while reader.next()?.is_some() {
         let origin = reader.origin()?;
@@ -84,9 +85,17 @@ pub(crate) fn extract(recording: &Path, out: &Path, args: &BagArgs) -> anyhow::R
     Ok(extracted)
 }
 
-/// Names this command's option in place of the graph file's key.
-fn named_here(error: &carff_recording::RecordingError) -> anyhow::Error {
-    anyhow::anyhow!(error.to_string().replace("`camera.topic`", "`--topic`"))
+/// Names this command's options in errors whose remedy is a key of the graph file.
+fn named_here(error: RecordingError) -> anyhow::Error {
+    match error {
+        RecordingError::SeveralImages { path, channels } => {
+            anyhow!("{} has images on several channels: name one with `--topic`: `{channels}`", path.display())
+        }
+        RecordingError::Calibration { path, cause } => {
+            anyhow!("{}: its calibration cannot be used: {cause}; pass --calibration FILE", path.display())
+        }
+        other => other.into(),
+    }
 }
 
 fn decoded(reader: &ImageReader, calibration: &Calibration) -> anyhow::Result<Image> {

@@ -87,7 +87,7 @@ impl KeptSpans {
     }
 }
 
-/// Returns the kept spans of a run, in the order in which they were written; none where there is no such file.
+/// Returns the kept spans of a run, in the order in which they were written; empty if the file is missing.
 pub(crate) fn kept_spans(path: &Path) -> Vec<Span> {
     let read = |path: &Path| std::fs::read(path).unwrap_or_default();
     // In this order, nothing is lost if the next file begins in between: the newest lines are then in the earlier file.

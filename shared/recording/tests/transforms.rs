@@ -92,8 +92,8 @@ fn written(path: &Path, messages: &[Message]) {
     writer.finish().unwrap();
 }
 
-/// Transforms are chained and interpolated; there is no pose in a gap of more than a second, in a circle, or where a
-/// transform is not rigid. Of two topics with poses, one must be named.
+/// Transforms are chained and interpolated. A gap of more than a second and a circle give no pose, and a transform that
+/// is not rigid is an error. If two topics have poses, one must be named.
 #[test]
 fn transforms_are_chained() {
     let folder = tempfile::tempdir().unwrap();
