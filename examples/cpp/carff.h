@@ -107,6 +107,30 @@ static_assert(offsetof(CarffHeader, capture_time_ns) == 32, "CarffHeader.capture
 static_assert(offsetof(CarffHeader, publish_time_ns) == 40, "CarffHeader.publish_time_ns");
 static_assert(offsetof(CarffHeader, seed) == 48, "CarffHeader.seed");
 
+#define CARFF_EGO_POSE_TYPE_NAME "carff.EgoPose.v1"
+typedef struct CarffEgoPose {
+    CarffHeader header;
+    double world_from_vehicle[16];
+} CarffEgoPose;
+
+static_assert(sizeof(CarffEgoPose) == 184, "CarffEgoPose");
+static_assert(offsetof(CarffEgoPose, header) == 0, "CarffEgoPose.header");
+static_assert(offsetof(CarffEgoPose, world_from_vehicle) == 56, "CarffEgoPose.world_from_vehicle");
+
+#define CARFF_EGO_MOTION_TYPE_NAME "carff.EgoMotion.v1"
+typedef struct CarffEgoMotion {
+    CarffHeader header;
+    double speed_mps;
+    double to_conflict_m;
+    double heading_rad;
+} CarffEgoMotion;
+
+static_assert(sizeof(CarffEgoMotion) == 80, "CarffEgoMotion");
+static_assert(offsetof(CarffEgoMotion, header) == 0, "CarffEgoMotion.header");
+static_assert(offsetof(CarffEgoMotion, speed_mps) == 56, "CarffEgoMotion.speed_mps");
+static_assert(offsetof(CarffEgoMotion, to_conflict_m) == 64, "CarffEgoMotion.to_conflict_m");
+static_assert(offsetof(CarffEgoMotion, heading_rad) == 72, "CarffEgoMotion.heading_rad");
+
 #define CARFF_INTRINSICS_TYPE_NAME "carff.Intrinsics.v1"
 typedef struct CarffIntrinsics {
     double fl_x_px;
@@ -369,6 +393,18 @@ static_assert(offsetof(CarffOccupancy, unknown_probability) == 76, "CarffOccupan
 static_assert(offsetof(CarffOccupancy, probability) == 80, "CarffOccupancy.probability");
 static_assert(offsetof(CarffOccupancy, stage_latency_ns) == 4176, "CarffOccupancy.stage_latency_ns");
 
+#define CARFF_LOOK_GAIN_TYPE_NAME "carff.LookGain.v1"
+typedef struct CarffLookGain {
+    CarffHeader header;
+    float gain_bits;
+    float ahead_m;
+} CarffLookGain;
+
+static_assert(sizeof(CarffLookGain) == 64, "CarffLookGain");
+static_assert(offsetof(CarffLookGain, header) == 0, "CarffLookGain.header");
+static_assert(offsetof(CarffLookGain, gain_bits) == 56, "CarffLookGain.gain_bits");
+static_assert(offsetof(CarffLookGain, ahead_m) == 60, "CarffLookGain.ahead_m");
+
 #define CARFF_VIEW_META_TYPE_NAME "carff.ViewMeta.v1"
 typedef struct CarffViewMeta {
     CarffHeader header;
@@ -464,6 +500,8 @@ static_assert(offsetof(CarffHealth, last_progress_ns) == 128, "CarffHealth.last_
 static_assert(offsetof(CarffHealth, rss_bytes) == 136, "CarffHealth.rss_bytes");
 
 /* Names of the topics, and of the types of their messages. */
+#define CARFF_TOPIC_EGO_POSE "ego/pose" /* CarffEgoPose */
+#define CARFF_TOPIC_EGO_MOTION "ego/motion" /* CarffEgoMotion */
 #define CARFF_TOPIC_CAMERA_FRAME "camera/frame" /* CarffFrameMeta (user header of a slice of bytes) */
 #define CARFF_TOPIC_ENCODER_POSTERIOR "encoder/posterior" /* CarffPosterior */
 #define CARFF_TOPIC_ENCODER_CHECK "encoder/check" /* CarffImageCheck */
@@ -471,6 +509,7 @@ static_assert(offsetof(CarffHealth, rss_bytes) == 136, "CarffHealth.rss_bytes");
 #define CARFF_TOPIC_PROBER_BELIEF "prober/belief" /* CarffBelief */
 #define CARFF_TOPIC_PROBER_UNKNOWN "prober/unknown" /* CarffUnknowns */
 #define CARFF_TOPIC_PROBER_OCCUPANCY "prober/occupancy" /* CarffOccupancy */
+#define CARFF_TOPIC_PROBER_LOOK "prober/look" /* CarffLookGain */
 #define CARFF_TOPIC_RENDERER_VIEW "renderer/view" /* CarffViewMeta (user header of a slice of bytes) */
 #define CARFF_TOPIC_CONTROLLER_ACTION "controller/action" /* CarffAction */
 #define CARFF_TOPIC_HEALTH_CAMERA "health/camera" /* CarffHealth */

@@ -2,7 +2,7 @@
 
 use crate::decisions::{Decisions, Shown};
 use crate::planning::{Planning, RunOutcome};
-use crate::report::{self, ReportFiles};
+use crate::report::{ReportFiles, RunReport};
 use crate::supervision::monitor::FrameRecord;
 use crate::supervision::{Ended, Feed, LAUNCHER, Supervisor};
 use anyhow::{Context, bail, ensure};
@@ -96,8 +96,8 @@ fn report(
     outcome: &RunOutcome,
     terminal: &Terminal,
 ) -> anyhow::Result<()> {
-    let mut own = report::json(outcome);
-    let mut text = report::text(outcome, &own);
+    let mut own = RunReport::of(outcome);
+    let mut text = own.text();
     terminal.line(&text);
     if let Some(files) = files {
         files.write(&own, &text)?;
@@ -116,7 +116,7 @@ fn report(
         terminal.status(String::new());
         terminal.line(&tables.text());
         text += &tables.text();
-        own["planning"] = serde_json::to_value(&tables)?;
+        own.planning = Some(tables);
         files.map_or(Ok(()), |files| files.write(&own, &text))?;
     }
     Ok(())

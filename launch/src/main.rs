@@ -1,9 +1,11 @@
 //! The commands that start graphs, and those that need neither a graph nor libtorch. It executes `carff-lab` for commands
 //! that compute with libtorch.
 
+use anyhow::Context;
 use carff::{parse, run_program};
 #[cfg(feature = "bench")]
 use carff_bench::BenchCommand;
+use carff_inference::library;
 use carff_launch::command::{Cli, Command};
 use carff_launch::lab::{self, CheckpointCommand, LabCommand};
 use carff_launch::schema::{FileKind, SchemaArgs};
@@ -15,6 +17,7 @@ fn main() -> ExitCode {
 }
 
 fn run() -> anyhow::Result<ExitCode> {
+    library::without_telemetry().context("the telemetry of ONNX Runtime cannot be switched off")?;
     carff_launch::shell::answer_shell(Cli::command);
     match parse::<Cli>()?.command {
         Command::Launch(args) => carff_launch::launch::run(&args),

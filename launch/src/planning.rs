@@ -3,9 +3,9 @@
 use crate::supervision::monitor::{FrameRecord, Records};
 use carff::provenance::Origin;
 use carff_checkpoint::CheckpointPlanning;
-use carff_config::{CameraSource, GraphConfig};
+use carff_config::{CameraSource, CompareImages, GraphConfig};
 use carff_dataset::{ScenarioInfo, drives::DriveKind};
-use carff_decision::TakeFrame;
+use carff_decision::{ImageEvidence, TakeFrame};
 use carff_messages::{ActionCode, Gaussian, Reason, Stage};
 use carff_scenes::Scenario;
 use carff_trials::run::{DecidedFrame, JudgedRun, RunPlanning, RunSettings, decisive_frames};
@@ -69,8 +69,22 @@ impl Planning {
 
 /// Selects the frame of each drive whose decision counts; none for a run without a scenario.
 pub fn decisive(outcome: &RunOutcome) -> Vec<(DecidedFrame, DriveKind)> {
-    let frames = outcome.records.frames.values().filter_map(decided);
+    let is_late = outcome.graph.checks.compare == CompareImages::NextFrame;
+    let frames = &outcome.records.frames;
+    let frames = frames.values().filter_map(|frame| {
+        let states = outcome.scenario.as_ref().map_or(0, ScenarioInfo::state_count);
+        let image = if is_late { image_before(frames, frame, states) } else { frame.image.clone() };
+        Some(DecidedFrame { image, ..decided(frame)? })
+    });
     outcome.scenario.as_ref().map_or_else(Vec::new, |scenario| decisive_frames(frames, scenario))
+}
+
+/// Evidence of the last compared image of a take before a frame; of the take's first frame, that nothing explains it.
+/// Images are compared after their decisions.
+fn image_before(frames: &BTreeMap<u64, FrameRecord>, frame: &FrameRecord, states: usize) -> Option<ImageEvidence> {
+    let mut before = frames.range(frame.take_start..frame.frame_id.max(frame.take_start)).rev();
+    let compared = before.find(|(_, frame)| frame.action.is_some());
+    compared.map_or_else(|| Some(ImageEvidence::unexplained(states)), |(_, before)| before.image.clone())
 }
 
 /// Posterior of a frame, with its place in its take.
@@ -99,7 +113,7 @@ fn settings(outcome: &RunOutcome) -> anyhow::Result<RunSettings> {
         samples: graph.run.samples as usize,
         sampling: graph.run.sampling,
         horizon: graph.run.horizon,
-        compares: graph.checks.compare,
+        compares: graph.checks.compare != CompareImages::Off,
         ignores_unknown: graph.checks.ignores_unknown(),
         remembers: graph.step_length(None).filter(|_| graph.remembers()),
         noise: graph.camera.noise,
@@ -170,5 +184,20 @@ mod tests {
             FrameRecord { action: None, ..frame() },
         ];
         assert!(others.iter().all(|other| decided(other).is_none()));
+    }
+
+    /// The image before is that of the last decided frame of the take; nothing explains a take's first frame.
+    #[test]
+    fn images_of_the_frame_before_count() {
+        let image = |ratio: f32| Some(ImageEvidence::new(&[ratio]));
+        let with = |frame_id, take_start, action, ratio| {
+            (frame_id, FrameRecord { frame_id, take_start, action, image: image(ratio), ..frame() })
+        };
+        let halt = Some(ActionCode::Halt);
+        let frames = [with(3, 3, halt, 3.0), with(4, 3, None, 4.0), with(5, 3, halt, 5.0), with(6, 6, halt, 6.0)];
+        let frames = BTreeMap::from(frames);
+        for (frame, before) in [(3, 0.0), (5, 3.0), (6, 0.0)] {
+            assert_eq!(image_before(&frames, &frames[&frame], 1), image(before), "{frame}");
+        }
     }
 }

@@ -175,7 +175,7 @@ impl Graph {
             let path = folder.path().join(format!("carff-{stage}"));
             let fault = if stage == Stage::Encoder { fault } else { "none" };
             let script = format!(
-                "#!/bin/sh\nCARFF_FAKE={stage}:{fault} CARFF_ARGS=\"$*\" exec {} --exact fake_stage --nocapture\n",
+                "#!/bin/sh\nCARFF_FAKE={stage}:{fault} CARFF_ARGS=\"$*\" exec {} --exact launching::fake_stage --nocapture\n",
                 test.display()
             );
             std::fs::write(&path, script).unwrap();

@@ -101,6 +101,30 @@ class Header(ctypes.Structure):
         return "carff.Header.v1"
 
 
+class EgoPose(ctypes.Structure):
+    _fields_ = [
+        ("header", Header),
+        ("world_from_vehicle", (ctypes.c_double * 16)),
+    ]
+
+    @staticmethod
+    def type_name() -> str:
+        return "carff.EgoPose.v1"
+
+
+class EgoMotion(ctypes.Structure):
+    _fields_ = [
+        ("header", Header),
+        ("speed_mps", ctypes.c_double),
+        ("to_conflict_m", ctypes.c_double),
+        ("heading_rad", ctypes.c_double),
+    ]
+
+    @staticmethod
+    def type_name() -> str:
+        return "carff.EgoMotion.v1"
+
+
 class Intrinsics(ctypes.Structure):
     _fields_ = [
         ("fl_x_px", ctypes.c_double),
@@ -304,6 +328,18 @@ class Occupancy(ctypes.Structure):
         return "carff.Occupancy.v1"
 
 
+class LookGain(ctypes.Structure):
+    _fields_ = [
+        ("header", Header),
+        ("gain_bits", ctypes.c_float),
+        ("ahead_m", ctypes.c_float),
+    ]
+
+    @staticmethod
+    def type_name() -> str:
+        return "carff.LookGain.v1"
+
+
 class ViewMeta(ctypes.Structure):
     _fields_ = [
         ("header", Header),
@@ -372,6 +408,8 @@ class Health(ctypes.Structure):
 # Size, alignment and offsets of the fields in the programs, bytes.
 LAYOUTS = {
     Header: (56, 8, {"schema_version": 0, "step": 4, "run_id": 8, "frame_id": 16, "sequence": 24, "capture_time_ns": 32, "publish_time_ns": 40, "seed": 48}),
+    EgoPose: (184, 8, {"header": 0, "world_from_vehicle": 56}),
+    EgoMotion: (80, 8, {"header": 0, "speed_mps": 56, "to_conflict_m": 64, "heading_rad": 72}),
     Intrinsics: (32, 8, {"fl_x_px": 0, "fl_y_px": 8, "cx_px": 16, "cy_px": 24}),
     DatasetView: (32, 4, {"known": 0, "view": 4, "branch": 8, "timestamp": 12, "drive": 16, "frame_in_drive": 20, "observability": 24, "last_of_timestamp": 28}),
     FrameMeta: (264, 8, {"header": 0, "width_px": 56, "height_px": 60, "intrinsics": 64, "world_from_camera": 96, "dataset_view": 224, "take_start": 256}),
@@ -384,6 +422,7 @@ LAYOUTS = {
     UnknownBox: (56, 8, {"center": 0, "half_size": 24, "probability": 48, "place": 52}),
     Unknowns: (824, 8, {"header": 0, "box_count": 56, "state_count": 60, "probability": 64, "residual": 68, "noise": 72, "gain": 76, "offset": 88, "explained": 100, "ratios": 104, "prior": 360, "boxes": 368, "stage_latency_ns": 816}),
     Occupancy: (4184, 8, {"header": 0, "columns": 56, "rows": 60, "cell_m": 64, "low_corner_m": 68, "unknown_probability": 76, "probability": 80, "stage_latency_ns": 4176}),
+    LookGain: (64, 8, {"header": 0, "gain_bits": 56, "ahead_m": 60}),
     ViewMeta: (280, 8, {"header": 0, "hypothesis": 56, "kind": 60, "state": 64, "width_px": 68, "height_px": 72, "probability": 76, "latent": 80, "intrinsics": 112, "world_from_camera": 144, "stage_latency_ns": 272}),
     Action: (120, 8, {"header": 0, "action": 56, "reason": 60, "rule": 64, "sample_count": 68, "confidence": 72, "hazard_probability": 76, "is_decision": 80, "unknown_probability": 84, "valid_until_ns": 88, "based_on_frame": 96, "latency_ns": 104, "target_speed_mps": 112, "look_gain_bits": 116}),
     Health: (144, 8, {"header": 0, "stage": 56, "state": 60, "pid": 64, "received": 72, "published": 80, "skipped": 88, "invalid": 96, "errors": 104, "last_latency_ns": 112, "max_latency_ns": 120, "last_progress_ns": 128, "rss_bytes": 136}),
@@ -412,6 +451,8 @@ class Topic(NamedTuple):
 
 
 TOPICS = [
+    Topic("ego/pose", EgoPose, False, Limits(10, 2, 14, 1, 16, 3, 2)),
+    Topic("ego/motion", EgoMotion, False, Limits(10, 2, 14, 1, 16, 3, 2)),
     Topic("camera/frame", FrameMeta, True, Limits(8, 2, 12, 0, 8, 2, 2)),
     Topic("encoder/posterior", Posterior, False, Limits(10, 2, 14, 48, 64, 3, 2)),
     Topic("encoder/check", ImageCheck, False, Limits(10, 2, 14, 0, 16, 3, 2)),
@@ -419,6 +460,7 @@ TOPICS = [
     Topic("prober/belief", Belief, False, Limits(10, 2, 14, 0, 16, 3, 2)),
     Topic("prober/unknown", Unknowns, False, Limits(10, 2, 14, 0, 16, 3, 2)),
     Topic("prober/occupancy", Occupancy, False, Limits(10, 2, 14, 0, 16, 3, 2)),
+    Topic("prober/look", LookGain, False, Limits(10, 2, 14, 0, 16, 3, 2)),
     Topic("renderer/view", ViewMeta, True, Limits(8, 2, 12, 0, 8, 2, 2)),
     Topic("controller/action", Action, False, Limits(10, 2, 14, 1, 16, 3, 2)),
     Topic("health/camera", Health, False, Limits(10, 2, 14, 1, 16, 3, 2)),

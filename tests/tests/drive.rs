@@ -53,6 +53,25 @@ fn drives_repeat() {
     }
 }
 
+/// A recording of a closed-loop drive is decided again as it was, bit for bit: it has the ego's motion, on which the
+/// approach rests.
+#[test]
+fn a_drive_is_decided_again_as_it_was() {
+    let folder = tempfile::tempdir().unwrap();
+    let run = format!("again-{}", std::process::id());
+    let carff = |words: &[&str]| {
+        let mut command = Command::new(program("carff"));
+        Process::start(command.current_dir(folder.path()).args(words).args(["--run", &run]))
+    };
+    let mut driving = drive(folder.path(), "again", &crossing(), &["--episodes", "2", "--seed", "3"]);
+    driving.wait_for("the stages", |text| text.contains("[renderer] INFO ready"));
+    carff(&["record", "-o", "run.mcap"]).end().assert_success();
+    driving.end().assert_success();
+    let again = carff(&["replay", "run.mcap", "--verify"]).end();
+    again.assert_success();
+    assert!(again.text.contains("all equal, bit for bit"), "{}", again.text);
+}
+
 /// An ego that never stops is as fast as its speed limit; one that never drives on is stuck and is not hit; the planner
 /// that knows the truth does not collide in the same episodes.
 #[test]

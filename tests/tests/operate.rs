@@ -5,7 +5,7 @@
 use carff_messages::Stage;
 use carff_observe::attach;
 use carff_tests::{
-    Finished, PATIENT_AND_ENDLESS, Process, TestGraph, WATCHDOG, decisions, eventually, program, scenario_set,
+    Finished, PATIENT, PATIENT_AND_ENDLESS, Process, TestGraph, WATCHDOG, decisions, eventually, program, scenario_set,
     shipped_checkpoint, skipped,
 };
 use carff_transport::{OpenError, TopicId};
@@ -261,6 +261,27 @@ fn a_recording_is_decided_again_as_it_was() {
     let pictures = std::fs::read_dir(graph.path("png")).unwrap().flatten();
     assert_eq!(pictures.filter(|e| e.file_name().to_string_lossy().starts_with("frame-")).count(), frames);
     rewritten_recordings_are_read(&graph);
+}
+
+/// With comparisons that count for the next frame, a recording is decided again as it was. The first frame of a take is
+/// answered safely, because nothing has been compared yet.
+#[test]
+fn comparisons_count_for_the_next_frame() {
+    let rest = format!("[checks]\ncompare = \"next-frame\"\n{PATIENT}");
+    let graph = TestGraph::new(&scenario_set(), &shipped_checkpoint(), &rest);
+    let mut launcher =
+        Process::start(&mut graph.launch(&graph.file(), &["--drives", "4", "--decisions", "decisions.jsonl"]));
+    launcher.wait_for("decision", |text| text.contains("hazard "));
+    carff(&graph, &["record"], &["-o", "run.mcap"]).end().assert_success();
+    launcher.end().assert_success();
+    let lines = std::fs::read_to_string(graph.path("decisions.jsonl")).unwrap();
+    let first: Value = serde_json::from_str(lines.lines().next().unwrap()).unwrap();
+    assert_eq!(first["action"], "halt", "{first}");
+    assert!(first["unknown"].as_f64() > Some(0.8), "{first}");
+    let same = replay(&graph, &["--verify"]);
+    same.assert_success();
+    assert!(same.text.contains("all equal, bit for bit"), "{}", same.text);
+    graph.assert_nothing_left();
 }
 
 /// A recorder that is killed leaves its written messages; a second recording of the same name is refused.

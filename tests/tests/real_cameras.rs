@@ -49,7 +49,8 @@ fn another_process_is_the_camera() {
     assert_eq!(info["transport"]["prefix"], graph.run().shared_memory_prefix());
     assert_eq!(info["camera"]["source"], "external");
     assert_eq!(info["camera"]["trained"]["width_px"], 128);
-    let frame = &info["topics"][0]["user_header"];
+    let frame = info["topics"].as_array().unwrap().iter().find(|topic| topic["name"] == "camera/frame").unwrap();
+    let frame = &frame["user_header"];
     assert_eq!((&frame["type_name"], &frame["size_bytes"]), (&"carff.FrameMeta.v2".into(), &264.into()));
     assert_eq!(
         (&frame["fields"][4]["name"], &frame["fields"][4]["offset_bytes"]),

@@ -2,7 +2,7 @@
 
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
-use carff_tests::{Process, TestGraph, scenario_set, shipped_checkpoint};
+use carff_tests::{Process, TestGraph, program, scenario_set, shipped_checkpoint};
 use carff_transport::runtime_dir;
 use rustix::process::Signal;
 use std::os::unix::fs::MetadataExt;
@@ -68,5 +68,27 @@ fn a_run_is_its_users_alone() {
     }
     launcher.signal(Signal::INT);
     assert_eq!(launcher.end().status.code(), Some(130));
+    graph.assert_nothing_left();
+}
+
+/// A graph, the tables after it, and `carff doctor` keep no file in the user's home folder: ONNX Runtime reports nothing to
+/// its maker.
+#[test]
+fn nothing_is_kept_in_the_home_folder() {
+    let graph = TestGraph::new(&scenario_set(), &shipped_checkpoint(), "");
+    let home = tempfile::tempdir().unwrap();
+    let at_home = |command: &mut Command| {
+        command.env("HOME", home.path()).env_remove("XDG_CACHE_HOME").env_remove("ORT_DISABLE_TELEMETRY");
+        Process::start(command).end()
+    };
+    at_home(&mut graph.launch(&graph.file(), &["--frames", "5"])).assert_success();
+    let doctor = at_home(Command::new(program("carff")).args(["doctor", "--json"]));
+    assert!(doctor.text.contains("ONNX Runtime"), "{}", doctor.text);
+    // A stage that is started by hand; its arguments are the same as before.
+    let stage = at_home(Command::new(program("carff-encoder")).args(["--graph", "missing.toml"]));
+    assert!(stage.text.contains("missing.toml"), "{}", stage.text);
+    let mut kept = Vec::new();
+    all_below(home.path(), &mut kept);
+    assert_eq!(kept, [home.path()]);
     graph.assert_nothing_left();
 }

@@ -3,8 +3,8 @@
 use crate::helper::{PATIENCE, ask_to_end, cpu_seconds, end_by};
 use crate::probes::Probes;
 use anyhow::{Context, bail, ensure};
-use carff_config::GraphConfig;
-use carff_messages::{Action, Belief, Forecast, FrameMeta, Health, HealthState, Posterior, Stage};
+use carff_config::{GraphConfig, StagesConfig};
+use carff_messages::{Action, Belief, Forecast, FrameMeta, Health, HealthState, Posterior, Stage, Unknowns};
 use carff_runtime::StageArgs;
 use carff_transport::{
     Image, Node, Receiver, Run, Stop, Waiter, Woken, monotonic_now_ns, remove_run_leftovers, run_id_of, topics,
@@ -90,6 +90,8 @@ struct Frame {
     published_ns: u64,
     /// Start and end of the encoder's work.
     encoded_ns: Option<(u64, u64)>,
+    /// End of the comparison of the image, which the prober does before it probes.
+    compared_ns: Option<u64>,
     /// Start and end of each step's forecast and probing.
     forecast_ns: BTreeMap<u32, (u64, u64)>,
     probed_ns: BTreeMap<u32, (u64, u64)>,
@@ -106,7 +108,8 @@ impl Frame {
         for (step, forecast) in &self.forecast_ns {
             let probed = self.probed_ns.get(step)?;
             gaps.push((from, forecast.0.saturating_sub(end)));
-            gaps.push(("forecaster to prober", probed.0.saturating_sub(forecast.1)));
+            let ready_ns = forecast.1.max(self.compared_ns.filter(|at_ns| *at_ns <= probed.0).unwrap_or(0));
+            gaps.push(("forecaster to prober", probed.0.saturating_sub(ready_ns)));
             (from, end) = ("prober to forecaster", probed.1);
         }
         gaps.push(("prober to controller", self.decided_ns?.saturating_sub(end)));
@@ -173,7 +176,8 @@ pub(crate) fn measure(plan: &Plan<'_>) -> anyhow::Result<Measured> {
     let result = {
         let node = Node::open(&run, "bench")?;
         let mut listener = Listener::open(&node)?;
-        let mut stages = Stages { children: Vec::new(), logs: folder.path().to_owned() };
+        let programs = plan.graph.stages.clone();
+        let mut stages = Stages { children: Vec::new(), logs: folder.path().to_owned(), programs };
         listen(plan, &args, &run, &mut listener, &mut stages)
     };
     remove_run_leftovers(&run)?;
@@ -272,6 +276,7 @@ fn listen(
 struct Listener {
     frames_in: Receiver<Image<FrameMeta>>,
     posteriors: Receiver<Posterior>,
+    unknowns: Receiver<Unknowns>,
     forecasts: Receiver<Forecast>,
     beliefs: Receiver<Belief>,
     actions: Receiver<Action>,
@@ -288,6 +293,7 @@ impl Listener {
         Ok(Self {
             frames_in: node.receiver(&topics::FRAME)?.polled(),
             posteriors: node.receiver(&topics::POSTERIOR)?.polled(),
+            unknowns: node.receiver(&topics::UNKNOWN)?.polled(),
             forecasts: node.receiver(&topics::FORECAST)?.polled(),
             beliefs: node.receiver(&topics::BELIEF)?.polled(),
             actions: node.receiver(&topics::ACTION)?.polled(),
@@ -309,6 +315,11 @@ impl Listener {
         while let Some(m) = self.posteriors.next()? {
             if let Some(frame) = self.frames.get_mut(&m.header.frame_id) {
                 frame.encoded_ns = Some(span(m.header.publish_time_ns, m.stage_latency_ns));
+            }
+        }
+        while let Some(m) = self.unknowns.next()? {
+            if let Some(frame) = self.frames.get_mut(&m.header.frame_id) {
+                frame.compared_ns = Some(m.header.publish_time_ns);
             }
         }
         while let Some(m) = self.forecasts.next()? {
@@ -347,12 +358,13 @@ impl Listener {
 struct Stages {
     children: Vec<(Stage, Child)>,
     logs: PathBuf,
+    programs: StagesConfig,
 }
 
 impl Stages {
     fn start(&mut self, stage: Stage, args: &StageArgs) -> anyhow::Result<()> {
         let folder = std::env::current_exe()?.parent().context("this program has no folder")?.to_owned();
-        let program = folder.join(format!("carff-{stage}"));
+        let program = folder.join(self.programs.program(stage));
         let log = std::fs::File::create(self.log(stage))?;
         let child = Command::new(&program)
             .args(args.to_command_line())
@@ -419,6 +431,7 @@ mod tests {
             captured_ns: 0,
             published_ns: 10,
             encoded_ns: Some((12, 50)),
+            compared_ns: None,
             forecast_ns: [(1, (53, 60)), (2, (85, 90))].into(),
             probed_ns: [(1, (64, 80)), (2, (96, 100))].into(),
             decided_ns: Some(107),
@@ -428,6 +441,12 @@ mod tests {
         wanted.extend(names.into_iter().zip(3..7));
         wanted.push(("prober to controller", 7));
         assert_eq!(frame.gaps_ns(), Some(wanted));
+        // A wait for the comparison is not a gap; a comparison after the belief changes nothing.
+        for (compared_ns, gap_ns) in [(62, 2), (110, 4)] {
+            frame.compared_ns = Some(compared_ns);
+            let gaps = frame.gaps_ns().unwrap();
+            assert!(gaps.contains(&("forecaster to prober", gap_ns)), "{gaps:?}");
+        }
         frame.probed_ns.remove(&1);
         assert_eq!(frame.gaps_ns(), None);
         assert_eq!(Frame::default().gaps_ns(), None);

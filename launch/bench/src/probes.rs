@@ -4,6 +4,7 @@ use crate::helper::{Helper, end_with_parent, say_ready};
 use anyhow::Context;
 use carff_messages::{Action, Belief, FrameMeta};
 use carff_transport::{Image, Node, Receiver, Run, Stop, Waiter, Woken, topics};
+use std::sync::Barrier;
 
 /// Arguments of the probes' process.
 #[derive(Clone, Debug, clap::Args)]
@@ -59,16 +60,22 @@ impl Probes {
 pub(crate) fn run(args: &ProbesArgs) -> anyhow::Result<()> {
     end_with_parent()?;
     let stop = Stop::on_signals()?;
-    let node = Node::open(&Run::new(&args.run, args.run_id)?, "probes")?;
-    let probes = (0..args.count).map(|_| Probe::open(&node)).collect::<anyhow::Result<Vec<_>>>()?;
+    let run = Run::new(&args.run, args.run_id)?;
+    let all_open = Barrier::new(args.count as usize + 1);
     let read = std::thread::scope(|scope| {
-        let threads: Vec<_> = probes
-            .into_iter()
-            .map(|probe| {
-                let waiter = Waiter::new(stop.clone());
-                scope.spawn(move || probe.listen(&waiter))
+        let threads: Vec<_> = (0..args.count)
+            .map(|_| {
+                scope.spawn(|| {
+                    let waiter = Waiter::new(stop.clone());
+                    let opened = Node::open(&run, "probes").map_err(anyhow::Error::from);
+                    let opened = opened.and_then(|node| Ok((Probe::open(&node)?, node)));
+                    all_open.wait();
+                    let (probe, _node) = opened?;
+                    probe.listen(&waiter)
+                })
             })
             .collect();
+        all_open.wait();
         say_ready()?;
         threads.into_iter().try_fold(0, |sum, thread| match thread.join() {
             Ok(read) => Ok(sum + read?),

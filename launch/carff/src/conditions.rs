@@ -1,13 +1,14 @@
 //! The conditions of a run's camera, counted over its checked images.
 
 use carff_messages::{Action, ImageCheck, ImageCondition};
+use serde::Serialize;
 use std::collections::{BTreeMap, VecDeque};
 
 /// Number of episodes that wait for their safe action.
 const WAITING: usize = 16;
 
 /// Counts of one condition.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct ConditionCount {
     /// Number of images.
     pub images: u64,

@@ -1,16 +1,16 @@
 //! `carff run info`: the identity of a run and the layouts of its topics, with which a program in any language joins.
 
 use crate::complete;
-use carff_config::GraphConfig;
+use carff_config::{CameraSource, GraphConfig};
 use carff_dataset::Dataset;
-use carff_messages::SCHEMA_VERSION;
-use carff_messages::layout::{Described, Layout};
+use carff_messages::layout::Layout;
+use carff_messages::{Intrinsics, SCHEMA_VERSION};
 use carff_observe::LiveRun;
-use carff_runtime::{EGO_MOTION, EGO_POSE, EgoMotion, EgoPose};
-use carff_transport::{Limits, Run, TRANSPORT_VERSION, TopicId};
+use carff_transport::{Run, TRANSPORT_VERSION, TopicId};
 use clap_complete::engine::ArgValueCandidates;
-use serde_json::{Value, json};
-use std::fmt::Write;
+use serde::Serialize;
+use std::fmt;
+use std::path::PathBuf;
 use std::process::ExitCode;
 
 /// The commands of `carff run`.
@@ -33,116 +33,176 @@ pub struct InfoArgs {
     json: bool,
 }
 
+/// Describes a run to a program that joins it. Its JSON is a contract with programs in other languages.
+#[derive(Clone, Debug, Serialize)]
+pub struct RunInfo {
+    run: String,
+    /// 16 hexadecimal digits, as in the header of each message.
+    run_id: String,
+    launcher_pid: u32,
+    schema_version: u32,
+    transport: TransportInfo,
+    graph: PathBuf,
+    dataset: PathBuf,
+    checkpoint: PathBuf,
+    /// `None` where the graph file cannot be read any more.
+    camera: Option<CameraInfo>,
+    topics: Vec<TopicInfo>,
+}
+
+#[derive(Clone, Debug, Serialize)]
+struct TransportInfo {
+    name: &'static str,
+    version: &'static str,
+    prefix: String,
+    root_path: PathBuf,
+}
+
+/// The camera that the graph expects.
+#[derive(Clone, Debug, Serialize)]
+struct CameraInfo {
+    source: CameraSource,
+    frame_rate_hz: f64,
+    /// The camera of the training; `None` without a dataset.
+    trained: Option<TrainedCamera>,
+}
+
+#[derive(Clone, Debug, Serialize)]
+struct TrainedCamera {
+    width_px: u32,
+    height_px: u32,
+    #[serde(flatten)]
+    intrinsics: Intrinsics,
+    field_of_view_deg: [f64; 2],
+}
+
+/// A topic: two services of its name, publish-subscribe, and an event for wake-ups.
+#[derive(Clone, Debug, Serialize)]
+struct TopicInfo {
+    name: &'static str,
+    payload: PayloadInfo,
+    /// Layout of the message that describes an image.
+    user_header: Option<Layout>,
+    limits: LimitsInfo,
+}
+
+#[derive(Clone, Debug, Serialize)]
+#[serde(untagged)]
+enum PayloadInfo {
+    Message(Layout),
+    Bytes { type_name: &'static str, variant: &'static str, content: &'static str },
+}
+
+#[derive(Clone, Debug, Serialize)]
+struct LimitsInfo {
+    max_subscribers: usize,
+    max_publishers: usize,
+    max_nodes: usize,
+    history_size: usize,
+    subscriber_max_buffer_size: usize,
+    subscriber_max_borrowed_samples: usize,
+    enable_safe_overflow: bool,
+    event_id_max_value: usize,
+}
+
 /// Runs one of the commands.
 pub fn run(command: &RunCommand) -> anyhow::Result<ExitCode> {
     let RunCommand::Info(args) = command;
-    let live = carff_observe::find(args.run.as_deref())?;
-    let info = info(&live)?;
+    let info = RunInfo::of(&carff_observe::find(args.run.as_deref())?)?;
     if args.json {
         println!("{}", serde_json::to_string_pretty(&info)?);
     } else {
-        print!("{}", text(&info));
+        print!("{info}");
     }
     Ok(ExitCode::SUCCESS)
 }
 
-/// Describes a run.
-pub fn info(live: &LiveRun) -> anyhow::Result<Value> {
-    let run = Run::within(&live.dir, &live.name, live.run_id)?;
-    let graph = TopicId::all().map(|id| topic(id.name(), id.is_image(), &id.layout(), id.limits()));
-    // A camera on a vehicle receives its pose, and a controller with an approach its motion.
-    let pose = topic(EGO_POSE.name, false, &EgoPose::layout(), EGO_POSE.limits);
-    let motion = topic(EGO_MOTION.name, false, &EgoMotion::layout(), EGO_MOTION.limits);
-    let topics: Vec<Value> = graph.chain([pose, motion]).collect();
-    Ok(json!({
-        "run": live.name,
-        "run_id": format!("{:016x}", live.run_id),
-        "launcher_pid": live.pid,
-        "schema_version": SCHEMA_VERSION,
-        "transport": {
-            "name": "iceoryx2",
-            "version": TRANSPORT_VERSION,
-            "prefix": run.shared_memory_prefix(),
-            "root_path": run.folder().to_string_lossy(),
-        },
-        "graph": live.graph,
-        "dataset": live.dataset,
-        "checkpoint": live.checkpoint,
-        "camera": camera(live),
-        "topics": topics,
-    }))
-}
-
-/// Describes the camera that the graph expects; `trained` is missing without a dataset.
-fn camera(live: &LiveRun) -> Value {
-    let Ok(graph) = GraphConfig::load(&live.graph) else { return Value::Null };
-    let trained = Dataset::open(&live.dataset).ok().and_then(|dataset| dataset.usual_camera()).map(|camera| {
-        json!({
-            "width_px": camera.width_px,
-            "height_px": camera.height_px,
-            "fl_x_px": camera.fl_x_px,
-            "fl_y_px": camera.fl_y_px,
-            "cx_px": camera.cx_px,
-            "cy_px": camera.cy_px,
-            "field_of_view_deg": camera.field_of_view_deg(),
+impl RunInfo {
+    /// Describes a run.
+    pub fn of(live: &LiveRun) -> anyhow::Result<Self> {
+        let run = Run::within(&live.dir, &live.name, live.run_id)?;
+        Ok(Self {
+            run: live.name.clone(),
+            run_id: format!("{:016x}", live.run_id),
+            launcher_pid: live.pid,
+            schema_version: SCHEMA_VERSION,
+            transport: TransportInfo {
+                name: "iceoryx2",
+                version: TRANSPORT_VERSION,
+                prefix: run.shared_memory_prefix(),
+                root_path: run.folder(),
+            },
+            graph: live.graph.clone(),
+            dataset: live.dataset.clone(),
+            checkpoint: live.checkpoint.clone(),
+            camera: CameraInfo::of(live),
+            topics: TopicId::all().map(TopicInfo::of).collect(),
         })
-    });
-    json!({ "source": graph.camera.source, "frame_rate_hz": graph.run.frame_rate_hz, "trained": trained })
+    }
 }
 
-/// Describes a topic. It is two services of its name: publish-subscribe, and an event for wake-ups.
-fn topic(name: &str, is_image: bool, layout: &Layout, limits: Limits) -> Value {
-    let (payload, header) = if is_image {
-        (json!({ "type_name": "u8", "variant": "slice", "content": "RGB, 8 bit, rows from the top" }), json!(layout))
-    } else {
-        (json!(layout), Value::Null)
-    };
-    json!({
-        "name": name,
-        "payload": payload,
-        "user_header": header,
-        "limits": {
-            "max_subscribers": limits.max_subscribers,
-            "max_publishers": limits.max_publishers,
-            "max_nodes": limits.max_nodes,
-            "history_size": limits.history,
-            "subscriber_max_buffer_size": limits.buffer,
-            "subscriber_max_borrowed_samples": limits.borrowed,
-            "enable_safe_overflow": true,
-            "event_id_max_value": 0,
-        },
-    })
+impl CameraInfo {
+    fn of(live: &LiveRun) -> Option<Self> {
+        let graph = GraphConfig::load(&live.graph).ok()?;
+        let camera = Dataset::open(&live.dataset).ok().and_then(|dataset| dataset.usual_camera());
+        let trained = camera.map(|camera| TrainedCamera {
+            width_px: camera.width_px,
+            height_px: camera.height_px,
+            intrinsics: Intrinsics::from(&camera),
+            field_of_view_deg: camera.field_of_view_deg(),
+        });
+        Some(Self { source: graph.camera.source, frame_rate_hz: graph.run.frame_rate_hz, trained })
+    }
 }
 
-/// Writing into a `String` cannot fail, so results of `writeln!` are dropped.
-fn text(info: &Value) -> String {
-    let word = |value: &Value| value.as_str().map_or_else(|| value.to_string(), str::to_owned);
-    let transport = &info["transport"];
-    let mut text = String::new();
-    for (name, value) in [
-        ("run", &info["run"]),
-        ("run id", &info["run_id"]),
-        ("schema version", &info["schema_version"]),
-        ("transport", &transport["version"]),
-        ("prefix", &transport["prefix"]),
-        ("root path", &transport["root_path"]),
-        ("camera", &info["camera"]["source"]),
-        ("frames a second", &info["camera"]["frame_rate_hz"]),
-    ] {
-        let _ = writeln!(text, "{name:<16} {}", word(value));
+impl TopicInfo {
+    fn of(topic: TopicId) -> Self {
+        let limits = topic.limits();
+        let bytes = PayloadInfo::Bytes { type_name: "u8", variant: "slice", content: "RGB, 8 bit, rows from the top" };
+        let (payload, user_header) =
+            if topic.is_image() { (bytes, Some(topic.layout())) } else { (PayloadInfo::Message(topic.layout()), None) };
+        Self {
+            name: topic.name(),
+            payload,
+            user_header,
+            limits: LimitsInfo {
+                max_subscribers: limits.max_subscribers,
+                max_publishers: limits.max_publishers,
+                max_nodes: limits.max_nodes,
+                history_size: limits.history,
+                subscriber_max_buffer_size: limits.buffer,
+                subscriber_max_borrowed_samples: limits.borrowed,
+                enable_safe_overflow: true,
+                event_id_max_value: 0,
+            },
+        }
     }
-    let _ = writeln!(text, "\n{:<22} {:<24} {:>6}  ALIGNMENT", "TOPIC", "MESSAGE", "BYTES");
-    for topic in info["topics"].as_array().into_iter().flatten() {
-        let message = if topic["user_header"].is_null() { &topic["payload"] } else { &topic["user_header"] };
-        let image = if topic["user_header"].is_null() { "" } else { " + RGB image" };
-        let _ = writeln!(
-            text,
-            "{:<22} {:<24} {:>6}  {}{image}",
-            word(&topic["name"]),
-            word(&message["type_name"]),
-            message["size_bytes"],
-            message["alignment_bytes"]
-        );
+}
+
+impl fmt::Display for RunInfo {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let mut row = |name: &str, value: &dyn fmt::Display| writeln!(f, "{name:<16} {value}");
+        row("run", &self.run)?;
+        row("run id", &self.run_id)?;
+        row("schema version", &self.schema_version)?;
+        row("transport", &self.transport.version)?;
+        row("prefix", &self.transport.prefix)?;
+        row("root path", &self.transport.root_path.display())?;
+        if let Some(camera) = &self.camera {
+            let source = serde_json::to_value(camera.source).map_err(|_| fmt::Error)?;
+            row("camera", &source.as_str().unwrap_or_default())?;
+            row("frames a second", &camera.frame_rate_hz)?;
+        }
+        writeln!(f, "\n{:<22} {:<24} {:>6}  ALIGNMENT", "TOPIC", "MESSAGE", "BYTES")?;
+        for topic in &self.topics {
+            let (layout, image) = match (&topic.user_header, &topic.payload) {
+                (Some(layout), _) => (layout, " + RGB image"),
+                (None, PayloadInfo::Message(layout)) => (layout, ""),
+                (None, PayloadInfo::Bytes { .. }) => continue,
+            };
+            let Layout { type_name, size_bytes, alignment_bytes, .. } = layout;
+            writeln!(f, "{:<22} {type_name:<24} {size_bytes:>6}  {alignment_bytes}{image}", topic.name)?;
+        }
+        Ok(())
     }
-    text
 }

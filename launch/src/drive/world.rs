@@ -8,8 +8,7 @@ use anyhow::Context;
 use carff::terminal::Terminal;
 use carff_base::random::Key;
 use carff_dataset::sensor::{SensorNoise, apply_noise_into};
-use carff_messages::{Action, DatasetView, FrameMeta, Header, ImageMeta, Occupancy, Reason};
-use carff_runtime::{EGO_MOTION, EgoMotion};
+use carff_messages::{Action, DatasetView, EgoMotion, FrameMeta, Header, ImageMeta, Occupancy, Reason};
 use carff_scenes::{ClosedLoop, Episode};
 use carff_transport::{Image, Node, Publisher, Receiver, Run, Stop, Waiter, Woken, monotonic_now_ns, topics};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -61,7 +60,7 @@ impl World {
         let bytes = (camera.width_px * camera.height_px) as usize * 3;
         let mut topics = Topics {
             frames: node.image_publisher(&topics::FRAME, bytes)?,
-            motions: node.publisher(&EGO_MOTION)?,
+            motions: node.publisher(&topics::EGO_MOTION)?,
             truths: node.publisher(&TRUTH)?,
             actions: node.receiver(&topics::ACTION)?,
             grids: node.receiver(&topics::OCCUPANCY)?,
@@ -145,10 +144,15 @@ impl World {
         (number, take_start): (u64, u64),
     ) -> anyhow::Result<()> {
         let (at_m, time_s, speed_mps) = (drive.vehicle.at_m, drive.time_s, drive.vehicle.speed_mps);
-        let [x, y, heading] = self.drives.ego_pose(at_m);
-        topics.motions.send(EgoMotion { header, speed_mps, to_conflict_m: drive.to_conflict_m(), heading })?;
-        let mut truth =
-            WorldTruth { header, episode: number, time_s, ego: [x, y, heading, speed_mps], ..WorldTruth::default() };
+        let [x, y, heading_rad] = self.drives.ego_pose(at_m);
+        topics.motions.send(EgoMotion { header, speed_mps, to_conflict_m: drive.to_conflict_m(), heading_rad })?;
+        let mut truth = WorldTruth {
+            header,
+            episode: number,
+            time_s,
+            ego: [x, y, heading_rad, speed_mps],
+            ..WorldTruth::default()
+        };
         let boxes = self.drives.actor_boxes(&drive.episode, time_s);
         truth.actor_count = boxes.len().min(MAX_ACTORS) as u64;
         for (to, from) in truth.actors.iter_mut().zip(&boxes) {

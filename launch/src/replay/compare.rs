@@ -1,7 +1,8 @@
 //! Compares a replayed graph's posteriors, forecasts, beliefs and decisions with the recorded ones.
 
+use carff_config::{CompareImages, GraphConfig};
 use carff_messages::forms::AnyMessage;
-use carff_messages::{Action, Belief, Forecast, Posterior};
+use carff_messages::{Action, Belief, Forecast, FrameMeta, Posterior};
 use carff_recording::Reader;
 use carff_transport::TopicId;
 use serde_json::Value;
@@ -32,7 +33,53 @@ pub(super) struct Comparison {
     different: u64,
     missing: u64,
     first: Option<(Order, String)>,
+    /// Frames whose results depend on earlier frames of their take that the recording does not have.
+    left_out: u64,
     cut_off: bool,
+}
+
+/// State that a graph carries from frame to frame of a take.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Carried {
+    /// Nothing: the results of a frame rest on it only.
+    Nothing,
+    /// The comparison of the frame before.
+    LastFrame,
+    /// A memory of all frames.
+    Take,
+}
+
+impl Carried {
+    /// Returns what a graph carries.
+    pub(super) fn of(graph: &GraphConfig) -> Self {
+        match (graph.remembers(), graph.checks.compare) {
+            (true, _) => Self::Take,
+            (false, CompareImages::NextFrame) => Self::LastFrame,
+            (false, _) => Self::Nothing,
+        }
+    }
+
+    /// Returns the frames whose results the recording determines, of all recorded ones in their order: number and
+    /// number of the first frame of the take.
+    fn determined(self, recorded: &[(u64, u64)]) -> BTreeSet<u64> {
+        let mut frames = BTreeSet::new();
+        let mut take = None;
+        for &(frame, take_start) in recorded {
+            let (first, is_first) = match take {
+                Some((start, first)) if start == take_start => (first, false),
+                _ => (frame, true),
+            };
+            take = Some((take_start, first));
+            if match self {
+                Self::Nothing => true,
+                Self::LastFrame => !is_first || frame == take_start,
+                Self::Take => first == take_start,
+            } {
+                frames.insert(frame);
+            }
+        }
+        frames
+    }
 }
 
 /// Returns a message without its times; `None` for topics that are not compared.
@@ -64,16 +111,18 @@ impl Replayed {
         self.made.extend(timeless(message));
     }
 
-    /// Compares all recorded messages about recorded frames.
-    pub(super) fn compare(&self, recording: &Path) -> anyhow::Result<Comparison> {
-        let mut frames = BTreeSet::new();
+    /// Compares all recorded messages about the recorded frames that determine them.
+    pub(super) fn compare(&self, recording: &Path, carried: Carried) -> anyhow::Result<Comparison> {
+        let mut recorded = Vec::new();
         let mut reader = Reader::open(recording)?.without_images();
         while let Some(entry) = reader.next()? {
-            if entry.topic == TopicId::FRAME {
-                frames.insert(entry.message.as_message().header().frame_id);
+            if let Some(frame) = entry.message.as_message().get::<FrameMeta>() {
+                recorded.push((frame.header.frame_id, frame.take_start));
             }
         }
-        let mut comparison = Comparison::default();
+        let frames = carried.determined(&recorded);
+        let left_out = (recorded.len() - frames.len()) as u64;
+        let mut comparison = Comparison { left_out, ..Comparison::default() };
         let mut reader = Reader::open(recording)?.without_images();
         while let Some(entry) = reader.next()? {
             let found = timeless(entry.message.as_message()).filter(|((_, frame, _), _)| frames.contains(frame));
@@ -154,6 +203,14 @@ impl fmt::Display for Comparison {
         if let Some((_, first)) = &self.first {
             write!(f, "\nfirst difference: {first}")?;
         }
+        if self.left_out > 0 {
+            write!(
+                f,
+                "\nnot compared: {} frames whose results rest on earlier frames of their take, which the recording does \
+                 not have",
+                self.left_out
+            )?;
+        }
         if self.cut_off {
             write!(f, "\nthe recording is incomplete")?;
         }
@@ -164,7 +221,7 @@ impl fmt::Display for Comparison {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use carff_messages::{Belief, FrameMeta, Header};
+    use carff_messages::Header;
     use carff_recording::{About, Writer};
 
     fn a_belief(frame: u64, hazard: f32) -> Belief {
@@ -192,6 +249,18 @@ mod tests {
         writer.finish().unwrap();
     }
 
+    /// A recording that begins within a take determines the frames that rest on themselves; those that rest on the frame
+    /// before but for the first; and none of the take where a memory rests on all of them.
+    #[test]
+    fn what_is_carried_must_be_recorded() {
+        let recorded = [(4, 0), (5, 0), (6, 6), (7, 6), (8, 0)];
+        for (carried, determined) in
+            [(Carried::Nothing, &[4, 5, 6, 7, 8][..]), (Carried::LastFrame, &[5, 6, 7]), (Carried::Take, &[6, 7])]
+        {
+            assert_eq!(carried.determined(&recorded), determined.iter().copied().collect(), "{carried:?}");
+        }
+    }
+
     /// Beliefs that differ only in time are equal, in whichever order they are recorded. The first different belief by
     /// its frame is reported with its field, and an absent one is missing.
     #[test]
@@ -205,12 +274,12 @@ mod tests {
             (belief.header.capture_time_ns, belief.header.sequence, belief.stage_latency_ns) = (99, 77, 55);
             replayed.take(AnyMessage::new(&belief, &[]));
         }
-        let same = replayed.compare(&path).unwrap();
+        let same = replayed.compare(&path, Carried::Nothing).unwrap();
         assert!(same.is_same() && same.compared[&TopicId::BELIEF] == 3, "{same}");
 
         replayed.take(AnyMessage::new(&a_belief(1, 0.5), &[]));
         replayed.made.remove(&(TopicId::BELIEF, 2, 1));
-        let other = replayed.compare(&path).unwrap();
+        let other = replayed.compare(&path, Carried::Nothing).unwrap();
         assert!(!other.is_same() && (other.different, other.missing) == (1, 1));
         let text = other.to_string();
         assert!(text.contains("frame 1, belief of step 1") && text.contains("hazard_probability"), "{text}");

@@ -4,8 +4,9 @@
 //! in between.
 
 use carff_decision::{Approach, Decision, Evidence, Motion, Policy, Speeds};
-use carff_messages::{Action, ActionCode, Belief, Header, ImageCheck, MAX_HORIZON, Message, Reason};
-use carff_runtime::{EgoMotion, Look};
+use carff_messages::{
+    Action, ActionCode, Belief, EgoMotion, Header, ImageCheck, LookGain, MAX_HORIZON, Message, Reason,
+};
 
 /// Settings of a controller.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -83,7 +84,7 @@ pub struct Controller {
     unusable: Option<Reason>,
     /// The newest motion of the vehicle, and the newest look from further on.
     motion: Option<EgoMotion>,
-    look: Option<Look>,
+    look: Option<LookGain>,
 }
 
 impl Controller {
@@ -108,7 +109,7 @@ impl Controller {
     }
 
     /// Records the value of a look from further on. Only decisions on its frame use it.
-    pub fn on_look(&mut self, look: &Look) {
+    pub fn on_look(&mut self, look: &LookGain) {
         self.look = Some(*look);
     }
 
@@ -223,7 +224,7 @@ impl Controller {
         let is_fresh = |motion: &&EgoMotion| now_ns.saturating_sub(motion.header.capture_time_ns) <= deadline_ns;
         let motion = self.motion.as_ref().filter(is_fresh);
         let motion = motion.map(|m| Motion { speed_mps: m.speed_mps, to_conflict_m: m.to_conflict_m });
-        let is_of_frame = |look: &&Look| look.header.capture_time_ns == pending.header.capture_time_ns;
+        let is_of_frame = |look: &&LookGain| look.header.capture_time_ns == pending.header.capture_time_ns;
         let look_gain_bits = self.look.as_ref().filter(is_of_frame).map_or(0.0, |look| look.gain_bits);
         let Settings { approach, speeds, .. } = self.settings;
         let (code, target_mps) = approach.drive(decision.halt, look_gain_bits.into(), motion, speeds);

@@ -3,10 +3,9 @@
 use anyhow::Context;
 use carff_checkpoint::load_policy;
 use carff_controller::{Controller, Settings};
-use carff_decision::Approach;
-use carff_decision::Policy;
+use carff_decision::{Approach, Policy};
 use carff_messages::Stage;
-use carff_runtime::{EGO_MOTION, LOOK, StageContext, frame_span};
+use carff_runtime::{StageContext, frame_span};
 use carff_transport::{Receiver, Woken, monotonic_now_ns, topics};
 
 /// Maximum number of beliefs between two reads of the clock, so that a flood of them delays no tick.
@@ -22,8 +21,8 @@ fn run(stage: &mut StageContext) -> anyhow::Result<()> {
     let mut actions = stage.output(&topics::ACTION)?;
     let settings = settings(stage)?;
     let moves = settings.approach != Approach::Stop;
-    let mut motions = moves.then(|| stage.input(&EGO_MOTION)).transpose()?.map(Receiver::polled);
-    let looks = (settings.approach == Approach::Look).then(|| stage.input(&LOOK)).transpose()?;
+    let mut motions = moves.then(|| stage.input(&topics::EGO_MOTION)).transpose()?.map(Receiver::polled);
+    let looks = (settings.approach == Approach::Look).then(|| stage.input(&topics::LOOK)).transpose()?;
     let mut looks = looks.map(Receiver::polled);
     let mut controller = Controller::new(settings);
     stage.ready();

@@ -285,7 +285,7 @@ fn approaches_use_what_is_fresh() {
             to_conflict_m: 20.0,
             ..EgoMotion::default()
         });
-        controller.on_look(&Look { header: header(looked_at), gain_bits: 0.8, ahead_m: 3.0 });
+        controller.on_look(&LookGain { header: header(looked_at), gain_bits: 0.8, ahead_m: 3.0 });
         controller.on_belief(&belief(frame, 1, 0.6, 6), frame * 100 * MS + MS);
         let action = controller.on_belief(&belief(frame, 2, 0.6, 6), frame * 100 * MS + 2 * MS).unwrap();
         action.validate().unwrap();

@@ -2,7 +2,7 @@
 //!
 //! `carff-encoder` computes with ONNX Runtime, and `carff-encoder-tch` with libtorch. Only the latter links libtorch.
 
-use carff_config::GraphConfig;
+use carff_config::{CompareImages, GraphConfig};
 use carff_messages::{FrameMeta, Gaussian, ImageCheck, Posterior};
 use carff_runtime::{StageContext, frame_span};
 use carff_transport::{monotonic_now_ns, topics};
@@ -26,7 +26,7 @@ pub fn run<E>(
     let mut checks = stage.output(&topics::CHECK)?;
     let limits = Known::load(&stage.checkpoint)?.map(|known| known.camera);
     // The prober compares images with a checkpoint's limits.
-    let needs_pose = stage.graph.checks.compare && limits.is_some();
+    let needs_pose = stage.graph.checks.compare != CompareImages::Off && limits.is_some();
     let mut camera = stage.graph.checks.camera.then(|| CameraCheck::new(limits, frozen_ns(&stage.graph)));
     let mut encoder = load(stage)?;
     // The first frame is then as fast as later ones.

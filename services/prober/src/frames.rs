@@ -1,81 +1,134 @@
-//! The camera's frames, each compared with the known states before its belief.
+//! The camera's frames, each compared with the known states before its belief, or before the next frame's.
 
 use crate::Images;
+use anyhow::Context;
 use carff_base::geometry::PinholeCamera;
 use carff_checkpoint::FieldProbe;
+use carff_config::CompareImages;
 use carff_decision::ImageEvidence;
-use carff_messages::{FrameMeta, Header, UnknownBox, Unknowns};
+use carff_messages::{Belief, FrameMeta, Header, UnknownBox, Unknowns};
 use carff_runtime::StageContext;
-use carff_transport::{Image, Input, Publisher, Receiver, monotonic_now_ns, topics};
+use carff_transport::{Image, Input, Publisher, Receiver, Sample, monotonic_now_ns, topics};
 use carff_unknown::Lanes;
+use std::collections::VecDeque;
+
+/// Number of frames that are remembered: later steps of a frame's forecast may follow those of newer frames.
+const REMEMBERED: usize = 16;
 
 /// Compares the frames of the camera, in order, and publishes the comparisons.
 ///
-/// Frames wait in the topic's buffer. Without a forecast the oldest is compared, while encoder and forecaster work on
-/// it. A forecast skips the frames before its own: at rates that the prober cannot keep up with, only frames with a
-/// forecast are compared. So each belief rests on the comparison of its own image at any rate.
+/// Frames wait in the topic's buffer. A forecast skips the frames before its own: at rates that the prober cannot keep
+/// up with, only frames with a forecast are compared. With `checks.compare = "same-frame"`, the oldest frame is compared
+/// while encoder and forecaster work on it, and its belief rests on it. With `"next-frame"`, it is compared after its
+/// last belief, and the beliefs about the next frame of the take rest on it. So each belief rests on the same comparison
+/// at any rate.
 #[derive(Debug)]
 pub struct Frames {
     images: Images,
     input: Receiver<Image<FrameMeta>>,
     output: Publisher<Unknowns>,
-    /// The last frame: capture time, camera, and boxes of something unknown.
-    last: Option<(u64, PinholeCamera, Vec<UnknownBox>)>,
+    /// True if a belief rests on the comparison of the frame before.
+    is_late: bool,
+    /// The frame that is compared after its last belief.
+    pending: Option<Sample<Image<FrameMeta>>>,
+    /// The last frames, the newest last.
+    taken: VecDeque<Taken>,
+    /// Boxes of something unknown in the last comparison.
+    boxes: Vec<UnknownBox>,
+}
+
+/// A frame that was taken from the topic.
+#[derive(Debug)]
+struct Taken {
+    /// Capture time: monotonic clock, nanoseconds.
+    at_ns: u64,
+    /// Number of the first frame of its take.
+    take_start: u64,
+    /// `None` for a pose that is not valid.
+    camera: Option<PinholeCamera>,
 }
 
 impl Frames {
     /// Opens the topics; `None` where the graph switches the comparison off, or the checkpoint has no limits of the
     /// known. An idle publisher would keep its connections to receivers that have died.
     pub fn open(stage: &StageContext, probe: &FieldProbe) -> anyhow::Result<Option<Self>> {
-        if !stage.graph.checks.compare {
+        let compare = stage.graph.checks.compare;
+        if compare == CompareImages::Off {
             return Ok(None);
         }
         let Some(images) = Images::load(&stage.checkpoint, probe, stage.graph.remembers())? else { return Ok(None) };
         let (input, output) = (stage.input(&topics::FRAME)?, stage.output(&topics::UNKNOWN)?);
-        Ok(Some(Self { images, input, output, last: None }))
+        let is_late = compare == CompareImages::NextFrame;
+        Ok(Some(Self { images, input, output, is_late, pending: None, taken: VecDeque::new(), boxes: Vec::new() }))
     }
 
-    /// The input to wait for.
-    pub fn input(&self) -> &dyn Input {
-        &self.input
+    /// The input to wait for; `None` while a frame waits for its belief.
+    pub fn input(&self) -> Option<&dyn Input> {
+        self.pending.is_none().then_some(&self.input)
     }
 
-    /// Compares the frame of a forecast, unless it has been compared; without a forecast, the next frame.
-    pub fn compare(&mut self, probe: &FieldProbe, forecast: Option<&Header>, threads: usize) -> anyhow::Result<()> {
-        if forecast.is_some_and(|header| self.images.has_compared(header)) {
+    /// Takes the frame of a forecast, unless it has been taken; without a forecast, the next frame. Compares it if its
+    /// own belief rests on it.
+    pub fn take(&mut self, probe: &FieldProbe, forecast: Option<&Header>, threads: usize) -> anyhow::Result<()> {
+        if forecast.is_some_and(|header| self.of(header).is_some()) {
+            return Ok(());
+        }
+        if forecast.is_none() && self.pending.is_some() {
             return Ok(());
         }
         while let Some(frame) = self.input.next()? {
             if forecast.is_some_and(|header| frame.header.capture_time_ns < header.capture_time_ns) {
                 continue;
             }
-            let started_ns = monotonic_now_ns();
             let camera = frame.camera();
-            self.last = camera.validate().is_ok().then_some((frame.header.capture_time_ns, camera, Vec::new()));
-            if let Some(mut unknowns) = self.images.compare(probe, &frame, frame.image(), threads) {
-                if let Some((_, _, boxes)) = &mut self.last {
-                    boxes.extend_from_slice(unknowns.boxes());
-                }
-                unknowns.stage_latency_ns = monotonic_now_ns() - started_ns;
-                self.output.send(unknowns)?;
+            let camera = camera.validate().is_ok().then_some(camera);
+            if self.taken.len() == REMEMBERED {
+                self.taken.pop_front();
+            }
+            self.taken.push_back(Taken { at_ns: frame.header.capture_time_ns, take_start: frame.take_start, camera });
+            self.pending = None;
+            if self.is_late {
+                self.pending = Some(frame);
+            } else {
+                self.compare(probe, &frame, threads)?;
             }
             break;
         }
         Ok(())
     }
 
-    /// The camera of a frame, if it was the last one, with a valid pose.
+    /// Compares the frame that waits for its belief, after its last one.
+    pub fn after(&mut self, probe: &FieldProbe, belief: &Belief, threads: usize) -> anyhow::Result<()> {
+        let is_last = |frame: &mut Sample<Image<FrameMeta>>| {
+            belief.is_final() && frame.header.capture_time_ns == belief.header.capture_time_ns
+        };
+        self.pending.take_if(is_last).map_or(Ok(()), |frame| self.compare(probe, &frame, threads))
+    }
+
+    fn compare(&mut self, probe: &FieldProbe, frame: &Sample<Image<FrameMeta>>, threads: usize) -> anyhow::Result<()> {
+        let started_ns = monotonic_now_ns();
+        self.boxes.clear();
+        if let Some(mut unknowns) = self.images.compare(probe, frame, frame.image(), threads) {
+            self.boxes.extend_from_slice(unknowns.boxes());
+            unknowns.stage_latency_ns = monotonic_now_ns() - started_ns;
+            self.output.send(unknowns)?;
+        }
+        Ok(())
+    }
+
+    /// The camera of a frame, if its pose is valid.
     pub fn camera_of(&self, header: &Header) -> Option<PinholeCamera> {
-        self.last_of(header).map(|(_, camera, _)| *camera)
+        self.of(header)?.camera
     }
 
-    /// The boxes of something unknown in a frame, if it was the last one.
+    /// The boxes of something unknown that a frame's belief rests on, if the frame was the last one.
     pub fn unknown_boxes(&self, header: &Header) -> &[UnknownBox] {
-        self.last_of(header).map_or(&[], |(_, _, boxes)| boxes)
+        let last = self.taken.back().filter(|taken| taken.at_ns == header.capture_time_ns);
+        last.map_or(&[], |_| &self.boxes)
     }
 
-    fn last_of(&self, header: &Header) -> Option<&(u64, PinholeCamera, Vec<UnknownBox>)> {
-        self.last.as_ref().filter(|(at_ns, ..)| *at_ns == header.capture_time_ns)
+    fn of(&self, header: &Header) -> Option<&Taken> {
+        self.taken.iter().rev().find(|taken| taken.at_ns == header.capture_time_ns)
     }
 
     /// The ground on which something counts.
@@ -83,18 +136,23 @@ impl Frames {
         self.images.lanes()
     }
 
-    /// The evidence of a forecast's frame, if it shows something to compare.
+    /// The evidence that a forecast's belief rests on; `None` if the compared frame shows nothing to compare.
     ///
     /// # Errors
     ///
-    /// The frame has not been compared: it did not arrive, or was overwritten by newer ones.
+    /// The frame has not been taken: it did not arrive, or was overwritten by newer ones.
     pub fn evidence(&self, forecast: &Header) -> anyhow::Result<Option<&ImageEvidence>> {
-        anyhow::ensure!(
-            self.images.has_compared(forecast),
-            "a forecast without its frame on `{}`: its image cannot be compared; set `checks.compare = false` for \
-             forecasts of another source",
-            topics::FRAME.name
-        );
-        Ok(self.images.evidence(forecast))
+        let taken = self.of(forecast).with_context(|| {
+            format!(
+                "a forecast without its frame on `{}`: its image cannot be compared; set `checks.compare = \"off\"` \
+                 for forecasts of another source",
+                topics::FRAME.name
+            )
+        })?;
+        Ok(if self.is_late {
+            self.images.evidence_before(taken.at_ns, taken.take_start)
+        } else {
+            self.images.evidence(forecast)
+        })
     }
 }

@@ -17,10 +17,23 @@ pub struct Images {
     known: Known,
     comparer: Comparer,
     states: Vec<[f32; LATENT_DIM]>,
-    /// The newest last. No evidence for a frame without a valid pose, or whose camera sees no lane.
-    compared: VecDeque<(u64, Option<ImageEvidence>)>,
+    /// The newest last.
+    compared: VecDeque<Compared>,
+    /// Evidence while no image of a take has been compared.
+    nothing_yet: ImageEvidence,
     /// Comparisons of the take so far, and the take's first frame.
     memory: Option<(ImageMemory, u64)>,
+}
+
+/// A compared frame.
+#[derive(Debug)]
+struct Compared {
+    /// Capture time: monotonic clock, nanoseconds.
+    at_ns: u64,
+    /// Number of the first frame of its take.
+    take_start: u64,
+    /// `None` for a frame without a valid pose, or whose camera sees no lane.
+    evidence: Option<ImageEvidence>,
 }
 
 impl Images {
@@ -35,6 +48,7 @@ impl Images {
             comparer: Comparer::default(),
             states: probe.states().iter().map(|state| state.mean).collect(),
             compared: VecDeque::with_capacity(REMEMBERED),
+            nothing_yet: ImageEvidence::unexplained(hazards.len()),
             memory: learned.map(|learned| (ImageMemory::new(hazards, learned.settings), 0)),
         }))
     }
@@ -58,7 +72,8 @@ impl Images {
         if self.compared.len() == REMEMBERED {
             self.compared.pop_front();
         }
-        self.compared.push_back((frame.header.capture_time_ns, evidence));
+        let (at_ns, take_start) = (frame.header.capture_time_ns, frame.take_start);
+        self.compared.push_back(Compared { at_ns, take_start, evidence });
         unknowns
     }
 
@@ -95,19 +110,17 @@ impl Images {
         &self.known.lanes
     }
 
-    /// Reports whether a frame has been compared, or tried without a result.
-    pub fn has_compared(&self, header: &Header) -> bool {
-        self.of(header).is_some()
-    }
-
     /// The evidence of a compared frame; `None` also for a frame that shows nothing to compare.
     pub fn evidence(&self, header: &Header) -> Option<&ImageEvidence> {
-        self.of(header)?.as_ref()
+        self.compared.iter().rev().find(|compared| compared.at_ns == header.capture_time_ns)?.evidence.as_ref()
     }
 
-    fn of(&self, header: &Header) -> Option<&Option<ImageEvidence>> {
-        let newest_first = self.compared.iter().rev();
-        newest_first.into_iter().find(|(at_ns, _)| *at_ns == header.capture_time_ns).map(|(_, evidence)| evidence)
+    /// The evidence of the frame of a take that was compared last before a capture time; `None` if it shows nothing to
+    /// compare. Before the first comparison of a take, something unknown is nearly certain.
+    pub fn evidence_before(&self, capture_time_ns: u64, take_start: u64) -> Option<&ImageEvidence> {
+        let is_before = |compared: &&Compared| compared.take_start == take_start && compared.at_ns < capture_time_ns;
+        let before = self.compared.iter().rev().find(is_before);
+        before.map_or(Some(&self.nothing_yet), |compared| compared.evidence.as_ref())
     }
 }
 

@@ -18,7 +18,7 @@ fn run(stage: &mut StageContext) -> anyhow::Result<()> {
     let mut outlook = Outlook::open(stage, &probe)?;
     stage.ready();
     loop {
-        let cameras = frames.iter().map(Frames::input);
+        let cameras = frames.iter().filter_map(Frames::input);
         let inputs: Vec<&dyn Input> = cameras.chain([&forecasts as &dyn Input]).collect();
         if !stage.wait(&inputs)? {
             return Ok(());
@@ -26,7 +26,7 @@ fn run(stage: &mut StageContext) -> anyhow::Result<()> {
         let started_ns = monotonic_now_ns();
         let forecast = forecasts.newest()?;
         if let Some(frames) = &mut frames {
-            frames.compare(&probe, forecast.as_ref().map(|forecast| &forecast.header), stage.threads)?;
+            frames.take(&probe, forecast.as_ref().map(|forecast| &forecast.header), stage.threads)?;
         }
         let Some(forecast) = forecast else { continue };
         let _span = frame_span(&forecast.header);
@@ -45,6 +45,9 @@ fn run(stage: &mut StageContext) -> anyhow::Result<()> {
                 let mut occupancy = grid.occupancy(&belief, boxes);
                 occupancy.stage_latency_ns = monotonic_now_ns() - believed_ns;
                 occupancies.send(occupancy)?;
+                if let Some(frames) = &mut frames {
+                    frames.after(&probe, &belief, stage.threads)?;
+                }
             }
             Err(error) => stage.refuse(&error),
         }

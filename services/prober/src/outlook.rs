@@ -4,9 +4,9 @@ use crate::Frames;
 use carff_checkpoint::FieldProbe;
 use carff_config::GraphConfig;
 use carff_decision::{Approach, look_gain_bits};
-use carff_messages::{Belief, LATENT_DIM};
-use carff_runtime::{EGO_MOTION, EgoMotion, LOOK, Look, StageContext};
-use carff_transport::{Publisher, Receiver};
+use carff_messages::{Belief, EgoMotion, LATENT_DIM, LookGain};
+use carff_runtime::StageContext;
+use carff_transport::{Publisher, Receiver, topics};
 use carff_unknown::{Lanes, Sight};
 
 /// Ways ahead of the vehicle from where a look is judged, metres.
@@ -19,7 +19,7 @@ pub struct Outlook {
     states: Vec<[f32; LATENT_DIM]>,
     hazards: Vec<bool>,
     input: Receiver<EgoMotion>,
-    output: Publisher<Look>,
+    output: Publisher<LookGain>,
     motion: Option<EgoMotion>,
 }
 
@@ -29,7 +29,7 @@ impl Outlook {
         if !is_asked(&stage.graph) {
             return Ok(None);
         }
-        let (input, output) = (stage.input(&EGO_MOTION)?.polled(), stage.output(&LOOK)?);
+        let (input, output) = (stage.input(&topics::EGO_MOTION)?.polled(), stage.output(&topics::LOOK)?);
         let states = probe.states().iter().map(|state| state.mean).collect();
         let hazards = probe.layout().hazard_states().to_vec();
         Ok(Some(Self { sight: Sight::default(), states, hazards, input, output, motion: None }))
@@ -54,8 +54,8 @@ impl Outlook {
         let (mut gain_bits, mut ahead_m) = (0.0, 0.0);
         for at_m in AHEAD_M.into_iter().filter(|at_m| most > 0.0 && *at_m < motion.to_conflict_m) {
             let mut ahead = camera;
-            ahead.world_from_camera[0][3] += at_m * motion.heading.cos();
-            ahead.world_from_camera[1][3] += at_m * motion.heading.sin();
+            ahead.world_from_camera[0][3] += at_m * motion.heading_rad.cos();
+            ahead.world_from_camera[1][3] += at_m * motion.heading_rad.sin();
             let lanes: &Lanes = frames.lanes();
             if !self.sight.look(probe.field(), &self.states, lanes, &ahead, threads) {
                 continue;
@@ -65,7 +65,7 @@ impl Outlook {
                 (gain_bits, ahead_m) = (gain, at_m);
             }
         }
-        let look = Look { header: belief.header, gain_bits: gain_bits as f32, ahead_m: ahead_m as f32 };
+        let look = LookGain { header: belief.header, gain_bits: gain_bits as f32, ahead_m: ahead_m as f32 };
         Ok(self.output.send(look)?)
     }
 }

@@ -3,6 +3,8 @@
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
 use carff_base::geometry::PinholeCamera;
+use carff_checkpoint::FieldProbe;
+use carff_decision::ImageEvidence;
 use carff_field::{RenderBuffer, RenderOptions};
 use carff_messages::{DatasetView, FrameMeta, Header, Message};
 use carff_prober::{Images, load};
@@ -23,17 +25,22 @@ fn frame(id: u64, at_ms: u64) -> FrameMeta {
     FrameMeta { header: Header::of_frame(id, at_ms * MS, 1), ..FrameMeta::of_camera(&camera, DatasetView::UNKNOWN) }
 }
 
+/// An image of a known state, as the field renders it.
+fn image_of(probe: &FieldProbe, state: usize) -> Array3<u8> {
+    let mut rendered = RenderBuffer::new();
+    let options = RenderOptions::default();
+    probe.field().render(&frame(1, 0).camera(), &probe.states()[state].mean, &options, &mut rendered);
+    Array3::from_shape_fn((SIDE, SIDE, 3), |(y, x, c)| {
+        (rendered.rgb[(y * SIDE + x) * 3 + c].clamp(0.0, 1.0) * 255.0) as u8
+    })
+}
+
 /// An image of a known state has no unknown box. The same image with a bright patch on the lane has one, where the patch
 /// is. A belief only uses the comparison of its own image.
 #[test]
 fn a_patch_on_the_lane_is_unknown() {
     let (probe, _) = load(&checkpoint()).unwrap();
-    let clear = probe.states().last().unwrap().mean;
-    let mut rendered = RenderBuffer::new();
-    probe.field().render(&frame(1, 0).camera(), &clear, &RenderOptions::default(), &mut rendered);
-    let known = Array3::from_shape_fn((SIDE, SIDE, 3), |(y, x, c)| {
-        (rendered.rgb[(y * SIDE + x) * 3 + c].clamp(0.0, 1.0) * 255.0) as u8
-    });
+    let known = image_of(&probe, probe.states().len() - 1);
     let mut patched = known.clone();
     patched.slice_mut(s![56..74, 50..78, ..]).fill(230);
 
@@ -49,10 +56,27 @@ fn a_patch_on_the_lane_is_unknown() {
 
     let header = |id, at_ms: u64| Header::of_frame(id, at_ms * MS, 1);
     assert!(images.evidence(&header(2, 200)).is_some());
-    assert!(!images.has_compared(&header(3, 210)) && images.evidence(&header(3, 210)).is_none());
+    assert!(images.evidence(&header(3, 210)).is_none());
 
     // A pose that is not a pose, and a camera that sees no lane, give no comparison.
     let lost = FrameMeta { world_from_camera: [0.0; 16], ..frame(5, 500) };
     assert!(images.compare(&probe, &lost, known.view(), 1).is_none());
-    assert!(images.has_compared(&lost.header) && images.evidence(&lost.header).is_none());
+    assert!(images.evidence(&lost.header).is_none());
+}
+
+/// The evidence before a frame is that of its take's last compared frame; before a take's first one, nothing is explained.
+#[test]
+fn evidence_of_the_frame_before() {
+    let (probe, _) = load(&checkpoint()).unwrap();
+    let mut images = Images::load(&checkpoint(), &probe, false).unwrap().unwrap();
+    for (id, take_start, state) in [(1, 1, 0), (2, 1, probe.states().len() - 1), (3, 3, 1)] {
+        let meta = FrameMeta { take_start, ..frame(id, 100 * id) };
+        assert!(images.compare(&probe, &meta, image_of(&probe, state).view(), 1).is_some());
+    }
+    let own = |id: u64| images.evidence(&Header::of_frame(id, 100 * id * MS, 1));
+    let before = |at_ms: u64, take_start| images.evidence_before(at_ms * MS, take_start);
+    assert!(own(1).is_some() && own(1) != own(2));
+    assert_eq!([before(200, 1), before(250, 1), before(350, 3)], [own(1), own(2), own(3)]);
+    let nothing = ImageEvidence::unexplained(probe.states().len());
+    assert_eq!([before(100, 1), before(300, 3)], [Some(&nothing); 2]);
 }

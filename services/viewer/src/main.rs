@@ -1,7 +1,7 @@
 //! `carff-viewer`: the live window.
 
 use anyhow::{Context, bail};
-use carff_observe::{First, Look, ViewArgs};
+use carff_observe::{First, Theme, ViewArgs};
 use carff_viewer::app::{Command, Options, Viewer, Waker, icon};
 use carff_viewer::input::{Album, Input};
 use carff_viewer::live::LiveFeed;
@@ -78,8 +78,8 @@ fn run(args: ViewArgs) -> anyhow::Result<()> {
         folder: args.folder,
         theme: match args.theme {
             None => ThemePreference::System,
-            Some(Look::Dark) => ThemePreference::Dark,
-            Some(Look::Light) => ThemePreference::Light,
+            Some(Theme::Dark) => ThemePreference::Dark,
+            Some(Theme::Light) => ThemePreference::Light,
         },
         one_shot: args.screenshot.clone().map(|path| (path, after)),
     };
@@ -129,9 +129,7 @@ fn album(asked: Option<&Path>, of_run: Option<PathBuf>, models: &Models) -> anyh
     if let Some(dir) = asked {
         return Ok(Ok(Album::open(dir, models)?));
     }
-    let Some(dir) = of_run.or_else(|| models.trained_on()) else {
-        return Ok(Err("No dataset: pass one with --dataset, or drop a PNG image here.".into()));
-    };
+    let dir = of_run.unwrap_or_else(|| models.trained.dataset.clone());
     if !dir.is_dir() {
         let name = &models.manifest.scenario.name;
         let dir = dir.display();

@@ -1,6 +1,6 @@
 //! A checkpoint's models, loaded once, with encoder and forecaster in libtorch.
 
-use carff_checkpoint::{CheckpointError, FieldProbe, Manifest, load_field_probe, load_policy};
+use carff_checkpoint::{CheckpointError, FieldProbe, Manifest, TrainedWith, load_field_probe, load_policy};
 use carff_dataset::Image;
 use carff_decision::Policy;
 use carff_field::Field;
@@ -19,6 +19,8 @@ pub struct Models {
     pub dir: PathBuf,
     /// Contents and training of the checkpoint.
     pub manifest: Manifest,
+    /// Settings of the training that the session takes over.
+    pub trained: TrainedWith,
     /// Probe that finds the state of a latent.
     pub probe: FieldProbe,
     /// Network from posterior to mixture, or the reason why there is none.
@@ -47,6 +49,7 @@ impl Models {
         let name = |state: usize| format!("{} t{}", scenario.branches[state / steps], state % steps);
         let models = Self {
             dir: dir.to_owned(),
+            trained: manifest.trained_with(dir)?,
             probe: load_field_probe(dir, &manifest)?,
             mixture,
             policy,
@@ -89,16 +92,5 @@ impl Models {
     /// Returns true if the hazard action is right in a state.
     pub fn is_hazard(&self, state: usize) -> bool {
         self.probe.layout().hazard_states().get(state).copied().unwrap_or(false)
-    }
-
-    /// Returns the number of steps of the calibrated look-ahead.
-    pub fn horizon(&self) -> u32 {
-        let recorded = self.manifest.training.pointer("/calibration/horizon").and_then(serde_json::Value::as_u64);
-        recorded.map_or(2, |h| h.clamp(1, u64::from(carff_messages::MAX_HORIZON)) as u32)
-    }
-
-    /// Returns the training dataset as the training file names it.
-    pub fn trained_on(&self) -> Option<PathBuf> {
-        self.manifest.training.pointer("/dataset").and_then(serde_json::Value::as_str).map(PathBuf::from)
     }
 }

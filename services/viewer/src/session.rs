@@ -189,8 +189,12 @@ pub struct Session {
 impl Session {
     /// Creates a session without an image.
     pub fn new(models: Models) -> Self {
-        let settings =
-            Settings { samples: 10, sampling: Sampling::Stratified, horizon: models.horizon().max(2), seed: 1 };
+        let settings = Settings {
+            samples: 10,
+            sampling: Sampling::Stratified,
+            horizon: models.trained.calibration.horizon.clamp(2, MAX_HORIZON),
+            seed: 1,
+        };
         Self { models, history: History::default(), settings, journal: Journal::default() }
     }
 

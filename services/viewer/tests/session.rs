@@ -1,7 +1,8 @@
 //! Tests of the session on the shipped checkpoint, without a window.
 
-mod common;
+use crate::common;
 
+use crate::common::{ABOVE_VIEW, HIDING_VIEW, copy_without, models, picture, scenario};
 use carff_dataset::Image;
 use carff_decision::{Evidence, Plan, Sampling, Step, look_ahead};
 use carff_messages::ActionCode;
@@ -9,7 +10,6 @@ use carff_scenes::{Extras, RenderOptions};
 use carff_viewer::input::{Album, Input};
 use carff_viewer::models::Models;
 use carff_viewer::session::{Moment, Selection, Session, SessionError, Settings};
-use common::{ABOVE_VIEW, HIDING_VIEW, copy_without, models, picture, scenario};
 use std::ops::ControlFlow;
 
 fn session() -> Session {

@@ -2,11 +2,9 @@
 
 #![allow(clippy::unwrap_used, reason = "also in shared fixtures")]
 
-mod common;
-
+use crate::common::{HIDING_VIEW, models, picture};
 use carff_viewer::app::{Options, Viewer, Waker};
 use carff_viewer::session::{Selection, Session};
-use common::{HIDING_VIEW, models, picture};
 use eframe::egui::{Event, Key, Modifiers, MouseWheelUnit, Theme, ThemePreference, Vec2, pos2, vec2};
 use egui_kittest::Harness;
 use egui_kittest::kittest::{NodeT, Queryable};

@@ -4,6 +4,17 @@
 //! training and its results. A checkpoint contains no code. Contents that do not match are an error that names the key.
 //! This crate reads the field's weights. `carff_networks` reads the weights of the tch networks, so that programs
 //! without them do not link libtorch.
+//!
+//! ```
+//! use carff_checkpoint::{Manifest, load_field_probe};
+//! # let dir = std::path::Path::new("../../configs/checkpoints/approaching-intersection");
+//! let manifest = Manifest::load(dir)?;
+//! let mut probe = load_field_probe(dir, &manifest)?;
+//! // Each known state's latent shows this state.
+//! let found = probe.probe(&manifest.states[2].mean);
+//! assert_eq!(found.reading.state, Some(2));
+//! # Ok::<(), carff_checkpoint::CheckpointError>(())
+//! ```
 
 pub mod backbones;
 mod field;
@@ -19,13 +30,16 @@ pub use planning::{Bound, CheckpointPlanning, CheckpointPlanningError, PlanningM
 pub use probe::{FieldProbe, PreparedField, load_field_probe, load_probing};
 pub use tensors::{Row, read_tensors};
 
-use carff_dataset::ScenarioInfo;
+use carff_dataset::{ScenarioInfo, sensor::SensorNoise};
 use carff_decision::{Calibration, Place, ProbingError};
 use carff_field::FieldConfig;
 use carff_messages::{Gaussian, MAX_PLACES, MAX_STATES};
 use serde::{Deserialize, Serialize};
 use shapes::{DecoderConfig, EncoderConfig, MixtureConfig};
 use std::path::{Path, PathBuf};
+
+// The field knows no messages: its latent has the same size as theirs.
+const _: () = assert!(carff_field::LATENT_DIM == carff_messages::LATENT_DIM);
 
 /// Version of the format that this program writes and reads.
 pub const FORMAT_VERSION: u32 = 1;
@@ -193,6 +207,35 @@ pub struct Manifest {
     pub metrics: serde_json::Value,
 }
 
+/// The settings of the training file that programs of a checkpoint take over.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+pub struct TrainedWith {
+    /// Folder of the training dataset.
+    pub dataset: PathBuf,
+    /// Scenario file that the dataset was rendered from.
+    pub scenario: Option<PathBuf>,
+    /// Settings of the calibration.
+    pub calibration: CalibratedWith,
+    /// Settings of the encoder's training.
+    pub vae: VaeTrainedWith,
+}
+
+/// The settings of a checkpoint's calibration.
+#[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
+pub struct CalibratedWith {
+    /// Noise of the sensor.
+    pub sensor: SensorNoise,
+    /// Steps of the look-ahead, 1..=[`MAX_HORIZON`](carff_messages::MAX_HORIZON).
+    pub horizon: u32,
+}
+
+/// The settings of an encoder's training.
+#[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
+pub struct VaeTrainedWith {
+    /// True if the decoder decodes what an image adds to its pose's mean image.
+    pub residual: bool,
+}
+
 /// File names in a checkpoint.
 pub mod files {
     /// Name of the manifest.
@@ -234,6 +277,14 @@ impl Manifest {
         let manifest: Self = serde_json::from_str(&text).map_err(|e| wrong(e.to_string()))?;
         manifest.check().map_err(wrong)?;
         Ok(manifest)
+    }
+
+    /// Returns the training settings that programs of the checkpoint in `dir` take over.
+    pub fn trained_with(&self, dir: &Path) -> Result<TrainedWith, CheckpointError> {
+        TrainedWith::deserialize(&self.training).map_err(|e| CheckpointError::Manifest {
+            path: dir.join(files::MANIFEST),
+            what: format!("`training`: {e}; make the checkpoint again with `carff train`"),
+        })
     }
 
     fn check(&self) -> Result<(), String> {

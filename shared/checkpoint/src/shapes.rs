@@ -20,6 +20,11 @@ pub struct EncoderConfig {
     pub hidden: i64,
 }
 
+impl EncoderConfig {
+    /// Range of the posterior's log-variances, so that no posterior collapses to a point or covers the whole space.
+    pub const LOG_VARIANCES: (f32, f32) = (-8.0, 4.0);
+}
+
 impl Default for EncoderConfig {
     fn default() -> Self {
         Self {
@@ -138,6 +143,26 @@ pub struct MixtureConfig {
     pub hidden: i64,
     /// Width of the weight head's hidden layers.
     pub weight_hidden: i64,
+}
+
+impl MixtureConfig {
+    /// Range of the components' log-variances.
+    pub const LOG_VARIANCES: (f32, f32) = (-7.0, 4.0);
+
+    /// Checks the ranges; returns the first key out of its range, with its value and the allowed ones.
+    pub fn check(&self) -> Result<(), (&'static str, i64, &'static str)> {
+        let Self { components, hidden, weight_hidden } = *self;
+        for (key, value, range, allowed) in [
+            ("mixture.components", components, 1..=4, "1 to 4"),
+            ("mixture.hidden", hidden, 1..=i64::MAX, "at least 1"),
+            ("mixture.weight_hidden", weight_hidden, 1..=i64::MAX, "at least 1"),
+        ] {
+            if !range.contains(&value) {
+                return Err((key, value, allowed));
+            }
+        }
+        Ok(())
+    }
 }
 
 impl Default for MixtureConfig {

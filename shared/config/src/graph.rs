@@ -100,9 +100,9 @@ pub struct ChecksConfig {
     /// rendered images without sensor noise may repeat images indefinitely. Default 300.
     #[schemars(range(min = 50, max = 60_000))]
     pub frozen_ms: u64,
-    /// Renders the known states from the camera's pose and compares them with the image, whose belief waits for it. A
-    /// checkpoint without `known.json` has no comparison. Default true.
-    pub compare: bool,
+    /// Renders the known states from the camera's pose and compares them with the image: `same-frame`, `next-frame` or
+    /// `off`. A checkpoint without `known.json` has no comparison. Default `same-frame`.
+    pub compare: CompareImages,
     /// Meaning of something unknown for every decision rule that looks at the belief: `hazard` or `ignored`. Default
     /// `hazard`.
     pub unknown: UnknownIs,
@@ -110,7 +110,7 @@ pub struct ChecksConfig {
 
 impl Default for ChecksConfig {
     fn default() -> Self {
-        Self { camera: true, frozen_ms: 300, compare: true, unknown: UnknownIs::Hazard }
+        Self { camera: true, frozen_ms: 300, compare: CompareImages::SameFrame, unknown: UnknownIs::Hazard }
     }
 }
 
@@ -119,6 +119,19 @@ impl ChecksConfig {
     pub fn ignores_unknown(&self) -> bool {
         self.unknown == UnknownIs::Ignored
     }
+}
+
+/// The belief that the comparison of an image counts for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+pub enum CompareImages {
+    /// None: images are not compared.
+    Off,
+    /// The belief about the same frame, which waits for it.
+    SameFrame,
+    /// The belief about the next frame, which then does not wait. In the first frame of a take, which no compared frame
+    /// is before, something unknown is nearly certain.
+    NextFrame,
 }
 
 /// Meaning of something unknown for the decision rules.

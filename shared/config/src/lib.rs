@@ -32,8 +32,8 @@ mod stages;
 pub use camera::{CalibrationChoice, CameraConfig, CameraSource, FramePace, Pose, PoseChoice};
 pub use error::ConfigError;
 pub use graph::{
-    ChecksConfig, ControllerConfig, GraphConfig, LauncherConfig, MemoryKind, OverloadConfig, Quality, RendererConfig,
-    RunConfig, UnknownIs, ViewChoice, WhenLost, is_stream,
+    ChecksConfig, CompareImages, ControllerConfig, GraphConfig, LauncherConfig, MemoryKind, OverloadConfig, Quality,
+    RendererConfig, RunConfig, UnknownIs, ViewChoice, WhenLost, is_stream,
 };
 pub use soak::{Contract, Kind, Pace, SoakConfig, Weights};
 pub use stages::{Backend, LogFormat, LogLevel, RestartPolicy, StageConfig, StagesConfig};

@@ -38,6 +38,11 @@ impl ImageEvidence {
         Self { ratios: ratios.iter().map(limited).collect(), prior: None }
     }
 
+    /// Evidence of an image that no state explains: something unknown is nearly certain.
+    pub fn unexplained(states: usize) -> Self {
+        Self::new(&vec![0.0; states])
+    }
+
     /// Returns the same evidence after earlier images of the take, whose comparisons leave the hazard this probability,
     /// 0..=1.
     #[must_use]
@@ -106,6 +111,16 @@ fn in_message(probability: f64) -> f64 {
 
 /// The comparisons of a take's images so far: a place that was seen clear, or a hazard that was seen, is remembered
 /// while it is hidden.
+///
+/// ```
+/// use carff_decision::{ImageEvidence, ImageMemory, MemorySettings};
+/// let hazards = [true, false];
+/// let mut memory = ImageMemory::new(hazards.to_vec(), MemorySettings { repeated_share: 0.0, distrust: 0.0 });
+/// memory.see(ImageEvidence::new(&[0.001, 80.0]));
+/// // The place was seen clear. It is hidden now: both states explain the image.
+/// let hidden = memory.see(ImageEvidence::new(&[50.0, 50.0]));
+/// assert!(hidden.weigh(0.0, &hazards).0 < 0.01);
+/// ```
 #[derive(Clone, Debug)]
 pub struct ImageMemory {
     hazard_states: Vec<bool>,
@@ -210,8 +225,9 @@ mod tests {
     /// An image that no state explains is unknown; ratios that are not numbers explain nothing.
     #[test]
     fn what_nothing_explains_is_unknown() {
-        for ratios in [[1e-3; 4], [f32::NAN; 4]] {
-            let (hazard, unknown) = ImageEvidence::new(&ratios).weigh(0.0, &STATES);
+        let evidence = [ImageEvidence::new(&[1e-3; 4]), ImageEvidence::new(&[f32::NAN; 4])];
+        for evidence in evidence.into_iter().chain([ImageEvidence::unexplained(4)]) {
+            let (hazard, unknown) = evidence.weigh(0.0, &STATES);
             assert!(unknown > 0.8 && hazard < 0.1, "{hazard} {unknown}");
         }
     }

@@ -34,6 +34,14 @@ pub struct Policy {
 }
 
 /// The outcome of a rule.
+///
+/// ```
+/// use carff_decision::{Evidence, Policy};
+/// use carff_messages::Rule;
+/// // Without samples, every rule halts.
+/// let decision = Policy::new(Rule::Calibrated, 0.2).decide(&Evidence::NONE);
+/// assert!(decision.halt && decision.confidence == 0.0);
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Decision {
     /// Halt (`true`) or advance.

@@ -34,6 +34,23 @@ impl From<&Posterior> for TakeFrame {
 }
 
 /// The belief over the frames of a take. It starts anew with each take, and after a gap of more than a time step.
+///
+/// ```
+/// use carff_decision::{Memory, MemorySettings, Mixture, StepLength, TakeFrame, TakeMemory};
+/// use carff_messages::Gaussian;
+/// let [left, right] = [-3.0, 3.0].map(|x| Gaussian { mean: [x; 8], log_variance: [-4.0; 8] });
+/// // Each state stays.
+/// let stays = |state: &Gaussian| Mixture { weights: vec![1.0], components: vec![*state] };
+/// let settings = MemorySettings { repeated_share: 0.0, distrust: 0.01 };
+/// let mut memory = TakeMemory::new(Memory::new(vec![left, right], stays, settings), StepLength::Frames(6));
+/// let image = |weight: f32| Mixture { weights: vec![weight, 1.0 - weight], components: vec![left, right] };
+/// let frame = |frame| TakeFrame { take_start: 0, frame, capture_time_ns: 100 * frame };
+/// memory.see(frame(0), &image(0.999));
+/// // The next image shows nothing: the belief is still that of the first one.
+/// let (belief, images) = memory.see(frame(1), &image(0.5));
+/// let of_left = belief.weights.iter().zip(&belief.components).filter(|(_, c)| c.mean[0] < 0.0);
+/// assert!(of_left.map(|(weight, _)| weight).sum::<f32>() > 0.9 && images == 2);
+/// ```
 #[derive(Clone, Debug)]
 pub struct TakeMemory {
     memory: Memory,

@@ -53,7 +53,7 @@ pub use tables::{
 };
 pub use trials::{
     Models,
-    looks::{ByTrialKind, TrialFigures},
+    views::{ByTrialKind, TrialFigures},
     watches::{Watch, WatchPlan, Watched, watches},
 };
 

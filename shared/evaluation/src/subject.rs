@@ -4,8 +4,7 @@ use crate::trials::watches::Watch;
 use crate::{ByRole, Decoding, EvaluationError, MaskedView, PosedImages, Progress, ROLES};
 use carff_base::geometry::PinholeCamera;
 use carff_base::random::Key;
-use carff_checkpoint::CheckpointPlanning;
-use carff_checkpoint::{CheckpointError, FieldProbe, Manifest, ScenarioIdentity, files};
+use carff_checkpoint::{CheckpointError, CheckpointPlanning, FieldProbe, Manifest, ScenarioIdentity, TrainedWith};
 use carff_dataset::{
     Image,
     drives::DriveKind,
@@ -20,7 +19,7 @@ use carff_networks::{
     stored::{load_decoder, load_encoder_on, load_mixture},
 };
 use carff_plots::Panel;
-use carff_scenes::{FreePose, UnknownLook};
+use carff_scenes::{FreePose, UnknownView};
 use carff_trials::{KnownStates, Perception, Planner};
 use carff_unknown::Known;
 use serde::{Deserialize, Serialize};
@@ -76,7 +75,7 @@ pub struct Novelty {
     /// True next to the road, where it is harmless.
     pub beside: bool,
     /// Images in which it is in sight.
-    pub looks: Vec<UnknownLook>,
+    pub views: Vec<UnknownView>,
 }
 
 /// The image of a drive whose decision has one right answer.
@@ -139,25 +138,8 @@ pub struct Subject {
     pub masked_views: Vec<MaskedView>,
     /// Settings of this evaluation.
     pub options: EvalOptions,
-    trained: TrainedWith,
-}
-
-/// The training settings that an evaluation takes over.
-#[derive(Clone, Copy, Debug, Deserialize)]
-struct TrainedWith {
-    calibration: CalibratedWith,
-    vae: VaeTrainedWith,
-}
-
-#[derive(Clone, Copy, Debug, Deserialize)]
-struct CalibratedWith {
-    sensor: SensorNoise,
-    horizon: u32,
-}
-
-#[derive(Clone, Copy, Debug, Deserialize)]
-struct VaeTrainedWith {
-    residual: bool,
+    /// Settings of the training that the evaluation takes over.
+    pub trained: TrainedWith,
 }
 
 /// Images between two progress reports.
@@ -176,10 +158,7 @@ impl Subject {
         let given = ScenarioIdentity::of(&posed.scenario, posed.dataset.view_count());
         manifest.check_scenario(checkpoint, &given)?;
         let encoder = load_encoder_on(checkpoint, &manifest, options.device)?;
-        let trained = TrainedWith::deserialize(&manifest.training).map_err(|e| EvaluationError::Format {
-            path: checkpoint.join(files::MANIFEST),
-            what: format!("`training`: {e}; make the checkpoint again with `carff train`"),
-        })?;
+        let trained = manifest.trained_with(checkpoint)?;
         let planning = CheckpointPlanning::load(checkpoint).ok();
         let mut subject = Self {
             checkpoint: checkpoint.to_owned(),

@@ -4,6 +4,17 @@
 //! network is native code. `carff_networks` holds the same networks in tch, for training and as the reference.
 //!
 //! ONNX Runtime is a shared library that is loaded at run time: see [`library`].
+//!
+//! ```
+//! use carff_checkpoint::Manifest;
+//! use carff_inference::MixtureNet;
+//! # let dir = std::path::Path::new("../../configs/checkpoints/approaching-intersection");
+//! let manifest = Manifest::load(dir)?;
+//! let forecaster = MixtureNet::load(dir, &manifest)?;
+//! let mixture = forecaster.forecast(&manifest.states[0]);
+//! assert!((mixture.weights.iter().sum::<f32>() - 1.0).abs() < 1e-5);
+//! # Ok::<(), carff_checkpoint::CheckpointError>(())
+//! ```
 
 mod encoder;
 pub mod library;

@@ -2,13 +2,11 @@
 
 use crate::InferenceError;
 use crate::weights::Weights;
-use carff_checkpoint::{CheckpointError, Forecasts, Manifest, files};
+use carff_checkpoint::{CheckpointError, Forecasts, Manifest, files, shapes::MixtureConfig};
 use carff_decision::Mixture;
 use carff_messages::{Gaussian, LATENT_DIM};
 use std::path::Path;
 
-/// Range of component log-variances, as in training.
-const LOG_VARIANCE_RANGE: (f32, f32) = (-7.0, 4.0);
 /// Sums that a dot product computes at once.
 const LANES: usize = 16;
 
@@ -32,15 +30,8 @@ impl MixtureNet {
         }
         let wrong = |e: InferenceError| CheckpointError::Weights { path: dir.into(), what: e.to_string() };
         let config = &manifest.mixture;
-        for (key, value, range, allowed) in [
-            ("mixture.components", config.components, 1..=4, "1 to 4"),
-            ("mixture.hidden", config.hidden, 1..=i64::MAX, "at least 1"),
-            ("mixture.weight_hidden", config.weight_hidden, 1..=i64::MAX, "at least 1"),
-        ] {
-            if !range.contains(&value) {
-                return Err(wrong(InferenceError::Setting { key, value, allowed }));
-            }
-        }
+        let refused = |(key, value, allowed)| wrong(InferenceError::Setting { key, value, allowed });
+        config.check().map_err(refused)?;
         let mut weights = Weights::read(&path).map_err(wrong)?;
         let (d, k, h, w) = (LATENT_DIM as i64, config.components, config.hidden, config.weight_hidden);
         let mut layer = |name: &str, from, to| Linear::take(&mut weights, name, from, to).map_err(wrong);
@@ -63,7 +54,7 @@ impl MixtureNet {
         }
         let [first, second, last] = &self.weights;
         let logits = last.forward(&second.relu(&first.relu(&x)));
-        let (low, high) = LOG_VARIANCE_RANGE;
+        let (low, high) = MixtureConfig::LOG_VARIANCES;
         let (means, log_variances) = (self.means.forward(&x), self.log_variances.forward(&x));
         let components = means.as_chunks().0.iter().zip(log_variances.as_chunks().0).map(|(mean, log_variance)| {
             Gaussian { mean: *mean, log_variance: log_variance.map(|v: f32| v.clamp(low, high)) }

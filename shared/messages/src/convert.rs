@@ -1,6 +1,6 @@
 //! Conversions between messages and the types of the libraries.
 
-use crate::{DatasetView, FrameMeta, Header, Intrinsics, ViewMeta};
+use crate::{DatasetView, EgoPose, FrameMeta, Header, Intrinsics, ViewMeta};
 use carff_base::geometry::PinholeCamera;
 
 impl From<&PinholeCamera> for Intrinsics {
@@ -12,8 +12,7 @@ impl From<&PinholeCamera> for Intrinsics {
 impl Intrinsics {
     fn camera(&self, width_px: u32, height_px: u32, world_from_camera: &[f64; 16]) -> PinholeCamera {
         let Self { fl_x_px, fl_y_px, cx_px, cy_px } = *self;
-        let (rows, _) = world_from_camera.as_chunks::<4>();
-        let world_from_camera = std::array::from_fn(|row| rows[row]);
+        let world_from_camera = rows(world_from_camera);
         PinholeCamera { width_px, height_px, fl_x_px, fl_y_px, cx_px, cy_px, world_from_camera }
     }
 }
@@ -21,6 +20,32 @@ impl Intrinsics {
 /// Returns a pose as messages store it: row-major.
 pub fn row_major(world_from_camera: &[[f64; 4]; 4]) -> [f64; 16] {
     std::array::from_fn(|i| world_from_camera[i / 4][i % 4])
+}
+
+/// Returns the rows of a pose that is stored row-major.
+fn rows(pose: &[f64; 16]) -> [[f64; 4]; 4] {
+    let (rows, _) = pose.as_chunks::<4>();
+    std::array::from_fn(|row| rows[row])
+}
+
+impl EgoPose {
+    /// Returns the message of a pose.
+    pub fn new(header: Header, world_from_vehicle: &[[f64; 4]; 4]) -> Self {
+        Self { header, world_from_vehicle: row_major(world_from_vehicle) }
+    }
+
+    /// Returns the pose: vehicle space to world space.
+    pub(crate) fn pose(&self) -> [[f64; 4]; 4] {
+        rows(&self.world_from_vehicle)
+    }
+
+    /// Returns the pose in the world of a camera on the vehicle.
+    pub fn world_from_camera(&self, vehicle_from_camera: &[[f64; 4]; 4]) -> [[f64; 4]; 4] {
+        let pose = self.pose();
+        std::array::from_fn(|i| {
+            std::array::from_fn(|j| (0..4).map(|k| pose[i][k] * vehicle_from_camera[k][j]).sum::<f64>())
+        })
+    }
 }
 
 impl FrameMeta {

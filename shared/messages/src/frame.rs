@@ -43,6 +43,12 @@ impl Intrinsics {
 }
 
 /// Position of a frame in a dataset: the truth, only for reports. No stage of the decision path reads it.
+///
+/// ```
+/// use carff_messages::DatasetView;
+/// let view = DatasetView { known: 1, view: 61, branch: 0, timestamp: 2, ..DatasetView::UNKNOWN };
+/// assert!(view.is_known() && !DatasetView::UNKNOWN.is_known());
+/// ```
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ZeroCopySend)]
 #[type_name("carff.DatasetView.v1")]
@@ -168,6 +174,15 @@ impl ImageMeta for FrameMeta {
 }
 
 /// Describes a rendered view: RGB, 8 bit, rows from the top (height x width x 3 bytes).
+///
+/// ```
+/// use carff_messages::{Header, ImageMeta, Intrinsics, Message, ViewKind, ViewMeta};
+/// let header = Header::of_frame(7, 1_000, 42).at_step(1);
+/// let intrinsics = Intrinsics { fl_x_px: 60.0, fl_y_px: 60.0, cx_px: 32.0, cy_px: 24.0 };
+/// let kind = ViewKind::ALL[0].code();
+/// let view = ViewMeta { header, kind, state: 2, width_px: 64, height_px: 48, intrinsics, ..ViewMeta::default() };
+/// assert_eq!((view.validate(), view.image_bytes()), (Ok(()), 64 * 48 * 3));
+/// ```
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Default, PartialEq, ZeroCopySend)]
 #[type_name("carff.ViewMeta.v1")]

@@ -6,6 +6,27 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// A stage's heartbeat: its state and its counts since its start.
+///
+/// ```
+/// use carff_messages::{Header, Health, HealthState, Message, Stage};
+/// let health = Health {
+///     header: Header::of_frame(7, 1_000, 42),
+///     stage: Stage::Prober.code(),
+///     state: HealthState::Ok.code(),
+///     pid: 4711,
+///     received: 20,
+///     published: 19,
+///     skipped: 1,
+///     invalid: 0,
+///     errors: 0,
+///     last_latency_ns: 1_200_000,
+///     max_latency_ns: 2_500_000,
+///     last_progress_ns: 90_000_000,
+///     rss_bytes: 30 << 20,
+/// };
+/// assert_eq!((health.validate(), health.stage()), (Ok(()), Ok(Stage::Prober)));
+/// assert!(Health { state: 99, ..health }.validate().is_err());
+/// ```
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ZeroCopySend, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]

@@ -19,6 +19,14 @@ use iceoryx2::service::static_config::message_type_details::{TypeDetail, TypeVar
 use serde::Serialize;
 
 /// A type in shared memory: a number, or a structure with fields.
+///
+/// ```
+/// use carff_messages::{Header, layout::Described};
+/// let header = Header::layout();
+/// assert_eq!((header.type_name.as_str(), header.size_bytes), ("carff.Header.v1", size_of::<Header>()));
+/// let frame = header.fields.iter().find(|field| field.name == "frame_id").expect("each header has a frame");
+/// assert_eq!((frame.offset_bytes, frame.kind.type_name.as_str()), (16, "u64"));
+/// ```
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct Layout {
     /// Name that the transport compares: of a structure its `type_name`, of a number its Rust name.

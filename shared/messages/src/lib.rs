@@ -25,6 +25,7 @@ mod frame;
 mod health;
 mod latent;
 pub mod layout;
+mod motion;
 mod novelty;
 mod occupancy;
 
@@ -37,6 +38,7 @@ pub use decision::Action;
 pub use frame::{DatasetView, FrameMeta, Intrinsics, ViewMeta};
 pub use health::Health;
 pub use latent::{Belief, Forecast, Gaussian, Posterior, ProbeResult};
+pub use motion::{EgoMotion, EgoPose, LookGain};
 pub use novelty::{ImageCheck, MAX_UNKNOWNS, UnknownBox, Unknowns};
 pub use occupancy::{MAX_CELLS, Occupancy};
 

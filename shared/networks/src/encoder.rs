@@ -11,9 +11,6 @@ use ndarray::ArrayView3;
 use std::path::Path;
 use tch::{Kind, Tensor, nn, nn::Module};
 
-/// Range of log-variances, so that no posterior collapses to a point or covers the whole space.
-pub const LOG_VARIANCE_RANGE: (f64, f64) = (-8.0, 4.0);
-
 /// Encoder with backbone and head.
 pub struct Encoder {
     stem: Option<(nn::Conv2D, nn::Conv2D)>,
@@ -100,7 +97,8 @@ impl Encoder {
         let x = self.head.pool.forward(&x).relu().flatten(1, -1);
         let x = if dropout > 0.0 { x.dropout(dropout, true) } else { x };
         let x = self.head.hidden.forward(&x).relu();
-        let log_variance = self.head.log_variance.forward(&x).clamp(LOG_VARIANCE_RANGE.0, LOG_VARIANCE_RANGE.1);
+        let (low, high) = EncoderConfig::LOG_VARIANCES;
+        let log_variance = self.head.log_variance.forward(&x).clamp(f64::from(low), f64::from(high));
         (self.head.mean.forward(&x), log_variance)
     }
 

@@ -6,9 +6,6 @@ use carff_decision::Mixture;
 use carff_messages::{Gaussian, LATENT_DIM};
 use tch::{Kind, Tensor, nn, nn::Module};
 
-/// Range of component log-variances.
-pub const LOG_VARIANCE_RANGE: (f64, f64) = (-7.0, 4.0);
-
 /// The mixture density network.
 #[derive(Debug)]
 pub struct MixtureNet {
@@ -23,13 +20,11 @@ pub struct MixtureNet {
 impl MixtureNet {
     /// Builds the network in `path`.
     pub fn new(path: &nn::Path, config: &MixtureConfig) -> Result<Self, ModelError> {
-        if !(1..=4).contains(&config.components) {
-            return Err(ModelError::Setting {
-                key: "mixture.components",
-                value: config.components.to_string(),
-                allowed: "1 to 4",
-            });
-        }
+        config.check().map_err(|(key, value, allowed)| ModelError::Setting {
+            key,
+            value: value.to_string(),
+            allowed,
+        })?;
         let linear = nn::LinearConfig::default();
         let (d, k, h, w) = (LATENT_DIM as i64, config.components, config.hidden, config.weight_hidden);
         Ok(Self {
@@ -57,11 +52,12 @@ impl MixtureNet {
         let input = Tensor::cat(&[mean.shallow_clone(), log_variance * 0.25], 1);
         let hidden = self.second.forward(&self.first.forward(&input).relu()).relu();
         let shape = [-1, self.components, LATENT_DIM as i64];
+        let (low, high) = MixtureConfig::LOG_VARIANCES;
         let logits = self.weights[2].forward(&self.weights[1].forward(&self.weights[0].forward(&hidden).relu()).relu());
         (
             logits.log_softmax(-1, Kind::Float),
             self.means.forward(&hidden).view(shape),
-            self.log_variances.forward(&hidden).view(shape).clamp(LOG_VARIANCE_RANGE.0, LOG_VARIANCE_RANGE.1),
+            self.log_variances.forward(&hidden).view(shape).clamp(f64::from(low), f64::from(high)),
         )
     }
 

@@ -114,6 +114,16 @@ pub fn runs() -> Result<Vec<LiveRun>, AttachError> {
 }
 
 /// Joins the named run, or the only living one, as `node_name`.
+///
+/// ```no_run
+/// use carff_transport::topics;
+/// let attached = carff_observe::attach(Some("crossing"), "my-probe")?;
+/// let mut actions = attached.node.receiver(&topics::ACTION)?;
+/// if let Some(action) = actions.newest()? {
+///     println!("hazard {:.2}", action.hazard_probability);
+/// }
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn attach(run: Option<&str>, node_name: &str) -> Result<Attached, AttachError> {
     let live = find(run)?;
     let node = Node::open(&Run::within(&live.dir, &live.name, live.run_id)?, node_name)?;

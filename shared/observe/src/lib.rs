@@ -13,4 +13,4 @@ mod view;
 pub use attach::{AttachError, Attached, LiveRun, attach, find, runs};
 pub use lock::{LockError, RunLock};
 pub use record::RunRecord;
-pub use view::{First, Look, ViewArgs};
+pub use view::{First, Theme, ViewArgs};

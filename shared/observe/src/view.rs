@@ -26,7 +26,7 @@ pub struct ViewArgs {
     pub threads: Option<usize>,
     /// Colours of the window. Default: the system's preference.
     #[arg(long)]
-    pub theme: Option<Look>,
+    pub theme: Option<Theme>,
     /// Folder for screenshots.
     #[arg(long, default_value = ".", value_hint = ValueHint::DirPath)]
     pub folder: PathBuf,
@@ -56,7 +56,7 @@ pub enum First {
 
 /// Colours of the window.
 #[derive(Clone, Copy, Debug, ValueEnum)]
-pub enum Look {
+pub enum Theme {
     /// Light on dark.
     Dark,
     /// Dark on light.

@@ -48,6 +48,15 @@ impl Kind {
 }
 
 /// Reads the images of one channel, in the order of the file.
+///
+/// ```no_run
+/// use carff_recording::ImageReader;
+/// let mut images = ImageReader::open("drive.mcap".as_ref(), Some("/camera/front/image_raw"))?;
+/// while let Some(recorded_ns) = images.next()? {
+///     println!("{recorded_ns}: {:?}", images.origin()?);
+/// }
+/// # Ok::<(), carff_recording::RecordingError>(())
+/// ```
 pub struct ImageReader {
     bag: Bag,
     topic: String,

@@ -6,8 +6,8 @@
 use crate::about::METADATA;
 use crate::channels::Content;
 use crate::{About, MessageError, RecordingError};
-use carff_messages::forms::{OwnedMessage, read};
-use carff_messages::{FrameMeta, MAX_IMAGE_BYTES, ViewMeta};
+use carff_messages::forms::{FormError, OwnedMessage, read};
+use carff_messages::{FrameMeta, MAX_IMAGE_BYTES, SCHEMA_VERSION, ViewMeta};
 use carff_transport::TopicId;
 use foxglove::Decode;
 use foxglove::messages::RawImage;
@@ -193,11 +193,12 @@ impl Reader {
     fn message(&mut self, located: &Located) -> Result<OwnedMessage, MessageError> {
         let topic = located.topic;
         let json = self.load(located.position)?;
+        let refused = |error: FormError| of_other_version(&json).unwrap_or_else(|| error.into());
         if self.without_images && topic == TopicId::FRAME {
-            return Ok(OwnedMessage::new(Box::new(read::<FrameMeta>(&json)?), Vec::new()));
+            return Ok(OwnedMessage::new(Box::new(read::<FrameMeta>(&json).map_err(refused)?), Vec::new()));
         }
         if self.without_images && topic == TopicId::VIEW {
-            return Ok(OwnedMessage::new(Box::new(read::<ViewMeta>(&json)?), Vec::new()));
+            return Ok(OwnedMessage::new(Box::new(read::<ViewMeta>(&json).map_err(refused)?), Vec::new()));
         }
         let bytes = if topic.is_image() {
             let key = (topic, located.published_ns, located.sequence);
@@ -208,7 +209,7 @@ impl Reader {
         } else {
             Vec::new()
         };
-        Ok(topic.read(&json, bytes)?)
+        topic.read(&json, bytes).map_err(refused)
     }
 
     /// Takes a message's bytes from the file.
@@ -353,4 +354,16 @@ pub(crate) fn records(
         }
     }
     Ok(())
+}
+
+/// The reason why the form of a message of another version is refused; `None` for this program's version.
+fn of_other_version(json: &[u8]) -> Option<MessageError> {
+    let form: serde_json::Value = serde_json::from_slice(json).ok()?;
+    let version = form.pointer("/header/schema_version")?.as_u64()?;
+    (version != u64::from(SCHEMA_VERSION)).then(|| {
+        MessageError(format!(
+            "it is of version {version} of the messages, and this program reads version {SCHEMA_VERSION}; use the \
+             version of carff that recorded it"
+        ))
+    })
 }

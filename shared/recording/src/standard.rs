@@ -194,6 +194,13 @@ fn label(oriented: &OrientedBox, text: String) -> TextPrimitive {
 }
 
 /// A line of a run's log, from a stage or the launcher.
+///
+/// ```
+/// use carff_recording::LogLine;
+/// let [source, level, message] = ["encoder", "WARN", "slow"].map(str::to_owned);
+/// let line = LogLine { wall_ns: 1_700_000_000_000_000_000, source, level, message };
+/// assert_eq!(line.encode().channel, "log");
+/// ```
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct LogLine {
     /// Time of the line, nanoseconds since 1970.

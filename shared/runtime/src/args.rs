@@ -25,6 +25,12 @@ pub fn parse<T: Parser>() -> Result<T> {
 
 /// Run one stage of a CARFF graph. `carff launch` starts all stages; if you start them yourself, use the same run name
 /// and id.
+///
+/// ```
+/// use carff_runtime::StageArgs;
+/// let args = StageArgs { frames: Some(100), ..StageArgs::new("graph.toml".as_ref(), "crossing", 7) };
+/// assert!(args.to_command_line().windows(2).any(|words| words == ["--frames", "100"]));
+/// ```
 #[derive(Clone, Debug, PartialEq, Eq, Parser)]
 #[command(version)]
 pub struct StageArgs {

@@ -1,12 +1,11 @@
 //! The output of a real camera's stage: images are rectified straight into the memory that the encoder reads.
 
-use crate::ego::{EGO_POSE, EgoPose};
 use crate::{StageContext, frame_span};
 use anyhow::{Context, ensure};
 use carff_base::geometry::PinholeCamera;
 use carff_config::Pose;
 use carff_dataset::{Calibration, Dataset, RawImage, Rectifier};
-use carff_messages::{DatasetView, FrameMeta, Header, ImageMeta, MAX_IMAGE_BYTES, rgb_bytes};
+use carff_messages::{DatasetView, EgoPose, FrameMeta, Header, ImageMeta, MAX_IMAGE_BYTES, rgb_bytes};
 use carff_transport::{Image, Publisher, Receiver, monotonic_now_ns, topics};
 
 /// Assumed horizontal field of view of a camera without a calibration, degrees.
@@ -17,6 +16,29 @@ const RAW_BYTES: usize = rgb_bytes(RAW_SIDE_PX, RAW_SIDE_PX);
 const IDENTITY: Pose = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]];
 
 /// Publishes the images of a real camera as frames.
+///
+/// ```no_run
+/// use carff_dataset::{PixelFormat, RawImage};
+/// use carff_messages::Stage;
+/// use carff_runtime::FrameOutput;
+/// use carff_transport::monotonic_now_ns;
+///
+/// fn main() -> std::process::ExitCode {
+///     carff_runtime::main(Stage::Camera, |stage| {
+///         let mut output = FrameOutput::open(stage, None)?;
+///         stage.ready();
+///         let mut next_ns = monotonic_now_ns();
+///         while !output.is_complete() && stage.pause_until(next_ns)? {
+///             // Here the driver of the camera delivers an image: 640 x 480 pixels, RGB.
+///             let bytes = vec![128; 640 * 480 * 3];
+///             let image = RawImage::new([640, 480], 640 * 3, PixelFormat::Rgb8, &bytes)?;
+///             output.publish(stage, &image, monotonic_now_ns())?;
+///             next_ns += 100_000_000;
+///         }
+///         Ok(())
+///     })
+/// }
+/// ```
 #[derive(Debug)]
 pub struct FrameOutput {
     /// Opened at the size of the first image; a larger image opens it again.
@@ -49,7 +71,7 @@ impl FrameOutput {
             );
         }
         let ego = match camera.vehicle_from_camera {
-            Some(pose) => Some((pose, stage.input(&EGO_POSE)?.polled())),
+            Some(pose) => Some((pose, stage.input(&topics::EGO_POSE)?.polled())),
             None => None,
         };
         Ok(Self {

@@ -6,9 +6,9 @@ use crate::realtime;
 use anyhow::Context;
 use carff_base::errors::sentence;
 use carff_config::{GraphConfig, LogFormat, LogLevel};
-use carff_messages::{Header, Health, HealthState, ImageMeta, Message, Stage};
+use carff_messages::{Header, HealthState, ImageMeta, Message, Stage};
 use carff_transport::{
-    Image, Input, Node, Payload, Publisher, Receiver, Run, Stop, Topic, Waiter, Woken, monotonic_now_ns, topics,
+    Image, Input, Node, Payload, Publisher, Receiver, Run, Stop, Topic, Waiter, Woken, monotonic_now_ns,
 };
 use rustix::process::{Signal, getppid, set_parent_process_death_signal};
 use std::io::Write;
@@ -87,10 +87,8 @@ impl StageContext {
         let run = Run::new(args.run.as_deref().unwrap_or(&graph.run.name), args.run_id)?;
         let node = Node::open(&run, stage.name())?;
         let vitals = Arc::new(Vitals::new());
-        let publisher: Publisher<Health> = node.publisher(topics::health(stage))?;
         let counters = node.counters().clone();
-        let heartbeat = Heartbeat::start(stage, graph.run.seed, publisher, vitals.clone(), counters)
-            .context("cannot start the heartbeat")?;
+        let heartbeat = Heartbeat::start(&run, stage, graph.run.seed, vitals.clone(), counters)?;
         Ok(Self {
             dataset: graph.resolve(args.dataset.as_ref().unwrap_or(&graph.run.dataset)),
             checkpoint: graph.resolve(args.checkpoint.as_ref().unwrap_or(&graph.run.checkpoint)),

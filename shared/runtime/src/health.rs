@@ -1,8 +1,9 @@
 //! The heartbeat: a separate thread, so that it continues while the stage loads or computes.
 
+use anyhow::Context;
 use carff_messages::{Header, Health, HealthState, Stage};
-use carff_transport::{Counters, Publisher, monotonic_now_ns};
-use crossbeam::channel::{RecvTimeoutError, Sender, bounded, unbounded};
+use carff_transport::{Counters, Node, Run, monotonic_now_ns, topics};
+use crossbeam::channel::{Receiver, RecvTimeoutError, Sender, bounded, unbounded};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering};
 use std::thread::JoinHandle;
@@ -75,38 +76,40 @@ pub(crate) struct Heartbeat {
 }
 
 impl Heartbeat {
+    /// Joins the run under the stage's name, and beats from then on. The thread has a node of its own, because the
+    /// ports of a node belong to one thread.
     pub(crate) fn start(
+        run: &Run,
         stage: Stage,
         seed: u64,
-        mut publisher: Publisher<Health>,
         vitals: Arc<Vitals>,
         counters: Arc<Counters>,
-    ) -> std::io::Result<Self> {
+    ) -> anyhow::Result<Self> {
         let (ask, asked) = unbounded::<Sender<()>>();
+        let (open, opened) = bounded(1);
+        let run = run.clone();
         let thread = std::thread::Builder::new().name("heartbeat".to_owned()).spawn(move || {
-            let mut beats = 0;
-            let mut beat = || {
-                let mut health = snapshot(stage, seed, &vitals, &counters);
-                // The node's counters include heartbeats, which are not work.
-                health.published = health.published.saturating_sub(beats);
-                match publisher.send(health) {
-                    Ok(()) => beats += 1,
-                    Err(error) => tracing::warn!(%error, "no heartbeat"),
+            let joined = Node::open(&run, stage.name())
+                .and_then(|node| Ok((node.publisher(topics::health(stage))?, node)))
+                .map(|(mut publisher, node)| {
+                    let beat = move || {
+                        if let Err(error) = publisher.send(snapshot(stage, seed, &vitals, &counters)) {
+                            tracing::warn!(%error, "no heartbeat");
+                        }
+                    };
+                    (beat, node)
+                });
+            match joined {
+                Ok((beat, _node)) => {
+                    let _ = open.send(Ok(()));
+                    beat_until_dropped(beat, &asked);
                 }
-            };
-            loop {
-                beat();
-                match asked.recv_timeout(PERIOD) {
-                    Ok(answer) => {
-                        beat();
-                        // The requester may have given up.
-                        let _ = answer.send(());
-                    }
-                    Err(RecvTimeoutError::Timeout) => {}
-                    Err(RecvTimeoutError::Disconnected) => return beat(),
-                }
+                Err(error) => drop(open.send(Err(error))),
             }
-        })?;
+        });
+        let thread = thread.context("cannot start the thread of the heartbeat")?;
+        // A thread that panicked has reported why.
+        opened.recv().context("the thread of the heartbeat ended")??;
         Ok(Self { ask: Some(ask), thread: Some(thread) })
     }
 
@@ -117,6 +120,22 @@ impl Heartbeat {
             && ask.send(answer).is_ok()
         {
             let _ = answered.recv_timeout(PATIENCE);
+        }
+    }
+}
+
+/// Beats at each interval and at each request, and once more when the stage ends.
+fn beat_until_dropped(mut beat: impl FnMut(), asked: &Receiver<Sender<()>>) {
+    loop {
+        beat();
+        match asked.recv_timeout(PERIOD) {
+            Ok(answer) => {
+                beat();
+                // The requester may have given up.
+                let _ = answer.send(());
+            }
+            Err(RecvTimeoutError::Timeout) => {}
+            Err(RecvTimeoutError::Disconnected) => return beat(),
         }
     }
 }

@@ -36,15 +36,11 @@
 mod args;
 mod camera;
 mod context;
-mod ego;
 mod health;
-mod motion;
 mod overload;
 mod realtime;
 
 pub use args::{StageArgs, parse};
 pub use camera::{FrameOutput, rectifier};
 pub use context::{StageContext, frame_span, main, run_with};
-pub use ego::{EGO_POSE, EgoPose};
-pub use motion::{EGO_MOTION, EgoMotion, LOOK, Look};
 pub use overload::{Overload, Quality};

@@ -20,7 +20,7 @@ mod closed_loop;
 pub mod config;
 mod error;
 mod free_drives;
-mod free_looks;
+mod free_views;
 mod lanes;
 mod materials;
 mod movers;
@@ -29,7 +29,7 @@ mod scenario;
 mod scenery;
 mod shapes;
 mod tracer;
-mod unknown_looks;
+mod unknown_views;
 mod variations;
 mod watches;
 
@@ -37,9 +37,9 @@ pub use cameras::ScenarioCamera;
 pub use closed_loop::{ClosedLoop, Episode};
 pub use error::ScenarioError;
 pub use free_drives::{FreeDrive, FreeFrame};
-pub use free_looks::{FreeLook, FreePose};
+pub use free_views::{FreePose, FreeView};
 pub use scenario::{
     ActorView, Detail, Extras, FULL_FRACTION, FULL_PIXELS, NONE_FRACTION, NONE_MEAN_DIFFERENCE, RenderOptions,
     Rendering, Scenario,
 };
-pub use unknown_looks::{IN_SIGHT_PX, UnknownLook, VISIBLE_DIFFERENCE};
+pub use unknown_views::{IN_SIGHT_PX, UnknownView, VISIBLE_DIFFERENCE};

@@ -25,13 +25,13 @@ impl Scenario {
     pub fn with_appearance(&self, name: &str) -> Result<Self, ScenarioError> {
         let all = self.appearances();
         let missing = || self.no_such("appearance", name, all.iter().map(|a| &a.name));
-        let look = all.iter().find(|a| a.name == name).ok_or_else(missing)?;
+        let appearance = all.iter().find(|a| a.name == name).ok_or_else(missing)?;
         let mut config = self.config().clone();
         for vehicle in config.vehicle.iter_mut().filter(|v| v.dynamic) {
-            vehicle.kind = look.kind;
-            vehicle.colour = look.colour;
-            vehicle.size_m = look.size_m;
-            vehicle.heading_deg = look.heading_deg;
+            vehicle.kind = appearance.kind;
+            vehicle.colour = appearance.colour;
+            vehicle.size_m = appearance.size_m;
+            vehicle.heading_deg = appearance.heading_deg;
         }
         Ok(self.varied(config, Unknown { appearance: true, ..*self.unknown() }, 0))
     }

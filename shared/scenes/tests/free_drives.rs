@@ -125,13 +125,13 @@ fn free_poses_show_every_branch() {
     for number in 0..6 {
         let pose = scenario.free_pose(number, 3).unwrap();
         assert_eq!(pose, scenario.free_pose(number, 3).unwrap());
-        assert_eq!((pose.looks.len(), pose.view_kind == "dash" || number % 2 == 1), (2, true));
+        assert_eq!((pose.views.len(), pose.view_kind == "dash" || number % 2 == 1), (2, true));
         assert!(pose.timestamp + 1 < scenario.info().timestamps);
         let states = [0, 1].map(|branch| scenario.info().state(branch, pose.timestamp).unwrap());
-        let alike = pose.looks[0].alike.contains(&states[1]);
-        assert_eq!(alike, carff_dataset::looks_same(&pose.looks[0].image, &pose.looks[1].image));
-        assert!(pose.looks.iter().zip(states).all(|(look, state)| look.alike.contains(&state)));
-        assert!(alike || pose.looks[0].observability != Some(Observability::None));
+        let alike = pose.views[0].alike.contains(&states[1]);
+        assert_eq!(alike, carff_dataset::looks_same(&pose.views[0].image, &pose.views[1].image));
+        assert!(pose.views.iter().zip(states).all(|(look, state)| look.alike.contains(&state)));
+        assert!(alike || pose.views[0].observability != Some(Observability::None));
     }
     assert_ne!(scenario.free_pose(0, 3).unwrap(), scenario.free_pose(0, 4).unwrap());
 }

@@ -1,4 +1,4 @@
-//! Tests of appearances, bystanders and unknown looks: only what is unknown changes.
+//! Tests of appearances, bystanders and unknown views: only what is unknown changes.
 
 #![allow(clippy::unwrap_used)] // The helpers below are parts of tests.
 
@@ -35,8 +35,8 @@ fn shipped_scenarios_have_variations() {
         assert!(of(VariationRole::Trained) >= 6 && of(VariationRole::HeldOut) >= 8, "{name}");
         let on = |place| scenario.bystanders().iter().filter(|b| b.place == place).count();
         assert!(on(BystanderPlace::Road) >= 4 && on(BystanderPlace::Roadside) >= 4, "{name}");
-        for look in scenario.appearances() {
-            assert_eq!(scenario.with_appearance(&look.name).unwrap().cameras(), scenario.cameras());
+        for appearance in scenario.appearances() {
+            assert_eq!(scenario.with_appearance(&appearance.name).unwrap().cameras(), scenario.cameras());
         }
         for object in scenario.bystanders() {
             assert_eq!(scenario.with_object(&object.name).unwrap().cameras(), scenario.cameras());
@@ -69,7 +69,7 @@ fn an_appearance_keeps_all_poses() {
     for number in 0..4 {
         let (own, other) = (scenario.free_pose(number, 7).unwrap(), van.free_pose(number, 7).unwrap());
         assert_eq!((own.view_kind, own.timestamp, own.camera), (other.view_kind, other.timestamp, other.camera));
-        assert_eq!(own.looks[1].image, other.looks[1].image);
+        assert_eq!(own.views[1].image, other.views[1].image);
     }
     assert_eq!(scenario.free_drive(1, 2, 7).unwrap(), van.free_drive(1, 2, 7).unwrap());
     let free = |scenario: Scenario| scenario.with_free_cameras(6, 7).unwrap().cameras().to_vec();
@@ -80,13 +80,13 @@ fn an_appearance_keeps_all_poses() {
 #[test]
 fn an_appearance_turns_the_vehicle() {
     let scenario = shipped("approaching-intersection");
-    let look = scenario.appearances().iter().find(|a| a.heading_deg != 0.0).unwrap();
-    let turned = scenario.with_appearance(&look.name).unwrap();
+    let appearance = scenario.appearances().iter().find(|a| a.heading_deg != 0.0).unwrap();
+    let turned = scenario.with_appearance(&appearance.name).unwrap();
     let of = |scenario: &Scenario| scenario.info().candidates[0].named_box.oriented_box;
     let (old, new) = (of(&scenario), of(&turned));
     assert_eq!(old.center[..2], new.center[..2]);
-    assert!((new.yaw - old.yaw - look.heading_deg.to_radians()).abs() < 1e-12);
-    assert_eq!(new.half_size, look.size_m.map(|v| v / 2.0));
+    assert!((new.yaw - old.yaw - appearance.heading_deg.to_radians()).abs() < 1e-12);
+    assert_eq!(new.half_size, appearance.size_m.map(|v| v / 2.0));
 }
 
 /// An added object is in every state, under its name and with its box on the ground, and cannot be added twice.
@@ -103,17 +103,17 @@ fn an_object_is_in_every_state() {
     assert!((found.oriented_box.center[2] - found.oriented_box.half_size[2]).abs() < 0.03);
     assert_eq!((with.object_of("actor"), scenario.object_of("crate-on-road")), (scenario.object_of("actor"), None));
     let both = with.with_object("animal-on-road").unwrap();
-    assert_eq!(both.unknown_look(1, 3).unwrap().boxes.len(), 2);
+    assert_eq!(both.unknown_view(1, 3).unwrap().boxes.len(), 2);
     let error = with.with_object("crate-on-road").unwrap_err().to_string();
     assert!(error.contains("no `bystander` named `crate-on-road`"), "{error}");
     let error = scenario.with_appearance("white-vam").unwrap_err().to_string();
     assert!(error.contains("did you mean `white-van`?"), "{error}");
 }
 
-/// An unknown look has the free pose's camera. Its image differs from the one without the unknown in the counted
+/// An unknown view has the free pose's camera. Its image differs from the one without the unknown in the counted
 /// pixels, and the image without is that of the clear branch, which shows no truck either.
 #[test]
-fn unknown_looks_count_their_pixels() {
+fn unknown_views_count_their_pixels() {
     let scenario = shipped("approaching-intersection");
     let van = scenario.with_appearance("white-van").unwrap();
     let object = scenario.with_object("trunk-on-road").unwrap();
@@ -121,19 +121,19 @@ fn unknown_looks_count_their_pixels() {
     for number in 0..6 {
         let pose = scenario.free_pose(number, 3).unwrap();
         for (variation, branch) in [(&van, 0), (&object, 1)] {
-            let look = variation.unknown_look(number, 3).unwrap();
-            assert_eq!((look.branch, look.timestamp, look.camera), (branch, pose.timestamp, pose.camera));
-            assert_eq!(look.without, pose.looks[1].image);
+            let view = variation.unknown_view(number, 3).unwrap();
+            assert_eq!((view.branch, view.timestamp, view.camera), (branch, pose.timestamp, pose.camera));
+            assert_eq!(view.without, pose.views[1].image);
             let differs = |(a, b): &(&[u8], &[u8])| (0..3).any(|c| a[c].abs_diff(b[c]) > VISIBLE_DIFFERENCE);
-            let (with, without) = (look.image.rgb.chunks(3), look.without.rgb.chunks(3));
-            assert_eq!(with.zip(without).filter(differs).count(), look.visible_px as usize);
-            assert_eq!((look.in_sight(), look.boxes.len()), (look.visible_px >= 100, 1));
-            assert_eq!(look, variation.unknown_look(number, 3).unwrap());
-            in_sight += usize::from(look.in_sight());
+            let (with, without) = (view.image.rgb.chunks(3), view.without.rgb.chunks(3));
+            assert_eq!(with.zip(without).filter(differs).count(), view.visible_px as usize);
+            assert_eq!((view.in_sight(), view.boxes.len()), (view.visible_px >= 100, 1));
+            assert_eq!(view, variation.unknown_view(number, 3).unwrap());
+            in_sight += usize::from(view.in_sight());
         }
     }
     assert!(in_sight > 0);
-    let error = scenario.unknown_look(0, 3).unwrap_err().to_string();
+    let error = scenario.unknown_view(0, 3).unwrap_err().to_string();
     assert!(error.contains("nothing is unknown"), "{error}");
 }
 

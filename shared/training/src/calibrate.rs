@@ -116,9 +116,9 @@ fn free_trials(context: Context, models: &Models, scenario: &Scenario) -> Result
             return Err(TrainingError::Stopped);
         }
         let pose = scenario.free_pose(number as u64, seed).map_err(|e| TrainingError::Unfit(e.to_string()))?;
-        for (branch, look) in pose.looks.iter().enumerate() {
-            if let Some(kind) = scenario.info().trial_kind(branch, pose.timestamp, look.observability) {
-                trials.extend(perception.trial((&pose.camera, &look.image), kind, trial_frame(number, branch)));
+        for (branch, view) in pose.views.iter().enumerate() {
+            if let Some(kind) = scenario.info().trial_kind(branch, pose.timestamp, view.observability) {
+                trials.extend(perception.trial((&pose.camera, &view.image), kind, trial_frame(number, branch)));
             }
         }
     }

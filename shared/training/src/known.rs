@@ -93,9 +93,9 @@ impl Work {
         let mut all = Vec::new();
         for number in 0..count {
             let pose = scenario.free_pose(number as u64, self.seed).map_err(|e| TrainingError::Unfit(e.to_string()))?;
-            for (branch, look) in pose.looks.iter().enumerate() {
+            for (branch, view) in pose.views.iter().enumerate() {
                 let Some(state) = scenario.info().state(branch, pose.timestamp) else { continue };
-                all.extend(self.compare(&pose.camera, &look.image, all.len()).map(|compared| (state, compared)));
+                all.extend(self.compare(&pose.camera, &view.image, all.len()).map(|compared| (state, compared)));
             }
             on_progress(&Progress { phase: "known", done: number + 1, total: count, line: String::new() });
         }

@@ -98,7 +98,7 @@ impl Training<'_> {
             ..CheckpointFigures::default()
         };
         let clouds = Clouds::new(posed, &posteriors[0])?;
-        let mut manifest = Manifest { places, ..new_manifest(context, clouds.states()) };
+        let mut manifest = Manifest { places, ..new_manifest(context, clouds.states())? };
         write_vae(config, &vae, self.out)?;
 
         // The mixture density network is trained before the field: it is quick, and needs only the posteriors.
@@ -197,7 +197,7 @@ impl Training<'_> {
             unseen: view_figures(context, &field, PoseRole::Unseen, Some(&mut strip)),
         };
         write_strip(context.run, "views.png", &strip)?;
-        let manifest = Manifest { field: Some(field.config().clone()), ..new_manifest(context, vec![only]) };
+        let manifest = Manifest { field: Some(field.config().clone()), ..new_manifest(context, vec![only])? };
         Ok((manifest, CheckpointFigures { views: Some(views), ..CheckpointFigures::default() }))
     }
 
@@ -236,9 +236,13 @@ fn save(mut manifest: Manifest, figures: &CheckpointFigures, out: &Path) -> Resu
 }
 
 /// Manifest of a checkpoint without trained models, except the states' latents.
-fn new_manifest(context: Context, states: Vec<Gaussian>) -> Manifest {
+fn new_manifest(context: Context, states: Vec<Gaussian>) -> Result<Manifest, TrainingError> {
     let Context { config, posed, .. } = context;
-    Manifest {
+    let training = serde_json::to_value(config).map_err(|e| TrainingError::Format {
+        path: config.out.join(files::MANIFEST),
+        what: format!("`training`: {e}"),
+    })?;
+    Ok(Manifest {
         format_version: FORMAT_VERSION,
         scenario: ScenarioIdentity::of(&posed.scenario, posed.dataset.view_count()),
         step_s: posed.scenario.step_s,
@@ -255,9 +259,9 @@ fn new_manifest(context: Context, states: Vec<Gaussian>) -> Manifest {
         states,
         places: Vec::new(),
         probing: None,
-        training: serde_json::to_value(config).unwrap_or(Value::Null),
+        training,
         metrics: Value::Null,
-    }
+    })
 }
 
 /// Accuracy of probed samples on the unoccluded views of one role.

@@ -11,7 +11,7 @@ use iceoryx2::service::static_config::publish_subscribe::StaticConfig;
 use std::collections::BTreeMap;
 
 /// A process that has joined the run.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Member {
     /// Name under which it joined.
     pub name: String,
@@ -42,9 +42,12 @@ pub struct Ports {
 type Members = BTreeMap<u128, Member>;
 
 impl Node {
-    /// Returns the living processes of the run, including this one.
+    /// Returns the living processes of the run by name, including this one. A process is one member per name.
     pub fn members(&self) -> Result<Vec<Member>, OpenError> {
-        Ok(self.members_by_id()?.into_values().collect())
+        let mut members: Vec<Member> = self.members_by_id()?.into_values().collect();
+        members.sort();
+        members.dedup();
+        Ok(members)
     }
 
     fn members_by_id(&self) -> Result<Members, OpenError> {

@@ -2,7 +2,7 @@
 //!
 //! `carff-messages` defines the messages; the stages process them.
 //!
-//! A process opens one [`Node`] in a [`Run`]. Every topic is one row of the table in [`topics`]. Sending stamps the
+//! A process opens one [`Node`] in a [`Run`], for each thread that sends or receives. Every topic is one row of the table in [`topics`]. Sending stamps the
 //! header and wakes the receivers that wait. Receiving drops and counts invalid messages, and gives access to valid
 //! ones in the sender's memory. A [`Waiter`] sleeps until one of several inputs has a message, a time, or a stop.
 //!
@@ -76,5 +76,6 @@ pub fn monotonic_now_ns() -> u64 {
     now.tv_sec as u64 * 1_000_000_000 + now.tv_nsec as u64
 }
 
-/// The variant of iceoryx2 in use: between processes, with ports that several threads can use.
-pub(crate) type Service = iceoryx2::prelude::ipc_threadsafe::Service;
+/// The variant of iceoryx2 in use: between processes, with nodes and ports that belong to one thread. The mutexes of the
+/// other variant take a quarter of a message's time.
+pub(crate) type Service = iceoryx2::prelude::ipc::Service;

@@ -18,7 +18,7 @@ use std::os::unix::fs::{DirBuilderExt, MetadataExt, PermissionsExt};
 use std::path::Path;
 use std::sync::Arc;
 
-/// A process's membership in a run. Open one per process; all its ports share its [`Counters`].
+/// A process's membership in a run. It and its ports belong to one thread; all its ports share its [`Counters`].
 #[derive(Debug)]
 pub struct Node {
     inner: iceoryx2::node::Node<Service>,

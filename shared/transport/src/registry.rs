@@ -1,9 +1,7 @@
 //! Topics with a payload type that is only known at run time: for probes, recordings and links.
 
 use crate::payload::Payload;
-use crate::{
-    Input, Limits, Node, OpenError, Ports, Publisher, ReceiveError, Receiver, Sample, SendError, Topic, topics,
-};
+use crate::{Input, Limits, Node, OpenError, Ports, Publisher, ReceiveError, Receiver, Sample, SendError, Topic};
 use carff_messages::Stage;
 use carff_messages::forms::{AnyMessage, FormError, OwnedMessage, Readable, read, schema};
 use carff_messages::layout::{Described, Layout};
@@ -53,7 +51,7 @@ pub trait AnyTopic: fmt::Debug + Sync {
 }
 
 /// A publisher for a topic of any payload.
-pub trait AnyPublisher: fmt::Debug + Send {
+pub trait AnyPublisher: fmt::Debug {
     /// Returns the size of the largest image that it can send, bytes.
     fn max_bytes(&self) -> usize;
 
@@ -65,7 +63,7 @@ pub trait AnyPublisher: fmt::Debug + Send {
 }
 
 /// A receiver for a topic of any payload.
-pub trait AnyReceiver: Input + fmt::Debug + Send {
+pub trait AnyReceiver: Input + fmt::Debug {
     /// Returns the oldest waiting valid message.
     fn next(&mut self) -> Result<Option<Box<dyn Received>>, ReceiveError>;
 
@@ -203,46 +201,15 @@ fn all_names() -> String {
 }
 
 impl TopicId {
-    /// `camera/frame`.
-    pub const FRAME: Self = Self { index: 0, topic: &topics::FRAME };
-    /// `encoder/posterior`.
-    pub const POSTERIOR: Self = Self { index: 1, topic: &topics::POSTERIOR };
-    /// `encoder/check`.
-    pub const CHECK: Self = Self { index: 2, topic: &topics::CHECK };
-    /// `forecaster/forecast`.
-    pub const FORECAST: Self = Self { index: 3, topic: &topics::FORECAST };
-    /// `prober/belief`.
-    pub const BELIEF: Self = Self { index: 4, topic: &topics::BELIEF };
-    /// `prober/unknown`.
-    pub const UNKNOWN: Self = Self { index: 5, topic: &topics::UNKNOWN };
-    /// `prober/occupancy`.
-    pub const OCCUPANCY: Self = Self { index: 6, topic: &topics::OCCUPANCY };
-    /// `renderer/view`.
-    pub const VIEW: Self = Self { index: 7, topic: &topics::VIEW };
-    /// `controller/action`.
-    pub const ACTION: Self = Self { index: 8, topic: &topics::ACTION };
-    /// The topics from the camera to the action, in the order of the data flow.
-    pub const FLOW: [Self; 9] = [
-        Self::FRAME,
-        Self::POSTERIOR,
-        Self::CHECK,
-        Self::FORECAST,
-        Self::BELIEF,
-        Self::UNKNOWN,
-        Self::OCCUPANCY,
-        Self::VIEW,
-        Self::ACTION,
-    ];
+    /// Returns the id of a topic in the graph's table.
+    pub(crate) const fn of_graph(index: usize, topic: &'static dyn AnyTopic) -> Self {
+        Self { index, topic }
+    }
 
     /// Returns the id of a user's own topic.
     pub fn of(topic: &'static dyn AnyTopic) -> Self {
         let known = Self::all().find(|known| known.name() == topic.name());
         known.unwrap_or(Self { index: usize::MAX, topic })
-    }
-
-    /// Returns the topic of a stage's heartbeats.
-    pub fn health(stage: Stage) -> Self {
-        Self { index: Self::FLOW.len() + stage.code() as usize - 1, topic: topics::health(stage) }
     }
 
     /// Returns all topics of the graph.
@@ -339,6 +306,7 @@ pub fn graph_bytes(frame_bytes: usize, view_bytes: usize) -> u64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::topics;
     use carff_messages::Posterior;
 
     /// Every name maps to its topic, also the last part of data topics; a misspelt name suggests the nearest one.

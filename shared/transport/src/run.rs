@@ -163,10 +163,13 @@ pub fn cleanup_dead(run: &Run) -> Result<u32, CleanupError> {
 
 /// Returns the living processes of a run.
 pub fn living_processes(run: &Run) -> Result<Vec<u32>, CleanupError> {
-    Ok(living_nodes(run)?.into_iter().map(|(_, pid)| pid).collect())
+    let mut living: Vec<u32> = living_nodes(run)?.into_iter().map(|(_, pid)| pid).collect();
+    living.dedup();
+    Ok(living)
 }
 
-/// Returns the living members of a run: the name under which each has joined, and its process.
+/// Returns the living members of a run in order of their process: the name under which each has joined, and its
+/// process. A process whose threads have nodes of one name is one member.
 pub fn living_nodes(run: &Run) -> Result<Vec<(String, u32)>, CleanupError> {
     crate::log::quiet();
     let failed = |cause: String| CleanupError::List { run: run.name.clone(), cause };
@@ -177,7 +180,10 @@ pub fn living_nodes(run: &Run) -> Result<Vec<(String, u32)>, CleanupError> {
         }
         _ => None,
     });
-    Ok(living.collect())
+    let mut living: Vec<_> = living.collect();
+    living.sort_by(|a, b| (a.1, &a.0).cmp(&(b.1, &b.0)));
+    living.dedup();
+    Ok(living)
 }
 
 /// Returns all nodes of a run, including dead ones; empty if its folder does not exist. iceoryx2 fails if a file or the

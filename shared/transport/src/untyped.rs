@@ -4,13 +4,12 @@
 
 use crate::in_use::OpenTopic;
 use crate::node::failed;
-use crate::payload::{Image, Loaned, Opened, Payload, Port, PublisherFactory, Received, Unopened};
+use crate::payload::{Loaned, Opened, Payload, Port, PublisherFactory, Received, Unopened};
+use crate::topics::of_known_payload;
 use crate::{AnyPublisher, AnyReceiver, AnyTopic, Limits, Node, OpenError, Ports, Receiver, Service, Topic, TopicId};
 use carff_messages::forms::{FormError, OwnedMessage, Readable};
 use carff_messages::layout::Layout;
-use carff_messages::{
-    Action, Belief, Forecast, FrameMeta, Header, Health, Invalid, Posterior, ViewMeta, ZeroCopySend, described, message,
-};
+use carff_messages::{Header, Invalid, ZeroCopySend, described, message};
 use iceoryx2::port::LoanError;
 use iceoryx2::port::subscriber::Subscriber;
 use iceoryx2::sample::Sample;
@@ -209,22 +208,12 @@ impl OpenTopic {
     /// Returns the topic. Of a message type that this program does not know, only the [`HeaderOnly`] is received. The
     /// description of a topic outside the graph remains in memory until the process ends.
     pub fn id(&self) -> TopicId {
-        TopicId::all().find(|topic| topic.name() == self.name).unwrap_or_else(|| TopicId::of(self.of_known_type()))
-    }
-
-    fn of_known_type(&self) -> &'static dyn AnyTopic {
-        self.typed::<Image<FrameMeta>>()
-            .or_else(|| self.typed::<Image<ViewMeta>>())
-            .or_else(|| self.typed::<Posterior>())
-            .or_else(|| self.typed::<Forecast>())
-            .or_else(|| self.typed::<Belief>())
-            .or_else(|| self.typed::<Action>())
-            .or_else(|| self.typed::<Health>())
-            .unwrap_or_else(|| self.untyped())
+        let known = || of_known_payload(self).unwrap_or_else(|| self.untyped());
+        TopicId::all().find(|topic| topic.name() == self.name).unwrap_or_else(|| TopicId::of(known()))
     }
 
     /// Returns the topic if its payload is of this type.
-    fn typed<P: Payload>(&self) -> Option<&'static dyn AnyTopic>
+    pub(crate) fn typed<P: Payload>(&self) -> Option<&'static dyn AnyTopic>
     where
         P::Message: Readable,
     {

@@ -2,13 +2,11 @@
 
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
-mod common;
-
+use crate::common::{TestRun, frame, in_seconds, posterior};
 use carff_messages::Message;
 use carff_transport::{
     Node, OpenError, Run, SendError, Stop, Waiter, Woken, living_processes, monotonic_now_ns, topics,
 };
-use common::{TestRun, frame, in_seconds, posterior};
 
 /// The newest message wins: of three messages the last is received, and two are counted as skipped.
 #[test]
@@ -187,20 +185,24 @@ fn polled_receivers_need_no_wake_up() {
     let node = Node::open(&run.0, "test").unwrap();
     let mut polled = node.receiver(&topics::POSTERIOR).unwrap().polled();
     let mut woken = node.receiver(&topics::POSTERIOR).unwrap();
-    let mut output = node.publisher(&topics::POSTERIOR).unwrap();
     let stop = Stop::new().unwrap();
     let waiter = Waiter::new(stop.clone());
     assert_eq!(waiter.wait_until(&[&polled], monotonic_now_ns() + 1_000_000).unwrap(), Woken::Timeout);
+    let theirs = run.0.clone();
+    let (all_read, wait_for_reads) = std::sync::mpsc::channel::<()>();
     let sender = std::thread::spawn(move || {
+        let node = Node::open(&theirs, "sender").unwrap();
+        let mut output = node.publisher(&topics::POSTERIOR).unwrap();
         std::thread::sleep(std::time::Duration::from_millis(20));
         output.send(posterior(5)).unwrap();
-        output
+        let _ = wait_for_reads.recv();
     });
     assert_eq!(waiter.wait_until(&[&polled], in_seconds(30)).unwrap(), Woken::Input);
     assert_eq!(polled.next().unwrap().unwrap().header.frame_id, 5);
     assert_eq!(waiter.wait_until(&[&woken], in_seconds(30)).unwrap(), Woken::Input);
     assert_eq!(woken.next().unwrap().unwrap().header.frame_id, 5);
-    drop(sender.join().unwrap());
+    drop(all_read);
+    sender.join().unwrap();
     stop.stop();
     assert_eq!(waiter.wait(&[&polled]).unwrap(), Woken::Stopped);
 }

@@ -2,10 +2,10 @@
 
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
-mod common;
+use crate::common;
 
+use crate::common::{Role, TestRun, frame, in_seconds, posterior};
 use carff_transport::{Node, Stop, Waiter, Woken, cleanup_dead, topics};
-use common::{Role, TestRun, frame, in_seconds, posterior};
 use std::io::{BufRead, BufReader, Write};
 
 const SIDE: u32 = 32;

@@ -2,11 +2,9 @@
 
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
-mod common;
-
+use crate::common::{TestRun, frame, posterior};
 use carff_messages::{FrameMeta, Header, ImageMeta, Invalid, Posterior, ZeroCopySend, message};
 use carff_transport::{HeaderOnly, Image, Limits, Node, OpenTopic, Topic, TopicId, monotonic_now_ns, topics};
-use common::{TestRun, frame, posterior};
 
 /// A message that no program of this workspace knows.
 #[repr(C)]

@@ -8,7 +8,7 @@ use carff_evaluation::{
     DecisiveImage, MaskedView, Novelty, OtherPlace, Perception, Progress, Subject, Watch, WatchPlan,
 };
 use carff_scenes::config::{BystanderPlace, VariationRole};
-use carff_scenes::{Detail, FreePose, RenderOptions, Scenario, UnknownLook};
+use carff_scenes::{Detail, FreePose, RenderOptions, Scenario, UnknownView};
 use ndarray::Axis;
 use std::path::PathBuf;
 
@@ -110,11 +110,11 @@ pub fn novelties(scenario: &Scenario, count: u32, seed: u64, display: &Display) 
     let total = scenario.appearances().len() + scenario.bystanders().len();
     let of_variation = |(done, varied): (usize, anyhow::Result<(Scenario, &String, VariationRole, bool)>)| {
         let (varied, name, role, beside) = varied?;
-        display.show(&Progress { phase: "unknown looks", done, total, line: name.clone() });
+        display.show(&Progress { phase: "unknown objects", done, total, line: name.clone() });
         // A vehicle of a hazard branch is absent at some time steps.
-        let looks = (0..u64::from(count)).filter_map(|number| varied.unknown_look(number, seed).ok());
-        let looks = looks.filter(UnknownLook::in_sight).collect();
-        Ok(Novelty { name: name.clone(), held_out: held_out(role), beside, looks })
+        let views = (0..u64::from(count)).filter_map(|number| varied.unknown_view(number, seed).ok());
+        let views = views.filter(UnknownView::in_sight).collect();
+        Ok(Novelty { name: name.clone(), held_out: held_out(role), beside, views })
     };
     vehicles.chain(objects).enumerate().map(of_variation).collect()
 }
@@ -127,7 +127,7 @@ pub fn other_places(
     seed: u64,
     display: &Display,
 ) -> anyhow::Result<Vec<OtherPlace>> {
-    let first = |pose: &FreePose| pose.looks.first().map(|look| (pose.camera, look.image.clone()));
+    let first = |pose: &FreePose| pose.views.first().map(|view| (pose.camera, view.image.clone()));
     let mut places = Vec::new();
     for path in scenario_files(scenario)? {
         let other = Scenario::load(&path)?;

@@ -3,9 +3,9 @@
 mod images;
 
 use crate::train::Display;
-use anyhow::{Context, bail};
+use anyhow::bail;
 use carff_base::files::check_writable;
-use carff_checkpoint::Manifest;
+use carff_checkpoint::{Manifest, TrainedWith};
 use carff_evaluation::{EvalOptions, Subject, Table, evaluate};
 use carff_launch::dataset::render;
 use carff_launch::lab::{EvalArgs, TableName};
@@ -44,7 +44,7 @@ pub fn run(args: &EvalArgs) -> anyhow::Result<ExitCode> {
     let manifest = Manifest::load(&args.checkpoint)?;
     let dataset = match &args.dataset {
         Some(dataset) => dataset.clone(),
-        None => trained_on(&manifest)?,
+        None => trained_on(&manifest.trained_with(&args.checkpoint)?)?,
     };
     let display = Display::default();
     let mut subject = Subject::load(&args.checkpoint, &dataset, options, &|p| display.show(p))?;
@@ -98,14 +98,13 @@ pub fn options(device: &str, threads: u16, seed: u64) -> anyhow::Result<EvalOpti
 }
 
 /// Training dataset of a checkpoint, rendered when it is missing and its scenario file is available.
-fn trained_on(manifest: &Manifest) -> anyhow::Result<PathBuf> {
-    let path = |key: &str| manifest.training.get(key).and_then(|v| v.as_str()).map(PathBuf::from);
-    let dataset = path("dataset").context("the checkpoint has no training dataset: name a dataset with --dataset")?;
+fn trained_on(trained: &TrainedWith) -> anyhow::Result<PathBuf> {
+    let dataset = trained.dataset.clone();
     let there = ["transforms.json", "transforms_train.json"].iter().any(|f| dataset.join(f).is_file());
     if !there {
-        match path("scenario").filter(|scenario| scenario.is_file()) {
+        match trained.scenario.as_ref().filter(|scenario| scenario.is_file()) {
             Some(scenario) => {
-                render(&Scenario::load(&scenario)?, &dataset, Extras::None)?;
+                render(&Scenario::load(scenario)?, &dataset, Extras::None)?;
             }
             None => bail!("no dataset in {}: name a dataset with --dataset", dataset.display()),
         }
@@ -115,8 +114,7 @@ fn trained_on(manifest: &Manifest) -> anyhow::Result<PathBuf> {
 
 /// Scenario from which the dataset was rendered: that of the checkpoint, when its cameras are those of the dataset.
 fn shown_scenario(subject: &Subject) -> Option<Scenario> {
-    let path = subject.manifest.training.get("scenario").and_then(|v| v.as_str()).map(PathBuf::from)?;
-    let scenario = Scenario::load(&path).ok()?;
+    let scenario = Scenario::load(subject.trained.scenario.as_ref()?).ok()?;
     let dataset = &subject.posed.dataset;
     let same_place = |view: usize, there: &carff_scenes::ScenarioCamera| {
         let frame = dataset.frame_index(0, view).and_then(|i| dataset.frames().get(i));

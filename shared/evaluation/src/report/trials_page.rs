@@ -5,7 +5,7 @@ use super::{
     Results,
     markdown::{head, percent, row},
 };
-use crate::trials::looks::{TrialFigures, kind_names};
+use crate::trials::views::{TrialFigures, kind_names};
 use std::fmt::Write;
 
 /// Writes the trials of six kinds with their baselines.

@@ -27,24 +27,24 @@ pub fn unknown_objects(subject: &Subject, path: &Path) -> Result<bool, Evaluatio
     let mut rows = Vec::new();
     // The first pose that has each in sight, with any result.
     let in_sight: Vec<usize> =
-        (0..subject.novelties.len()).filter(|&i| !subject.novelties[i].looks.is_empty()).collect();
+        (0..subject.novelties.len()).filter(|&i| !subject.novelties[i].views.is_empty()).collect();
     for index in spread(&in_sight, ROWS) {
         let novelty = &subject.novelties[index];
-        let Some(look) = novelty.looks.first() else { continue };
-        let Some(compared) = known.compare(&look.camera, &look.image) else { continue };
+        let Some(view) = novelty.views.first() else { continue };
+        let Some(compared) = known.compare(&view.camera, &view.image) else { continue };
         let evidence = ImageEvidence::new(&compared.seen.ratios);
         let unknown = evidence.unknown_probability(probe.layout().hazard_states());
         let place = if novelty.beside { "next to the road" } else { "on the road" };
         let boxes = compared.seen.boxes.len();
         let image = StripCell {
             emphasis: carff_decision::is_likely(unknown).then_some(UNKNOWN),
-            ..StripCell::new(with_boxes(&look.image, &look.camera, &compared), &[format!("unknown {unknown:.2}")])
+            ..StripCell::new(with_boxes(&view.image, &view.camera, &compared), &[format!("unknown {unknown:.2}")])
         };
         let best = subject.state_name(compared.best);
         let cells = vec![
             image,
-            StripCell::new(enlarged(&rendered(&compared), &look.image), &["best state".into(), best]),
-            StripCell::new(enlarged(&residual(&compared), &look.image), &["residual".into(), format!("{boxes} boxes")]),
+            StripCell::new(enlarged(&rendered(&compared), &view.image), &["best state".into(), best]),
+            StripCell::new(enlarged(&residual(&compared), &view.image), &["residual".into(), format!("{boxes} boxes")]),
         ];
         rows.push(StripRow { caption: vec![novelty.name.clone(), place.to_owned()], cells });
     }

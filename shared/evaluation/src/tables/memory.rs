@@ -1,7 +1,7 @@
 //! The belief with and without memory, on drives whose camera pans.
 
 use crate::trials::{
-    looks::SUREST,
+    views::SUREST,
     watches::{Watch, Watched},
 };
 use crate::{Progress, Subject};

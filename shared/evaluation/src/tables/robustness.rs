@@ -1,6 +1,6 @@
 //! Decisions on images that no training has seen: corrupted ones, unknown vehicles and objects, other places.
 
-use crate::trials::looks::{Look, free_looks};
+use crate::trials::views::{TrialView, free_views};
 use crate::{Progress, Subject};
 use carff_base::geometry::PinholeCamera;
 use carff_base::random::Key;
@@ -129,9 +129,9 @@ pub fn robustness(subject: &Subject, on_progress: &dyn Fn(&Progress)) -> Result<
     let judge = Judge { subject, known, policy: Policy::new(Rule::Calibrated, threshold) };
     let mut table = Robustness::default();
     for novelty in &subject.novelties {
-        let shots = novelty.looks.iter().enumerate().map(|(i, look)| Shot {
-            image: look.image.clone(),
-            camera: &look.camera,
+        let shots = novelty.views.iter().enumerate().map(|(i, view)| Shot {
+            image: view.image.clone(),
+            camera: &view.camera,
             frame: FIRST + i as u64,
         });
         let verdicts = judge.verdicts(&shots.collect::<Vec<_>>())?;
@@ -163,13 +163,13 @@ pub fn robustness(subject: &Subject, on_progress: &dyn Fn(&Progress)) -> Result<
         table.other_places.insert(other.name.clone(), figures);
     }
     table.bound = judge.bound()?;
-    let looks = free_looks(&subject.free_poses, &subject.posed.scenario);
+    let views = free_views(&subject.free_poses, &subject.posed.scenario);
     let mut cells: Vec<(Option<Corruption>, u8)> = vec![(None, 0)];
     cells.extend(Corruption::ALL.into_iter().flat_map(|c| c.severities().map(move |s| (Some(c), s))));
     let total = cells.len();
     for (done, (corruption, severity)) in cells.into_iter().enumerate() {
         let name = corruption.map_or("clean", Corruption::name);
-        let figures = judge.corrupted(&looks, corruption, severity)?;
+        let figures = judge.corrupted(&views, corruption, severity)?;
         table.corruptions.entry(name.to_owned()).or_default().insert(severity, figures);
         on_progress(&Progress { phase: "corruptions", done: done + 1, total, line: name.to_owned() });
     }
@@ -209,23 +209,23 @@ impl Judge<'_> {
 
     fn corrupted(
         &self,
-        looks: &[Look],
+        views: &[TrialView],
         corruption: Option<Corruption>,
         severity: u8,
     ) -> Result<CorruptionFigures, String> {
-        let counts = |look: &&Look| look.hazard || look.kind == "clear_visible";
+        let counts = |view: &&TrialView| view.hazard || view.kind == "clear_visible";
         let mut shots = Vec::new();
-        for look in looks.iter().filter(counts) {
-            let key = Key::named("corr", self.subject.options.seed, look.frame);
+        for view in views.iter().filter(counts) {
+            let key = Key::named("corr", self.subject.options.seed, view.frame);
             let image = match corruption {
-                Some(corruption) => corruption.apply(look.image, severity, key).map_err(|e| e.to_string())?,
-                None => look.image.clone(),
+                Some(corruption) => corruption.apply(view.image, severity, key).map_err(|e| e.to_string())?,
+                None => view.image.clone(),
             };
-            shots.push(Shot { image, camera: look.camera, frame: FIRST + look.frame });
+            shots.push(Shot { image, camera: view.camera, frame: FIRST + view.frame });
         }
         let mut figures = CorruptionFigures::default();
-        for (look, verdict) in looks.iter().filter(counts).zip(self.verdicts(&shots)?) {
-            if look.hazard {
+        for (view, verdict) in views.iter().filter(counts).zip(self.verdicts(&shots)?) {
+            if view.hazard {
                 figures.hazard_trials += 1;
                 figures.r#unsafe += usize::from(verdict.advances);
             } else {

@@ -2,7 +2,7 @@
 
 use crate::trials::{
     baselines::{ReadOut, nearest_neighbour},
-    looks::{Answer, ByTrialKind, Look, figures, free_looks, looks_of_role, taken},
+    views::{Answer, ByTrialKind, TrialView, figures, free_views, taken, views_of_role},
 };
 use crate::{Progress, Subject};
 use carff_dataset::PoseRole;
@@ -50,28 +50,28 @@ pub fn trials(subject: &Subject, on_progress: &dyn Fn(&Progress)) -> Result<Tria
     let threshold = subject.threshold.ok_or("the checkpoint has no threshold")?;
     let planner = subject.planner(Sampling::Stratified)?;
     let posed = &subject.posed;
-    let mut parts: Vec<(&str, Vec<Look>)> =
-        PARTS.into_iter().map(|(name, role)| (name, looks_of_role(posed, role))).collect();
-    parts.push(("free", free_looks(&subject.free_poses, &posed.scenario)));
-    parts.retain(|(_, looks)| !looks.is_empty());
+    let mut parts: Vec<(&str, Vec<TrialView>)> =
+        PARTS.into_iter().map(|(name, role)| (name, views_of_role(posed, role))).collect();
+    parts.push(("free", free_views(&subject.free_poses, &posed.scenario)));
+    parts.retain(|(_, views)| !views.is_empty());
     let read_out = ReadOut::fit(posed, &subject.posteriors);
     let read_out_threshold = read_out_threshold(subject, &read_out).unwrap_or(threshold);
     let (mut own, mut baselines) = (ByPart::new(), BTreeMap::<String, Baseline>::new());
     let total = parts.len();
-    for (done, (part, looks)) in parts.into_iter().enumerate() {
+    for (done, (part, views)) in parts.into_iter().enumerate() {
         on_progress(&Progress { phase: "trials", done, total, line: part.to_owned() });
-        let taken = taken(&subject.perception(), &looks);
+        let taken = taken(&subject.perception(), &views);
         let evidence = planner.evidence(&taken, SAMPLES);
         let by_rule = |rule| by_rule(&evidence, Policy::new(rule, threshold));
-        own.insert(part.to_owned(), figures(&looks, &by_rule(Rule::Calibrated)));
-        let constant = |p: f64| looks.iter().map(|_| Answer::at(p, 0.5)).collect::<Vec<_>>();
+        own.insert(part.to_owned(), figures(&views, &by_rule(Rule::Calibrated)));
+        let constant = |p: f64| views.iter().map(|_| Answer::at(p, 0.5)).collect::<Vec<_>>();
         let at = |threshold: f64, p: Vec<f64>| p.into_iter().map(|p| Answer::at(p, threshold)).collect::<Vec<_>>();
-        let exact = looks.iter().map(|look| look.exact).collect();
+        let exact = views.iter().map(|view| view.exact).collect();
         let of_posterior = |trial: &Trial| read_out.hazard_probability(&trial.posterior);
         let answers = [
             constant(1.0),
             constant(0.0),
-            at(0.5, nearest_neighbour(posed, &looks, part == "rest")),
+            at(0.5, nearest_neighbour(posed, &views, part == "rest")),
             at(read_out_threshold, taken.iter().map(of_posterior).collect()),
             by_rule(Rule::Paper),
             at(threshold, exact),
@@ -79,7 +79,7 @@ pub fn trials(subject: &Subject, on_progress: &dyn Fn(&Progress)) -> Result<Tria
         for ((name, about), answers) in BASELINES.into_iter().zip(answers) {
             let baseline = baselines.entry(name.to_owned()).or_default();
             about.clone_into(&mut baseline.about);
-            baseline.trials.insert(part.to_owned(), figures(&looks, &answers));
+            baseline.trials.insert(part.to_owned(), figures(&views, &answers));
         }
     }
     Ok((own, baselines))
@@ -95,15 +95,15 @@ fn by_rule(evidence: &[Evidence], policy: Policy) -> Vec<Answer> {
 
 /// Threshold of the read-out, chosen like that of the calibrated rule on the calibration poses.
 fn read_out_threshold(subject: &Subject, read_out: &ReadOut) -> Option<f64> {
-    let looks = looks_of_role(&subject.posed, PoseRole::Calibration);
-    let taken = taken(&subject.perception(), &looks);
-    let trials: Vec<CalibrationTrial> = looks
+    let views = views_of_role(&subject.posed, PoseRole::Calibration);
+    let taken = taken(&subject.perception(), &views);
+    let trials: Vec<CalibrationTrial> = views
         .iter()
         .zip(&taken)
-        .filter(|(look, _)| matches!(look.kind, "hazard_hidden" | "clear_visible"))
-        .map(|(look, trial)| CalibrationTrial {
+        .filter(|(view, _)| matches!(view.kind, "hazard_hidden" | "clear_visible"))
+        .map(|(view, trial)| CalibrationTrial {
             hazard_probability: read_out.hazard_probability(&trial.posterior),
-            halt_is_right: look.hazard,
+            halt_is_right: view.hazard,
         })
         .collect();
     choose_threshold(&trials)

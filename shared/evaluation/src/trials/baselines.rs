@@ -1,6 +1,6 @@
 //! Baselines of the trials: observers that use less than the whole system, or know more.
 
-use super::looks::Look;
+use super::views::TrialView;
 use crate::PosedImages;
 use carff_dataset::Image;
 use carff_messages::{Gaussian, LATENT_DIM};
@@ -27,9 +27,9 @@ fn thumbnail(image: &Image) -> Vec<f32> {
     sums.iter().enumerate().map(|(i, sum)| sum / counts[i / 3].max(1.0)).collect()
 }
 
-/// Hazard probability (0 or 1) of each look: that of the nearest image of trained poses by thumbnail. With
-/// `leave_out`, images of the look's own pose are left out.
-pub fn nearest_neighbour(posed: &PosedImages, looks: &[Look], leave_out: bool) -> Vec<f64> {
+/// Hazard probability (0 or 1) of each view: that of the nearest image of trained poses by thumbnail. With
+/// `leave_out`, images of the view's own pose are left out.
+pub fn nearest_neighbour(posed: &PosedImages, views: &[TrialView], leave_out: bool) -> Vec<f64> {
     let scenario = &posed.scenario;
     let known: Vec<(usize, bool, Vec<f32>)> = posed
         .trained()
@@ -41,11 +41,11 @@ pub fn nearest_neighbour(posed: &PosedImages, looks: &[Look], leave_out: bool) -
         })
         .collect();
     let distance = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum::<f32>();
-    looks
+    views
         .iter()
-        .map(|look| {
-            let own = thumbnail(look.image);
-            let others = known.iter().filter(|(view, ..)| !leave_out || *view != look.pose);
+        .map(|view| {
+            let own = thumbnail(view.image);
+            let others = known.iter().filter(|(pose, ..)| !leave_out || *pose != view.pose);
             let nearest = others.min_by(|a, b| distance(&a.2, &own).total_cmp(&distance(&b.2, &own)));
             nearest.map_or(0.5, |&(_, hazard, _)| f64::from(u8::from(hazard)))
         })

@@ -1,7 +1,7 @@
 //! Trials with known answers: images, baselines and watches. `carff_trials` computes with them.
 
 pub mod baselines;
-pub mod looks;
+pub mod views;
 pub mod watches;
 
 use carff_checkpoint::{CheckpointError, FieldProbe, Manifest};

@@ -119,7 +119,7 @@ mod tests {
     use super::*;
     use carff_dataset::StateInfo;
 
-    /// Two branches of three time steps: a hazard that was in sight stays certain when it is hidden, and a look by itself
+    /// Two branches of three time steps: a hazard that was in sight stays certain when it is hidden, and a view by itself
     /// does not.
     #[test]
     fn exact_memory_keeps_what_was_seen() {

@@ -19,8 +19,6 @@ use std::path::Path;
 
 /// Name of the file in a checkpoint. The stages do not read it; it is for other tools.
 pub const FILE: &str = "encoder.onnx";
-/// Range of log-variances, as in training.
-const LOG_VARIANCE_RANGE: (f32, f32) = (-8.0, 4.0);
 const LATENT: i64 = LATENT_DIM as i64;
 
 /// Returns the encoder of a checkpoint as the bytes of an ONNX file. Equal weights give equal bytes.
@@ -114,7 +112,7 @@ impl Head<'_> {
         let x = graph.node("Relu", &[&x], Vec::new());
         let mean = self.linear(graph, &x, "head.mean", hidden, LATENT)?;
         let log_variance = self.linear(graph, &x, "head.log_variance", hidden, LATENT)?;
-        let (low, high) = LOG_VARIANCE_RANGE;
+        let (low, high) = EncoderConfig::LOG_VARIANCES;
         Ok((mean, graph.clip(&log_variance, low, high)))
     }
 

@@ -3,7 +3,8 @@
 use super::{ActionForm, BeliefForm, ForecastForm, FormError, FrameForm, OccupancyForm, UnknownsForm, ViewForm};
 use crate::layout::Described;
 use crate::{
-    Action, Belief, Forecast, FrameMeta, Header, Health, ImageCheck, Message, Occupancy, Posterior, Unknowns, ViewMeta,
+    Action, Belief, EgoMotion, EgoPose, Forecast, FrameMeta, Header, Health, ImageCheck, LookGain, Message, Occupancy,
+    Posterior, Unknowns, ViewMeta,
 };
 use schemars::JsonSchema;
 use serde::Serialize;
@@ -66,6 +67,9 @@ plain! {
     Posterior = "carff.Posterior";
     Health = "carff.Health";
     ImageCheck = "carff.ImageCheck";
+    EgoPose = "carff.EgoPose";
+    EgoMotion = "carff.EgoMotion";
+    LookGain = "carff.LookGain";
 }
 
 readable! {

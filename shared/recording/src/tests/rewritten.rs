@@ -240,3 +240,31 @@ fn older_recordings_are_read() {
     write(&path, &messages, WriteOptions::new(), Place::First);
     assert!(matches(&read(&path).0, 0..FRAMES));
 }
+
+/// A recording with another version of the messages is refused with both versions and the remedy, for messages by
+/// themselves and for images.
+#[test]
+fn other_versions_are_named() {
+    let folder = tempfile::tempdir().unwrap();
+    let original = recording(folder.path());
+    for channel in ["prober/belief", "camera/frame"] {
+        let mut messages = copied(&original);
+        for (.., data) in messages.iter_mut().filter(|m| m.0 == channel) {
+            let mut form: serde_json::Value = serde_json::from_slice(data).unwrap();
+            form["header"]["schema_version"] = 2.into();
+            *data = serde_json::to_vec(&form).unwrap();
+        }
+        let path = folder.path().join("old.mcap");
+        write(&path, &messages, WriteOptions::new(), Place::First);
+        for mut reader in [Reader::open(&path).unwrap(), Reader::open(&path).unwrap().without_images()] {
+            let error = loop {
+                match reader.next() {
+                    Ok(entry) => assert!(entry.is_some(), "no error"),
+                    Err(error) => break error.to_string(),
+                }
+            };
+            assert!(error.contains(channel) && error.contains("version 2 of the messages"), "{error}");
+            assert!(error.contains("reads version 3") && error.contains("the version of carff"), "{error}");
+        }
+    }
+}

@@ -1,4 +1,4 @@
-//! Variations of a scenario: other looks of the dynamic vehicle, and objects that its datasets do not contain.
+//! Variations of a scenario: other views of the dynamic vehicle, and objects that its datasets do not contain.
 
 use super::{Colour, VehicleKind, colour, heading, point3, size3};
 use schemars::JsonSchema;

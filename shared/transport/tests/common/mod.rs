@@ -53,7 +53,7 @@ pub struct Role(pub Child);
 impl Role {
     pub fn start(role: &str, run: &Run) -> Self {
         let child = Command::new(std::env::current_exe().unwrap())
-            .args(["--exact", "role", "--nocapture", "--test-threads=1"])
+            .args(["--exact", "processes::role", "--nocapture", "--test-threads=1"])
             .env("CARFF_TEST_ROLE", role)
             .env("CARFF_TEST_RUN", run.name())
             .stdin(Stdio::piped())

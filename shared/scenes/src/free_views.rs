@@ -1,6 +1,6 @@
-//! Free looks: images of every branch at one time step, from one camera pose that is not in any dataset.
+//! Free views: images of every branch at one time step, from one camera pose that is not in any dataset.
 //!
-//! Every pose gives one look at each branch, so that the pose does not reveal the branch. Each look has the states that
+//! Every pose gives one view at each branch, so that the pose does not reveal the branch. Each view has the states that
 //! look the same from its pose: with equally probable states, they are the exact posterior of an observer that knows
 //! the scenario and the pose.
 
@@ -15,7 +15,7 @@ use carff_dataset::{Image, Observability, looks_same};
 /// Name of the random stream.
 const STREAM: u32 = Key::named("look", 0, 0).step;
 
-/// A camera pose at one time step, with one look at each branch.
+/// A camera pose at one time step, with one view at each branch.
 #[derive(Clone, Debug, PartialEq)]
 pub struct FreePose {
     /// Kind of the camera's group.
@@ -25,17 +25,17 @@ pub struct FreePose {
     /// Pose and intrinsics.
     pub camera: PinholeCamera,
     /// One look at each branch, in their order.
-    pub looks: Vec<FreeLook>,
+    pub views: Vec<FreeView>,
 }
 
 /// The image of one branch.
 #[derive(Clone, Debug, PartialEq)]
-pub struct FreeLook {
+pub struct FreeView {
     /// The image, without sensor noise.
     pub image: Image,
     /// Visibility of the actor or of its place; `None` if nothing in the scenario is dynamic.
     pub observability: Option<Observability>,
-    /// States that look the same from this pose, including the look's own.
+    /// States that look the same from this pose, including the view's own.
     pub alike: Vec<usize>,
 }
 
@@ -49,15 +49,15 @@ impl Scenario {
     /// # fn main() -> Result<(), carff_scenes::ScenarioError> {
     /// let scenario = Scenario::load("configs/scenarios/approaching-intersection.toml".as_ref())?;
     /// let pose = scenario.free_pose(0, 1)?;
-    /// assert_eq!(pose.looks.len(), scenario.info().branches.len());
+    /// assert_eq!(pose.views.len(), scenario.info().branches.len());
     /// # Ok(())
     /// # }
     /// ```
     pub fn free_pose(&self, number: u64, seed: u64) -> Result<FreePose, ScenarioError> {
         let (drive, timestamp) = self.free_course(number, seed)?;
         let (camera, _) = self.free_view(&drive, timestamp);
-        let looks = self.looks(&drive, timestamp, &camera);
-        Ok(FreePose { view_kind: drive.view_kind().to_owned(), timestamp, camera, looks })
+        let views = self.views(&drive, timestamp, &camera);
+        Ok(FreePose { view_kind: drive.view_kind().to_owned(), timestamp, camera, views })
     }
 
     /// Draws pose `number` as a drive through the first branch, with the time step of its looks.
@@ -76,20 +76,20 @@ impl Scenario {
         Err(ScenarioError::NoPose { path: self.path().to_owned(), tries: MAX_TRIES })
     }
 
-    fn looks(&self, drive: &FreeDrive, timestamp: usize, camera: &PinholeCamera) -> Vec<FreeLook> {
+    fn views(&self, drive: &FreeDrive, timestamp: usize, camera: &PinholeCamera) -> Vec<FreeView> {
         let info = self.info();
         let placement = |branch, t| self.free_view(&drive.through(branch), t).1;
         let images: Vec<Image> = (0..info.state_count())
             .map(|state| self.picture_of(&placement(info.branch_of(state), info.timestamp_of(state)), camera))
             .collect();
-        let look = |branch: usize| {
+        let view = |branch: usize| {
             let own = &images[info.state(branch, timestamp)?];
-            Some(FreeLook {
+            Some(FreeView {
                 image: own.clone(),
                 observability: self.free_observability(&placement(branch, timestamp), timestamp, camera),
                 alike: (0..images.len()).filter(|&state| looks_same(own, &images[state])).collect(),
             })
         };
-        (0..info.branches.len()).filter_map(look).collect()
+        (0..info.branches.len()).filter_map(view).collect()
     }
 }

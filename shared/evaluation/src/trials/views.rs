@@ -1,4 +1,4 @@
-//! Looks: images with a hazard or without, from poses that give both, and their six kinds.
+//! Views: images with a hazard or without, from poses that give both, and their six kinds.
 
 use crate::PosedImages;
 use carff_base::geometry::PinholeCamera;
@@ -12,19 +12,19 @@ use std::collections::{BTreeMap, BTreeSet};
 /// Names of the kinds by branch (hazard, clear) and visibility of the actor or its place.
 const KINDS: [[&str; 3]; 2] =
     [["hazard_visible", "hazard_partial", "hazard_hidden"], ["clear_visible", "clear_partial", "clear_hidden"]];
-/// First frame number of free looks, which share no random draws with images of the dataset or free drives.
+/// First frame number of free views, which share no random draws with images of the dataset or free drives.
 const FIRST_FREE: u64 = 1 << 41;
 /// Probabilities are clamped to this and its complement in the log loss.
 pub const SUREST: f64 = 1e-3;
 
 /// One image of a part of the trials.
 #[derive(Clone, Debug)]
-pub struct Look<'a> {
+pub struct TrialView<'a> {
     /// The image, without sensor noise.
     pub image: &'a Image,
     /// The camera.
     pub camera: &'a PinholeCamera,
-    /// Pose of the camera; looks from one pose are not independent.
+    /// Pose of the camera; views from one pose are not independent.
     pub pose: usize,
     /// Name of the kind.
     pub kind: &'static str,
@@ -32,11 +32,11 @@ pub struct Look<'a> {
     pub hazard: bool,
     /// Probability of a hazard, given the image, the pose and the scenario, with equally probable states.
     pub exact: f64,
-    /// Frame number, which names the look's random draws.
+    /// Frame number, which names the view's random draws.
     pub frame: u64,
 }
 
-/// Answer of an observer to one look.
+/// Answer of an observer to one view.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Answer {
     /// Probability of a hazard, 0..=1.
@@ -101,15 +101,15 @@ fn exact_probability(scenario: &ScenarioInfo, alike: impl Iterator<Item = usize>
     hazards as f64 / all.max(1) as f64
 }
 
-/// Looks of the dataset's poses of one role, at all time steps but the last.
-pub fn looks_of_role(posed: &PosedImages, role: PoseRole) -> Vec<Look<'_>> {
+/// Views of the dataset's poses of one role, at all time steps but the last.
+pub fn views_of_role(posed: &PosedImages, role: PoseRole) -> Vec<TrialView<'_>> {
     let scenario = &posed.scenario;
     let all = posed.with_roles(&[role]).into_iter();
     all.filter(|&i| scenario.timestamp_of(posed.labels[i].state) + 1 < scenario.timestamps)
         .map(|i| {
             let label = posed.labels[i];
             let hazard = scenario.is_hazard(scenario.branch_of(label.state));
-            Look {
+            TrialView {
                 image: &posed.images[i],
                 camera: &posed.dataset.frames()[i].camera,
                 pose: label.view,
@@ -122,20 +122,20 @@ pub fn looks_of_role(posed: &PosedImages, role: PoseRole) -> Vec<Look<'_>> {
         .collect()
 }
 
-/// Looks of free poses.
-pub fn free_looks<'a>(poses: &'a [FreePose], scenario: &ScenarioInfo) -> Vec<Look<'a>> {
+/// Views of free poses.
+pub fn free_views<'a>(poses: &'a [FreePose], scenario: &ScenarioInfo) -> Vec<TrialView<'a>> {
     let branches = scenario.branches.len();
     let of_pose = |(pose, free): (usize, &'a FreePose)| {
-        free.looks.iter().enumerate().map(move |(branch, look)| {
+        free.views.iter().enumerate().map(move |(branch, view)| {
             let hazard = scenario.is_hazard(branch);
-            let observability = look.observability.unwrap_or(Observability::Full);
-            Look {
-                image: &look.image,
+            let observability = view.observability.unwrap_or(Observability::Full);
+            TrialView {
+                image: &view.image,
                 camera: &free.camera,
                 pose,
                 kind: kind_name(hazard, observability),
                 hazard,
-                exact: exact_probability(scenario, look.alike.iter().copied()),
+                exact: exact_probability(scenario, view.alike.iter().copied()),
                 frame: FIRST_FREE + (pose * branches + branch) as u64,
             }
         })
@@ -143,25 +143,25 @@ pub fn free_looks<'a>(poses: &'a [FreePose], scenario: &ScenarioInfo) -> Vec<Loo
     poses.iter().enumerate().flat_map(of_pose).collect()
 }
 
-/// Trials of looks.
-pub fn taken(perception: &Perception, looks: &[Look]) -> Vec<Trial> {
+/// Trials of views.
+pub fn taken(perception: &Perception, views: &[TrialView]) -> Vec<Trial> {
     let kind = |hazard| if hazard { DriveKind::Hazard } else { DriveKind::Clear };
-    looks.iter().filter_map(|look| perception.trial((look.camera, look.image), kind(look.hazard), look.frame)).collect()
+    views.iter().filter_map(|view| perception.trial((view.camera, view.image), kind(view.hazard), view.frame)).collect()
 }
 
 /// Figures of the answers to looks, in the same order.
-pub fn figures(looks: &[Look], answers: &[Answer]) -> ByTrialKind {
+pub fn figures(views: &[TrialView], answers: &[Answer]) -> ByTrialKind {
     let mut poses: BTreeMap<&str, BTreeSet<usize>> = BTreeMap::new();
     let mut table = ByTrialKind::new();
-    for (look, answer) in looks.iter().zip(answers) {
-        let figures = table.entry(look.kind.to_owned()).or_default();
-        poses.entry(look.kind).or_default().insert(look.pose);
-        let truth = f64::from(u8::from(look.hazard));
+    for (view, answer) in views.iter().zip(answers) {
+        let figures = table.entry(view.kind.to_owned()).or_default();
+        poses.entry(view.kind).or_default().insert(view.pose);
+        let truth = f64::from(u8::from(view.hazard));
         let p = answer.hazard_probability.clamp(SUREST, 1.0 - SUREST);
         figures.images += 1;
         figures.trials += 1;
         figures.halts += usize::from(answer.halt);
-        figures.log_loss -= if look.hazard { p.ln() } else { (1.0 - p).ln() };
+        figures.log_loss -= if view.hazard { p.ln() } else { (1.0 - p).ln() };
         figures.brier += (answer.hazard_probability - truth).powi(2);
     }
     for (kind, figures) in &mut table {
@@ -184,7 +184,7 @@ mod tests {
     fn figures_of_a_known_case() {
         let image = Image::filled(2, 2, [0; 3]);
         let camera = PinholeCamera::look_at([1.0; 3], [0.0; 3], [0.0, 0.0, 1.0], 2, 2, 60.0);
-        let look = |pose, hazard| Look {
+        let view = |pose, hazard| TrialView {
             image: &image,
             camera: &camera,
             pose,
@@ -193,9 +193,9 @@ mod tests {
             exact: 0.5,
             frame: 0,
         };
-        let looks = [look(0, true), look(0, true), look(1, true), look(1, true), look(1, false)];
+        let views = [view(0, true), view(0, true), view(1, true), view(1, true), view(1, false)];
         let answers = [0.5, 0.5, 1.0, 0.0, 0.25].map(|p| Answer::at(p, 0.4));
-        let table = figures(&looks, &answers);
+        let table = figures(&views, &answers);
         let hazard = table["hazard_hidden"];
         assert_eq!((hazard.images, hazard.poses, hazard.halts, hazard.trials), (4, 2, 3, 4));
         assert_eq!(hazard.halt_interval, wilson_interval_of_share(0.75, 2.0));

@@ -1,4 +1,4 @@
-//! Unknown looks: images that contain something no state explains, from the camera poses of the free looks.
+//! Unknown views: images that contain something no state explains, from the camera poses of the free views.
 
 use crate::ScenarioError;
 use crate::movers::movers;
@@ -13,7 +13,7 @@ pub const IN_SIGHT_PX: u32 = 100;
 
 /// An image with something unknown, and its truth.
 #[derive(Clone, Debug, PartialEq)]
-pub struct UnknownLook {
+pub struct UnknownView {
     /// Kind of the camera's group.
     pub view_kind: String,
     /// Branch of everything that is known.
@@ -34,7 +34,7 @@ pub struct UnknownLook {
     pub boxes: Vec<NamedBox>,
 }
 
-impl UnknownLook {
+impl UnknownView {
     /// Returns true if at least [`IN_SIGHT_PX`] pixels show the unknown, in proportion to the image's size.
     pub fn in_sight(&self) -> bool {
         let size = f64::from(self.image.width_px) * f64::from(self.image.height_px);
@@ -52,8 +52,8 @@ impl Scenario {
     /// # fn main() -> Result<(), carff_scenes::ScenarioError> {
     /// let scenario = Scenario::load("configs/scenarios/approaching-intersection.toml".as_ref())?;
     /// let van = scenario.with_appearance("white-van")?;
-    /// let look = van.unknown_look(0, 1)?;
-    /// assert_eq!(look.camera, scenario.free_pose(0, 1)?.camera);
+    /// let view = van.unknown_view(0, 1)?;
+    /// assert_eq!(view.camera, scenario.free_pose(0, 1)?.camera);
     /// # Ok(())
     /// # }
     /// ```
@@ -61,7 +61,7 @@ impl Scenario {
     /// # Errors
     ///
     /// The scenario has neither an appearance nor an added object, or no branch can show it.
-    pub fn unknown_look(&self, number: u64, seed: u64) -> Result<UnknownLook, ScenarioError> {
+    pub fn unknown_view(&self, number: u64, seed: u64) -> Result<UnknownView, ScenarioError> {
         let (drive, timestamp) = self.free_course(number, seed)?;
         let (camera, _) = self.free_view(&drive, timestamp);
         let (branch, parts) = self.unknown_parts(timestamp)?;
@@ -71,7 +71,7 @@ impl Scenario {
             known[part] = None;
         }
         let (image, without) = (self.picture_of(&placement, &camera), self.picture_of(&known, &camera));
-        Ok(UnknownLook {
+        Ok(UnknownView {
             view_kind: drive.view_kind().to_owned(),
             branch,
             timestamp,

@@ -1,0 +1,6 @@
+//! The integration tests of this crate, as one program: each further one links the whole crate again.
+
+mod common;
+mod live;
+mod session;
+mod window;

@@ -1,0 +1,4 @@
+//! The integration tests of this crate, as one program: each further one links the whole crate again.
+
+mod images;
+mod transforms;
