@@ -61,7 +61,7 @@ pub(crate) fn run(args: &ProbesArgs) -> anyhow::Result<()> {
     end_with_parent()?;
     let stop = Stop::on_signals()?;
     let run = Run::new(&args.run, args.run_id)?;
-    let all_open = Barrier::new(args.count as usize + 1);
+    let all_open = Barrier::new(args.count + 1);
     let read = std::thread::scope(|scope| {
         let threads: Vec<_> = (0..args.count)
             .map(|_| {

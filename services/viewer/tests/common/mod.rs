@@ -1,5 +1,4 @@
 //! Fixtures of the viewer's tests: the shipped checkpoint, and true images of its scenario.
-#![allow(dead_code, reason = "each test program uses a part")]
 #![allow(clippy::unwrap_used, reason = "a failure here fails a test")]
 
 use carff_scenes::{RenderOptions, Scenario};

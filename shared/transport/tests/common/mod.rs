@@ -1,6 +1,6 @@
 //! Fixtures of the transport's tests: unique runs, messages, and children with a watchdog.
 
-#![allow(dead_code, reason = "each test file uses a part of it")]
+#![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
 use carff_messages::{DatasetView, FrameMeta, Gaussian, Header, Intrinsics, Posterior};
 use carff_transport::{Run, monotonic_now_ns, remove_run_leftovers};
