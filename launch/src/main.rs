@@ -2,7 +2,7 @@
 //! that compute with libtorch.
 
 use anyhow::Context;
-use carff::{parse, run_program};
+use carff::{end_on_signals, parse, run_program};
 #[cfg(feature = "bench")]
 use carff_bench::BenchCommand;
 use carff_inference::library;
@@ -19,7 +19,12 @@ fn main() -> ExitCode {
 fn run() -> anyhow::Result<ExitCode> {
     library::without_telemetry().context("the telemetry of ONNX Runtime cannot be switched off")?;
     carff_launch::shell::answer_shell(Cli::command);
-    match parse::<Cli>()?.command {
+    let command = parse::<Cli>()?.command;
+    if needs_libtorch(&command) {
+        return lab::start();
+    }
+    end_on_signals()?;
+    match command {
         Command::Launch(args) => carff_launch::launch::run(&args),
         Command::Drive(args) => carff_launch::drive::run(&args),
         Command::Attach(command) => command.run(),
@@ -30,7 +35,7 @@ fn run() -> anyhow::Result<ExitCode> {
         Command::Lab(LabCommand::Checkpoint(CheckpointCommand::Onnx(args))) => {
             done(carff_launch::checkpoint::onnx(&args))
         }
-        Command::Lab(_) | Command::Schema(SchemaArgs { kind: Some(FileKind::Training), .. }) => lab::start(),
+        Command::Lab(_) => lab::start(),
         #[cfg(feature = "bench")]
         Command::Bench(BenchCommand::Tensors(_)) => lab::start(),
         #[cfg(feature = "bench")]
@@ -48,6 +53,17 @@ fn run() -> anyhow::Result<ExitCode> {
         Command::Completions(args) => done(carff_launch::shell::completions(&args)),
         Command::Man(args) => done(carff_launch::shell::man(&args, Cli::command())),
         Command::Dataset(command) => done(carff_launch::dataset::run(command)),
+    }
+}
+
+/// Returns true for the commands of `carff-lab`.
+fn needs_libtorch(command: &Command) -> bool {
+    match command {
+        Command::Lab(LabCommand::Checkpoint(CheckpointCommand::Onnx(_))) => false,
+        Command::Lab(_) | Command::Schema(SchemaArgs { kind: Some(FileKind::Training), .. }) => true,
+        #[cfg(feature = "bench")]
+        Command::Bench(BenchCommand::Tensors(_)) => true,
+        _ => false,
     }
 }
 

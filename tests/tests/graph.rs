@@ -112,8 +112,8 @@ fn an_interrupt_leaves_nothing() {
     graph.assert_nothing_left();
 }
 
-/// A signal ends each command in each phase with exit code 130, also while it computes with models. (`carff` becomes
-/// `carff-launch` for the commands that start graphs.)
+/// A signal ends each command in each phase with exit code 130, also while it computes with models. It takes no signal
+/// before it has become the program of the command.
 #[test]
 fn a_signal_ends_every_command() {
     let (set, checkpoint) = (scenario_set(), shipped_checkpoint());
@@ -134,7 +134,7 @@ fn a_signal_ends_every_command() {
         for signal in [Signal::INT, Signal::TERM, Signal::HUP] {
             // Also where the tests themselves run under `nohup`.
             let mut started = std::process::Command::new("env");
-            started.arg("--default-signal=HUP").arg(program("carff-launch")).args(command);
+            started.args(["--default-signal=HUP", "--unset=ORT_DISABLE_TELEMETRY"]).arg(program("carff")).args(command);
             let process = Process::start(started.current_dir(project_root()));
             assert!(eventually(|| process.catches(signal)), "{command:?} takes no {signal:?}");
             process.signal(signal);

@@ -169,8 +169,14 @@ fn is_closed_pipe(error: &anyhow::Error) -> bool {
     error.chain().any(|cause| cause.downcast_ref().is_some_and(is_closed))
 }
 
-/// Runs a program to its end, and returns its exit code. An error is printed as one sentence. After a signal the code is
-/// [`INTERRUPTED`]; a signal also ends each phase that waits for no stop.
+/// Lets a signal end each phase that waits for no stop, with the exit code [`INTERRUPTED`]. A program that becomes another
+/// one does not call it: a signal that it takes while it becomes the other would be lost.
+pub fn end_on_signals() -> anyhow::Result<()> {
+    exit_on_signals().context("cannot handle signals")
+}
+
+/// Runs a program to its end, and returns its exit code. An error is printed as one sentence. After a signal that a stop
+/// has taken, the code is [`INTERRUPTED`].
 pub fn run_program(program: impl FnOnce() -> anyhow::Result<ExitCode>) -> ExitCode {
     let print_panic = std::panic::take_hook();
     std::panic::set_hook(Box::new(move |info| {
@@ -178,7 +184,6 @@ pub fn run_program(program: impl FnOnce() -> anyhow::Result<ExitCode>) -> ExitCo
             print_panic(info);
         }
     }));
-    let program = || exit_on_signals().context("cannot handle signals").and_then(|()| program());
     let result = std::panic::catch_unwind(AssertUnwindSafe(program)).unwrap_or_else(|payload| {
         match failed_output(&*payload) {
             // The reader has closed the pipe (`| head`): no message, and the shell's exit code for it.

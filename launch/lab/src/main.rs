@@ -1,7 +1,7 @@
 //! The commands of `carff` that compute with libtorch.
 
 use anyhow::bail;
-use carff::{parse, run_program};
+use carff::{end_on_signals, parse, run_program};
 use carff_bench::BenchCommand;
 use carff_lab::{ablate, backbone, bench, checkpoint, eval, train};
 use carff_launch::command::{Cli, Command};
@@ -15,6 +15,7 @@ fn main() -> ExitCode {
 }
 
 fn run() -> anyhow::Result<ExitCode> {
+    end_on_signals()?;
     match parse::<Cli>()?.command {
         Command::Lab(LabCommand::Train(args)) => train::run(&args),
         Command::Lab(LabCommand::Eval(args)) => eval::run(&args),
