@@ -260,6 +260,25 @@ def check_sources() -> None:
     print(f"files: {count}")
 
 
+def check_test_programs() -> None:
+    """Checks that each crate has one program of integration tests, which contains each of its files: cargo would not
+    run a file that the program leaves out."""
+    for main in sorted(ROOT.glob("**/tests/main.rs")):
+        if "target" in main.relative_to(ROOT).parts:
+            continue
+        modules = set(re.findall(r"^mod (\w+);", main.read_text(encoding="utf-8"), re.MULTILINE))
+        files = {file.stem for file in main.parent.glob("*.rs")} - {"main"}
+        for name in sorted(files - modules):
+            find(f"{main.relative_to(ROOT)}: no `mod {name};`, so that the tests of {name}.rs do not run")
+    for manifest in sorted(ROOT.glob("**/Cargo.toml")):
+        tests = manifest.parent / "tests"
+        if "target" in manifest.relative_to(ROOT).parts or (tests / "main.rs").is_file():
+            continue
+        programs = sorted(file.name for file in tests.glob("*.rs"))
+        if len(programs) > 1:
+            find(f"{manifest.relative_to(ROOT)}: {', '.join(programs)} are a program each; make them modules of tests/main.rs")
+
+
 def main() -> None:
     deny = tomllib.loads((ROOT / "deny.toml").read_text(encoding="utf-8"))
     targets = deny["graph"]["targets"]
@@ -270,6 +289,7 @@ def main() -> None:
     check_tensors(metadata)
     check_libraries(targets)
     check_sources()
+    check_test_programs()
     for text in findings:
         print(f"error: {text}", file=sys.stderr)
     if findings:
