@@ -119,12 +119,12 @@ fn a_signal_ends_every_command() {
     let (set, checkpoint) = (scenario_set(), shipped_checkpoint());
     let (set, checkpoint) = (set.to_str().unwrap(), checkpoint.to_str().unwrap());
     let folder = tempfile::tempdir().unwrap();
-    let out = folder.path().join("out");
-    let out = out.to_str().unwrap();
+    let out = |name: &str| folder.path().join(name).display().to_string();
+    let (results, data) = (out("results"), out("data"));
     let scenario = project_root().join("configs/scenarios/two-lane-merge.toml");
     let commands = [
-        &["eval", checkpoint, "--dataset", set, "--out", out][..],
-        &["dataset", "render", scenario.to_str().unwrap(), "--out", out],
+        &["eval", checkpoint, "--dataset", set, "--out", &results][..],
+        &["dataset", "render", scenario.to_str().unwrap(), "--out", &data],
         &["bench", "field"],
         &["bench", "encoder"],
         // It waits for a run of its own: the runs of other tests end at any time, and the command with them.

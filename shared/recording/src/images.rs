@@ -55,7 +55,7 @@ impl Kind {
 /// while let Some(recorded_ns) = images.next()? {
 ///     println!("{recorded_ns}: {:?}", images.origin()?);
 /// }
-/// # Ok::<(), carff_recording::RecordingError>(())
+/// # Ok::<(), Box<dyn std::error::Error>>(())
 /// ```
 pub struct ImageReader {
     bag: Bag,

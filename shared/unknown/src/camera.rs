@@ -57,7 +57,7 @@ impl Measured {
     /// ```
     /// use carff_unknown::Measured;
     /// let black = ndarray::Array3::zeros((48, 64, 3));
-    /// assert_eq!(Measured::of(black.view()).mean, 0.0);
+    /// assert_eq!(Measured::of(black.view()).luminance, 0.0);
     /// ```
     pub fn of(image: ArrayView3<'_, u8>) -> Self {
         let (height, width, _) = image.dim();
