@@ -79,11 +79,12 @@ pub fn decisive(outcome: &RunOutcome) -> Vec<(DecidedFrame, DriveKind)> {
     outcome.scenario.as_ref().map_or_else(Vec::new, |scenario| decisive_frames(frames, scenario))
 }
 
-/// Evidence of the last compared image of a take before a frame; of the take's first frame, that nothing explains it.
-/// Images are compared after their decisions.
+/// Evidence of the last compared image of a take before a frame; for the take's first frame, and after a pause, that
+/// nothing explains it. Images are compared after their decisions.
 fn image_before(frames: &BTreeMap<u64, FrameRecord>, frame: &FrameRecord, states: usize) -> Option<ImageEvidence> {
     let mut before = frames.range(frame.take_start..frame.frame_id.max(frame.take_start)).rev();
     let compared = before.find(|(_, frame)| frame.action.is_some());
+    let compared = compared.filter(|(before, _)| ImageEvidence::counts_later(**before, frame.frame_id));
     compared.map_or_else(|| Some(ImageEvidence::unexplained(states)), |(_, before)| before.image.clone())
 }
 
@@ -186,7 +187,8 @@ mod tests {
         assert!(others.iter().all(|other| decided(other).is_none()));
     }
 
-    /// The image before is that of the last decided frame of the take; nothing explains a take's first frame.
+    /// The image before is that of the last decided frame of the take; nothing explains a take's first frame, or one
+    /// after a pause.
     #[test]
     fn images_of_the_frame_before_count() {
         let image = |ratio: f32| Some(ImageEvidence::new(&[ratio]));
@@ -194,9 +196,15 @@ mod tests {
             (frame_id, FrameRecord { frame_id, take_start, action, image: image(ratio), ..frame() })
         };
         let halt = Some(ActionCode::Halt);
-        let frames = [with(3, 3, halt, 3.0), with(4, 3, None, 4.0), with(5, 3, halt, 5.0), with(6, 6, halt, 6.0)];
+        let frames = [
+            with(3, 3, halt, 3.0),
+            with(4, 3, None, 4.0),
+            with(5, 3, halt, 5.0),
+            with(6, 6, halt, 6.0),
+            with(12, 6, halt, 9.0),
+        ];
         let frames = BTreeMap::from(frames);
-        for (frame, before) in [(3, 0.0), (5, 3.0), (6, 0.0)] {
+        for (frame, before) in [(3, 0.0), (5, 3.0), (6, 0.0), (12, 0.0)] {
             assert_eq!(image_before(&frames, &frames[&frame], 1), image(before), "{frame}");
         }
     }

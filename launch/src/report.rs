@@ -71,7 +71,7 @@ pub struct RunReport {
     pub unknown_images: UnknownReport,
     /// Messages that stages have skipped.
     pub skipped: u64,
-    /// The same by stage.
+    /// Skipped messages by stage.
     pub skipped_by_stage: BTreeMap<&'static str, u64>,
     /// Invalid messages that stages have dropped.
     pub invalid_by_stage: BTreeMap<&'static str, u64>,
@@ -81,7 +81,7 @@ pub struct RunReport {
     pub given_up: BTreeMap<&'static str, u64>,
     /// Restarts of stages.
     pub restarts: u32,
-    /// The same by stage.
+    /// Restarts by stage.
     pub restarts_by_stage: BTreeMap<&'static str, u32>,
     /// Times of the frames and of the stages.
     pub latency_ms: LatencyReport,

@@ -59,24 +59,26 @@ impl Carried {
         }
     }
 
-    /// Returns the frames whose results the recording determines, of all recorded ones in their order: number and
-    /// number of the first frame of the take.
-    fn determined(self, recorded: &[(u64, u64)]) -> BTreeSet<u64> {
+    /// Returns the frames whose results the recording determines, of all recorded ones in their order (number, and
+    /// number of the first frame of the take) and of those that the graph has `answered`. A replay answers each frame:
+    /// where the graph has skipped one, it carried something else.
+    fn determined(self, recorded: &[(u64, u64)], answered: &BTreeSet<u64>) -> BTreeSet<u64> {
         let mut frames = BTreeSet::new();
-        let mut take = None;
+        // The frame before, its take, and whether the take is complete up to it.
+        let mut last: Option<(u64, u64, bool)> = None;
         for &(frame, take_start) in recorded {
-            let (first, is_first) = match take {
-                Some((start, first)) if start == take_start => (first, false),
-                _ => (frame, true),
-            };
-            take = Some((take_start, first));
+            let follows = last.filter(|(before, take, _)| *take == take_start && before + 1 == frame);
+            let is_first = frame == take_start;
+            let is_known = follows.is_some_and(|(before, ..)| answered.contains(&before));
+            let is_whole = is_first || is_known && follows.is_some_and(|(.., whole)| whole);
             if match self {
                 Self::Nothing => true,
-                Self::LastFrame => !is_first || frame == take_start,
-                Self::Take => first == take_start,
+                Self::LastFrame => is_first || is_known,
+                Self::Take => is_whole,
             } {
                 frames.insert(frame);
             }
+            last = Some((frame, take_start, is_whole));
         }
         frames
     }
@@ -113,14 +115,16 @@ impl Replayed {
 
     /// Compares all recorded messages about the recorded frames that determine them.
     pub(super) fn compare(&self, recording: &Path, carried: Carried) -> anyhow::Result<Comparison> {
-        let mut recorded = Vec::new();
+        let (mut recorded, mut answered) = (Vec::new(), BTreeSet::new());
         let mut reader = Reader::open(recording)?.without_images();
         while let Some(entry) = reader.next()? {
-            if let Some(frame) = entry.message.as_message().get::<FrameMeta>() {
+            let message = entry.message.as_message();
+            if let Some(frame) = message.get::<FrameMeta>() {
                 recorded.push((frame.header.frame_id, frame.take_start));
             }
+            answered.extend(timeless(message).map(|((_, frame, _), _)| frame));
         }
-        let frames = carried.determined(&recorded);
+        let frames = carried.determined(&recorded, &answered);
         let left_out = (recorded.len() - frames.len()) as u64;
         let mut comparison = Comparison { left_out, ..Comparison::default() };
         let mut reader = Reader::open(recording)?.without_images();
@@ -250,14 +254,18 @@ mod tests {
     }
 
     /// A recording that begins within a take determines the frames that rest on themselves; those that rest on the frame
-    /// before but for the first; and none of the take where a memory rests on all of them.
+    /// before but for the first, and but for those after a frame without an answer or a gap; and none of the take where a
+    /// memory rests on all of them.
     #[test]
     fn what_is_carried_must_be_recorded() {
-        let recorded = [(4, 0), (5, 0), (6, 6), (7, 6), (8, 0)];
-        for (carried, determined) in
-            [(Carried::Nothing, &[4, 5, 6, 7, 8][..]), (Carried::LastFrame, &[5, 6, 7]), (Carried::Take, &[6, 7])]
-        {
-            assert_eq!(carried.determined(&recorded), determined.iter().copied().collect(), "{carried:?}");
+        let recorded = [(4, 0), (5, 0), (6, 6), (7, 6), (8, 6), (9, 6), (11, 6), (12, 0)];
+        let answered = [4, 5, 6, 8, 9, 11, 12].into();
+        for (carried, determined) in [
+            (Carried::Nothing, &[4, 5, 6, 7, 8, 9, 11, 12][..]),
+            (Carried::LastFrame, &[5, 6, 7, 9]),
+            (Carried::Take, &[6, 7]),
+        ] {
+            assert_eq!(carried.determined(&recorded, &answered), determined.iter().copied().collect(), "{carried:?}");
         }
     }
 

@@ -35,9 +35,9 @@ pub struct ReplayArgs {
     /// Stop this many seconds after the beginning.
     #[arg(long, value_parser = positive)]
     pub to: Option<f64>,
-    /// Topics to send from the recording, separated by commas. Default: only `camera/frame`. `ego/motion` comes with
-    /// it where it was recorded. The stages that publish
-    /// them, and all stages before those, are not started. `all`: no stage is started.
+    /// Topics to send from the recording, separated by commas. Default: only `camera/frame`, and with it `ego/motion`
+    /// where it was recorded. The stages that publish them, and all stages before those, are not started. `all`: no
+    /// stage is started.
     #[arg(long, value_parser = only)]
     pub only: Option<Only>,
     /// Send one frame at a time and wait for its decision; then compare every posterior, forecast, belief and decision

@@ -150,7 +150,7 @@ impl Frames {
             )
         })?;
         Ok(if self.is_late {
-            self.images.evidence_before(taken.at_ns, taken.take_start)
+            self.images.evidence_before(forecast.frame_id, taken.take_start)
         } else {
             self.images.evidence(forecast)
         })

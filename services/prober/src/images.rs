@@ -30,6 +30,8 @@ pub struct Images {
 struct Compared {
     /// Capture time: monotonic clock, nanoseconds.
     at_ns: u64,
+    /// Number of the frame.
+    frame_id: u64,
     /// Number of the first frame of its take.
     take_start: u64,
     /// `None` for a frame without a valid pose, or whose camera sees no lane.
@@ -72,8 +74,8 @@ impl Images {
         if self.compared.len() == REMEMBERED {
             self.compared.pop_front();
         }
-        let (at_ns, take_start) = (frame.header.capture_time_ns, frame.take_start);
-        self.compared.push_back(Compared { at_ns, take_start, evidence });
+        let Header { capture_time_ns: at_ns, frame_id, .. } = frame.header;
+        self.compared.push_back(Compared { at_ns, frame_id, take_start: frame.take_start, evidence });
         unknowns
     }
 
@@ -115,11 +117,13 @@ impl Images {
         self.compared.iter().rev().find(|compared| compared.at_ns == header.capture_time_ns)?.evidence.as_ref()
     }
 
-    /// The evidence of the frame of a take that was compared last before a capture time; `None` if it shows nothing to
-    /// compare. Before the first comparison of a take, something unknown is nearly certain.
-    pub fn evidence_before(&self, capture_time_ns: u64, take_start: u64) -> Option<&ImageEvidence> {
-        let is_before = |compared: &&Compared| compared.take_start == take_start && compared.at_ns < capture_time_ns;
-        let before = self.compared.iter().rev().find(is_before);
+    /// The evidence of the frame of a take that was compared last before frame `frame_id`; `None` if it shows nothing to
+    /// compare. Without a comparison in the take, or after a pause, something unknown is nearly certain.
+    pub fn evidence_before(&self, frame_id: u64, take_start: u64) -> Option<&ImageEvidence> {
+        let counts = |compared: &&Compared| {
+            compared.take_start == take_start && ImageEvidence::counts_later(compared.frame_id, frame_id)
+        };
+        let before = self.compared.iter().rev().find(counts);
         before.map_or(Some(&self.nothing_yet), |compared| compared.evidence.as_ref())
     }
 }

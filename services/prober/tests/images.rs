@@ -64,7 +64,8 @@ fn a_patch_on_the_lane_is_unknown() {
     assert!(images.evidence(&lost.header).is_none());
 }
 
-/// The evidence before a frame is that of its take's last compared frame; before a take's first one, nothing is explained.
+/// The evidence before a frame is that of its take's last compared frame; before a take's first one, and after a pause, nothing
+/// is explained.
 #[test]
 fn evidence_of_the_frame_before() {
     let (probe, _) = load(&checkpoint()).unwrap();
@@ -74,9 +75,9 @@ fn evidence_of_the_frame_before() {
         assert!(images.compare(&probe, &meta, image_of(&probe, state).view(), 1).is_some());
     }
     let own = |id: u64| images.evidence(&Header::of_frame(id, 100 * id * MS, 1));
-    let before = |at_ms: u64, take_start| images.evidence_before(at_ms * MS, take_start);
+    let before = |frame_id, take_start| images.evidence_before(frame_id, take_start);
     assert!(own(1).is_some() && own(1) != own(2));
-    assert_eq!([before(200, 1), before(250, 1), before(350, 3)], [own(1), own(2), own(3)]);
+    assert_eq!([before(2, 1), before(3, 1), before(7, 1), before(4, 3)], [own(1), own(2), own(2), own(3)]);
     let nothing = ImageEvidence::unexplained(probe.states().len());
-    assert_eq!([before(100, 1), before(300, 3)], [Some(&nothing); 2]);
+    assert_eq!([before(1, 1), before(3, 3), before(8, 1)], [Some(&nothing); 3]);
 }

@@ -129,8 +129,8 @@ pub enum CompareImages {
     Off,
     /// The belief about the same frame, which waits for it.
     SameFrame,
-    /// The belief about the next frame, which then does not wait. In the first frame of a take, which no compared frame
-    /// is before, something unknown is nearly certain.
+    /// The belief about the next frame, which then does not wait. In the first frame of a take, and after five frames
+    /// without a comparison, something unknown is nearly certain.
     NextFrame,
 }
 

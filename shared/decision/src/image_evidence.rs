@@ -28,7 +28,16 @@ pub struct ImageEvidence {
     prior: Option<f64>,
 }
 
+/// Most frames between an image and a later one whose belief may rest on its comparison: longer without a comparison, for
+/// example while the camera was covered, anything can have come.
+const MOST_FRAMES_BEFORE: u64 = 5;
+
 impl ImageEvidence {
+    /// Reports whether the comparison of an image of the same take may count for the belief about frame `frame_id`.
+    pub fn counts_later(compared_frame_id: u64, frame_id: u64) -> bool {
+        compared_frame_id < frame_id && frame_id - compared_frame_id <= MOST_FRAMES_BEFORE
+    }
+
     /// Evidence of the likelihood ratios of the known states against something unknown, each above 0. A ratio that is
     /// not a number counts as the smallest.
     pub fn new(ratios: &[f32]) -> Self {
@@ -230,6 +239,13 @@ mod tests {
             let (hazard, unknown) = evidence.weigh(0.0, &STATES);
             assert!(unknown > 0.8 && hazard < 0.1, "{hazard} {unknown}");
         }
+    }
+
+    /// A comparison counts for the next frames only: neither for its own, nor for one after a pause.
+    #[test]
+    fn comparisons_do_not_count_forever() {
+        let counts = |frame| ImageEvidence::counts_later(7, frame);
+        assert_eq!([6, 7, 8, 12, 13].map(counts), [false, false, true, true, false]);
     }
 
     /// A place that was seen clear stays clear while it is hidden, a hazard that was seen stays, and a cleared memory is
