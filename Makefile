@@ -17,7 +17,7 @@ else ifneq ($(CARGO_TARGET_DIR),)
 export LD_LIBRARY_PATH := $(CURDIR)/.libtorch/lib:$(CURDIR)/.onnxruntime/lib$(if $(LD_LIBRARY_PATH),:$(LD_LIBRARY_PATH))
 endif
 
-.PHONY: help run build deb check-deb arm64-tools type-check-arm64 deb-arm64 check-arm64 link check-link camera-rtsp camera-gst check-cameras test soak fuzz bench-peer lint sanitize miri sbom fmt libtorch onnxruntime
+.PHONY: help run build deb check-deb arm64-tools type-check-arm64 deb-arm64 check-arm64 results link check-link camera-rtsp camera-gst check-cameras test soak fuzz bench-peer lint sanitize miri sbom fmt libtorch onnxruntime
 
 help: ## List the targets
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -77,6 +77,22 @@ check-arm64: arm64-tools onnxruntime ## Cross-build for 64-bit Arm; test and dri
 	$(BUILD_RUNNING)
 	$(ARM64_ENV) $(BUILD_RUNNING) $(ARM64_BUILD)
 	$(ARM64_ENV) $(PYTHON) tests/scripts/check_arm64.py $(TARGET) $(ARM64_TESTED)
+
+# Checkpoint and seeds of the tables in docs/RESULTS.md.
+CHECKPOINT ?= approaching-intersection
+SEED ?= 7
+EVAL = $(TARGET)/release/carff eval configs/checkpoints/$(CHECKPOINT) --out reports/results/$(CHECKPOINT)
+
+results: build ## Make the tables of docs/RESULTS.md for CHECKPOINT (default approaching-intersection) in reports/results (hours)
+	$(EVAL)/tables --seed $(SEED)
+	$(EVAL)/trials --only trials --seed 29
+	$(EVAL)/robustness --only robustness --free-poses 40 --free-drives 1000 --seed 53
+	$(EVAL)/memory --only memory --free-drives 400 --seed 71
+	$(EVAL)/localisation --only localisation --seed 7 --threads 1
+	for rule in always-halt always-advance calibrated phantom peek look oracle; do \
+		$(TARGET)/release/carff drive $(CHECKPOINT) --checkpoint configs/checkpoints/$(CHECKPOINT) --rule $$rule \
+			--episodes $(or $(EPISODES),300) --seed 101 --set renderer.max_rate_hz=0.1 \
+			--json reports/results/$(CHECKPOINT)/drive-$$rule.json || exit 1; done
 
 link: ## Build carff-link, which forwards topics to another machine (optional; zenoh adds 300 crates)
 	cargo build --release --locked --manifest-path services/link/Cargo.toml --target-dir $(TARGET)/link

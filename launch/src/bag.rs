@@ -2,7 +2,7 @@
 //! imported.
 
 use anyhow::{Context, anyhow, bail, ensure};
-use carff_dataset::{Calibration, DistortionModel, Image};
+use carff_dataset::{CameraCalibration, DistortionModel, Image};
 use carff_recording::{ImageReader, RecordingError, Transforms};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
@@ -47,7 +47,7 @@ pub(crate) fn is_recording(path: &Path) -> bool {
 pub(crate) fn extract(recording: &Path, out: &Path, args: &BagArgs) -> anyhow::Result<Extracted> {
     let mut reader = ImageReader::open(recording, args.topic.as_deref()).map_err(named_here)?;
     let calibration = match &args.calibration {
-        Some(path) => Some(Calibration::load(path)?),
+        Some(path) => Some(CameraCalibration::load(path)?),
         None => reader.calibration().map_err(named_here)?,
     };
     let calibration = calibration.with_context(|| {
@@ -98,7 +98,7 @@ fn named_here(error: RecordingError) -> anyhow::Error {
     }
 }
 
-fn decoded(reader: &ImageReader, calibration: &Calibration) -> anyhow::Result<Image> {
+fn decoded(reader: &ImageReader, calibration: &CameraCalibration) -> anyhow::Result<Image> {
     let image = reader.with_image(|raw| {
         let [width_px, height_px] = raw.size_px();
         let mut image = Image::filled(width_px, height_px, [0; 3]);
@@ -118,7 +118,7 @@ fn decoded(reader: &ImageReader, calibration: &Calibration) -> anyhow::Result<Im
 }
 
 /// Returns the keys of a calibration in nerfstudio's format.
-fn intrinsics(calibration: &Calibration) -> Value {
+fn intrinsics(calibration: &CameraCalibration) -> Value {
     let coefficient = |index: usize| calibration.distortion.get(index).copied().unwrap_or(0.0);
     let mut keys = json!({
         "w": calibration.width_px,

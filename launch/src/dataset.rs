@@ -236,8 +236,8 @@ pub(crate) fn find_scenario(scenario: &Path) -> anyhow::Result<PathBuf> {
 
 /// Renders a dataset, with a progress bar. Returns the number of images.
 pub fn render(scenario: &Scenario, out: &Path, extras: Extras) -> anyhow::Result<u64> {
-    let pictures = (scenario.cameras().len() * scenario.info().state_count()) as u64;
-    let bar = ProgressBar::new(pictures);
+    let images = (scenario.cameras().len() * scenario.info().state_count()) as u64;
+    let bar = ProgressBar::new(images);
     bar.set_style(ProgressStyle::with_template("{msg} [{bar:40}] {pos}/{len} images, {eta} left")?);
     bar.set_message(scenario.info().name.clone());
     let rendered = scenario.render_dataset(out, extras, |done, _| {
@@ -246,7 +246,7 @@ pub fn render(scenario: &Scenario, out: &Path, extras: Extras) -> anyhow::Result
     });
     bar.finish_and_clear();
     rendered.with_context(|| format!("cannot render {} into {}", scenario.path().display(), out.display()))?;
-    Ok(pictures)
+    Ok(images)
 }
 
 fn check(dir: &Path, sheet: Option<&Path>, columns: usize) -> anyhow::Result<()> {
@@ -295,7 +295,7 @@ name = "small"
 bounds_m = [[-2.0, -2.0, 0.0], [2.0, 2.0, 2.0]]
 timestamps = 1
 branches = ["only"]
-picture = { width_px = 16, height_px = 16, fov_deg = 60.0 }
+image = { width_px = 16, height_px = 16, fov_deg = 60.0 }
 
 [[overhead]]
 view_kind = "bev"

@@ -1,7 +1,7 @@
 //! Shows the decisions of a run, and writes them as JSON lines.
 
 use crate::planning::decided;
-use crate::supervision::monitor::FrameRecord;
+use crate::supervision::monitor::FrameHistory;
 use anyhow::{Context, anyhow};
 use carff::terminal::Terminal;
 use carff_config::{CameraSource, GraphConfig};
@@ -39,7 +39,7 @@ pub(crate) struct Decisions {
     file: Option<(PathBuf, LineWriter<File>)>,
     failed: Option<anyhow::Error>,
     /// Decided frames of the current drive.
-    drive: Vec<FrameRecord>,
+    drive: Vec<FrameHistory>,
     /// The latest action of a source without drives.
     action: Option<ActionCode>,
 }
@@ -79,7 +79,7 @@ impl Decisions {
     }
 
     /// Takes one decided frame.
-    pub(crate) fn take(&mut self, frame: &FrameRecord) {
+    pub(crate) fn take(&mut self, frame: &FrameHistory) {
         if let Some((path, file)) = &mut self.file
             && let Err(error) = writeln!(file, "{}", record(frame, &self.images))
         {
@@ -114,7 +114,7 @@ impl Decisions {
     }
 
     /// Number of a drive, its actions, and its decisive frame where it has one.
-    fn drive_line(&self, drive: i32, frames: &[FrameRecord]) -> String {
+    fn drive_line(&self, drive: i32, frames: &[FrameHistory]) -> String {
         let halts = frames.iter().filter(|f| f.action.is_none_or(ActionCode::is_safe)).count();
         let mut line = format!("drive {:>3}/{}  {:>3} frames, {halts:>3} halts", drive + 1, self.drives, frames.len());
         let decisive = self.scenario.as_ref().map(|s| decisive_frames(frames.iter().filter_map(decided), s));
@@ -134,7 +134,7 @@ impl Decisions {
         line
     }
 
-    fn frame_line(&self, frame: &FrameRecord) -> String {
+    fn frame_line(&self, frame: &FrameHistory) -> String {
         let halted = frame.action.is_none_or(ActionCode::is_safe);
         let name = if frame.action == Some(ActionCode::Creep) { "creep  " } else { action_name(halted) };
         let action = self.terminal.alarm(name, halted);
@@ -146,7 +146,7 @@ impl Decisions {
         )
     }
 
-    fn place(&self, frame: &FrameRecord) -> String {
+    fn place(&self, frame: &FrameHistory) -> String {
         if frame.drive < 0 {
             return format!("frame {:>6}", frame.frame_id);
         }
@@ -167,7 +167,7 @@ fn action_name(halted: bool) -> &'static str {
     if halted { "HALT   " } else { "advance" }
 }
 
-fn latency_ms(frame: &FrameRecord) -> f64 {
+fn latency_ms(frame: &FrameHistory) -> f64 {
     frame.latency_ns as f64 / 1e6
 }
 
@@ -182,7 +182,7 @@ fn source(view: i32, images: &[PathBuf]) -> serde_json::Value {
 }
 
 /// A decided frame as one JSON object.
-fn record(frame: &FrameRecord, images: &[PathBuf]) -> serde_json::Value {
+fn record(frame: &FrameHistory, images: &[PathBuf]) -> serde_json::Value {
     json!({
         "frame": frame.frame_id,
         "drive": u32::try_from(frame.drive).ok(),

@@ -3,7 +3,7 @@
 use crate::decisions::{Decisions, Shown};
 use crate::planning::{Planning, RunOutcome};
 use crate::report::{ReportFiles, RunReport};
-use crate::supervision::monitor::FrameRecord;
+use crate::supervision::monitor::FrameHistory;
 use crate::supervision::{Ended, Feed, LAUNCHER, Supervisor};
 use anyhow::{Context, bail, ensure};
 use carff::provenance;
@@ -142,18 +142,10 @@ pub(crate) fn run_graph(
     let run = Run::new(&name, run_id_of(&name, monotonic_now_ns()))?;
     let dataset = graph.resolve(args.dataset.as_ref().unwrap_or(&graph.run.dataset));
     let checkpoint = graph.resolve(args.checkpoint.as_ref().unwrap_or(&graph.run.checkpoint));
-    let absolute = |path: &Path| std::path::absolute(path).map(|p| p.display().to_string());
     // Settings of the command line and a piped file exist only here: stages and probes read a copy.
     let copied = !args.set.is_empty() || is_stream(&args.graph);
     let graph_file = if copied { runtime_dir().join(format!("{name}.toml")) } else { args.graph.clone() };
-    let record = RunRecord {
-        pid: std::process::id(),
-        run_id: run.id(),
-        graph: absolute(&graph_file)?,
-        dataset: absolute(&dataset)?,
-        checkpoint: absolute(&checkpoint)?,
-        started_unix_s: SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default().as_secs(),
-    };
+    let record = run_record(&run, [&graph_file, &dataset, &checkpoint])?;
     let lock = RunLock::take(&runtime_dir(), &name, &record, "--run")?;
     lock.sweep(&run, "--run")?;
     terminal.log_to(&log_path(run.dir(), &name)).context("cannot write the run's log")?;
@@ -180,20 +172,11 @@ pub(crate) fn run_graph(
     let view_bytes = carff_messages::rgb_bytes(graph.renderer.width_px, graph.renderer.height_px);
     check_space(Path::new("/dev/shm"), "the graph", graph_bytes(FRAME_BYTES, view_bytes))?;
 
-    let mut stage_args = StageArgs::new(&graph_file, &name, run.id());
-    stage_args.dataset = Some(dataset.clone());
-    stage_args.checkpoint = Some(checkpoint.clone());
-    (stage_args.drives, stage_args.frames) = (args.drives, args.frames);
-    stage_args.parent_pid = Some(std::process::id());
-    let folder = match &args.stages {
-        Some(folder) => folder.clone(),
-        None => std::env::current_exe()?.parent().context("this program has no folder")?.to_owned(),
-    };
-
     let result = {
         let node = Node::open(&run, "launcher")?;
-        let mut decided = |frame: &FrameRecord| decisions.take(frame);
-        let mut supervisor = Supervisor::new(&node, &graph, (folder, stage_args), &stop, terminal, &mut decided)?;
+        let mut decided = |frame: &FrameHistory| decisions.take(frame);
+        let programs = stage_programs(args, &run, [&graph_file, &dataset, &checkpoint])?;
+        let mut supervisor = Supervisor::new(&node, &graph, programs, &stop, terminal, &mut decided)?;
         let result = supervisor.drive(&run, &stop, feed);
         terminal.status(String::new());
         supervisor.shut_down();
@@ -222,6 +205,35 @@ pub(crate) fn run_graph(
     }
     decisions.finish()?;
     Ok(result)
+}
+
+/// Returns the record by which other programs find the run.
+fn run_record(run: &Run, files: [&Path; 3]) -> anyhow::Result<RunRecord> {
+    let absolute = |path: &Path| std::path::absolute(path).map(|p| p.display().to_string());
+    let [graph, dataset, checkpoint] = files.map(absolute);
+    Ok(RunRecord {
+        pid: std::process::id(),
+        run_id: run.id(),
+        graph: graph?,
+        dataset: dataset?,
+        checkpoint: checkpoint?,
+        started_unix_s: SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default().as_secs(),
+    })
+}
+
+/// Returns the folder of the stages' programs, and the arguments that all stages get.
+fn stage_programs(args: &LaunchArgs, run: &Run, files: [&Path; 3]) -> anyhow::Result<(PathBuf, StageArgs)> {
+    let [graph_file, dataset, checkpoint] = files;
+    let mut stage_args = StageArgs::new(graph_file, run.name(), run.id());
+    stage_args.dataset = Some(dataset.to_owned());
+    stage_args.checkpoint = Some(checkpoint.to_owned());
+    (stage_args.drives, stage_args.frames) = (args.drives, args.frames);
+    stage_args.parent_pid = Some(std::process::id());
+    let folder = match &args.stages {
+        Some(folder) => folder.clone(),
+        None => std::env::current_exe()?.parent().context("this program has no folder")?.to_owned(),
+    };
+    Ok((folder, stage_args))
 }
 
 /// Writes the effective configuration for the time of the run.

@@ -1,6 +1,6 @@
 //! A finished run, and the inputs by which `carff_trials::run` judges its drives.
 
-use crate::supervision::monitor::{FrameRecord, Records};
+use crate::supervision::monitor::{FrameHistory, Records};
 use carff::provenance::Origin;
 use carff_checkpoint::CheckpointPlanning;
 use carff_config::{CameraSource, CompareImages, GraphConfig};
@@ -81,7 +81,7 @@ pub fn decisive(outcome: &RunOutcome) -> Vec<(DecidedFrame, DriveKind)> {
 
 /// Evidence of the last compared image of a take before a frame; for the take's first frame, and after a pause, that
 /// nothing explains it. Images are compared after their decisions.
-fn image_before(frames: &BTreeMap<u64, FrameRecord>, frame: &FrameRecord, states: usize) -> Option<ImageEvidence> {
+fn image_before(frames: &BTreeMap<u64, FrameHistory>, frame: &FrameHistory, states: usize) -> Option<ImageEvidence> {
     let mut before = frames.range(frame.take_start..frame.frame_id.max(frame.take_start)).rev();
     let compared = before.find(|(_, frame)| frame.action.is_some());
     let compared = compared.filter(|(before, _)| ImageEvidence::counts_later(**before, frame.frame_id));
@@ -89,8 +89,8 @@ fn image_before(frames: &BTreeMap<u64, FrameRecord>, frame: &FrameRecord, states
 }
 
 /// Posterior of a frame, with its place in its take.
-fn taken(frame: &FrameRecord) -> Option<(TakeFrame, Gaussian)> {
-    let FrameRecord { take_start, frame_id, capture_time_ns, .. } = *frame;
+fn taken(frame: &FrameHistory) -> Option<(TakeFrame, Gaussian)> {
+    let FrameHistory { take_start, frame_id, capture_time_ns, .. } = *frame;
     Some((TakeFrame { take_start, frame: frame_id, capture_time_ns }, frame.posterior?))
 }
 
@@ -124,7 +124,7 @@ fn settings(outcome: &RunOutcome) -> anyhow::Result<RunSettings> {
 }
 
 /// A frame of a drive on which the controller decided; `None` for any other frame.
-pub(crate) fn decided(frame: &FrameRecord) -> Option<DecidedFrame> {
+pub(crate) fn decided(frame: &FrameHistory) -> Option<DecidedFrame> {
     let action = frame.action?;
     Some(DecidedFrame {
         frame: frame.frame_id,
@@ -148,8 +148,8 @@ mod tests {
     use carff_messages::Observability;
 
     /// A decided frame of the first timestamp of a drive that hides the actor's place.
-    fn frame() -> FrameRecord {
-        FrameRecord {
+    fn frame() -> FrameHistory {
+        FrameHistory {
             frame_id: 0,
             view: 0,
             branch: 0,
@@ -175,14 +175,14 @@ mod tests {
     /// action except an advance is a halt.
     #[test]
     fn decided_frames_are_those_of_drives() {
-        let found = decided(&FrameRecord { view: -1, ..frame() }).unwrap();
+        let found = decided(&FrameHistory { view: -1, ..frame() }).unwrap();
         assert_eq!((found.view, found.halted, found.other_reason), (None, true, None));
-        assert!(!decided(&FrameRecord { action: Some(ActionCode::Advance), ..frame() }).unwrap().halted);
+        assert!(!decided(&FrameHistory { action: Some(ActionCode::Advance), ..frame() }).unwrap().halted);
         let others = [
-            FrameRecord { drive: -1, ..frame() },
-            FrameRecord { branch: -1, ..frame() },
-            FrameRecord { timestamp: -1, ..frame() },
-            FrameRecord { action: None, ..frame() },
+            FrameHistory { drive: -1, ..frame() },
+            FrameHistory { branch: -1, ..frame() },
+            FrameHistory { timestamp: -1, ..frame() },
+            FrameHistory { action: None, ..frame() },
         ];
         assert!(others.iter().all(|other| decided(other).is_none()));
     }
@@ -193,7 +193,7 @@ mod tests {
     fn images_of_the_frame_before_count() {
         let image = |ratio: f32| Some(ImageEvidence::new(&[ratio]));
         let with = |frame_id, take_start, action, ratio| {
-            (frame_id, FrameRecord { frame_id, take_start, action, image: image(ratio), ..frame() })
+            (frame_id, FrameHistory { frame_id, take_start, action, image: image(ratio), ..frame() })
         };
         let halt = Some(ActionCode::Halt);
         let frames = [

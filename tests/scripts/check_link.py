@@ -164,11 +164,11 @@ class Check:
         self.here = {topic: self.echo(self.vehicle, "car", topic) for topic in topics}
         self.there = {topic: self.echo(self.desk, "desk", topic) for topic in topics}
         self.until("the vehicle is seen", lambda: all(p.messages for p in self.here.values()))
-        self.pictures = []
+        self.images = []
         for host, run in [(self.vehicle, "car"), (self.desk, "desk")]:
-            folder = RUNS / "pictures"
+            folder = RUNS / "images"
             host.start("carff", "probe", "image", "view", "-o", str(folder), "--run", run)
-            self.pictures.append(host.root() / folder.relative_to("/"))
+            self.images.append(host.root() / folder.relative_to("/"))
         self.send = self.link()
         self.until("messages arrive", lambda: all(len(p.messages) > 30 for p in self.there.values()))
         told = [line for line in self.receive.lines if "clock" in line]
@@ -196,13 +196,13 @@ class Check:
             off_ms = [(s - AHEAD_S * 1_000_000_000) / 1e6 for s in shifts]
             say(f"{topic}: {len(pairs)} messages as they were; times are moved by {off_ms[0]:.3f} ms too much at first, "
                 f"{off_ms[-1]:.3f} ms in the end")
-        before, after = self.pictures
-        self.until("pictures are on both hosts", lambda: len(both(before, after)) >= 5)
+        before, after = self.images
+        self.until("images are on both hosts", lambda: len(both(before, after)) >= 5)
         names = both(before, after)
         # The last file of each folder may be incomplete.
         same = [n for n in names[:-1] if (before / n).read_bytes() == (after / n).read_bytes()]
-        self.must("pictures are as they were", len(same) == len(names) - 1)
-        say(f"views: {len(same)} pictures as they were, byte for byte")
+        self.must("images are as they were", len(same) == len(names) - 1)
+        say(f"views: {len(same)} images as they were, byte for byte")
 
     def look_around(self) -> None:
         self.must("nothing listens on the vehicle", self.vehicle.listening() == set())
@@ -287,7 +287,7 @@ class Check:
         for process in self.vehicle.processes + self.desk.processes:
             if "probe" in process.name:
                 process.popen.wait(PATIENCE_S)
-        left = [p for p in self.vehicle.shared() + self.desk.shared() if "pictures" not in p and "desk.mcap" not in p]
+        left = [p for p in self.vehicle.shared() + self.desk.shared() if "images" not in p and "desk.mcap" not in p]
         self.must(f"nothing is left: {left}", not left)
         for process in [self.send, self.receive]:
             say("; ".join(line for line in process.lines if "carff-link" not in line))

@@ -15,7 +15,7 @@ mod sets;
 
 pub use graph::{PATIENT, PATIENT_AND_ENDLESS, TestGraph, decisions};
 pub use process::{Finished, Process};
-pub use sets::{copy_checkpoint, picture_set, scenario_set};
+pub use sets::{copy_checkpoint, image_set, scenario_set};
 
 use carff_transport::monotonic_now_ns;
 use std::io::Write;

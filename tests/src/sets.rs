@@ -36,7 +36,7 @@ pub fn scenario_set() -> PathBuf {
 
 /// Writes a small dataset of plain images: two branches x two time steps x 20 poses of 8 x 8 pixels, half of the poses
 /// blind and half of them clear.
-pub fn picture_set(folder: &Path) {
+pub fn image_set(folder: &Path) {
     let images = folder.join("images");
     std::fs::create_dir_all(&images).unwrap();
     let mut frames = Vec::new();

@@ -2,7 +2,7 @@
 
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
-use carff_tests::{Process, TestGraph, picture_set, program, skipped};
+use carff_tests::{Process, TestGraph, image_set, program, skipped};
 use std::path::Path;
 use std::process::Command;
 
@@ -48,7 +48,7 @@ fn missing_data_sets() {
 #[test]
 fn missing_checkpoint() {
     let set = tempfile::tempdir().unwrap();
-    picture_set(set.path());
+    image_set(set.path());
     let graph = TestGraph::new(set.path(), &set.path().join("untrained"), "");
     graph.launch_to_end(&[]).assert_one_error(&["untrained", "carff train"]);
     graph.assert_nothing_left();
@@ -58,7 +58,7 @@ fn missing_checkpoint() {
 #[test]
 fn checkpoint_of_another_format() {
     let set = tempfile::tempdir().unwrap();
-    picture_set(set.path());
+    image_set(set.path());
     let checkpoint = set.path().join("checkpoint");
     std::fs::create_dir(&checkpoint).unwrap();
     let planning = r#"{"format_version": 1, "split_seed": 1, "hazard_threshold": 0.25}"#;
@@ -74,7 +74,7 @@ fn checkpoint_of_another_format() {
 #[test]
 fn missing_program() {
     let set = tempfile::tempdir().unwrap();
-    picture_set(set.path());
+    image_set(set.path());
     let graph = TestGraph::new(set.path(), &set.path().join("none"), "");
     let folder = set.path().to_str().unwrap().to_owned();
     graph.launch_to_end(&["--stages", &folder]).assert_one_error(&["cannot start", "carff-controller", "cargo build"]);
@@ -85,7 +85,7 @@ fn missing_program() {
 #[test]
 fn dataset_check_names_the_place() {
     let set = tempfile::tempdir().unwrap();
-    picture_set(set.path());
+    image_set(set.path());
     let check = || {
         let mut command = Command::new(program("carff"));
         Process::start(command.args(["dataset", "check"]).arg(set.path())).end()
@@ -96,7 +96,7 @@ fn dataset_check_names_the_place() {
     std::fs::write(&file, whole.replacen("\"view_id\":3", "\"view_id\":\"three\"", 1)).unwrap();
     check().assert_one_error(&["transforms.json", "frame 3 (images/b0_t0_v3.png)", "`view_id`"]);
     std::fs::write(&file, &whole).unwrap();
-    std::fs::write(set.path().join("images/b1_t0_v7.png"), "no picture").unwrap();
+    std::fs::write(set.path().join("images/b1_t0_v7.png"), "no image").unwrap();
     let lists_the_image = || {
         let finished = check();
         finished.assert_one_error(&["1 images or masks cannot be used"]);
@@ -126,7 +126,7 @@ fn shared_memory_full_or_not_writable() {
         return;
     }
     let set = tempfile::tempdir().unwrap();
-    picture_set(set.path());
+    image_set(set.path());
     let graph = TestGraph::new(set.path(), &set.path().join("none"), "");
     let launch = graph.launch(&graph.file(), &[]);
     let words = std::iter::once(launch.get_program()).chain(launch.get_args());
@@ -144,7 +144,7 @@ fn shared_memory_full_or_not_writable() {
 #[test]
 fn a_reader_that_has_seen_enough() {
     let set = tempfile::tempdir().unwrap();
-    picture_set(set.path());
+    image_set(set.path());
     for args in [&["dataset", "check", set.path().to_str().unwrap()][..], &["schema", "graph"]] {
         let (reader, writer) = std::io::pipe().unwrap();
         drop(reader);

@@ -4,23 +4,23 @@
 
 use carff_dataset::Image;
 use carff_messages::{Health, Stage};
-use carff_tests::{TestGraph, eventually, picture_set};
+use carff_tests::{TestGraph, eventually, image_set};
 use carff_transport::{Node, topics};
 use std::path::Path;
 
 /// Unreadable and wrong-sized images of a folder are named, counted as errors and never shown; the others are shown.
 #[test]
-fn a_folder_with_bad_pictures() {
-    let pictures = tempfile::tempdir().unwrap();
-    let path = |name: &str| pictures.path().join(name);
+fn a_folder_with_bad_images() {
+    let images = tempfile::tempdir().unwrap();
+    let path = |name: &str| images.path().join(name);
     Image::filled(16, 8, [10, 10, 10]).save_png(&path("a.png")).unwrap();
-    std::fs::write(path("b.png"), "no picture").unwrap();
+    std::fs::write(path("b.png"), "no image").unwrap();
     Image::filled(8, 8, [50, 50, 50]).save_png(&path("c.png")).unwrap();
     Image::filled(16, 8, [90, 90, 90]).save_png(&path("d.png")).unwrap();
     let rest = format!(
         "frame_rate_hz = 5.0\n[camera]\nsource = \"folder\"\nfolder = \"{}\"\nframes_per_timestamp = 3\n\
          [camera.noise]\nsigma = 0.0\ngain_sigma = 0.0\nchannel_gain_sigma = 0.0\nchannel_offset_sigma = 0.0\n",
-        pictures.path().display()
+        images.path().display()
     );
     let graph = TestGraph::new(Path::new("none"), Path::new("none"), &rest);
     let node = Node::open(graph.run(), "test").unwrap();
@@ -50,10 +50,10 @@ fn a_folder_with_bad_pictures() {
 /// A dataset with unreadable images, or with images of another size than its description, ends the camera with an error
 /// that names the image: no drive is shown without it.
 #[test]
-fn drives_with_bad_pictures() {
+fn drives_with_bad_images() {
     let set = tempfile::tempdir().unwrap();
     let spoil = |write: &dyn Fn(&Path)| {
-        picture_set(set.path());
+        image_set(set.path());
         for entry in std::fs::read_dir(set.path().join("images")).unwrap() {
             write(&entry.unwrap().path());
         }
@@ -65,7 +65,7 @@ fn drives_with_bad_pictures() {
         assert!(!finished.text.contains("panicked at"), "{}", finished.text);
         finished
     };
-    spoil(&|path| std::fs::write(path, "no picture").unwrap());
+    spoil(&|path| std::fs::write(path, "no image").unwrap());
     let unreadable = camera();
     assert_eq!(unreadable.status.code(), Some(1), "{}", unreadable.text);
     assert!(unreadable.text.contains("ERROR") && unreadable.text.contains(".png"), "{}", unreadable.text);

@@ -245,20 +245,20 @@ fn a_lost_camera_ends_the_run() {
 /// In a folder with a broken image and an image of another size, both are reported as errors of the camera, and the
 /// graph decides on the other images.
 #[test]
-fn bad_pictures_are_left_out() {
-    let pictures = tempfile::tempdir().unwrap();
-    let path = |name: &str| pictures.path().join(name);
+fn bad_images_are_left_out() {
+    let images = tempfile::tempdir().unwrap();
+    let path = |name: &str| images.path().join(name);
     for (name, grey) in [("a.png", 60), ("d.png", 120), ("e.png", 180)] {
         Image::filled(128, 128, [grey; 3]).save_png(&path(name)).unwrap();
     }
-    std::fs::write(path("b.png"), "no picture").unwrap();
+    std::fs::write(path("b.png"), "no image").unwrap();
     Image::filled(64, 64, [90; 3]).save_png(&path("c.png")).unwrap();
     let rest = format!(
         "frame_rate_hz = 2.0\n{PATIENT}[camera]\nsource = \"folder\"\nfolder = \"{}\"\nframes_per_timestamp = 2\n\
          linger_ms = 10000\n",
-        pictures.path().display()
+        images.path().display()
     );
-    let graph = TestGraph::new(pictures.path(), &shipped_checkpoint(), &rest);
+    let graph = TestGraph::new(images.path(), &shipped_checkpoint(), &rest);
     let finished = graph.launch_to_end(&["--report", "report.json"]);
     finished.assert_success();
     let report = graph.report();

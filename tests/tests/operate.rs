@@ -98,10 +98,10 @@ fn probes_show_what_runs() {
         shown.starts_with("\x1b_Ga=T,f=100,") && shown.trim_end().ends_with(|c: char| c.is_ascii_digit()),
         "{shown}"
     );
-    probe(&graph, &["image", "camera/frame"], &["-o", "pictures", "--count", "2"]);
-    let pictures: Vec<_> = std::fs::read_dir(graph.path("pictures")).unwrap().map(|e| e.unwrap().path()).collect();
-    assert_eq!(pictures.len(), 2);
-    assert!(carff_dataset::Image::load(&pictures[0]).is_ok());
+    probe(&graph, &["image", "camera/frame"], &["-o", "images", "--count", "2"]);
+    let images: Vec<_> = std::fs::read_dir(graph.path("images")).unwrap().map(|e| e.unwrap().path()).collect();
+    assert_eq!(images.len(), 2);
+    assert!(carff_dataset::Image::load(&images[0]).is_ok());
     let belief = probe(&graph, &["belief"], &["--count", "1"]);
     assert!(belief.contains("step 1 of 2") && belief.contains("unknown"), "{belief}");
     let trace = probe(&graph, &["trace", "next"], &["--perfetto", "trace.json"]);
@@ -258,8 +258,8 @@ fn a_recording_is_decided_again_as_it_was() {
     assert!(std::fs::read(graph.path("film.mp4")).unwrap()[4..].starts_with(b"ftyp"));
     let frames = rows(&graph.path("csv/camera-frame.csv"));
     assert!(frames > 0);
-    let pictures = std::fs::read_dir(graph.path("png")).unwrap().flatten();
-    assert_eq!(pictures.filter(|e| e.file_name().to_string_lossy().starts_with("frame-")).count(), frames);
+    let images = std::fs::read_dir(graph.path("png")).unwrap().flatten();
+    assert_eq!(images.filter(|e| e.file_name().to_string_lossy().starts_with("frame-")).count(), frames);
     rewritten_recordings_are_read(&graph);
 }
 
@@ -542,9 +542,9 @@ fn a_bridge_serves_clients_that_only_look() {
     let belief = belief_of((first_ns, data));
     assert_eq!(belief["header"]["run_id"], run_id.as_str());
     assert!(belief["hazard_probability"].as_f64().is_some_and(|p| (0.0..=1.0).contains(&p)), "{belief}");
-    let picture = RawImage::decode(&client.receive(8).1[..]).unwrap();
-    assert_eq!((picture.encoding.as_str(), picture.step), ("rgb8", picture.width * 3));
-    assert!(picture.height > 0 && picture.data.len() as u32 == picture.step * picture.height);
+    let image = RawImage::decode(&client.receive(8).1[..]).unwrap();
+    assert_eq!((image.encoding.as_str(), image.step), ("rgb8", image.width * 3));
+    assert!(image.height > 0 && image.data.len() as u32 == image.step * image.height);
 
     // The client's own action is not accepted as a channel, and its data is not forwarded.
     client.say(&json!({ "op": "advertise", "channels": [

@@ -8,7 +8,7 @@ use carff_messages::{
 };
 use carff_observe::attach;
 use carff_tests::{
-    Process, TestGraph, decisions, eventually, picture_set, program, project_root, scenario_set, shipped_checkpoint,
+    Process, TestGraph, decisions, eventually, image_set, program, project_root, scenario_set, shipped_checkpoint,
 };
 use carff_transport::{Image as ImageTopic, Node, Topic, monotonic_now_ns, topics};
 use rustix::process::Signal;
@@ -143,7 +143,7 @@ struct Recorded {
 impl Recorded {
     fn new() -> Self {
         let folder = tempfile::tempdir().unwrap();
-        picture_set(folder.path());
+        image_set(folder.path());
         Self { folder }
     }
 

@@ -238,7 +238,21 @@ fn listen(
     }
     stages.check()?;
     let probed = probes.map_or(Ok(0), Probes::finish)?;
+    let used = Used { views, uses, probe_cores, probed };
+    Ok(measured(listener, [from_ns, to_ns], used))
+}
 
+/// Work of the stages and probes in the measured time.
+struct Used {
+    views: u64,
+    uses: Vec<Use>,
+    probe_cores: f64,
+    probed: u64,
+}
+
+/// Returns the figures of the frames that were captured in an interval.
+fn measured(listener: &Listener, [from_ns, to_ns]: [u64; 2], used: Used) -> Measured {
+    let Used { views, uses, probe_cores, probed } = used;
     let frames: Vec<&Frame> = listener.frames.values().filter(|f| (from_ns..to_ns).contains(&f.captured_ns)).collect();
     // Frame numbers have no gaps: a missing number is a frame that was not received.
     let (first, last) = (
@@ -258,7 +272,7 @@ fn listen(
     }
     let span_ns = frames.last().map_or(0, |f| f.captured_ns) - frames.first().map_or(0, |f| f.captured_ns);
     let count = last.saturating_sub(first) as usize;
-    Ok(Measured {
+    Measured {
         latency_ms: decided.iter().map(|(f, at)| (at - f.captured_ns) as f64 / 1e6).collect(),
         ipc_share: between_ns as f64 / all_ns as f64,
         hand_overs_ms,
@@ -269,7 +283,7 @@ fn listen(
         uses,
         probe_cores,
         probed,
-    })
+    }
 }
 
 /// Receives all messages of a run, by polling: wake-ups by each message would take a core from the stages.

@@ -52,7 +52,7 @@ pub fn run(args: &ExportArgs) -> anyhow::Result<ExitCode> {
     check_distinct([path.as_path()], files())?;
     files().try_for_each(check_writable)?;
     if let Some(folder) = png {
-        println!("{}: {} images", folder.display(), pictures(path, folder)?);
+        println!("{}: {} images", folder.display(), images(path, folder)?);
     }
     if let Some(folder) = csv {
         for (file, rows) in tables(path, folder)? {
@@ -82,7 +82,7 @@ fn make_folder(folder: &Path) -> anyhow::Result<()> {
     std::fs::create_dir_all(folder).with_context(|| format!("cannot create the folder {}", folder.display()))
 }
 
-fn pictures(recording: &Path, folder: &Path) -> anyhow::Result<u64> {
+fn images(recording: &Path, folder: &Path) -> anyhow::Result<u64> {
     make_folder(folder)?;
     let mut reader = Reader::open(recording)?;
     note_cut_off(&reader, recording);
@@ -255,9 +255,9 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("r.mcap");
         recording(&path);
-        assert_eq!(pictures(&path, &folder.path().join("png")).unwrap(), 3);
-        let picture = image::open(folder.path().join("png/frame-000002.png")).unwrap().into_rgb8();
-        assert_eq!((picture.dimensions(), picture.as_raw().as_slice()), ((2, 1), [2; 6].as_slice()));
+        assert_eq!(images(&path, &folder.path().join("png")).unwrap(), 3);
+        let image = image::open(folder.path().join("png/frame-000002.png")).unwrap().into_rgb8();
+        assert_eq!((image.dimensions(), image.as_raw().as_slice()), ((2, 1), [2; 6].as_slice()));
 
         let tables = tables(&path, &folder.path().join("csv")).unwrap();
         assert_eq!(tables.len(), 2);

@@ -27,7 +27,7 @@ const TICKS_HZ: NonZeroU32 = NonZeroU32::new(90_000).unwrap();
 /// Coarsest quantization, of 0 to 51; its effect is hardly visible.
 const COARSENESS: QpRange = QpRange::new(12, 16);
 /// Time between key images, seconds; players seek to these.
-const WHOLE_PICTURE_EVERY_S: f64 = 2.0;
+const WHOLE_IMAGE_EVERY_S: f64 = 2.0;
 /// Shortest side that the encoder accepts.
 const MIN_SIDE_PX: u32 = 16;
 /// Frame rates that the encoder accepts, hertz.
@@ -66,7 +66,7 @@ impl FilmWriter {
             .skip_frames(false)
             .background_detection(false)
             .max_frame_rate(FrameRate::from_hz(rate_hz.clamp(*RATES_HZ.start(), *RATES_HZ.end()) as f32))
-            .intra_frame_period(IntraFramePeriod::from_num_frames((WHOLE_PICTURE_EVERY_S * rate_hz).max(1.0) as u32))
+            .intra_frame_period(IntraFramePeriod::from_num_frames((WHOLE_IMAGE_EVERY_S * rate_hz).max(1.0) as u32))
             .num_threads(1)
             // The colour conversion, and the colour space.
             .vui(
@@ -102,20 +102,20 @@ impl FilmWriter {
     /// Adds an image, RGB bytes row by row, captured at this time.
     pub(crate) fn add(&mut self, rgb: &[u8], at_ns: u64) -> anyhow::Result<()> {
         let (rgb, [width_px, height_px]) = fitting(rgb, self.size_px);
-        let picture = RgbSliceU8::new(&rgb, (width_px as usize, height_px as usize));
+        let image = RgbSliceU8::new(&rgb, (width_px as usize, height_px as usize));
         let stream = self
             .encoder
-            .encode(&YUVBuffer::from_rgb8_source(picture))
+            .encode(&YUVBuffer::from_rgb8_source(image))
             .with_context(|| format!("cannot encode images of {width_px} x {height_px} pixels"))?;
         let keyframe = stream.frame_type() == FrameType::IDR;
-        let (mut sequence, mut pictures, mut data) = (Vec::new(), Vec::new(), Vec::new());
+        let (mut sequence, mut images, mut data) = (Vec::new(), Vec::new(), Vec::new());
         for layer in (0..stream.num_layers()).filter_map(|i| stream.layer(i)) {
             for unit in (0..layer.nal_count()).filter_map(|i| layer.nal_unit(i)) {
                 let unit = unit.strip_prefix(&[0, 0, 0, 1]).or_else(|| unit.strip_prefix(&[0, 0, 1])).unwrap_or(unit);
                 // The file's index contains the parameter sets once; the rest is the image.
                 match unit.first().map(|byte| byte & 0x1f) {
                     Some(7) => sequence.push(unit.to_vec()),
-                    Some(8) => pictures.push(unit.to_vec()),
+                    Some(8) => images.push(unit.to_vec()),
                     _ => {
                         data.extend((unit.len() as u32).to_be_bytes());
                         data.extend(unit);
@@ -125,7 +125,7 @@ impl FilmWriter {
         }
         ensure!(!data.is_empty(), "the film's encoder skipped image {}", self.count);
         let entry = match self.last {
-            None => Some(sample_entry([width_px, height_px], sequence, pictures)?),
+            None => Some(sample_entry([width_px, height_px], sequence, images)?),
             Some(_) => None,
         };
 
@@ -174,7 +174,7 @@ impl FilmWriter {
 }
 
 /// Returns the description of the encoding, for the index.
-fn sample_entry(size_px: [u32; 2], sequence: Vec<Vec<u8>>, pictures: Vec<Vec<u8>>) -> anyhow::Result<SampleEntry> {
+fn sample_entry(size_px: [u32; 2], sequence: Vec<Vec<u8>>, images: Vec<Vec<u8>>) -> anyhow::Result<SampleEntry> {
     let [width, height] = size_px.map(u16::try_from);
     let profile = sequence.first().and_then(|unit| unit.get(1..4)).context("the film's encoder gave no parameters")?;
     Ok(SampleEntry::Avc1(Avc1Box {
@@ -194,7 +194,7 @@ fn sample_entry(size_px: [u32; 2], sequence: Vec<Vec<u8>>, pictures: Vec<Vec<u8>
             avc_level_indication: profile[2],
             length_size_minus_one: Uint::new(3),
             sps_list: sequence,
-            pps_list: pictures,
+            pps_list: images,
             chroma_format: None,
             bit_depth_luma_minus8: None,
             bit_depth_chroma_minus8: None,
@@ -289,8 +289,9 @@ fn first_view_px(recording: &Path) -> anyhow::Result<Option<[u32; 2]>> {
 /// Draws a grid from above, +y up: from white for a free cell to red for a taken one.
 fn grid_image(grid: &Occupancy) -> Image {
     let colour = |p: f32| [1.0, 1.0 - 0.85 * p, 1.0 - 0.9 * p].map(|v| (255.0 * v.clamp(0.0, 1.0)) as u8);
-    let rows = grid.cells().chunks_exact((grid.columns as usize).max(1)).rev();
-    let rgb = rows.flat_map(|row| row.iter().flat_map(move |p| colour(*p))).collect();
+    let cells = grid.grid();
+    let rgb =
+        cells.outer_iter().rev().flat_map(|row| row.iter().flat_map(|p| colour(*p)).collect::<Vec<_>>()).collect();
     Image { width_px: grid.columns, height_px: grid.rows, rgb }
 }
 
@@ -402,7 +403,7 @@ mod tests {
     use shiguredo_mp4::demux::{Input, Mp4FileDemuxer};
 
     /// Returns an image in which everything moves.
-    fn picture([width_px, height_px]: [u32; 2], number: u32) -> Vec<u8> {
+    fn image([width_px, height_px]: [u32; 2], number: u32) -> Vec<u8> {
         let pixel = |x: u32, y: u32| {
             let wave = ((x + 3 * number) as f32 / 20.0).sin() + (y as f32 / 15.0).cos();
             [90.0 + 40.0 * wave, 120.0 - 30.0 * wave, 60.0 + (x / 2 + number) as f32].map(|value| value as u8)
@@ -417,7 +418,7 @@ mod tests {
         whole: Vec<usize>,
         times: Vec<u64>,
         ticks: u64,
-        pictures: Vec<Vec<u8>>,
+        images: Vec<Vec<u8>>,
     }
 
     fn play(path: &Path) -> Played {
@@ -434,7 +435,7 @@ mod tests {
             whole: Vec::new(),
             times: Vec::new(),
             ticks: tracks[0].duration,
-            pictures: Vec::new(),
+            images: Vec::new(),
         };
         let mut decoder = Decoder::new().unwrap();
         while let Some(sample) = demuxer.next_sample().unwrap() {
@@ -460,7 +461,7 @@ mod tests {
             assert_eq!([width as u32, height as u32], played.size_px);
             let mut rgb = vec![0; width * height * 3];
             decoded.write_rgb8(&mut rgb);
-            played.pictures.push(rgb);
+            played.images.push(rgb);
         }
         played
     }
@@ -475,7 +476,7 @@ mod tests {
         let at_ns = |number: u32| 7_000 + u64::from(number) * 100_000_000 + u64::from(number > 29) * 1_000_000_000;
         let mut film = FilmWriter::create(&path, size_px, 10.0).unwrap();
         for number in 0..50 {
-            film.add(&picture(size_px, number), at_ns(number)).unwrap();
+            film.add(&image(size_px, number), at_ns(number)).unwrap();
         }
         assert_eq!(film.finish().unwrap(), 50);
 
@@ -485,8 +486,8 @@ mod tests {
         assert_eq!(played.times, expected);
         assert_eq!(played.ticks, expected[49] + 9_000);
         assert!(played.whole.contains(&0) && played.whole.windows(2).all(|w| w[1] - w[0] <= 20), "{:?}", played.whole);
-        for (number, decoded) in played.pictures.iter().enumerate() {
-            let [found, wanted] = [decoded, &picture(size_px, number as u32)]
+        for (number, decoded) in played.images.iter().enumerate() {
+            let [found, wanted] = [decoded, &image(size_px, number as u32)]
                 .map(|p| p.iter().map(|&byte| f32::from(byte) / 255.0).collect::<Vec<_>>());
             let psnr_db = carff_base::statistics::psnr_db(&found, &wanted).unwrap();
             assert!(psnr_db > 35.0, "image {number}: {psnr_db} dB");
@@ -577,7 +578,7 @@ mod tests {
                 [shown, &board.rgb].map(|p| p.iter().map(|&b| f32::from(b) / 255.0).collect::<Vec<_>>());
             carff_base::statistics::psnr_db(&shown, &board).unwrap()
         };
-        for (shown, [own, other]) in played.pictures.iter().zip([[0, 1], [1, 0]]) {
+        for (shown, [own, other]) in played.images.iter().zip([[0, 1], [1, 0]]) {
             let [own, other] = [own, other].map(|board| psnr_db(shown, &boards[board]));
             assert!(own > 30.0 && other < 20.0, "own board {own} dB, the other frame's {other} dB");
         }
@@ -590,10 +591,10 @@ mod tests {
         let path = folder.path().join("film.mp4");
         for (size_px, fitting_px) in [([2, 1], [16, 16]), ([37, 21], [38, 22])] {
             let mut film = FilmWriter::create(&path, size_px, 10.0).unwrap();
-            film.add(&picture(size_px, 0), 5).unwrap();
+            film.add(&image(size_px, 0), 5).unwrap();
             assert_eq!(film.finish().unwrap(), 1);
             let played = play(&path);
-            assert_eq!((played.size_px, played.pictures.len(), played.ticks), (fitting_px, 1, 9_000));
+            assert_eq!((played.size_px, played.images.len(), played.ticks), (fitting_px, 1, 9_000));
         }
         let counting: Vec<u8> = (0..17 * 16 * 3).map(|i| (i / 3) as u8).collect();
         let (rgb, _) = fitting(&counting, [17, 16]);

@@ -9,7 +9,7 @@ use crate::{complete, provenance};
 use anyhow::Context;
 use carff_checkpoint::Manifest;
 use carff_observe::LiveRun;
-use carff_recording::{About, Limits, LogLine, RecordingQueue, RotatingWriter};
+use carff_recording::{About, LogLine, RecordingQueue, RotatingWriter, RotationLimits};
 use carff_transport::TopicId;
 use carff_transport::monotonic_now_ns;
 use clap::Args;
@@ -87,7 +87,7 @@ fn record(args: &RecordArgs, mut session: Session, out: &Path) -> anyhow::Result
             Default::default()
         }
     };
-    let limits = Limits {
+    let limits = RotationLimits {
         file_bytes: args.file_mb.map(|mb| mb.saturating_mul(1_000_000)),
         file_ns: args.file_seconds.map(|s| s.saturating_mul(1_000_000_000)),
         files: args.keep.map(|n| n as usize),

@@ -6,7 +6,7 @@ use carff_checkpoint::Manifest;
 use carff_launch::dataset::render;
 use carff_launch::lab::{StageName, TrainArgs};
 use carff_scenes::{
-    Extras, Scenario,
+    ClosedLoop, Extras, Scenario,
     config::{BystanderPlace, VariationRole},
 };
 use carff_training::{
@@ -118,20 +118,16 @@ fn scenario(config: &TrainingConfig) -> anyhow::Result<Scenario> {
 
 /// Folders of the datasets of random poses, rendered where they are missing; none for a dataset without a scenario file.
 fn rendered_random_poses(config: &TrainingConfig, given: Option<&Path>) -> anyhow::Result<Vec<PathBuf>> {
-    let FreePoses { count, per_appearance, seed, .. } = config.free_poses;
+    let FreePoses { count, on_path, per_appearance, seed, .. } = config.free_poses;
     if count == 0 || given.is_some() || config.scenario.is_none() {
         return Ok(Vec::new());
     }
-    let free = |scenario: Scenario, count: usize, seed: u64, suffix: &str| {
-        let mut name = config.dataset.file_name().unwrap_or_default().to_owned();
-        name.push(format!("-free-{count}-{seed}{suffix}"));
-        let dir = config.dataset.with_file_name(name);
-        if !dir.join("transforms.json").is_file() {
-            render(&scenario.with_free_cameras(count, seed)?, &dir, Extras::None)?;
-        }
-        anyhow::Ok(dir)
-    };
-    let mut all = vec![free(scenario(config)?, count, seed, "")?];
+    let drawn = || Ok(scenario(config)?.with_free_cameras(count, seed)?);
+    let mut all = vec![rendered(config, &format!("free-{count}-{seed}"), drawn)?];
+    if on_path > 0 {
+        let drawn = || Ok(ClosedLoop::new(scenario(config)?)?.with_training_cameras(on_path, seed)?);
+        all.push(rendered(config, &format!("path-{on_path}-{seed}"), drawn)?);
+    }
     if per_appearance == 0 {
         return Ok(all);
     }
@@ -146,9 +142,26 @@ fn rendered_random_poses(config: &TrainingConfig, given: Option<&Path>) -> anyho
             varied = varied.with_object(&object.name)?;
         }
         // Each appearance has poses of its own.
-        all.push(free(varied, per_appearance, seed + 1 + number as u64, &format!("-{}", appearance.name))?);
+        let seed = seed + 1 + number as u64;
+        let suffix = format!("free-{per_appearance}-{seed}-{}", appearance.name);
+        all.push(rendered(config, &suffix, || Ok(varied.with_free_cameras(per_appearance, seed)?))?);
     }
     Ok(all)
+}
+
+/// Folder of a dataset next to the training file's own, rendered if it is missing.
+fn rendered(
+    config: &TrainingConfig,
+    suffix: &str,
+    scenario: impl FnOnce() -> anyhow::Result<Scenario>,
+) -> anyhow::Result<PathBuf> {
+    let mut name = config.dataset.file_name().unwrap_or_default().to_owned();
+    name.push(format!("-{suffix}"));
+    let dir = config.dataset.with_file_name(name);
+    if !dir.join("transforms.json").is_file() {
+        render(&scenario()?, &dir, Extras::None)?;
+    }
+    Ok(dir)
 }
 
 /// Folders of the datasets of random poses: the rendered ones, else one that a field renders if the training file requests

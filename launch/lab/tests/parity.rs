@@ -136,7 +136,7 @@ fn values_in_bf16_are_near() {
     let z = latent(2);
     let mut field = rough_field(config(), 4);
     for (set, precision) in
-        [(InstructionSet::detect(), Precision::Bf16), (InstructionSet::detect_for_pictures(), Precision::F32)]
+        [(InstructionSet::detect(), Precision::Bf16), (InstructionSet::detect_for_images(), Precision::F32)]
     {
         if precision == Precision::F32 && !set.is_bf16() {
             continue;

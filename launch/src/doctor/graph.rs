@@ -28,7 +28,7 @@ pub fn check(path: &Path, graph: &GraphConfig, dataset: Option<&Path>, checkpoin
     let checkpoint = graph.resolve(checkpoint.unwrap_or(&graph.run.checkpoint));
     let renders = graph.camera.source == CameraSource::FreeDrives || !dataset.exists();
     let scenario = scenario(graph, renders, &mut findings);
-    let shown = pictures(graph, &dataset, scenario.as_ref(), &mut findings);
+    let shown = images(graph, &dataset, scenario.as_ref(), &mut findings);
     models(&checkpoint, shown.as_ref(), &mut findings);
     findings
 }
@@ -111,7 +111,7 @@ fn calibration(graph: &GraphConfig) -> Option<Finding> {
 }
 
 /// Checks the source of images. Returns the scenario of the images.
-fn pictures(
+fn images(
     graph: &GraphConfig,
     dataset: &Path,
     scenario: Option<&Scenario>,

@@ -16,7 +16,7 @@ use crate::supervision::{Ended, Feed};
 use anyhow::{Context, ensure};
 use carff::terminal::Terminal;
 use carff_base::files::{check_distinct, check_writable};
-use carff_checkpoint::{Manifest, ScenarioIdentity};
+use carff_checkpoint::{CheckpointPlanning, Manifest, ScenarioIdentity};
 use carff_config::{CameraSource, GraphConfig};
 use carff_decision::Approach;
 use carff_messages::{Rule, Stage};
@@ -69,6 +69,10 @@ pub struct DriveArgs {
     /// Write each decision here as one JSON line.
     #[arg(long, value_name = "FILE")]
     pub decisions: Option<PathBuf>,
+    /// Write into the checkpoint how often cells of the others' lane are taken where the belief takes them for free and
+    /// for taken, at each step. The prober then publishes grids with these rates.
+    #[arg(long)]
+    pub learn_occupancy: bool,
     /// Set a key of the graph's configuration, for example `run.samples=35`; may be given several times.
     #[arg(long, value_name = "KEY=VALUE")]
     pub set: Vec<String>,
@@ -199,6 +203,12 @@ pub fn run(args: &DriveArgs) -> anyhow::Result<ExitCode> {
         let text = serde_json::to_string_pretty(&report)? + "\n";
         std::fs::write(path, text).with_context(|| format!("cannot write {}", path.display()))?;
         terminal.line(&format!("JSON: {}", path.display()));
+    }
+    if args.learn_occupancy && ended != Ended::Interrupted {
+        let old = CheckpointPlanning::load(&args.checkpoint)?;
+        let check = occupancy.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+        CheckpointPlanning { occupancy: Some(check.rates(old.occupancy)?), ..old }.save(&args.checkpoint)?;
+        terminal.line(&format!("rates of the occupancy grid: written into {}", args.checkpoint.display()));
     }
     terminal.check()?;
     Ok(ExitCode::SUCCESS)

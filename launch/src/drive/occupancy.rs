@@ -1,8 +1,10 @@
 //! Calibration of the occupancy grid in closed-loop drives: which cells of the others' lane were forecast as taken, and
 //! which were taken.
 
+use anyhow::Context;
 use carff_base::geometry::OrientedBox;
-use carff_messages::Occupancy;
+use carff_checkpoint::{OccupancyRates, StepRates};
+use carff_messages::{MAX_HORIZON, Occupancy};
 use carff_scenes::{ClosedLoop, Episode};
 use carff_trials::{Reliability, ReliabilitySums};
 use serde::Serialize;
@@ -29,11 +31,43 @@ struct OfStep {
     log_loss: f64,
     taken: u64,
     grids: u64,
+    line: LineSums,
 }
 
 impl Default for OfStep {
     fn default() -> Self {
-        Self { sums: ReliabilitySums::new(BINS), log_loss: 0.0, taken: 0, grids: 0 }
+        let line = LineSums::default();
+        Self { sums: ReliabilitySums::new(BINS), log_loss: 0.0, taken: 0, grids: 0, line }
+    }
+}
+
+/// Sums for the line of least squares from the forecast probability of a cell to the truth.
+#[derive(Clone, Copy, Debug, Default)]
+struct LineSums {
+    count: f64,
+    forecast: f64,
+    square: f64,
+    taken: f64,
+    product: f64,
+}
+
+impl LineSums {
+    fn add(&mut self, forecast: f64, is_taken: bool) {
+        let taken = f64::from(u8::from(is_taken));
+        self.count += 1.0;
+        self.forecast += forecast;
+        self.square += forecast * forecast;
+        self.taken += taken;
+        self.product += forecast * taken;
+    }
+
+    /// Returns the rates of the line within 0..=1; `None` if all forecasts are equal.
+    fn rates(&self) -> Option<OccupancyRates> {
+        let (forecast, taken) = (self.forecast / self.count, self.taken / self.count);
+        let variance = self.square / self.count - forecast * forecast;
+        let slope = (self.product / self.count - forecast * taken) / variance;
+        let at = |p: f64| (taken + slope.max(0.0) * (p - forecast)).clamp(0.0, 1.0);
+        (self.count > 0.0 && variance > 1e-9).then(|| OccupancyRates { where_free: at(0.0), where_taken: at(1.0) })
     }
 }
 
@@ -43,6 +77,7 @@ impl OfStep {
         self.log_loss -= right.clamp(LEAST, 1.0 - LEAST).ln();
         self.sums.add(probability, is_taken);
         self.taken += u64::from(is_taken);
+        self.line.add(probability, is_taken);
     }
 
     fn figures(&self) -> StepOccupancy {
@@ -110,24 +145,35 @@ impl OccupancyCheck {
         let others = drives.actor_boxes(episode, frame.time_s + f64::from(grid.header.step) * step_s);
         let of_step = self.steps.entry(grid.header.step).or_default();
         of_step.grids += 1;
-        for (cell, &probability) in grid.cells().iter().enumerate() {
-            let middle_m = middle_m(grid, cell);
+        for ((row, column), &probability) in grid.grid().indexed_iter() {
+            let middle_m = grid.middle_m([row, column]);
             if contains(drives.lane_boxes(), middle_m) {
                 of_step.add(f64::from(probability), contains(&others, middle_m));
             }
         }
     }
 
+    /// Returns the rates of each step that make the grids of these drives calibrated, where the grids had the rates `old`.
+    /// Steps beyond the look-ahead have those of the last one.
+    ///
+    /// # Errors
+    ///
+    /// No grid has been compared, or all of them are equal.
+    pub(super) fn rates(&self, old: Option<StepRates>) -> anyhow::Result<StepRates> {
+        let mut last = None;
+        let mut all = old.unwrap_or([OccupancyRates::EXACT; MAX_HORIZON as usize]);
+        for (step, rates) in (1_u32..).zip(&mut all) {
+            last = self.steps.get(&step).and_then(|of_step| of_step.line.rates()).or(last);
+            let line = last.context("no grid of these drives has probabilities that differ: drive more episodes")?;
+            *rates = OccupancyRates { where_free: line.of(rates.where_free), where_taken: line.of(rates.where_taken) };
+        }
+        Ok(all)
+    }
+
     /// Returns the figures of each step.
     pub(super) fn figures(&self) -> BTreeMap<u32, StepOccupancy> {
         self.steps.iter().map(|(step, of_step)| (*step, of_step.figures())).collect()
     }
-}
-
-/// Returns the middle of a cell on the ground, x and y in metres.
-fn middle_m(grid: &Occupancy, cell: usize) -> [f64; 2] {
-    let place = [cell % grid.columns as usize, cell / grid.columns as usize];
-    [0, 1].map(|axis| f64::from(grid.low_corner_m[axis]) + (place[axis] as f64 + 0.5) * f64::from(grid.cell_m))
 }
 
 /// Reports whether a point of the ground is in one of the boxes.
@@ -153,8 +199,11 @@ mod tests {
             let mut grid = Occupancy::empty(Header::of_frame(7, 1, 1).at_step(2));
             (grid.columns, grid.rows, grid.cell_m, grid.low_corner_m) = (32, 32, 1.25, [-20.0, -20.0]);
             let others = drives.actor_boxes(&episode, time_s);
-            let taken: Vec<bool> =
-                (0..grid.cells().len()).map(|cell| contains(&others, middle_m(&grid, cell))).collect();
+            let cells = grid.grid();
+            let taken: Vec<bool> = cells
+                .indexed_iter()
+                .map(|((row, column), _)| contains(&others, grid.middle_m([row, column])))
+                .collect();
             for (to, taken) in grid.probability.iter_mut().zip(taken) {
                 *to = f32::from(u8::from(taken));
             }
@@ -181,5 +230,37 @@ mod tests {
         let error = free.reliability.expected_calibration_error;
         assert!((error - share).abs() < 1e-12 && free.log_loss > free.share_log_loss, "{free:?}");
         assert!(OccupancyCheck::new(None).figures().is_empty());
+    }
+
+    /// Forecasts of 0.2 and 0.8 that come true in 20 and 50 of 100 cells give the line through both points. With these
+    /// rates the grid's probabilities are the shares. Steps without grids take those of the step before; equal forecasts
+    /// are refused.
+    #[test]
+    fn rates_make_grids_calibrated() {
+        let mut check = OccupancyCheck::new(Some(0.6));
+        assert!(check.rates(None).is_err());
+        let of_step = check.steps.entry(1).or_default();
+        for cell in 0..100 {
+            of_step.add(0.2, cell < 20);
+        }
+        assert!(check.rates(None).is_err());
+        let of_step = check.steps.entry(1).or_default();
+        for cell in 0..100 {
+            of_step.add(0.8, cell < 50);
+        }
+        let rates = check.rates(None).unwrap();
+        let near = |rates: OccupancyRates, free: f64, taken: f64| {
+            assert!((rates.where_free - free).abs() < 1e-9 && (rates.where_taken - taken).abs() < 1e-9, "{rates:?}");
+        };
+        near(rates[0], 0.1, 0.6);
+        assert_eq!(rates[7], rates[0]);
+        // Grids with these rates have the shares as probabilities, so they keep their rates.
+        let mut later = OccupancyCheck::new(Some(0.6));
+        let of_step = later.steps.entry(1).or_default();
+        for cell in 0..100 {
+            of_step.add(rates[0].of(0.2), cell < 20);
+            of_step.add(rates[0].of(0.8), cell < 50);
+        }
+        near(later.rates(Some(rates)).unwrap()[0], 0.1, 0.6);
     }
 }

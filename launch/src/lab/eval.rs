@@ -61,5 +61,5 @@ pub enum TableName {
     /// Frequency of each outcome where several are open.
     Frequencies,
     /// t-SNE, reconstructions, curves, beliefs, density.
-    Pictures,
+    Images,
 }

@@ -39,21 +39,13 @@ impl Soak<'_> {
                 self.kill(fault.target, pid);
                 self.recover(Some(pid))?;
             }
-            Kind::Stop => {
-                let victim = Victim::new(self.pid_of(fault, &pids)?)?;
-                self.excuse(fault.target, fault.hold_ms);
-                victim.signal(Signal::STOP);
-                self.look_for(fault.hold_ms)?;
-                victim.signal(Signal::CONT);
-                self.recover(None)?;
-            }
+            Kind::Stop => self.hold_still(fault, &pids, fault.hold_ms)?,
             Kind::Drop => {
-                let camera = Fault { target: Some(Stage::Camera), ..*fault };
-                let victim = Victim::new(self.pid_of(&camera, &pids)?)?;
-                victim.signal(Signal::STOP);
-                self.look_for((DROPPED_FRAMES * 1000.0 / self.graph.config.run.frame_rate_hz) as u64)?;
-                victim.signal(Signal::CONT);
-                self.recover(None)?;
+                let hold_ms = (DROPPED_FRAMES * 1000.0 / self.graph.config.run.frame_rate_hz) as u64;
+                self.hold_still(&Fault { target: Some(Stage::Camera), ..*fault }, &pids, hold_ms)?;
+            }
+            Kind::Stall => {
+                self.hold_still(&Fault { target: Some(Stage::Camera), ..*fault }, &pids, fault.hold_ms)?;
             }
             Kind::Slow => {
                 let victim = Victim::new(self.pid_of(fault, &pids)?)?;
@@ -67,14 +59,6 @@ impl Soak<'_> {
                 self.recover(None)?;
             }
             Kind::Nan | Kind::Garbage | Kind::Schema | Kind::ForeignRun => self.lie(fault)?,
-            Kind::Stall => {
-                let camera = Fault { target: Some(Stage::Camera), ..*fault };
-                let victim = Victim::new(self.pid_of(&camera, &pids)?)?;
-                victim.signal(Signal::STOP);
-                self.look_for(fault.hold_ms)?;
-                victim.signal(Signal::CONT);
-                self.recover(None)?;
-            }
             Kind::DeviceLoss => {
                 if self.graph.config.camera.source != CameraSource::Drives {
                     return Ok(false);
@@ -120,6 +104,16 @@ impl Soak<'_> {
             Kind::KillLauncher => self.cycle(Signal::KILL)?,
         }
         Ok(true)
+    }
+
+    /// Stops a process for a time, and continues it.
+    fn hold_still(&mut self, fault: &Fault, pids: &BTreeMap<Stage, u32>, hold_ms: u64) -> anyhow::Result<()> {
+        let victim = Victim::new(self.pid_of(fault, pids)?)?;
+        self.excuse(fault.target, hold_ms);
+        victim.signal(Signal::STOP);
+        self.look_for(hold_ms)?;
+        victim.signal(Signal::CONT);
+        self.recover(None)
     }
 
     fn pid_of(&self, fault: &Fault, pids: &BTreeMap<Stage, u32>) -> anyhow::Result<u32> {

@@ -15,7 +15,7 @@ use std::fmt;
 /// Time limits of a stage, nanoseconds.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[allow(clippy::struct_field_names, reason = "the postfix is the unit")]
-pub struct Limits {
+pub struct HealthLimits {
     /// Limit from the start until the stage is ready.
     pub start_ns: u64,
     /// Time without a heartbeat after which the stage is stale.
@@ -86,14 +86,14 @@ enum Phase {
 /// The health of one stage.
 #[derive(Clone, Copy, Debug)]
 pub struct StageHealth {
-    limits: Limits,
+    limits: HealthLimits,
     phase: Phase,
     was_ready: bool,
 }
 
 impl StageHealth {
     /// Creates the health of a stage whose first process has just started.
-    pub fn started(limits: Limits, pid: u32, now_ns: u64) -> Self {
+    pub fn started(limits: HealthLimits, pid: u32, now_ns: u64) -> Self {
         let mut health = Self { limits, phase: Phase::Restarting, was_ready: false };
         health.restarted(pid, now_ns);
         health
@@ -222,7 +222,7 @@ mod tests {
     use carff_messages::{Header, Stage};
 
     const MS: u64 = 1_000_000;
-    const LIMITS: Limits = Limits {
+    const LIMITS: HealthLimits = HealthLimits {
         start_ns: 5000 * MS,
         silence_ns: 1000 * MS,
         hang_ns: 2000 * MS,

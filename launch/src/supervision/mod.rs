@@ -25,8 +25,8 @@ use carff_observe::RunRecord;
 use carff_runtime::StageArgs;
 use carff_transport::{Node, Run, Stop, Waiter, Woken, monotonic_now_ns, topics};
 use external::ForeignCamera;
-use health::{Ailment, Limits, StageHealth};
-use monitor::{FrameRecord, Monitor, Records};
+use health::{Ailment, HealthLimits, StageHealth};
+use monitor::{FrameHistory, Monitor, Records};
 use process::StageProcess;
 use restart::{RestartBudget, Verdict};
 use service_manager::Watchdog;
@@ -96,7 +96,7 @@ pub(crate) struct Supervisor<'a> {
     stages: Vec<Watched>,
     stage_args: StageArgs,
     folder: PathBuf,
-    decided: &'a mut dyn FnMut(&FrameRecord),
+    decided: &'a mut dyn FnMut(&FrameHistory),
     terminal: Arc<Terminal>,
     watchdog: Watchdog,
     /// Thread of the feed, once it has started.
@@ -123,7 +123,7 @@ impl<'a> Supervisor<'a> {
         stages: (PathBuf, StageArgs),
         stop: &Stop,
         terminal: &Arc<Terminal>,
-        decided: &'a mut dyn FnMut(&FrameRecord),
+        decided: &'a mut dyn FnMut(&FrameHistory),
     ) -> anyhow::Result<Self> {
         let (folder, stage_args) = stages;
         let run = node.run();
@@ -253,7 +253,7 @@ impl<'a> Supervisor<'a> {
         Ok(())
     }
 
-    fn limits(&self, stage: Stage) -> Limits {
+    fn limits(&self, stage: Stage) -> HealthLimits {
         const NS_PER_MS: u64 = 1_000_000;
         let (graph, launcher) = (self.graph, &self.graph.launcher);
         let hang_ns = launcher.hang_timeout_ms * NS_PER_MS;
@@ -269,7 +269,7 @@ impl<'a> Supervisor<'a> {
         };
         // The controller has its own rate.
         let frames_ns = if stage == Stage::Controller { 0.0 } else { QUIET_FRAMES * frame_ns };
-        Limits {
+        HealthLimits {
             start_ns: launcher.start_timeout_ms * NS_PER_MS,
             silence_ns: topics::health(stage).deadline.as_nanos() as u64,
             hang_ns,

@@ -14,7 +14,7 @@ use std::collections::{BTreeMap, VecDeque};
 
 /// Record of a camera frame. Values from the dataset are -1 or `Unknown` without a dataset.
 #[derive(Clone, Debug)]
-pub struct FrameRecord {
+pub struct FrameHistory {
     /// Frame number in the run.
     pub frame_id: u64,
     /// Camera pose.
@@ -53,7 +53,7 @@ pub struct FrameRecord {
     pub latency_ns: u64,
 }
 
-impl FrameRecord {
+impl FrameHistory {
     /// Creates the record of a frame without a decision.
     fn of(header: &Header, view: &DatasetView) -> Self {
         Self {
@@ -141,7 +141,7 @@ pub struct Records {
     /// Values that the graph file requests, and the limit of records.
     wanted: Wanted,
     /// Frames by number.
-    pub frames: BTreeMap<u64, FrameRecord>,
+    pub frames: BTreeMap<u64, FrameHistory>,
     /// Number of valid camera frames that the launcher has read.
     pub frames_seen: u64,
     /// Number of published actions, both decisions and repeats.
@@ -188,7 +188,7 @@ struct Wanted {
 
 impl Records {
     /// Returns the frames in order.
-    pub fn frames(&self) -> Vec<FrameRecord> {
+    pub fn frames(&self) -> Vec<FrameHistory> {
         self.frames.values().cloned().collect()
     }
 
@@ -220,10 +220,10 @@ impl Records {
     fn take_frame(&mut self, meta: &FrameMeta) {
         self.spoke_ns.insert(Stage::Camera, meta.header.publish_time_ns);
         self.frames_seen += 1;
-        self.record(FrameRecord::of(&meta.header, &meta.dataset_view));
+        self.record(FrameHistory::of(&meta.header, &meta.dataset_view));
     }
 
-    fn record(&mut self, record: FrameRecord) {
+    fn record(&mut self, record: FrameHistory) {
         self.frames.insert(record.frame_id, record);
         while self.frames.len() > self.wanted.keep {
             self.frames.pop_first();
@@ -287,7 +287,7 @@ impl Records {
         // A replay of later messages has no camera.
         if !self.spoke_ns.contains_key(&Stage::Camera) && !self.frames.contains_key(&action.based_on_frame) {
             let header = Header { frame_id: action.based_on_frame, ..action.header };
-            self.record(FrameRecord::of(&header, &DatasetView::UNKNOWN));
+            self.record(FrameHistory::of(&header, &DatasetView::UNKNOWN));
         }
         let frame = self.frames.get_mut(&action.based_on_frame)?;
         frame.action = action.code().ok();
@@ -344,7 +344,7 @@ impl Monitor {
     }
 
     /// Reads all waiting messages. Calls `decided` for each frame with a decision.
-    pub fn drain(&mut self, mut decided: impl FnMut(&FrameRecord)) -> Result<(), ReceiveError> {
+    pub fn drain(&mut self, mut decided: impl FnMut(&FrameHistory)) -> Result<(), ReceiveError> {
         // Topics are read in the order of the data flow, so that each message finds its frame.
         while let Some(frame) = self.frames.next()? {
             self.spans.add(AnyMessage::new(&*frame, &[]));

@@ -57,7 +57,7 @@ impl DriveSource {
                 entry.insert(dataset.load_image(frame)?);
             }
         }
-        tracing::info!(drives = drives.len(), poses = views.len(), pictures = images.len(), "planned");
+        tracing::info!(drives = drives.len(), poses = views.len(), images = images.len(), "planned");
         Ok(Self {
             dataset,
             drives,
@@ -113,9 +113,9 @@ impl Source for DriveSource {
         Ok(Some(FrameMeta { take_start: start, ..FrameMeta::of_camera(&frame.camera, dataset_view) }))
     }
 
-    fn write(&mut self, frame_id: u64, picture: &mut [u8]) -> anyhow::Result<()> {
+    fn write(&mut self, frame_id: u64, pixels: &mut [u8]) -> anyhow::Result<()> {
         let image = self.images.get(&self.current).context("no frame has been advanced to")?;
         let key = Key { seed: self.seed, frame: frame_id, step: 0, sample: 0 };
-        Ok(apply_noise_into(&image.rgb, picture, &self.noise, key)?)
+        Ok(apply_noise_into(&image.rgb, pixels, &self.noise, key)?)
     }
 }

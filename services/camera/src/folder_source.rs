@@ -21,7 +21,7 @@ pub struct FolderSource {
     noise: SensorNoise,
     seed: u64,
     repeat: bool,
-    frames_per_picture: usize,
+    frames_per_image: usize,
     shown: usize,
     current: usize,
     /// The camera of rectified images.
@@ -65,7 +65,7 @@ impl FolderSource {
             noise: graph.camera.noise,
             seed: graph.run.seed,
             repeat: graph.camera.repeat,
-            frames_per_picture: graph.camera.frames_per_timestamp as usize,
+            frames_per_image: graph.camera.frames_per_timestamp as usize,
             shown: 0,
             current: 0,
             camera: None,
@@ -92,11 +92,11 @@ impl Source for FolderSource {
     }
 
     fn advance(&mut self) -> anyhow::Result<Option<FrameMeta>> {
-        let total = self.images.len() * self.frames_per_picture;
+        let total = self.images.len() * self.frames_per_image;
         if self.shown >= total && !self.repeat {
             return Ok(None);
         }
-        self.current = self.shown % total / self.frames_per_picture;
+        self.current = self.shown % total / self.frames_per_image;
         self.shown += 1;
         let (view, image) = &self.images[self.current];
         let [eye, ahead, up] = [[0.0; 3], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
@@ -108,9 +108,9 @@ impl Source for FolderSource {
         Ok(Some(FrameMeta { take_start, ..FrameMeta::of_camera(&camera, dataset_view) }))
     }
 
-    fn write(&mut self, frame_id: u64, picture: &mut [u8]) -> anyhow::Result<()> {
+    fn write(&mut self, frame_id: u64, image: &mut [u8]) -> anyhow::Result<()> {
         let key = Key { seed: self.seed, frame: frame_id, step: 0, sample: 0 };
-        Ok(apply_noise_into(&self.images[self.current].1.rgb, picture, &self.noise, key)?)
+        Ok(apply_noise_into(&self.images[self.current].1.rgb, image, &self.noise, key)?)
     }
 }
 
@@ -126,14 +126,14 @@ mod tests {
     /// Broken and wrong-sized images are omitted, each with an error that names the file; the others are shown in
     /// order, each as often as configured.
     #[test]
-    fn bad_pictures_are_named_and_left_out() {
+    fn bad_images_are_named_and_left_out() {
         let folder = tempfile::tempdir().unwrap();
         let path = |name: &str| folder.path().join(name);
         Image::filled(4, 2, [10, 10, 10]).save_png(&path("a.png")).unwrap();
         std::fs::write(path("b.png"), b"not an image").unwrap();
         Image::filled(3, 2, [0, 0, 0]).save_png(&path("c.png")).unwrap();
         Image::filled(4, 2, [90, 90, 90]).save_png(&path("d.png")).unwrap();
-        std::fs::write(path("notes.txt"), b"no picture").unwrap();
+        std::fs::write(path("notes.txt"), b"no image").unwrap();
 
         let mut graph = graph();
         let off = SensorNoise::OFF;
@@ -147,12 +147,12 @@ mod tests {
         assert!(errors[0].contains("b.png") && errors[1].contains("c.png"), "{errors:?}");
 
         let (mut greys, mut views) = (Vec::new(), Vec::new());
-        let mut picture = vec![0; source.max_image_bytes()];
+        let mut image = vec![0; source.max_image_bytes()];
         while let Some(meta) = source.advance().unwrap() {
             assert_eq!((meta.width_px, meta.height_px), (4, 2));
             views.push(meta.dataset_view.view);
-            source.write(greys.len() as u64, &mut picture).unwrap();
-            greys.push(picture[0]);
+            source.write(greys.len() as u64, &mut image).unwrap();
+            greys.push(image[0]);
         }
         assert_eq!(greys, [10, 10, 90, 90]);
         assert_eq!(views, [0, 0, 3, 3], "the index of the file, also of files that are left out");

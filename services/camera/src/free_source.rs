@@ -93,9 +93,9 @@ impl Source for FreeDriveSource {
         Ok(Some(FrameMeta { take_start, ..FrameMeta::of_camera(&frame.camera, dataset_view) }))
     }
 
-    fn write(&mut self, frame_id: u64, picture: &mut [u8]) -> anyhow::Result<()> {
+    fn write(&mut self, frame_id: u64, image: &mut [u8]) -> anyhow::Result<()> {
         let frame = self.current.as_ref().context("no frame has been advanced to")?;
         let key = Key { seed: self.seed, frame: frame_id, step: 0, sample: 0 };
-        Ok(apply_noise_into(&frame.image.rgb, picture, &self.noise, key)?)
+        Ok(apply_noise_into(&frame.image.rgb, image, &self.noise, key)?)
     }
 }

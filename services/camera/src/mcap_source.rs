@@ -2,7 +2,7 @@
 
 use crate::recorded::Recorded;
 use carff_config::GraphConfig;
-use carff_dataset::{Calibration, RawImage};
+use carff_dataset::{CameraCalibration, RawImage};
 use carff_recording::ImageReader;
 use std::path::Path;
 
@@ -22,7 +22,7 @@ impl McapSource {
 }
 
 impl Recorded for McapSource {
-    fn calibration(&mut self) -> anyhow::Result<Option<Calibration>> {
+    fn calibration(&mut self) -> anyhow::Result<Option<CameraCalibration>> {
         Ok(self.reader.calibration()?)
     }
 

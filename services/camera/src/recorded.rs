@@ -2,7 +2,7 @@
 
 use anyhow::Context;
 use carff_config::FramePace;
-use carff_dataset::{Calibration, RawImage};
+use carff_dataset::{CameraCalibration, RawImage};
 use carff_runtime::{FrameOutput, StageContext};
 use carff_transport::{Woken, monotonic_now_ns};
 
@@ -13,7 +13,7 @@ const MAX_GAP_NS: u64 = 5_000_000_000;
 /// Recorded images, one after the other.
 pub trait Recorded {
     /// Returns the calibration that was recorded with the images.
-    fn calibration(&mut self) -> anyhow::Result<Option<Calibration>>;
+    fn calibration(&mut self) -> anyhow::Result<Option<CameraCalibration>>;
 
     /// Advances to the next image. Returns the time at which it was recorded, nanoseconds; `None` at the end. After an
     /// error nothing more can be read.

@@ -13,5 +13,5 @@ pub trait Source {
 
     /// Writes the current frame's image (RGB, 8 bit) once, into memory of exactly its size: the topic's shared memory.
     /// `frame_id` names the noise.
-    fn write(&mut self, frame_id: u64, picture: &mut [u8]) -> anyhow::Result<()>;
+    fn write(&mut self, frame_id: u64, image: &mut [u8]) -> anyhow::Result<()>;
 }

@@ -2,7 +2,7 @@
 
 use crate::recorded::Recorded;
 use anyhow::{Context, anyhow, bail, ensure};
-use carff_dataset::{Calibration, RawImage};
+use carff_dataset::{CameraCalibration, RawImage};
 use openh264::decoder::{DecodeOptions, DecodedYUV, Decoder, Flush};
 use openh264::formats::YUVSource;
 use shiguredo_mp4::TrackKind;
@@ -112,7 +112,7 @@ impl VideoSource {
 }
 
 impl Recorded for VideoSource {
-    fn calibration(&mut self) -> anyhow::Result<Option<Calibration>> {
+    fn calibration(&mut self) -> anyhow::Result<Option<CameraCalibration>> {
         Ok(None)
     }
 

@@ -66,16 +66,16 @@ fn drives_show_timestamps_in_order_with_fresh_noise() {
             let frame_id = shots.len() as u64;
             meta.header = Header::of_frame(frame_id, 0, 1);
             meta.validate().unwrap();
-            let mut picture = vec![0; meta.image_bytes()];
-            source.write(frame_id, &mut picture).unwrap();
-            shots.push((meta.dataset_view, picture));
+            let mut image = vec![0; meta.image_bytes()];
+            source.write(frame_id, &mut image).unwrap();
+            shots.push((meta.dataset_view, image));
         }
         assert_eq!(source.drives().len(), 4);
         shots
     };
     let shots = shoot();
     assert_eq!(shots.len(), 4 * 3 * 2);
-    for (i, (view, picture)) in shots.iter().enumerate() {
+    for (i, (view, image)) in shots.iter().enumerate() {
         let (drive, in_drive) = (i / 6, i % 6);
         assert_eq!(
             (view.drive, view.frame_in_drive, view.timestamp),
@@ -83,7 +83,7 @@ fn drives_show_timestamps_in_order_with_fresh_noise() {
         );
         assert_eq!(view.branch, drive as i32 % 2, "hazard and clear drives alternate");
         assert_eq!(view.last_of_timestamp, in_drive as u32 % 2);
-        let mean = picture.iter().map(|&b| f64::from(b)).sum::<f64>() / picture.len() as f64;
+        let mean = image.iter().map(|&b| f64::from(b)).sum::<f64>() / image.len() as f64;
         let wanted = f64::from(GREY) * f64::from(view.branch * 3 + view.timestamp + 1);
         assert!((mean - wanted).abs() < 20.0, "frame {i}: mean {mean}, wanted about {wanted}");
     }
@@ -95,12 +95,12 @@ fn drives_show_timestamps_in_order_with_fresh_noise() {
 
 /// A broken image of a dataset stops the camera at its start, with an error that names the file.
 #[test]
-fn a_broken_picture_is_named() {
+fn a_broken_image_is_named() {
     let folder = tempfile::tempdir().unwrap();
     write_dataset(folder.path());
     CheckpointPlanning::new(3, 0.5).save(folder.path()).unwrap();
     for view in 0..VIEWS {
-        std::fs::write(folder.path().join(format!("images/b0_t1_v{view}.png")), b"no picture").unwrap();
+        std::fs::write(folder.path().join(format!("images/b0_t1_v{view}.png")), b"no image").unwrap();
     }
     let error = DriveSource::open(folder.path(), folder.path(), &graph(), 4).unwrap_err();
     assert!(format!("{error:#}").contains("b0_t1_v"), "{error:#}");

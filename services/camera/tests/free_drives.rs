@@ -26,12 +26,12 @@ fn free_drives_show_timestamps_in_order() {
             meta.header = Header::of_frame(frame_id, 0, 1);
             meta.validate().unwrap();
             assert_eq!(meta.image_bytes(), source.max_image_bytes());
-            let mut picture = vec![0; meta.image_bytes()];
-            source.write(frame_id, &mut picture).unwrap();
+            let mut image = vec![0; meta.image_bytes()];
+            source.write(frame_id, &mut image).unwrap();
             let mut other_noise = vec![0; meta.image_bytes()];
             source.write(frame_id + 1, &mut other_noise).unwrap();
-            assert_ne!(picture, other_noise);
-            shots.push((meta, picture));
+            assert_ne!(image, other_noise);
+            shots.push((meta, image));
         }
         shots
     };

@@ -1,7 +1,8 @@
 //! The occupancy grid: what each known state takes on the ground, weighed by the belief.
 
-use carff_checkpoint::FieldProbe;
-use carff_messages::{Belief, LATENT_DIM, MAX_CELLS, Occupancy, UnknownBox};
+use carff_checkpoint::{FieldProbe, OccupancyRates, StepRates};
+use carff_decision::ProbeLayout;
+use carff_messages::{Belief, LATENT_DIM, MAX_CELLS, MAX_HORIZON, Occupancy, UnknownBox};
 
 /// Number of cells along the longer side of the grid.
 const LONGEST: usize = 32;
@@ -26,11 +27,15 @@ pub struct Grid {
     height_m: f32,
     /// For each state, the taken share of each cell, 0..=1.
     taken: Vec<Vec<f32>>,
+    /// For each cell, true if its middle is on the lane of a vehicle that is a hazard.
+    on_lane: Vec<bool>,
+    /// Rates on these cells at each step of the look-ahead.
+    rates: StepRates,
 }
 
 impl Grid {
-    /// Probes the field in every known state, within its bounds.
-    pub fn probe(probe: &FieldProbe) -> Self {
+    /// Probes the field in every known state, within its bounds. Without `rates` the known states hold exactly.
+    pub fn probe(probe: &FieldProbe, rates: Option<StepRates>) -> Self {
         let bounds_m = probe.field().config().bounds_m.map(|corner| corner.map(f64::from));
         let side_m = [0, 1].map(|axis| bounds_m[1][axis] - bounds_m[0][axis]);
         let cell_m = (side_m[0].max(side_m[1]) / LONGEST as f64).max(1e-3);
@@ -43,7 +48,10 @@ impl Grid {
             ground_m: bounds_m[0][2] as f32,
             height_m: ((bounds_m[1][2] - bounds_m[0][2]) as f32).min(HIGHEST_M),
             taken: Vec::new(),
+            on_lane: Vec::new(),
+            rates: rates.unwrap_or([OccupancyRates::EXACT; MAX_HORIZON as usize]),
         };
+        grid.on_lane = (0..columns * rows).map(|cell| is_on_lane(probe.layout(), grid.middle_m(cell))).collect();
         let points = grid.points();
         let of_state = |latent: &[f32; LATENT_DIM]| {
             let mut densities = vec![0.0; points.len()];
@@ -88,7 +96,7 @@ impl Grid {
     }
 
     /// Returns the grid of a belief. What is probable but unknown has no place, unless it is in one of the boxes; what
-    /// every state takes is taken.
+    /// every state takes is taken. On the others' lane, what only some states take counts with the rates of the step.
     pub fn occupancy(&self, belief: &Belief, unknown: &[UnknownBox]) -> Occupancy {
         let probabilities = &belief.state_probability[..self.taken.len().min(belief.state_probability.len())];
         let mut occupancy = Occupancy::empty(belief.header);
@@ -96,34 +104,66 @@ impl Grid {
         (occupancy.cell_m, occupancy.low_corner_m) = (self.cell_m as f32, self.low_corner_m.map(|v| v as f32));
         occupancy.unknown_probability = belief.unknown_probability;
         let other = (1.0 - probabilities.iter().sum::<f32>()).max(0.0);
+        let rates = self.rates[(belief.header.step.max(1) as usize - 1).min(MAX_HORIZON as usize - 1)];
         for (cell, to) in occupancy.probability.iter_mut().take((self.columns * self.rows).min(MAX_CELLS)).enumerate() {
             let known: f32 = probabilities.iter().zip(&self.taken).map(|(p, taken)| p * taken[cell]).sum();
             let still = self.taken.iter().map(|taken| taken[cell]).fold(1.0, f32::min);
+            let mut taken = known + other * still;
+            if self.on_lane[cell] && still < 1.0 {
+                let moving = f64::from((taken - still) / (1.0 - still));
+                taken = still + (1.0 - still) * rates.of(moving) as f32;
+            }
             let free = unknown.iter().filter(|b| self.is_in(cell, b)).map(|b| 1.0 - b.probability).product::<f32>();
-            *to = (1.0 - (1.0 - known - other * still) * free).clamp(0.0, 1.0);
+            *to = (1.0 - (1.0 - taken) * free).clamp(0.0, 1.0);
         }
         occupancy
     }
 
     /// Reports whether the middle of a cell is in a box.
     fn is_in(&self, cell: usize, unknown: &UnknownBox) -> bool {
-        let place = [cell % self.columns, cell / self.columns];
-        (0..2).all(|axis| {
-            let middle_m = self.low_corner_m[axis] + (place[axis] as f64 + 0.5) * self.cell_m;
-            (middle_m - unknown.center[axis]).abs() <= unknown.half_size[axis]
-        })
+        let middle_m = self.middle_m(cell);
+        (0..2).all(|axis| (middle_m[axis] - unknown.center[axis]).abs() <= unknown.half_size[axis])
     }
+
+    /// Returns the middle of a cell, x and y in metres.
+    fn middle_m(&self, cell: usize) -> [f64; 2] {
+        let place = [cell % self.columns, cell / self.columns];
+        [0, 1].map(|axis| self.low_corner_m[axis] + (place[axis] as f64 + 0.5) * self.cell_m)
+    }
+}
+
+/// Reports whether a point is on the lane of a place that only states with the hazard take: in the place's box, extended
+/// along its heading.
+fn is_on_lane(layout: &ProbeLayout, [x, y]: [f64; 2]) -> bool {
+    layout.places().iter().any(|place| {
+        let mut states = place.occupied_in.iter().zip(layout.hazard_states());
+        let is_hazard = place.occupied_in.contains(&true) && states.all(|(taken, hazard)| !taken || *hazard);
+        let of = &place.oriented_box;
+        let aside_m = (y - of.center[1]) * of.yaw.cos() - (x - of.center[0]) * of.yaw.sin();
+        is_hazard && aside_m.abs() <= of.half_size[1]
+    })
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use carff_base::geometry::OrientedBox;
     use carff_messages::Header;
 
     /// Two states on two cells: one takes the first cell; both take half of the second.
     fn grid() -> Grid {
         let taken = vec![vec![1.0, 0.5], vec![0.0, 0.5]];
-        Grid { columns: 2, rows: 1, cell_m: 1.0, low_corner_m: [0.0, 0.0], ground_m: 1.0, height_m: 2.0, taken }
+        Grid {
+            columns: 2,
+            rows: 1,
+            cell_m: 1.0,
+            low_corner_m: [0.0, 0.0],
+            ground_m: 1.0,
+            height_m: 2.0,
+            taken,
+            on_lane: vec![true, false],
+            rates: [OccupancyRates::EXACT; MAX_HORIZON as usize],
+        }
     }
 
     /// A cell is taken with the probability of the states that take it; the unknown counts where everyone is, and in its
@@ -140,6 +180,40 @@ mod tests {
         let unknown = UnknownBox { center: [0.5, 0.5, 0.5], half_size: [0.4; 3], probability: 0.8, place: -1 };
         let occupancy = grid().occupancy(&belief, &[unknown]);
         assert!((occupancy.cells()[0] - 0.85).abs() < 1e-6 && occupancy.cells()[1] == 0.5, "{:?}", occupancy.cells());
+    }
+
+    /// On the lane, a cell counts with the learned rates of its step; off the lane, and for what every state takes, it does
+    /// not.
+    #[test]
+    fn cells_on_the_lane_have_rates() {
+        let mut grid = grid();
+        grid.rates[1] = OccupancyRates { where_free: 0.1, where_taken: 0.6 };
+        let of_step = |grid: &Grid, step| {
+            let mut belief = Belief::empty(Header::of_frame(1, 2, 3).at_step(step), 2);
+            belief.state_count = 2;
+            belief.state_probability[..2].copy_from_slice(&[0.25, 0.75]);
+            grid.occupancy(&belief, &[]).cells().to_vec()
+        };
+        assert_eq!(of_step(&grid, 1), [0.25, 0.5]);
+        assert!((of_step(&grid, 2)[0] - 0.225).abs() < 1e-6 && of_step(&grid, 2)[1] == 0.5);
+        // Half of each column is always taken, and the other half is not.
+        grid.on_lane[1] = true;
+        assert!((of_step(&grid, 2)[1] - (0.5 + 0.5 * 0.1)).abs() < 1e-6);
+    }
+
+    /// The lane is the place's box, extended along its heading; places that are taken without the hazard have none.
+    #[test]
+    fn lanes_continue_the_places() {
+        let place = |occupied_in: [bool; 2], yaw: f64| carff_decision::Place {
+            name: "actor".into(),
+            oriented_box: OrientedBox { center: [1.0, 2.0, 0.5], half_size: [2.0, 1.0, 0.5], yaw },
+            occupied_in: occupied_in.to_vec(),
+        };
+        let is_on = |places, at| is_on_lane(&ProbeLayout::new(places, vec![true, false]).unwrap(), at);
+        assert!(is_on(vec![place([true, false], 0.0)], [-30.0, 2.9]));
+        assert!(!is_on(vec![place([true, false], 0.0)], [1.0, 3.1]));
+        assert!(is_on(vec![place([true, false], std::f64::consts::FRAC_PI_2)], [1.9, 30.0]));
+        assert!(!is_on(vec![place([true, true], 0.0)], [1.0, 2.0]));
     }
 
     /// Columns without density are free, and dense ones are taken.

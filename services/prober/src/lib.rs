@@ -10,20 +10,20 @@ pub use grid::Grid;
 pub use images::Images;
 pub use outlook::Outlook;
 
-use carff_checkpoint::{FieldProbe, Manifest, load_field_probe};
+use carff_checkpoint::{CheckpointPlanning, FieldProbe, Manifest, load_field_probe};
 use carff_decision::{ImageEvidence, mixture_and_draws};
 use carff_messages::{Belief, Forecast};
 use std::path::Path;
 
-/// Loads the field and its calibration with the grid of the known states, and probes each known state once, so that the first forecast is as fast as
-/// later ones.
+/// Loads the field and its calibration with the grid of the known states, and probes each known state once, so that the
+/// first forecast is as fast as later ones.
 pub fn load(checkpoint: &Path) -> anyhow::Result<(FieldProbe, Grid)> {
     let manifest = Manifest::load(checkpoint)?;
     let mut probe = load_field_probe(checkpoint, &manifest)?;
     for state in &manifest.states {
         probe.probe(&state.mean);
     }
-    let grid = Grid::probe(&probe);
+    let grid = Grid::probe(&probe, CheckpointPlanning::load(checkpoint)?.occupancy);
     Ok((probe, grid))
 }
 

@@ -11,7 +11,7 @@ use std::path::Path;
 /// Loads the field for rendering.
 pub fn load(checkpoint: &Path) -> anyhow::Result<Field> {
     let mut field = carff_checkpoint::load_field(checkpoint, &Manifest::load(checkpoint)?)?;
-    field.set_instruction_set(InstructionSet::detect_for_pictures());
+    field.set_instruction_set(InstructionSet::detect_for_images());
     Ok(field)
 }
 
@@ -103,10 +103,10 @@ pub fn render(
 }
 
 /// Writes an image as 8-bit RGB, rows from the top.
-pub fn write(picture: &RenderBuffer, rgb: &mut [u8]) -> anyhow::Result<()> {
-    let wanted = picture.rgb.len();
+pub fn write(image: &RenderBuffer, rgb: &mut [u8]) -> anyhow::Result<()> {
+    let wanted = image.rgb.len();
     (rgb.len() == wanted).then_some(()).with_context(|| format!("{} bytes for a view of {wanted}", rgb.len()))?;
-    for (to, from) in rgb.iter_mut().zip(&picture.rgb) {
+    for (to, from) in rgb.iter_mut().zip(&image.rgb) {
         *to = (from.clamp(0.0, 1.0) * 255.0 + 0.5) as u8;
     }
     Ok(())

@@ -44,7 +44,7 @@ fn run(stage: &mut StageContext) -> anyhow::Result<()> {
             let camera = camera(&field, choice, width_px, height_px);
             render(&field, &camera, &hypotheses, stage.threads, &mut buffer);
             let rendered_ns = (monotonic_now_ns() - started_ns) / hypotheses.len().max(1) as u64;
-            for (hypothesis, image) in hypotheses.iter().zip(&buffer.pictures) {
+            for (hypothesis, image) in hypotheses.iter().zip(&buffer.images) {
                 let written_ns = monotonic_now_ns();
                 let mut loan = views.loan(rgb_bytes(width_px, height_px))?;
                 write(image, loan.bytes_mut())?;

@@ -75,16 +75,16 @@ impl OrbitCamera {
     }
 
     /// Turns about the target for a drag over an image of this size; down and right are positive.
-    pub fn orbit(&mut self, drag_px: [f64; 2], picture_px: [f64; 2]) {
-        let deg_per_px = ORBIT_DEG_PER_SIDE / picture_px[0].min(picture_px[1]).max(1.0);
+    pub fn orbit(&mut self, drag_px: [f64; 2], image_px: [f64; 2]) {
+        let deg_per_px = ORBIT_DEG_PER_SIDE / image_px[0].min(image_px[1]).max(1.0);
         self.azimuth_deg = (self.azimuth_deg - drag_px[0] * deg_per_px).rem_euclid(360.0);
         self.elevation_deg =
             (self.elevation_deg + drag_px[1] * deg_per_px).clamp(LEAST_ELEVATION_DEG, MOST_ELEVATION_DEG);
     }
 
     /// Moves parallel to the image plane, so that points at the target's distance follow the mouse.
-    pub fn pan(&mut self, drag_px: [f64; 2], picture_px: [f64; 2]) {
-        let shorter_px = picture_px[0].min(picture_px[1]).max(1.0);
+    pub fn pan(&mut self, drag_px: [f64; 2], image_px: [f64; 2]) {
+        let shorter_px = image_px[0].min(image_px[1]).max(1.0);
         let metres_per_px = 2.0 * self.distance_m * (self.fov_deg / 2.0).to_radians().tan() / shorter_px;
         let [right, up, _] = self.axes();
         for i in 0..3 {

@@ -39,14 +39,14 @@ pub struct Truth {
 
 impl Input {
     /// Creates an input without metadata, for example from a file.
-    pub fn of_picture(title: impl Into<String>, image: Image) -> Arc<Self> {
+    pub fn of_image(title: impl Into<String>, image: Image) -> Arc<Self> {
         Arc::new(Self { title: title.into(), image, camera: None, truth: None, frame: 0, seed: None })
     }
 
     /// Reads an input from a PNG file.
     pub fn load_png(path: &Path) -> Result<Arc<Self>, DatasetError> {
         let title = path.file_name().map_or_else(|| path.display().to_string(), |n| n.to_string_lossy().into_owned());
-        Ok(Self::of_picture(title, Image::load(path)?))
+        Ok(Self::of_image(title, Image::load(path)?))
     }
 }
 

@@ -28,7 +28,7 @@ const NICE: i32 = 5;
 #[command(
     version,
     after_help = "Examples:\n  carff-viewer --dataset data/approaching-intersection\n  carff-viewer --run\n  \
-                  carff-viewer --picture frame.png --do predict --do probe --screenshot scene.png"
+                  carff-viewer --image frame.png --do predict --do probe --screenshot scene.png"
 )]
 struct Cli {
     #[command(flatten)]
@@ -71,7 +71,7 @@ fn run(args: ViewArgs) -> anyhow::Result<()> {
     let checkpoint = args.checkpoint.or_else(|| watched.as_ref().map(|run| run.checkpoint.clone()));
     let models = Models::load(&checkpoint.unwrap_or_else(|| SHIPPED.into()), MODEL_THREADS)?;
     let album = album(args.dataset.as_deref(), watched.map(|run| run.dataset), &models)?;
-    let picture = args.picture.as_deref().map(Input::load_png).transpose()?;
+    let image = args.image.as_deref().map(Input::load_png).transpose()?;
     let after = Duration::try_from_secs_f32(args.after).context("--after: must be a number of seconds, 0 or more")?;
     let options = Options {
         threads,
@@ -86,7 +86,7 @@ fn run(args: ViewArgs) -> anyhow::Result<()> {
     let is_live = live.is_some();
     let mut viewer =
         Viewer::new(Session::new(models), album, live, options, waker).context("cannot start a thread to draw with")?;
-    if let Some(input) = picture {
+    if let Some(input) = image {
         viewer.toggle_input(input).map_err(anyhow::Error::msg)?;
     } else if !is_live {
         viewer.begin();

@@ -220,7 +220,7 @@ pub struct RenderWorker {
 impl RenderWorker {
     /// Starts the thread. It renders with `threads` threads and calls `wake` when it has a result.
     pub fn start(mut field: Field, threads: usize, wake: impl Fn() + Send + 'static) -> std::io::Result<Self> {
-        field.set_instruction_set(InstructionSet::detect_for_pictures());
+        field.set_instruction_set(InstructionSet::detect_for_images());
         let shared =
             Arc::new(Shared { desk: Mutex::default(), called: Condvar::new(), newest_view: AtomicU64::new(0) });
         let theirs = shared.clone();
@@ -360,7 +360,7 @@ impl Painter {
             Job::View(view) => self.draw_view(view, shared),
             Job::BirdsEye { latent, camera } => {
                 self.field.render(&camera, &latent, &self.options, &mut self.buffer);
-                (vec![Drawn::BirdsEye { latent, image: picture(&camera, &self.buffer) }], None)
+                (vec![Drawn::BirdsEye { latent, image: image_of(&camera, &self.buffer) }], None)
             }
             Job::Slice { latent, height_m, longest_px } => {
                 let image = density_slice(&self.field, &latent, height_m, longest_px);
@@ -370,8 +370,8 @@ impl Painter {
                 let end = (done + BATCH).min(latents.len());
                 let batch = &latents[done.min(end)..end];
                 self.field.render_hypotheses(&camera, batch, &self.options, &mut self.hypotheses);
-                let drawn = batch.iter().zip(&self.hypotheses.pictures).enumerate().map(|(i, (latent, drawn))| {
-                    Drawn::Thumbnail { index: done + i, latent: *latent, image: picture(&camera, drawn) }
+                let drawn = batch.iter().zip(&self.hypotheses.images).enumerate().map(|(i, (latent, drawn))| {
+                    Drawn::Thumbnail { index: done + i, latent: *latent, image: image_of(&camera, drawn) }
                 });
                 let drawn = drawn.collect();
                 (drawn, (end < latents.len()).then_some(Job::Thumbnails { latents, camera, done: end }))
@@ -435,7 +435,7 @@ fn bytes(rendered: &RenderBuffer) -> impl Iterator<Item = u8> {
     rendered.rgb.iter().map(|v| (v.clamp(0.0, 1.0) * 255.0 + 0.5) as u8)
 }
 
-fn picture(camera: &PinholeCamera, rendered: &RenderBuffer) -> Image {
+fn image_of(camera: &PinholeCamera, rendered: &RenderBuffer) -> Image {
     Image { width_px: camera.width_px, height_px: camera.height_px, rgb: bytes(rendered).collect() }
 }
 
@@ -493,7 +493,7 @@ mod tests {
 
     /// A final view equals the field's own image from that camera, for any bands and intermediate sizes.
     #[test]
-    fn a_view_ends_as_the_whole_picture() {
+    fn a_view_ends_as_the_whole_image() {
         let (worker, until_idle) = worker();
         let camera = camera(70, 45);
         worker.ask(Job::View(View::new([0.3; LATENT_DIM], camera, Pace::Resting)));
@@ -501,7 +501,7 @@ mod tests {
         let Some(Drawn::View { image, is_final: true, .. }) = drawn.last() else { panic!("{}", drawn.len()) };
         let mut whole = RenderBuffer::new();
         field().render(&camera, &[0.3; LATENT_DIM], &RenderOptions::default(), &mut whole);
-        let whole = picture(&camera, &whole);
+        let whole = image_of(&camera, &whole);
         assert_eq!((image.width_px, image.height_px), (70, 45));
         let apart = image.rgb.iter().zip(&whole.rgb).map(|(a, b)| a.abs_diff(*b)).max();
         assert!(apart <= Some(1), "{apart:?}");

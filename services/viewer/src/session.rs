@@ -152,7 +152,7 @@ pub enum SessionError {
     NoInput,
     /// The encoder refused the image.
     #[error("the encoder cannot read `{title}`: {width_px} x {height_px} pixels")]
-    Picture {
+    Image {
         /// Name of the image.
         title: String,
         /// Width of the image, pixels.
@@ -236,7 +236,7 @@ impl Session {
         let started = Instant::now();
         let Some(posterior) = self.models.encode(&input.image) else {
             let (width_px, height_px) = (input.image.width_px, input.image.height_px);
-            return Err(SessionError::Picture { title: input.title.clone(), width_px, height_px });
+            return Err(SessionError::Image { title: input.title.clone(), width_px, height_px });
         };
         self.journal.took_next("encoder", ms(started));
         let moment = Moment::of_posterior(input, posterior);

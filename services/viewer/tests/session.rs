@@ -2,11 +2,11 @@
 
 use crate::common;
 
-use crate::common::{ABOVE_VIEW, HIDING_VIEW, copy_without, models, picture, scenario};
+use crate::common::{ABOVE_VIEW, HIDING_VIEW, copy_without, image, models, scenario};
 use carff_dataset::Image;
 use carff_decision::{Evidence, Plan, Sampling, Step, look_ahead};
 use carff_messages::ActionCode;
-use carff_scenes::{Extras, RenderOptions};
+use carff_scenes::{Detail, Extras};
 use carff_viewer::input::{Album, Input};
 use carff_viewer::models::Models;
 use carff_viewer::session::{Moment, Selection, Session, SessionError, Settings};
@@ -18,10 +18,10 @@ fn session() -> Session {
 
 /// Toggling an unambiguous image shows a scene in which probing finds the true actor.
 #[test]
-fn toggle_shows_what_the_picture_shows() {
+fn toggle_shows_what_the_image_shows() {
     let mut session = session();
     for (branch, timestamp) in [(0, 1), (1, 1)] {
-        session.toggle(picture(branch, timestamp, ABOVE_VIEW)).unwrap();
+        session.toggle(image(branch, timestamp, ABOVE_VIEW)).unwrap();
         session.probe().unwrap();
         let found = session.moment().unwrap().found.as_ref().unwrap();
         let state = session.models().state(branch, timestamp).unwrap();
@@ -42,7 +42,7 @@ fn follows_the_stages_path() {
     let mut session = session();
     let settings = Settings { samples: 7, horizon: 3, seed: 5, ..session.settings() };
     session.set_settings(settings);
-    let input = picture(0, 0, HIDING_VIEW);
+    let input = image(0, 0, HIDING_VIEW);
     let plan = Plan { samples: 7, sampling: Sampling::Stratified, horizon: 3, seed: 5, frame: HIDING_VIEW as u64 };
     session.toggle(input).unwrap();
     let posterior = session.moment().unwrap().source;
@@ -73,7 +73,7 @@ fn follows_the_stages_path() {
 #[test]
 fn goes_on_from_the_shown_scene() {
     let mut session = session();
-    session.toggle(picture(0, 0, HIDING_VIEW)).unwrap();
+    session.toggle(image(0, 0, HIDING_VIEW)).unwrap();
     session.predict().unwrap();
     session.probe().unwrap();
     let belief = session.moment().unwrap().belief.clone().unwrap();
@@ -97,7 +97,7 @@ fn goes_on_from_the_shown_scene() {
 fn history_and_horizon() {
     let mut session = session();
     assert_eq!(session.settings().horizon, 2);
-    session.toggle(picture(0, 1, HIDING_VIEW)).unwrap();
+    session.toggle(image(0, 1, HIDING_VIEW)).unwrap();
     session.predict().unwrap();
     session.select(Selection::Sample(4)).unwrap();
     let first = session.shown().unwrap();
@@ -121,7 +121,7 @@ fn history_and_horizon() {
 #[test]
 fn predicting_again_draws_again() {
     let mut session = session();
-    session.toggle(picture(1, 0, HIDING_VIEW)).unwrap();
+    session.toggle(image(1, 0, HIDING_VIEW)).unwrap();
     let draws = |session: &mut Session, settings: Settings| {
         session.set_settings(settings);
         session.predict().unwrap();
@@ -144,9 +144,9 @@ fn errors_say_what_to_do() {
     assert_eq!(session.probe(), Err(SessionError::NoInput));
     assert!(session.shown().is_none() && session.scenes().is_empty());
     let broken = Image { width_px: 4, height_px: 4, rgb: vec![0; 5] };
-    let error = session.toggle(Input::of_picture("broken.png", broken)).unwrap_err();
+    let error = session.toggle(Input::of_image("broken.png", broken)).unwrap_err();
     assert!(error.to_string().contains("broken.png"), "{error}");
-    session.toggle(picture(0, 0, ABOVE_VIEW)).unwrap();
+    session.toggle(image(0, 0, ABOVE_VIEW)).unwrap();
     assert_eq!(session.select(Selection::Sample(0)), Err(SessionError::NoScene));
     assert_eq!(session.select(Selection::State(99)), Err(SessionError::NoScene));
     assert_eq!(session.moment().unwrap().selection, Selection::Source);
@@ -157,7 +157,7 @@ fn errors_say_what_to_do() {
 fn a_checkpoint_without_forecaster_toggles() {
     let folder = copy_without(&["mixture.safetensors"]);
     let mut session = Session::new(Models::load(folder.path(), 1).unwrap());
-    session.toggle(picture(0, 0, ABOVE_VIEW)).unwrap();
+    session.toggle(image(0, 0, ABOVE_VIEW)).unwrap();
     session.probe().unwrap();
     let error = session.predict().unwrap_err();
     assert!(error.to_string().contains("carff train --stage mdn"), "{error}");
@@ -169,7 +169,7 @@ fn a_checkpoint_without_forecaster_toggles() {
 fn follows_a_running_graph() {
     let mut other = session();
     let mut moments = |view: usize| -> Vec<Moment> {
-        other.toggle(picture(0, 0, view)).unwrap();
+        other.toggle(image(0, 0, view)).unwrap();
         let first = other.moment().unwrap().clone();
         other.predict().unwrap();
         other.probe().unwrap();
@@ -221,7 +221,7 @@ fn albums_are_leafed_through() {
     let input = album.input(4, 1, &models).unwrap().unwrap();
     let truth = input.truth.unwrap();
     assert_eq!((truth.branch, truth.timestamp, truth.view), (1, 1, 1));
-    assert_eq!(input.image, scenario.render(1, 1, &input.camera.unwrap(), &RenderOptions::default()).unwrap().image);
+    assert_eq!(input.image, scenario.render(1, 1, &input.camera.unwrap(), Detail::default()).unwrap().image);
     assert!(album.input(4, 2, &models).unwrap().is_none() && album.input(6, 0, &models).unwrap().is_none());
     assert_eq!([album.next_view(0, 0, true, None), album.next_view(0, 0, false, None)], [Some(1), Some(1)]);
     for view in 0..2 {

@@ -2,7 +2,7 @@
 
 #![allow(clippy::unwrap_used, reason = "also in shared fixtures")]
 
-use crate::common::{HIDING_VIEW, models, picture};
+use crate::common::{HIDING_VIEW, image, models};
 use carff_viewer::app::{Options, Viewer, Waker};
 use carff_viewer::session::{Selection, Session};
 use eframe::egui::{Event, Key, Modifiers, MouseWheelUnit, Theme, ThemePreference, Vec2, pos2, vec2};
@@ -21,7 +21,7 @@ fn window(view: Option<usize>, folder: &Path) -> Harness<'static, Viewer> {
     let mut viewer = Viewer::new(Session::new(models()), none, None, options, Waker::default()).unwrap();
     viewer.finest_px = 96;
     if let Some(view) = view {
-        viewer.toggle_input(picture(0, 0, view)).unwrap();
+        viewer.toggle_input(image(0, 0, view)).unwrap();
     }
     let mut harness = Harness::builder()
         .with_size(vec2(1440.0, 900.0))
@@ -199,7 +199,7 @@ fn the_mouse_moves_the_camera() {
     assert_eq!(harness.state().camera.elevation_deg, 90.0);
     press(&mut harness, Modifiers::NONE, Key::Num3);
     let eye_m = harness.state().camera.eye_m();
-    let taken_m = picture(0, 0, HIDING_VIEW).camera.unwrap().position_m();
+    let taken_m = image(0, 0, HIDING_VIEW).camera.unwrap().position_m();
     assert!((0..3).all(|i| (eye_m[i] - taken_m[i]).abs() < 1e-6));
     press(&mut harness, Modifiers::NONE, Key::Num1);
     assert_eq!(harness.state().camera, before);

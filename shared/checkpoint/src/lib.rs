@@ -26,12 +26,14 @@ mod tensors;
 
 pub use field::{load_field, save_field};
 pub use networks::{Encodes, Forecasts};
-pub use planning::{Bound, CheckpointPlanning, CheckpointPlanningError, PlanningMemory, load_policy};
+pub use planning::{
+    Bound, CheckpointPlanning, CheckpointPlanningError, OccupancyRates, PlanningMemory, StepRates, load_policy,
+};
 pub use probe::{FieldProbe, PreparedField, load_field_probe, load_probing};
 pub use tensors::{Row, read_tensors};
 
 use carff_dataset::{ScenarioInfo, sensor::SensorNoise};
-use carff_decision::{Calibration, Place, ProbingError};
+use carff_decision::{Place, ProbeCalibration, ProbingError};
 use carff_field::FieldConfig;
 use carff_messages::{Gaussian, MAX_PLACES, MAX_STATES};
 use serde::{Deserialize, Serialize};
@@ -200,7 +202,7 @@ pub struct Manifest {
     /// Places to probe.
     pub places: Vec<Place>,
     /// Calibration of the places' occupancy, once the field is trained.
-    pub probing: Option<Calibration>,
+    pub probing: Option<ProbeCalibration>,
     /// The training file, as used.
     pub training: serde_json::Value,
     /// Results by training phase.

@@ -1,7 +1,7 @@
 //! The part of a checkpoint for stages without models: the split of the poses and the calibrated threshold.
 
 use carff_decision::{MemorySettings, Policy};
-use carff_messages::Rule;
+use carff_messages::{MAX_HORIZON, Rule};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 
@@ -26,6 +26,40 @@ pub struct CheckpointPlanning {
     /// The belief's memory, if it was learned.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub memory: Option<PlanningMemory>,
+    /// Rates of the occupancy grid at each step of the look-ahead, if they were learned.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub occupancy: Option<StepRates>,
+}
+
+/// Rates of the occupancy grid at each step of the look-ahead, from the first.
+pub type StepRates = [OccupancyRates; MAX_HORIZON as usize];
+
+/// Shares of the cells on the other vehicles' lane that are taken when a step of the look-ahead has come, by what the
+/// belief states. Vehicles are anywhere on their lane, and known states have them at a few places.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct OccupancyRates {
+    /// Share of the cells that are free in the known state, 0 to 1.
+    pub where_free: f64,
+    /// Share of the cells that a vehicle takes in the known state, 0 to 1.
+    pub where_taken: f64,
+}
+
+impl OccupancyRates {
+    /// The rates of states that hold exactly.
+    pub const EXACT: Self = Self { where_free: 0.0, where_taken: 1.0 };
+
+    /// Returns the probability that a cell is taken, from the belief that it is, 0..=1.
+    ///
+    /// ```
+    /// use carff_checkpoint::OccupancyRates;
+    /// let rates = OccupancyRates { where_free: 0.1, where_taken: 0.6 };
+    /// assert_eq!((rates.of(0.0), rates.of(1.0)), (0.1, 0.6));
+    /// assert_eq!(OccupancyRates::EXACT.of(0.3), 0.3);
+    /// ```
+    pub fn of(self, believed: f64) -> f64 {
+        self.where_free + (self.where_taken - self.where_free) * believed
+    }
 }
 
 /// Memory of the belief, with the threshold of the calibrated rule for it.
@@ -96,7 +130,14 @@ pub enum CheckpointPlanningError {
 impl CheckpointPlanning {
     /// Creates the contents with the current format version.
     pub fn new(split_seed: u64, hazard_threshold: f64) -> Self {
-        Self { format_version: FORMAT_VERSION, split_seed, hazard_threshold, bound: None, memory: None }
+        Self {
+            format_version: FORMAT_VERSION,
+            split_seed,
+            hazard_threshold,
+            bound: None,
+            memory: None,
+            occupancy: None,
+        }
     }
 
     /// Returns the threshold of the calibrated rule, with or without a memory.
@@ -121,6 +162,11 @@ impl CheckpointPlanning {
                 return Err(format(format!("`hazard_threshold` is {threshold}; allowed: 0 to 1")));
             }
         }
+        for rates in planning.occupancy.iter().flatten() {
+            if ![rates.where_free, rates.where_taken].iter().all(|rate| (0.0..=1.0).contains(rate)) {
+                return Err(format(format!("`occupancy` has the rates {rates:?}; allowed: 0 to 1")));
+            }
+        }
         Ok(planning)
     }
 
@@ -143,12 +189,15 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let missing = CheckpointPlanning::load(folder.path()).unwrap_err().to_string();
         assert!(missing.contains(FILE) && missing.contains("carff train"), "{missing}");
-        let planning = CheckpointPlanning::new(7, 0.25);
+        let occupancy = Some([OccupancyRates { where_free: 0.1, where_taken: 0.4 }; MAX_HORIZON as usize]);
+        let planning = CheckpointPlanning { occupancy, ..CheckpointPlanning::new(7, 0.25) };
         planning.save(folder.path()).unwrap();
         assert_eq!(CheckpointPlanning::load(folder.path()).unwrap(), planning);
+        let wrong_rates = OccupancyRates { where_free: -0.1, where_taken: 1.0 };
         for (wrong, key) in [
             (CheckpointPlanning { format_version: 2, ..planning }, "format_version"),
             (CheckpointPlanning { hazard_threshold: 1.5, ..planning }, "hazard_threshold"),
+            (CheckpointPlanning { occupancy: Some([wrong_rates; MAX_HORIZON as usize]), ..planning }, "occupancy"),
         ] {
             wrong.save(folder.path()).unwrap();
             let error = CheckpointPlanning::load(folder.path()).unwrap_err().to_string();

@@ -1,7 +1,7 @@
 //! The density probe of a checkpoint: its field, places, calibration and state posteriors.
 
 use crate::{CheckpointError, Manifest, files, load_field};
-use carff_decision::{Calibration, Localiser, ProbeLayout, SceneProbe};
+use carff_decision::{Localiser, ProbeCalibration, ProbeLayout, SceneProbe};
 use carff_field::{Field, PreparedPoints};
 use carff_messages::LATENT_DIM;
 use std::ops::Deref;
@@ -53,7 +53,7 @@ pub fn load_field_probe(dir: &Path, manifest: &Manifest) -> Result<FieldProbe, C
 }
 
 /// Returns the probe layout of a checkpoint and its calibration.
-pub fn load_probing(dir: &Path, manifest: &Manifest) -> Result<(ProbeLayout, Calibration), CheckpointError> {
+pub fn load_probing(dir: &Path, manifest: &Manifest) -> Result<(ProbeLayout, ProbeCalibration), CheckpointError> {
     let missing = || CheckpointError::Missing { path: dir.into(), part: "probe calibration", stage: "nerf" };
     let calibration = manifest.probing.clone().ok_or_else(missing)?;
     let layout = ProbeLayout::new(manifest.places.clone(), manifest.scenario.hazard_states())

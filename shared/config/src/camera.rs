@@ -3,7 +3,7 @@
 use crate::ConfigError;
 use crate::error::Source;
 use carff_dataset::sensor::SensorNoise;
-use carff_dataset::{Calibration, CalibrationError};
+use carff_dataset::{CalibrationError, CameraCalibration};
 use schemars::JsonSchema;
 use serde::de::value::MapAccessDeserializer;
 use serde::de::{Deserializer, MapAccess, Visitor};
@@ -85,7 +85,7 @@ pub enum CalibrationChoice {
     /// Path of the file.
     File(PathBuf),
     /// The values.
-    Table(Calibration),
+    Table(CameraCalibration),
 }
 
 impl<'de> Deserialize<'de> for CalibrationChoice {
@@ -104,7 +104,7 @@ impl<'de> Deserialize<'de> for CalibrationChoice {
             }
 
             fn visit_map<A: MapAccess<'de>>(self, map: A) -> Result<CalibrationChoice, A::Error> {
-                Calibration::deserialize(MapAccessDeserializer::new(map)).map(CalibrationChoice::Table)
+                CameraCalibration::deserialize(MapAccessDeserializer::new(map)).map(CalibrationChoice::Table)
             }
         }
         deserializer.deserialize_any(Choice)

@@ -8,7 +8,7 @@ use crate::camera::{CalibrationChoice, CameraConfig, CameraSource};
 use crate::error::{Source, read};
 use crate::ranges;
 use crate::stages::{LogFormat, StageConfig, StagesConfig};
-use carff_dataset::{Calibration, CalibrationError};
+use carff_dataset::{CalibrationError, CameraCalibration};
 use carff_decision::{Approach, Sampling, Speeds, StepLength};
 use carff_messages::{Rule, Stage};
 use schemars::JsonSchema;
@@ -292,7 +292,7 @@ pub enum WhenLost {
 /// A quality that the graph gives up under overload.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
-pub enum Quality {
+pub enum Reduction {
     /// Width and height of the rendered views: halved, then quartered.
     Resolution,
     /// Latents drawn from each mixture: halved down to `min_samples`.
@@ -309,7 +309,7 @@ pub enum Quality {
 pub struct OverloadConfig {
     /// Order of giving up: `resolution`, `samples`, `horizon`, each at most once. Default: none, only frames are
     /// skipped.
-    pub order: Vec<Quality>,
+    pub order: Vec<Reduction>,
     /// Share of `controller.deadline_ms` above which a frame's belief is a sign of overload, as a skipped frame is;
     /// 0.05 to
     /// 1. Default 0.8.
@@ -466,12 +466,12 @@ impl GraphConfig {
     /// # Errors
     ///
     /// If its file cannot be read.
-    pub fn calibration(&self) -> Result<Option<Calibration>, CalibrationError> {
+    pub fn calibration(&self) -> Result<Option<CameraCalibration>, CalibrationError> {
         self.camera
             .calibration
             .as_ref()
             .map(|choice| match choice {
-                CalibrationChoice::File(path) => Calibration::load(&self.resolve(path)),
+                CalibrationChoice::File(path) => CameraCalibration::load(&self.resolve(path)),
                 CalibrationChoice::Table(table) => Ok(table.clone()),
             })
             .transpose()

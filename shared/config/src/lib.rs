@@ -32,7 +32,7 @@ mod stages;
 pub use camera::{CalibrationChoice, CameraConfig, CameraSource, FramePace, Pose, PoseChoice};
 pub use error::ConfigError;
 pub use graph::{
-    ChecksConfig, CompareImages, ControllerConfig, GraphConfig, LauncherConfig, MemoryKind, OverloadConfig, Quality,
+    ChecksConfig, CompareImages, ControllerConfig, GraphConfig, LauncherConfig, MemoryKind, OverloadConfig, Reduction,
     RendererConfig, RunConfig, UnknownIs, ViewChoice, WhenLost, is_stream,
 };
 pub use soak::{Contract, Kind, Pace, SoakConfig, Weights};

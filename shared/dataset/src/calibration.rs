@@ -25,7 +25,7 @@ pub enum DistortionModel {
 /// Calibration of a camera, with the numbers that ROS and `OpenCV` print: the centre of the top left pixel is at 0.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
-pub struct Calibration {
+pub struct CameraCalibration {
     /// Width of the calibrated images, pixels, 1 to 8192.
     #[schemars(range(min = 1, max = 8192))]
     pub width_px: u32,
@@ -133,7 +133,7 @@ struct CameraInfo {
     distortion_coefficients: Option<Matrix>,
 }
 
-impl Calibration {
+impl CameraCalibration {
     /// Reads a ROS `camera_info` YAML file.
     pub fn load(path: &Path) -> Result<Self, CalibrationError> {
         let text =
@@ -258,11 +258,11 @@ mod tests {
     const ECHOED: &str = "header:\n  frame_id: cam\nheight: 480\nwidth: 640\ndistortion_model: equidistant\nd:\n- 0.1\n\
         - 0.0\n- 0.0\n- 0.0\nk:\n- 400.0\n- 0.0\n- 319.5\n- 0.0\n- 400.0\n- 239.5\n- 0.0\n- 0.0\n- 1.0\n---\nheight: 1\n";
 
-    fn load(text: &str) -> Result<Calibration, CalibrationError> {
+    fn load(text: &str) -> Result<CameraCalibration, CalibrationError> {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("camera.yaml");
         std::fs::write(&path, text).unwrap();
-        Calibration::load(&path)
+        CameraCalibration::load(&path)
     }
 
     /// The files of calibrators and the text of `ros2 topic echo` are read.
@@ -300,7 +300,7 @@ mod tests {
             let error = load(text).unwrap_err().to_string();
             assert!(error.contains(words), "{words}: {error}");
         }
-        let missing = Calibration::load(Path::new("no/such/file.yaml")).unwrap_err().to_string();
+        let missing = CameraCalibration::load(Path::new("no/such/file.yaml")).unwrap_err().to_string();
         assert!(missing.contains("no/such/file.yaml"), "{missing}");
     }
 }

@@ -188,8 +188,8 @@ mod tests {
         let mut records = Vec::new();
         for (branch, timestamp, view) in (0..2).flat_map(|b| (0..3).flat_map(move |t| (0..6).map(move |v| (b, t, v)))) {
             let path = format!("images/b{branch}_t{timestamp}_v{view}.png");
-            let picture = Image::filled(4, 4, [branch as u8, timestamp as u8, view as u8]);
-            writer.write_image(&path, &picture).unwrap();
+            let image = Image::filled(4, 4, [branch as u8, timestamp as u8, view as u8]);
+            writer.write_image(&path, &image).unwrap();
             let mut record = FrameRecord::new(path, camera);
             record.branch_and_timestamp = Some((branch, timestamp));
             record.view = Some(view);
@@ -319,7 +319,7 @@ mod tests {
 
     /// A pose that is not in the dataset cannot be driven, and the error reports it.
     #[test]
-    fn missing_pictures_are_an_error() {
+    fn missing_images_are_an_error() {
         let folder = tempfile::tempdir().unwrap();
         let error = plan_drives(&dataset(folder.path()), &[7, 8], 4, 1).unwrap_err();
         assert_eq!(error, DrivesError::NoneWhole { views: 2 });

@@ -41,9 +41,9 @@ impl Equivalence {
         Self::of(states, &frames, |&a, &b| known(a, b).unwrap_or_else(|| compared(a, b)))
     }
 
-    /// Compares all pairs of states in each view; `pictures` has a row of `states` images per view.
-    pub fn of_pictures(states: usize, pictures: &[Vec<Option<&Image>>]) -> Self {
-        Self::of(states, pictures, |a, b| looks_same(a, b))
+    /// Compares all pairs of states in each view; `images` has a row of `states` images per view.
+    pub fn of_images(states: usize, images: &[Vec<Option<&Image>>]) -> Self {
+        Self::of(states, images, |a, b| looks_same(a, b))
     }
 
     fn of<T: Sync>(states: usize, rows: &[Vec<Option<T>>], alike: impl Fn(&T, &T) -> bool + Sync) -> Self {

@@ -42,7 +42,7 @@ mod unique;
 mod views;
 mod writer;
 
-pub use calibration::{Calibration, CalibrationError, DistortionModel};
+pub use calibration::{CalibrationError, CameraCalibration, DistortionModel};
 pub use carff_messages::Observability;
 pub use corruptions::{Corruption, CorruptionError};
 pub use dataset::Dataset;

@@ -2,7 +2,7 @@
 
 use carff_base::geometry::PinholeCamera;
 
-use crate::calibration::{Calibration, CalibrationError};
+use crate::calibration::{CalibrationError, CameraCalibration};
 use crate::lens::neighbours;
 use crate::raw::RawImage;
 
@@ -23,10 +23,10 @@ struct Tap {
 ///
 /// ```
 /// use carff_base::geometry::PinholeCamera;
-/// use carff_dataset::{Calibration, DistortionModel, RawImage, Rectifier};
+/// use carff_dataset::{CameraCalibration, DistortionModel, RawImage, Rectifier};
 /// # fn main() -> Result<(), Box<dyn std::error::Error>> {
 /// let trained = PinholeCamera::look_at([0.0; 3], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], 32, 32, 60.0);
-/// let calibration = Calibration {
+/// let calibration = CameraCalibration {
 ///     width_px: 64, height_px: 64, fl_x_px: 50.0, fl_y_px: 50.0, cx_px: 31.5, cy_px: 31.5,
 ///     model: DistortionModel::PlumbBob, distortion: vec![-0.1, 0.01],
 /// };
@@ -52,7 +52,7 @@ impl Rectifier {
     /// # Errors
     ///
     /// If the lens does not show the whole field of view of the trained camera.
-    pub fn new(calibration: &Calibration, trained: &PinholeCamera) -> Result<Self, CalibrationError> {
+    pub fn new(calibration: &CameraCalibration, trained: &PinholeCamera) -> Result<Self, CalibrationError> {
         calibration.check()?;
         let (lens, sensor) = (calibration.lens(), calibration.sensor());
         let scale = (sensor.fl_x_px / trained.fl_x_px).max(sensor.fl_y_px / trained.fl_y_px);
@@ -148,9 +148,9 @@ mod tests {
         PinholeCamera::look_at([0.0; 3], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], side_px, side_px, fov_deg)
     }
 
-    fn calibration(side_px: u32, fl_px: f64, model: DistortionModel, distortion: &[f64]) -> Calibration {
+    fn calibration(side_px: u32, fl_px: f64, model: DistortionModel, distortion: &[f64]) -> CameraCalibration {
         let centre = f64::from(side_px) / 2.0 - 0.5;
-        Calibration {
+        CameraCalibration {
             width_px: side_px,
             height_px: side_px,
             fl_x_px: fl_px,
@@ -192,15 +192,15 @@ mod tests {
         ];
         for (model, distortion, scale) in lenses {
             let calibration = calibration(320, 200.0, model, &distortion);
-            let mut picture = Image::filled(320, 320, [0; 3]);
+            let mut image = Image::filled(320, 320, [0; 3]);
             let dot = [x * scale * 200.0 + 160.0, y * scale * 200.0 + 160.0];
-            for (i, pixel) in picture.rgb.chunks_exact_mut(3).enumerate() {
+            for (i, pixel) in image.rgb.chunks_exact_mut(3).enumerate() {
                 let (u, v) = ((i % 320) as f64 + 0.5, (i / 320) as f64 + 0.5);
                 let distance = (u - dot[0]).hypot(v - dot[1]);
                 pixel.fill((255.0 * (-distance * distance / 50.0).exp()) as u8);
             }
             let mut out = vec![0; 64 * 64 * 3];
-            let raw = RawImage::rgb([320, 320], &picture.rgb).unwrap();
+            let raw = RawImage::rgb([320, 320], &image.rgb).unwrap();
             Rectifier::new(&calibration, &camera).unwrap().write(&raw, &mut out).unwrap();
             let (mut sum, mut at) = (0.0, [0.0; 2]);
             for (i, pixel) in out.chunks_exact(3).enumerate() {

@@ -73,17 +73,7 @@ pub(crate) fn read_scenario(path: &Path, dir: &Path, value: &Value) -> Result<Sc
     if (0..3).any(|i| bounds[0][i] >= bounds[1][i]) {
         return Err(place.error("bounds", "the first corner must be below the second along every axis"));
     }
-    let mut branches = Vec::new();
-    for branch in place.array(map, "branches")? {
-        let name = branch.as_str().ok_or_else(|| place.error("branches", "must be a list of names"))?;
-        if branches.iter().any(|b| b == name) {
-            return Err(place.error("branches", format!("`{name}` is named twice")));
-        }
-        branches.push(name.to_owned());
-    }
-    if branches.is_empty() || branches.len() > MAX_BRANCHES {
-        return Err(place.error("branches", format!("{} names; from 1 to {MAX_BRANCHES} are allowed", branches.len())));
-    }
+    let branches = read_branches(&place, map)?;
     let timestamps = place
         .index(map, "timestamps", MAX_TIMESTAMPS + 1)?
         .filter(|t| *t > 0)
@@ -104,16 +94,7 @@ pub(crate) fn read_scenario(path: &Path, dir: &Path, value: &Value) -> Result<Sc
         let at = place.within(format!("scenario.static_boxes[{i}]"));
         static_boxes.push(read_box(&at, at.object(value)?)?);
     }
-    let mut hazard_branches = Vec::new();
-    for value in optional_list(&place, map, "hazard_branches")? {
-        let branch = value.as_u64().map(|b| b as usize).filter(|b| *b < branches.len());
-        hazard_branches.push(branch.ok_or_else(|| {
-            place.error(
-                "hazard_branches",
-                format!("must be branch indices from 0 to {}, found {value}", branches.len() - 1),
-            )
-        })?);
-    }
+    let hazard_branches = read_hazard_branches(&place, map, branches.len())?;
     let (mut hazard_action, mut clear_action) = ("halt".to_owned(), "advance".to_owned());
     if let Some(actions) = present(map, "actions") {
         let at = place.within("scenario.actions".to_owned());
@@ -146,6 +127,32 @@ pub(crate) fn read_scenario(path: &Path, dir: &Path, value: &Value) -> Result<Sc
         hazard_action,
         clear_action,
     })
+}
+
+fn read_branches(place: &Place, map: &Map<String, Value>) -> Result<Vec<String>, DatasetError> {
+    let mut branches = Vec::new();
+    for branch in place.array(map, "branches")? {
+        let name = branch.as_str().ok_or_else(|| place.error("branches", "must be a list of names"))?;
+        if branches.iter().any(|b| b == name) {
+            return Err(place.error("branches", format!("`{name}` is named twice")));
+        }
+        branches.push(name.to_owned());
+    }
+    if branches.is_empty() || branches.len() > MAX_BRANCHES {
+        return Err(place.error("branches", format!("{} names; from 1 to {MAX_BRANCHES} are allowed", branches.len())));
+    }
+    Ok(branches)
+}
+
+fn read_hazard_branches(place: &Place, map: &Map<String, Value>, count: usize) -> Result<Vec<usize>, DatasetError> {
+    let mut hazard_branches = Vec::new();
+    for value in optional_list(place, map, "hazard_branches")? {
+        let branch = value.as_u64().map(|b| b as usize).filter(|b| *b < count);
+        hazard_branches.push(branch.ok_or_else(|| {
+            place.error("hazard_branches", format!("must be branch indices from 0 to {}, found {value}", count - 1))
+        })?);
+    }
+    Ok(hazard_branches)
 }
 
 fn optional_list<'v>(place: &Place, map: &'v Map<String, Value>, key: &str) -> Result<&'v [Value], DatasetError> {

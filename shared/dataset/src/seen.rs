@@ -11,7 +11,7 @@ use rayon::prelude::*;
 /// first error of an image is returned.
 ///
 /// `image` loads the image of a frame. `valid` returns the test for pixels that the masks of two frames include.
-pub(crate) fn told_by_pictures<V: Fn(usize) -> bool>(
+pub(crate) fn told_by_images<V: Fn(usize) -> bool>(
     frames: &[Frame],
     image: impl Fn(usize) -> Result<Image, DatasetError> + Sync,
     valid: impl Fn([usize; 2]) -> V + Sync,
@@ -26,7 +26,7 @@ pub(crate) fn told_by_pictures<V: Fn(usize) -> bool>(
     let told: Vec<Vec<(usize, Option<Observability>)>> = of_view
         .par_iter()
         .map(|of_view| {
-            let pictures: Vec<Image> = of_view.iter().map(|&i| image(i)).collect::<Result<_, _>>()?;
+            let images: Vec<Image> = of_view.iter().map(|&i| image(i)).collect::<Result<_, _>>()?;
             let frame_of = |place: usize| &frames[of_view[place]];
             let tell = |own: usize| {
                 let (branch, timestamp) = (frame_of(own).branch, frame_of(own).timestamp);
@@ -34,7 +34,7 @@ pub(crate) fn told_by_pictures<V: Fn(usize) -> bool>(
                     .filter(|&other| frame_of(other).timestamp == timestamp && frame_of(other).branch != branch);
                 let (alike, different): (Vec<usize>, Vec<usize>) = others.partition(|&other| {
                     let valid = valid([of_view[own], of_view[other]]);
-                    looks_same_where(&pictures[own], &pictures[other], valid)
+                    looks_same_where(&images[own], &images[other], valid)
                 });
                 match (alike.is_empty(), different.is_empty()) {
                     (true, true) => None,

@@ -33,11 +33,11 @@ fn instant_ngp_layout() {
         let frames: Vec<Value> = range
             .map(|i| {
                 // The left half is transparent, the right half is green.
-                let mut picture = image::RgbaImage::from_pixel(40, 30, image::Rgba([0, 200, 0, 255]));
-                for (x, _, pixel) in picture.enumerate_pixels_mut() {
+                let mut image = image::RgbaImage::from_pixel(40, 30, image::Rgba([0, 200, 0, 255]));
+                for (x, _, pixel) in image.enumerate_pixels_mut() {
                     pixel.0[3] = if x < 20 { 0 } else { 255 };
                 }
-                picture.save(from.path().join(format!("{split}/r_{i}.png"))).unwrap();
+                image.save(from.path().join(format!("{split}/r_{i}.png"))).unwrap();
                 json!({"file_path": format!("./{split}/r_{i}"), "rotation": 0.01,
                     "transform_matrix": cameras[i].world_from_camera})
             })
@@ -118,7 +118,7 @@ fn nerfstudio_layout() {
 
 /// An image with another aspect ratio than its intrinsics is an error that names it; so is a missing image.
 #[test]
-fn wrong_pictures_are_named() {
+fn wrong_images_are_named() {
     let (from, to) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
     let set = |name: &str| {
         json!({"w": 40, "h": 30, "fl_x": 30.0, "frames": [
@@ -133,7 +133,7 @@ fn wrong_pictures_are_named() {
     assert!(error.contains("square.png") && error.contains("30x30") && error.contains("40x30"), "{error}");
     let error = attempt("missing.jpg");
     assert!(error.contains("missing.jpg") && error.contains("there is no file"), "{error}");
-    std::fs::write(from.path().join("broken.jpg"), "no picture").unwrap();
+    std::fs::write(from.path().join("broken.jpg"), "no image").unwrap();
     let error = attempt("broken.jpg");
     assert!(error.contains("broken.jpg") && error.contains("not a readable PNG or JPEG image"), "{error}");
 }

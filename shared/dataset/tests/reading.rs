@@ -97,7 +97,7 @@ fn whole_set() {
 /// The book's example is a complete dataset: it is read without warnings, and each state has its boxes.
 #[test]
 fn the_books_example_is_a_set() {
-    let page = include_str!("../../../docs/book/src/sets-of-pictures.md");
+    let page = include_str!("../../../docs/book/src/dataset-format.md");
     let example = page.split("```json").nth(1).and_then(|rest| rest.split("```").next()).unwrap();
     let set: Value = serde_json::from_str(example).unwrap();
     let dir = tempfile::tempdir().unwrap();
@@ -133,7 +133,7 @@ fn authors_form() {
 /// Observability is derived for a dataset without it, with a warning: `none` if all branches look the same, `partial`
 /// if some do, `full` if none does. Values in the dataset are kept.
 #[test]
-fn pictures_tell_observability() {
+fn images_tell_observability() {
     let dir = tempfile::tempdir().unwrap();
     let mut set = whole();
     set["scenario"]["branches"] = json!(["with", "without", "late"]);
@@ -385,8 +385,8 @@ fn errors_of_files() {
     std::fs::write(dir.path().join("transforms.json"), "{\n  \"w\": 8,\n  oops\n}").unwrap();
     assert!(message(dir.path()).contains("transforms.json: not valid JSON") && message(dir.path()).contains("line 3"));
     put(dir.path(), "transforms.json", &whole());
-    let picture = dir.path().join("images/b0_t1_v1.png");
-    Image::filled(9, 8, [0; 3]).save_png(&picture).unwrap();
+    let image = dir.path().join("images/b0_t1_v1.png");
+    Image::filled(9, 8, [0; 3]).save_png(&image).unwrap();
     let dataset = Dataset::open(dir.path()).unwrap();
     let error = dataset.load_all_images().unwrap_err().to_string();
     assert!(
@@ -396,7 +396,7 @@ fn errors_of_files() {
     assert!(
         dataset.load_image(8).unwrap_err().to_string().contains("frame 8 does not exist; the dataset has 8 frames")
     );
-    std::fs::remove_file(picture).unwrap();
+    std::fs::remove_file(image).unwrap();
     let error = message(dir.path());
     assert!(error.contains("frame 3 (images/b0_t1_v1.png): key `file_path`: there is no file"), "{error}");
 }

@@ -16,20 +16,20 @@ const MIN_MEAN_PROBABILITY: f64 = 0.5;
 ///
 /// ```
 /// use carff_base::geometry::OrientedBox;
-/// use carff_decision::{Calibration, Place, ProbeLayout};
+/// use carff_decision::{ProbeCalibration, Place, ProbeLayout};
 /// let place = Place {
 ///     name: "truck".into(),
 ///     oriented_box: OrientedBox { center: [0.0, 0.0, 1.0], half_size: [1.0; 3], yaw: 0.0 },
 ///     occupied_in: vec![true, false],
 /// };
 /// let layout = ProbeLayout::new(vec![place], vec![true, false])?;
-/// let calibration = Calibration::fit(&layout, &[vec![0.8, 0.9], vec![0.05, 0.1]])?;
+/// let calibration = ProbeCalibration::fit(&layout, &[vec![0.8, 0.9], vec![0.05, 0.1]])?;
 /// assert!(calibration.separations()[0] > 3.0);
 /// assert_eq!(calibration.read(&layout, &[0.02]).state, Some(1));
 /// # Ok::<(), carff_decision::ProbingError>(())
 /// ```
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Calibration {
+pub struct ProbeCalibration {
     places: Vec<PlaceCalibration>,
 }
 
@@ -55,7 +55,7 @@ pub struct Reading {
     pub state_probabilities: Vec<f32>,
 }
 
-impl Calibration {
+impl ProbeCalibration {
     /// Fits on the occupancies of the known states: for each state, rows of one value a place, one row a latent.
     pub fn fit(layout: &ProbeLayout, occupancies_by_state: &[Vec<f32>]) -> Result<Self, ProbingError> {
         let n = layout.places().len();
@@ -256,9 +256,9 @@ mod tests {
         .unwrap()
     }
 
-    fn calibration(layout: &ProbeLayout) -> Calibration {
+    fn calibration(layout: &ProbeLayout) -> ProbeCalibration {
         let rows = |a: f32, b: f32| (0..10).flat_map(|i| [a + 0.01 * i as f32, b + 0.005 * i as f32]).collect();
-        Calibration::fit(layout, &[rows(0.8, 0.05), rows(0.05, 0.7), rows(0.03, 0.02)]).unwrap()
+        ProbeCalibration::fit(layout, &[rows(0.8, 0.05), rows(0.05, 0.7), rows(0.03, 0.02)]).unwrap()
     }
 
     /// Each known state is read back from its own occupancies, "nobody there" among them.

@@ -57,7 +57,7 @@ pub struct Place {
 /// The places of a scenario and the points to query in them.
 ///
 /// ```
-/// use carff_decision::{Calibration, Place, ProbeLayout};
+/// use carff_decision::{ProbeCalibration, Place, ProbeLayout};
 /// use carff_base::geometry::OrientedBox;
 /// let place = |x: f64, occupied_in: Vec<bool>| Place {
 ///     name: "actor".into(),
@@ -68,7 +68,7 @@ pub struct Place {
 /// let layout = ProbeLayout::new(places, vec![true, false])?;
 /// // State 0 shows something at the first place, state 1 nothing at all.
 /// let known = vec![vec![0.9, 0.1, 0.8, 0.0], vec![0.1, 0.1, 0.0, 0.05]];
-/// let calibration = Calibration::fit(&layout, &known)?;
+/// let calibration = ProbeCalibration::fit(&layout, &known)?;
 /// let reading = calibration.read(&layout, &[0.85, 0.02]);
 /// assert_eq!(reading.state, Some(0));
 /// assert!(reading.hazard_likelihood > 0.9);

@@ -30,7 +30,7 @@ mod take;
 mod threshold;
 
 pub use approach::{Approach, Drive, Motion, Speeds, stopping_mps};
-pub use calibration::{Calibration, Reading, Resolved, resolve};
+pub use calibration::{ProbeCalibration, Reading, Resolved, resolve};
 pub use convert::{mixture_and_draws, set_mixture_and_draws};
 pub use evidence::{Evidence, SampleEvidence};
 pub use image_evidence::{ImageEvidence, ImageMemory};

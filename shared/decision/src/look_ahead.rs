@@ -1,6 +1,6 @@
 //! One step of the belief, and the autoregressive loop over steps (paper section 3.2).
 
-use crate::{Calibration, Draw, ImageEvidence, Mixture, ProbeLayout, Reading, Resolved, Sampling, resolve};
+use crate::{Draw, ImageEvidence, Mixture, ProbeCalibration, ProbeLayout, Reading, Resolved, Sampling, resolve};
 use carff_messages::{Gaussian, LATENT_DIM};
 
 /// Finds out which places of a scenario are taken in the scenes of latents (paper section 3.2: by the density of the
@@ -16,7 +16,7 @@ pub trait Localiser {
 pub struct SceneProbe<L> {
     localiser: L,
     layout: ProbeLayout,
-    calibration: Calibration,
+    calibration: ProbeCalibration,
     states: Vec<Gaussian>,
     occupancies: Vec<f32>,
 }
@@ -49,7 +49,7 @@ pub struct Step {
 
 impl<L: Localiser> SceneProbe<L> {
     /// Puts the parts together; `states` are the posteriors that represent the known states.
-    pub fn new(localiser: L, layout: ProbeLayout, calibration: Calibration, states: Vec<Gaussian>) -> Self {
+    pub fn new(localiser: L, layout: ProbeLayout, calibration: ProbeCalibration, states: Vec<Gaussian>) -> Self {
         Self { localiser, layout, calibration, states, occupancies: Vec::new() }
     }
 

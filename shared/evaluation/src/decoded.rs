@@ -66,9 +66,9 @@ impl Decoding<'_> {
         let psnr = |sum: f64, n: f64| psnr_of_mse(sum / n.max(1.0));
         DecodedQuality {
             psnr_db: psnr(error, count),
-            mean_picture_psnr_db: psnr(mean_error, count),
+            mean_image_psnr_db: psnr(mean_error, count),
             changed_pixels_psnr_db: psnr(changed_error, changed_count),
-            pictures: pairs.len(),
+            images: pairs.len(),
         }
     }
 }

@@ -43,7 +43,7 @@ pub use stats::{
 pub use subject::{About, DecisiveImage, EvalOptions, Novelty, OtherPlace, Subject};
 pub use tables::{
     encoder::{EncoderTable, SvmScore, SvmTable, encoder_table},
-    field::{FieldPictures, NovelViews, PictureTable},
+    field::{FieldImages, ImageTable, NovelViews},
     forecast::{ForecastTable, FrequencyTable, RoleCurves},
     localisation::{LocalisationFigures, LocalisationTable, MethodFigures},
     memory::{ByObserver, MemoryTable, ObserverFigures, RightFrames},

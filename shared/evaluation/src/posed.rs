@@ -4,12 +4,12 @@ use crate::EvaluationError;
 use carff_dataset::{
     Dataset, Equivalence, Frame, Image, NamedBox, Observability, PoseRole, PoseSplit, ScenarioInfo, StateInfo,
 };
-use carff_networks::decoder::PICTURE_PX;
+use carff_networks::decoder::IMAGE_PX;
 use std::path::Path;
 use tch::{Kind, Tensor};
 
 const NO_SCENARIO: &str = "transforms.json has no `scenario`, which lists the states \
-                           (`docs/book/src/sets-of-pictures.md` has an example); a dataset of one scene is imported \
+                           (`docs/book/src/dataset-format.md` has an example); a dataset of one scene is imported \
                            without it: `carff dataset import`";
 
 /// Label of one image.
@@ -159,7 +159,7 @@ impl PosedImages {
 }
 
 fn valid_targets(dataset: &Dataset, chosen: &[usize]) -> Option<Tensor> {
-    let all = || Tensor::ones([1, PICTURE_PX, PICTURE_PX], (Kind::Float, tch::Device::Cpu));
+    let all = || Tensor::ones([1, IMAGE_PX, IMAGE_PX], (Kind::Float, tch::Device::Cpu));
     let flags = |frame: &usize| {
         let Some(mask) = dataset.valid_pixels(*frame) else { return all() };
         let camera = &dataset.frames()[*frame].camera;
@@ -215,15 +215,15 @@ fn labels(
 /// Decoder target of one image `[3, 128, 128]`, 0..=1.
 fn target(image: &Image) -> Tensor {
     let bytes = Tensor::from_slice(&image.rgb).view([1, i64::from(image.height_px), i64::from(image.width_px), 3]);
-    at_target_size(&carff_networks::encoder::pictures_from_bytes(&bytes))
+    at_target_size(&carff_networks::encoder::images_from_bytes(&bytes))
 }
 
 /// Resizes one image `[1, C, H, W]` to `[C, 128, 128]`.
 fn at_target_size(image: &Tensor) -> Tensor {
-    let image = if image.size()[2] == PICTURE_PX && image.size()[3] == PICTURE_PX {
+    let image = if image.size()[2] == IMAGE_PX && image.size()[3] == IMAGE_PX {
         image.shallow_clone()
     } else {
-        image.internal_upsample_bilinear2d_aa([PICTURE_PX, PICTURE_PX], false, None, None)
+        image.internal_upsample_bilinear2d_aa([IMAGE_PX, IMAGE_PX], false, None, None)
     };
     image.squeeze_dim(0)
 }

@@ -6,7 +6,7 @@
 use carff_base::geometry::PinholeCamera;
 use carff_base::random::{Key, gaussians, stream};
 use carff_dataset::Dataset;
-use carff_decision::{Calibration, Localiser, Place, ProbeLayout, SceneProbe};
+use carff_decision::{Localiser, Place, ProbeCalibration, ProbeLayout, SceneProbe};
 use carff_field::Field;
 use carff_messages::{Gaussian, LATENT_DIM};
 use carff_trials::{FieldRenderer, hypotheses::birds_eye_camera};
@@ -169,7 +169,7 @@ impl SegmentedField {
                 rows
             })
             .collect();
-        let calibration = Calibration::fit(&layout, &occupancies).ok()?;
+        let calibration = ProbeCalibration::fit(&layout, &occupancies).ok()?;
         Some(SceneProbe::new(self, layout, calibration, states))
     }
 }

@@ -14,7 +14,7 @@ use carff_decision::{MemorySettings, Sampling};
 use carff_messages::Gaussian;
 use carff_networks::{
     decoder::Decoder,
-    encoder::{Encoder, pictures_from_bytes},
+    encoder::{Encoder, images_from_bytes},
     mixture::MixtureNet,
     stored::{load_decoder, load_encoder_on, load_mixture},
 };
@@ -54,7 +54,7 @@ pub struct About {
     /// Folder of the dataset, as given.
     pub dataset: String,
     /// Images of the dataset.
-    pub pictures: usize,
+    pub images: usize,
     /// Number of poses of each role.
     pub poses: ByRole<usize>,
     /// Seed of the training.
@@ -262,7 +262,7 @@ impl Subject {
             timestamps: scenario.timestamps,
             checkpoint: self.checkpoint.display().to_string(),
             dataset: self.posed.dataset.dir().display().to_string(),
-            pictures: self.posed.images.len(),
+            images: self.posed.images.len(),
             poses,
             training_seed: self.manifest.seed,
             split_seed: self.manifest.split.seed,
@@ -274,7 +274,7 @@ impl Subject {
 /// Bytes of an image of the size of `image` as `[1, 3, H, W]` in 0..=1.
 fn as_tensor(rgb: &[u8], image: &Image) -> Tensor {
     let sides = [1, i64::from(image.height_px), i64::from(image.width_px), 3];
-    pictures_from_bytes(&Tensor::from_slice(rgb).view(sides))
+    images_from_bytes(&Tensor::from_slice(rgb).view(sides))
 }
 
 /// Turns a part that is not trained yet into the reason to leave tables out. A damaged part is an error.

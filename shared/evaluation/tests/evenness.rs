@@ -5,7 +5,7 @@
 use carff_dataset::Observability;
 use carff_decision::{Evidence, Plan, Sampling, look_ahead};
 use carff_evaluation::Models;
-use carff_scenes::{RenderOptions, Scenario};
+use carff_scenes::{Detail, Scenario};
 use std::path::Path;
 
 /// The branches with and without the actor, at the first step.
@@ -20,7 +20,7 @@ fn hidden_views_give_an_even_belief() {
     let mut models = Models::load(&root.join("configs/checkpoints/approaching-intersection")).unwrap();
     let mut hazard = |view: usize, branch: usize, timestamp: usize| {
         let camera = scenario.cameras()[view].camera;
-        let rendering = scenario.render(branch, timestamp, &camera, &RenderOptions::default()).unwrap();
+        let rendering = scenario.render(branch, timestamp, &camera, Detail::default()).unwrap();
         let hidden = rendering.actor.is_some_and(|actor| actor.observability == Observability::None);
         let image = rendering.image;
         let sides = [i64::from(image.height_px), i64::from(image.width_px), 3];

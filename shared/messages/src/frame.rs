@@ -157,7 +157,7 @@ pub struct FrameMeta {
 impl FrameMeta {
     fn check(&self) -> Result<(), Invalid> {
         self.header.validate()?;
-        picture_size(self.width_px, self.height_px)?;
+        image_size(self.width_px, self.height_px)?;
         self.intrinsics.check()?;
         finite_f64("world_from_camera", &self.world_from_camera)?;
         at_most("take_start", self.take_start, self.header.frame_id)?;
@@ -217,7 +217,7 @@ impl ViewMeta {
         at_most("hypothesis", self.hypothesis.into(), MAX_SAMPLES as u64)?;
         ViewKind::try_from(self.kind)?;
         in_range("state", self.state.into(), -1, MAX_STATES as i64 - 1)?;
-        picture_size(self.width_px, self.height_px)?;
+        image_size(self.width_px, self.height_px)?;
         within("probability", [&self.probability], 0.0, 1.0)?;
         finite("latent", &self.latent)?;
         self.intrinsics.check()?;
@@ -233,7 +233,7 @@ impl ImageMeta for ViewMeta {
     }
 }
 
-fn picture_size(width_px: u32, height_px: u32) -> Result<(), Invalid> {
+fn image_size(width_px: u32, height_px: u32) -> Result<(), Invalid> {
     in_range("width_px", width_px.into(), 1, MAX_SIDE_PX.into())?;
     in_range("height_px", height_px.into(), 1, MAX_SIDE_PX.into())?;
     at_most("width_px * height_px * 3", u64::from(width_px) * u64::from(height_px) * 3, MAX_IMAGE_BYTES as u64)

@@ -3,6 +3,7 @@
 use crate::check::{at_most, probability, within};
 use crate::{Header, Invalid, message};
 use iceoryx2::prelude::ZeroCopySend;
+use ndarray::{ArrayView2, aview2};
 
 /// Maximum number of cells in an [`Occupancy`].
 pub const MAX_CELLS: usize = 1024;
@@ -16,8 +17,9 @@ pub const MAX_CELLS: usize = 1024;
 /// (occupancy.columns, occupancy.rows, occupancy.cell_m) = (4, 2, 0.5);
 /// occupancy.probability[5] = 0.9;
 /// assert!(occupancy.validate().is_ok());
-/// // The second cell of the second row.
-/// assert_eq!(occupancy.cells()[5], 0.9);
+/// // The second cell of the second row, whose middle is 0.75 m from the corner along both axes.
+/// assert_eq!(occupancy.grid()[[1, 1]], 0.9);
+/// assert_eq!(occupancy.middle_m([1, 1]), [0.75, 0.75]);
 /// ```
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, ZeroCopySend)]
@@ -59,6 +61,19 @@ impl Occupancy {
     /// Returns the probabilities of the cells, along x, then along y.
     pub fn cells(&self) -> &[f32] {
         &self.probability[..(self.columns as usize * self.rows as usize).min(MAX_CELLS)]
+    }
+
+    /// Returns the probabilities by row (along y) and column (along x); empty if the message has more cells than fit.
+    pub fn grid(&self) -> ArrayView2<'_, f32> {
+        let shape = (self.rows as usize, self.columns as usize);
+        ArrayView2::from_shape(shape, self.cells()).unwrap_or_else(|_| aview2::<f32, 1>(&[]))
+    }
+
+    /// Returns the middle of a cell, given by row and column: x and y, metres, world space.
+    pub fn middle_m(&self, [row, column]: [usize; 2]) -> [f64; 2] {
+        let cell_m = f64::from(self.cell_m);
+        let [x, y] = self.low_corner_m.map(f64::from);
+        [x + (column as f64 + 0.5) * cell_m, y + (row as f64 + 0.5) * cell_m]
     }
 
     fn check(&self) -> Result<(), Invalid> {

@@ -5,7 +5,7 @@ use carff_messages::LATENT_DIM;
 use tch::{Tensor, nn, nn::Module};
 
 /// Side of the decoder's images, pixels.
-pub const PICTURE_PX: i64 = 128;
+pub const IMAGE_PX: i64 = 128;
 
 /// Side of the images of a small decoder, pixels.
 pub const SMALL_PX: i64 = 32;
@@ -31,7 +31,7 @@ pub struct Decoder {
 }
 
 impl Decoder {
-    /// Builds a decoder for `poses` fixed camera poses, with images of [`PICTURE_PX`].
+    /// Builds a decoder for `poses` fixed camera poses, with images of [`IMAGE_PX`].
     pub fn new(path: &nn::Path, config: &DecoderConfig, poses: i64) -> Self {
         let c = config.channels;
         Self::with_layers(path, config, poses, &[("up16", c), ("up32", c * 3 / 4), ("up64", c * 3 / 8)])
@@ -110,7 +110,7 @@ mod tests {
             let decoder = Decoder::new(&store.root(), &config, 3);
             let latents = Tensor::ones([2, LATENT_DIM as i64], (Kind::Float, Device::Cpu));
             let out = decoder.forward(&latents, &Tensor::from_slice(&[0_i64, 2]));
-            assert_eq!(out.size(), [2, 3, PICTURE_PX, PICTURE_PX]);
+            assert_eq!(out.size(), [2, 3, IMAGE_PX, IMAGE_PX]);
             (out.get(0) - out.get(1)).abs().max().double_value(&[]) > 1e-6
         };
         assert!(differs(true, false) && differs(true, true) && !differs(false, false));

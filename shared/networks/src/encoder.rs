@@ -76,11 +76,11 @@ impl Encoder {
     }
 
     /// Maps images `[N, 3, H, W]` in 0..=1 to backbone features `[N, C, h, w]`, on the encoder's device.
-    pub fn features(&self, pictures: &Tensor) -> Tensor {
-        let pictures = &pictures.to_device(self.head.center.device());
+    pub fn features(&self, images: &Tensor) -> Tensor {
+        let images = &images.to_device(self.head.center.device());
         match &self.stem {
-            None => self.backbone.features(pictures),
-            Some((first, last)) => self.backbone.features(&(pictures + last.forward(&first.forward(pictures).relu()))),
+            None => self.backbone.features(images),
+            Some((first, last)) => self.backbone.features(&(images + last.forward(&first.forward(images).relu()))),
         }
     }
 
@@ -114,16 +114,16 @@ impl Encoder {
     }
 
     /// Returns the posteriors of images `[N, 3, H, W]`.
-    pub fn encode(&self, pictures: &Tensor) -> Vec<Gaussian> {
+    pub fn encode(&self, images: &Tensor) -> Vec<Gaussian> {
         tch::no_grad(|| {
-            let (mean, log_variance) = self.posterior(&self.features(pictures), 0.0);
+            let (mean, log_variance) = self.posterior(&self.features(images), 0.0);
             gaussians(&mean, &log_variance)
         })
     }
 
     /// Returns the posterior of one image, `[H, W, 3]` bytes.
-    pub fn encode_bytes(&self, picture: &Tensor) -> Option<Gaussian> {
-        self.encode(&pictures_from_bytes(&picture.unsqueeze(0))).into_iter().next()
+    pub fn encode_bytes(&self, image: &Tensor) -> Option<Gaussian> {
+        self.encode(&images_from_bytes(&image.unsqueeze(0))).into_iter().next()
     }
 }
 
@@ -134,7 +134,7 @@ impl Encodes for Encoder {
 }
 
 /// Converts `[N, H, W, 3]` bytes to `[N, 3, H, W]` in 0..=1.
-pub fn pictures_from_bytes(bytes: &Tensor) -> Tensor {
+pub fn images_from_bytes(bytes: &Tensor) -> Tensor {
     bytes.permute([0, 3, 1, 2]).to_kind(Kind::Float) * (1.0 / 255.0)
 }
 

@@ -141,13 +141,13 @@ fn an_efficientnet_is_what_it_was() {
     tensors.insert("_fc.weight".into(), Tensor::zeros([10, 1280], (Kind::Float, Device::Cpu)));
     let behind: Tensors = tensors.iter().map(|(k, t)| (format!("state_dict.{k}"), t.shallow_clone())).collect();
     let dir = tempfile::tempdir().unwrap();
-    let picture = Tensor::rand([1, 3, 224, 224], (Kind::Float, Device::Cpu));
-    let expected = direct.features(&picture);
+    let image = Tensor::rand([1, 3, 224, 224], (Kind::Float, Device::Cpu));
+    let expected = direct.features(&image);
     for tensors in [&tensors, &behind] {
         let (published, built) = written_and_built(tensors, dir.path());
         assert_eq!(published.config.kind, BackboneKind::EfficientNetLite0);
         assert!(!published.tensors.contains_key("_fc.weight"));
-        assert_eq!(built.features(&picture), expected);
+        assert_eq!(built.features(&image), expected);
     }
     tensors.remove("_blocks.3._bn1.running_var");
     tensors.insert("_conv_stem.weight".into(), Tensor::zeros([32, 3, 5, 5], (Kind::Float, Device::Cpu)));
@@ -167,14 +167,14 @@ fn a_vision_transformer_tells_its_size() {
     let direct = VisionTransformer::new(&store.root(), &size, Some(&tensors), 96).unwrap();
     tensors.insert("head.weight".into(), Tensor::zeros([10, 128], (Kind::Float, Device::Cpu)));
     let dir = tempfile::tempdir().unwrap();
-    let picture = Tensor::rand([1, 3, 96, 96], (Kind::Float, Device::Cpu));
+    let image = Tensor::rand([1, 3, 96, 96], (Kind::Float, Device::Cpu));
     let (published, built) = written_and_built(&tensors, dir.path());
     assert_eq!(
         (published.config.kind, published.config.input_px, &published.config.vit),
         (BackboneKind::Vit, 96, &size)
     );
     assert!(!published.tensors.contains_key("head.weight"));
-    assert_eq!(built.features(&picture), direct.features(&picture));
+    assert_eq!(built.features(&image), direct.features(&image));
     tensors.insert("pos_embed".into(), Tensor::zeros([1, 30, 128], (Kind::Float, Device::Cpu)));
     let error = carff_networks::pretrained::backbone(&tensors).unwrap_err().to_string();
     assert!(error.contains("29 patches"), "{error}");

@@ -37,7 +37,7 @@ fn networks_come_back_as_they_were() {
     let dir = dir.path();
     std::fs::copy(shipped.join(files::BACKBONE), dir.join(files::BACKBONE)).unwrap();
 
-    let picture = random(&[2, 3, 128, 128]);
+    let image = random(&[2, 3, 128, 128]);
     for kind in [BackboneKind::EfficientNetLite0, BackboneKind::ConvNet] {
         manifest.encoder.backbone.kind = kind;
         manifest.encoder.backbone.frozen = kind == BackboneKind::EfficientNetLite0;
@@ -51,8 +51,8 @@ fn networks_come_back_as_they_were() {
             kept.extend(round(&backbone));
         }
         save_weights(dir, files::ENCODER, &kept).unwrap();
-        let read: Vec<Gaussian> = load_encoder(dir, &manifest).unwrap().encode(&picture);
-        assert_eq!(read, encoder.encode(&picture), "{kind:?}");
+        let read: Vec<Gaussian> = load_encoder(dir, &manifest).unwrap().encode(&image);
+        assert_eq!(read, encoder.encode(&image), "{kind:?}");
     }
 
     let store = VarStore::new(Device::Cpu);

@@ -2,7 +2,7 @@
 //!
 //! Probes, recorder and viewer process the messages of a run.
 //!
-//! An observer takes one of the spare subscriber slots of each topic that it opens ([`carff_transport::Limits`]);
+//! An observer takes one of the spare subscriber slots of each topic that it opens ([`carff_transport::TopicLimits`]);
 //! opening fails if no slot is left. Observers may join and leave at any time, and no stage waits for them.
 
 mod attach;

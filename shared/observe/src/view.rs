@@ -17,7 +17,7 @@ pub struct ViewArgs {
     pub run: Option<String>,
     /// A PNG image to start with.
     #[arg(long, value_name = "FILE", conflicts_with = "run")]
-    pub picture: Option<PathBuf>,
+    pub image: Option<PathBuf>,
     /// Command to run first; can be given several times.
     #[arg(long = "do", value_name = "WHAT")]
     pub first: Vec<First>,

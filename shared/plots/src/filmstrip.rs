@@ -221,7 +221,7 @@ mod tests {
         vec![
             StripRow { caption: vec![long.repeat(12)], cells: vec![cell(8, 200, long), cell(128, 128, long)] },
             StripRow { caption: Vec::new(), cells: vec![cell(300, 20, "short")] },
-            StripRow { caption: vec!["no pictures".into()], cells: Vec::new() },
+            StripRow { caption: vec!["no images".into()], cells: Vec::new() },
             StripRow { caption: vec!["x".into()], cells: vec![cell(128, 128, ""), cell(1, 1, long), cell(9, 9, "W")] },
         ]
     }
@@ -251,7 +251,7 @@ mod tests {
 
     /// The file is a PNG of the laid-out size with every image unchanged in its frame, small images enlarged by two.
     #[test]
-    fn pictures_are_shown_unchanged() {
+    fn images_are_shown_unchanged() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("strip.png");
         let rows = odd_rows();

@@ -6,7 +6,7 @@ use crate::bag::{Bag, Channel};
 use crate::cdr::Cdr;
 use crate::{MessageError, RecordingError};
 use bytes::Bytes;
-use carff_dataset::{Calibration, CalibrationError, Image, PixelFormat, RawImage};
+use carff_dataset::{CalibrationError, CameraCalibration, Image, PixelFormat, RawImage};
 use foxglove::Decode;
 use foxglove::messages;
 use std::collections::BTreeMap;
@@ -138,7 +138,7 @@ impl ImageReader {
     }
 
     /// Returns the calibration that the recording contains for its images, and then starts again at the first image.
-    pub fn calibration(&mut self) -> Result<Option<Calibration>, RecordingError> {
+    pub fn calibration(&mut self) -> Result<Option<CameraCalibration>, RecordingError> {
         let namespace = namespace(&self.topic);
         let is_rectified = self.topic.rsplit('/').any(|part| part.starts_with("image_rect"));
         let calibrates = |channel: &Channel| {
@@ -287,7 +287,7 @@ fn calibration_of(
     kind: Kind,
     message: &Bytes,
     is_rectified: bool,
-) -> Result<Result<Calibration, CalibrationError>, MessageError> {
+) -> Result<Result<CameraCalibration, CalibrationError>, MessageError> {
     let (size_px, model, d, k, p) = if kind == Kind::RosCalibration {
         let mut cdr = Cdr::new(message)?;
         cdr.header()?;
@@ -305,7 +305,7 @@ fn calibration_of(
         ([c.width, c.height], c.distortion_model, c.d, c.k, c.p)
     };
     if let (true, &[fx, _, cx, _, _, fy, cy, ..]) = (is_rectified, &p[..]) {
-        return Ok(Calibration::of_ros(size_px, "", &[fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0], &[]));
+        return Ok(CameraCalibration::of_ros(size_px, "", &[fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0], &[]));
     }
-    Ok(Calibration::of_ros(size_px, &model, &k, &d))
+    Ok(CameraCalibration::of_ros(size_px, &model, &k, &d))
 }

@@ -34,7 +34,7 @@ pub use channels::{Encoded, Encoder, Format};
 pub use images::{ImageError, ImageOrigin, ImageReader};
 pub use queue::{QueueCounts, RecordingQueue};
 pub use reader::{Entry, Reader};
-pub use rotation::{Limits, RotatingWriter};
+pub use rotation::{RotatingWriter, RotationLimits};
 pub use standard::LogLine;
 pub use transforms::Transforms;
 pub use writer::Writer;

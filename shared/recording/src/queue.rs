@@ -51,11 +51,11 @@ impl Item {
 /// ```
 /// use carff_messages::forms::OwnedMessage;
 /// use carff_messages::{Gaussian, Header, Posterior};
-/// use carff_recording::{About, Limits, RecordingQueue, RotatingWriter};
+/// use carff_recording::{About, RotationLimits, RecordingQueue, RotatingWriter};
 /// use carff_transport::TopicId;
 /// # let folder = tempfile::tempdir()?;
 /// # let path = folder.path().join("run.mcap");
-/// let limits = Limits { files: Some(3), file_bytes: Some(1 << 30), ..Limits::default() };
+/// let limits = RotationLimits { files: Some(3), file_bytes: Some(1 << 30), ..RotationLimits::default() };
 /// let writer = RotatingWriter::create(&path, About::default(), Vec::new(), limits)?;
 /// let queue = RecordingQueue::start(writer, 64 << 20)?;
 /// let header = Header::of_frame(7, 1_000, 42);

@@ -340,7 +340,7 @@ pub(crate) fn records(
     while let Some(event) = reader.next_event() {
         match event? {
             LinearReadEvent::ReadRequest(wanted) => {
-                // Limits the buffer to the maximum length of a record, for any length that the file states.
+                // RotationLimits the buffer to the maximum length of a record, for any length that the file states.
                 let read = file.read(reader.insert(wanted.min(MAX_RECORD_BYTES)))?;
                 reader.notify_read(read);
             }

@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 
 /// Limits of each file. `None`: unlimited.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Limits {
+pub struct RotationLimits {
     /// Maximum size of a file, bytes.
     pub file_bytes: Option<u64>,
     /// Maximum time that a file covers, nanoseconds.
@@ -24,7 +24,7 @@ pub struct RotatingWriter {
     first: PathBuf,
     about: About,
     places: Vec<Place>,
-    limits: Limits,
+    limits: RotationLimits,
     writer: Writer,
     /// Publication time of the file's first message.
     begun_ns: Option<u64>,
@@ -34,7 +34,12 @@ pub struct RotatingWriter {
 
 impl RotatingWriter {
     /// Starts with the file `first`; later files have a number before the extension.
-    pub fn create(first: &Path, about: About, places: Vec<Place>, limits: Limits) -> Result<Self, RecordingError> {
+    pub fn create(
+        first: &Path,
+        about: About,
+        places: Vec<Place>,
+        limits: RotationLimits,
+    ) -> Result<Self, RecordingError> {
         let writer = Writer::create(first, &about, &places)?;
         let written = VecDeque::from([first.to_owned()]);
         Ok(Self { first: first.to_owned(), about, places, limits, writer, begun_ns: None, written, files: 1 })

@@ -201,7 +201,7 @@ fn damage_is_told_of() {
 fn files_are_rotated() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("run.mcap");
-    let limits = Limits { file_ns: Some(10_000_000), files: Some(2), ..Limits::default() };
+    let limits = RotationLimits { file_ns: Some(10_000_000), files: Some(2), ..RotationLimits::default() };
     let mut writer = RotatingWriter::create(&path, about(), places(), limits).unwrap();
     for frame in 0..35 {
         for (topic, message) in messages(frame) {
@@ -224,7 +224,7 @@ fn queues_drop_whole_messages() {
     let folder = tempfile::tempdir().unwrap();
     for (name, limit_bytes, all) in [("roomy.mcap", 1 << 26, true), ("none.mcap", 100, false)] {
         let path = folder.path().join(name);
-        let writer = RotatingWriter::create(&path, about(), places(), Limits::default()).unwrap();
+        let writer = RotatingWriter::create(&path, about(), places(), RotationLimits::default()).unwrap();
         let queue = RecordingQueue::start(writer, limit_bytes).unwrap();
         for frame in 0..20 {
             for (topic, message) in messages(frame) {

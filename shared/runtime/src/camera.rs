@@ -4,7 +4,7 @@ use crate::{StageContext, frame_span};
 use anyhow::{Context, ensure};
 use carff_base::geometry::PinholeCamera;
 use carff_config::Pose;
-use carff_dataset::{Calibration, Dataset, RawImage, Rectifier};
+use carff_dataset::{CameraCalibration, Dataset, RawImage, Rectifier};
 use carff_messages::{DatasetView, EgoPose, FrameMeta, Header, ImageMeta, MAX_IMAGE_BYTES, rgb_bytes};
 use carff_transport::{Image, Publisher, Receiver, monotonic_now_ns, topics};
 
@@ -61,7 +61,7 @@ impl FrameOutput {
     /// # Errors
     ///
     /// As [`rectifier`].
-    pub fn open(stage: &StageContext, recorded: Option<Calibration>) -> anyhow::Result<Self> {
+    pub fn open(stage: &StageContext, recorded: Option<CameraCalibration>) -> anyhow::Result<Self> {
         let camera = &stage.graph.camera;
         let rectifier = rectifier(stage, recorded)?;
         if rectifier.is_none() {
@@ -201,7 +201,7 @@ fn assumed_camera(width_px: u32, height_px: u32) -> PinholeCamera {
 /// # Errors
 ///
 /// If the calibration or the dataset cannot be read, or the lens does not show the trained field of view.
-pub fn rectifier(stage: &StageContext, recorded: Option<Calibration>) -> anyhow::Result<Option<Rectifier>> {
+pub fn rectifier(stage: &StageContext, recorded: Option<CameraCalibration>) -> anyhow::Result<Option<Rectifier>> {
     let Some(calibration) = stage.graph.calibration()?.or(recorded) else { return Ok(None) };
     Ok(Some(Rectifier::new(&calibration, &trained_camera(stage)?)?))
 }

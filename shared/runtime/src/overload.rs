@@ -3,7 +3,7 @@
 //! Every stage that reads beliefs sees the same signs: the duration of each frame and skipped frames. So all stages
 //! reach the same level independently; each reduces its own work.
 
-use carff_config::{GraphConfig, Quality as Part};
+use carff_config::{GraphConfig, Reduction};
 use carff_messages::Belief;
 
 /// Maximum number of doublings of the wait before a restoration.
@@ -160,19 +160,19 @@ fn levels(graph: &GraphConfig) -> Vec<Quality> {
     let mut levels = vec![quality];
     for part in &graph.overload.order {
         match part {
-            Part::Resolution => {
+            Reduction::Resolution => {
                 for divisor in [2, 4] {
                     quality.resolution_divisor = divisor;
                     levels.push(quality);
                 }
             }
-            Part::Samples => {
+            Reduction::Samples => {
                 while quality.samples > graph.overload.min_samples {
                     quality.samples = (quality.samples / 2).max(graph.overload.min_samples);
                     levels.push(quality);
                 }
             }
-            Part::Horizon => {
+            Reduction::Horizon => {
                 while quality.horizon > 1 {
                     quality.horizon -= 1;
                     levels.push(quality);

@@ -16,6 +16,8 @@ pub struct ScenarioCamera {
     pub view_kind: String,
     /// Intrinsics and pose.
     pub camera: PinholeCamera,
+    /// Pose of the ego in the images of this camera: x, y in metres and heading in radians. `None`: the state gives it.
+    pub ego_pose: Option<[f64; 3]>,
 }
 
 /// Minimum height above the ground, as a share of the clearance from static things.
@@ -94,9 +96,9 @@ pub(crate) fn cameras(
 }
 
 fn look(config: &ScenarioConfig, kind: &str, eye: [f64; 3], target: [f64; 3], up: [f64; 3]) -> ScenarioCamera {
-    let p = &config.picture;
+    let p = &config.image;
     let camera = PinholeCamera::look_at(eye, target, up, p.width_px, p.height_px, p.fov_deg);
-    ScenarioCamera { view_kind: kind.to_owned(), camera }
+    ScenarioCamera { view_kind: kind.to_owned(), camera, ego_pose: None }
 }
 
 /// A camera with its position.

@@ -4,7 +4,7 @@
 //! on its number, the seed and the time. All random values of episode `n` come from the stream (seed, frame `n`, step
 //! `loop`), so episodes can be made one by one, in any order.
 
-use crate::cameras::Mount;
+use crate::cameras::{Mount, ScenarioCamera};
 use crate::config::{ClosedLoopConfig, DashConfig};
 use crate::error::ScenarioError;
 use crate::movers::{Mover, Pose};
@@ -15,10 +15,16 @@ use carff_base::random::Key;
 use carff_dataset::Image;
 use rand::Rng;
 
+/// Name of the random stream of training cameras.
+const TRAINING_STREAM: u32 = Key::named("path", 0, 0).step;
 /// Name of the random stream.
 const STREAM: u32 = Key::named("loop", 0, 0).step;
 /// Length by which the line of the others' course is extended in both directions, metres.
 const EXTENDED_M: f64 = 80.0;
+/// Length of the part behind the stop line on which training cameras are drawn, metres.
+const BEYOND_LINE_M: f64 = 1.0;
+/// Largest number of draws of a training camera.
+const MAX_TRIES: u32 = 400;
 /// Step of the search for the place where the ways meet, metres.
 const SEARCH_M: f64 = 0.05;
 
@@ -134,6 +140,31 @@ impl ClosedLoop {
         Episode { actors: drawn, mount: Mount::draw(&self.mounting, &mut rng) }
     }
 
+    /// Returns the scenario with `count` random cameras on the ego's roof, from the start of its way to one metre behind
+    /// the stop line, and without a bird's-eye view. The ego is at the camera in the images of every state. The poses are
+    /// for training an encoder that sees what a drive shows; the vehicles stand at the places of the states.
+    ///
+    /// # Errors
+    ///
+    /// Static things block the way.
+    pub fn with_training_cameras(self, count: usize, seed: u64) -> Result<Scenario, ScenarioError> {
+        let cameras: Option<Vec<_>> = (0..count as u64).map(|number| self.training_camera(number, seed)).collect();
+        let path = self.scenario.path().to_owned();
+        let cameras = cameras.ok_or(ScenarioError::NoRoom { path, key: "closed_loop" })?;
+        Ok(self.scenario.with_cameras(cameras))
+    }
+
+    fn training_camera(&self, number: u64, seed: u64) -> Option<ScenarioCamera> {
+        let mut rng = carff_base::random::stream(Key { seed, frame: number, step: TRAINING_STREAM, sample: 0 });
+        (0..MAX_TRIES).find_map(|_| {
+            let at_m = rng.random_range(0.0..self.conflict_m[0] + BEYOND_LINE_M);
+            let camera = self.camera_at(&Mount::draw(&self.mounting, &mut rng), at_m);
+            let free = self.scenario.obstacles().clear(camera.position_m());
+            let view_kind = self.mounting.view_kind.clone();
+            free.then(|| ScenarioCamera { view_kind, camera, ego_pose: Some(self.path.at(at_m)) })
+        })
+    }
+
     /// Returns the ego's box at a place on its way, metres from the start.
     pub fn ego_box(&self, at_m: f64) -> OrientedBox {
         self.footprint(self.ego, self.path.at(at_m))
@@ -158,9 +189,13 @@ impl ClosedLoop {
 
     /// Returns the camera on the ego's roof.
     pub fn camera(&self, episode: &Episode, at_m: f64) -> PinholeCamera {
-        let (eye, target) = episode.mount.at(self.path.at(at_m));
-        let picture = &self.scenario.config().picture;
-        PinholeCamera::look_at(eye, target, [0.0, 0.0, 1.0], picture.width_px, picture.height_px, picture.fov_deg)
+        self.camera_at(&episode.mount, at_m)
+    }
+
+    fn camera_at(&self, mount: &Mount, at_m: f64) -> PinholeCamera {
+        let (eye, target) = mount.at(self.path.at(at_m));
+        let image = &self.scenario.config().image;
+        PinholeCamera::look_at(eye, target, [0.0, 0.0, 1.0], image.width_px, image.height_px, image.fov_deg)
     }
 
     /// Renders the image of the ego's camera, without sensor noise.
@@ -175,7 +210,7 @@ impl ClosedLoop {
         placement[self.actor] = None;
         let actor = Mover::Vehicle(&self.scenario.config().vehicle[self.actor]);
         let poses: Vec<Pose> = episode.actors.iter().map(|a| upright(self.actor_pose(a, time_s))).collect();
-        self.scenario.picture_with(&placement, &[(actor, &poses)], camera)
+        self.scenario.image_with(&placement, &[(actor, &poses)], camera)
     }
 
     fn actor_pose(&self, actor: &Actor, time_s: f64) -> [f64; 3] {

@@ -249,7 +249,7 @@ impl Scenario {
         }
         let (camera, placement) = self.free_view(drive, frame);
         Ok(FreeFrame {
-            image: self.picture_of(&placement, &camera),
+            image: self.image_of(&placement, &camera),
             camera,
             branch: drive.branch,
             timestamp,
@@ -304,9 +304,9 @@ impl Scenario {
             }
         }
         let [x, y, z, yaw] = course.swaying(time);
-        let picture = &self.config().picture;
+        let image = &self.config().image;
         let look = |eye: [f64; 3], target: [f64; 3], up: [f64; 3]| {
-            PinholeCamera::look_at(eye, target, up, picture.width_px, picture.height_px, picture.fov_deg)
+            PinholeCamera::look_at(eye, target, up, image.width_px, image.height_px, image.fov_deg)
         };
         let camera = match &course.camera {
             Carrier::Roof { vehicle, mount } => {

@@ -80,7 +80,7 @@ impl Scenario {
         let info = self.info();
         let placement = |branch, t| self.free_view(&drive.through(branch), t).1;
         let images: Vec<Image> = (0..info.state_count())
-            .map(|state| self.picture_of(&placement(info.branch_of(state), info.timestamp_of(state)), camera))
+            .map(|state| self.image_of(&placement(info.branch_of(state), info.timestamp_of(state)), camera))
             .collect();
         let view = |branch: usize| {
             let own = &images[info.state(branch, timestamp)?];

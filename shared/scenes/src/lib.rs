@@ -4,11 +4,11 @@
 //! on the dataset's readers, or on processes.
 //!
 //! ```no_run
-//! use carff_scenes::{RenderOptions, Scenario};
+//! use carff_scenes::{Detail, Scenario};
 //! # fn main() -> Result<(), carff_scenes::ScenarioError> {
 //! let scenario = Scenario::load("configs/scenarios/approaching-intersection.toml".as_ref())?;
 //! let camera = scenario.cameras()[0].camera;
-//! let rendering = scenario.render(0, 2, &camera, &RenderOptions::default())?;
+//! let rendering = scenario.render(0, 2, &camera, Detail::default())?;
 //! rendering.image.save_png("view.png".as_ref())?;
 //! # Ok(())
 //! # }
@@ -39,7 +39,6 @@ pub use error::ScenarioError;
 pub use free_drives::{FreeDrive, FreeFrame};
 pub use free_views::{FreePose, FreeView};
 pub use scenario::{
-    ActorView, Detail, Extras, FULL_FRACTION, FULL_PIXELS, NONE_FRACTION, NONE_MEAN_DIFFERENCE, RenderOptions,
-    Rendering, Scenario,
+    ActorView, Detail, Extras, FULL_FRACTION, FULL_PIXELS, NONE_FRACTION, NONE_MEAN_DIFFERENCE, Rendering, Scenario,
 };
 pub use unknown_views::{IN_SIGHT_PX, UnknownView, VISIBLE_DIFFERENCE};

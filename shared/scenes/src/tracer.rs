@@ -263,7 +263,7 @@ impl Scene {
 
     /// Renders an image with RGB, depth along the ray through each pixel's centre (metres; infinite for the sky), and
     /// the object index of the first hit there.
-    pub fn picture(&self, setting: &Setting, camera: &PinholeCamera) -> (Image, Vec<f32>, Vec<u16>) {
+    pub fn trace(&self, setting: &Setting, camera: &PinholeCamera) -> (Image, Vec<f32>, Vec<u16>) {
         let (w, h) = (camera.width_px as usize, camera.height_px as usize);
         let mut rgb = vec![0_u8; w * h * 3];
         let mut depth_m = vec![0.0_f32; w * h];

@@ -70,7 +70,7 @@ impl Scenario {
         for &part in &parts {
             known[part] = None;
         }
-        let (image, without) = (self.picture_of(&placement, &camera), self.picture_of(&known, &camera));
+        let (image, without) = (self.image_of(&placement, &camera), self.image_of(&known, &camera));
         Ok(UnknownView {
             view_kind: drive.view_kind().to_owned(),
             branch,

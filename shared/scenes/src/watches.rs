@@ -46,7 +46,7 @@ impl Scenario {
     /// Renders frame `frame` of a drive without its truth: the camera and the image, without sensor noise.
     pub fn free_image(&self, drive: &FreeDrive, frame: usize) -> (PinholeCamera, Image) {
         let (camera, placement) = self.free_view(drive, frame);
-        (camera, self.picture_of(&placement, &camera))
+        (camera, self.image_of(&placement, &camera))
     }
 
     /// Returns the states that look the same from the camera of a frame, including its own. All vehicles except the ego
@@ -56,13 +56,13 @@ impl Scenario {
         let info = self.info();
         let (camera, own) = self.free_view(drive, frame);
         let camera = camera.resized(camera.width_px.div_ceil(SMALLER), camera.height_px.div_ceil(SMALLER));
-        let own = self.picture_of(&own, &camera);
+        let own = self.image_of(&own, &camera);
         let timestamp = drive.timestamp_of(frame);
         let same = |state: usize| {
             let through = drive.through(info.branch_of(state));
             let of_state = info.timestamp_of(state);
             let at = if of_state == timestamp { frame } else { through.last_frame_of(of_state) };
-            same_when_small(&own, &self.picture_of(&self.free_view(&through, at).1, &camera))
+            same_when_small(&own, &self.image_of(&self.free_view(&through, at).1, &camera))
         };
         (0..info.state_count()).filter(|&state| same(state)).collect()
     }

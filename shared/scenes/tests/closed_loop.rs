@@ -2,7 +2,8 @@
 
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
-use carff_scenes::{ClosedLoop, Scenario};
+use carff_scenes::{ClosedLoop, Extras, Scenario};
+use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
 fn file() -> PathBuf {
@@ -67,6 +68,37 @@ fn images_show_the_others() {
     let image = |episode, time_s| drives.image_from(episode, at_line_m, time_s, &camera);
     assert_ne!(image(&one, middle.unwrap()), image(&none, middle.unwrap()));
     assert_eq!(image(&one, 300.0), image(&none, 300.0), "long gone");
+}
+
+/// Training cameras are on the ego's roof, anywhere up to one metre behind the stop line, and the same arguments give the
+/// same ones. The ego is at the camera in the images of every state: states without the actor look the same, and those
+/// with the actor do not.
+#[test]
+fn training_cameras_follow_the_way() {
+    let cameras = drives().with_training_cameras(60, 3).unwrap().cameras().to_vec();
+    assert_eq!(cameras, drives().with_training_cameras(60, 3).unwrap().cameras());
+    assert_ne!(cameras, drives().with_training_cameras(60, 4).unwrap().cameras());
+    let mut places: Vec<f64> = Vec::new();
+    for camera in &cameras {
+        let ([x, y, yaw], at) = (camera.ego_pose.unwrap(), camera.camera.position_m());
+        assert!(x == 1.8 && (yaw - std::f64::consts::FRAC_PI_2).abs() < 1e-9, "{x} {yaw}");
+        assert!((-0.3..=0.6).contains(&(at[1] - y)) && (1.85..=2.3).contains(&at[2]), "{at:?} {y}");
+        places.push(y);
+    }
+    places.sort_by(f64::total_cmp);
+    let end = -16.2 + drives().conflict_m()[0] + 1.0;
+    assert!(places[0] < -15.2 && (end - 1.0..end).contains(&places[59]), "{places:?}");
+    assert!(places.windows(2).all(|pair| pair[1] - pair[0] < 1.5), "{places:?}");
+
+    let dir = tempfile::tempdir().unwrap();
+    let scenario = drives().with_training_cameras(3, 3).unwrap();
+    assert_eq!(scenario.info().bev_view, None);
+    scenario.render_dataset(dir.path(), Extras::None, |_, _| ControlFlow::Continue(())).unwrap();
+    let image = |branch: usize, timestamp: usize, view: usize| {
+        std::fs::read(dir.path().join(format!("images/b{branch}_t{timestamp}_v00{view}.png"))).unwrap()
+    };
+    assert!((0..3).all(|view| image(1, 0, view) == image(1, 1, view) && image(1, 1, view) == image(1, 2, view)));
+    assert!((0..3).any(|view| image(0, 0, view) != image(0, 2, view)));
 }
 
 /// A scenario without closed-loop drives, and one whose ego never meets the others, are refused with the reason.

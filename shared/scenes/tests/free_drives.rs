@@ -7,7 +7,7 @@ use std::path::Path;
 use carff_base::geometry::PinholeCamera;
 use carff_dataset::Observability;
 use carff_dataset::drives::DriveKind;
-use carff_scenes::{RenderOptions, Scenario};
+use carff_scenes::{Detail, Scenario};
 
 const FRAMES: usize = 6;
 
@@ -89,7 +89,7 @@ fn the_truth_is_true() {
         assert_eq!(scenario.info().is_hazard(drive.branch()), hazard);
         let frame = scenario.free_frame(&drive, drive.decisive_frame()).unwrap();
         assert!(frame.last_of_timestamp && frame.timestamp == drive.eligible_timestamp() && frame.timestamp < 2);
-        let state = scenario.render(frame.branch, frame.timestamp, &frame.camera, &RenderOptions::default()).unwrap();
+        let state = scenario.render(frame.branch, frame.timestamp, &frame.camera, Detail::default()).unwrap();
         let seen = state.actor.unwrap().visible_fraction;
         if hazard {
             assert_eq!(frame.observability, Some(Observability::None));

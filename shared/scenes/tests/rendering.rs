@@ -8,7 +8,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 
 use carff_base::geometry::PinholeCamera;
 use carff_dataset::{Dataset, Observability};
-use carff_scenes::{Detail, Extras, RenderOptions, Scenario, ScenarioError};
+use carff_scenes::{Detail, Extras, Scenario, ScenarioError};
 
 /// A scenario with one block, half of which a wall hides from the camera at -Y. The sun is opposite the camera, so
 /// shadows fall towards it.
@@ -20,7 +20,7 @@ branches = ["with", "without"]
 hazard_branches = ["with"]
 bev_view = 0
 
-[picture]
+[image]
 width_px = 96
 height_px = 80
 fov_deg = 60.0
@@ -88,7 +88,7 @@ fn in_pool<T: Send>(threads: usize, work: impl FnOnce() -> T + Send) -> T {
 fn same_bytes_whatever_the_threads() {
     let scenario = small();
     let camera = scenario.cameras()[1].camera;
-    let render = || scenario.render(0, 0, &camera, &RenderOptions::default()).unwrap();
+    let render = || scenario.render(0, 0, &camera, Detail::default()).unwrap();
     let one = in_pool(1, render);
     let three = in_pool(3, render);
     assert_eq!(one, three);
@@ -101,7 +101,7 @@ fn same_bytes_whatever_the_threads() {
 fn depth_agrees_with_the_planes() {
     let scenario = small();
     let camera = scenario.cameras()[0].camera;
-    let rendering = scenario.render(0, 0, &camera, &RenderOptions { detail: Detail::Picture }).unwrap();
+    let rendering = scenario.render(0, 0, &camera, Detail::Image).unwrap();
     let block = scenario.object_of("block").unwrap();
     let (mut ground, mut top) = (0, 0);
     for y in 0..80_usize {
@@ -127,25 +127,25 @@ fn depth_agrees_with_the_planes() {
 #[test]
 fn half_hidden_is_one_half() {
     let scenario = small();
-    let options = RenderOptions::default();
-    let with = scenario.render(0, 0, &front(), &options).unwrap().actor.unwrap();
-    let without = scenario.render(1, 0, &front(), &options).unwrap().actor.unwrap();
+    let options = Detail::default();
+    let with = scenario.render(0, 0, &front(), options).unwrap().actor.unwrap();
+    let without = scenario.render(1, 0, &front(), options).unwrap().actor.unwrap();
     assert_eq!(with, without);
     assert!((with.visible_fraction - 0.5).abs() < 0.03, "{with:?}");
     assert_eq!(with.observability, Observability::Partial);
-    let above = scenario.render(1, 0, &scenario.cameras()[0].camera, &options).unwrap().actor.unwrap();
+    let above = scenario.render(1, 0, &scenario.cameras()[0].camera, options).unwrap().actor.unwrap();
     assert_eq!((above.visible_fraction, above.observability), (1.0, Observability::Full));
 }
 
 /// Parts outside the image count as not visible: a camera that cuts the block's place in two sees half of it.
 #[test]
-fn outside_the_picture_is_not_visible() {
+fn outside_the_image_is_not_visible() {
     let scenario = small();
     // From +Y, without a wall in between; rotated by half its field of view, so that x = 0 is the image's edge.
     let turn = 10.0_f64.to_radians();
     let camera =
         PinholeCamera::look_at([0.0, 40.0, 0.5], [40.0 * turn.tan(), 0.0, 0.5], [0.0, 0.0, 1.0], 256, 128, 20.0);
-    let actor = scenario.render(0, 0, &camera, &RenderOptions::default()).unwrap().actor.unwrap();
+    let actor = scenario.render(0, 0, &camera, Detail::default()).unwrap().actor.unwrap();
     assert!((actor.visible_fraction - 0.5).abs() < 0.05, "{actor:?}");
 }
 
@@ -154,15 +154,15 @@ fn outside_the_picture_is_not_visible() {
 #[test]
 fn hidden_pairs_are_equal() {
     let scenario = small();
-    let options = RenderOptions::default();
-    let with = scenario.render(0, 1, &front(), &options).unwrap();
-    let without = scenario.render(1, 1, &front(), &options).unwrap();
+    let options = Detail::default();
+    let with = scenario.render(0, 1, &front(), options).unwrap();
+    let without = scenario.render(1, 1, &front(), options).unwrap();
     assert_eq!(with.image, without.image);
     assert_eq!(with.actor.unwrap().observability, Observability::None);
     assert_eq!(with.actor, without.actor);
     let behind = PinholeCamera::look_at([-3.0, 9.0, 2.0], [-3.0, 0.0, 0.5], [0.0, 0.0, 1.0], 96, 80, 60.0);
-    let with = scenario.render(0, 1, &behind, &options).unwrap();
-    let without = scenario.render(1, 1, &behind, &options).unwrap();
+    let with = scenario.render(0, 1, &behind, options).unwrap();
+    let without = scenario.render(1, 1, &behind, options).unwrap();
     assert_ne!(with.image, without.image);
 }
 
@@ -175,8 +175,8 @@ fn a_visible_shadow_is_partial() {
         .replace("elevation_deg = 80.0", "elevation_deg = 12.0");
     let scenario = Scenario::parse("small.toml".as_ref(), &low_sun).unwrap();
     let camera = PinholeCamera::look_at([0.0, -20.0, 2.5], [0.0, 0.0, 0.5], [0.0, 0.0, 1.0], 96, 80, 40.0);
-    let with = scenario.render(0, 1, &camera, &RenderOptions::default()).unwrap();
-    let without = scenario.render(1, 1, &camera, &RenderOptions::default()).unwrap();
+    let with = scenario.render(0, 1, &camera, Detail::default()).unwrap();
+    let without = scenario.render(1, 1, &camera, Detail::default()).unwrap();
     assert_eq!(with.actor.unwrap().actor_px, 0);
     assert_ne!(with.image, without.image);
     assert_eq!(with.actor.unwrap().observability, Observability::Partial);
@@ -187,14 +187,14 @@ fn a_visible_shadow_is_partial() {
 #[test]
 fn colours_are_plausible() {
     let scenario = small();
-    let rendering = scenario.render(0, 0, &scenario.cameras()[0].camera, &RenderOptions::default()).unwrap();
+    let rendering = scenario.render(0, 0, &scenario.cameras()[0].camera, Detail::default()).unwrap();
     let [r, g, b] = rendering.image.pixel(48, 40).unwrap();
     assert!(r > 120 && g < 80 && b < 80, "{r} {g} {b}");
     let brightest = (0..96).map(|x| rendering.image.pixel(x, 40).unwrap()[1]).max().unwrap();
     let asphalt = rendering.image.pixel(60, 48).unwrap()[1];
     assert!(brightest > asphalt + 60, "{brightest} {asphalt}");
     let up = PinholeCamera::look_at([0.0, 0.0, 2.0], [1.0, 0.0, 2.6], [0.0, 0.0, 1.0], 16, 16, 30.0);
-    let sky = scenario.render(1, 0, &up, &RenderOptions::default()).unwrap();
+    let sky = scenario.render(1, 0, &up, Detail::default()).unwrap();
     assert!(sky.object_id.iter().all(|id| *id == 0) && sky.depth_m.iter().all(|d| d.is_infinite()));
     let [r, _, b] = sky.image.pixel(8, 8).unwrap();
     assert!(b > r + 20);
@@ -225,7 +225,7 @@ fn rendered_sets_are_read() {
     assert_eq!(info.static_boxes[0].name, "wall");
     let frame = &dataset.frames()[4];
     assert_eq!((frame.branch, frame.timestamp, frame.view), (Some(0), Some(1), Some(1)));
-    let rendering = scenario.render(0, 1, &scenario.cameras()[1].camera, &RenderOptions::default()).unwrap();
+    let rendering = scenario.render(0, 1, &scenario.cameras()[1].camera, Detail::default()).unwrap();
     assert_eq!(dataset.load_image(4).unwrap(), rendering.image);
     assert_eq!(frame.actor_px, Some(rendering.actor.unwrap().actor_px));
     let text = std::fs::read_to_string(out.join("transforms.json")).unwrap();
@@ -278,10 +278,10 @@ fn an_interrupted_rendering_goes_on() {
 fn bad_requests() {
     let scenario = small();
     let mut camera = scenario.cameras()[0].camera;
-    let error = scenario.render(2, 0, &camera, &RenderOptions::default()).unwrap_err().to_string();
+    let error = scenario.render(2, 0, &camera, Detail::default()).unwrap_err().to_string();
     assert_eq!(error, "there is no branch 2 at timestamp 0; the scenario has 2 x 2");
     camera.fl_x_px = f64::NAN;
-    let error = scenario.render(0, 0, &camera, &RenderOptions::default()).unwrap_err().to_string();
+    let error = scenario.render(0, 0, &camera, Detail::default()).unwrap_err().to_string();
     assert_eq!(error, "the camera is not usable: `fl_x` must be finite");
 }
 
@@ -424,7 +424,7 @@ fn every_shipped_scenario_has_seeing_and_blind_views() {
         let mut seen = Vec::new();
         for camera in scenario.cameras().iter().step_by(4) {
             let camera = camera.camera.resized(48, 48);
-            seen.push(scenario.render(0, 0, &camera, &RenderOptions::default()).unwrap().actor.unwrap().observability);
+            seen.push(scenario.render(0, 0, &camera, Detail::default()).unwrap().actor.unwrap().observability);
         }
         for wanted in [Observability::Full, Observability::None] {
             assert!(seen.iter().filter(|o| **o == wanted).count() >= 3, "{name}: {wanted:?} among {seen:?}");
@@ -443,13 +443,13 @@ fn undecided_first_timestamps_look_the_same() {
         let boxes = |branch: usize, timestamp: usize| &info.states[branch * info.timestamps + timestamp].boxes;
         assert_eq!(boxes(0, 0), boxes(1, 0), "{name}");
         assert_ne!(boxes(0, last), boxes(1, last), "{name}");
-        let options = RenderOptions { detail: Detail::Picture };
+        let options = Detail::Image;
         let mut differing = 0;
         for camera in scenario.cameras().iter().step_by(10) {
             let camera = camera.camera.resized(48, 48);
-            let picture = |b: usize, t: usize| scenario.render(b, t, &camera, &options).unwrap().image;
-            assert_eq!(picture(0, 0), picture(1, 0), "{name}");
-            differing += usize::from(picture(0, last) != picture(1, last));
+            let image = |b: usize, t: usize| scenario.render(b, t, &camera, options).unwrap().image;
+            assert_eq!(image(0, 0), image(1, 0), "{name}");
+            differing += usize::from(image(0, last) != image(1, last));
         }
         assert!(differing >= 5, "{name}: {differing}");
     }
@@ -464,7 +464,7 @@ name = "objects"
 bounds_m = [[-1.0, -1.0, 0.0], [1.0, 1.0, 1.0]]
 timestamps = 2
 branches = ["there", "gone"]
-picture = { width_px = 64, height_px = 64, fov_deg = 40.0 }
+image = { width_px = 64, height_px = 64, fov_deg = 40.0 }
 ground_surface = "plain"
 ground_colour = "#808080"
 clearance_m = 0.05
@@ -537,19 +537,19 @@ spread_m = 0.0
 
     // From -X the side -X is visible, green, with the capsule on top; 90 degrees to the left, the side +Y, blue.
     let camera = PinholeCamera::look_at([-3.0, 0.0, 0.3], [0.0, 0.0, 0.3], [0.0, 0.0, 1.0], 64, 64, 20.0);
-    let picture = |t: usize| scenario.render(0, t, &camera, &RenderOptions::default()).unwrap();
+    let image = |t: usize| scenario.render(0, t, &camera, Detail::default()).unwrap();
     let below = |image: &carff_dataset::Image, z: f64| image.pixel(32, (32.0 - (z - 0.3) * 60.5) as u32).unwrap();
-    let before = picture(0).image;
+    let before = image(0).image;
     let [r, g, b] = below(&before, 0.17);
     assert!(g > 60 && r < g / 2 && b < g / 2, "{r} {g} {b}");
     let [r, g, b] = below(&before, 0.45);
     assert!(g > 60 && b > 60 && r < g / 2, "{r} {g} {b}");
-    let [r, g, b] = below(&picture(1).image, 0.22);
+    let [r, g, b] = below(&image(1).image, 0.22);
     assert!(b > 60 && r < b / 2 && g < b / 2, "{r} {g} {b}");
 
     // A view that only sees the tail is not blind: the image without the actor lacks the tail too.
     let tail_alone = PinholeCamera::look_at([-0.4, 0.0, 1.0], [-0.4, 0.0, 0.0], [0.0, 1.0, 0.0], 64, 64, 15.0);
-    let view = scenario.render(0, 0, &tail_alone, &RenderOptions::default()).unwrap();
+    let view = scenario.render(0, 0, &tail_alone, Detail::default()).unwrap();
     assert_eq!(view.actor.unwrap().actor_px, 0);
     assert_eq!(view.actor.unwrap().observability, Observability::Partial);
 

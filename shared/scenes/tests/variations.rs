@@ -6,7 +6,7 @@ use std::path::Path;
 
 use carff_dataset::Image;
 use carff_scenes::config::{BystanderPlace, VariationRole};
-use carff_scenes::{Detail, RenderOptions, Scenario, VISIBLE_DIFFERENCE};
+use carff_scenes::{Detail, Scenario, VISIBLE_DIFFERENCE};
 
 /// Scenarios on roads.
 const ROADS: [&str; 3] = ["approaching-intersection", "two-lane-merge", "single-approaching-intersection"];
@@ -21,9 +21,9 @@ fn shipped(name: &str) -> Scenario {
 }
 
 /// Returns the image of a state from fixed camera 0.
-fn picture(scenario: &Scenario, branch: usize, timestamp: usize) -> Image {
+fn image(scenario: &Scenario, branch: usize, timestamp: usize) -> Image {
     let camera = scenario.cameras()[0].camera.resized(64, 64);
-    scenario.render(branch, timestamp, &camera, &RenderOptions { detail: Detail::Picture }).unwrap().image
+    scenario.render(branch, timestamp, &camera, Detail::Image).unwrap().image
 }
 
 /// Each scenario on roads has enough variations of each role and place, and each one can be chosen.
@@ -54,7 +54,7 @@ fn variations_change_nothing_by_default() {
         assert!(plain.appearances().is_empty() && plain.bystanders().is_empty());
         let full = shipped(name);
         assert_eq!((plain.cameras(), plain.info()), (full.cameras(), full.info()));
-        assert_eq!(picture(&plain, 0, 1), picture(&full, 0, 1));
+        assert_eq!(image(&plain, 0, 1), image(&full, 0, 1));
         assert_eq!(plain.free_pose(3, 5).unwrap(), full.free_pose(3, 5).unwrap());
     }
 }
@@ -64,8 +64,8 @@ fn variations_change_nothing_by_default() {
 fn an_appearance_keeps_all_poses() {
     let scenario = shipped("approaching-intersection");
     let van = scenario.with_appearance("red-van").unwrap();
-    assert_ne!(picture(&van, 0, 2), picture(&scenario, 0, 2));
-    assert_eq!(picture(&van, 1, 2), picture(&scenario, 1, 2));
+    assert_ne!(image(&van, 0, 2), image(&scenario, 0, 2));
+    assert_eq!(image(&van, 1, 2), image(&scenario, 1, 2));
     for number in 0..4 {
         let (own, other) = (scenario.free_pose(number, 7).unwrap(), van.free_pose(number, 7).unwrap());
         assert_eq!((own.view_kind, own.timestamp, own.camera), (other.view_kind, other.timestamp, other.camera));
@@ -96,7 +96,7 @@ fn an_object_is_in_every_state() {
     let with = scenario.with_object("crate-on-road").unwrap();
     for state in 0..scenario.info().state_count() {
         let (branch, timestamp) = (scenario.info().branch_of(state), scenario.info().timestamp_of(state));
-        assert_ne!(picture(&with, branch, timestamp), picture(&scenario, branch, timestamp));
+        assert_ne!(image(&with, branch, timestamp), image(&scenario, branch, timestamp));
     }
     let is_crate = |b: &&carff_dataset::NamedBox| b.name == "crate-on-road";
     let found = with.info().static_boxes.iter().find(is_crate).unwrap();

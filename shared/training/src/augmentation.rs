@@ -4,7 +4,7 @@ use carff_base::random::Key;
 use carff_dataset::sensor::{SensorNoise, apply_noise_into};
 use carff_dataset::{Corruption, Image};
 use carff_evaluation::PosedImages;
-use carff_networks::encoder::pictures_from_bytes;
+use carff_networks::encoder::images_from_bytes;
 use rand::Rng;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -108,12 +108,12 @@ impl Augmentation {
         }
         let one_size = planes.windows(2).all(|pair| pair[0].size() == pair[1].size());
         let images = if one_size {
-            pictures_from_bytes(&Tensor::cat(&planes, 0))
+            images_from_bytes(&Tensor::cat(&planes, 0))
         } else {
             // Datasets may mix sizes: a batch has the size of its first image.
             let size = planes[0].size();
             let resized = planes.iter().map(|plane| {
-                let image = pictures_from_bytes(plane);
+                let image = images_from_bytes(plane);
                 image.internal_upsample_bilinear2d_aa([size[1], size[2]], false, None, None)
             });
             Tensor::cat(&resized.collect::<Vec<_>>(), 0)

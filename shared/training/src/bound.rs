@@ -62,18 +62,18 @@ pub struct ChosenBound {
 ///
 /// There are too few drives for the bound, or the scenario has no hazard.
 pub fn bound_threshold(input: BoundInput, on_progress: &dyn Fn(&Progress)) -> Result<ChosenBound, TrainingError> {
-    let unfit = |problem: String| TrainingError::Unfit(problem);
     let BoundInput { level, confidence, .. } = input;
     // Every second drive has the hazard. Too few are refused before any is rendered.
     let expected = input.drives.div_ceil(2);
     bounded_threshold(&vec![1.0; expected], level, confidence).ok_or_else(|| too_few(&input, expected))?;
     let models = Models::load(input.checkpoint)?;
-    let known = Known::load(input.checkpoint).map_err(|e| unfit(e.to_string()))?;
+    let known = Known::load(input.checkpoint)?;
     let seed = models.manifest.seed ^ BOUND;
-    let old = CheckpointPlanning::load(input.checkpoint).map_err(|e| unfit(e.to_string()))?;
+    let old = CheckpointPlanning::load(input.checkpoint)?;
     let settings = match old.memory.filter(|_| input.remembers) {
         None if input.remembers => {
-            return Err(unfit("no memory was learned: run `carff checkpoint memory` first".into()));
+            let missing = "no memory was learned: run `carff checkpoint memory` first";
+            return Err(TrainingError::Insufficient(missing.into()));
         }
         memory => memory.map(|memory| memory.settings),
     };
@@ -101,13 +101,13 @@ pub fn bound_threshold(input: BoundInput, on_progress: &dyn Fn(&Progress)) -> Re
         }
         None => CheckpointPlanning { hazard_threshold, bound, ..old },
     };
-    planning.save(input.checkpoint).map_err(|e| unfit(e.to_string()))?;
+    planning.save(input.checkpoint)?;
     Ok(ChosenBound { planning, hazard, clear })
 }
 
 fn too_few(input: &BoundInput, hazards: usize) -> TrainingError {
     let least = ((1.0 - input.confidence).ln() / (1.0 - input.level).ln()).ceil();
-    TrainingError::Unfit(format!(
+    TrainingError::Insufficient(format!(
         "{hazards} drives with a hazard are too few for this bound: it needs {least}, give more drives"
     ))
 }
@@ -132,8 +132,7 @@ fn drives(
     let memories = memory.map(|settings| TakeMemories::new(net, probe, settings, FRAMES_PER_TIMESTAMP as u64));
     let mut all = Vec::with_capacity(input.drives);
     for number in 0..input.drives {
-        let unfit = |e: carff_scenes::ScenarioError| TrainingError::Unfit(e.to_string());
-        let drive = input.scenario.free_drive(number as u64, FRAMES_PER_TIMESTAMP, seed).map_err(unfit)?;
+        let drive = input.scenario.free_drive(number as u64, FRAMES_PER_TIMESTAMP, seed)?;
         let decisive = drive.decisive_frame();
         let (first, last) = match (&memories, drive.kind()) {
             (None, _) => (decisive, decisive),

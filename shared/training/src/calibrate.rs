@@ -15,7 +15,7 @@ use carff_dataset::{
     drives::{DriveKind, eligible_inputs},
 };
 use carff_decision::{
-    Calibration, CalibrationTrial, Evidence, Plan, ProbeLayout, Sampling, choose_threshold, look_ahead,
+    CalibrationTrial, Evidence, Plan, ProbeCalibration, ProbeLayout, Sampling, choose_threshold, look_ahead,
     unchosen_threshold,
 };
 use carff_evaluation::{Models, Perception, Progress, Trial, trial_frame};
@@ -36,7 +36,7 @@ pub fn calibrated_probing(
     field: &Field,
     clouds: &Clouds,
     seed: u64,
-) -> Result<(ProbeLayout, Calibration), TrainingError> {
+) -> Result<(ProbeLayout, ProbeCalibration), TrainingError> {
     let layout = ProbeLayout::new(manifest.places.clone(), manifest.scenario.hazard_states())?;
     let places = layout.places().len();
     let mut densities = vec![0.0; layout.points().len()];
@@ -54,7 +54,7 @@ pub fn calibrated_probing(
             rows
         })
         .collect();
-    let calibration = Calibration::fit(&layout, &occupancies)?;
+    let calibration = ProbeCalibration::fit(&layout, &occupancies)?;
     Ok((layout, calibration))
 }
 

@@ -93,6 +93,9 @@ impl Default for CalibrationConfig {
 pub struct FreePoses {
     /// Number of poses; 0 turns them off.
     pub count: usize,
+    /// Number of further poses on the ego's roof, anywhere on the way of the scenario's closed-loop drives up to its stop
+    /// line, with the ego at the camera. A scenario without `closed_loop` has none.
+    pub on_path: usize,
     /// Number of further poses for each appearance of the scenario file with the role `trained`: the dynamic vehicle
     /// has this appearance in their images, and those of every second appearance have a trained roadside object too. A
     /// dataset without a scenario file has none.
@@ -105,7 +108,7 @@ pub struct FreePoses {
 
 impl Default for FreePoses {
     fn default() -> Self {
-        Self { count: 0, per_appearance: 0, seed: 0, field_steps: 8000 }
+        Self { count: 0, on_path: 0, per_appearance: 0, seed: 0, field_steps: 8000 }
     }
 }
 
@@ -290,6 +293,7 @@ impl TrainingConfig {
             ("mdn.steps", self.mdn.steps, 1, 1_000_000),
             ("mdn.batch", self.mdn.batch, 2, 65_536),
             ("free_poses.count", self.free_poses.count, 0, 10_000),
+            ("free_poses.on_path", self.free_poses.on_path, 0, 10_000),
             ("free_poses.per_appearance", self.free_poses.per_appearance, 0, 10_000),
             ("free_poses.field_steps", self.free_poses.field_steps as usize, 0, 1_000_000),
             ("augmentation.copies", self.augmentation.copies, 0, 64),

@@ -57,7 +57,7 @@ const VAE: [Chart<VaeRecord>; 3] = [
         log_y: false,
         lines: &[
             ("decoded", |r| r.figures.psnr_db),
-            ("mean image of the pose", |r| r.figures.mean_picture_psnr_db),
+            ("mean image of the pose", |r| r.figures.mean_image_psnr_db),
             ("decoded, pixels that change", |r| r.figures.changed_pixels_psnr_db),
         ],
     },

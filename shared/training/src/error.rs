@@ -46,6 +46,18 @@ pub enum TrainingError {
         /// The problem.
         what: String,
     },
+    /// The scenario file cannot be read, or has no room for a camera.
+    #[error(transparent)]
+    Scenario(#[from] carff_scenes::ScenarioError),
+    /// The checkpoint's thresholds cannot be read or written.
+    #[error(transparent)]
+    Planning(#[from] carff_checkpoint::CheckpointPlanningError),
+    /// The checkpoint's limits of known images cannot be read or written.
+    #[error(transparent)]
+    Known(#[from] carff_unknown::KnownError),
+    /// The checkpoint or the number of drives does not suffice for the request.
+    #[error("{0}")]
+    Insufficient(String),
     /// The dataset lacks something that this training needs.
     #[error("the dataset cannot train this model: {0}")]
     Unfit(String),

@@ -50,7 +50,7 @@ pub struct KnownInput<'a> {
 pub fn calibrate_known(input: KnownInput, on_progress: &dyn Fn(&Progress)) -> Result<Known, TrainingError> {
     let manifest = Manifest::load(input.checkpoint)?;
     let mut field = load_field(input.checkpoint, &manifest)?;
-    field.set_instruction_set(InstructionSet::detect_for_pictures());
+    field.set_instruction_set(InstructionSet::detect_for_images());
     let posed = PosedImages::open(input.dataset, manifest.split.seed)?;
     let mut work = Work {
         lanes: lanes(&manifest, &field, input.scenario),
@@ -70,7 +70,7 @@ pub fn calibrate_known(input: KnownInput, on_progress: &dyn Fn(&Progress)) -> Re
         known.clear.limit *= TRAINED_POSES;
         known.hazard.limit *= TRAINED_POSES;
     }
-    known.save(input.checkpoint).map_err(|e| TrainingError::Unfit(e.to_string()))?;
+    known.save(input.checkpoint)?;
     Ok(known)
 }
 
@@ -92,7 +92,7 @@ impl Work {
     ) -> Result<Vec<(usize, Comparison)>, TrainingError> {
         let mut all = Vec::new();
         for number in 0..count {
-            let pose = scenario.free_pose(number as u64, self.seed).map_err(|e| TrainingError::Unfit(e.to_string()))?;
+            let pose = scenario.free_pose(number as u64, self.seed)?;
             for (branch, view) in pose.views.iter().enumerate() {
                 let Some(state) = scenario.info().state(branch, pose.timestamp) else { continue };
                 all.extend(self.compare(&pose.camera, &view.image, all.len()).map(|compared| (state, compared)));

@@ -47,14 +47,13 @@ pub struct LearnedMemory {
 ///
 /// The checkpoint has no forecaster or field, or the scenario has no such drive.
 pub fn learn_memory(input: MemoryInput, on_progress: &dyn Fn(&Progress)) -> Result<LearnedMemory, TrainingError> {
-    let unfit = |problem: String| TrainingError::Unfit(problem);
     let models = Models::load(input.checkpoint)?;
     let seed = models.manifest.seed ^ MEMORY;
     let noise = SensorNoise::default();
     let perception = Perception { encoder: &models.encoder, noise, seed, known: None };
     let plan = WatchPlan { count: input.drives, seed, exact: false };
     let drives = watches(input.scenario, &perception, &models.mixture, plan, on_progress);
-    let drives = drives.map_err(|e| unfit(e.to_string()))?;
+    let drives = drives?;
     let memory =
         |settings| Memory::new(models.probe.states().to_vec(), |state| models.mixture.forecast(state), settings);
     let hazards = models.probe.layout().hazard_states();
@@ -64,11 +63,11 @@ pub fn learn_memory(input: MemoryInput, on_progress: &dyn Fn(&Progress)) -> Resu
         .flat_map(|repeated_share| DISTRUSTS.map(|distrust| MemorySettings { repeated_share, distrust }));
     let scored: Vec<(MemorySettings, f64)> = candidates.map(|settings| (settings, of(settings))).collect();
     let best = scored.into_iter().min_by(|a, b| a.1.total_cmp(&b.1));
-    let (settings, log_loss) = best.ok_or_else(|| unfit("there are no drives".into()))?;
-    let old = CheckpointPlanning::load(input.checkpoint).map_err(|e| unfit(e.to_string()))?;
+    let (settings, log_loss) = best.ok_or_else(|| TrainingError::Insufficient("there are no drives".into()))?;
+    let old = CheckpointPlanning::load(input.checkpoint)?;
     let planning =
         CheckpointPlanning { memory: Some(PlanningMemory { settings, hazard_threshold: None, bound: None }), ..old };
-    planning.save(input.checkpoint).map_err(|e| unfit(e.to_string()))?;
+    planning.save(input.checkpoint)?;
     let alone = memory(settings);
     let without_memory = drives.par_iter().map(|drive| log_loss_of(&alone, hazards, drive, true)).sum::<f64>();
     let frames: usize = drives.iter().map(|drive| drive.frames.len()).sum();

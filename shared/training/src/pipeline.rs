@@ -204,15 +204,15 @@ impl Training<'_> {
     /// Planning tables of a checkpoint. Its threshold was chosen before; these tables choose nothing.
     fn planning_figures(&self, context: Context, models: &Models) -> Result<PlanningFigures, TrainingError> {
         let Context { config, posed, .. } = context;
-        let unfit = |e: &dyn std::fmt::Display| TrainingError::Unfit(e.to_string());
-        let threshold = CheckpointPlanning::load(self.out).map_err(|e| unfit(&e))?.hazard_threshold;
+        let threshold = CheckpointPlanning::load(self.out)?.hazard_threshold;
         let Models { encoder, mixture, probe, .. } = models;
         let noise = config.calibration.sensor;
         let perception = Perception { encoder, noise, seed: config.seed + 1, known: None };
         let horizon = config.calibration.horizon;
         let planner = Planner { net: mixture, probe, sampling: Sampling::Stratified, horizon };
         let table = |role| {
-            let inputs = eligible_inputs(&posed.dataset, &posed.split.views(role)).map_err(|e| unfit(&e))?;
+            let inputs = eligible_inputs(&posed.dataset, &posed.split.views(role))
+                .map_err(|e| TrainingError::Unfit(e.to_string()))?;
             let trials = perception.trials(&posed.dataset, &inputs, PLANNING_REPEATS)?;
             Ok::<_, TrainingError>(planner.table(&trials, &Policy::all(threshold)).0)
         };
@@ -303,7 +303,7 @@ fn view_figures(context: Context, field: &Field, role: PoseRole, mut strip: Opti
         let Some(strip) = &mut strip else { continue };
         let size = |t: &carff_dataset::Image| (t.width_px, t.height_px);
         if strip.truths.len() < STRIP_IMAGES && strip.truths.first().is_none_or(|t| size(t) == size(truth)) {
-            strip.pictures.push(carff_dataset::Image { rgb: to_bytes(values), ..*truth });
+            strip.images.push(carff_dataset::Image { rgb: to_bytes(values), ..*truth });
             strip.truths.push(truth.clone());
         }
     }
@@ -337,14 +337,14 @@ fn copy(from: &Path, to: &Path) -> std::io::Result<()> {
 
 /// Draws rendered images above true ones, one column for each.
 fn write_strip(run: &Run, name: &str, view: &carff_evaluation::BirdsEye) -> Result<(), TrainingError> {
-    let (Some(first), columns) = (view.pictures.first(), view.pictures.len()) else { return Ok(()) };
+    let (Some(first), columns) = (view.images.first(), view.images.len()) else { return Ok(()) };
     let (w, h) = (first.width_px as usize, first.height_px as usize);
     let mut sheet = carff_dataset::Image {
         width_px: (w * columns) as u32,
         height_px: (h * 2) as u32,
         rgb: vec![0; w * columns * h * 2 * 3],
     };
-    for (row, images) in [&view.pictures, &view.truths].into_iter().enumerate() {
+    for (row, images) in [&view.images, &view.truths].into_iter().enumerate() {
         for (column, image) in images.iter().enumerate() {
             for y in 0..h {
                 let to = ((row * h + y) * w * columns + column * w) * 3;

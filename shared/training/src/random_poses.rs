@@ -109,7 +109,7 @@ fn render(context: Context, dir: &Path) -> Result<bool, TrainingError> {
         let records_of_view: Vec<FrameRecord> = records_of_view.collect();
         if !notes.contains(&view) {
             field.render_hypotheses(camera, &together, &options, &mut buffer);
-            let mut of_states: Vec<Vec<u8>> = buffer.pictures[1..].iter().map(|image| to_bytes(&image.rgb)).collect();
+            let mut of_states: Vec<Vec<u8>> = buffer.images[1..].iter().map(|image| to_bytes(&image.rgb)).collect();
             settle(&mut of_states);
             for (record, rgb) in records_of_view.iter().zip(of_states) {
                 let image = Image { width_px: camera.width_px, height_px: camera.height_px, rgb };
@@ -178,7 +178,7 @@ fn cameras(
     let mut buffer = HypothesisBuffer::default();
     let mut near_m = |camera: &PinholeCamera| {
         field.render_hypotheses(&camera.resized(LOOK_PX, LOOK_PX), latents, options, &mut buffer);
-        buffer.pictures.iter().map(|image| nearest_m(&image.depth_m)).fold(f32::INFINITY, f32::min)
+        buffer.images.iter().map(|image| nearest_m(&image.depth_m)).fold(f32::INFINITY, f32::min)
     };
     let known_near_m: Vec<f32> = known.iter().map(&mut near_m).collect();
     let scenario = &posed.scenario;

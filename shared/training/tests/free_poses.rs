@@ -3,7 +3,7 @@
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
 use carff_dataset::{Dataset, Equivalence, Image, PoseRole, PoseSplit};
-use carff_scenes::{Extras, RenderOptions, Scenario};
+use carff_scenes::{Detail, Extras, Scenario};
 use carff_training::{Phases, Progress, Run, Training, TrainingConfig, TrainingError, render_random_poses};
 use std::collections::BTreeMap;
 use std::ops::ControlFlow;
@@ -108,7 +108,7 @@ fn free_poses_show_what_is_there() {
     for (frame, image) in set.frames().iter().zip(&images) {
         assert_eq!((image.width_px, image.height_px), (32, 32));
         let (branch, timestamp) = (frame.branch.unwrap(), frame.timestamp.unwrap());
-        let truth = place.scenario.render(branch, timestamp, &frame.camera, &RenderOptions::default()).unwrap().image;
+        let truth = place.scenario.render(branch, timestamp, &frame.camera, Detail::default()).unwrap().image;
         let count = truth.rgb.len() as u64 / 3;
         let mean =
             [0, 1, 2].map(|c| (truth.rgb.iter().skip(c).step_by(3).map(|&v| u64::from(v)).sum::<u64>() / count) as u8);

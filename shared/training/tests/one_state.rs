@@ -16,7 +16,7 @@ name = "still"
 bounds_m = [[-3.0, -3.0, 0.0], [3.0, 3.0, 2.0]]
 timestamps = 1
 branches = ["only"]
-picture = { width_px = 48, height_px = 48, fov_deg = 45.0 }
+image = { width_px = 48, height_px = 48, fov_deg = 45.0 }
 ground_surface = "plain"
 ground_colour = "#808080"
 

@@ -134,16 +134,16 @@ fn every_table_is_made() {
         serde_json::from_str(&std::fs::read_to_string(place.at("results/results.json")).unwrap()).unwrap();
     assert_eq!((&read.targets, &read.subject, &read.gallery), (&results.targets, &results.subject, &results.gallery));
 
-    let pictures = results.pictures.as_ref().unwrap();
-    let toggled = pictures.toggled.as_ref().unwrap();
+    let images = results.images.as_ref().unwrap();
+    let toggled = images.toggled.as_ref().unwrap();
     assert_eq!((toggled.psnr_db.len(), toggled.renderings), (4, 4));
-    assert!(toggled.actor_db.is_some() && pictures.novel_views.unseen.as_ref().unwrap().pictures > 0);
-    let predicted = pictures.predicted.as_ref().unwrap();
+    assert!(toggled.actor_db.is_some() && images.novel_views.unseen.as_ref().unwrap().images > 0);
+    let predicted = images.predicted.as_ref().unwrap();
     assert!(predicted.psnr_db[0].is_none() && predicted.psnr_db[1].is_some(), "first steps are not forecast");
 
     let encoder = results.encoder.as_ref().unwrap();
     let trained = results.subject.poses.trained.unwrap() + results.subject.poses.calibration.unwrap();
-    assert_eq!(encoder.svm.trained.pictures, 4 * trained);
+    assert_eq!(encoder.svm.trained.images, 4 * trained);
     assert!(encoder.svm.trained.ceiling > 0.25 && encoder.svm.trained.ceiling <= 1.0);
     assert!(encoder.state_accuracy.unseen.unwrap().full.trials > 0);
 
@@ -208,10 +208,10 @@ fn every_variant_has_a_row() {
         })
     };
     let rows: Vec<_> = Variant::ALL.into_iter().map(row).collect();
-    assert!(rows.iter().all(|r| r.scores.train.psnr_db > 5.0 && r.scores.svm.trained.pictures > 0));
+    assert!(rows.iter().all(|r| r.scores.train.psnr_db > 5.0 && r.scores.svm.trained.images > 0));
     let checkpoint = ablation::folders(&out, Variant::Full).1;
     std::fs::remove_dir_all(&checkpoint).unwrap();
-    assert_eq!(row(Variant::Full).scores.train.pictures, rows[0].scores.train.pictures);
+    assert_eq!(row(Variant::Full).scores.train.images, rows[0].scores.train.images);
     assert!(!checkpoint.exists(), "read, not trained again");
     let table = ablation::AblationTable { dataset: "set".into(), epochs: 1, free_poses: 0, seed: 3, rows };
     ablation::write_table(&table, &out).unwrap();

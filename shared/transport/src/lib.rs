@@ -62,7 +62,7 @@ pub use registry::{AnyPublisher, AnyReceiver, AnyTopic, Received, TopicId, Unkno
 pub use run::{Run, cleanup_dead, living_nodes, living_processes, remove_run_leftovers, run_id_of};
 pub use space::{SHARED_MEMORY_DIR, check_space};
 pub use stop::{INTERRUPTED, Stop, exit_on_signals, is_interrupted};
-pub use topic::{Limits, Topic};
+pub use topic::{Topic, TopicLimits};
 pub use untyped::HeaderOnly;
 pub use wait::{Input, Waiter, Woken};
 

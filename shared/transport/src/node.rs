@@ -5,7 +5,7 @@ use crate::payload::{Image, Opened, Payload, Unopened};
 use crate::retry::retry;
 use crate::run::CLEANUP_PATIENCE;
 use crate::space::{MANAGEMENT_BYTES, SHARED_MEMORY_DIR, check_open_files, check_space};
-use crate::{Counters, Limits, OpenError, Publisher, Receiver, Run, Service, Topic, log};
+use crate::{Counters, OpenError, Publisher, Receiver, Run, Service, Topic, TopicLimits, log};
 use carff_messages::{ImageMeta, Message};
 use iceoryx2::port::listener::{Listener, ListenerCreateError};
 use iceoryx2::port::notifier::{Notifier, NotifierCreateError};
@@ -144,7 +144,7 @@ impl Node {
         retry(topic.name, || P::open_or_create(service.clone()))
     }
 
-    fn event(&self, topic: &str, limits: Limits) -> Result<EventFactory<Service>, OpenError> {
+    fn event(&self, topic: &str, limits: TopicLimits) -> Result<EventFactory<Service>, OpenError> {
         let service = self
             .inner
             .service_builder(&service_name(topic)?)
@@ -156,14 +156,14 @@ impl Node {
         retry(topic, || service.clone().open_or_create())
     }
 
-    fn listener(&self, topic: &str, limits: Limits) -> Result<Listener<Service>, OpenError> {
+    fn listener(&self, topic: &str, limits: TopicLimits) -> Result<Listener<Service>, OpenError> {
         self.event(topic, limits)?.listener_builder().create().map_err(|e| match e {
             ListenerCreateError::ExceedsMaxSupportedListeners => too_many(topic, "listeners", limits.max_subscribers),
             _ => failed(topic, &e),
         })
     }
 
-    fn notifier(&self, topic: &str, limits: Limits) -> Result<Notifier<Service>, OpenError> {
+    fn notifier(&self, topic: &str, limits: TopicLimits) -> Result<Notifier<Service>, OpenError> {
         self.event(topic, limits)?.notifier_builder().create().map_err(|e| match e {
             NotifierCreateError::ExceedsMaxSupportedNotifiers => too_many(topic, "notifiers", limits.max_publishers),
             _ => failed(topic, &e),

@@ -1,7 +1,7 @@
 //! Topics with a payload type that is only known at run time: for probes, recordings and links.
 
 use crate::payload::Payload;
-use crate::{Input, Limits, Node, OpenError, Ports, Publisher, ReceiveError, Receiver, Sample, SendError, Topic};
+use crate::{Input, Node, OpenError, Ports, Publisher, ReceiveError, Receiver, Sample, SendError, Topic, TopicLimits};
 use carff_messages::Stage;
 use carff_messages::forms::{AnyMessage, FormError, OwnedMessage, Readable, read, schema};
 use carff_messages::layout::{Described, Layout};
@@ -24,7 +24,7 @@ pub trait AnyTopic: fmt::Debug + Sync {
     fn schema(&self) -> (&'static str, Value);
 
     /// Returns the limits that all its users share.
-    fn limits(&self) -> Limits;
+    fn limits(&self) -> TopicLimits;
 
     /// Returns the layout of its message; of an image, the message that describes it. A message of a type that this
     /// program does not know has no fields.
@@ -93,7 +93,7 @@ where
         (P::Message::SCHEMA, schema::<<P::Message as Readable>::Form>())
     }
 
-    fn limits(&self) -> Limits {
+    fn limits(&self) -> TopicLimits {
         self.limits
     }
 

@@ -7,13 +7,13 @@ use std::time::Duration;
 /// The limits of a topic, fixed when its first user opens it.
 ///
 /// ```
-/// use carff_transport::{Limits, topics};
+/// use carff_transport::{TopicLimits, topics};
 /// // Messages of which a late subscriber needs the latest one, and that one process publishes.
-/// const SETTINGS: Limits = Limits { history: 1, max_publishers: 1, ..topics::MESSAGES };
+/// const SETTINGS: TopicLimits = TopicLimits { history: 1, max_publishers: 1, ..topics::MESSAGES };
 /// assert_eq!(SETTINGS.buffer, topics::MESSAGES.buffer);
 /// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Limits {
+pub struct TopicLimits {
     /// Maximum number of subscribers: those of the graph, and spare ones for launcher, recorder, viewer and probes.
     pub max_subscribers: usize,
     /// Maximum number of publishers: one, and one to replace it while a dead one's slot is being freed.
@@ -30,7 +30,7 @@ pub struct Limits {
     pub loaned: usize,
 }
 
-impl Limits {
+impl TopicLimits {
     /// Returns the number of messages for which a publisher reserves memory.
     pub(crate) fn preallocated(&self) -> usize {
         self.max_subscribers * (self.buffer + self.borrowed) + self.history + self.loaned
@@ -45,7 +45,7 @@ pub struct Topic<P> {
     /// Name within the run.
     pub name: &'static str,
     /// Limits of the topic.
-    pub limits: Limits,
+    pub limits: TopicLimits,
     /// Time without a message, once the topic has begun, after which its receivers report it as stale.
     pub deadline: Duration,
     payload: PhantomData<fn() -> P>,
@@ -53,7 +53,7 @@ pub struct Topic<P> {
 
 impl<P> Topic<P> {
     /// Returns a topic. Its first user fixes the limits; all others must use the same.
-    pub const fn new(name: &'static str, limits: Limits, deadline_ms: u64) -> Self {
+    pub const fn new(name: &'static str, limits: TopicLimits, deadline_ms: u64) -> Self {
         Self { name, limits, deadline: Duration::from_millis(deadline_ms), payload: PhantomData }
     }
 }

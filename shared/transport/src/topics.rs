@@ -14,7 +14,7 @@
 
 use crate::in_use::OpenTopic;
 use crate::payload::Image;
-use crate::topic::{Limits, Topic};
+use crate::topic::{Topic, TopicLimits};
 use crate::{AnyTopic, TopicId};
 use carff_messages::{
     Action, Belief, EgoMotion, EgoPose, Forecast, FrameMeta, Health, ImageCheck, LookGain, Occupancy, Posterior, Stage,
@@ -22,19 +22,26 @@ use carff_messages::{
 };
 
 /// Limits of small messages; some receivers need every message.
-pub const MESSAGES: Limits =
-    Limits { max_subscribers: 10, max_publishers: 2, max_nodes: 14, history: 0, buffer: 16, borrowed: 3, loaned: 2 };
+pub const MESSAGES: TopicLimits = TopicLimits {
+    max_subscribers: 10,
+    max_publishers: 2,
+    max_nodes: 14,
+    history: 0,
+    buffer: 16,
+    borrowed: 3,
+    loaned: 2,
+};
 /// Limits of messages that a restarted receiver takes up again: those of the last seconds.
-pub const REMEMBERED: Limits = Limits { history: 48, buffer: 64, ..MESSAGES };
+pub const REMEMBERED: TopicLimits = TopicLimits { history: 48, buffer: 64, ..MESSAGES };
 /// Limits of images: only a few wait, because they are large and only the newest counts.
-pub const IMAGES: Limits =
-    Limits { max_subscribers: 8, max_publishers: 2, max_nodes: 12, history: 0, buffer: 8, borrowed: 2, loaned: 2 };
+pub const IMAGES: TopicLimits =
+    TopicLimits { max_subscribers: 8, max_publishers: 2, max_nodes: 12, history: 0, buffer: 8, borrowed: 2, loaned: 2 };
 /// Limits of status messages: a late receiver gets the latest one.
-pub const STATUS: Limits = Limits { history: 1, ..MESSAGES };
+pub const STATUS: TopicLimits = TopicLimits { history: 1, ..MESSAGES };
 
 /// Limits of images for one observer: large ones need little memory.
-const ONE_IMAGE: Limits =
-    Limits { max_subscribers: 1, max_publishers: 2, max_nodes: 4, history: 0, buffer: 1, borrowed: 1, loaned: 1 };
+const ONE_IMAGE: TopicLimits =
+    TopicLimits { max_subscribers: 1, max_publishers: 2, max_nodes: 4, history: 0, buffer: 1, borrowed: 1, loaned: 1 };
 
 /// Images of a real camera before rectification, for `carff camera check`; published only for it.
 pub const RAW: Topic<Image<FrameMeta>> = Topic::new("camera/raw", ONE_IMAGE, 500);

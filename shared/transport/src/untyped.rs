@@ -6,7 +6,9 @@ use crate::in_use::OpenTopic;
 use crate::node::failed;
 use crate::payload::{Loaned, Opened, Payload, Port, PublisherFactory, Received, Unopened};
 use crate::topics::of_known_payload;
-use crate::{AnyPublisher, AnyReceiver, AnyTopic, Limits, Node, OpenError, Ports, Receiver, Service, Topic, TopicId};
+use crate::{
+    AnyPublisher, AnyReceiver, AnyTopic, Node, OpenError, Ports, Receiver, Service, Topic, TopicId, TopicLimits,
+};
 use carff_messages::forms::{FormError, OwnedMessage, Readable};
 use carff_messages::layout::Layout;
 use carff_messages::{Header, Invalid, ZeroCopySend, described, message};
@@ -168,7 +170,7 @@ impl<const IMAGE: bool> AnyTopic for Untyped<IMAGE> {
         (self.message, Value::Bool(true))
     }
 
-    fn limits(&self) -> Limits {
+    fn limits(&self) -> TopicLimits {
         self.topic.limits
     }
 
@@ -234,7 +236,7 @@ impl OpenTopic {
     }
 
     fn topic<P: Payload>(&self) -> Topic<P> {
-        let limits = Limits {
+        let limits = TopicLimits {
             max_subscribers: self.config.max_subscribers(),
             max_publishers: self.config.max_publishers(),
             max_nodes: self.config.max_nodes(),

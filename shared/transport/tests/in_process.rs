@@ -74,7 +74,7 @@ fn invalid_messages_are_dropped_and_counted() {
 
 /// An image whose size differs from its description is refused by the sender and dropped by the receiver.
 #[test]
-fn pictures_must_have_the_size_they_claim() {
+fn images_must_have_the_size_they_claim() {
     let run = TestRun::new();
     let node = Node::open(&run.0, "test").unwrap();
     let mut input = node.receiver(&topics::FRAME).unwrap();
@@ -91,8 +91,8 @@ fn pictures_must_have_the_size_they_claim() {
     let mut loan = output.loan(8 * 4 * 3).unwrap();
     loan.bytes_mut()[95] = 200;
     output.send_image(loan, frame(2, 8, 4)).unwrap();
-    let picture = input.newest().unwrap().unwrap();
-    assert_eq!((picture.header.frame_id, picture.bytes().len(), picture.bytes()[95]), (2, 96, 200));
+    let image = input.newest().unwrap().unwrap();
+    assert_eq!((image.header.frame_id, image.bytes().len(), image.bytes()[95]), (2, 96, 200));
     assert_eq!(node.counters().invalid(), 1);
 }
 
@@ -209,7 +209,7 @@ fn polled_receivers_need_no_wake_up() {
 
 /// An image from other memory arrives complete; one whose size differs from its description is refused.
 #[test]
-fn pictures_are_sent_from_elsewhere() {
+fn images_are_sent_from_elsewhere() {
     let run = TestRun::new();
     let node = Node::open(&run.0, "test").unwrap();
     let mut input = node.receiver(&topics::FRAME).unwrap();
@@ -217,8 +217,8 @@ fn pictures_are_sent_from_elsewhere() {
     let meta = frame(3, 4, 5);
     let bytes: Vec<u8> = (0..meta.width_px * meta.height_px * 3).map(|i| i as u8).collect();
     output.send_bytes(&bytes, meta).unwrap();
-    let picture = input.next().unwrap().unwrap();
-    assert_eq!((picture.bytes(), picture.header.frame_id), (&bytes[..], 3));
+    let image = input.next().unwrap().unwrap();
+    assert_eq!((image.bytes(), image.header.frame_id), (&bytes[..], 3));
     let error = output.send_bytes(&bytes[1..], meta).unwrap_err();
     assert!(matches!(error, SendError::Size { .. }), "{error}");
     let error = output.send_bytes(&[0; 1001], meta).unwrap_err();

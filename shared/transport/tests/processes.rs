@@ -64,7 +64,7 @@ fn wait_for(lines: &mut impl Iterator<Item = String>, wanted: &str) {
 /// Zero copy: the receiver reads an address inside a mapping of the publisher's data segment, which the other process
 /// created in shared memory. A second image is read in place too.
 #[test]
-fn pictures_are_read_in_the_publishers_segment() {
+fn images_are_read_in_the_publishers_segment() {
     let run = TestRun::new();
     let node = Node::open(&run.0, "test").unwrap();
     let mut input = node.receiver(&topics::FRAME).unwrap();
@@ -75,9 +75,9 @@ fn pictures_are_read_in_the_publishers_segment() {
     for i in 0..3_u8 {
         writeln!(camera.0.stdin.as_mut().unwrap(), "next").unwrap();
         assert_eq!(waiter.wait_until(&[&input], in_seconds(30)).unwrap(), Woken::Input);
-        let picture = input.newest().unwrap().unwrap();
-        assert!(picture.bytes().iter().all(|&b| b == i + 1));
-        let (first, last) = (picture.bytes().as_ptr() as usize, &raw const picture.bytes()[BYTES - 1] as usize);
+        let image = input.newest().unwrap().unwrap();
+        assert!(image.bytes().iter().all(|&b| b == i + 1));
+        let (first, last) = (image.bytes().as_ptr() as usize, &raw const image.bytes()[BYTES - 1] as usize);
         let mapping = mapping_of(first).expect("the address is in a mapping of a file");
         assert!(mapping.range.contains(&last), "the mapping contains the whole image");
         assert!(mapping.file.contains(&run.0.shared_memory_prefix()), "{}", mapping.file);

@@ -4,7 +4,7 @@
 
 use crate::common::{TestRun, frame, posterior};
 use carff_messages::{FrameMeta, Header, ImageMeta, Invalid, Posterior, ZeroCopySend, message};
-use carff_transport::{HeaderOnly, Image, Limits, Node, OpenTopic, Topic, TopicId, monotonic_now_ns, topics};
+use carff_transport::{HeaderOnly, Image, Node, OpenTopic, Topic, TopicId, TopicLimits, monotonic_now_ns, topics};
 
 /// A message that no program of this workspace knows.
 #[repr(C)]
@@ -47,9 +47,9 @@ impl Late {
 
 message!(Late);
 
-const FEW: Limits = Limits { max_subscribers: 3, max_nodes: 5, buffer: 4, ..topics::MESSAGES };
+const FEW: TopicLimits = TopicLimits { max_subscribers: 3, max_nodes: 5, buffer: 4, ..topics::MESSAGES };
 const NOTE: Topic<Note> = Topic::new("stranger/note", FEW, 500);
-const PICTURE: Topic<Image<Note>> = Topic::new("stranger/picture", topics::IMAGES, 500);
+const IMAGE: Topic<Image<Note>> = Topic::new("stranger/image", topics::IMAGES, 500);
 const OPINION: Topic<Posterior> = Topic::new("stranger/posterior", FEW, 500);
 const EYE: Topic<Image<FrameMeta>> = Topic::new("stranger/frame", topics::IMAGES, 500);
 const LATE: Topic<Late> = Topic::new("stranger/late", FEW, 500);
@@ -65,8 +65,8 @@ fn headers_of_unknown_types_are_received() {
     let run = TestRun::new();
     let (stranger, probe) = (Node::open(&run.0, "stranger").unwrap(), Node::open(&run.0, "probe").unwrap());
     let mut notes = stranger.publisher(&NOTE).unwrap();
-    let mut pictures = stranger.image_publisher(&PICTURE, 1000).unwrap();
-    for (name, is_image, size) in [(NOTE.name, false, size_of::<Note>()), (PICTURE.name, true, 56 + 12)] {
+    let mut images = stranger.image_publisher(&IMAGE, 1000).unwrap();
+    for (name, is_image, size) in [(NOTE.name, false, size_of::<Note>()), (IMAGE.name, true, 56 + 12)] {
         let (topic, open) = found(&probe, name);
         assert_eq!((topic.name(), topic.is_image(), open.message.as_str()), (name, is_image, "stranger.Note.v1"));
         assert_eq!(topic.ports(&probe).unwrap().publishers[0].name, "stranger");
@@ -74,7 +74,7 @@ fn headers_of_unknown_types_are_received() {
         let mut receivers = [topic.receiver(&probe).unwrap(), topic.polled_receiver(&probe).unwrap()];
         let note = Note { header: Header::of_frame(7, 1, 2), values: [1.5; 3], size_px: [2, 2] };
         if is_image {
-            pictures.send_bytes(&[9; 12], note).unwrap();
+            images.send_bytes(&[9; 12], note).unwrap();
         } else {
             notes.send(note).unwrap();
         }

@@ -18,12 +18,13 @@ pub struct BirdsEye {
     /// Mean off the diagonal.
     pub unmatching_db: f64,
     /// Mean PSNR of the mean image of all states: the score of a field without states.
-    pub mean_picture_db: f64,
+    #[serde(alias = "mean_picture_db")]
+    pub mean_image_db: f64,
     /// PSNR of matching pairs over the pixels that differ from the mean image by more than the pixel tolerance.
     pub changed_db: f64,
     /// Rendered images by state.
     #[serde(skip)]
-    pub pictures: Vec<Image>,
+    pub images: Vec<Image>,
     /// True images by state.
     #[serde(skip)]
     pub truths: Vec<Image>,
@@ -46,7 +47,7 @@ pub fn birds_eye(
         let truth = dataset.load_image(index)?;
         rendered.push(to_unit(&image.rgb));
         true_values.push(to_unit(&truth.rgb));
-        result.pictures.push(image);
+        result.images.push(image);
         result.truths.push(truth);
     }
     let Some(average) = mean_image(&true_values) else { return Ok(None) };
@@ -62,7 +63,7 @@ pub fn birds_eye(
     }
     result.matching_db = mean(&matching).unwrap_or(0.0);
     result.unmatching_db = mean(&unmatching).unwrap_or(0.0);
-    result.mean_picture_db = mean(&of_mean).unwrap_or(0.0);
+    result.mean_image_db = mean(&of_mean).unwrap_or(0.0);
     result.changed_db = mean(&changed).unwrap_or(0.0);
     Ok(Some(result))
 }

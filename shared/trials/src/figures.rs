@@ -65,7 +65,8 @@ pub struct VaeFigures {
     pub psnr_db: Option<f64>,
     /// PSNR of each pose's mean image, which needs no encoder, dB.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub mean_picture_psnr_db: Option<f64>,
+    #[serde(alias = "mean_picture_psnr_db")]
+    pub mean_image_psnr_db: Option<f64>,
     /// PSNR over the pixels that differ from the mean image, dB.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub changed_pixels_psnr_db: Option<f64>,
@@ -78,11 +79,12 @@ pub struct DecodedQuality {
     /// PSNR, dB.
     pub psnr_db: f64,
     /// PSNR of each pose's mean image over the states, which needs no encoder, dB.
-    pub mean_picture_psnr_db: f64,
+    #[serde(alias = "mean_picture_psnr_db")]
+    pub mean_image_psnr_db: f64,
     /// PSNR over the pixels that differ from the mean image by more than [`carff_dataset::PIXEL_TOLERANCE`], dB.
     pub changed_pixels_psnr_db: f64,
     /// Images.
-    pub pictures: usize,
+    pub images: usize,
 }
 
 impl VaeFigures {
@@ -91,7 +93,7 @@ impl VaeFigures {
     pub fn with_quality(self, quality: DecodedQuality) -> Self {
         Self {
             psnr_db: Some(quality.psnr_db),
-            mean_picture_psnr_db: Some(quality.mean_picture_psnr_db),
+            mean_image_psnr_db: Some(quality.mean_image_psnr_db),
             changed_pixels_psnr_db: Some(quality.changed_pixels_psnr_db),
             ..self
         }
@@ -200,7 +202,7 @@ impl CheckpointFigures {
                 vec![
                     db("matching", birds_eye.matching_db),
                     db("un-matching", birds_eye.unmatching_db),
-                    db("mean image of all states", birds_eye.mean_picture_db),
+                    db("mean image of all states", birds_eye.mean_image_db),
                     db("pixels that change among states", birds_eye.changed_db),
                 ],
             ));
@@ -232,6 +234,11 @@ mod tests {
             let figures = CheckpointFigures::of(&manifest, Path::new(name)).unwrap();
             assert_eq!(serde_json::to_value(&figures).unwrap(), manifest.metrics, "{name}");
             assert!(figures.summary().lines().count() >= 5, "{name}: {}", figures.summary());
+            // The keys of earlier versions.
+            let mut earlier = manifest.clone();
+            renamed(&mut earlier.metrics, "mean_image_db", "mean_picture_db");
+            renamed(&mut earlier.metrics, "mean_image_psnr_db", "mean_picture_psnr_db");
+            assert_eq!(CheckpointFigures::of(&earlier, Path::new(name)).unwrap(), figures);
         }
     }
 

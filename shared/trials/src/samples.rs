@@ -111,7 +111,7 @@ mod tests {
     fn all_equivalent_states_may_continue() {
         // Two branches of two steps; their first steps look the same.
         let shades = [0, 50, 0, 100].map(|v| Image::filled(4, 4, [v; 3]));
-        let equivalence = Equivalence::of_pictures(4, &[shades.iter().map(Some).collect()]);
+        let equivalence = Equivalence::of_images(4, &[shades.iter().map(Some).collect()]);
         let scenario = ScenarioInfo {
             name: "test".into(),
             bounds: [[-1.0; 3], [1.0; 3]],

@@ -113,15 +113,15 @@ impl Comparer {
             field.render_hypotheses_where(&small, states, |i| judged[i] || is_sample(i), &options, &mut self.buffer);
             self.shown = Some((small, judged.clone(), states.to_vec()));
         }
-        let pictures = &self.buffer.pictures;
+        let images = &self.buffer.images;
         let image = reduced(image, width, height);
-        let is_still = |i: usize| !pictures[0].changing[i];
+        let is_still = |i: usize| !images[0].changing[i];
         let fit = Fit {
-            explained: explained(&image, &pictures[0].rgb, |i| is_sample(i) && is_still(i)),
-            ..fit(&image, &pictures[0].rgb, |i| judged[i] && is_still(i))
+            explained: explained(&image, &images[0].rgb, |i| is_sample(i) && is_still(i)),
+            ..fit(&image, &images[0].rgb, |i| judged[i] && is_still(i))
         };
-        let energy = |picture: &RenderBuffer| energy(&image, &picture.rgb, &fit, &judged, width);
-        let energies: Vec<Vec<f32>> = pictures.iter().map(energy).collect();
+        let energy = |rendered: &RenderBuffer| energy(&image, &rendered.rgb, &fit, &judged, width);
+        let energies: Vec<Vec<f32>> = images.iter().map(energy).collect();
         let pixels: Vec<usize> = (0..judged.len()).filter(|&i| judged[i]).collect();
         let of_state = |(state, energy): (usize, &Vec<f32>)| {
             let mut energy = energy.clone();
@@ -137,7 +137,7 @@ impl Comparer {
 
     /// The rendered states of the last comparison, RGB, 0..=1, row by row; pixels that were not compared are black.
     pub fn rendered(&self) -> impl Iterator<Item = &[f32]> {
-        self.buffer.pictures.iter().map(|picture| picture.rgb.as_slice())
+        self.buffer.images.iter().map(|image| image.rgb.as_slice())
     }
 }
 

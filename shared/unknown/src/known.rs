@@ -37,9 +37,9 @@ pub struct Known {
     /// For each known state, true if it has the hazard.
     pub hazard_states: Vec<bool>,
     /// Limits of the states without the hazard.
-    pub clear: Limits,
+    pub clear: KnownLimits,
     /// Limits of the states with the hazard, whose vehicle has no fixed place.
-    pub hazard: Limits,
+    pub hazard: KnownLimits,
     /// Share of a view's variation that the field explains, from which on the view is of this place.
     pub least_explained: f32,
     /// Limits of images of a camera in order.
@@ -49,7 +49,7 @@ pub struct Known {
 /// Limits of what some of the known states leave unexplained of their own images.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Limits {
+pub struct KnownLimits {
     /// The field's own errors on the lanes.
     pub errors: ErrorMap,
     /// Strength of a blob that 97 of 100 images stay below.
@@ -102,7 +102,7 @@ impl Known {
             let states: Vec<usize> = (0..hazard_states.len()).filter(|&s| hazard_states[s] == side).collect();
             let images: Vec<&Comparison> =
                 comparisons.iter().filter(|(state, _)| states.contains(state)).map(|(_, c)| c).collect();
-            Limits::fit(&lanes, &states, &images)
+            KnownLimits::fit(&lanes, &states, &images)
         };
         let (clear, hazard) = (of_side(false), of_side(true));
         let least = comparisons.iter().map(|(_, c)| c.fit.explained).fold(1.0, f32::min);
@@ -189,7 +189,7 @@ impl Known {
     }
 }
 
-impl Limits {
+impl KnownLimits {
     /// Fits the limits of some states on comparisons of their images, each under its best one of these states.
     /// Residuals of the first half of the images make the error map, and those of the second half the limit.
     fn fit(lanes: &Lanes, states: &[usize], images: &[&Comparison]) -> Self {
@@ -225,7 +225,7 @@ mod tests {
             nearest_m: 1.0,
             own: Vec::new(),
         };
-        let limits = Limits { errors: ErrorMap::even(&lanes, 1.0), limit: 5.0, images: 10 };
+        let limits = KnownLimits { errors: ErrorMap::even(&lanes, 1.0), limit: 5.0, images: 10 };
         Known {
             format_version: FORMAT_VERSION,
             lanes,
@@ -247,7 +247,7 @@ mod tests {
         assert_eq!(Known::load(folder.path()).unwrap(), Some(known.clone()));
         for (broken, word) in [
             (Known { format_version: 9, ..known.clone() }, "format_version"),
-            (Known { clear: Limits { limit: -1.0, ..known.clear.clone() }, ..known.clone() }, "limit"),
+            (Known { clear: KnownLimits { limit: -1.0, ..known.clear.clone() }, ..known.clone() }, "limit"),
         ] {
             broken.save(folder.path()).unwrap();
             assert!(Known::load(folder.path()).unwrap_err().to_string().contains(word));

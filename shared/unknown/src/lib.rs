@@ -19,6 +19,6 @@ mod sight;
 pub use blobs::Blob;
 pub use camera::{CameraCheck, CameraLimits, Measured, Measurement};
 pub use compare::{Comparer, Comparison, Fit};
-pub use known::{Known, KnownError, Limits, Seen};
+pub use known::{Known, KnownError, KnownLimits, Seen};
 pub use lanes::{ErrorMap, Ground, Lanes, OwnBox};
 pub use sight::Sight;

@@ -45,7 +45,7 @@ impl Sight {
 
     /// Reports whether two states look the same in the last look that saw a lane.
     pub fn alike(&self, a: usize, b: usize) -> bool {
-        let Some((a, b)) = self.buffer.pictures.get(a).zip(self.buffer.pictures.get(b)) else { return true };
+        let Some((a, b)) = self.buffer.images.get(a).zip(self.buffer.images.get(b)) else { return true };
         let differ = |(a, b): &(&[f32], &[f32])| a.iter().zip(*b).any(|(a, b)| (a - b).abs() > DIFFERENCE);
         a.rgb.chunks_exact(3).zip(b.rgb.chunks_exact(3)).filter(differ).take(DIFFERENT_PX).count() < DIFFERENT_PX
     }

@@ -9,7 +9,7 @@ use carff_base::geometry::PinholeCamera;
 use carff_checkpoint::CheckpointPlanning;
 use carff_checkpoint::Manifest;
 use carff_config::{GraphConfig, Kind, SoakConfig};
-use carff_dataset::{Calibration, Dataset, Image, ImportOptions, Rectifier, import};
+use carff_dataset::{CameraCalibration, Dataset, Image, ImportOptions, Rectifier, import};
 use carff_field::FieldConfig;
 use carff_messages::forms::AnyMessage;
 use carff_messages::{
@@ -45,7 +45,7 @@ pub const READERS: [Reader; 15] = [
     Reader { name: "training", read: training, examples: |_| shipped("configs/training", "toml") },
     Reader { name: "dataset", read: dataset, examples: |_| vec![SET.into()] },
     Reader { name: "import", read: plain_set, examples: |_| vec![PLAIN_SET.into()] },
-    Reader { name: "png", read: png, examples: pictures },
+    Reader { name: "png", read: png, examples: images },
     Reader { name: "planning", read: planning, examples: |_| vec![shipped_file(PLANNING)] },
     Reader { name: "manifest", read: manifest, examples: |_| vec![shipped_file(MANIFEST)] },
     Reader { name: "weights", read: weights, examples: small_weights },
@@ -216,7 +216,7 @@ fn training(bytes: &[u8], folder: &Path) -> Verdict {
 }
 
 fn dataset(bytes: &[u8], folder: &Path) -> Verdict {
-    small_picture(folder);
+    small_image(folder);
     put(folder, "transforms.json", bytes);
     let set = Dataset::open(folder).map_err(words)?;
     for i in 0..set.frames().len().min(4) {
@@ -233,14 +233,14 @@ fn plain_set(bytes: &[u8], folder: &Path) -> Verdict {
     fs::create_dir_all(&from).unwrap_or_else(|e| panic!("{}: {e}", from.display()));
     // The folder exists if an earlier input was accepted.
     let _ = fs::remove_dir_all(&out);
-    small_picture(&from);
+    small_image(&from);
     put(&from, "transforms.json", bytes);
     import(&from, &out, &ImportOptions::default()).map_err(words)?;
     Dataset::open(&out).unwrap_or_else(|e| panic!("an imported dataset is refused: {e}"));
     Ok(())
 }
 
-fn small_picture(folder: &Path) {
+fn small_image(folder: &Path) {
     let path = folder.join("a.png");
     if !path.is_file() {
         Image::filled(2, 2, [9; 3]).save_png(&path).unwrap_or_else(|e| panic!("{e}"));
@@ -269,23 +269,23 @@ fn bag(bytes: &[u8], folder: &Path) -> Verdict {
 fn calibration(bytes: &[u8], folder: &Path) -> Verdict {
     let path = folder.join("camera.yaml");
     fs::write(&path, bytes).map_err(|e| e.to_string())?;
-    let calibration = Calibration::load(&path).map_err(|e| e.to_string())?;
+    let calibration = CameraCalibration::load(&path).map_err(|e| e.to_string())?;
     let trained = PinholeCamera::look_at([0.0; 3], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], 8, 8, 30.0);
     Rectifier::new(&calibration, &trained).map(drop).map_err(|e| e.to_string())
 }
 
 fn png(bytes: &[u8], folder: &Path) -> Verdict {
-    let path = put(folder, "picture.png", bytes);
+    let path = put(folder, "image.png", bytes);
     let image = Image::load(&path).map_err(|e| {
-        assert!(e.to_string().contains("picture.png"), "{e}");
+        assert!(e.to_string().contains("image.png"), "{e}");
         words(e)
     })?;
     assert_eq!(image.rgb.len(), image.width_px as usize * image.height_px as usize * 3);
     Ok(())
 }
 
-fn pictures(folder: &Path) -> Vec<Vec<u8>> {
-    small_picture(folder);
+fn images(folder: &Path) -> Vec<Vec<u8>> {
+    small_image(folder);
     vec![fs::read(folder.join("a.png")).unwrap_or_else(|e| panic!("{e}"))]
 }
 

@@ -100,7 +100,7 @@ readers!(
     training_files "training",
     data_sets "dataset",
     plain_sets "import",
-    pictures "png",
+    images "png",
     thresholds "planning",
     manifests "manifest",
     field_weights "weights",

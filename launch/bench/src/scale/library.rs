@@ -6,7 +6,7 @@ use crate::birds_eye;
 use crate::stats::{Contender, Times, alternate, timed};
 use anyhow::ensure;
 use carff_checkpoint::{FieldProbe, Manifest, PreparedField, load_field_probe};
-use carff_decision::{Calibration, Draw, Mixture, Place, ProbeLayout};
+use carff_decision::{Draw, Mixture, Place, ProbeCalibration, ProbeLayout};
 use carff_field::{Field, LATENT_DIM, RenderBuffer, RenderOptions};
 use rustix::time::{ClockId, clock_gettime};
 use std::cell::RefCell;
@@ -66,7 +66,7 @@ pub(crate) fn candidates(checkpoint: &Path, quick: bool) -> anyhow::Result<Axis>
         // The occupancies of the repeated places; their fit does not affect the speed.
         let seen: Vec<Vec<f32>> =
             seen.iter().map(|row| row.iter().copied().cycle().take(count as usize).collect()).collect();
-        let calibration = Calibration::fit(&layout, &seen)?;
+        let calibration = ProbeCalibration::fit(&layout, &seen)?;
         let field = PreparedField::new(Field::clone(base.field()), &layout);
         let mut probe = FieldProbe::new(field, layout, calibration, manifest.states.clone());
         let latents = &latents;

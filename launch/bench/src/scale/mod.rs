@@ -51,7 +51,7 @@ pub(crate) enum AxisName {
     /// Number of look-ahead steps, in a running graph.
     Horizon,
     /// Side of the camera image, in a running graph.
-    Picture,
+    Image,
     /// Side of a rendered view.
     View,
     /// Number of probed places.
@@ -64,7 +64,7 @@ pub(crate) enum AxisName {
 
 impl AxisName {
     const ALL: [Self; 7] =
-        [Self::Samples, Self::Horizon, Self::Picture, Self::View, Self::Candidates, Self::Stages, Self::Probes];
+        [Self::Samples, Self::Horizon, Self::Image, Self::View, Self::Candidates, Self::Stages, Self::Probes];
 }
 
 /// Measurements along one axis.
@@ -122,7 +122,7 @@ pub(crate) fn run(args: &ScaleArgs) -> anyhow::Result<Report> {
             AxisName::View => library::views(&subject.checkpoint, args.quick)?,
             AxisName::Candidates => library::candidates(&subject.checkpoint, args.quick)?,
             AxisName::Stages => chain::measure(args.quick)?,
-            AxisName::Samples | AxisName::Horizon | AxisName::Picture | AxisName::Probes => continue,
+            AxisName::Samples | AxisName::Horizon | AxisName::Image | AxisName::Probes => continue,
         });
     }
     let seconds = if args.quick { 1.0 } else { args.seconds.clamp(1.0, 3600.0) };

@@ -160,8 +160,8 @@ impl GraphBench {
                 Law::Linear,
                 choose(self.quick, &HORIZONS_QUICK, &HORIZONS),
             ),
-            AxisName::Picture => (
-                "picture",
+            AxisName::Image => (
+                "image",
                 "Camera image: camera to action",
                 "side of the image (px)",
                 "px",
@@ -181,7 +181,7 @@ impl GraphBench {
         let setting = |x: u32| match name {
             AxisName::Samples => Setting { samples: x, ..MAIN },
             AxisName::Horizon => Setting { horizon: x, ..MAIN },
-            AxisName::Picture => Setting { image_px: Some(x), ..MAIN },
+            AxisName::Image => Setting { image_px: Some(x), ..MAIN },
             _ => Setting { probes: x, ..MAIN },
         };
         let (cost_key, cost_label) = ("cores", "cores in use, less the renderer");
@@ -268,7 +268,7 @@ mod tests {
                 quick,
                 seconds: 1.0,
             };
-            let names = [AxisName::Samples, AxisName::Horizon, AxisName::Picture, AxisName::Probes];
+            let names = [AxisName::Samples, AxisName::Horizon, AxisName::Image, AxisName::Probes];
             let axes: Vec<_> = names.iter().map(|name| bench.axis(*name).unwrap().1).collect();
             let all = distinct(axes.iter().flatten().map(|(_, setting)| *setting));
             assert_eq!(all.iter().filter(|s| **s == MAIN).count(), 1);

@@ -44,7 +44,7 @@ pub(super) fn run(args: &BeliefArgs) -> anyhow::Result<()> {
                 steps.push(*belief);
                 // A frame whose first steps came before the probe is not shown.
                 if belief.is_final() && steps.first().is_some_and(|b| b.header.step == 1) {
-                    let text = picture(&steps, &states, &decided, colour);
+                    let text = image(&steps, &states, &decided, colour);
                     // On a terminal the bars stay in place.
                     let begin = if live { "\x1b[H\x1b[J" } else { "" };
                     let mut out = std::io::stdout().lock();
@@ -80,7 +80,7 @@ fn bar(probability: f32) -> String {
 }
 
 /// Formats a frame's beliefs, step by step: hazard states in red, others in green, and what is not known in no colour.
-fn picture(steps: &[Belief], known: &[State], decided: &str, colour: bool) -> String {
+fn image(steps: &[Belief], known: &[State], decided: &str, colour: bool) -> String {
     let paint = |text: &str, code: &str| if colour { format!("\x1b[{code}m{text}\x1b[0m") } else { text.to_owned() };
     let mut text = String::new();
     if let Some(first) = steps.first() {
@@ -134,7 +134,7 @@ mod tests {
         belief.resolved_state = 0;
         let states = [("truck, t0", true), ("no actor, t0", false)]
             .map(|(name, is_hazard)| State { name: name.into(), is_hazard });
-        let text = picture(&[belief], &states, "advance", false);
+        let text = image(&[belief], &states, "advance", false);
         let line = |name: &str| text.lines().find(|l| l.contains(name)).unwrap_or_default().to_owned();
         assert!(line("truck").starts_with("> truck, t0") && line("truck").ends_with("\u{2022}\u{2022}"), "{text}");
         assert!(line("truck").contains(&"\u{2588}".repeat(20)) && line("no actor").contains("0.250"), "{text}");
@@ -156,14 +156,14 @@ mod tests {
         belief.state_probability[..4].copy_from_slice(&[0.25, 0.25, 0.25, 0.125]);
         // Only a harmless state has a sample, which contradicts the scenario.
         belief.samples[0] = ProbeResult { state: 0, hazard_likelihood: 0.9, ..ProbeResult::NONE };
-        let text = picture(&[belief], &states(&scenario), "advance", true);
+        let text = image(&[belief], &states(&scenario), "advance", true);
         let line = |text: &str, name: &str| text.lines().find(|l| l.contains(name)).unwrap_or_default().to_owned();
         for (name, colour) in [("no actor, t0", "32"), ("no actor, t1", "32"), ("truck, t0", "31"), ("truck, t1", "31")]
         {
             assert!(line(&text, name).contains(&format!("\x1b[{colour}m")), "{name}: {text:?}");
         }
         assert!(!line(&text, "unknown").contains('\x1b'), "{text:?}");
-        let without_manifest = picture(&[belief], &[], "advance", true);
+        let without_manifest = image(&[belief], &[], "advance", true);
         assert!(line(&without_manifest, "state 3").contains("0.125") && !without_manifest.contains('\x1b'));
     }
 

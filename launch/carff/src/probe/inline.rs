@@ -65,10 +65,10 @@ impl Inline {
             Self::Kitty => in_kitty(&png(rgb, [width_px, height_px])?, drawn_columns),
             Self::Iterm => in_iterm(&png(rgb, [width_px, height_px])?, drawn_columns),
             Self::Sixel => {
-                let picture = RgbImage::from_raw(width_px, height_px, rgb.to_vec()).context("no image")?;
+                let image = RgbImage::from_raw(width_px, height_px, rgb.to_vec()).context("no image")?;
                 let wide_px = drawn_columns * COLUMN_PX;
                 let high_px = (height_px * wide_px / width_px.max(1)).max(1);
-                in_sixels(&resize(&picture, wide_px, high_px, FilterType::Triangle))
+                in_sixels(&resize(&image, wide_px, high_px, FilterType::Triangle))
             }
             Self::Auto | Self::Blocks => in_blocks(rgb, [width_px, height_px], columns.clamp(1, width_px.max(1))),
         })
@@ -173,11 +173,11 @@ fn in_iterm(png: &[u8], columns: u32) -> String {
 
 /// Encodes sixels: six rows at a time, one colour after another. Each character is a column of six pixels, with a bit
 /// for each pixel of the colour. <https://vt100.net/docs/vt3xx-gp/chapter14.html>
-fn in_sixels(picture: &RgbImage) -> String {
-    let rgba: Vec<u8> = picture.pixels().flat_map(|p| [p[0], p[1], p[2], u8::MAX]).collect();
+fn in_sixels(image: &RgbImage) -> String {
+    let rgba: Vec<u8> = image.pixels().flat_map(|p| [p[0], p[1], p[2], u8::MAX]).collect();
     let palette = NeuQuant::new(1, SIXEL_COLOURS, &rgba);
     let indices: Vec<usize> = rgba.chunks_exact(4).map(|pixel| palette.index_of(pixel)).collect();
-    let (width, height) = (picture.width() as usize, picture.height());
+    let (width, height) = (image.width() as usize, image.height());
     let mut text = format!("\x1bP0;1q\"1;1;{width};{height}");
     for (index, colour) in palette.color_map_rgb().chunks_exact(3).enumerate() {
         let [r, g, b] = [colour[0], colour[1], colour[2]].map(|part| (u32::from(part) * 100 + 127) / 255);
@@ -232,23 +232,23 @@ mod tests {
     const SIZE_PX: [u32; 2] = [61, 40];
 
     /// Returns noise over a gradient: long when compressed, and with more colours than a palette.
-    fn picture() -> Vec<u8> {
+    fn image() -> Vec<u8> {
         let [width_px, height_px] = SIZE_PX;
         let pixel = |x: u32, y: u32| [x * 4, y * 6, (x * 7919 + y * 104_729) % 97].map(|part| part as u8);
         (0..height_px).flat_map(|y| (0..width_px).flat_map(move |x| pixel(x, y))).collect()
     }
 
     fn pixels_of(png: &[u8]) -> (Vec<u8>, [u32; 2]) {
-        let picture = image::load_from_memory_with_format(png, image::ImageFormat::Png).unwrap().into_rgb8();
-        let size_px = [picture.width(), picture.height()];
-        (picture.into_raw(), size_px)
+        let image = image::load_from_memory_with_format(png, image::ImageFormat::Png).unwrap().into_rgb8();
+        let size_px = [image.width(), image.height()];
+        (image.into_raw(), size_px)
     }
 
     /// The output for kitty decodes to the image, bit for bit. Parts have at most the maximum length, all but the last
     /// announce more, and only the first has the display options.
     #[test]
-    fn kitty_is_sent_the_picture() {
-        let text = Inline::Kitty.encode(&picture(), SIZE_PX, 80).unwrap();
+    fn kitty_is_sent_the_image() {
+        let text = Inline::Kitty.encode(&image(), SIZE_PX, 80).unwrap();
         let parts: Vec<&str> = text.strip_suffix("\x1b\\\n").unwrap().split("\x1b\\").collect();
         assert!(parts.len() > 1, "{}", text.len());
         let mut data = String::new();
@@ -260,18 +260,18 @@ mod tests {
             assert!(chunk.len() <= 4096 && (more == 0 || chunk.len() % 4 == 0), "{}", chunk.len());
             data += chunk;
         }
-        assert_eq!(pixels_of(&BASE64_STANDARD.decode(data).unwrap()), (picture(), SIZE_PX));
+        assert_eq!(pixels_of(&BASE64_STANDARD.decode(data).unwrap()), (image(), SIZE_PX));
     }
 
     /// The output for iTerm2 decodes to the image, bit for bit, and contains its size in bytes.
     #[test]
-    fn iterm_is_sent_the_picture() {
-        let text = Inline::Iterm.encode(&picture(), SIZE_PX, 80).unwrap();
+    fn iterm_is_sent_the_image() {
+        let text = Inline::Iterm.encode(&image(), SIZE_PX, 80).unwrap();
         let text = text.strip_prefix("\x1b]1337;File=").unwrap().strip_suffix("\x07\n").unwrap();
         let (keys, data) = text.split_once(':').unwrap();
         let png = BASE64_STANDARD.decode(data).unwrap();
         assert_eq!(keys, format!("inline=1;size={};width=23;preserveAspectRatio=1", png.len()));
-        assert_eq!(pixels_of(&png), (picture(), SIZE_PX));
+        assert_eq!(pixels_of(&png), (image(), SIZE_PX));
     }
 
     /// Decodes sixels like a terminal: colours in hundredths, repeats, returns and new bands.
@@ -290,7 +290,7 @@ mod tests {
             list
         };
         let [1, 1, width, height] = numbers(&mut bytes)[..] else { panic!("no raster attributes") };
-        let mut picture = RgbImage::new(width, height);
+        let mut image = RgbImage::new(width, height);
         let mut painted = vec![false; (width * height) as usize];
         let mut palette = vec![[0; 3]; 256];
         let (mut x, mut y, mut colour, mut repeat) = (0, 0, 0, 1);
@@ -308,7 +308,7 @@ mod tests {
                     let bits = six.checked_sub(b'?').filter(|bits| *bits < 64).expect("a sixel");
                     for _ in 0..std::mem::replace(&mut repeat, 1) {
                         for row in (0..6).filter(|row| bits & (1 << row) != 0) {
-                            picture.put_pixel(x, y + row, image::Rgb(palette[colour]));
+                            image.put_pixel(x, y + row, image::Rgb(palette[colour]));
                             let was = std::mem::replace(&mut painted[((y + row) * width + x) as usize], true);
                             assert!(!was, "pixel {x}, {} twice", y + row);
                         }
@@ -318,18 +318,18 @@ mod tests {
             }
         }
         assert!(painted.iter().all(|&pixel| pixel), "all pixels are painted");
-        picture
+        image
     }
 
     /// Sixels paint every pixel once, in a colour close to the image's.
     #[test]
-    fn sixels_paint_the_picture() {
-        let picture = RgbImage::from_raw(SIZE_PX[0], SIZE_PX[1], picture()).unwrap();
-        let drawn = drawn(&in_sixels(&picture));
-        let off: u64 = drawn.iter().zip(picture.iter()).map(|(&a, &b)| u64::from(a.abs_diff(b))).sum();
+    fn sixels_paint_the_image() {
+        let image = RgbImage::from_raw(SIZE_PX[0], SIZE_PX[1], image()).unwrap();
+        let drawn = drawn(&in_sixels(&image));
+        let off: u64 = drawn.iter().zip(image.iter()).map(|(&a, &b)| u64::from(a.abs_diff(b))).sum();
         assert!(off / drawn.len() as u64 <= 12, "{} of 255 on average", off / drawn.len() as u64);
         // In a terminal of 20 columns.
-        let text = Inline::Sixel.encode(picture.as_raw(), SIZE_PX, 20).unwrap();
+        let text = Inline::Sixel.encode(image.as_raw(), SIZE_PX, 20).unwrap();
         assert!(text.starts_with("\x1bP0;1q\"1;1;160;104#"), "{}", &text[..40]);
     }
 

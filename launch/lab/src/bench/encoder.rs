@@ -12,7 +12,7 @@ use carff_decision::{Mixture, Sampling};
 use carff_messages::Gaussian;
 use carff_networks::{
     borrow,
-    encoder::{Encoder, gaussians, pictures_from_bytes},
+    encoder::{Encoder, gaussians, images_from_bytes},
 };
 use ndarray::ArrayView3;
 use tch::{Device, Kind, nn::VarStore};
@@ -125,10 +125,10 @@ fn in_bf16(args: &EncoderArgs, manifest: &Manifest, encoder: &Encoder, rgb: &[u8
     let halved = Encoder::new(&manifest.encoder, &(backbone.root() / "backbone"), &head.root(), Some(file.as_path()))?;
     backbone.set_kind(Kind::BFloat16);
     let encode_halved = || {
-        borrow::with_image(image(rgb)?, |picture| {
-            let picture = pictures_from_bytes(&picture.unsqueeze(0)).to_kind(Kind::BFloat16);
+        borrow::with_image(image(rgb)?, |image| {
+            let image = images_from_bytes(&image.unsqueeze(0)).to_kind(Kind::BFloat16);
             let (mean, log_variance) =
-                tch::no_grad(|| encoder.posterior(&halved.features(&picture).to_kind(Kind::Float), 0.0));
+                tch::no_grad(|| encoder.posterior(&halved.features(&image).to_kind(Kind::Float), 0.0));
             gaussians(&mean, &log_variance)
         })
         .and_then(|all| all.into_iter().next())
@@ -174,7 +174,7 @@ fn in_tch<'a>(encoder: &'a Encoder, rgb: &'a [u8], threads: i32) -> Contender<'a
 
 /// Computes the posterior of an image's bytes in libtorch.
 fn encode(encoder: &Encoder, rgb: &[u8]) -> Option<Gaussian> {
-    borrow::with_image(image(rgb)?, |picture| encoder.encode_bytes(picture)).flatten()
+    borrow::with_image(image(rgb)?, |image| encoder.encode_bytes(image)).flatten()
 }
 
 fn image(rgb: &[u8]) -> Option<ArrayView3<'_, u8>> {

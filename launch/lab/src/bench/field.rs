@@ -43,7 +43,7 @@ pub(crate) fn run(args: &FieldArgs) -> anyhow::Result<Report> {
         args.checkpoint.display(),
         field.parameter_count(),
         field.instruction_set().name(),
-        InstructionSet::detect_for_pictures().name(),
+        InstructionSet::detect_for_images().name(),
         threads
     );
     let bench = Bench {
@@ -54,10 +54,10 @@ pub(crate) fn run(args: &FieldArgs) -> anyhow::Result<Report> {
     };
 
     let mut fast = field.clone();
-    fast.set_instruction_set(InstructionSet::detect_for_pictures());
+    fast.set_instruction_set(InstructionSet::detect_for_images());
     let mut report = Report::default();
     report.set_value("field.instruction_set", field.instruction_set().name().into());
-    report.set_value("field.instruction_set_for_pictures", fast.instruction_set().name().into());
+    report.set_value("field.instruction_set_for_images", fast.instruction_set().name().into());
     report.set("field.threads", threads as f64);
     bench.networks(&field, &fast, &mut report);
     bench.rendering(&field, &fast, &states, &mut report);
@@ -222,22 +222,10 @@ impl Bench {
         let native = self.versus("render", count, &chunks, &seconds, report);
         println!("(tensor operations receive the positions of the samples, so that they need not march)");
         if fast.instruction_set().is_bf16() {
-            let ratio = Ratio::new(&in_f32, &seconds[0]);
-            let (mut here, mut exact) = (Vec::new(), Vec::new());
-            for z in states {
-                for (field, all) in [(fast, &mut here), (field, &mut exact)] {
-                    field.render(&camera, z, &options, &mut buffer);
-                    all.extend_from_slice(&buffer.rgb);
-                }
-            }
-            let db = carff_base::statistics::psnr_db(&here, &exact).unwrap_or(f64::INFINITY);
-            println!("native kernels with bf16 products are {ratio} as fast as in f32; {} dB against it", number(db));
-            report.set("field.render_f32_ms", Times::new(in_f32).median() * 1e3);
-            report.set("field.render_bf16_vs_f32", ratio.of_medians);
-            report.set("field.render_bf16_psnr_db", db);
+            bf16_against_f32([fast, field], states, &camera, [&seconds[0], &in_f32], report);
         }
-        let changing = together.pictures[0].changing.iter().filter(|c| **c).count() as f64
-            / f64::from(self.side_px * self.side_px);
+        let changing =
+            together.images[0].changing.iter().filter(|c| **c).count() as f64 / f64::from(self.side_px * self.side_px);
         println!(
             "{HYPOTHESES} hypotheses together: {} ms, {} frames a second, each; {} of the rays meet what changes\n",
             number(shared * 1e3),
@@ -585,4 +573,29 @@ fn round_and_round<'a>(count: usize, mut action: impl FnMut(usize) + 'a) -> Cont
 
 fn percent(share: f64) -> String {
     format!("{:.1} %", share * 100.0)
+}
+
+/// Prints and records speed and image quality of kernels with bf16 products against those in f32.
+fn bf16_against_f32(
+    fields: [&Field; 2],
+    states: &[[f32; LATENT_DIM]],
+    camera: &PinholeCamera,
+    [in_bf16, in_f32]: [&[f64]; 2],
+    report: &mut Report,
+) {
+    let options = RenderOptions::default();
+    let mut buffer = RenderBuffer::new();
+    let ratio = Ratio::new(in_f32, in_bf16);
+    let mut images = [Vec::new(), Vec::new()];
+    for z in states {
+        for (field, all) in fields.into_iter().zip(&mut images) {
+            field.render(camera, z, &options, &mut buffer);
+            all.extend_from_slice(&buffer.rgb);
+        }
+    }
+    let db = carff_base::statistics::psnr_db(&images[0], &images[1]).unwrap_or(f64::INFINITY);
+    println!("native kernels with bf16 products are {ratio} as fast as in f32; {} dB against it", number(db));
+    report.set("field.render_f32_ms", Times::new(in_f32.to_vec()).median() * 1e3);
+    report.set("field.render_bf16_vs_f32", ratio.of_medians);
+    report.set("field.render_bf16_psnr_db", db);
 }

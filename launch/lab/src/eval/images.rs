@@ -8,7 +8,7 @@ use carff_evaluation::{
     DecisiveImage, MaskedView, Novelty, OtherPlace, Perception, Progress, Subject, Watch, WatchPlan,
 };
 use carff_scenes::config::{BystanderPlace, VariationRole};
-use carff_scenes::{Detail, FreePose, RenderOptions, Scenario, UnknownView};
+use carff_scenes::{Detail, FreePose, Scenario, UnknownView};
 use ndarray::Axis;
 use std::path::PathBuf;
 
@@ -76,8 +76,8 @@ pub fn masked_views(
             }
             let state = done % states;
             let (branch, timestamp) = (scenario.info().branch_of(state), scenario.info().timestamp_of(state));
-            let options = RenderOptions { detail: Detail::Picture };
-            let rendering = scenario.render(branch, timestamp, &moved, &options)?;
+            let options = Detail::Image;
+            let rendering = scenario.render(branch, timestamp, &moved, options)?;
             let class = |object: &u16| classes.iter().find(|(of, _)| of == object).map_or(0, |(_, class)| *class);
             Ok(MaskedView {
                 rgb: carff_evaluation::to_unit(&rendering.image.rgb),

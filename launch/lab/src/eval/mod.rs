@@ -31,7 +31,7 @@ fn table(name: TableName) -> Table {
         TableName::Localisation => Table::Localisation,
         TableName::Memory => Table::Memory,
         TableName::Frequencies => Table::Frequencies,
-        TableName::Pictures => Table::Pictures,
+        TableName::Images => Table::Images,
     }
 }
 
@@ -60,7 +60,7 @@ pub fn run(args: &EvalArgs) -> anyhow::Result<ExitCode> {
         }
         // The gallery shows the first pose that has each in sight.
         let novelty_poses = if wants(Table::Robustness) { args.free_poses } else { args.free_poses.min(GALLERY_POSES) };
-        if wants(Table::Robustness) || wants(Table::Pictures) {
+        if wants(Table::Robustness) || wants(Table::Images) {
             subject.novelties = images::novelties(&scenario, novelty_poses, args.seed, &display)?;
         }
         if wants(Table::Trials) || wants(Table::Robustness) {

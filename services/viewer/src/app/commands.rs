@@ -22,9 +22,9 @@ pub enum Command {
     /// Shows the next scene.
     SceneAfter,
     /// Takes the previous image.
-    PictureBefore,
+    ImageBefore,
     /// Takes the next image.
-    PictureAfter,
+    ImageAfter,
     /// Follows the running graph, or holds its frame.
     Follow,
     /// Looks from above a corner.
@@ -32,7 +32,7 @@ pub enum Command {
     /// Looks straight down.
     CameraAbove,
     /// Looks from the pose of the image.
-    CameraPicture,
+    CameraImage,
     /// Shows or hides the probed boxes.
     Boxes,
     /// Shows or hides the densities in the boxes.
@@ -71,8 +71,8 @@ impl Command {
             &[
                 (Self::SceneBefore, Modifiers::NONE, Key::ArrowLeft, "Previous scene"),
                 (Self::SceneAfter, Modifiers::NONE, Key::ArrowRight, "Next scene"),
-                (Self::PictureBefore, Modifiers::NONE, Key::PageUp, "Previous image"),
-                (Self::PictureAfter, Modifiers::NONE, Key::PageDown, "Next image"),
+                (Self::ImageBefore, Modifiers::NONE, Key::PageUp, "Previous image"),
+                (Self::ImageAfter, Modifiers::NONE, Key::PageDown, "Next image"),
                 (Self::Follow, Modifiers::NONE, Key::Space, "Follow the running graph, or hold its frame"),
             ],
         ),
@@ -81,7 +81,7 @@ impl Command {
             &[
                 (Self::CameraCorner, Modifiers::NONE, Key::Num1, "Look from above a corner"),
                 (Self::CameraAbove, Modifiers::NONE, Key::Num2, "Look straight down"),
-                (Self::CameraPicture, Modifiers::NONE, Key::Num3, "Look from the image's pose"),
+                (Self::CameraImage, Modifiers::NONE, Key::Num3, "Look from the image's pose"),
                 (Self::Boxes, Modifiers::NONE, Key::B, "Probed boxes"),
                 (Self::Densities, Modifiers::NONE, Key::D, "Densities in the boxes"),
             ],

@@ -21,7 +21,7 @@ impl Viewer {
         ScrollArea::vertical().auto_shrink(false).show(ui, |ui| {
             ui.label(theme::heading("Image"));
             ui.spacing_mut().item_spacing.y = 4.0;
-            self.picture(ui, height);
+            self.chosen_image(ui, height);
             self.chooser(ui, commands);
             self.posterior(ui);
             ui.add_space(4.0);
@@ -35,7 +35,7 @@ impl Viewer {
         });
     }
 
-    fn picture(&mut self, ui: &mut Ui, max_height: f32) {
+    fn chosen_image(&mut self, ui: &mut Ui, max_height: f32) {
         let palette = theme::palette(ui.ctx());
         let width = ui.available_width();
         let Some(moment) = self.session.moment() else {
@@ -95,9 +95,9 @@ impl Viewer {
             }
         });
         ui.horizontal(|ui| {
-            self.command_button(ui, Command::PictureBefore, Button::new("‹"), commands);
+            self.command_button(ui, Command::ImageBefore, Button::new("‹"), commands);
             ui.add(Slider::new(&mut choice.view, 0..=views.saturating_sub(1)).text("view"));
-            self.command_button(ui, Command::PictureAfter, Button::new("›"), commands);
+            self.command_button(ui, Command::ImageAfter, Button::new("›"), commands);
         });
         ui.horizontal(|ui| {
             ui.weak("browse");
@@ -115,8 +115,8 @@ impl Viewer {
         });
         if choice != before {
             self.choice = choice;
-            let picture = |c: &Choice| (c.branch, c.timestamp, c.view);
-            if picture(&choice) != picture(&before)
+            let image = |c: &Choice| (c.branch, c.timestamp, c.view);
+            if image(&choice) != image(&before)
                 && let Err(why) = self.toggle_chosen()
             {
                 self.say(why, true);

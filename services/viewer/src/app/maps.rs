@@ -19,7 +19,7 @@ impl Viewer {
         ui.horizontal(|ui| {
             let palette = theme::palette(ui.ctx());
             for (name, texture, palette, latent) in [
-                ("Bird's eye", birds_eye, theme::on_pictures(), self.drawn.birds_eye),
+                ("Bird's eye", birds_eye, theme::on_images(), self.drawn.birds_eye),
                 ("Density", slice, palette, self.drawn.slice),
             ] {
                 ui.vertical(|ui| {

@@ -75,7 +75,7 @@ impl Viewer {
 
     /// Draws boxes and densities.
     fn overlay(&self, painter: &Painter, rect: Rect, camera: &PinholeCamera) {
-        let palette = theme::on_pictures();
+        let palette = theme::on_images();
         let at = |p: [f64; 2]| rect.min + vec2(p[0] as f32, p[1] as f32);
         let found = self.recent(&self.drawn.view).and_then(|recent| recent.found.as_ref());
         let prober = self.session.models().probe.layout();
@@ -136,7 +136,7 @@ impl Viewer {
             let name = self.session.models().state_name(state);
             text = format!("{text}  shows {name} ({:.0} %)", 100.0 * probed.reading.confidence);
             let is_hazard = state.is_some_and(|s| self.session.models().is_hazard(s));
-            color = if is_hazard { theme::on_pictures().hazard } else { Color32::WHITE };
+            color = if is_hazard { theme::on_images().hazard } else { Color32::WHITE };
         }
         caption(&painter, rect.left_top() + vec2(12.0, 12.0), Align2::LEFT_TOP, &text, color, 13.0);
         if let Some((image, took_ms)) = &self.view {
@@ -168,7 +168,7 @@ impl Viewer {
                 for (command, name) in [
                     (Command::CameraCorner, "Corner"),
                     (Command::CameraAbove, "Above"),
-                    (Command::CameraPicture, "Image"),
+                    (Command::CameraImage, "Image"),
                 ] {
                     self.command_button(ui, command, Button::new(name), commands);
                 }

@@ -7,7 +7,7 @@ use eframe::egui::{
 };
 
 const CARD: [f32; 2] = [116.0, 120.0];
-const PICTURE: [f32; 2] = [116.0, 87.0];
+const IMAGE: [f32; 2] = [116.0, 87.0];
 
 impl Viewer {
     pub(super) fn scenes_strip(&mut self, ui: &mut Ui) {
@@ -51,13 +51,13 @@ impl Viewer {
         let painter = ui.painter_at(rect.expand(2.0));
         let fill = if response.hovered() { palette.raised.lerp_to_gamma(palette.accent, 0.15) } else { palette.raised };
         painter.rect_filled(rect, 7.0, fill);
-        let picture = Rect::from_min_size(rect.min, vec2(PICTURE[0], PICTURE[1]));
+        let area = Rect::from_min_size(rect.min, vec2(IMAGE[0], IMAGE[1]));
         if let Some(id) = self.textures.thumbnail(index) {
             let whole = Rect::from_min_max(pos2(0.0, 0.0), pos2(1.0, 1.0));
-            let image = eframe::egui::Image::new(eframe::egui::load::SizedTexture::new(id, picture.size()));
-            image.uv(whole).corner_radius(7).paint_at(ui, picture);
+            let image = eframe::egui::Image::new(eframe::egui::load::SizedTexture::new(id, area.size()));
+            image.uv(whole).corner_radius(7).paint_at(ui, area);
         } else {
-            painter.rect_filled(picture, 7.0, palette.ground);
+            painter.rect_filled(area, 7.0, palette.ground);
         }
         let name = rect.left_bottom() + vec2(7.0, -19.0);
         let text = ui.visuals().text_color();

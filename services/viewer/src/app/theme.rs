@@ -82,7 +82,7 @@ pub fn palette(ctx: &Context) -> &'static Palette {
 }
 
 /// Returns the palette for overlays on images, which is the same in both themes.
-pub fn on_pictures() -> &'static Palette {
+pub fn on_images() -> &'static Palette {
     &DARK
 }
 

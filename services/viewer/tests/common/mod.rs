@@ -1,7 +1,7 @@
 //! Fixtures of the viewer's tests: the shipped checkpoint, and true images of its scenario.
 #![allow(clippy::unwrap_used, reason = "a failure here fails a test")]
 
-use carff_scenes::{RenderOptions, Scenario};
+use carff_scenes::{Detail, Scenario};
 use carff_viewer::input::Input;
 use carff_viewer::models::Models;
 use std::path::{Path, PathBuf};
@@ -28,11 +28,11 @@ pub fn scenario() -> Scenario {
 }
 
 /// Returns the image of a state from a camera of the scenario.
-pub fn picture(branch: usize, timestamp: usize, view: usize) -> Arc<Input> {
+pub fn image(branch: usize, timestamp: usize, view: usize) -> Arc<Input> {
     let scenario = scenario();
     let camera = scenario.cameras()[view].camera;
-    let image = scenario.render(branch, timestamp, &camera, &RenderOptions::default()).unwrap().image;
-    let input = Input::of_picture(format!("b{branch} t{timestamp} v{view}"), image);
+    let image = scenario.render(branch, timestamp, &camera, Detail::default()).unwrap().image;
+    let input = Input::of_image(format!("b{branch} t{timestamp} v{view}"), image);
     Arc::new(Input { camera: Some(camera), frame: view as u64, ..(*input).clone() })
 }
 

@@ -19,12 +19,12 @@ use tch::{Kind, Tensor};
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Gallery {
     /// In the order of the page.
-    pub pictures: Vec<GalleryPicture>,
+    pub images: Vec<GalleryImage>,
 }
 
 /// One image of the gallery.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-pub struct GalleryPicture {
+pub struct GalleryImage {
     /// File name, in the folder of the page.
     pub file: String,
     /// Heading.
@@ -50,11 +50,11 @@ const HAZARD: [u8; 3] = [236, 140, 20];
 /// Draws all images of the gallery into `out`.
 pub fn gallery(subject: &Subject, out: &Path, on_progress: &dyn Fn(&Progress)) -> Result<Gallery, EvaluationError> {
     let mut gallery = Gallery::default();
-    let tell = |done, line: &str| on_progress(&Progress { phase: "pictures", done, total: 7, line: line.to_owned() });
+    let tell = |done, line: &str| on_progress(&Progress { phase: "images", done, total: 7, line: line.to_owned() });
     let mut add = |drawn: bool, file: &str, title: &str, text: &str| {
         if drawn {
             let [file, title, text] = [file, title, text].map(str::to_owned);
-            gallery.pictures.push(GalleryPicture { file, title, text });
+            gallery.images.push(GalleryImage { file, title, text });
         }
     };
     tell(0, "from above");

@@ -12,7 +12,7 @@ mod unknown_sheet;
 
 use crate::tables::{
     encoder::{EncoderTable, encoder_table},
-    field::{PictureTable, picture_table},
+    field::{ImageTable, image_table},
     forecast::{self, ForecastTable, FrequencyTable},
     localisation::{self, LocalisationTable},
     memory::{self, MemoryTable},
@@ -51,7 +51,7 @@ pub enum Table {
     /// Frequency of each outcome where several are open.
     Frequencies,
     /// t-SNE, reconstructions, curves, beliefs, density.
-    Pictures,
+    Images,
 }
 
 impl Table {
@@ -66,7 +66,7 @@ impl Table {
         Self::Localisation,
         Self::Memory,
         Self::Frequencies,
-        Self::Pictures,
+        Self::Images,
     ];
 
     /// Name of the table for `--only`.
@@ -81,7 +81,7 @@ impl Table {
             Self::Localisation => "localisation",
             Self::Memory => "memory",
             Self::Frequencies => "frequencies",
-            Self::Pictures => "pictures",
+            Self::Images => "images",
         }
     }
 }
@@ -96,7 +96,7 @@ pub struct Results {
     pub targets: Vec<Target>,
     /// Images of the field.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub pictures: Option<PictureTable>,
+    pub images: Option<ImageTable>,
     /// Encoder and decoder.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub encoder: Option<EncoderTable>,
@@ -145,7 +145,7 @@ pub fn evaluate(
     let mut results = Results { subject: subject.about(), ..Results::default() };
     let has = |table| tables.contains(&table);
     if has(Table::Psnr) {
-        results.pictures = results.kept(Table::Psnr, picture_table(subject, on_progress));
+        results.images = results.kept(Table::Psnr, image_table(subject, on_progress));
     }
     if has(Table::Encoder) {
         results.encoder = Some(encoder_table(subject));
@@ -184,7 +184,7 @@ pub fn evaluate(
     if has(Table::Memory) {
         results.memory = results.kept(Table::Memory, memory::memory(subject, on_progress));
     }
-    if has(Table::Pictures) {
+    if has(Table::Images) {
         results.gallery = Some(gallery::gallery(subject, out, on_progress)?);
     }
     results.targets = targets::targets(&results);

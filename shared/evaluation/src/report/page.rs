@@ -10,9 +10,7 @@ use super::{
 };
 use crate::stats::draws::Frequencies;
 use crate::tables::planning::{PlanningResults, ViewCounts};
-use crate::{
-    ByRole, EncoderTable, FieldPictures, FrequencyTable, PairMeans, PictureTable, SAMPLE_COUNTS, Share, SvmScore,
-};
+use crate::{ByRole, EncoderTable, FieldImages, FrequencyTable, ImageTable, PairMeans, SAMPLE_COUNTS, Share, SvmScore};
 use carff_trials::{Count, PlanningTable};
 use std::fmt::Write;
 
@@ -35,15 +33,15 @@ pub fn page(results: &Results) -> String {
         about.branches.len(),
         about.branches.join(", "),
         about.timestamps,
-        about.pictures,
+        about.images,
         trained + calibration + held_out,
         about.training_seed,
         about.split_seed,
         about.seed
     );
     targets(&mut page, results);
-    if let Some(table) = &results.pictures {
-        pictures(&mut page, table);
+    if let Some(table) = &results.images {
+        images(&mut page, table);
     }
     if let Some(table) = &results.encoder {
         let _ = writeln!(page, "## Encoder and decoder\n");
@@ -60,8 +58,8 @@ pub fn page(results: &Results) -> String {
     memory(&mut page, results);
     reliability(&mut page, results);
     frequencies(&mut page, &results.frequencies);
-    for picture in results.gallery.iter().flat_map(|g| &g.pictures) {
-        let _ = writeln!(page, "## {}\n\n{}\n\n![{0}]({})\n", picture.title, picture.text, picture.file);
+    for image in results.gallery.iter().flat_map(|g| &g.images) {
+        let _ = writeln!(page, "## {}\n\n{}\n\n![{0}]({})\n", image.title, image.text, image.file);
     }
     if !results.left_out.is_empty() {
         let _ = writeln!(page, "## Left out\n");
@@ -93,7 +91,7 @@ fn targets(page: &mut String, results: &Results) {
     page.push('\n');
 }
 
-fn pictures(page: &mut String, table: &PictureTable) {
+fn images(page: &mut String, table: &ImageTable) {
     let _ = writeln!(page, "## Images of the field\n");
     if let Some(toggled) = &table.toggled {
         let _ = writeln!(
@@ -104,7 +102,7 @@ fn pictures(page: &mut String, table: &PictureTable) {
             toggled.renderings
         );
         matrix(page, &table.states, toggled);
-        means(page, toggled, table.mean_picture_db);
+        means(page, toggled, table.mean_image_db);
     }
     if let Some(predicted) = &table.predicted {
         let _ = writeln!(
@@ -115,7 +113,7 @@ fn pictures(page: &mut String, table: &PictureTable) {
             predicted.renderings
         );
         matrix(page, &table.states, predicted);
-        means(page, predicted, table.mean_picture_db);
+        means(page, predicted, table.mean_image_db);
     } else if table.toggled.is_some() {
         let _ = writeln!(
             page,
@@ -136,9 +134,9 @@ fn pictures(page: &mut String, table: &PictureTable) {
                 page,
                 &[
                     part.into(),
-                    v.pictures.to_string(),
+                    v.images.to_string(),
                     db(Some(v.psnr_db)),
-                    db(Some(v.mean_picture_db)),
+                    db(Some(v.mean_image_db)),
                     format!("{:+.1}", v.gain_db),
                     format!("{:.3}", v.ssim),
                     db(v.actor_db),
@@ -149,7 +147,7 @@ fn pictures(page: &mut String, table: &PictureTable) {
     }
 }
 
-fn matrix(page: &mut String, states: &[String], table: &FieldPictures) {
+fn matrix(page: &mut String, states: &[String], table: &FieldImages) {
     let mut cells = vec!["rendered \\ true"];
     cells.extend(states.iter().map(String::as_str));
     head(page, &cells);
@@ -163,7 +161,7 @@ fn matrix(page: &mut String, states: &[String], table: &FieldPictures) {
     page.push('\n');
 }
 
-fn means(page: &mut String, table: &FieldPictures, mean_picture_db: Option<f64>) {
+fn means(page: &mut String, table: &FieldImages, mean_image_db: Option<f64>) {
     head(page, &["branch", "matching, dB", "un-matching, dB", "difference, dB"]);
     let mut line = |name: &str, m: &PairMeans| {
         row(page, &[name.into(), db(m.matching_db), db(m.unmatching_db), db(m.margin_db)]);
@@ -172,7 +170,7 @@ fn means(page: &mut String, table: &FieldPictures, mean_picture_db: Option<f64>)
         line(branch, m);
     }
     line("all", &table.all);
-    let gain = table.all.matching_db.zip(mean_picture_db).map(|(a, b)| format!("{:+.1}", a - b));
+    let gain = table.all.matching_db.zip(mean_image_db).map(|(a, b)| format!("{:+.1}", a - b));
     let _ = writeln!(
         page,
         "\nMatching pairs: SSIM {}, {} dB inside the dynamic actors' pixels, {} dB over the pixels that change among \
@@ -181,7 +179,7 @@ fn means(page: &mut String, table: &FieldPictures, mean_picture_db: Option<f64>)
         db(table.actor_db),
         db(table.changed_db),
         gain.unwrap_or_else(|| "-".into()),
-        db(mean_picture_db)
+        db(mean_image_db)
     );
 }
 
@@ -221,7 +219,7 @@ pub fn encoder_rows(page: &mut String, rows: &[(String, &EncoderTable)]) {
             &[
                 name.clone(),
                 db(Some(t.train.psnr_db)),
-                db(Some(t.train.mean_picture_psnr_db)),
+                db(Some(t.train.mean_image_psnr_db)),
                 db(Some(t.train.changed_pixels_psnr_db)),
                 db(Some(t.novel_view.psnr_db)),
                 db(Some(t.novel_view.changed_pixels_psnr_db)),
@@ -238,7 +236,7 @@ pub fn encoder_rows(page: &mut String, rows: &[(String, &EncoderTable)]) {
         let _ = writeln!(
             page,
             "\n{} images of trained poses, {} of held-out poses, {} decoded from the latent of another pose.\n",
-            t.svm.trained.pictures, t.svm.unseen.pictures, t.novel_view.pictures
+            t.svm.trained.images, t.svm.unseen.images, t.novel_view.images
         );
     }
 }
@@ -286,9 +284,9 @@ fn forecast(page: &mut String, results: &Results) {
             "### {} poses\n\nAccuracy: {} trials of {} images. Recall: {} trials of {} images.\n",
             capital(part),
             c.accuracy.trials,
-            c.accuracy.pictures,
+            c.accuracy.images,
             c.recall.trials,
-            c.recall.pictures
+            c.recall.images
         );
         let mut cells = vec!["%".to_owned()];
         cells.extend(counts.iter().map(|n| format!("n = {n}")));
@@ -455,7 +453,7 @@ fn group_rows(page: &mut String, group: &Frequencies) {
             page,
             &[
                 first(open.join(", ")),
-                first(format!("{}, {}", group.pictures, group.samples)),
+                first(format!("{}, {}", group.images, group.samples)),
                 outcome.outcome.clone(),
                 format!("{} ({:.0} to {:.0})", percent(outcome.drawn), 100.0 * low, 100.0 * high),
                 percent(outcome.expected),
@@ -500,18 +498,18 @@ mod tests {
     /// Tables are even, missing values are dashes, and figures are rounded.
     #[test]
     fn tables_are_even() {
-        let pictures = FieldPictures {
+        let images = FieldImages {
             psnr_db: vec![Some(vec![30.04, 20.0]), None],
             by_branch: BTreeMap::from([("a".into(), PairMeans::default())]),
-            ..FieldPictures::default()
+            ..FieldImages::default()
         };
         let mut planning = PlanningResults { threshold: Some(0.25), ..PlanningResults::default() };
         planning.all_views.add(Rule::Paper, 10, DriveKind::Clear, true);
         let results = Results {
-            pictures: Some(PictureTable {
+            images: Some(ImageTable {
                 states: vec!["a t0".into(), "a t1".into()],
-                toggled: Some(pictures),
-                ..PictureTable::default()
+                toggled: Some(images),
+                ..ImageTable::default()
             }),
             encoder: Some(EncoderTable {
                 state_accuracy: ByRole { unseen: Some(ByObservability::default()), ..ByRole::default() },

@@ -24,7 +24,7 @@ pub struct Target {
 /// Targets of all figures that were computed.
 pub fn targets(results: &Results) -> Vec<Target> {
     let mut list = List { targets: Vec::new() };
-    list.pictures(results);
+    list.images(results);
     list.encoder(results);
     list.forecast(results);
     list.planning(results);
@@ -72,8 +72,8 @@ impl List {
         self.add(what, paper, format!("at least {}", text(least)), text(value), value >= least);
     }
 
-    fn pictures(&mut self, results: &Results) {
-        let Some(toggled) = results.pictures.as_ref().and_then(|t| t.toggled.as_ref()) else { return };
+    fn images(&mut self, results: &Results) {
+        let Some(toggled) = results.images.as_ref().and_then(|t| t.toggled.as_ref()) else { return };
         let kind = kind(&results.subject.scenario);
         let paper = match kind {
             Kind::Single => "29.06 dB",
@@ -189,7 +189,7 @@ impl List {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{FieldPictures, PairMeans, PictureTable, PlanningResults};
+    use crate::{FieldImages, ImageTable, PairMeans, PlanningResults};
     use carff_messages::Rule;
 
     /// The SVM's absolute accuracy, with its ceiling, stands next to the paper's absolute accuracy.
@@ -210,9 +210,9 @@ mod tests {
     fn missed_figures_are_shown() {
         assert!(targets(&Results::default()).is_empty());
         let all = PairMeans { matching_db: Some(31.0), unmatching_db: Some(27.0), margin_db: Some(4.0) };
-        let toggled = Some(FieldPictures { all, ..FieldPictures::default() });
+        let toggled = Some(FieldImages { all, ..FieldImages::default() });
         let mut results =
-            Results { pictures: Some(PictureTable { toggled, ..PictureTable::default() }), ..Results::default() };
+            Results { images: Some(ImageTable { toggled, ..ImageTable::default() }), ..Results::default() };
         results.subject.scenario = "blender-intersection".into();
         let found = targets(&results);
         let brief: Vec<_> = found.iter().map(|t| (t.paper.as_str(), t.found.as_str(), t.reached)).collect();

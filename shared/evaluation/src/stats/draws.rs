@@ -40,7 +40,7 @@ impl Shown {
 #[derive(Clone, Debug, PartialEq)]
 pub struct TrialCurve {
     /// Number of the image: trials of one image are not independent.
-    pub picture: usize,
+    pub image: usize,
     /// Value for n samples at index n - 1, 0..=1.
     pub values: Vec<f64>,
 }
@@ -56,7 +56,7 @@ pub struct Curve {
     /// Trials.
     pub trials: usize,
     /// Images of the trials.
-    pub pictures: usize,
+    pub images: usize,
 }
 
 impl Curve {
@@ -69,14 +69,14 @@ impl Curve {
 /// Mean accuracy, with the band that holds 80 % of the images.
 pub fn accuracy_curve(trials: &[TrialCurve]) -> Curve {
     let mut curve = means(trials);
-    let mut by_picture = std::collections::BTreeMap::<usize, Vec<&TrialCurve>>::new();
+    let mut by_image = std::collections::BTreeMap::<usize, Vec<&TrialCurve>>::new();
     for trial in trials {
-        by_picture.entry(trial.picture).or_default().push(trial);
+        by_image.entry(trial.image).or_default().push(trial);
     }
     curve.band = (0..curve.mean.len())
         .map(|i| {
             let of = |t: &Vec<&TrialCurve>| t.iter().map(|t| t.values[i]).sum::<f64>() / t.len() as f64;
-            let means: Vec<f64> = by_picture.values().map(of).collect();
+            let means: Vec<f64> = by_image.values().map(of).collect();
             [0.1, 0.9].map(|q| percentile(&means, q).unwrap_or(0.0))
         })
         .collect();
@@ -94,10 +94,10 @@ pub fn recall_curve(trials: &[TrialCurve]) -> Curve {
 fn means(trials: &[TrialCurve]) -> Curve {
     let counts = trials.iter().map(|t| t.values.len()).min().unwrap_or(0);
     let mean = |i: usize| trials.iter().map(|t| t.values[i]).sum::<f64>() / trials.len() as f64;
-    let mut pictures: Vec<usize> = trials.iter().map(|t| t.picture).collect();
-    pictures.sort_unstable();
-    pictures.dedup();
-    Curve { mean: (0..counts).map(mean).collect(), band: Vec::new(), trials: trials.len(), pictures: pictures.len() }
+    let mut images: Vec<usize> = trials.iter().map(|t| t.image).collect();
+    images.sort_unstable();
+    images.dedup();
+    Curve { mean: (0..counts).map(mean).collect(), band: Vec::new(), trials: trials.len(), images: images.len() }
 }
 
 /// Share of correct samples among the first n, for each n.
@@ -175,7 +175,7 @@ pub struct Frequencies {
     /// Share of samples that show an outcome that was not open, 0..=1.
     pub ruled_out: f64,
     /// Images.
-    pub pictures: usize,
+    pub images: usize,
     /// Samples of all images.
     pub samples: usize,
 }
@@ -214,7 +214,7 @@ fn frequencies_of(expected: &[f64], members: &[&OpenInput], names: &[String]) ->
         .collect();
     let known: f64 = (0..expected.len()).map(total).sum();
     let ruled_out: f64 = (0..expected.len()).filter(|&o| expected[o] <= 0.0).map(total).sum();
-    Frequencies { outcomes, unknown: (1.0 - known).max(0.0), ruled_out, pictures: members.len(), samples }
+    Frequencies { outcomes, unknown: (1.0 - known).max(0.0), ruled_out, images: members.len(), samples }
 }
 
 /// 95 % interval of the mean of shares, clamped to 0..=1.
@@ -246,10 +246,10 @@ mod tests {
     /// Without trials there is no curve.
     #[test]
     fn curves_of_counted_trials() {
-        let trial = |picture, values: [f64; 2]| TrialCurve { picture, values: values.to_vec() };
+        let trial = |image, values: [f64; 2]| TrialCurve { image, values: values.to_vec() };
         let trials = [trial(1, [1.0, 0.0]), trial(1, [0.0, 0.0]), trial(2, [1.0, 1.0]), trial(3, [1.0, 1.0])];
         let accuracy = accuracy_curve(&trials);
-        assert_eq!((accuracy.mean.as_slice(), accuracy.trials, accuracy.pictures), ([0.75, 0.5].as_slice(), 4, 3));
+        assert_eq!((accuracy.mean.as_slice(), accuracy.trials, accuracy.images), ([0.75, 0.5].as_slice(), 4, 3));
         assert_eq!(accuracy.band, [[0.5, 1.0], [0.0, 1.0]]);
         let recall = recall_curve(&trials);
         assert_eq!(recall.band[1], wilson_interval(2, 4));
@@ -268,7 +268,7 @@ mod tests {
                         let key = carff_base::random::Key { seed: 1, frame, step: 0, sample };
                         u64::from(carff_base::random::uniform(key) < probability)
                     });
-                    TrialCurve { picture: frame as usize, values: met_all(met, 1) }
+                    TrialCurve { image: frame as usize, values: met_all(met, 1) }
                 })
                 .collect();
             recall_curve(&trials)
@@ -307,7 +307,7 @@ mod tests {
         let found = frequencies(&inputs, &names);
         assert_eq!(found.len(), 2);
         let first = &found[0];
-        assert_eq!((first.pictures, first.samples, first.outcomes.len()), (2, 20, 2));
+        assert_eq!((first.images, first.samples, first.outcomes.len()), (2, 20, 2));
         assert!((first.outcomes[0].drawn - 0.5).abs() < 1e-12 && (first.outcomes[1].drawn - 0.4).abs() < 1e-12);
         assert!((first.ruled_out - 0.05).abs() < 1e-12 && (first.unknown - 0.05).abs() < 1e-12);
         let [low, high] = first.outcomes[0].interval;

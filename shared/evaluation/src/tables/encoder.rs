@@ -52,7 +52,7 @@ pub struct SvmScore {
     /// Accuracy up to visual equivalence, 0..=1.
     pub up_to_equivalence: f64,
     /// Images.
-    pub pictures: usize,
+    pub images: usize,
 }
 
 impl From<Share> for SvmScore {
@@ -61,7 +61,7 @@ impl From<Share> for SvmScore {
             accuracy: share.raw(),
             ceiling: share.ceiling(),
             up_to_equivalence: share.accuracy(),
-            pictures: share.trials,
+            images: share.trials,
         }
     }
 }

@@ -16,18 +16,18 @@ use std::collections::BTreeMap;
 /// Images of the field against true images.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct PictureTable {
+pub struct ImageTable {
     /// Names of the states, in the order of the matrices.
     pub states: Vec<String>,
     /// Rendered with the latents of the known states. Absent where the dataset has no view from above.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub toggled: Option<FieldPictures>,
+    pub toggled: Option<FieldImages>,
     /// Rendered with latents drawn from forecasts of the previous step, from unambiguous images.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub predicted: Option<FieldPictures>,
+    pub predicted: Option<FieldImages>,
     /// PSNR from above of the mean image of all states, which needs no model, dB.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub mean_picture_db: Option<f64>,
+    pub mean_image_db: Option<f64>,
     /// Images from the dataset's poses, for trained and held-out poses.
     pub novel_views: ByRole<NovelViews>,
 }
@@ -35,7 +35,7 @@ pub struct PictureTable {
 /// Images from above.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct FieldPictures {
+pub struct FieldImages {
     /// `psnr_db[rendered][true]`; null for a state that is never forecast.
     pub psnr_db: Vec<Option<Vec<f64>>>,
     /// Means over all pairs of states that look different.
@@ -59,15 +59,15 @@ pub struct NovelViews {
     /// Mean PSNR, dB.
     pub psnr_db: f64,
     /// Mean PSNR of the pose's mean image over the states, which is made of the pose's true images, dB.
-    pub mean_picture_db: f64,
-    /// `psnr_db` minus `mean_picture_db`, dB.
+    pub mean_image_db: f64,
+    /// `psnr_db` minus `mean_image_db`, dB.
     pub gain_db: f64,
     /// Mean structural similarity.
     pub ssim: f64,
     /// Mean PSNR inside the dynamic actors' pixels, where any is visible, dB.
     pub actor_db: Option<f64>,
     /// Images.
-    pub pictures: usize,
+    pub images: usize,
 }
 
 /// Largest number of images of one role.
@@ -76,15 +76,15 @@ const MOST_IMAGES: usize = 60;
 const PREDICTED: usize = 6;
 
 /// Computes the table, or returns the reason why it is missing.
-pub fn picture_table(subject: &Subject, on_progress: &dyn Fn(&Progress)) -> Result<PictureTable, String> {
+pub fn image_table(subject: &Subject, on_progress: &dyn Fn(&Progress)) -> Result<ImageTable, String> {
     let field = subject.probe.as_ref().map_err(Clone::clone)?.field();
     let states = subject.posed.scenario.state_count();
     let mut artist = Artist { field, renderer: FieldRenderer::new(subject.options.threads) };
-    let mut table = PictureTable { states: (0..states).map(|s| subject.state_name(s)).collect(), ..Default::default() };
+    let mut table = ImageTable { states: (0..states).map(|s| subject.state_name(s)).collect(), ..Default::default() };
     let tell = |done, line: &str| on_progress(&Progress { phase: "psnr", done, total: 4, line: line.to_owned() });
     tell(0, "from above");
     if let Some(above) = Above::of(subject) {
-        table.mean_picture_db = mean(&above.truths.iter().filter_map(|t| psnr_db(&above.mean, t)).collect::<Vec<_>>());
+        table.mean_image_db = mean(&above.truths.iter().filter_map(|t| psnr_db(&above.mean, t)).collect::<Vec<_>>());
         let toggled: Vec<Vec<[f32; LATENT_DIM]>> = subject.manifest.states.iter().map(|s| vec![s.mean]).collect();
         table.toggled = Some(above.images(subject, &mut artist, &toggled));
         tell(1, "forecasts from above");
@@ -157,10 +157,10 @@ impl Above {
         Some(Self { camera: posed.dataset.frames()[*indices.first()?].camera, truths, mean })
     }
 
-    fn images(&self, subject: &Subject, artist: &mut Artist, latents: &[Vec<[f32; LATENT_DIM]>]) -> FieldPictures {
+    fn images(&self, subject: &Subject, artist: &mut Artist, latents: &[Vec<[f32; LATENT_DIM]>]) -> FieldImages {
         let width = self.camera.width_px as usize;
         let [mut similar, mut actor, mut changed] = [(); 3].map(|()| Vec::new());
-        let mut table = FieldPictures::default();
+        let mut table = FieldImages::default();
         for (state, latents) in latents.iter().enumerate() {
             let truth = &self.truths[state];
             let within = actor_pixels(subject, state, &self.camera);
@@ -214,14 +214,14 @@ fn novel_views(subject: &Subject, artist: &mut Artist, role: PoseRole) -> Option
             actor.extend(psnr_where(&image, &truth, |v| within[v / 3] && valid(v / 3)));
         }
     }
-    let (psnr_db, mean_picture_db) = (mean(&psnr)?, mean(&of_mean)?);
+    let (psnr_db, mean_image_db) = (mean(&psnr)?, mean(&of_mean)?);
     Some(NovelViews {
         psnr_db,
-        mean_picture_db,
-        gain_db: psnr_db - mean_picture_db,
+        mean_image_db,
+        gain_db: psnr_db - mean_image_db,
         ssim: mean(&similar).unwrap_or(0.0),
         actor_db: mean(&actor),
-        pictures: chosen.len(),
+        images: chosen.len(),
     })
 }
 

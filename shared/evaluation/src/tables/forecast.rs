@@ -222,7 +222,7 @@ fn curves(subject: &Subject, open: &[Trial], sure: &[Trial]) -> RoleCurves {
         shown.any(|s| states.iter().any(|&other| posed.equivalence.same(view, s, other)))
     };
     let of = |trials: &[Trial], values: &dyn Fn(&Trial) -> Vec<f64>| -> Vec<TrialCurve> {
-        trials.iter().map(|t| TrialCurve { picture: t.input.image, values: values(t) }).collect()
+        trials.iter().map(|t| TrialCurve { image: t.input.image, values: values(t) }).collect()
     };
     let next_right =
         |t: &Trial| t.independent.iter().map(|s| looks_like_any(t, *s, &t.input.next)).collect::<Vec<bool>>();

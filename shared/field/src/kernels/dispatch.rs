@@ -55,7 +55,7 @@ impl InstructionSet {
 
     /// Returns the fastest instruction set of this processor for images: with products of the networks in bf16 where
     /// the processor has an instruction for them, else as [`Self::detect`].
-    pub fn detect_for_pictures() -> Self {
+    pub fn detect_for_images() -> Self {
         #[cfg(target_arch = "x86_64")]
         if Self::detect().0 == Set::Avx512
             && std::is_x86_feature_detected!("avx512bw")
@@ -234,7 +234,7 @@ pub(crate) fn dense_forward_bf16(
 ) {
     #[cfg(target_arch = "x86_64")]
     if set.0 == Set::Avx512Bf16 {
-        // SAFETY: `Set::Avx512Bf16` is only ever made by `detect_for_pictures`, after the processor reported
+        // SAFETY: `Set::Avx512Bf16` is only ever made by `detect_for_images`, after the processor reported
         // AVX-512F, AVX-512BW and AVX-512 BF16.
         unsafe { bf16::forward(layer, x, y, activation) }
     }
@@ -336,7 +336,7 @@ mod tests {
     /// also odd numbers, and more inputs than are packed at once. (Only where the processor has the instruction.)
     #[test]
     fn bf16_layers_are_the_sums_of_rounded_numbers() {
-        let set = InstructionSet::detect_for_pictures();
+        let set = InstructionSet::detect_for_images();
         if !set.is_bf16() {
             eprintln!("no bf16 instruction on this processor: not tested");
             return;

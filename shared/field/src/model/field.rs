@@ -136,7 +136,7 @@ impl Field {
     }
 
     /// Sets the instruction set that the kernels run on; a new field runs on [`InstructionSet::detect`]. Fields that
-    /// only render images may run on [`InstructionSet::detect_for_pictures`].
+    /// only render images may run on [`InstructionSet::detect_for_images`].
     pub fn set_instruction_set(&mut self, set: InstructionSet) {
         self.set = set;
         self.pairs.clear();

@@ -39,7 +39,7 @@ pub struct RenderBuffer {
 #[derive(Debug, Default)]
 pub struct HypothesisBuffer {
     /// One image for each latent.
-    pub pictures: Vec<RenderBuffer>,
+    pub images: Vec<RenderBuffer>,
     /// Rays that meet a cell in which the states differ, by index in the first image's rays.
     pub(super) changing: Vec<u32>,
     pub(super) rays: Vec<Ray>,

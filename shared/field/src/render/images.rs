@@ -88,9 +88,9 @@ impl Field {
         options: &RenderOptions,
         out: &mut HypothesisBuffer,
     ) {
-        let HypothesisBuffer { pictures, changing, rays, by_ray, pool } = out;
-        pictures.resize_with(latents.len(), RenderBuffer::default);
-        let Some((first, others)) = pictures.split_first_mut() else { return };
+        let HypothesisBuffer { images, changing, rays, by_ray, pool } = out;
+        images.resize_with(latents.len(), RenderBuffer::default);
+        let Some((first, others)) = images.split_first_mut() else { return };
         self.render_where(camera, &latents[0], selected, options, first);
         changing.clear();
         changing.extend((0..first.rays.len() as u32).filter(|i| first.by_ray.changing[*i as usize]));
@@ -188,16 +188,16 @@ mod tests {
         for threads in [1, 2] {
             let options = RenderOptions { threads, ..options };
             field.render_hypotheses(&camera(), &latents, &options, &mut buffer);
-            for (image, single) in buffer.pictures.iter().zip(&single) {
+            for (image, single) in buffer.images.iter().zip(&single) {
                 assert!(largest_difference(&image.rgb, single) < 1e-5);
             }
         }
         field.changing.set_from(|i| i % 16 < 8);
         field.render_hypotheses(&camera(), &latents, &options, &mut buffer);
-        let changing = buffer.pictures[0].changing.clone();
+        let changing = buffer.images[0].changing.clone();
         let share = changing.iter().filter(|c| **c).count();
         assert!(share > 20 && share + 20 < changing.len(), "{share} of {}", changing.len());
-        for (k, image) in buffer.pictures.iter().enumerate() {
+        for (k, image) in buffer.images.iter().enumerate() {
             let mut apart = 0;
             for (i, pixel) in image.rgb.chunks_exact(3).enumerate() {
                 let first = &single[0][3 * i..3 * i + 3];
@@ -209,7 +209,7 @@ mod tests {
         // Selected pixels have nearly the same colours, as other rays share their blocks of samples; the others are black.
         let mut some = HypothesisBuffer::default();
         field.render_hypotheses_where(&camera(), &latents, |i| i % 3 == 0, &options, &mut some);
-        for (all, some) in buffer.pictures.iter().zip(&some.pictures) {
+        for (all, some) in buffer.images.iter().zip(&some.images) {
             for (i, (all, some)) in all.rgb.chunks_exact(3).zip(some.rgb.chunks_exact(3)).enumerate() {
                 assert!(
                     if i % 3 == 0 { largest_difference(all, some) < 2e-2 } else { some == [0.0; 3] },
@@ -219,11 +219,11 @@ mod tests {
         }
         field.changing.set_from(|_| false);
         field.render_hypotheses(&camera(), &latents, &options, &mut buffer);
-        for image in &buffer.pictures {
+        for image in &buffer.images {
             assert_eq!(largest_difference(&image.rgb, &single[0]), 0.0);
         }
         field.render_hypotheses(&camera(), &[], &options, &mut buffer);
-        assert!(buffer.pictures.is_empty());
+        assert!(buffer.images.is_empty());
     }
 
     /// Samples of low weight take the mean colour of their ray's other samples: that hardly changes an image.

@@ -32,8 +32,8 @@ impl ConvNet {
 }
 
 impl Backbone for ConvNet {
-    fn features(&self, pictures: &Tensor) -> Tensor {
-        let x = (resize(pictures, self.input_px) - 0.5) * 4.0;
+    fn features(&self, images: &Tensor) -> Tensor {
+        let x = (resize(images, self.input_px) - 0.5) * 4.0;
         self.layers.iter().fold(x, |x, (conv, norm)| norm.forward(&conv.forward(&x)).relu())
     }
 

@@ -155,9 +155,9 @@ fn relu6(mut x: Tensor) -> Tensor {
 }
 
 impl Backbone for EfficientNetLite0 {
-    fn features(&self, pictures: &Tensor) -> Tensor {
+    fn features(&self, images: &Tensor) -> Tensor {
         // The published model's input is (byte - 127) / 128.
-        let x = resize(pictures, self.input_px) * (255.0 / 128.0) - 127.0 / 128.0;
+        let x = resize(images, self.input_px) * (255.0 / 128.0) - 127.0 / 128.0;
         let mut x = relu6(self.stem.forward(&x));
         for block in &self.blocks {
             let inner = block.expand.as_ref().map_or_else(|| x.shallow_clone(), |e| relu6(e.forward(&x)));

@@ -16,7 +16,7 @@ use tch::{Tensor, nn};
 /// A network from images to spatial features.
 pub trait Backbone: Send {
     /// Maps images `[N, 3, H, W]` in 0..=1, of any size, to `[N, channels, grid, grid]`.
-    fn features(&self, pictures: &Tensor) -> Tensor;
+    fn features(&self, images: &Tensor) -> Tensor;
     /// Returns the number of feature channels.
     fn channels(&self) -> i64;
     /// Returns the side of the feature map, in cells.
@@ -65,14 +65,14 @@ pub fn build(
 }
 
 /// Resizes images to a square of `side` pixels, bilinearly; images of that size are unchanged.
-pub(crate) fn resize(pictures: &Tensor, side: i64) -> Tensor {
-    let size = pictures.size();
+pub(crate) fn resize(images: &Tensor, side: i64) -> Tensor {
+    let size = images.size();
     if size[2] == side && size[3] == side {
-        pictures.shallow_clone()
+        images.shallow_clone()
     } else if size[2] > side || size[3] > side {
         // Averaging removes detail finer than the new pixels, to avoid aliasing.
-        pictures.internal_upsample_bilinear2d_aa([side, side], false, None, None)
+        images.internal_upsample_bilinear2d_aa([side, side], false, None, None)
     } else {
-        pictures.upsample_bilinear2d([side, side], false, None, None)
+        images.upsample_bilinear2d([side, side], false, None, None)
     }
 }

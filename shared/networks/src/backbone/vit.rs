@@ -267,9 +267,9 @@ impl Block {
 }
 
 impl Backbone for VisionTransformer {
-    fn features(&self, pictures: &Tensor) -> Tensor {
+    fn features(&self, images: &Tensor) -> Tensor {
         // timm's vision transformers take (x - 0.5) / 0.5.
-        let x = resize(pictures, self.input_px) * 2.0 - 1.0;
+        let x = resize(images, self.input_px) * 2.0 - 1.0;
         let n = x.size()[0];
         let tokens = self.patch.forward(&x).flatten(2, 3).transpose(1, 2);
         let class = self.class_token.expand([n, 1, self.width], false);
@@ -335,13 +335,13 @@ mod tests {
             };
             hugging.insert(renamed, t.shallow_clone());
         }
-        let picture = Tensor::rand([1, 3, 64, 64], (Kind::Float, Device::Cpu));
-        let expected = net.features(&picture);
+        let image = Tensor::rand([1, 3, 64, 64], (Kind::Float, Device::Cpu));
+        let expected = net.features(&image);
         assert_eq!(expected.size(), [1, 12, 4, 4]);
         for names in [&timm, &hugging] {
             let other = VarStore::new(Device::Cpu);
             let read = VisionTransformer::new(&other.root(), &tiny(), Some(names), 64).unwrap();
-            assert!(read.features(&picture).allclose(&expected, 1e-5, 1e-6, false));
+            assert!(read.features(&image).allclose(&expected, 1e-5, 1e-6, false));
             let heads_of_64 = VitConfig { heads: 1, ..tiny() };
             assert_eq!(VisionTransformer::shape_of(names).unwrap(), (heads_of_64, 64));
         }

@@ -1,6 +1,6 @@
 //! Closed-loop drives: the ego's way, its camera, and the vehicles that may come.
 
-use super::{clearance, in_range, range, vector, whole};
+use super::values::{clearance, in_range, range, vector, whole};
 use schemars::JsonSchema;
 use serde::de::Error as _;
 use serde::{Deserialize, Deserializer};

@@ -1,6 +1,7 @@
 //! Variations of a scenario: other views of the dynamic vehicle, and objects that its datasets do not contain.
 
-use super::{Colour, VehicleKind, colour, heading, point3, size3};
+use super::VehicleKind;
+use super::values::{Colour, colour, heading, point3, size3};
 use schemars::JsonSchema;
 use serde::Deserialize;
 
