@@ -1,6 +1,6 @@
 //! The occupancy grid: what each known state takes on the ground, weighed by the belief.
 
-use carff_checkpoint::{FieldProbe, OccupancyRates, StepRates};
+use carff_checkpoint::{FieldProbe, StepRates};
 use carff_decision::ProbeLayout;
 use carff_messages::{Belief, LATENT_DIM, MAX_CELLS, MAX_HORIZON, Occupancy, UnknownBox};
 
@@ -29,8 +29,8 @@ pub struct Grid {
     taken: Vec<Vec<f32>>,
     /// For each cell, true if its middle is on the lane of a vehicle that is a hazard.
     on_lane: Vec<bool>,
-    /// Rates on these cells at each step of the look-ahead.
-    rates: StepRates,
+    /// Rates on these cells at each step of the look-ahead; `None`: the known states hold exactly.
+    rates: Option<StepRates>,
 }
 
 impl Grid {
@@ -49,7 +49,7 @@ impl Grid {
             height_m: ((bounds_m[1][2] - bounds_m[0][2]) as f32).min(HIGHEST_M),
             taken: Vec::new(),
             on_lane: Vec::new(),
-            rates: rates.unwrap_or([OccupancyRates::EXACT; MAX_HORIZON as usize]),
+            rates,
         };
         grid.on_lane = (0..columns * rows).map(|cell| is_on_lane(probe.layout(), grid.middle_m(cell))).collect();
         let points = grid.points();
@@ -96,7 +96,7 @@ impl Grid {
     }
 
     /// Returns the grid of a belief. What is probable but unknown has no place, unless it is in one of the boxes; what
-    /// every state takes is taken. On the others' lane, what only some states take counts with the rates of the step.
+    /// every state takes is taken. On the others' lane, the rest counts with the rates of the step.
     pub fn occupancy(&self, belief: &Belief, unknown: &[UnknownBox]) -> Occupancy {
         let probabilities = &belief.state_probability[..self.taken.len().min(belief.state_probability.len())];
         let mut occupancy = Occupancy::empty(belief.header);
@@ -104,17 +104,19 @@ impl Grid {
         (occupancy.cell_m, occupancy.low_corner_m) = (self.cell_m as f32, self.low_corner_m.map(|v| v as f32));
         occupancy.unknown_probability = belief.unknown_probability;
         let other = (1.0 - probabilities.iter().sum::<f32>()).max(0.0);
-        let rates = self.rates[(belief.header.step.max(1) as usize - 1).min(MAX_HORIZON as usize - 1)];
+        let step = (belief.header.step.max(1) as usize - 1).min(MAX_HORIZON as usize - 1);
+        let rates = self.rates.map(|rates| rates[step]);
         for (cell, to) in occupancy.probability.iter_mut().take((self.columns * self.rows).min(MAX_CELLS)).enumerate() {
             let known: f32 = probabilities.iter().zip(&self.taken).map(|(p, taken)| p * taken[cell]).sum();
             let still = self.taken.iter().map(|taken| taken[cell]).fold(1.0, f32::min);
-            let mut taken = known + other * still;
-            if self.on_lane[cell] && still < 1.0 {
-                let moving = f64::from((taken - still) / (1.0 - still));
-                taken = still + (1.0 - still) * rates.of(moving) as f32;
-            }
+            let taken = known + other * still;
             let free = unknown.iter().filter(|b| self.is_in(cell, b)).map(|b| 1.0 - b.probability).product::<f32>();
-            *to = (1.0 - (1.0 - taken) * free).clamp(0.0, 1.0);
+            let mut occupied = 1.0 - (1.0 - taken) * free;
+            if let Some(rates) = rates.filter(|_| self.on_lane[cell] && still < 1.0) {
+                let moving = f64::from((occupied - still) / (1.0 - still));
+                occupied = still + (1.0 - still) * rates.of(moving) as f32;
+            }
+            *to = occupied.clamp(0.0, 1.0);
         }
         occupancy
     }
@@ -148,6 +150,7 @@ fn is_on_lane(layout: &ProbeLayout, [x, y]: [f64; 2]) -> bool {
 mod tests {
     use super::*;
     use carff_base::geometry::OrientedBox;
+    use carff_checkpoint::OccupancyRates;
     use carff_messages::Header;
 
     /// Two states on two cells: one takes the first cell; both take half of the second.
@@ -162,7 +165,7 @@ mod tests {
             height_m: 2.0,
             taken,
             on_lane: vec![true, false],
-            rates: [OccupancyRates::EXACT; MAX_HORIZON as usize],
+            rates: None,
         }
     }
 
@@ -187,7 +190,9 @@ mod tests {
     #[test]
     fn cells_on_the_lane_have_rates() {
         let mut grid = grid();
-        grid.rates[1] = OccupancyRates { where_free: 0.1, where_taken: 0.6 };
+        let mut rates = [OccupancyRates::EXACT; MAX_HORIZON as usize];
+        rates[1] = OccupancyRates { where_free: 0.1, where_taken: 0.6 };
+        grid.rates = Some(rates);
         let of_step = |grid: &Grid, step| {
             let mut belief = Belief::empty(Header::of_frame(1, 2, 3).at_step(step), 2);
             belief.state_count = 2;
