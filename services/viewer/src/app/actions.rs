@@ -114,7 +114,7 @@ impl Viewer {
         }
     }
 
-    /// Shows the scene of the current image before any forecast, or of the chosen image if there is no current one.
+    /// Shows the current image's scene, without a forecast. Without a current image, it shows the chosen one's.
     fn toggle(&mut self) -> Result<(), String> {
         if std::mem::take(&mut self.is_following) {
             // The graph supplied the posterior.
