@@ -76,6 +76,8 @@ fn severities_grow() {
             let series: Vec<&[f64]> = match corruption {
                 Corruption::Frost => vec![&distances[..3], &distances[3..]],
                 Corruption::ElasticTransform | Corruption::Snow => vec![&distances[..2], &distances[2..]],
+                // The largest shift is beyond the street's own pattern.
+                Corruption::TurnedCamera => vec![&distances[..4]],
                 _ => vec![&distances],
             };
             for series in series {

@@ -1,6 +1,8 @@
 //! Render and compare: every known state is rendered from the camera's own pose and compared with the image.
 
+use crate::align::{View, align};
 use crate::blobs::{Blob, blobs};
+use crate::fit::{Fit, LEAST_NOISE, fit, median};
 use crate::lanes::{ErrorMap, Ground, Lanes};
 use carff_base::geometry::PinholeCamera;
 use carff_field::{Field, HypothesisBuffer, RenderBuffer, RenderOptions};
@@ -19,41 +21,19 @@ const QUICK: RenderOptions =
 const PLACE_STEP_PX: usize = 4;
 /// Largest difference that counts in that comparison, of 1: a vehicle that covers a part of the view is not a place.
 const PLACE_CAP: f32 = 0.25;
-/// Passes of the robust fit of gain and offset.
-const PASSES: usize = 5;
-/// Pixels beyond this many robust deviations do not count in the fit.
-const TRIM: f32 = 2.5;
-/// Smallest deviation of a pixel, of 1.
-const LEAST_NOISE: f32 = 0.015;
-/// Fewest pixels of a fit.
-const FEWEST: f64 = 16.0;
-/// A robust deviation is the median times this, for normally distributed values.
-const OF_MEDIAN: f32 = 1.4826;
-
-/// Gain and offset of a camera against the field, by channel, and what is left.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Fit {
-    /// Factor from rendered to seen values.
-    pub gain: [f32; 3],
-    /// Offset from rendered to seen values, of 1.
-    pub offset: [f32; 3],
-    /// Robust deviation of a pixel, of 1.
-    pub noise: f32,
-    /// Share of the view's variation that the still parts of the field explain, at most 1; 0 or below for a view of
-    /// another place, or from another pose. 1 where the view shows no still part.
-    pub explained: f32,
-}
+/// A moved image counts if it leaves less than this share of what the image leaves unexplained.
+const BETTER: f32 = 0.7;
 
 /// An image with its residuals under the known states, at the compared size.
 #[derive(Clone, Debug)]
 pub struct Comparison {
     /// The camera at the compared size.
     pub camera: PinholeCamera,
-    /// The image, 0..=1, RGB, row by row.
+    /// The image, 0..=1, RGB, row by row; not numbers where a moved image does not show the rendered view.
     pub image: Vec<f32>,
     /// Gain, offset and noise of the image.
     pub fit: Fit,
-    /// For each pixel, the ground that it looks at.
+    /// For each rendered pixel, the ground that it looks at.
     pub ground: Vec<Option<Ground>>,
     /// True for pixels that were compared.
     pub judged: Vec<bool>,
@@ -104,21 +84,57 @@ impl Comparer {
             return None;
         }
         let judged = grown(&seen, width, MARGIN_PX);
-        let is_sample = |i: usize| i % width % PLACE_STEP_PX == 1 && i / width % PLACE_STEP_PX == 1;
         let is_shown = |(camera, pixels, of): &(PinholeCamera, Vec<bool>, Vec<_>)| {
             *camera == small && *pixels == judged && of == states
         };
         if !self.shown.as_ref().is_some_and(is_shown) {
             let options = RenderOptions { threads: threads.max(1), ..QUICK };
-            field.render_hypotheses_where(&small, states, |i| judged[i] || is_sample(i), &options, &mut self.buffer);
+            field.render_hypotheses_where(
+                &small,
+                states,
+                |i| judged[i] || is_sample(i, width),
+                &options,
+                &mut self.buffer,
+            );
             self.shown = Some((small, judged.clone(), states.to_vec()));
         }
-        let images = &self.buffer.images;
-        let image = reduced(image, width, height);
-        let is_still = |i: usize| !images[0].changing[i];
+        Some(self.compared(small, reduced(image, width, height), ground, judged, lanes))
+    }
+
+    /// Compares the image of the last comparison again, moved to where its place is rendered: the pose or the lens may
+    /// have a small error. `None` if the moved image does not fit the place much better, or shows less than half of the
+    /// lanes.
+    pub fn align(&self, last: &Comparison, lanes: &Lanes) -> Option<Comparison> {
+        let shown = self.buffer.images.first()?;
+        let (width, height) = (last.camera.width_px as usize, last.camera.height_px as usize);
+        let is_still = |&i: &usize| (last.judged[i] || is_sample(i, width)) && !shown.changing[i];
+        let still: Vec<usize> = (0..last.judged.len()).filter(is_still).collect();
+        let moved = align(View { rgb: &last.image, width, height }, &shown.rgb, &still)?;
+        let aligned = self.compared(last.camera, moved, last.ground.clone(), last.judged.clone(), lanes);
+        let left = |of: &Comparison| 1.0 - of.fit.explained;
+        let on_lanes = |of: &Comparison| of.on_lanes(0).count();
+        let is_better = left(&aligned) < BETTER * left(last) && 2 * on_lanes(&aligned) >= on_lanes(last);
+        is_better.then_some(aligned)
+    }
+
+    /// Compares an image at the compared size with the rendered states. Pixels whose values are not numbers do not count.
+    fn compared(
+        &self,
+        camera: PinholeCamera,
+        image: Vec<f32>,
+        ground: Vec<Option<Ground>>,
+        mut judged: Vec<bool>,
+        lanes: &Lanes,
+    ) -> Comparison {
+        let (images, width) = (&self.buffer.images, camera.width_px as usize);
+        judged.iter_mut().zip(image.chunks_exact(3)).for_each(|(judged, rgb)| *judged &= !rgb[0].is_nan());
+        let still = |counts: &dyn Fn(usize) -> bool| -> Vec<usize> {
+            let is_still = |&i: &usize| counts(i) && !images[0].changing[i] && !image[i * 3].is_nan();
+            (0..judged.len()).filter(is_still).collect()
+        };
         let fit = Fit {
-            explained: explained(&image, &images[0].rgb, |i| is_sample(i) && is_still(i)),
-            ..fit(&image, &images[0].rgb, |i| judged[i] && is_still(i))
+            explained: explained(&image, &images[0].rgb, &still(&|i| is_sample(i, width))),
+            ..fit(&image, &images[0].rgb, &still(&|i| judged[i]))
         };
         let energy = |rendered: &RenderBuffer| energy(&image, &rendered.rgb, &fit, &judged, width);
         let energies: Vec<Vec<f32>> = images.iter().map(energy).collect();
@@ -126,19 +142,24 @@ impl Comparer {
         let of_state = |(state, energy): (usize, &Vec<f32>)| {
             let mut energy = energy.clone();
             // The place of the vehicle itself varies, and nothing else can be there.
-            for i in lanes.own_pixels(&small, state, &pixels) {
+            for i in lanes.own_pixels(&camera, state, &pixels) {
                 energy[i] = 0.0;
             }
             smoothed(&energy, &judged, width, fit.noise)
         };
         let residuals: Vec<Vec<f32>> = energies.iter().enumerate().map(of_state).collect();
-        Some(Comparison { camera: small, image, fit, ground, judged, residuals })
+        Comparison { camera, image, fit, ground, judged, residuals }
     }
 
     /// The rendered states of the last comparison, RGB, 0..=1, row by row; pixels that were not compared are black.
     pub fn rendered(&self) -> impl Iterator<Item = &[f32]> {
         self.buffer.images.iter().map(|image| image.rgb.as_slice())
     }
+}
+
+/// Reports whether a pixel of a view of this width is one of those that show whether the view is of this place.
+fn is_sample(i: usize, width: usize) -> bool {
+    i % width % PLACE_STEP_PX == 1 && i / width % PLACE_STEP_PX == 1
 }
 
 /// The same camera at the compared size.
@@ -181,42 +202,14 @@ fn grown(marked: &[bool], width: usize, margin: usize) -> Vec<bool> {
     out
 }
 
-fn median(values: &mut [f32]) -> f32 {
-    if values.is_empty() {
-        return 0.0;
-    }
-    let middle = values.len() / 2;
-    *values.select_nth_unstable_by(middle, f32::total_cmp).1
-}
-
-/// Fits gain and offset of each channel by least squares over the pixels that count, without outliers.
-fn fit(image: &[f32], rendered: &[f32], counts: impl Fn(usize) -> bool) -> Fit {
-    let (mut gain, mut offset, mut noise) = ([1.0; 3], [0.0; 3], [LEAST_NOISE; 3]);
-    for c in 0..3 {
-        let of_channel = (0..image.len() / 3).filter(|&i| counts(i)).map(|i| (rendered[i * 3 + c], image[i * 3 + c]));
-        let pairs: Vec<(f32, f32)> = of_channel.collect();
-        let mut limit = f32::INFINITY;
-        for _ in 0..PASSES {
-            let error = |(x, y): (f32, f32)| (y - gain[c] * x - offset[c]).abs();
-            let Some(line) = line(pairs.iter().copied().filter(|pair| error(*pair) <= limit)) else { break };
-            (gain[c], offset[c]) = line;
-            let mut errors: Vec<f32> = pairs.iter().map(|(x, y)| (y - line.0 * x - line.1).abs()).collect();
-            noise[c] = OF_MEDIAN * median(&mut errors);
-            limit = (TRIM * noise[c]).max(LEAST_NOISE);
-        }
-    }
-    let noise = (noise.iter().map(|v| v * v).sum::<f32>() / 3.0).sqrt().max(LEAST_NOISE);
-    Fit { gain, offset, noise, explained: 1.0 }
-}
-
 /// Share of an image's variation, over the pixels that count, that a gain and an offset of the rendered one explain.
 /// The gain is at least 0: an inverted image shows another place.
-fn explained(image: &[f32], rendered: &[f32], counts: impl Fn(usize) -> bool) -> f32 {
-    let fit = fit(image, rendered, &counts);
+fn explained(image: &[f32], rendered: &[f32], pixels: &[usize]) -> f32 {
+    let fit = fit(image, rendered, pixels);
     let capped = |difference: f32| difference.abs().min(PLACE_CAP).powi(2);
     let (mut left, mut all, mut least) = (0.0, 0.0, 0.0);
     for c in 0..3 {
-        let seen = || (0..image.len() / 3).filter(|&i| counts(i)).map(|i| (rendered[i * 3 + c], image[i * 3 + c]));
+        let seen = || pixels.iter().map(|&i| (rendered[i * 3 + c], image[i * 3 + c]));
         let middle = median(&mut seen().map(|(_, y)| y).collect::<Vec<_>>());
         let gain = fit.gain[c].max(0.0);
         left += seen().map(|(x, y)| capped(y - gain * x - fit.offset[c])).sum::<f32>();
@@ -229,25 +222,6 @@ fn explained(image: &[f32], rendered: &[f32], counts: impl Fn(usize) -> bool) ->
         least if all < least => 0.0,
         _ => 1.0 - left / all,
     }
-}
-
-/// Slope and offset of the line of least squares; `None` for too few points or equal ones.
-fn line(pairs: impl Iterator<Item = (f32, f32)>) -> Option<(f32, f32)> {
-    let [mut n, mut sx, mut sy, mut sxx, mut sxy] = [0.0_f64; 5];
-    for (x, y) in pairs {
-        let (x, y) = (f64::from(x), f64::from(y));
-        n += 1.0;
-        sx += x;
-        sy += y;
-        sxx += x * x;
-        sxy += x * y;
-    }
-    let spread = n * sxx - sx * sx;
-    if n < FEWEST || spread <= 1e-6 {
-        return None;
-    }
-    let slope = (n * sxy - sx * sy) / spread;
-    Some((slope as f32, ((sy - slope * sx) / n) as f32))
 }
 
 /// Pixels of a 3 x 3 neighbourhood that were compared.
@@ -285,18 +259,6 @@ mod tests {
     use super::*;
     use ndarray::Array3;
 
-    /// Gain and offset are found with a ninth of the pixels covered by something else.
-    #[test]
-    fn the_fit_is_robust() {
-        let rendered: Vec<f32> = (0..900).map(|i| 0.1 + 0.8 * ((i * 37 % 100) as f32) / 100.0).collect();
-        let image: Vec<f32> =
-            rendered.iter().enumerate().map(|(i, v)| if i / 3 % 9 < 1 { 0.95 } else { 0.6 * v + 0.2 }).collect();
-        let fit = fit(&image, &rendered, |_| true);
-        for c in 0..3 {
-            assert!((fit.gain[c] - 0.6).abs() < 0.05 && (fit.offset[c] - 0.2).abs() < 0.05, "{fit:?}");
-        }
-    }
-
     /// A view of this place is explained in any exposure and with a ninth of it covered; another image, a negative and a
     /// uniform one are not.
     #[test]
@@ -304,7 +266,7 @@ mod tests {
         let rendered: Vec<f32> = (0..900).map(|i| 0.1 + 0.8 * ((i / 3 * 37 % 100) as f32) / 100.0).collect();
         let explained = |of: &dyn Fn(usize, f32) -> f32| {
             let image: Vec<f32> = rendered.iter().enumerate().map(|(i, v)| of(i, *v)).collect();
-            explained(&image, &rendered, |_| true)
+            explained(&image, &rendered, &(0..300).collect::<Vec<_>>())
         };
         assert!(explained(&|_, v| 0.6 * v + 0.2) > 0.99);
         assert!(explained(&|i, v| if i / 3 % 9 < 1 { 0.95 } else { v }) > 0.7);
@@ -315,6 +277,45 @@ mod tests {
         ] {
             assert!(share < 0.2, "{share}");
         }
+    }
+
+    /// A view that has shifted is moved to where it belongs if it then still shows half of the lanes; another view, and
+    /// one that fits as it is, are not moved.
+    #[test]
+    fn shifted_views_are_aligned() {
+        let side = 48;
+        let view = |du: f32| -> Vec<f32> {
+            let of_pixel = |i: usize| {
+                let (x, y) = ((i % side) as f32 + du, (i / side) as f32);
+                let wave = (0.23 * x).sin() * (0.19 * y + 0.5).cos() + 0.5 * (0.41 * y - 0.13 * x).sin();
+                [0.5 + 0.2 * wave, 0.45 + 0.2 * wave, 0.4 + 0.15 * wave]
+            };
+            (0..side * side).flat_map(of_pixel).collect()
+        };
+        let mut rendered = RenderBuffer::default();
+        (rendered.rgb, rendered.changing) = (view(0.0), vec![false; side * side]);
+        let mut comparer = Comparer::default();
+        comparer.buffer.images = vec![rendered];
+        let camera = PinholeCamera::look_at([0.0, -8.0, 6.0], [0.0; 3], [0.0, 0.0, 1.0], 48, 48, 60.0);
+        let lanes = Lanes {
+            areas: Vec::new(),
+            ground_m: 0.0,
+            bounds_m: [[-9.0, -9.0], [9.0, 9.0]],
+            nearest_m: 1.0,
+            own: Vec::new(),
+        };
+        let aligned = |image: Vec<f32>, lane_px: std::ops::Range<usize>| {
+            let is_lane = |i: usize| lane_px.contains(&(i % side));
+            let ground = |i| is_lane(i).then_some(Ground { distance_m: 5.0, at_m: [0.0; 2], on_lanes: true });
+            let (ground, judged) = (0..side * side).map(|i| (ground(i), is_lane(i))).unzip();
+            let last = comparer.compared(camera, image, ground, judged, &lanes);
+            (last.fit.explained, comparer.align(&last, &lanes).map(|moved| moved.fit.explained))
+        };
+        let (before, after) = aligned(view(4.0), 0..48);
+        assert!(before < 0.8 && after.is_some_and(|share| share > 0.97), "{before} {after:?}");
+        assert_eq!(aligned(view(4.0), 0..4).1, None, "the lane is out of view");
+        assert_eq!(aligned(view(0.0), 0..48).1, None, "nothing is left to explain");
+        assert_eq!(aligned(view(23.0), 0..48).1, None, "another view");
     }
 
     /// A patch that the rendered image does not have is the only residual; a shift by one pixel leaves none.

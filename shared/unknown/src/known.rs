@@ -127,7 +127,13 @@ impl Known {
         threads: usize,
     ) -> Option<(Seen, Comparison)> {
         let comparison = comparer.compare(field, states, &self.lanes, camera, image, threads)?;
-        Some((self.judge(&comparison), comparison))
+        let seen = self.judge(&comparison);
+        if seen.residual <= 1.0 {
+            return Some((seen, comparison));
+        }
+        // Before something unknown is suspected, the pose is: a camera that has turned a little leaves residuals, too.
+        let Some(aligned) = comparer.align(&comparison, &self.lanes) else { return Some((seen, comparison)) };
+        Some((self.judge(&aligned), aligned))
     }
 
     /// Judges a comparison. No state explains a view of another place, and nothing has a box in it.

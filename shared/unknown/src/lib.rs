@@ -3,22 +3,27 @@
 //! | module | content |
 //! |---|---|
 //! | `compare` | every known state, rendered from the camera's own pose and compared with the image |
+//! | `align` | errors of pose and lens, and veils, that a comparison takes out of an image |
+//! | `fit` | robust fits of an image to a rendered one |
 //! | `lanes` | the ground on which something unknown counts |
 //! | `blobs` | connected residuals: their size, and the place on the ground where they stand |
 //! | `known` | the limits of the known, calibrated on images without anything unknown, and their file |
 //! | `sight` | which of the known states would look the same from a pose ahead |
 //! | `camera` | the condition of a camera, from its images |
 
+mod align;
 mod blobs;
 mod camera;
 mod compare;
+mod fit;
 mod known;
 mod lanes;
 mod sight;
 
 pub use blobs::Blob;
 pub use camera::{CameraCheck, CameraLimits, Measured, Measurement};
-pub use compare::{Comparer, Comparison, Fit};
+pub use compare::{Comparer, Comparison};
+pub use fit::Fit;
 pub use known::{Known, KnownError, KnownLimits, Seen};
 pub use lanes::{ErrorMap, Ground, Lanes, OwnBox};
 pub use sight::Sight;

@@ -17,6 +17,8 @@ const BLOT_EDGE: f32 = 0.55;
 const NARROW: [f32; 5] = [1.1, 1.2, 1.35, 1.55, 1.8];
 /// Barrel distortion: relative loss of magnification from the middle to the corner.
 const BARREL: [f32; 5] = [0.1, 0.2, 0.35, 0.55, 0.8];
+/// Shift of a turned camera's view, share of the longer side.
+const TURNED: [f32; 5] = [0.01, 0.02, 0.035, 0.05, 0.07];
 /// All orders of the channels but the usual one.
 const ORDERS: [[usize; 3]; 5] = [[0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]];
 
@@ -59,6 +61,12 @@ pub(super) fn narrow(raster: &Raster<3>, level: usize) -> Raster<3> {
 
 pub(super) fn barrel(raster: &Raster<3>, level: usize) -> Raster<3> {
     magnified(raster, |away| (1.0 + BARREL[level] * away * away) / (1.0 + BARREL[level]))
+}
+
+pub(super) fn turned(raster: &Raster<3>, level: usize, rng: &mut impl Rng) -> Raster<3> {
+    let shift = TURNED[level] * raster.width.max(raster.height) as f32;
+    let (sin, cos) = rng.random_range(-std::f32::consts::PI..=std::f32::consts::PI).sin_cos();
+    raster.like(|x, y| raster.sample(x as f32 + shift * cos, y as f32 + shift * sin))
 }
 
 /// Samples the raster at pixels whose distance from the middle is multiplied by a factor of the distance itself, 0 in

@@ -69,6 +69,8 @@ pub enum Corruption {
     NarrowLens,
     /// Barrel distortion that the camera does not report.
     BarrelDistortion,
+    /// A shifted view: the camera has turned from the pose that it reports.
+    TurnedCamera,
 }
 
 /// Reason why an image cannot be corrupted.
@@ -106,7 +108,7 @@ pub enum CorruptionError {
 
 impl Corruption {
     /// All corruptions; the first fifteen are those of ImageNet-C.
-    pub const ALL: [Self; 21] = [
+    pub const ALL: [Self; 22] = [
         Self::GaussianNoise,
         Self::ShotNoise,
         Self::ImpulseNoise,
@@ -128,6 +130,7 @@ impl Corruption {
         Self::ChannelSwap,
         Self::NarrowLens,
         Self::BarrelDistortion,
+        Self::TurnedCamera,
     ];
 
     /// Returns the name in files and tables.
@@ -154,6 +157,7 @@ impl Corruption {
             Self::ChannelSwap => "channel_swap",
             Self::NarrowLens => "narrow_lens",
             Self::BarrelDistortion => "barrel_distortion",
+            Self::TurnedCamera => "turned_camera",
         }
     }
 
@@ -225,6 +229,7 @@ impl Corruption {
             Self::ChannelSwap => lens::channel_swap(source, rng),
             Self::NarrowLens => lens::narrow(&source, level),
             Self::BarrelDistortion => lens::barrel(&source, level),
+            Self::TurnedCamera => lens::turned(&source, level, rng),
         };
         Ok(corrupted.into_image())
     }

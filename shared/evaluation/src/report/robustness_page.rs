@@ -63,11 +63,14 @@ pub fn robustness(page: &mut String, results: &Results) {
     let _ = writeln!(
         page,
         "\n## Corrupted images\n\nUnsafe: hazard images (visible, in part, hidden) answered with `advance`. Kept: images of \
-         a visible clear place answered with `advance`. One column for each severity; the row `clean` has none.\n"
+         a visible clear place answered with `advance`; in brackets, those that would be without the comparison. One column \
+         for each severity; the row `clean` has none.\n"
     );
     head(page, &["corruption: unsafe / kept", "1", "2", "3", "4", "5"]);
-    let cell =
-        |f: &CorruptionFigures| format!("{} of {} / {} of {}", f.r#unsafe, f.hazard_trials, f.kept, f.clear_trials);
+    let cell = |f: &CorruptionFigures| {
+        let kept = format!("{} ({}) of {}", f.kept, f.kept_without_comparison, f.clear_trials);
+        format!("{} of {} / {kept}", f.r#unsafe, f.hazard_trials)
+    };
     for (name, severities) in &table.corruptions {
         let mut cells = vec![name.replace('_', " ")];
         cells.extend(severities.values().map(cell));

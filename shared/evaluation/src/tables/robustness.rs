@@ -81,6 +81,12 @@ pub struct CorruptionFigures {
     pub hazard_trials: usize,
     /// Clear images answered with `advance`.
     pub kept: usize,
+    /// Clear images that would be answered with `advance` without the comparison with the known states.
+    #[serde(default)]
+    pub kept_without_comparison: usize,
+    /// Clear images that the check of the camera refuses.
+    #[serde(default)]
+    pub refused: usize,
     /// Images of a visible clear place.
     pub clear_trials: usize,
 }
@@ -113,6 +119,7 @@ struct Shot<'a> {
 
 /// The decision on one image.
 struct Verdict {
+    usable: bool,
     advances: bool,
     advances_without_comparison: bool,
     probability: f64,
@@ -231,6 +238,8 @@ impl Judge<'_> {
             } else {
                 figures.clear_trials += 1;
                 figures.kept += usize::from(verdict.advances);
+                figures.kept_without_comparison += usize::from(verdict.advances_without_comparison);
+                figures.refused += usize::from(!verdict.usable);
             }
         }
         Ok(figures)
@@ -256,6 +265,7 @@ impl Judge<'_> {
         let verdict = |((with, without), usable): ((_, _), bool)| {
             let advances = |evidence| usable && !self.policy.decide(evidence).halt;
             Verdict {
+                usable,
                 advances: advances(with),
                 advances_without_comparison: advances(without),
                 probability: if usable { with.hazard_or_unknown_probability() } else { 1.0 },

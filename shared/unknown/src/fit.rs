@@ -1,0 +1,125 @@
+//! Robust fits: gain and offset of an image against a rendered one, and least squares.
+
+/// Passes of the robust fit of gain and offset.
+const PASSES: usize = 5;
+/// Pixels beyond this many robust deviations do not count in the fit.
+const TRIM: f32 = 2.5;
+/// Smallest deviation of a pixel, of 1.
+pub(crate) const LEAST_NOISE: f32 = 0.015;
+/// Fewest points of a fit.
+const FEWEST: f64 = 16.0;
+/// A robust deviation is the median times this, for normally distributed values.
+const OF_MEDIAN: f32 = 1.4826;
+
+/// Gain and offset of a camera against the field, by channel, and what is left.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Fit {
+    /// Factor from rendered to seen values.
+    pub gain: [f32; 3],
+    /// Offset from rendered to seen values, of 1.
+    pub offset: [f32; 3],
+    /// Robust deviation of a pixel, of 1.
+    pub noise: f32,
+    /// Share of the view's variation that the still parts of the field explain, at most 1; 0 or below for a view of
+    /// another place, or from another pose. 1 where the view shows no still part.
+    pub explained: f32,
+}
+
+pub(crate) fn median(values: &mut [f32]) -> f32 {
+    if values.is_empty() {
+        return 0.0;
+    }
+    let middle = values.len() / 2;
+    *values.select_nth_unstable_by(middle, f32::total_cmp).1
+}
+
+/// Fits gain and offset of each channel by least squares over some pixels, without outliers.
+pub(crate) fn fit(image: &[f32], rendered: &[f32], pixels: &[usize]) -> Fit {
+    let (mut gain, mut offset, mut noise) = ([1.0; 3], [0.0; 3], [LEAST_NOISE; 3]);
+    for c in 0..3 {
+        let pairs: Vec<(f32, f32)> = pixels.iter().map(|&i| (rendered[i * 3 + c], image[i * 3 + c])).collect();
+        let mut limit = f32::INFINITY;
+        for _ in 0..PASSES {
+            let error = |(x, y): (f32, f32)| (y - gain[c] * x - offset[c]).abs();
+            let within = pairs.iter().copied().filter(|pair| error(*pair) <= limit);
+            let Some(line) = least_squares(within.map(|(x, y)| ([x, 1.0], y))) else { break };
+            [gain[c], offset[c]] = line;
+            let mut errors: Vec<f32> = pairs.iter().map(|(x, y)| (y - line[0] * x - line[1]).abs()).collect();
+            noise[c] = OF_MEDIAN * median(&mut errors);
+            limit = (TRIM * noise[c]).max(LEAST_NOISE);
+        }
+    }
+    let noise = (noise.iter().map(|v| v * v).sum::<f32>() / 3.0).sqrt().max(LEAST_NOISE);
+    Fit { gain, offset, noise, explained: 1.0 }
+}
+
+/// Solves for the factors of N terms, by least squares over rows of terms and their value; `None` for too few rows or
+/// dependent terms.
+pub(crate) fn least_squares<const N: usize>(rows: impl Iterator<Item = ([f32; N], f32)>) -> Option<[f32; N]> {
+    let (mut count, mut matrix, mut right) = (0.0, [[0.0_f64; N]; N], [0.0_f64; N]);
+    for (row, value) in rows {
+        count += 1.0;
+        let row = row.map(f64::from);
+        for i in 0..N {
+            right[i] += row[i] * f64::from(value);
+            for j in 0..N {
+                matrix[i][j] += row[i] * row[j];
+            }
+        }
+    }
+    if count < FEWEST {
+        return None;
+    }
+    // Elimination with the largest pivot.
+    let least = 1e-9 * count;
+    for column in 0..N {
+        let pivot = (column..N).max_by(|&a, &b| matrix[a][column].abs().total_cmp(&matrix[b][column].abs()))?;
+        if matrix[pivot][column].abs() <= least {
+            return None;
+        }
+        matrix.swap(column, pivot);
+        right.swap(column, pivot);
+        let (pivot_row, pivot_right) = (matrix[column], right[column]);
+        for (row, right) in matrix.iter_mut().zip(&mut right).skip(column + 1) {
+            let factor = row[column] / pivot_row[column];
+            row.iter_mut().zip(pivot_row).for_each(|(term, of_pivot)| *term -= factor * of_pivot);
+            *right -= factor * pivot_right;
+        }
+    }
+    let mut found = [0.0; N];
+    for row in (0..N).rev() {
+        let known: f64 = (row + 1..N).map(|k| matrix[row][k] * found[k]).sum();
+        found[row] = (right[row] - known) / matrix[row][row];
+    }
+    Some(found.map(|v| v as f32))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Gain and offset are found with a ninth of the pixels covered by something else.
+    #[test]
+    fn the_fit_is_robust() {
+        let rendered: Vec<f32> = (0..900).map(|i| 0.1 + 0.8 * ((i * 37 % 100) as f32) / 100.0).collect();
+        let image: Vec<f32> =
+            rendered.iter().enumerate().map(|(i, v)| if i / 3 % 9 < 1 { 0.95 } else { 0.6 * v + 0.2 }).collect();
+        let fit = fit(&image, &rendered, &(0..300).collect::<Vec<_>>());
+        for c in 0..3 {
+            assert!((fit.gain[c] - 0.6).abs() < 0.05 && (fit.offset[c] - 0.2).abs() < 0.05, "{fit:?}");
+        }
+    }
+
+    /// Factors are found exactly where the values have no noise; too few rows and dependent terms have none.
+    #[test]
+    fn least_squares_are_solved() {
+        let row = |i: usize| {
+            let x = i as f32 / 10.0;
+            ([1.0, x, x * x], 2.0 - 3.0 * x + 0.5 * x * x)
+        };
+        let found = least_squares((0..40).map(row)).unwrap();
+        assert!(found.iter().zip([2.0, -3.0, 0.5]).all(|(a, b)| (a - b).abs() < 1e-3), "{found:?}");
+        assert_eq!(least_squares((0..15).map(row)), None);
+        assert_eq!(least_squares((0..40).map(|i| ([i as f32, 2.0 * i as f32], 1.0))), None);
+    }
+}
