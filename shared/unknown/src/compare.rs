@@ -280,7 +280,7 @@ mod tests {
     }
 
     /// A view that has shifted is moved to where it belongs if it then still shows half of the lanes; another view, and
-    /// one that fits as it is, are not moved.
+    /// one that already fits, are not moved.
     #[test]
     fn shifted_views_are_aligned() {
         let side = 48;
