@@ -102,10 +102,10 @@ impl Comparer {
     }
 
     /// Compares the image of the last comparison again, moved to where its place is rendered: the pose or the lens may
-    /// have a small error. `None` if the moved image does not fit the place much better, or shows less than half of the
-    /// lanes.
+    /// have a small error. `None` if the moved image does not fit the place much better, if it shows less than half of the
+    /// lanes, or if `last` is larger than the rendered states.
     pub fn align(&self, last: &Comparison, lanes: &Lanes) -> Option<Comparison> {
-        let shown = self.buffer.images.first()?;
+        let shown = self.buffer.images.first().filter(|shown| shown.changing.len() >= last.judged.len())?;
         let (width, height) = (last.camera.width_px as usize, last.camera.height_px as usize);
         let is_still = |&i: &usize| (last.judged[i] || is_sample(i, width)) && !shown.changing[i];
         let still: Vec<usize> = (0..last.judged.len()).filter(is_still).collect();

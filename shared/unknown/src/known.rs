@@ -117,7 +117,8 @@ impl Known {
         }
     }
 
-    /// Compares an image with the known states. `None` if the camera sees no lane.
+    /// Compares an image with the known states; one that leaves something unexplained is aligned first. `None` if the
+    /// camera sees no lane.
     pub fn see(
         &self,
         comparer: &mut Comparer,
