@@ -15,7 +15,7 @@ use carff_evaluation::{PosedImages, Progress};
 use carff_field::{Field, InstructionSet};
 use carff_messages::LATENT_DIM;
 use carff_scenes::Scenario;
-use carff_unknown::{CameraLimits, Comparer, Comparison, Known, Lanes, Measured, OwnBox};
+use carff_unknown::{CameraLimits, Comparer, Comparison, Known, KnownScene, Lanes, Measured, OwnBox};
 use std::path::Path;
 
 /// Part of the seed of these images, so that they share no draws with training, thresholds or evaluation.
@@ -52,7 +52,9 @@ pub fn calibrate_known(input: KnownInput, on_progress: &dyn Fn(&Progress)) -> Re
     let mut field = load_field(input.checkpoint, &manifest)?;
     field.set_instruction_set(InstructionSet::detect_for_images());
     let posed = PosedImages::open(input.dataset, manifest.split.seed)?;
+    let hazard_states = manifest.scenario.hazard_states();
     let mut work = Work {
+        hazard_states: hazard_states.clone(),
         lanes: lanes(&manifest, &field, input.scenario),
         states: manifest.states.iter().map(|state| state.mean).collect(),
         field,
@@ -64,7 +66,6 @@ pub fn calibrate_known(input: KnownInput, on_progress: &dyn Fn(&Progress)) -> Re
         Some(scenario) => work.free_poses(scenario, input.free_poses, on_progress)?,
         None => work.trained_poses(&posed, on_progress),
     };
-    let hazard_states = manifest.scenario.hazard_states();
     let mut known = Known::fit(work.lanes.clone(), hazard_states, &comparisons, camera_limits(&posed, work.seed));
     if input.scenario.is_none() {
         known.clear.limit *= TRAINED_POSES;
@@ -77,6 +78,7 @@ pub fn calibrate_known(input: KnownInput, on_progress: &dyn Fn(&Progress)) -> Re
 struct Work {
     lanes: Lanes,
     states: Vec<[f32; LATENT_DIM]>,
+    hazard_states: Vec<bool>,
     field: Field,
     seed: u64,
     threads: usize,
@@ -116,8 +118,8 @@ impl Work {
     /// Compares an image with sensor noise.
     fn compare(&mut self, camera: &PinholeCamera, image: &Image, number: usize) -> Option<Comparison> {
         let noisy = noisy(image, Key::named("knwn", self.seed, number as u64));
-        let Self { lanes, states, field, threads, comparer, .. } = self;
-        comparer.compare(field, states, lanes, camera, noisy.view()?, *threads)
+        let Self { lanes, states, hazard_states, field, threads, comparer, .. } = self;
+        comparer.compare(KnownScene { field, states, hazard_states, lanes }, camera, noisy.view()?, *threads)
     }
 }
 

@@ -5,14 +5,14 @@ use carff_base::geometry::PinholeCamera;
 
 /// Pixels that count for the strength of a blob: a vehicle of 100 pixels in an image of 128 x 128 has 25 at the
 /// compared size.
-const STRONGEST: usize = 9;
+const STRONGEST: usize = 25;
 /// Smallest and largest height of a blob's box, as a share of its width.
 const HEIGHT_SHARE: [f64; 2] = [0.3, 1.2];
 
 /// Connected pixels that a state does not explain, and that stand on the lanes.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Blob {
-    /// Root mean square of the nine largest residuals, in units in which 1 is the field's own error.
+    /// Root mean square of the 25 largest residuals, in units in which 1 is the field's own error.
     pub strength: f32,
     /// Number of pixels at the compared size.
     pub pixels: usize,

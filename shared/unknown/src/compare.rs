@@ -11,7 +11,8 @@ use ndarray::{ArrayView3, s};
 
 /// Longest side of the compared images, pixels.
 const SIDE_PX: u32 = 64;
-/// Pixels around the lanes that are compared too: residuals are smoothed, and objects next to a lane are followed.
+/// Pixels around the lanes that are compared too: each residual rests on its neighbours, and objects next to a lane are
+/// followed.
 const MARGIN_PX: usize = 3;
 /// Fewer samples than for images to look at: errors of a few per cent are below the noise. Half the resolution was
 /// tried: cars of the road's colour stay within the range of the coarser pixels.
@@ -23,6 +24,19 @@ const PLACE_STEP_PX: usize = 4;
 const PLACE_CAP: f32 = 0.25;
 /// A moved image counts if it leaves less than this share of what the image leaves unexplained.
 const BETTER: f32 = 0.7;
+
+/// A field with what is known about it: the known states, and the lanes on which something unknown counts.
+#[derive(Clone, Copy, Debug)]
+pub struct KnownScene<'a> {
+    /// The field of the scene.
+    pub field: &'a Field,
+    /// Latents of the known states.
+    pub states: &'a [[f32; LATENT_DIM]],
+    /// For each state, true if it has the hazard.
+    pub hazard_states: &'a [bool],
+    /// The ground on which something unknown counts.
+    pub lanes: &'a Lanes,
+}
 
 /// An image with its residuals under the known states, at the compared size.
 #[derive(Clone, Debug)]
@@ -69,13 +83,12 @@ impl Comparer {
     /// Compares an image (height, width, channel) with each state. `None` if the camera sees no lane.
     pub fn compare(
         &mut self,
-        field: &Field,
-        states: &[[f32; LATENT_DIM]],
-        lanes: &Lanes,
+        scene: KnownScene,
         camera: &PinholeCamera,
         image: ArrayView3<'_, u8>,
         threads: usize,
     ) -> Option<Comparison> {
+        let KnownScene { field, states, lanes, .. } = scene;
         let small = reduced_camera(camera);
         let (width, height) = (small.width_px as usize, small.height_px as usize);
         let ground = lanes.ground_points(&small);
@@ -98,19 +111,19 @@ impl Comparer {
             );
             self.shown = Some((small, judged.clone(), states.to_vec()));
         }
-        Some(self.compared(small, reduced(image, width, height), ground, judged, lanes))
+        Some(self.compared(small, reduced(image, width, height), ground, judged, scene))
     }
 
     /// Compares the image of the last comparison again, moved to where its place is rendered: the pose or the lens may
     /// have a small error. `None` if the moved image does not fit the place much better, if it shows less than half of the
     /// lanes, or if `last` is larger than the rendered states.
-    pub fn align(&self, last: &Comparison, lanes: &Lanes) -> Option<Comparison> {
+    pub fn align(&self, last: &Comparison, scene: KnownScene) -> Option<Comparison> {
         let shown = self.buffer.images.first().filter(|shown| shown.changing.len() >= last.judged.len())?;
         let (width, height) = (last.camera.width_px as usize, last.camera.height_px as usize);
         let is_still = |&i: &usize| (last.judged[i] || is_sample(i, width)) && !shown.changing[i];
         let still: Vec<usize> = (0..last.judged.len()).filter(is_still).collect();
         let moved = align(View { rgb: &last.image, width, height }, &shown.rgb, &still)?;
-        let aligned = self.compared(last.camera, moved, last.ground.clone(), last.judged.clone(), lanes);
+        let aligned = self.compared(last.camera, moved, last.ground.clone(), last.judged.clone(), scene);
         let left = |of: &Comparison| 1.0 - of.fit.explained;
         let on_lanes = |of: &Comparison| of.on_lanes(0).count();
         let is_better = left(&aligned) < BETTER * left(last) && 2 * on_lanes(&aligned) >= on_lanes(last);
@@ -124,7 +137,7 @@ impl Comparer {
         image: Vec<f32>,
         ground: Vec<Option<Ground>>,
         mut judged: Vec<bool>,
-        lanes: &Lanes,
+        scene: KnownScene,
     ) -> Comparison {
         let (images, width) = (&self.buffer.images, camera.width_px as usize);
         judged.iter_mut().zip(image.chunks_exact(3)).for_each(|(judged, rgb)| *judged &= !rgb[0].is_nan());
@@ -134,20 +147,15 @@ impl Comparer {
         };
         let fit = Fit {
             explained: explained(&image, &images[0].rgb, &still(&|i| is_sample(i, width))),
-            ..fit(&image, &images[0].rgb, &still(&|i| judged[i]))
+            // The lanes by themselves have too little contrast for a gain.
+            ..fit(&image, &images[0].rgb, &still(&|i| judged[i] || is_sample(i, width)))
         };
         let energy = |rendered: &RenderBuffer| energy(&image, &rendered.rgb, &fit, &judged, width);
-        let energies: Vec<Vec<f32>> = images.iter().map(energy).collect();
+        let mut energies: Vec<Vec<f32>> = images.iter().map(energy).collect();
         let pixels: Vec<usize> = (0..judged.len()).filter(|&i| judged[i]).collect();
-        let of_state = |(state, energy): (usize, &Vec<f32>)| {
-            let mut energy = energy.clone();
-            // The place of the vehicle itself varies, and nothing else can be there.
-            for i in lanes.own_pixels(&camera, state, &pixels) {
-                energy[i] = 0.0;
-            }
-            smoothed(&energy, &judged, width, fit.noise)
-        };
-        let residuals: Vec<Vec<f32>> = energies.iter().enumerate().map(of_state).collect();
+        let own: Vec<Vec<usize>> = (0..images.len()).map(|s| scene.lanes.own_pixels(&camera, s, &pixels)).collect();
+        explain_own(&mut energies, &own, scene.hazard_states);
+        let residuals = energies.iter().map(|energy| middle(energy, &judged, width, fit.noise)).collect();
         Comparison { camera, image, fit, ground, judged, residuals }
     }
 
@@ -245,11 +253,33 @@ fn energy(image: &[f32], rendered: &[f32], fit: &Fit, judged: &[bool], width: us
     (0..judged.len()).map(|i| if judged[i] { (0..3).map(|c| of_channel(i, c)).sum() } else { 0.0 }).collect()
 }
 
-/// Root mean square over 3 x 3 pixels and channels, in deviations.
-fn smoothed(energy: &[f32], judged: &[bool], width: usize, noise: f32) -> Vec<f32> {
+/// Lets each state explain the pixels of the vehicle itself as the other states do that have it elsewhere, but agree about
+/// the hazard: the vehicle's place varies. `energies` and `own` have one entry a state, and `own` is sorted.
+fn explain_own(energies: &mut [Vec<f32>], own: &[Vec<usize>], hazard_states: &[bool]) {
+    let before = energies.to_vec();
+    for (state, pixels) in own.iter().enumerate() {
+        for &i in pixels {
+            let elsewhere = |other: &usize| {
+                hazard_states.get(*other) == hazard_states.get(state) && own[*other].binary_search(&i).is_err()
+            };
+            let others = (0..own.len()).filter(elsewhere).map(|other| before[other][i]);
+            energies[state][i] = others.fold(before[state][i], f32::min);
+        }
+    }
+}
+
+/// Root of the middle value over 3 x 3 pixels, of the mean over channels, in deviations: a speck or a thin line that the
+/// field misses is not an object.
+fn middle(energy: &[f32], judged: &[bool], width: usize, noise: f32) -> Vec<f32> {
     let of_pixel = |i: usize| {
-        let (sum, n) = neighbours(i, judged, width).fold((0.0, 0), |(sum, n), at| (sum + energy[at], n + 3));
-        (sum / n.max(1) as f32).sqrt() / noise
+        let (mut near, mut count) = ([0.0; 9], 0);
+        for at in neighbours(i, judged, width) {
+            near[count] = energy[at];
+            count += 1;
+        }
+        let near = &mut near[..count];
+        near.sort_unstable_by(f32::total_cmp);
+        (near[(count - 1) / 2] / 3.0).sqrt() / noise
     };
     (0..judged.len()).map(|i| if judged[i] { of_pixel(i) } else { 0.0 }).collect()
 }
@@ -304,12 +334,14 @@ mod tests {
             nearest_m: 1.0,
             own: Vec::new(),
         };
+        let field = Field::new(carff_field::FieldConfig { log2_table_size: 10, ..Default::default() }, 1).unwrap();
+        let scene = KnownScene { field: &field, states: &[], hazard_states: &[false], lanes: &lanes };
         let aligned = |image: Vec<f32>, lane_px: std::ops::Range<usize>| {
             let is_lane = |i: usize| lane_px.contains(&(i % side));
             let ground = |i| is_lane(i).then_some(Ground { distance_m: 5.0, at_m: [0.0; 2], on_lanes: true });
             let (ground, judged) = (0..side * side).map(|i| (ground(i), is_lane(i))).unzip();
-            let last = comparer.compared(camera, image, ground, judged, &lanes);
-            (last.fit.explained, comparer.align(&last, &lanes).map(|moved| moved.fit.explained))
+            let last = comparer.compared(camera, image, ground, judged, scene);
+            (last.fit.explained, comparer.align(&last, scene).map(|moved| moved.fit.explained))
         };
         let (before, after) = aligned(view(4.0), 0..48);
         assert!(before < 0.8 && after.is_some_and(|share| share > 0.97), "{before} {after:?}");
@@ -318,7 +350,7 @@ mod tests {
         assert_eq!(aligned(view(23.0), 0..48).1, None, "another view");
     }
 
-    /// A patch that the rendered image does not have is the only residual; a shift by one pixel leaves none.
+    /// A patch that the rendered image does not have is the only residual; a shift by one pixel and a thin line leave none.
     #[test]
     fn residuals_are_where_something_is() {
         let width = 32;
@@ -328,6 +360,8 @@ mod tests {
                 let (x, y) = (i / 3 % width, i / 3 / width);
                 if (4..9).contains(&x) && (20..25).contains(&y) {
                     0.9
+                } else if x == 25 && y % 3 > 0 {
+                    0.1
                 } else if x < 17 {
                     0.2
                 } else {
@@ -337,11 +371,24 @@ mod tests {
             .collect();
         let fit = Fit { gain: [1.0; 3], offset: [0.0; 3], noise: LEAST_NOISE, explained: 1.0 };
         let judged = vec![true; width * width];
-        let out = smoothed(&energy(&seen, &rendered, &fit, &judged, width), &judged, width, fit.noise);
+        let out = middle(&energy(&seen, &rendered, &fit, &judged, width), &judged, width, fit.noise);
         assert!(out[22 * width + 6] > 20.0);
         let elsewhere =
             (0..width * width).filter(|i| !(2..11).contains(&(i % width)) || !(18..27).contains(&(i / width)));
         assert!(elsewhere.map(|i| out[i]).fold(0.0, f32::max) < 1e-3);
+    }
+
+    /// The place where a state has the vehicle itself hides nothing: its pixels must be explained with the vehicle there, or
+    /// as by a state of the same side that has it elsewhere.
+    #[test]
+    fn the_own_place_hides_nothing() {
+        // Pixel 0: the vehicle is there. Pixel 1: the road is seen. Pixel 2: something else. Pixel 3: the hazard.
+        let with_it = vec![0.0, 4.0, 4.0, 4.0];
+        let without = vec![4.0, 0.0, 4.0, 4.0];
+        let hazard = vec![4.0, 0.0, 4.0, 0.0];
+        let mut energies = [with_it, without.clone(), hazard.clone()];
+        explain_own(&mut energies, &[vec![0, 1, 2, 3], vec![], vec![]], &[false, false, true]);
+        assert_eq!(energies, [vec![0.0, 0.0, 4.0, 4.0], without, hazard]);
     }
 
     /// Cells are means; images smaller than the grid repeat their pixels.

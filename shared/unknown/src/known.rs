@@ -2,7 +2,7 @@
 
 use crate::blobs::Blob;
 use crate::camera::CameraLimits;
-use crate::compare::{Comparer, Comparison};
+use crate::compare::{Comparer, Comparison, KnownScene};
 use crate::lanes::{ErrorMap, Lanes};
 use carff_base::geometry::PinholeCamera;
 use carff_field::Field;
@@ -127,13 +127,14 @@ impl Known {
         (camera, image): (&PinholeCamera, ArrayView3<'_, u8>),
         threads: usize,
     ) -> Option<(Seen, Comparison)> {
-        let comparison = comparer.compare(field, states, &self.lanes, camera, image, threads)?;
+        let scene = KnownScene { field, states, hazard_states: &self.hazard_states, lanes: &self.lanes };
+        let comparison = comparer.compare(scene, camera, image, threads)?;
         let seen = self.judge(&comparison);
         if seen.residual <= 1.0 {
             return Some((seen, comparison));
         }
         // Before something unknown is suspected, the pose is: a camera that has turned a little leaves residuals, too.
-        let Some(aligned) = comparer.align(&comparison, &self.lanes) else { return Some((seen, comparison)) };
+        let Some(aligned) = comparer.align(&comparison, scene) else { return Some((seen, comparison)) };
         Some((self.judge(&aligned), aligned))
     }
 

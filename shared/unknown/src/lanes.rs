@@ -21,7 +21,8 @@ pub struct Lanes {
     pub bounds_m: [[f64; 2]; 2],
     /// Distance from the camera below which nothing is judged, metres: the vehicle that carries the camera.
     pub nearest_m: f64,
-    /// Boxes of the vehicle itself, which knows where it stands: nothing is judged behind them.
+    /// Boxes of the vehicle itself. Its place varies by a margin, so a state may explain the pixels behind them in two
+    /// ways: with the vehicle there, or elsewhere.
     pub own: Vec<OwnBox>,
 }
 

@@ -22,7 +22,7 @@ mod sight;
 
 pub use blobs::Blob;
 pub use camera::{CameraCheck, CameraLimits, Measured, Measurement};
-pub use compare::{Comparer, Comparison};
+pub use compare::{Comparer, Comparison, KnownScene};
 pub use fit::Fit;
 pub use known::{Known, KnownError, KnownLimits, Seen};
 pub use lanes::{ErrorMap, Ground, Lanes, OwnBox};
