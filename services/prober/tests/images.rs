@@ -70,7 +70,7 @@ fn a_patch_on_the_lane_is_unknown() {
 fn evidence_of_the_frame_before() {
     let (probe, _) = load(&checkpoint()).unwrap();
     let mut images = Images::load(&checkpoint(), &probe, false).unwrap().unwrap();
-    for (id, take_start, state) in [(1, 1, 0), (2, 1, probe.states().len() - 1), (3, 3, 1)] {
+    for (id, take_start, state) in [(1, 1, 1), (2, 1, probe.states().len() - 1), (3, 3, 0)] {
         let meta = FrameMeta { take_start, ..frame(id, 100 * id) };
         assert!(images.compare(&probe, &meta, image_of(&probe, state).view(), 1).is_some());
     }

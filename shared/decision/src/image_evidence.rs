@@ -238,7 +238,7 @@ mod tests {
     fn a_hazard_hidden_in_one_state_weighs_one_state() {
         let evidence = ImageEvidence::new(&[80.0, 1e-3, 1e-3, 80.0, 80.0, 80.0]);
         let states = [true, true, true, false, false, false];
-        // One of the four states that explain the image has a hazard; the encoder, which excludes it, has half of the say.
+        // One of the four states that explain the image has a hazard; the encoder, which excludes it, has half of the weight.
         let (hazard, unknown) = evidence.weigh(0.0, &states);
         assert!((hazard - 0.125).abs() < 1e-3 && unknown < 0.01, "{hazard} {unknown}");
         let (visible, _) = ImageEvidence::new(&[1e-3, 80.0, 1e-3, 1e-3, 1e-3, 1e-3]).weigh(0.5, &states);
