@@ -35,15 +35,20 @@ fn image_of(probe: &FieldProbe, state: usize) -> Array3<u8> {
     })
 }
 
+/// The image with a bright patch on the lane.
+fn patched(image: &Array3<u8>) -> Array3<u8> {
+    let mut patched = image.clone();
+    patched.slice_mut(s![56..74, 50..78, ..]).fill(230);
+    patched
+}
+
 /// An image of a known state has no unknown box. The same image with a bright patch on the lane has one, where the patch
 /// is. A belief only uses the comparison of its own image.
 #[test]
 fn a_patch_on_the_lane_is_unknown() {
     let (probe, _) = load(&checkpoint()).unwrap();
     let known = image_of(&probe, probe.states().len() - 1);
-    let mut patched = known.clone();
-    patched.slice_mut(s![56..74, 50..78, ..]).fill(230);
-
+    let patched = patched(&known);
     let mut images = Images::load(&checkpoint(), &probe, true).unwrap().unwrap();
     let before = images.compare(&probe, &frame(1, 100), known.view(), 1).unwrap();
     before.validate().unwrap();
@@ -70,9 +75,10 @@ fn a_patch_on_the_lane_is_unknown() {
 fn evidence_of_the_frame_before() {
     let (probe, _) = load(&checkpoint()).unwrap();
     let mut images = Images::load(&checkpoint(), &probe, false).unwrap().unwrap();
-    for (id, take_start, state) in [(1, 1, 1), (2, 1, probe.states().len() - 1), (3, 3, 0)] {
+    let known = image_of(&probe, 0);
+    for (id, take_start, image) in [(1, 1, &known), (2, 1, &patched(&known)), (3, 3, &known)] {
         let meta = FrameMeta { take_start, ..frame(id, 100 * id) };
-        assert!(images.compare(&probe, &meta, image_of(&probe, state).view(), 1).is_some());
+        assert!(images.compare(&probe, &meta, image.view(), 1).is_some());
     }
     let own = |id: u64| images.evidence(&Header::of_frame(id, 100 * id * MS, 1));
     let before = |frame_id, take_start| images.evidence_before(frame_id, take_start);
