@@ -7,7 +7,9 @@ use crate::TrainingError;
 use carff_base::random::tag;
 use carff_checkpoint::{Bound, CheckpointPlanning, PlanningMemory};
 use carff_dataset::{drives::DriveKind, sensor::SensorNoise};
-use carff_decision::{CalibrationTrial, Evidence, MemorySettings, Sampling, bounded_threshold, choose_threshold};
+use carff_decision::{
+    CalibrationTrial, Evidence, ImageEvidence, MemorySettings, Sampling, bounded_threshold, choose_threshold,
+};
 use carff_evaluation::{KnownStates, Models, Perception, Planner, Progress, TakeMemories, Trial};
 use carff_scenes::Scenario;
 use carff_unknown::Known;
@@ -55,8 +57,8 @@ pub struct ChosenBound {
     pub clear: Vec<f64>,
 }
 
-/// Chooses the threshold that separates drives with and without the hazard, at most the largest one that keeps the
-/// bound, and writes it into the checkpoint.
+/// Chooses the threshold that separates drives with and without the hazard, and writes it into the checkpoint. It is at
+/// most the largest one that keeps the bound, and at most the probability of a hazard that cannot be seen.
 ///
 /// # Errors
 ///
@@ -91,6 +93,8 @@ pub fn bound_threshold(input: BoundInput, on_progress: &dyn Fn(&Progress)) -> Re
     let largest = bounded_threshold(&hazard, level, confidence).ok_or_else(|| too_few(&input, hazard.len()))?;
     let trial = |halt_is_right: bool| move |&p: &f64| CalibrationTrial { hazard_probability: p, halt_is_right };
     let drives: Vec<_> = hazard.iter().map(trial(true)).chain(clear.iter().map(trial(false))).collect();
+    let unseen = known.as_ref().map_or(1.0, |known| ImageEvidence::unseen_hazard(&known.hazard_states));
+    let largest = largest.min(unseen);
     let hazard_threshold = choose_threshold(&drives).map_or(largest, |t| t.min(largest));
     let advances = hazard.iter().filter(|p| **p < hazard_threshold).count();
     let bound = Some(Bound { level, confidence, drives: hazard.len(), advances });
