@@ -155,7 +155,7 @@ impl Comparer {
         let pixels: Vec<usize> = (0..judged.len()).filter(|&i| judged[i]).collect();
         let own: Vec<Vec<usize>> = (0..images.len()).map(|s| scene.lanes.own_pixels(&camera, s, &pixels)).collect();
         explain_own(&mut energies, &own, scene.hazard_states);
-        let residuals = energies.iter().map(|energy| middle(energy, &judged, width, fit.noise)).collect();
+        let residuals = energies.iter().map(|energy| median_residual(energy, &judged, width, fit.noise)).collect();
         Comparison { camera, image, fit, ground, judged, residuals }
     }
 
@@ -268,9 +268,9 @@ fn explain_own(energies: &mut [Vec<f32>], own: &[Vec<usize>], hazard_states: &[b
     }
 }
 
-/// Root of the middle value over 3 x 3 pixels, of the mean over channels, in deviations: a speck or a thin line that the
-/// field misses is not an object.
-fn middle(energy: &[f32], judged: &[bool], width: usize, noise: f32) -> Vec<f32> {
+/// Root of the median over 3 x 3 pixels (the lower one of an even number), of the mean over channels, in deviations: a
+/// speck or a thin line that the field misses is not an object.
+fn median_residual(energy: &[f32], judged: &[bool], width: usize, noise: f32) -> Vec<f32> {
     let of_pixel = |i: usize| {
         let (mut near, mut count) = ([0.0; 9], 0);
         for at in neighbours(i, judged, width) {
@@ -371,7 +371,7 @@ mod tests {
             .collect();
         let fit = Fit { gain: [1.0; 3], offset: [0.0; 3], noise: LEAST_NOISE, explained: 1.0 };
         let judged = vec![true; width * width];
-        let out = middle(&energy(&seen, &rendered, &fit, &judged, width), &judged, width, fit.noise);
+        let out = median_residual(&energy(&seen, &rendered, &fit, &judged, width), &judged, width, fit.noise);
         assert!(out[22 * width + 6] > 20.0);
         let elsewhere =
             (0..width * width).filter(|i| !(2..11).contains(&(i % width)) || !(18..27).contains(&(i / width)));
