@@ -84,7 +84,7 @@ SEED ?= 7
 EVAL = $(TARGET)/release/carff eval configs/checkpoints/$(CHECKPOINT) --out reports/results/$(CHECKPOINT)
 
 results: build ## Make the tables of docs/RESULTS.md for CHECKPOINT (default approaching-intersection) in reports/results (hours)
-	$(EVAL)/tables --seed $(SEED)
+	$(EVAL)/tables $(addprefix --only ,psnr encoder recall planning frequencies images) --seed $(SEED)
 	$(EVAL)/trials --only trials --seed 29
 	$(EVAL)/robustness --only robustness --free-poses 40 --free-drives 1000 --seed 53
 	$(EVAL)/memory --only memory --free-drives 400 --seed 71

@@ -2,11 +2,11 @@
 
 use crate::supervision::monitor::{FrameHistory, Records};
 use carff::provenance::Origin;
-use carff_checkpoint::CheckpointPlanning;
+use carff_checkpoint::{CheckpointPlanning, load_policy};
 use carff_config::{CameraSource, CompareImages, GraphConfig};
 use carff_dataset::{ScenarioInfo, drives::DriveKind};
 use carff_decision::{ImageEvidence, TakeFrame};
-use carff_messages::{ActionCode, Gaussian, Reason, Stage};
+use carff_messages::{ActionCode, Gaussian, Reason, Rule, Stage};
 use carff_scenes::Scenario;
 use carff_trials::run::{DecidedFrame, JudgedRun, RunPlanning, RunSettings, decisive_frames};
 use std::collections::BTreeMap;
@@ -102,7 +102,9 @@ fn settings(outcome: &RunOutcome) -> anyhow::Result<RunSettings> {
         (CameraSource::FreeDrives, Some(path)) => Some(Scenario::load(&path)?),
         _ => None,
     };
-    let threshold = graph.controller.threshold.unwrap_or(known.threshold(graph.remembers()));
+    let given = graph.controller.threshold;
+    let approach = graph.controller.approach;
+    let policy = load_policy(Rule::Calibrated, given, &outcome.checkpoint, graph.remembers(), approach)?;
     Ok(RunSettings {
         run: outcome.run.clone(),
         dataset: outcome.dataset.clone(),
@@ -110,7 +112,7 @@ fn settings(outcome: &RunOutcome) -> anyhow::Result<RunSettings> {
         free,
         frames_per_timestamp: graph.camera.frames_per_timestamp as usize,
         rule: graph.controller.rule,
-        threshold,
+        threshold: policy.threshold,
         samples: graph.run.samples as usize,
         sampling: graph.run.sampling,
         horizon: graph.run.horizon,

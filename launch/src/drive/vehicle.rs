@@ -41,6 +41,8 @@ impl Vehicle {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use carff_decision::{Approach, Motion, Speeds};
+    use carff_messages::ActionCode;
 
     const SUBSTEP_S: f64 = 0.02;
 
@@ -62,6 +64,24 @@ mod tests {
             if target_mps == 0.0 {
                 assert!((5.0_f64.powi(2) / (2.0 * BRAKING_MPS2)..4.5).contains(&vehicle.at_m), "{}", vehicle.at_m);
             }
+        }
+    }
+
+    /// Wherever a controller has the vehicle stop ahead of the place where others drive, it stops ahead of it.
+    #[test]
+    fn a_stop_ahead_of_the_place_is_possible() {
+        let speeds = Speeds { advance_mps: 8.0, creep_mps: 1.5 };
+        for (tenths_mps, tenths_m) in (1..80).flat_map(|v| (1..100).map(move |d| (v, d))) {
+            let (speed_mps, to_conflict_m) = (f64::from(tenths_mps) / 10.0, f64::from(tenths_m) / 10.0);
+            let motion = Some(Motion { speed_mps, to_conflict_m });
+            if Approach::Stop.drive(true, 0.0, motion, speeds).0 != ActionCode::Halt {
+                continue;
+            }
+            let mut vehicle = Vehicle::at_start(speed_mps);
+            for _ in 0..400 {
+                vehicle.substep(0.0, SUBSTEP_S);
+            }
+            assert!(vehicle.at_m <= to_conflict_m + 0.05, "{speed_mps} m/s, {to_conflict_m} m: {}", vehicle.at_m);
         }
     }
 }

@@ -36,10 +36,11 @@ pub(super) struct Terms {
 impl Terms {
     pub(super) fn new(graph: &GraphConfig, checkpoint: &Path, contract: &Contract) -> anyhow::Result<Self> {
         let controller = &graph.controller;
-        let policy = load_policy(controller.rule, controller.threshold, checkpoint, graph.remembers())?;
+        let (rule, approach) = (controller.rule, controller.approach);
+        let policy = load_policy(rule, controller.threshold, checkpoint, graph.remembers(), approach)?;
         Ok(Self {
             policy: Policy { ignores_unknown: graph.checks.ignores_unknown(), ..policy },
-            approach: controller.approach,
+            approach,
             deadline_ns: controller.deadline_ms * 1_000_000,
             period_ns: (1e9 / controller.rate_hz) as u64,
             slack_ns: contract.slack_ms * 1_000_000,

@@ -1,6 +1,7 @@
 //! The part of a checkpoint for stages without models: the split of the poses and the calibrated threshold.
 
-use carff_decision::{MemorySettings, Policy};
+use crate::{CheckpointError, Manifest};
+use carff_decision::{Approach, ImageEvidence, MemorySettings, Policy};
 use carff_messages::{MAX_HORIZON, Rule};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
@@ -92,15 +93,25 @@ pub struct Bound {
 
 /// Returns the policy of a rule: with `threshold` if given, else with the checkpoint's threshold, with or without a
 /// memory. Only the calibrated rule reads the threshold.
+///
+/// With an approach, the checkpoint's threshold is at most the hazard probability that one hidden state leaves: a vehicle
+/// that gains speed in view of a hidden lane cannot stop any more when somebody appears there.
 pub fn load_policy(
     rule: Rule,
     threshold: Option<f64>,
     checkpoint: &Path,
     remembers: bool,
+    approach: Approach,
 ) -> Result<Policy, CheckpointPlanningError> {
     let threshold = match (rule, threshold) {
         (_, Some(threshold)) => threshold,
-        (Rule::Calibrated, None) => CheckpointPlanning::load(checkpoint)?.threshold(remembers),
+        (Rule::Calibrated, None) => {
+            let limit = match approach {
+                Approach::Stop => 1.0,
+                _ => ImageEvidence::hidden_hazard(&Manifest::load(checkpoint)?.scenario.hazard_states(), 1),
+            };
+            CheckpointPlanning::load(checkpoint)?.threshold(remembers).min(limit)
+        }
         (_, None) => 1.0,
     };
     Ok(Policy::new(rule, threshold))
@@ -125,6 +136,9 @@ pub enum CheckpointPlanningError {
         /// Description of the error.
         problem: String,
     },
+    /// The manifest, which contains the states, cannot be used.
+    #[error(transparent)]
+    Manifest(#[from] CheckpointError),
 }
 
 impl CheckpointPlanning {
@@ -182,6 +196,23 @@ impl CheckpointPlanning {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// A vehicle with an approach commits itself only below the probability of a hazard that one hidden state leaves. A given
+    /// threshold is used unchanged.
+    #[test]
+    fn an_approach_limits_the_threshold() {
+        let checkpoint =
+            Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs/checkpoints/approaching-intersection");
+        let threshold =
+            |given, approach| load_policy(Rule::Calibrated, given, &checkpoint, false, approach).unwrap().threshold;
+        let shipped = CheckpointPlanning::load(&checkpoint).unwrap().hazard_threshold;
+        assert_eq!(threshold(None, Approach::Stop), shipped);
+        for approach in [Approach::Phantom, Approach::Peek, Approach::Look] {
+            // Three of six states have a hazard: of the four that explain the image, one, and half of the weight.
+            assert!((threshold(None, approach) - 0.125).abs() < 1e-3, "{approach:?}");
+            assert_eq!(threshold(Some(0.3), approach), 0.3);
+        }
+    }
 
     /// A saved file is loaded unchanged; a missing file, another version and a bad threshold name the file and the key.
     #[test]

@@ -200,7 +200,8 @@ pub struct ControllerConfig {
     /// 60000. Default 150.
     #[schemars(range(min = 1, max = 60_000))]
     pub deadline_ms: u64,
-    /// Threshold on the hazard probability for the calibrated rule, 0 to 1. Default: the checkpoint's threshold.
+    /// Threshold on the hazard probability for the calibrated rule, 0 to 1. Default: the checkpoint's threshold, and with
+    /// an `approach` at most the probability that a hazard leaves that is hidden in one known state.
     #[schemars(range(min = 0.0, max = 1.0))]
     pub threshold: Option<f64>,
     /// Behaviour of the vehicle while the rule does not let it advance: `stop`, or, where the topic `ego/motion` is

@@ -10,8 +10,9 @@ use serde::{Deserialize, Serialize};
 /// Braking that a planned stop uses, and the hardest braking, m/s².
 const BRAKING_MPS2: f64 = 2.5;
 const HARDEST_MPS2: f64 = 6.0;
-/// Time until a vehicle brakes as planned, seconds.
+/// Time until a vehicle brakes as planned, and as hard as it can, seconds.
 const REACTION_S: f64 = 0.5;
+const HARDEST_REACTION_S: f64 = 0.25;
 /// Space between a stopped vehicle and the place where others drive, metres.
 const SPACE_M: f64 = 0.6;
 /// Distance of the first stop of [`Approach::Peek`] from that place, metres.
@@ -91,7 +92,8 @@ impl Approach {
 impl Motion {
     /// Reports whether the vehicle is in the way of others, or cannot stop before it is.
     fn is_committed(self) -> bool {
-        self.to_conflict_m <= 0.0 || self.speed_mps.powi(2) / (2.0 * HARDEST_MPS2) > self.to_conflict_m
+        let stops_within_m = self.speed_mps * HARDEST_REACTION_S + self.speed_mps.powi(2) / (2.0 * HARDEST_MPS2);
+        self.to_conflict_m <= 0.0 || stops_within_m > self.to_conflict_m
     }
 
     /// Highest speed from which the vehicle stops a distance ahead of the place.

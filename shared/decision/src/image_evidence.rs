@@ -47,10 +47,22 @@ impl ImageEvidence {
         Self { ratios: ratios.iter().map(limited).collect(), prior: None }
     }
 
-    /// Returns the hazard probability that stays where the image shows no difference between the states and the encoder
-    /// excludes the hazard. A threshold above it would let the encoder decide by itself about what nobody can see.
-    pub fn unseen_hazard(hazard_states: &[bool]) -> f64 {
-        Self::new(&vec![f32::INFINITY; hazard_states.len()]).weigh(0.0, hazard_states).0
+    /// Returns the hazard probability that stays where the encoder excludes the hazard, and the image is explained by every
+    /// state without a hazard and by `hidden` of those with one. A threshold above it would let the encoder decide by itself
+    /// about what nobody can see.
+    ///
+    /// ```
+    /// use carff_decision::ImageEvidence;
+    /// let states = [true, true, true, false, false, false];
+    /// assert!((ImageEvidence::hidden_hazard(&states, 3) - 0.25).abs() < 1e-3);
+    /// assert!((ImageEvidence::hidden_hazard(&states, 1) - 0.125).abs() < 1e-3);
+    /// ```
+    pub fn hidden_hazard(hazard_states: &[bool], hidden: usize) -> f64 {
+        let hazards = (0..hazard_states.len()).filter(|state| hazard_states[*state]);
+        let excluded: Vec<usize> = hazards.skip(hidden).collect();
+        let ratio = |state: usize| if excluded.contains(&state) { 0.0 } else { f32::INFINITY };
+        let ratios: Vec<f32> = (0..hazard_states.len()).map(ratio).collect();
+        Self::new(&ratios).weigh(0.0, hazard_states).0
     }
 
     /// Evidence of an image that no state explains: something unknown is nearly certain.
@@ -90,10 +102,12 @@ impl ImageEvidence {
     /// `hazard_states` marks the states with a hazard, and must have one entry a state.
     ///
     /// Two opinions are pooled with equal weights: one starts from the encoder's probability, the other from earlier
-    /// images of the take, or else from equally probable states. Each is weighed by the best explanation with and without a hazard (Bayes' rule). The image adds
-    /// to the hazard and never takes from it: a hazard may be hidden at a place where no known state has it.
+    /// images of the take, or else from equally probable states. Each is weighed by the image (Bayes' rule), with the
+    /// states of each side, with and without a hazard, equally probable: a hazard that is hidden in one of three states
+    /// and excluded in the others weighs a third of one that is hidden in all. The image adds to the hazard and never
+    /// takes from it: a hazard may be hidden at a place where no known state has it.
     pub fn weigh(&self, hazard_probability: f32, hazard_states: &[bool]) -> (f64, f64) {
-        let (with, without) = (self.best(true, hazard_states), self.best(false, hazard_states));
+        let (with, without) = (self.ratio(true, hazard_states), self.ratio(false, hazard_states));
         let hazards = self.prior_or_even(hazard_states);
         let posterior = |hazard: f64| {
             let known = 1.0 - UNKNOWN_PRIOR;
@@ -108,10 +122,10 @@ impl ImageEvidence {
         (pooled(trusting.0, doubting.0).max(encoder * (1.0 - unknown)), unknown)
     }
 
-    /// Ratio of the best explanation with or without a hazard.
-    fn best(&self, hazard: bool, hazard_states: &[bool]) -> f64 {
-        let of = self.ratios.iter().zip(hazard_states).filter(|(_, h)| **h == hazard).map(|(r, _)| *r);
-        of.fold(0.0, f64::max)
+    /// Likelihood ratio of the states with or without a hazard: their mean, or 0 where there is none.
+    fn ratio(&self, hazard: bool, hazard_states: &[bool]) -> f64 {
+        let of = || self.ratios.iter().zip(hazard_states).filter(|(_, h)| **h == hazard).map(|(r, _)| *r);
+        of().sum::<f64>() / of().count().max(1) as f64
     }
 }
 
@@ -167,8 +181,8 @@ impl ImageMemory {
         if evidence.ratios.len() != self.hazard_states.len() {
             return evidence;
         }
-        let best = |hazard| evidence.best(hazard, &self.hazard_states).max(1.0 / MAX_RATIO);
-        let ratio = (best(true) / best(false)).ln();
+        let of = |hazard| evidence.ratio(hazard, &self.hazard_states).max(1.0 / MAX_RATIO);
+        let ratio = (of(true) / of(false)).ln();
         let before = self.log_odds - self.settings.repeated(ratio, self.last);
         (self.log_odds, self.last) = ((before + ratio).clamp(-LARGEST_LOG_ODDS, LARGEST_LOG_ODDS), ratio);
         evidence.after(in_message(1.0 / (1.0 + (-before).exp())))
@@ -238,8 +252,20 @@ mod tests {
         // No threshold may be above it.
         for ratio in [50.0, 1e3, f32::INFINITY] {
             let (hazard, unknown) = ImageEvidence::new(&[ratio; 4]).weigh(0.0, &STATES);
-            assert!(hazard + unknown >= ImageEvidence::unseen_hazard(&STATES), "{ratio}");
+            assert!(hazard + unknown >= ImageEvidence::hidden_hazard(&STATES, 2), "{ratio}");
         }
+    }
+
+    /// A hazard that the image leaves possible in one of several states weighs its share of them.
+    #[test]
+    fn a_hazard_hidden_in_one_state_weighs_one_state() {
+        let evidence = ImageEvidence::new(&[80.0, 1e-3, 1e-3, 80.0, 80.0, 80.0]);
+        let states = [true, true, true, false, false, false];
+        // One of the four states that explain the image has a hazard; the encoder, which excludes it, has half of the weight.
+        let (hazard, unknown) = evidence.weigh(0.0, &states);
+        assert!((hazard - 0.125).abs() < 1e-3 && unknown < 0.01, "{hazard} {unknown}");
+        let (visible, _) = ImageEvidence::new(&[1e-3, 80.0, 1e-3, 1e-3, 1e-3, 1e-3]).weigh(0.5, &states);
+        assert!(visible > 0.99, "{visible}");
     }
 
     /// An image that no state explains is unknown; ratios that are not numbers explain nothing.
