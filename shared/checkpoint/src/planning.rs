@@ -96,6 +96,10 @@ pub struct Bound {
 ///
 /// With an approach, the checkpoint's threshold is at most the hazard probability that one hidden state leaves: a vehicle
 /// that gains speed in view of a hidden lane cannot stop any more when somebody appears there.
+///
+/// # Errors
+///
+/// The calibrated rule has no given threshold, and `planning.json`, or with an approach the manifest, cannot be used.
 pub fn load_policy(
     rule: Rule,
     threshold: Option<f64>,
