@@ -170,7 +170,7 @@ mod tests {
                 if path.extension().is_none_or(|e| e != "md") {
                     continue;
                 }
-                // A command that goes on after a backslash is one command.
+                // A command that continues after a backslash is one command.
                 let text = std::fs::read_to_string(&path).unwrap().replace("\\\n", " ");
                 for line in text.split("```").skip(1).step_by(2).flat_map(str::lines) {
                     let line = line.trim_start_matches("target/release/").trim_start_matches("bin/");
