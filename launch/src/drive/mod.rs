@@ -205,13 +205,17 @@ pub fn run(args: &DriveArgs) -> anyhow::Result<ExitCode> {
         terminal.line(&format!("JSON: {}", path.display()));
     }
     if args.learn_occupancy && ended != Ended::Interrupted {
-        let old = CheckpointPlanning::load(&args.checkpoint)?;
-        let check = occupancy.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
-        CheckpointPlanning { occupancy: Some(check.rates(old.occupancy)?), ..old }.save(&args.checkpoint)?;
+        learn(&occupancy.lock().unwrap_or_else(std::sync::PoisonError::into_inner), &args.checkpoint)?;
         terminal.line(&format!("rates of the occupancy grid: written into {}", args.checkpoint.display()));
     }
     terminal.check()?;
     Ok(ExitCode::SUCCESS)
+}
+
+/// Writes the rates of the occupancy grid into the checkpoint.
+fn learn(check: &OccupancyCheck, checkpoint: &Path) -> anyhow::Result<()> {
+    let old = CheckpointPlanning::load(checkpoint)?;
+    Ok(CheckpointPlanning { occupancy: Some(check.rates(old.occupancy)?), ..old }.save(checkpoint)?)
 }
 
 /// Returns the graph file of a drive.

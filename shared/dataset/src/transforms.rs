@@ -30,25 +30,8 @@ pub(crate) struct Transforms {
 }
 
 pub(crate) fn read(dir: &Path) -> Result<Transforms, DatasetError> {
-    if !dir.is_dir() {
-        return Err(DatasetError::NotAFolder { path: dir.to_owned() });
-    }
-    let whole = dir.join("transforms.json");
-    let files: Vec<PathBuf> = if whole.is_file() {
-        vec![whole]
-    } else {
-        ["train", "val", "test"]
-            .iter()
-            .map(|part| dir.join(format!("transforms_{part}.json")))
-            .filter(|path| path.is_file())
-            .collect()
-    };
-    if files.is_empty() {
-        return Err(DatasetError::NoTransforms { path: dir.to_owned() });
-    }
-
     let mut documents = Vec::new();
-    for path in files {
+    for path in files(dir)? {
         documents.push(Document { root: parse(&path)?, path });
     }
     // The scenario is read first, from whichever file has it: it defines how a scene_id splits into branch and time
@@ -110,6 +93,20 @@ pub(crate) fn read(dir: &Path) -> Result<Transforms, DatasetError> {
     }
     check_views(&frames, &places, scenario.as_ref())?;
     Ok(Transforms { frames, scenario, warnings, faults })
+}
+
+/// Returns the files of a folder: one, or one for each part.
+fn files(dir: &Path) -> Result<Vec<PathBuf>, DatasetError> {
+    if !dir.is_dir() {
+        return Err(DatasetError::NotAFolder { path: dir.to_owned() });
+    }
+    let whole = dir.join("transforms.json");
+    if whole.is_file() {
+        return Ok(vec![whole]);
+    }
+    let of_parts = ["train", "val", "test"].map(|part| dir.join(format!("transforms_{part}.json")));
+    let files: Vec<PathBuf> = of_parts.into_iter().filter(|path| path.is_file()).collect();
+    if files.is_empty() { Err(DatasetError::NoTransforms { path: dir.to_owned() }) } else { Ok(files) }
 }
 
 struct Document {

@@ -336,11 +336,9 @@ pub(crate) fn vehicle_bodies(vehicle: &VehicleConfig, [x, y, yaw]: [f64; 3], obj
     }
     let center = Vec3::new(cabin_x, 0.0, belt + cabin_half.z - 0.02);
     add(cabin(cabin_half, front, rear, 0.13 * half_w), center, glass(cabin_half, pillars));
-    for axle in axles {
-        for side in [-1.0, 1.0] {
-            let wheel = Form::Cylinder { axis: 1, radius, half_length: 0.11 };
-            add(wheel, Vec3::new(axle, side * (half_w - 0.085), radius), Material::Wheel { rim: 0.62 * radius });
-        }
+    for (axle, side) in axles.into_iter().flat_map(|axle| [(axle, -1.0), (axle, 1.0)]) {
+        let wheel = Form::Cylinder { axis: 1, radius, half_length: 0.11 };
+        add(wheel, Vec3::new(axle, side * (half_w - 0.085), radius), Material::Wheel { rim: 0.62 * radius });
     }
     bodies
 }

@@ -74,12 +74,7 @@ pub(crate) fn run(args: &EncoderArgs) -> anyhow::Result<Report> {
     let forecaster_gain = Ratio::new(&seconds[1], &seconds[0]);
 
     if !args.no_vit {
-        let config = EncoderConfig {
-            backbone: BackboneConfig { kind: BackboneKind::Vit, ..BackboneConfig::default() },
-            ..EncoderConfig::default()
-        };
-        let store = VarStore::new(Device::Cpu);
-        let vit = Encoder::new(&config, &(store.root() / "backbone"), &(store.root() / "head"), None)?;
+        let vit = random_vit()?;
         let seconds = alternate(if args.quick { 2 } else { 10 }, &mut [in_tch(&vit, &rgb, 1), in_tch(&vit, &rgb, 2)]);
         note("encoder, ViT-L/16 of random weights, libtorch, 1 thread", "encoder.vit_l16.", &seconds[0]);
         note("encoder, ViT-L/16 of random weights, libtorch, 2 threads", "encoder.vit_l16.two_threads.", &seconds[1]);
@@ -103,6 +98,16 @@ pub(crate) fn run(args: &EncoderArgs) -> anyhow::Result<Report> {
         report.set("encoder.bf16.moves_mean_by_deviations", halved.moved);
     }
     Ok(report)
+}
+
+/// Returns the paper's encoder with random weights.
+fn random_vit() -> anyhow::Result<Encoder> {
+    let config = EncoderConfig {
+        backbone: BackboneConfig { kind: BackboneKind::Vit, ..BackboneConfig::default() },
+        ..EncoderConfig::default()
+    };
+    let store = VarStore::new(Device::Cpu);
+    Ok(Encoder::new(&config, &(store.root() / "backbone"), &(store.root() / "head"), None)?)
 }
 
 /// The encoder with its backbone in bf16.
