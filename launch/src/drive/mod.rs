@@ -205,7 +205,7 @@ pub fn run(args: &DriveArgs) -> anyhow::Result<ExitCode> {
         terminal.line(&format!("JSON: {}", path.display()));
     }
     if args.learn_occupancy && ended != Ended::Interrupted {
-        learn(&occupancy.lock().unwrap_or_else(std::sync::PoisonError::into_inner), &args.checkpoint)?;
+        save_rates(&occupancy.lock().unwrap_or_else(std::sync::PoisonError::into_inner), &args.checkpoint)?;
         terminal.line(&format!("rates of the occupancy grid: written into {}", args.checkpoint.display()));
     }
     terminal.check()?;
@@ -213,7 +213,7 @@ pub fn run(args: &DriveArgs) -> anyhow::Result<ExitCode> {
 }
 
 /// Writes the rates of the occupancy grid into the checkpoint.
-fn learn(check: &OccupancyCheck, checkpoint: &Path) -> anyhow::Result<()> {
+fn save_rates(check: &OccupancyCheck, checkpoint: &Path) -> anyhow::Result<()> {
     let old = CheckpointPlanning::load(checkpoint)?;
     Ok(CheckpointPlanning { occupancy: Some(check.rates(old.occupancy)?), ..old }.save(checkpoint)?)
 }
