@@ -25,6 +25,7 @@
 mod camera;
 mod error;
 mod graph;
+mod launcher;
 mod ranges;
 mod soak;
 mod stages;
@@ -32,8 +33,9 @@ mod stages;
 pub use camera::{CalibrationChoice, CameraConfig, CameraSource, FramePace, Pose, PoseChoice};
 pub use error::ConfigError;
 pub use graph::{
-    ChecksConfig, CompareImages, ControllerConfig, GraphConfig, LauncherConfig, MemoryKind, OverloadConfig, Reduction,
-    RendererConfig, RunConfig, UnknownIs, ViewChoice, WhenLost, is_stream,
+    ChecksConfig, CompareImages, ControllerConfig, GraphConfig, MemoryKind, RendererConfig, RunConfig, UnknownIs,
+    ViewChoice, is_stream,
 };
+pub use launcher::{LauncherConfig, OverloadConfig, Reduction, WhenLost};
 pub use soak::{Contract, Kind, Pace, SoakConfig, Weights};
 pub use stages::{Backend, LogFormat, LogLevel, RestartPolicy, StageConfig, StagesConfig};

@@ -1,17 +1,18 @@
 //! Compares the field's kernels with the same model in tensor operations and with the machine's limits.
 
+use super::inputs::{Piece, TRAINING_RAYS, pieces, random_latent, random_point, training_batch};
 use super::limits::{matrix_product, triad};
+use super::{best, round_and_round};
 use crate::reference::{Precision, Rays, ReferenceField, Samples, huber_sum};
 use anyhow::Context;
 use carff_base::geometry::{PinholeCamera, Ray};
-use carff_base::random::{Key, gaussians, uniform};
 use carff_bench::report::{Report, number, table};
 use carff_bench::stats::{Contender, Ratio, Times, alternate, timed};
 use carff_bench::{FieldArgs, birds_eye};
 use carff_checkpoint::{FieldProbe, Manifest, load_field_probe};
 use carff_decision::{Draw, Mixture};
 use carff_field::{
-    Field, FieldConfig, FieldTrainer, HypothesisBuffer, InstructionSet, LATENT_DIM, RayBatch, RayLimits, RaySamples,
+    Field, FieldConfig, FieldTrainer, HypothesisBuffer, InstructionSet, LATENT_DIM, RayLimits, RaySamples,
     RenderBuffer, RenderOptions, TrainerConfig,
 };
 use std::time::Instant;
@@ -19,8 +20,7 @@ use tch::{Kind, Tensor, nn::OptimizerConfig};
 
 /// Number of hypotheses that are probed.
 const HYPOTHESES: usize = 10;
-/// Rays of a training step; with the samples per ray, a step has 2^17 samples.
-const TRAINING_RAYS: usize = 4096;
+/// Samples of a ray in a training step, which has 2^17 of them.
 const SAMPLES_PER_RAY: usize = 32;
 /// Learning rate that leaves the field unchanged, so that each step is the same work.
 const STANDSTILL: f32 = 1e-12;
@@ -469,106 +469,6 @@ fn precisions(field: &Field) -> Vec<Precision> {
     } else {
         vec![Precision::F32, Precision::Bf16]
     }
-}
-
-/// Part of a training batch, as tensors.
-struct Piece {
-    rays: Rays,
-    samples: Samples,
-    latents: Tensor,
-    targets: Tensor,
-}
-
-/// Splits a batch into pieces of `size` rays.
-fn pieces(batch: &RayBatch, samples: &RaySamples, size: usize, degree: usize) -> Vec<Piece> {
-    let flat = |rows: Vec<f32>, width: i64| Tensor::from_slice(&rows).view([-1, width]);
-    (0..batch.rays.len())
-        .step_by(size.max(1))
-        .map(|first| {
-            let range = first..(first + size).min(batch.rays.len());
-            let from = samples.ray.partition_point(|r| (*r as usize) < range.start);
-            let to = samples.ray.partition_point(|r| (*r as usize) < range.end);
-            let own = RaySamples {
-                ray: samples.ray[from..to].iter().map(|r| r - first as u32).collect(),
-                distance_m: samples.distance_m[from..to].to_vec(),
-                delta_m: samples.delta_m[from..to].to_vec(),
-                ..RaySamples::default()
-            };
-            let latents = batch.latent_index[range.clone()].iter().flat_map(|l| batch.latents[*l as usize]).collect();
-            let targets = batch.target_rgb[range.clone()].iter().flatten().copied().collect();
-            Piece {
-                rays: Rays::new(&batch.rays[range], degree),
-                samples: Samples::new(&own),
-                latents: flat(latents, LATENT_DIM as i64),
-                targets: flat(targets, 3),
-            }
-        })
-        .collect()
-}
-
-/// Returns rays from around the bounds into them, of any state. Their target colours do not affect the speed.
-fn training_batch(config: &FieldConfig, states: &[[f32; LATENT_DIM]]) -> RayBatch {
-    let [low, high] = config.bounds_m;
-    let mut batch = RayBatch { latents: states.to_vec(), ..RayBatch::default() };
-    for i in 0..TRAINING_RAYS {
-        let at = |k: u32| uniform(Key { seed: 7, frame: i as u64, step: k, sample: 0 }) as f32;
-        let angle = std::f32::consts::TAU * at(0);
-        let radius = 0.5 * (high[0] - low[0]).max(high[1] - low[1]);
-        let origin = [
-            0.5 * (low[0] + high[0]) + radius * angle.cos(),
-            0.5 * (low[1] + high[1]) + radius * angle.sin(),
-            low[2] + 1.0 + 8.0 * at(1),
-        ];
-        let target = random_point(config, i as u64);
-        let d: [f32; 3] = std::array::from_fn(|k| target[k] - origin[k]);
-        let n = d.iter().map(|v| v * v).sum::<f32>().sqrt().max(1e-6);
-        // The width of a pixel in an image of 128 x 128 pixels with a field of view of 60 degrees.
-        batch.rays.push(Ray { origin, direction: d.map(|v| v / n), spread: 0.009 });
-        batch.target_rgb.push([at(2), at(3), at(4)]);
-        batch.latent_index.push((i % states.len()) as u32);
-    }
-    batch
-}
-
-fn random_point(config: &FieldConfig, i: u64) -> [f32; 3] {
-    let [low, high] = config.bounds_m;
-    std::array::from_fn(|k| {
-        let at = uniform(Key { seed: 3, frame: i, step: k as u32, sample: 0 }) as f32;
-        low[k] + (high[k] - low[k]) * at
-    })
-}
-
-fn random_latent(i: u64) -> [f32; LATENT_DIM] {
-    gaussians(Key { seed: 5, frame: i, step: 0, sample: 0 })
-}
-
-/// Returns the fastest setting after two trials of each. A long trial is the last one.
-fn best(settings: &[i64], mut action: impl FnMut(i64)) -> i64 {
-    const LONG_S: f64 = 4.0;
-    let mut least = (f64::INFINITY, settings[0]);
-    for &setting in settings {
-        for _ in 0..2 {
-            let start = Instant::now();
-            action(setting);
-            let seconds = start.elapsed().as_secs_f64();
-            if seconds < least.0 {
-                least = (seconds, setting);
-            }
-            if seconds > LONG_S {
-                return least.1;
-            }
-        }
-    }
-    least.1
-}
-
-/// Times an action on the next of `count` items at each turn.
-fn round_and_round<'a>(count: usize, mut action: impl FnMut(usize) + 'a) -> Contender<'a> {
-    let mut turn = 0;
-    timed(move || {
-        action(turn % count);
-        turn += 1;
-    })
 }
 
 fn percent(share: f64) -> String {
