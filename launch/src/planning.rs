@@ -103,8 +103,7 @@ fn settings(outcome: &RunOutcome) -> anyhow::Result<RunSettings> {
         _ => None,
     };
     let given = graph.controller.threshold;
-    let approach = graph.controller.approach;
-    let policy = load_policy(Rule::Calibrated, given, &outcome.checkpoint, graph.remembers(), approach)?;
+    let policy = load_policy(Rule::Calibrated, given, &outcome.checkpoint, graph.remembers())?;
     Ok(RunSettings {
         run: outcome.run.clone(),
         dataset: outcome.dataset.clone(),

@@ -40,7 +40,8 @@ fn known(args: &KnownArgs) -> anyhow::Result<()> {
     };
     let known = calibrate_known(input, &|_| {}).context("cannot calibrate what the checkpoint knows")?;
     for (side, limits) in [("clear", &known.clear), ("hazard", &known.hazard)] {
-        println!("{side}: limit {:.2} on {} images", limits.limit, limits.images);
+        let [unexpected, missing] = [&limits.unexpected, &limits.missing].map(|of| of.limit);
+        println!("{side}: limits {unexpected:.2} (unexpected) and {missing:.2} (missing) on {} images", limits.images);
     }
     println!("this place: at least {:.2} of the view explained", known.least_explained);
     Ok(())

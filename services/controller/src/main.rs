@@ -77,7 +77,7 @@ fn run(stage: &mut StageContext) -> anyhow::Result<()> {
 fn settings(stage: &StageContext) -> anyhow::Result<Settings> {
     let config = &stage.graph.controller;
     let remembers = stage.graph.remembers();
-    let policy = load_policy(config.rule, config.threshold, &stage.checkpoint, remembers, config.approach)
+    let policy = load_policy(config.rule, config.threshold, &stage.checkpoint, remembers)
         .context("no threshold for the calibrated rule: set `controller.threshold`, or use a checkpoint")?;
     Ok(Settings {
         policy: Policy { ignores_unknown: stage.graph.checks.ignores_unknown(), ..policy },

@@ -2,7 +2,7 @@
 
 use carff_checkpoint::{CheckpointError, FieldProbe, Manifest, TrainedWith, load_field_probe, load_policy};
 use carff_dataset::Image;
-use carff_decision::{Approach, Policy};
+use carff_decision::Policy;
 use carff_field::Field;
 use carff_messages::{Gaussian, Rule};
 use carff_networks::{
@@ -43,8 +43,7 @@ impl Models {
             Err(error @ CheckpointError::Missing { .. }) => Err(error.to_string()),
             other => Ok(other?),
         };
-        let policy =
-            load_policy(Rule::Calibrated, None, dir, false, Approach::Stop).unwrap_or(Policy::new(Rule::Paper, 1.0));
+        let policy = load_policy(Rule::Calibrated, None, dir, false).unwrap_or(Policy::new(Rule::Paper, 1.0));
         let scenario = &manifest.scenario;
         let steps = scenario.timestamps.max(1);
         let name = |state: usize| format!("{} t{}", scenario.branches[state / steps], state % steps);

@@ -58,7 +58,8 @@ pub struct ChosenBound {
 }
 
 /// Chooses the threshold that separates drives with and without the hazard, and writes it into the checkpoint. It is at
-/// most the largest one that keeps the bound, and at most the probability of a hazard that cannot be seen.
+/// most the largest one that keeps the bound, and at most the hazard probability that one hidden state leaves: a vehicle
+/// that gains speed in view of a hidden lane cannot stop any more when somebody appears there.
 ///
 /// # Errors
 ///
@@ -93,9 +94,7 @@ pub fn bound_threshold(input: BoundInput, on_progress: &dyn Fn(&Progress)) -> Re
     let largest = bounded_threshold(&hazard, level, confidence).ok_or_else(|| too_few(&input, hazard.len()))?;
     let trial = |halt_is_right: bool| move |&p: &f64| CalibrationTrial { hazard_probability: p, halt_is_right };
     let drives: Vec<_> = hazard.iter().map(trial(true)).chain(clear.iter().map(trial(false))).collect();
-    let unseen = known
-        .as_ref()
-        .map_or(1.0, |known| ImageEvidence::hidden_hazard(&known.hazard_states, known.hazard_states.len()));
+    let unseen = known.as_ref().map_or(1.0, |known| ImageEvidence::hidden_hazard(&known.hazard_states, 1));
     let largest = largest.min(unseen);
     let hazard_threshold = choose_threshold(&drives).map_or(largest, |t| t.min(largest));
     let advances = hazard.iter().filter(|p| **p < hazard_threshold).count();

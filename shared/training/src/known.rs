@@ -68,8 +68,8 @@ pub fn calibrate_known(input: KnownInput, on_progress: &dyn Fn(&Progress)) -> Re
     };
     let mut known = Known::fit(work.lanes.clone(), hazard_states, &comparisons, camera_limits(&posed, work.seed));
     if input.scenario.is_none() {
-        known.clear.limit *= TRAINED_POSES;
-        known.hazard.limit *= TRAINED_POSES;
+        known.clear = known.clear.times(TRAINED_POSES);
+        known.hazard = known.hazard.times(TRAINED_POSES);
     }
     known.save(input.checkpoint)?;
     Ok(known)

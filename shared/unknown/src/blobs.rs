@@ -2,6 +2,7 @@
 
 use crate::lanes::{ErrorMap, Ground};
 use carff_base::geometry::PinholeCamera;
+use std::collections::BTreeMap;
 
 /// Pixels that count for the strength of a blob: a vehicle of 100 pixels in an image of 128 x 128 has 25 at the
 /// compared size.
@@ -16,7 +17,7 @@ pub struct Blob {
     pub strength: f32,
     /// Number of pixels at the compared size.
     pub pixels: usize,
-    /// Place where it stands, x and y, metres: the nearest ground that it covers.
+    /// Place where it stands, x and y, metres: the nearest ground that it covers, on the lanes.
     pub foot_m: [f64; 2],
     /// Distance of that place from the camera, metres.
     pub distance_m: f64,
@@ -91,17 +92,30 @@ fn connected(start: usize, width: usize, relative: &[f32], taken: &mut [bool]) -
     pixels
 }
 
-/// Describes connected pixels; `None` if they do not stand on the lanes.
-fn blob(camera: &PinholeCamera, pixels: &[usize], relative: &[f32], ground: &[Option<Ground>]) -> Option<Blob> {
-    let seen = || pixels.iter().filter_map(|&p| Some((p, ground[p]?)));
-    let (_, foot) = seen().min_by(|a, b| a.1.distance_m.total_cmp(&b.1.distance_m))?;
-    if !foot.on_lanes {
-        return None;
+/// The nearest ground that some pixels look at.
+fn foot(pixels: impl Iterator<Item = usize>, ground: &[Option<Ground>]) -> Option<Ground> {
+    pixels.filter_map(|p| ground[p]).min_by(|a, b| a.distance_m.total_cmp(&b.distance_m))
+}
+
+/// Returns those of the connected pixels whose column stands on the lanes. Each column stands for itself: a vehicle that
+/// fills the lanes is connected with its shadow next to them.
+fn on_lanes(pixels: &[usize], width: usize, ground: &[Option<Ground>]) -> Vec<usize> {
+    let mut columns: BTreeMap<usize, Vec<usize>> = BTreeMap::new();
+    for &pixel in pixels {
+        columns.entry(pixel % width).or_default().push(pixel);
     }
+    let stands = |column: &Vec<usize>| foot(column.iter().copied(), ground).is_some_and(|foot| foot.on_lanes);
+    columns.into_values().filter(stands).flatten().collect()
+}
+
+/// Describes connected pixels; `None` if no column of them stands on the lanes.
+fn blob(camera: &PinholeCamera, pixels: &[usize], relative: &[f32], ground: &[Option<Ground>]) -> Option<Blob> {
+    let width = camera.width_px as usize;
+    let pixels = on_lanes(pixels, width, ground);
+    let foot = foot(pixels.iter().copied(), ground)?;
     let mut strongest: Vec<f32> = pixels.iter().map(|&p| relative[p]).collect();
     strongest.sort_by(|a, b| b.total_cmp(a));
     let sum: f32 = strongest.iter().take(STRONGEST).map(|v| v * v).sum();
-    let width = camera.width_px as usize;
     let columns = || pixels.iter().map(|p| p % width);
     let rows = || pixels.iter().map(|p| p / width);
     let span = |low: Option<usize>, high: Option<usize>| (high.unwrap_or(0) - low.unwrap_or(0) + 1) as f64;
@@ -115,4 +129,39 @@ fn blob(camera: &PinholeCamera, pixels: &[usize], relative: &[f32], ground: &[Op
         width_m,
         height_m: height_m.clamp(HEIGHT_SHARE[0] * width_m, HEIGHT_SHARE[1] * width_m),
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::lanes::Lanes;
+    use carff_base::geometry::OrientedBox;
+
+    /// A vehicle on the lane is found although it is connected with a shadow that reaches nearer ground next to the lane;
+    /// the shadow by itself is not found.
+    #[test]
+    fn each_column_stands_for_itself() {
+        let camera = PinholeCamera::look_at([0.0, -8.0, 6.0], [0.0; 3], [0.0, 0.0, 1.0], 32, 32, 60.0);
+        let lanes = Lanes {
+            areas: vec![OrientedBox { center: [0.0, 1.0, 0.0], half_size: [9.0, 2.0, 1.0], yaw: 0.0 }],
+            ground_m: 0.0,
+            bounds_m: [[-9.0, -9.0], [9.0, 9.0]],
+            nearest_m: 1.0,
+            own: Vec::new(),
+        };
+        let (ground, judged, errors) = (lanes.ground_points(&camera), [true; 32 * 32], ErrorMap::even(&lanes, 1.0));
+        let found = |is_residual: &dyn Fn(usize, usize) -> bool| {
+            let residual: Vec<f32> =
+                (0..32 * 32).map(|i| if is_residual(i % 32, i / 32) { 9.0 } else { 0.0 }).collect();
+            blobs(&camera, &residual, &judged, &ground, &errors)
+        };
+        let is_lane = |y: &usize| ground[y * 32 + 10].is_some_and(|g| g.on_lanes);
+        let (first, last) = ((0..32).find(is_lane).unwrap(), (0..32).rfind(is_lane).unwrap());
+        let vehicle = |x: usize, y: usize| (8..16).contains(&x) && (first..=last).contains(&y);
+        let shadow = |x: usize, y: usize| (16..20).contains(&x) && (first..last + 4).contains(&y);
+        let both = found(&|x, y| vehicle(x, y) || shadow(x, y));
+        assert_eq!(both, found(&vehicle));
+        assert_eq!(both.len(), 1);
+        assert!(found(&shadow).is_empty());
+    }
 }

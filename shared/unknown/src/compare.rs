@@ -2,10 +2,10 @@
 
 use crate::align::{View, align};
 use crate::blobs::{Blob, blobs};
-use crate::fit::{Fit, LEAST_NOISE, fit, median};
+use crate::fit::{Fit, LEAST_NOISE, fit, median, noise};
 use crate::lanes::{ErrorMap, Ground, Lanes};
 use carff_base::geometry::PinholeCamera;
-use carff_field::{Field, HypothesisBuffer, RenderBuffer, RenderOptions};
+use carff_field::{Field, HypothesisBuffer, RenderOptions};
 use carff_messages::LATENT_DIM;
 use ndarray::{ArrayView3, s};
 
@@ -22,6 +22,8 @@ const QUICK: RenderOptions =
 const PLACE_STEP_PX: usize = 4;
 /// Largest difference that counts in that comparison, of 1: a vehicle that covers a part of the view is not a place.
 const PLACE_CAP: f32 = 0.25;
+/// Difference of the states' rendered values, of 1, from which on a pixel shows which of them it is.
+const TOLD_APART: f32 = 0.05;
 /// A moved image counts if it leaves less than this share of what the image leaves unexplained.
 const BETTER: f32 = 0.7;
 
@@ -38,6 +40,23 @@ pub struct KnownScene<'a> {
     pub lanes: &'a Lanes,
 }
 
+/// Kinds of residuals.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Kind {
+    /// The image has a value that the state does not have there.
+    Unexpected,
+    /// The state has a value that the image does not have there: a vehicle that is not there.
+    Missing,
+}
+
+impl Kind {
+    /// Both kinds.
+    pub const ALL: [Self; 2] = [Self::Unexpected, Self::Missing];
+}
+
+/// Both residuals of a pixel, or their squares.
+type ByKind = [f32; 2];
+
 /// An image with its residuals under the known states, at the compared size.
 #[derive(Clone, Debug)]
 pub struct Comparison {
@@ -51,22 +70,34 @@ pub struct Comparison {
     pub ground: Vec<Option<Ground>>,
     /// True for pixels that were compared.
     pub judged: Vec<bool>,
-    /// For each state, the residual of each pixel, in deviations; 0 where it was not compared.
-    pub residuals: Vec<Vec<f32>>,
+    /// For each state and kind, the residual of each pixel, in deviations; 0 where it was not compared.
+    residuals: Vec<[Vec<f32>; 2]>,
 }
 
 impl Comparison {
+    /// Returns the number of states.
+    pub fn states(&self) -> usize {
+        self.residuals.len()
+    }
+
+    /// Returns the residual of each pixel of a state, in deviations; 0 where it was not compared.
+    pub fn residual(&self, state: usize, kind: Kind) -> &[f32] {
+        self.residuals.get(state).map_or(&[], |residuals| &residuals[kind as usize])
+    }
+
     /// Returns the residuals on the lanes with the ground points where they were found, for one state.
-    pub fn on_lanes(&self, state: usize) -> impl Iterator<Item = ([f64; 2], f32)> + '_ {
-        let residual = self.residuals.get(state).into_iter().flatten();
+    pub fn on_lanes(&self, state: usize, kind: Kind) -> impl Iterator<Item = ([f64; 2], f32)> + '_ {
+        let residual = self.residual(state, kind).iter();
         let pixels = residual.zip(&self.ground).zip(&self.judged);
         pixels.filter_map(|((r, ground), judged)| Some((ground.filter(|g| g.on_lanes && *judged)?.at_m, *r)))
     }
 
     /// Returns the blobs of a state that stand on the lanes, the strongest first.
-    pub fn blobs(&self, state: usize, errors: &ErrorMap) -> Vec<Blob> {
-        let residual = self.residuals.get(state);
-        residual.map_or(Vec::new(), |r| blobs(&self.camera, r, &self.judged, &self.ground, errors))
+    pub fn blobs(&self, state: usize, kind: Kind, errors: &ErrorMap) -> Vec<Blob> {
+        match self.residual(state, kind) {
+            [] => Vec::new(),
+            residual => blobs(&self.camera, residual, &self.judged, &self.ground, errors),
+        }
     }
 }
 
@@ -125,7 +156,7 @@ impl Comparer {
         let moved = align(View { rgb: &last.image, width, height }, &shown.rgb, &still)?;
         let aligned = self.compared(last.camera, moved, last.ground.clone(), last.judged.clone(), scene);
         let left = |of: &Comparison| 1.0 - of.fit.explained;
-        let on_lanes = |of: &Comparison| of.on_lanes(0).count();
+        let on_lanes = |of: &Comparison| of.on_lanes(0, Kind::Unexpected).count();
         let is_better = left(&aligned) < BETTER * left(last) && 2 * on_lanes(&aligned) >= on_lanes(last);
         is_better.then_some(aligned)
     }
@@ -145,17 +176,15 @@ impl Comparer {
             let is_still = |&i: &usize| counts(i) && !images[0].changing[i] && !image[i * 3].is_nan();
             (0..judged.len()).filter(is_still).collect()
         };
-        let fit = Fit {
-            explained: explained(&image, &images[0].rgb, &still(&|i| is_sample(i, width))),
-            // The lanes by themselves have too little contrast for a gain.
-            ..fit(&image, &images[0].rgb, &still(&|i| judged[i] || is_sample(i, width)))
-        };
-        let energy = |rendered: &RenderBuffer| energy(&image, &rendered.rgb, &fit, &judged, width);
-        let mut energies: Vec<Vec<f32>> = images.iter().map(energy).collect();
+        let fit = fitted(&image, &images[0].rgb, &still(&|i| is_sample(i, width)), &still(&|i| judged[i]));
+        let rendered: Vec<&[f32]> = self.rendered().collect();
+        let pixels = Pixels { image: &image, judged: &judged, told_apart: &told_apart(&rendered), width };
+        let mut energies: Vec<Vec<ByKind>> = rendered.iter().map(|rendered| energy(pixels, rendered, &fit)).collect();
         let pixels: Vec<usize> = (0..judged.len()).filter(|&i| judged[i]).collect();
         let own: Vec<Vec<usize>> = (0..images.len()).map(|s| scene.lanes.own_pixels(&camera, s, &pixels)).collect();
         explain_own(&mut energies, &own, scene.hazard_states);
-        let residuals = energies.iter().map(|energy| median_residual(energy, &judged, width, fit.noise)).collect();
+        let residual = |energy: &[ByKind], kind| median_residual(energy, kind, &judged, width, fit.noise);
+        let residuals = energies.iter().map(|energy| Kind::ALL.map(|kind| residual(energy, kind))).collect();
         Comparison { camera, image, fit, ground, judged, residuals }
     }
 
@@ -210,10 +239,17 @@ fn grown(marked: &[bool], width: usize, margin: usize) -> Vec<bool> {
     out
 }
 
+/// Fits the image over samples of the whole view: the lanes by themselves have too little contrast for a gain, and a
+/// vehicle may fill them. The noise is the smaller one of view and lanes: what stands on the lanes is not noise.
+fn fitted(image: &[f32], rendered: &[f32], samples: &[usize], lanes: &[usize]) -> Fit {
+    let fit = fit(image, rendered, samples);
+    let of_lanes = if lanes.is_empty() { fit.noise } else { noise(image, rendered, &fit, lanes) };
+    Fit { explained: explained(image, rendered, &fit, samples), noise: fit.noise.min(of_lanes), ..fit }
+}
+
 /// Share of an image's variation, over the pixels that count, that a gain and an offset of the rendered one explain.
 /// The gain is at least 0: an inverted image shows another place.
-fn explained(image: &[f32], rendered: &[f32], pixels: &[usize]) -> f32 {
-    let fit = fit(image, rendered, pixels);
+fn explained(image: &[f32], rendered: &[f32], fit: &Fit, pixels: &[usize]) -> f32 {
     let capped = |difference: f32| difference.abs().min(PLACE_CAP).powi(2);
     let (mut left, mut all, mut least) = (0.0, 0.0, 0.0);
     for c in 0..3 {
@@ -241,21 +277,59 @@ fn neighbours(i: usize, judged: &[bool], width: usize) -> impl Iterator<Item = u
     all.filter(|&n| judged[n])
 }
 
+/// The image and the pixels of it that count.
+#[derive(Clone, Copy)]
+struct Pixels<'a> {
+    image: &'a [f32],
+    judged: &'a [bool],
+    /// True where the rendered states do not look alike.
+    told_apart: &'a [bool],
+    width: usize,
+}
+
+/// Pixels at which the rendered states differ by more than their errors.
+fn told_apart(states: &[&[f32]]) -> Vec<bool> {
+    let Some(first) = states.first() else { return Vec::new() };
+    let differs = |i: usize| {
+        let (low, high) = range(states.iter().map(|state| state[i]));
+        high - low > TOLD_APART
+    };
+    (0..first.len() / 3).map(|pixel| (pixel * 3..pixel * 3 + 3).any(differs)).collect()
+}
+
+/// Smallest and largest value.
+fn range(values: impl Iterator<Item = f32>) -> (f32, f32) {
+    values.fold((f32::INFINITY, f32::NEG_INFINITY), |(low, high), v| (low.min(v), high.max(v)))
+}
+
+/// Distance of a value from the range of some others.
+fn beyond(value: f32, others: impl Iterator<Item = f32>) -> f32 {
+    let (low, high) = range(others);
+    (value - high).max(low - value).max(0.0)
+}
+
 /// Squared distance of each pixel from the range of its neighbours' rendered values, summed over the channels. The
 /// range forgives what a blurred edge, or a pose that is off by half a pixel, changes.
-fn energy(image: &[f32], rendered: &[f32], fit: &Fit, judged: &[bool], width: usize) -> Vec<f32> {
-    let of_channel = |i: usize, c: usize| {
-        let expected = neighbours(i, judged, width).map(|n| fit.gain[c] * rendered[n * 3 + c] + fit.offset[c]);
-        let (low, high) = expected.fold((f32::INFINITY, f32::NEG_INFINITY), |(l, h), v| (l.min(v), h.max(v)));
-        let seen = image[i * 3 + c];
-        (seen - high).max(low - seen).max(0.0).powi(2)
+///
+/// It also forgives a vehicle that the state has and the image does not show: the vehicle's edges, windows and wheels
+/// span the road's values. So where the states do not look alike, the distance of the rendered value from the range of
+/// the image's neighbours counts too, as the second kind.
+fn energy(pixels: Pixels, rendered: &[f32], fit: &Fit) -> Vec<ByKind> {
+    let Pixels { image, judged, told_apart, width } = pixels;
+    let of_channel = |i: usize, c: usize| -> ByKind {
+        let expected = |n: usize| fit.gain[c] * rendered[n * 3 + c] + fit.offset[c];
+        let seen = |n: usize| image[n * 3 + c];
+        let unexpected = beyond(seen(i), neighbours(i, judged, width).map(expected));
+        let missing = if told_apart[i] { beyond(expected(i), neighbours(i, judged, width).map(seen)) } else { 0.0 };
+        [unexpected.powi(2), missing.powi(2)]
     };
-    (0..judged.len()).map(|i| if judged[i] { (0..3).map(|c| of_channel(i, c)).sum() } else { 0.0 }).collect()
+    let of_pixel = |i: usize| (0..3).map(|c| of_channel(i, c)).fold([0.0; 2], |a, b| [a[0] + b[0], a[1] + b[1]]);
+    (0..judged.len()).map(|i| if judged[i] { of_pixel(i) } else { [0.0; 2] }).collect()
 }
 
 /// Lets each state explain the pixels of the vehicle itself as the other states do that have it elsewhere, but agree about
 /// the hazard: the vehicle's place varies. `energies` and `own` have one entry a state, and `own` is sorted.
-fn explain_own(energies: &mut [Vec<f32>], own: &[Vec<usize>], hazard_states: &[bool]) {
+fn explain_own(energies: &mut [Vec<ByKind>], own: &[Vec<usize>], hazard_states: &[bool]) {
     let before = energies.to_vec();
     for (state, pixels) in own.iter().enumerate() {
         for &i in pixels {
@@ -263,18 +337,19 @@ fn explain_own(energies: &mut [Vec<f32>], own: &[Vec<usize>], hazard_states: &[b
                 hazard_states.get(*other) == hazard_states.get(state) && own[*other].binary_search(&i).is_err()
             };
             let others = (0..own.len()).filter(elsewhere).map(|other| before[other][i]);
-            energies[state][i] = others.fold(before[state][i], f32::min);
+            let smaller = |a: ByKind, b: ByKind| if b[0] + b[1] < a[0] + a[1] { b } else { a };
+            energies[state][i] = others.fold(before[state][i], smaller);
         }
     }
 }
 
 /// Root of the median over 3 x 3 pixels (the lower one of an even number), of the mean over channels, in deviations: a
 /// speck or a thin line that the field misses is not an object.
-fn median_residual(energy: &[f32], judged: &[bool], width: usize, noise: f32) -> Vec<f32> {
+fn median_residual(energy: &[ByKind], kind: Kind, judged: &[bool], width: usize, noise: f32) -> Vec<f32> {
     let of_pixel = |i: usize| {
         let (mut near, mut count) = ([0.0; 9], 0);
         for at in neighbours(i, judged, width) {
-            near[count] = energy[at];
+            near[count] = energy[at][kind as usize];
             count += 1;
         }
         let near = &mut near[..count];
@@ -287,6 +362,7 @@ fn median_residual(energy: &[f32], judged: &[bool], width: usize, noise: f32) ->
 #[cfg(test)]
 mod tests {
     use super::*;
+    use carff_field::RenderBuffer;
     use ndarray::Array3;
 
     /// A view of this place is explained in any exposure and with a ninth of it covered; another image, a negative and a
@@ -296,7 +372,8 @@ mod tests {
         let rendered: Vec<f32> = (0..900).map(|i| 0.1 + 0.8 * ((i / 3 * 37 % 100) as f32) / 100.0).collect();
         let explained = |of: &dyn Fn(usize, f32) -> f32| {
             let image: Vec<f32> = rendered.iter().enumerate().map(|(i, v)| of(i, *v)).collect();
-            explained(&image, &rendered, &(0..300).collect::<Vec<_>>())
+            let pixels: Vec<usize> = (0..300).collect();
+            fitted(&image, &rendered, &pixels, &[]).explained
         };
         assert!(explained(&|_, v| 0.6 * v + 0.2) > 0.99);
         assert!(explained(&|i, v| if i / 3 % 9 < 1 { 0.95 } else { v }) > 0.7);
@@ -371,11 +448,50 @@ mod tests {
             .collect();
         let fit = Fit { gain: [1.0; 3], offset: [0.0; 3], noise: LEAST_NOISE, explained: 1.0 };
         let judged = vec![true; width * width];
-        let out = median_residual(&energy(&seen, &rendered, &fit, &judged, width), &judged, width, fit.noise);
+        let pixels = Pixels { image: &seen, judged: &judged, told_apart: &vec![true; width * width], width };
+        let out = median_residual(&energy(pixels, &rendered, &fit), Kind::Unexpected, &judged, width, fit.noise);
         assert!(out[22 * width + 6] > 20.0);
         let elsewhere =
             (0..width * width).filter(|i| !(2..11).contains(&(i % width)) || !(18..27).contains(&(i / width)));
         assert!(elsewhere.map(|i| out[i]).fold(0.0, f32::max) < 1e-3);
+    }
+
+    /// A vehicle that a state has and the image does not show is a residual, where another state looks different; a
+    /// detail that all states have and the image has lost is none.
+    #[test]
+    fn a_missing_vehicle_counts() {
+        let width = 16;
+        // The vehicle's dark and bright parts alternate, so the road's value is in the range at each of its pixels.
+        let vehicle = |i: usize| if (i % width).is_multiple_of(2) { 0.1 } else { 0.9 };
+        let is_vehicle = |i: usize| (4..11).contains(&(i % width)) && (4..11).contains(&(i / width));
+        let with_it: Vec<f32> =
+            (0..width * width * 3).map(|i| if is_vehicle(i / 3) { vehicle(i / 3) } else { 0.5 }).collect();
+        let road = vec![0.5; width * width * 3];
+        let fit = Fit { gain: [1.0; 3], offset: [0.0; 3], noise: LEAST_NOISE, explained: 1.0 };
+        let judged = vec![true; width * width];
+        let residual = |states: &[&[f32]]| {
+            let pixels = Pixels { image: &road, judged: &judged, told_apart: &told_apart(states), width };
+            let energy = energy(pixels, &with_it, &fit);
+            Kind::ALL.map(|kind| median_residual(&energy, kind, &judged, width, fit.noise)[7 * width + 7])
+        };
+        let [unexpected, missing] = residual(&[&with_it, &road]);
+        assert!(unexpected < 1e-3 && missing > 20.0, "{unexpected} {missing}");
+        assert_eq!(residual(&[&with_it, &with_it]), [unexpected, 0.0]);
+    }
+
+    /// A vehicle that fills the lanes stays as large against the noise as one that covers a small part of them.
+    #[test]
+    fn a_vehicle_that_fills_the_lanes_is_no_noise() {
+        let all: Vec<usize> = (0..1600).collect();
+        let (samples, lanes): (Vec<usize>, Vec<usize>) = all.iter().partition(|&&i| i % 4 == 1);
+        let rendered: Vec<f32> = (0..4800).map(|i| 0.2 + 0.5 * ((i / 3 * 37 % 100) as f32) / 100.0).collect();
+        let noise_of = |covered: usize| {
+            let shown = |i: usize| if i / 3 % 4 != 1 && i / 12 < covered { 0.95 } else { rendered[i] };
+            let image: Vec<f32> = (0..4800).map(shown).collect();
+            fitted(&image, &rendered, &samples, &lanes).noise
+        };
+        assert_eq!(noise_of(20), LEAST_NOISE);
+        assert_eq!(noise_of(390), LEAST_NOISE);
     }
 
     /// The place where a state has the vehicle itself hides nothing: its pixels must be explained with the vehicle there, or
@@ -383,12 +499,13 @@ mod tests {
     #[test]
     fn the_own_place_hides_nothing() {
         // Pixel 0: the vehicle is there. Pixel 1: the road is seen. Pixel 2: something else. Pixel 3: the hazard.
-        let with_it = vec![0.0, 4.0, 4.0, 4.0];
-        let without = vec![4.0, 0.0, 4.0, 4.0];
-        let hazard = vec![4.0, 0.0, 4.0, 0.0];
+        let energy = |values: [f32; 4]| values.map(|v| [v, 0.0]).to_vec();
+        let with_it = energy([0.0, 4.0, 4.0, 4.0]);
+        let without = energy([4.0, 0.0, 4.0, 4.0]);
+        let hazard = energy([4.0, 0.0, 4.0, 0.0]);
         let mut energies = [with_it, without.clone(), hazard.clone()];
         explain_own(&mut energies, &[vec![0, 1, 2, 3], vec![], vec![]], &[false, false, true]);
-        assert_eq!(energies, [vec![0.0, 0.0, 4.0, 4.0], without, hazard]);
+        assert_eq!(energies, [energy([0.0, 0.0, 4.0, 4.0]), without, hazard]);
     }
 
     /// Cells are means; images smaller than the grid repeat their pixels.

@@ -33,24 +33,32 @@ pub(crate) fn median(values: &mut [f32]) -> f32 {
     *values.select_nth_unstable_by(middle, f32::total_cmp).1
 }
 
+/// Robust deviation of pixels from a gain and an offset of the rendered image, of 1: the root mean square over the
+/// channels, at least [`LEAST_NOISE`].
+pub(crate) fn noise(image: &[f32], rendered: &[f32], fit: &Fit, pixels: &[usize]) -> f32 {
+    let of_channel = |c: usize| {
+        let error = |&i: &usize| (image[i * 3 + c] - fit.gain[c] * rendered[i * 3 + c] - fit.offset[c]).abs();
+        OF_MEDIAN * median(&mut pixels.iter().map(error).collect::<Vec<_>>())
+    };
+    ((0..3).map(|c| of_channel(c).powi(2)).sum::<f32>() / 3.0).sqrt().max(LEAST_NOISE)
+}
+
 /// Fits gain and offset of each channel by least squares over some pixels, without outliers.
 pub(crate) fn fit(image: &[f32], rendered: &[f32], pixels: &[usize]) -> Fit {
-    let (mut gain, mut offset, mut noise) = ([1.0; 3], [0.0; 3], [LEAST_NOISE; 3]);
+    let mut fit = Fit { gain: [1.0; 3], offset: [0.0; 3], noise: LEAST_NOISE, explained: 1.0 };
     for c in 0..3 {
         let pairs: Vec<(f32, f32)> = pixels.iter().map(|&i| (rendered[i * 3 + c], image[i * 3 + c])).collect();
         let mut limit = f32::INFINITY;
         for _ in 0..PASSES {
-            let error = |(x, y): (f32, f32)| (y - gain[c] * x - offset[c]).abs();
+            let error = |(x, y): (f32, f32)| (y - fit.gain[c] * x - fit.offset[c]).abs();
             let within = pairs.iter().copied().filter(|pair| error(*pair) <= limit);
             let Some(line) = least_squares(within.map(|(x, y)| ([x, 1.0], y))) else { break };
-            [gain[c], offset[c]] = line;
+            [fit.gain[c], fit.offset[c]] = line;
             let mut errors: Vec<f32> = pairs.iter().map(|(x, y)| (y - line[0] * x - line[1]).abs()).collect();
-            noise[c] = OF_MEDIAN * median(&mut errors);
-            limit = (TRIM * noise[c]).max(LEAST_NOISE);
+            limit = (TRIM * OF_MEDIAN * median(&mut errors)).max(LEAST_NOISE);
         }
     }
-    let noise = (noise.iter().map(|v| v * v).sum::<f32>() / 3.0).sqrt().max(LEAST_NOISE);
-    Fit { gain, offset, noise, explained: 1.0 }
+    Fit { noise: noise(image, rendered, &fit, pixels), ..fit }
 }
 
 /// Solves for the factors of N terms, by least squares over rows of terms and their value; `None` for too few rows or

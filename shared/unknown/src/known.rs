@@ -2,7 +2,7 @@
 
 use crate::blobs::Blob;
 use crate::camera::CameraLimits;
-use crate::compare::{Comparer, Comparison, KnownScene};
+use crate::compare::{Comparer, Comparison, Kind, KnownScene};
 use crate::lanes::{ErrorMap, Lanes};
 use carff_base::geometry::PinholeCamera;
 use carff_field::Field;
@@ -13,12 +13,12 @@ use std::path::{Path, PathBuf};
 
 /// File name in a checkpoint.
 const FILE: &str = "known.json";
-/// Version of the file's format. The limits of version 1 are for other residuals, and about twice too large for these.
-const FORMAT_VERSION: u32 = 2;
+/// Version of the file's format. The limits of earlier versions are for other residuals.
+const FORMAT_VERSION: u32 = 3;
 /// Steepness of the evidence against a state beyond the limit: at 1.5 times the limit, something unknown explains the
 /// image 58 times better.
 const STEEPNESS: f64 = 10.0;
-/// Share of the known images that leave less than the limit.
+/// Share of the known images that leave less than the limit of a kind.
 const WITHIN: f64 = 0.97;
 /// Share of the known images' smallest explained share below which a view is of another place.
 const OF_LEAST_EXPLAINED: f32 = 0.8;
@@ -30,7 +30,7 @@ const ELSEWHERE: f32 = 100.0;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Known {
-    /// Format of this file; 2.
+    /// Format of this file; 3.
     pub format_version: u32,
     /// The ground on which something unknown counts.
     pub lanes: Lanes,
@@ -50,12 +50,22 @@ pub struct Known {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct KnownLimits {
+    /// Limits of what the image shows and the state does not have.
+    pub unexpected: KindLimits,
+    /// Limits of what the state has and the image does not show.
+    pub missing: KindLimits,
+    /// Number of images that the limits rest on.
+    pub images: usize,
+}
+
+/// Limits of one kind of residuals.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct KindLimits {
     /// The field's own errors on the lanes.
     pub errors: ErrorMap,
     /// Strength of a blob that 97 of 100 images stay below.
     pub limit: f32,
-    /// Number of images that the limit rests on.
-    pub images: usize,
 }
 
 /// Reason why the file cannot be used.
@@ -141,23 +151,21 @@ impl Known {
     /// Judges a comparison. No state explains a view of another place, and nothing has a box in it.
     pub fn judge(&self, comparison: &Comparison) -> Seen {
         if comparison.fit.explained < self.least_explained {
-            let ratios = vec![0.0; comparison.residuals.len()];
+            let ratios = vec![0.0; comparison.states()];
             return Seen { ratios, boxes: Vec::new(), residual: ELSEWHERE };
         }
         let limits =
             |state: usize| if self.hazard_states.get(state) == Some(&true) { &self.hazard } else { &self.clear };
-        let of_states: Vec<Vec<Blob>> =
-            (0..comparison.residuals.len()).map(|s| comparison.blobs(s, &limits(s).errors)).collect();
-        let in_limits = |state: usize, blob: &Blob| blob.strength / limits(state).limit;
-        let strongest = |state: usize| of_states[state].first().map_or(0.0, |blob| in_limits(state, blob));
+        let of_states: Vec<InLimits> = (0..comparison.states()).map(|s| limits(s).judge(comparison, s)).collect();
+        let strongest = |state: usize| of_states[state].first().map_or(0.0, |(strength, _)| *strength);
         let ratio = |in_limits: f32| f64::from(1.0 / in_limits.max(0.25)).powf(STEEPNESS);
         let ratios = (0..of_states.len()).map(|s| ratio(strongest(s)) as f32).collect();
         let best = (0..of_states.len()).min_by(|&a, &b| strongest(a).total_cmp(&strongest(b)));
         let Some(best) = best else { return Seen { ratios, boxes: Vec::new(), residual: 0.0 } };
-        let unknown = of_states[best].iter().take(MAX_UNKNOWNS).filter(|blob| in_limits(best, blob) > 1.0);
-        let boxes = unknown.map(|blob| {
+        let unknown = of_states[best].iter().take(MAX_UNKNOWNS).filter(|(strength, _)| *strength > 1.0);
+        let boxes = unknown.map(|(strength, blob)| {
             let (center, half_size) = blob.upright_box(&comparison.camera, self.lanes.ground_m);
-            let probability = (1.0 / (1.0 + ratio(in_limits(best, blob)))) as f32;
+            let probability = (1.0 / (1.0 + ratio(*strength))) as f32;
             UnknownBox { center, half_size, probability, place: -1 }
         });
         Seen { ratios, boxes: boxes.collect(), residual: strongest(best) }
@@ -178,7 +186,7 @@ impl Known {
             return Err(format(format!("`format_version` is {found}, this program reads {FORMAT_VERSION}")));
         }
         for limits in [&known.clear, &known.hazard] {
-            if !(limits.errors.is_valid() && limits.limit.is_finite() && limits.limit > 0.0) {
+            if !Kind::ALL.iter().all(|kind| limits.of(*kind).is_valid()) {
                 return Err(format("`errors` and `limit` must be positive numbers".to_owned()));
             }
         }
@@ -197,26 +205,80 @@ impl Known {
     }
 }
 
+/// Blobs of one state and kind with their strengths in limits, the strongest first.
+type InLimits = Vec<(f32, Blob)>;
+
 impl KnownLimits {
     /// Fits the limits of some states on comparisons of their images, each under its best one of these states.
-    /// Residuals of the first half of the images make the error map, and those of the second half the limit.
+    /// Residuals of the first half of the images make the error maps, and those of the second half the limits.
     fn fit(lanes: &Lanes, states: &[usize], images: &[&Comparison]) -> Self {
         let (for_errors, for_limit) = images.split_at(images.len() / 2);
-        let mut points = Vec::new();
+        let mut points = [Vec::new(), Vec::new()];
         for comparison in for_errors {
-            let sum = |s: usize| comparison.on_lanes(s).map(|(_, r)| r * r).sum::<f32>();
-            let best = states.iter().copied().min_by(|&a, &b| sum(a).total_cmp(&sum(b)));
-            points.extend(best.into_iter().flat_map(|best| comparison.on_lanes(best)));
+            let of = |s: usize| Kind::ALL.into_iter().flat_map(move |kind| comparison.on_lanes(s, kind));
+            let Some(best) = best(states, |s| of(s).map(|(_, r)| r * r).sum()) else { continue };
+            for kind in Kind::ALL {
+                points[kind as usize].extend(comparison.on_lanes(best, kind));
+            }
         }
-        let errors = ErrorMap::fit(lanes, &points);
-        let strongest = |c: &Comparison, s: usize| c.blobs(s, &errors).first().map_or(0.0, |blob| blob.strength);
-        let least = |c: &&Comparison| states.iter().map(|&s| strongest(c, s)).fold(f32::INFINITY, f32::min);
-        let mut strengths: Vec<f32> = for_limit.iter().map(least).collect();
-        strengths.sort_by(f32::total_cmp);
-        let at = ((strengths.len() as f64 * WITHIN).ceil() as usize).saturating_sub(1);
-        let limit = strengths.get(at).copied().unwrap_or(1.0).max(1.0);
-        Self { errors, limit, images: strengths.len() }
+        let errors = Kind::ALL.map(|kind| ErrorMap::fit(lanes, &points[kind as usize]));
+        let mut strengths = [Vec::new(), Vec::new()];
+        for comparison in for_limit {
+            let of_kind = |s: usize, kind: Kind| {
+                comparison.blobs(s, kind, &errors[kind as usize]).first().map_or(0.0, |blob| blob.strength)
+            };
+            let of = |s: usize| Kind::ALL.map(|kind| of_kind(s, kind));
+            let Some(best) = best(states, |s| of(s).into_iter().fold(0.0, f32::max)) else { continue };
+            strengths.iter_mut().zip(of(best)).for_each(|(all, strength)| all.push(strength));
+        }
+        let images = strengths[0].len();
+        let of_kind = |errors, mut strengths: Vec<f32>| {
+            strengths.sort_by(f32::total_cmp);
+            let at = ((strengths.len() as f64 * WITHIN).ceil() as usize).saturating_sub(1);
+            KindLimits { errors, limit: strengths.get(at).copied().unwrap_or(1.0).max(1.0) }
+        };
+        let ([unexpected_errors, missing_errors], [unexpected, missing]) = (errors, strengths);
+        Self { unexpected: of_kind(unexpected_errors, unexpected), missing: of_kind(missing_errors, missing), images }
     }
+
+    /// Returns the limits of one kind.
+    pub fn of(&self, kind: Kind) -> &KindLimits {
+        match kind {
+            Kind::Unexpected => &self.unexpected,
+            Kind::Missing => &self.missing,
+        }
+    }
+
+    /// Multiplies the limits.
+    #[must_use]
+    pub fn times(mut self, factor: f32) -> Self {
+        self.unexpected.limit *= factor;
+        self.missing.limit *= factor;
+        self
+    }
+
+    /// Returns the blobs of a state, of the kind that has the strongest one: an object covers what a state has there.
+    fn judge(&self, comparison: &Comparison, state: usize) -> InLimits {
+        let [unexpected, missing] = Kind::ALL.map(|kind| -> InLimits {
+            let KindLimits { errors, limit } = self.of(kind);
+            let in_limits = |blob: Blob| (blob.strength / limit, blob);
+            comparison.blobs(state, kind, errors).into_iter().map(in_limits).collect()
+        });
+        let strongest = |blobs: &InLimits| blobs.first().map_or(0.0, |(strength, _)| *strength);
+        if strongest(&missing) > strongest(&unexpected) { missing } else { unexpected }
+    }
+}
+
+impl KindLimits {
+    /// Reports whether the limits can be used: numbers above 0.
+    fn is_valid(&self) -> bool {
+        self.errors.is_valid() && self.limit.is_finite() && self.limit > 0.0
+    }
+}
+
+/// The state with the smallest value.
+fn best(states: &[usize], value: impl Fn(usize) -> f32) -> Option<usize> {
+    states.iter().copied().min_by(|&a, &b| value(a).total_cmp(&value(b)))
 }
 
 #[cfg(test)]
@@ -233,7 +295,8 @@ mod tests {
             nearest_m: 1.0,
             own: Vec::new(),
         };
-        let limits = KnownLimits { errors: ErrorMap::even(&lanes, 1.0), limit: 5.0, images: 10 };
+        let of_kind = KindLimits { errors: ErrorMap::even(&lanes, 1.0), limit: 5.0 };
+        let limits = KnownLimits { unexpected: of_kind.clone(), missing: of_kind, images: 10 };
         Known {
             format_version: FORMAT_VERSION,
             lanes,
@@ -254,9 +317,9 @@ mod tests {
         known.save(folder.path()).unwrap();
         assert_eq!(Known::load(folder.path()).unwrap(), Some(known.clone()));
         for (broken, word) in [
-            (Known { format_version: 1, ..known.clone() }, "format_version"),
+            (Known { format_version: FORMAT_VERSION - 1, ..known.clone() }, "format_version"),
             (Known { format_version: 9, ..known.clone() }, "format_version"),
-            (Known { clear: KnownLimits { limit: -1.0, ..known.clear.clone() }, ..known.clone() }, "limit"),
+            (Known { clear: known.clear.clone().times(-1.0), ..known.clone() }, "limit"),
         ] {
             broken.save(folder.path()).unwrap();
             assert!(Known::load(folder.path()).unwrap_err().to_string().contains(word));

@@ -22,8 +22,8 @@ mod sight;
 
 pub use blobs::Blob;
 pub use camera::{CameraCheck, CameraLimits, Measured, Measurement};
-pub use compare::{Comparer, Comparison, KnownScene};
+pub use compare::{Comparer, Comparison, Kind, KnownScene};
 pub use fit::Fit;
-pub use known::{Known, KnownError, KnownLimits, Seen};
+pub use known::{KindLimits, Known, KnownError, KnownLimits, Seen};
 pub use lanes::{ErrorMap, Ground, Lanes, OwnBox};
 pub use sight::Sight;

@@ -7,6 +7,7 @@ use carff_dataset::Image;
 use carff_decision::ImageEvidence;
 use carff_plots::{StripCell, StripRow};
 use carff_trials::Compared;
+use carff_unknown::Kind;
 use std::path::Path;
 
 /// Largest number of objects.
@@ -99,10 +100,11 @@ fn rendered(compared: &Compared) -> Image {
     of_size(compared, compared.rendered.iter().enumerate().map(pixel).collect())
 }
 
-/// The residual of the best state, black to white.
+/// The residual of the best state, the larger one of both kinds, black to white.
 fn residual(compared: &Compared) -> Image {
-    let residual = &compared.comparison.residuals[compared.best];
-    let grey = residual.iter().flat_map(|r| [(255.0 * (r / WHITE_DEVIATIONS).clamp(0.0, 1.0)) as u8; 3]);
+    let [unexpected, missing] = Kind::ALL.map(|kind| compared.comparison.residual(compared.best, kind));
+    let larger = unexpected.iter().zip(missing).map(|(a, b)| a.max(*b));
+    let grey = larger.flat_map(|r| [(255.0 * (r / WHITE_DEVIATIONS).clamp(0.0, 1.0)) as u8; 3]);
     of_size(compared, grey.collect())
 }
 
