@@ -133,20 +133,15 @@ fn controller(stage: &mut StageContext) -> anyhow::Result<()> {
                 continue;
             }
             actions.send(Action {
-                header: belief.header,
                 action: ActionCode::Advance.code(),
-                reason: Reason::Belief.code(),
-                rule: Rule::Calibrated.code(),
                 sample_count: 1,
                 confidence: 1.0,
                 hazard_probability: 0.25,
                 is_decision: 1,
-                unknown_probability: 0.0,
                 valid_until_ns: monotonic_now_ns(),
                 based_on_frame: belief.header.frame_id,
                 latency_ns: 1,
-                target_speed_mps: 0.0,
-                look_gain_bits: 0.0,
+                ..Action::halt(belief.header, Reason::Belief, Rule::Calibrated)
             })?;
         }
     }

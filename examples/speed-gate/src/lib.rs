@@ -49,20 +49,10 @@ mod tests {
 
     fn action(code: ActionCode) -> Action {
         Action {
-            header: Header::of_frame(7, 1_000, 42),
             action: code.code(),
-            reason: Reason::Belief.code(),
-            rule: Rule::Calibrated.code(),
-            sample_count: 1,
-            confidence: 1.0,
-            hazard_probability: 0.0,
             is_decision: 1,
-            unknown_probability: 0.0,
-            valid_until_ns: 0,
             based_on_frame: 7,
-            latency_ns: 0,
-            target_speed_mps: 0.0,
-            look_gain_bits: 0.0,
+            ..Action::halt(Header::of_frame(7, 1_000, 42), Reason::Belief, Rule::Calibrated)
         }
     }
 

@@ -131,29 +131,15 @@ impl Conditions {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use carff_messages::{ActionCode, Header, Reason};
+    use carff_messages::{Header, Reason, Rule};
 
     fn check(frame_id: u64, condition: ImageCondition, repeats_s: f32) -> ImageCheck {
         ImageCheck { condition: condition.code(), repeats_s, ..ImageCheck::of_frame(Header::of_frame(frame_id, 1, 1)) }
     }
 
     fn action(frame_id: u64, reason: Reason) -> Action {
-        Action {
-            header: Header::of_frame(frame_id, 1, 1),
-            action: ActionCode::Halt.code(),
-            reason: reason.code(),
-            rule: 3,
-            sample_count: 0,
-            confidence: 0.0,
-            hazard_probability: 1.0,
-            is_decision: 1,
-            unknown_probability: 0.0,
-            valid_until_ns: 1,
-            based_on_frame: frame_id,
-            latency_ns: 0,
-            target_speed_mps: 0.0,
-            look_gain_bits: 0.0,
-        }
+        let halt = Action::halt(Header::of_frame(frame_id, 1, 1), reason, Rule::Calibrated);
+        Action { is_decision: 1, based_on_frame: frame_id, ..halt }
     }
 
     /// Consecutive images of a condition are one episode, and every image counts.

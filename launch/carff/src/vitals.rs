@@ -266,7 +266,7 @@ fn used_ns(stat: &str) -> Option<u64> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use carff_messages::{Gaussian, Header};
+    use carff_messages::{Gaussian, Header, Rule};
 
     fn health(pid: u32, state: HealthState) -> Health {
         Health {
@@ -342,20 +342,15 @@ mod tests {
 
     fn action(latency_ns: u64) -> Action {
         Action {
-            header: Header::of_frame(7, 1, 1),
             action: ActionCode::Advance.code(),
-            reason: Reason::Belief.code(),
-            rule: 3,
             sample_count: 10,
             confidence: 1.0,
             hazard_probability: 0.1,
             is_decision: 1,
-            unknown_probability: 0.0,
             valid_until_ns: 1,
             based_on_frame: 7,
             latency_ns,
-            target_speed_mps: 0.0,
-            look_gain_bits: 0.0,
+            ..Action::halt(Header::of_frame(7, 1, 1), Reason::Belief, Rule::Calibrated)
         }
     }
 

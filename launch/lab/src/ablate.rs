@@ -5,7 +5,7 @@ use crate::train::{Display, datasets, refuse_another_configuration, stop_on_sign
 use anyhow::{Context, anyhow};
 use carff_base::files::check_writable;
 use carff_launch::lab::AblateArgs;
-use carff_training::ablation::{AblationTable, Variant, folders, row, write_table};
+use carff_training::ablation::{AblationTable, Variant, folder, row, write_table};
 use carff_training::{Progress, Run, Training, TrainingConfig, TrainingError};
 use std::process::ExitCode;
 
@@ -42,25 +42,25 @@ pub fn run(args: &AblateArgs) -> anyhow::Result<ExitCode> {
         dataset: dataset.display().to_string(),
         epochs: config.vae.epochs,
         free_poses: if random_poses.is_empty() { 0 } else { config.free_poses.count },
-        seed: config.seed,
         rows: Vec::new(),
     };
-    let training = Training {
-        config: &config,
-        dataset: &dataset,
-        random_poses: &random_poses,
-        scenario: None,
-        out: &args.out,
-        device: options.device,
-    };
-    for variant in variants {
-        carff::say(&format!("{}: {}", variant.name(), variant.description(&config)));
-        let (dir, _) = folders(&args.out, variant);
+    for (variant, seed) in variants.iter().flat_map(|&v| (0..args.seeds).map(move |k| (v, config.seed + k))) {
+        let config = TrainingConfig { seed, ..config.clone() };
+        carff::say(&format!("{}, seed {seed}: {}", variant.name(), variant.description(&config)));
+        let dir = folder(&args.out, variant, seed).join("run");
         std::fs::create_dir_all(&dir).with_context(|| format!("cannot make {}", dir.display()))?;
         refuse_another_configuration(&dir, &variant.apply(&config), &dataset)?;
         let display = Display::default();
         let report = |progress: &Progress| display.show(progress);
         let run = Run { dir, on_progress: &report, stop: stop.flag() };
+        let training = Training {
+            config: &config,
+            dataset: &dataset,
+            random_poses: &random_poses,
+            scenario: None,
+            out: &args.out,
+            device: options.device,
+        };
         let found = row(&training, variant, &run, options);
         display.finish();
         match found {

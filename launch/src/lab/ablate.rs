@@ -10,9 +10,13 @@ pub struct AblateArgs {
     /// Dataset to train on, instead of the training file's.
     #[arg(long)]
     pub dataset: Option<PathBuf>,
-    /// Train only these variants, by the name of their folder: full, stem, conv-net, unfrozen, transformer, no-pose.
+    /// Train only these variants, by the name of their folder: full, stem, conv-net, unfrozen, transformer, no-pose,
+    /// eight-poses, one-pose, own-pose, one-stage.
     #[arg(long)]
     pub only: Vec<String>,
+    /// Number of trainings of each variant, with the training file's seed and the numbers after it.
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=100))]
+    pub seeds: u64,
     /// Device of training and scoring: `auto`, `cpu` or `cuda:N`.
     #[arg(long, default_value = "auto")]
     pub device: String,

@@ -77,7 +77,7 @@ impl Answer {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use carff_messages::Reason;
+    use carff_messages::{Reason, Rule};
 
     const MS: u64 = 1_000_000;
     /// Number of the first bad frame.
@@ -89,22 +89,8 @@ mod tests {
     }
 
     fn action(frame_id: u64, reason: Reason) -> Action {
-        Action {
-            header: Header::of_frame(frame_id, 1, 1),
-            action: ActionCode::Halt.code(),
-            reason: reason.code(),
-            rule: 3,
-            sample_count: 0,
-            confidence: 0.0,
-            hazard_probability: 1.0,
-            is_decision: 1,
-            unknown_probability: 0.0,
-            valid_until_ns: 1,
-            based_on_frame: frame_id,
-            latency_ns: 0,
-            target_speed_mps: 0.0,
-            look_gain_bits: 0.0,
-        }
+        let halt = Action::halt(Header::of_frame(frame_id, 1, 1), reason, Rule::Calibrated);
+        Action { is_decision: 1, based_on_frame: frame_id, ..halt }
     }
 
     /// A condition must be named within three checked images; earlier frames and skipped ones do not count.

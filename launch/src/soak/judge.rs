@@ -239,20 +239,16 @@ mod tests {
         let mut header = Header::of_frame(frame_id, frame_id * 100 * MS, 1);
         header.publish_time_ns = at_ms * MS;
         Action {
-            header,
             action: code.code(),
-            reason: Reason::Belief.code(),
-            rule: Rule::Calibrated.code(),
             sample_count: 2,
             confidence: 1.0,
             hazard_probability: 0.0,
             is_decision: 1,
-            unknown_probability: 0.0,
             valid_until_ns: (at_ms + 150) * MS,
             based_on_frame: frame_id,
             latency_ns: (at_ms - frame_id * 100) * MS,
             target_speed_mps: if code == ActionCode::Advance { 5.0 } else { 0.0 },
-            look_gain_bits: 0.0,
+            ..Action::halt(header, Reason::Belief, Rule::Calibrated)
         }
     }
 

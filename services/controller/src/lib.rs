@@ -4,9 +4,7 @@
 //! in between.
 
 use carff_decision::{Approach, Decision, Evidence, Motion, Policy, Speeds};
-use carff_messages::{
-    Action, ActionCode, Belief, EgoMotion, Header, ImageCheck, LookGain, MAX_HORIZON, Message, Reason,
-};
+use carff_messages::{Action, Belief, EgoMotion, Header, ImageCheck, LookGain, MAX_HORIZON, Message, Reason};
 
 /// Settings of a controller.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -247,21 +245,10 @@ impl Controller {
     }
 
     fn safe_action(&self, reason: Reason, now_ns: u64) -> Action {
+        let header = Header::of_frame(self.settled.map_or(0, |(_, id)| id), now_ns, self.settings.seed);
         Action {
-            header: Header::of_frame(self.settled.map_or(0, |(_, id)| id), now_ns, self.settings.seed),
-            action: ActionCode::Halt.code(),
-            reason: reason.code(),
-            rule: self.settings.policy.rule.code(),
-            sample_count: 0,
-            confidence: 0.0,
-            hazard_probability: 1.0,
-            is_decision: 0,
-            unknown_probability: 0.0,
             valid_until_ns: now_ns.saturating_add(2 * self.settings.period_ns),
-            based_on_frame: u64::MAX,
-            latency_ns: 0,
-            target_speed_mps: 0.0,
-            look_gain_bits: 0.0,
+            ..Action::halt(header, reason, self.settings.policy.rule)
         }
     }
 }

@@ -1,5 +1,5 @@
 use super::*;
-use carff_messages::{ImageCheck, ImageCondition, ProbeResult, Rule};
+use carff_messages::{ActionCode, ImageCheck, ImageCondition, ProbeResult, Rule};
 
 const MS: u64 = 1_000_000;
 const HORIZON: u32 = 2;

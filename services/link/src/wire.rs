@@ -111,20 +111,15 @@ mod tests {
 
     fn action() -> Action {
         Action {
-            header: header(),
             action: ActionCode::ALL[0].code(),
-            reason: Reason::ALL[0].code(),
-            rule: Rule::ALL[0].code(),
             sample_count: 10,
             confidence: 0.9,
             hazard_probability: 0.3,
             is_decision: 1,
-            unknown_probability: 0.0,
             valid_until_ns: 9_000,
             based_on_frame: 7,
             latency_ns: 1_000,
-            target_speed_mps: 0.0,
-            look_gain_bits: 0.0,
+            ..Action::halt(header(), Reason::ALL[0], Rule::ALL[0])
         }
     }
 

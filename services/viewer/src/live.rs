@@ -497,20 +497,13 @@ mod tests {
     #[test]
     fn decisions_are_written_down_once() {
         let action = |reason: Reason, is_decision| Action {
-            header: Header::of_frame(4, 5, 77),
-            action: ActionCode::Halt.code(),
-            reason: reason.code(),
-            rule: Rule::Calibrated.code(),
             sample_count: 10,
             confidence: 0.5,
             hazard_probability: 0.5,
             is_decision,
-            unknown_probability: 0.0,
-            valid_until_ns: 0,
             based_on_frame: 4,
             latency_ns: 2_500_000,
-            target_speed_mps: 0.0,
-            look_gain_bits: 0.0,
+            ..Action::halt(Header::of_frame(4, 5, 77), reason, Rule::Calibrated)
         };
         let mut last = None;
         let stream = [

@@ -94,20 +94,13 @@ fn watches_a_run_from_frame_to_decision() {
     assert!(feed.take_newest().is_none(), "each frame is reported once");
 
     let action = Action {
-        header,
-        action: ActionCode::Halt.code(),
-        reason: Reason::Belief.code(),
-        rule: Rule::Paper.code(),
         sample_count: 2,
         confidence: 0.75,
         hazard_probability: 0.75,
         is_decision: 1,
-        unknown_probability: 0.0,
-        valid_until_ns: 0,
         based_on_frame: 4,
         latency_ns: 8_000_000,
-        target_speed_mps: 0.0,
-        look_gain_bits: 0.0,
+        ..Action::halt(header, Reason::Belief, Rule::Paper)
     };
     actions.send(action).unwrap();
     let decision = wait_for(|| feed.watched().journal.decisions().next().cloned());

@@ -3,6 +3,7 @@
 //! | module | content |
 //! |---|---|
 //! | [`geometry`] | cameras, rays and boxes, with their spaces and units |
+//! | [`linear`] | small systems of equations |
 //! | [`random`] | random streams, named by their purpose |
 //! | [`statistics`] | percentiles, intervals and PSNR |
 //! | [`names`] | suggestions for unknown names |
@@ -12,6 +13,7 @@
 pub mod errors;
 pub mod files;
 pub mod geometry;
+pub mod linear;
 pub mod names;
 pub mod random;
 pub mod statistics;

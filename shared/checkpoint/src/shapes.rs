@@ -143,6 +143,10 @@ pub struct MixtureConfig {
     pub hidden: i64,
     /// Width of the weight head's hidden layers.
     pub weight_hidden: i64,
+    /// Width of the hidden layer in the heads of means and log-variances, 0 to 4096. 0: these heads have one layer
+    /// (paper: two).
+    #[schemars(range(min = 0, max = 4096))]
+    pub head_hidden: i64,
 }
 
 impl MixtureConfig {
@@ -151,11 +155,12 @@ impl MixtureConfig {
 
     /// Checks the ranges; returns the first key out of its range, with its value and the allowed ones.
     pub fn check(&self) -> Result<(), (&'static str, i64, &'static str)> {
-        let Self { components, hidden, weight_hidden } = *self;
+        let Self { components, hidden, weight_hidden, head_hidden } = *self;
         for (key, value, range, allowed) in [
             ("mixture.components", components, 1..=4, "1 to 4"),
             ("mixture.hidden", hidden, 1..=i64::MAX, "at least 1"),
             ("mixture.weight_hidden", weight_hidden, 1..=i64::MAX, "at least 1"),
+            ("mixture.head_hidden", head_hidden, 0..=4096, "0 to 4096"),
         ] {
             if !range.contains(&value) {
                 return Err((key, value, allowed));
@@ -167,6 +172,6 @@ impl MixtureConfig {
 
 impl Default for MixtureConfig {
     fn default() -> Self {
-        Self { components: 2, hidden: 512, weight_hidden: 128 }
+        Self { components: 2, hidden: 512, weight_hidden: 128, head_hidden: 0 }
     }
 }

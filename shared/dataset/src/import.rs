@@ -6,6 +6,7 @@
 use std::path::Path;
 
 use carff_base::geometry::PinholeCamera;
+use carff_base::linear::solve;
 use image::imageops::{FilterType, resize};
 use rayon::prelude::*;
 
@@ -172,7 +173,8 @@ fn scaled_down(image: &Image, width_px: u32, height_px: u32) -> Image {
 /// spread.
 fn bounds_of(cameras: &[PinholeCamera]) -> [[f64; 3]; 2] {
     let ahead = |c: &PinholeCamera| [0, 1, 2].map(|i| -c.world_from_camera[i][2]);
-    // Sum over lines of (I - d d^T) (x - p) = 0.
+    // Sum over lines of (I - d d^T) (x - p) = 0. The pivots of nearly parallel lines are about as large as their number,
+    // but for one.
     let (mut matrix, mut right) = ([[0.0; 3]; 3], [0.0; 3]);
     for camera in cameras {
         let (p, d) = (camera.position_m(), ahead(camera));
@@ -190,7 +192,7 @@ fn bounds_of(cameras: &[PinholeCamera]) -> [[f64; 3]; 2] {
     };
     let middle = mean(&PinholeCamera::position_m);
     let distance = |a: [f64; 3], b: [f64; 3]| (0..3).map(|i| (a[i] - b[i]).powi(2)).sum::<f64>().sqrt();
-    let center = solve(matrix, right, 1e-3 * count).unwrap_or_else(|| {
+    let center = solve(matrix, right, 1e-3 / count).unwrap_or_else(|| {
         let spread = cameras.iter().map(|c| distance(c.position_m(), middle)).fold(0.0, f64::max).max(1.0);
         let direction = mean(&ahead);
         [0, 1, 2].map(|i| middle[i] + 2.0 * spread * direction[i])
@@ -199,25 +201,6 @@ fn bounds_of(cameras: &[PinholeCamera]) -> [[f64; 3]; 2] {
     distances.sort_by(f64::total_cmp);
     let half = 0.5 * distances.get(distances.len() / 2).copied().unwrap_or(1.0).max(1e-3);
     [center.map(|v| v - half), center.map(|v| v + half)]
-}
-
-/// Solves a symmetric 3x3 system; `None` if its determinant is so small that the lines are nearly parallel.
-fn solve(m: [[f64; 3]; 3], right: [f64; 3], least: f64) -> Option<[f64; 3]> {
-    let determinant = |m: &[[f64; 3]; 3]| {
-        m[0][0] * (m[1][1] * m[2][2] - m[1][2] * m[2][1]) - m[0][1] * (m[1][0] * m[2][2] - m[1][2] * m[2][0])
-            + m[0][2] * (m[1][0] * m[2][1] - m[1][1] * m[2][0])
-    };
-    let whole = determinant(&m);
-    if whole.abs() < least {
-        return None;
-    }
-    Some([0, 1, 2].map(|column| {
-        let mut replaced = m;
-        for (row, value) in replaced.iter_mut().zip(right) {
-            row[column] = value;
-        }
-        determinant(&replaced) / whole
-    }))
 }
 
 #[cfg(test)]

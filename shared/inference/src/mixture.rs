@@ -16,8 +16,8 @@ const LANES: usize = 16;
 #[derive(Clone, Debug)]
 pub struct MixtureNet {
     hidden: [Linear; 2],
-    means: Linear,
-    log_variances: Linear,
+    means: Head,
+    log_variances: Head,
     weights: [Linear; 3],
 }
 
@@ -37,8 +37,8 @@ impl MixtureNet {
         let mut layer = |name: &str, from, to| Linear::take(&mut weights, name, from, to).map_err(wrong);
         let net = Self {
             hidden: [layer("first", 2 * d, h)?, layer("second", h, h)?],
-            means: layer("means", h, k * d)?,
-            log_variances: layer("log_variances", h, k * d)?,
+            means: Head::new(&mut layer, "means", config)?,
+            log_variances: Head::new(&mut layer, "log_variances", config)?,
             weights: [layer("weight0", h, w)?, layer("weight1", w, w)?, layer("weight2", w, k)?],
         };
         weights.finish(|_| false).map_err(wrong)?;
@@ -66,6 +66,30 @@ impl MixtureNet {
 impl Forecasts for MixtureNet {
     fn forecast(&self, posterior: &Gaussian) -> Mixture {
         self.forecast(posterior)
+    }
+}
+
+/// Head of all components' means or log-variances, with a hidden layer where the checkpoint has one.
+#[derive(Clone, Debug)]
+struct Head {
+    hidden: Option<Linear>,
+    last: Linear,
+}
+
+impl Head {
+    fn new<E>(
+        layer: &mut impl FnMut(&str, i64, i64) -> Result<Linear, E>,
+        name: &str,
+        config: &MixtureConfig,
+    ) -> Result<Self, E> {
+        let (hidden, width) = (config.hidden, config.head_hidden);
+        let first = if width > 0 { Some(layer(&format!("{name}_hidden"), hidden, width)?) } else { None };
+        let inputs = if width > 0 { width } else { hidden };
+        Ok(Self { hidden: first, last: layer(name, inputs, config.components * LATENT_DIM as i64)? })
+    }
+
+    fn forward(&self, x: &[f32]) -> Vec<f32> {
+        self.hidden.as_ref().map_or_else(|| self.last.forward(x), |hidden| self.last.forward(&hidden.relu(x)))
     }
 }
 

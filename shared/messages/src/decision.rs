@@ -65,6 +65,34 @@ pub struct Action {
 }
 
 impl Action {
+    /// Returns the safe action of a rule, for a reason: to halt, without a frame that it is based on and without samples,
+    /// with the hazard taken for certain. It has no time of validity yet.
+    ///
+    /// ```
+    /// use carff_messages::{Action, ActionCode, Header, Message, Reason, Rule};
+    /// let action = Action::halt(Header::of_frame(7, 1_000, 42), Reason::StaleBelief, Rule::Calibrated);
+    /// assert!(action.validate().is_ok() && !action.is_decision());
+    /// assert_eq!((action.code(), action.hazard_probability), (Ok(ActionCode::Halt), 1.0));
+    /// ```
+    pub fn halt(header: Header, reason: Reason, rule: Rule) -> Self {
+        Self {
+            header,
+            action: ActionCode::Halt.code(),
+            reason: reason.code(),
+            rule: rule.code(),
+            sample_count: 0,
+            confidence: 0.0,
+            hazard_probability: 1.0,
+            is_decision: 0,
+            unknown_probability: 0.0,
+            valid_until_ns: 0,
+            based_on_frame: u64::MAX,
+            latency_ns: 0,
+            target_speed_mps: 0.0,
+            look_gain_bits: 0.0,
+        }
+    }
+
     /// Returns the action of the vehicle.
     pub fn code(&self) -> Result<ActionCode, Invalid> {
         ActionCode::try_from(self.action)

@@ -17,13 +17,27 @@ fn joined(poses: i64, concatenated: bool) -> i64 {
     if concatenated { poses + latent } else { poses + poses.max(1) * latent }
 }
 
+/// Maps latents `[N, 8]` and pose indices `[N]` to the inputs of the first layer.
+fn join(latents: &Tensor, poses: &Tensor, count: i64, concatenated: bool) -> Tensor {
+    if count == 0 {
+        return latents.shallow_clone();
+    }
+    let one_hot = poses.one_hot(count).to_kind(latents.kind());
+    let latent = if concatenated {
+        latents.shallow_clone()
+    } else {
+        (one_hot.unsqueeze(2) * latents.unsqueeze(1)).flatten(1, -1)
+    };
+    Tensor::cat(&[latent, one_hot], 1)
+}
+
 /// The decoder.
 #[derive(Debug)]
 pub struct Decoder {
     join: nn::Linear,
     spread: nn::Linear,
     /// Each follows a doubling of the side.
-    up: Vec<nn::Conv2D>,
+    up: [nn::Conv2D; 3],
     out: nn::Conv2D,
     channels: i64,
     poses: i64,
@@ -31,36 +45,23 @@ pub struct Decoder {
 }
 
 impl Decoder {
-    /// Builds a decoder for `poses` fixed camera poses, with images of [`IMAGE_PX`].
+    /// Builds a decoder for `poses` fixed camera poses.
     pub fn new(path: &nn::Path, config: &DecoderConfig, poses: i64) -> Self {
-        let c = config.channels;
-        Self::with_layers(path, config, poses, &[("up16", c), ("up32", c * 3 / 4), ("up64", c * 3 / 8)])
-    }
-
-    /// Builds a decoder with images of [`SMALL_PX`]: it costs a thirtieth of [`Self::new`].
-    pub fn small(path: &nn::Path, config: &DecoderConfig, poses: i64) -> Self {
-        Self::with_layers(path, config, poses, &[("up16", config.channels)])
-    }
-
-    /// Builds a decoder; `layers` has the name and the output channels of the layer after each doubling.
-    fn with_layers(path: &nn::Path, config: &DecoderConfig, poses: i64, layers: &[(&str, i64)]) -> Self {
         let same = nn::ConvConfig { padding: 1, ..Default::default() };
         let linear = nn::LinearConfig::default();
         let poses = if config.pose_condition { poses } else { 0 };
-        let mut channels = config.channels;
-        let up = layers.iter().map(|&(name, to)| {
-            let layer = nn::conv2d(path / name, channels, to, 3, same);
-            channels = to;
-            layer
-        });
-        let up = up.collect();
+        let c = config.channels;
         Self {
             join: nn::linear(path / "join", joined(poses, config.concatenated), config.hidden, linear),
-            spread: nn::linear(path / "spread", config.hidden, config.channels * 64, linear),
-            up,
+            spread: nn::linear(path / "spread", config.hidden, c * 64, linear),
+            up: [
+                nn::conv2d(path / "up16", c, c, 3, same),
+                nn::conv2d(path / "up32", c, c * 3 / 4, 3, same),
+                nn::conv2d(path / "up64", c * 3 / 4, c * 3 / 8, 3, same),
+            ],
             // 12 = 3 colours of 2x2 pixels: the last doubling is a pixel shuffle.
-            out: nn::conv2d(path / "out", channels, 12, 3, same),
-            channels: config.channels,
+            out: nn::conv2d(path / "out", c * 3 / 8, 12, 3, same),
+            channels: c,
             poses,
             concatenated: config.concatenated,
         }
@@ -71,27 +72,44 @@ impl Decoder {
         self.join.ws.device()
     }
 
-    /// Maps latents `[N, 8]` and pose indices `[N]` (int64) to `[N, 3, S, S]`: an image in 0..=1, or the residual over
+    /// Maps latents `[N, 8]` and pose indices `[N]` (int64) to `[N, 3, 128, 128]`: an image in 0..=1, or the residual over
     /// the pose's mean image, as trained.
     pub fn forward(&self, latents: &Tensor, poses: &Tensor) -> Tensor {
-        let input = if self.poses > 0 {
-            let one_hot = poses.one_hot(self.poses).to_kind(latents.kind());
-            let latent = if self.concatenated {
-                latents.shallow_clone()
-            } else {
-                (one_hot.unsqueeze(2) * latents.unsqueeze(1)).flatten(1, -1)
-            };
-            Tensor::cat(&[latent, one_hot], 1)
-        } else {
-            latents.shallow_clone()
-        };
-        let x = self.join.forward(&input).relu();
+        let x = self.join.forward(&join(latents, poses, self.poses, self.concatenated)).relu();
         let mut x = self.spread.forward(&x).relu().view([-1, self.channels, 8, 8]);
         for layer in &self.up {
             let side = x.size()[2] * 2;
             x = layer.forward(&x.upsample_nearest2d([side, side], None, None)).relu();
         }
         self.out.forward(&x).pixel_shuffle(2)
+    }
+}
+
+/// A decoder of small images, for the poses that the input does not show. It has dense layers only.
+#[derive(Debug)]
+pub struct SmallDecoder {
+    join: nn::Linear,
+    out: nn::Linear,
+    poses: i64,
+    concatenated: bool,
+}
+
+impl SmallDecoder {
+    /// Builds a decoder for `poses` fixed camera poses.
+    pub fn new(path: &nn::Path, config: &DecoderConfig, poses: i64) -> Self {
+        let linear = nn::LinearConfig::default();
+        Self {
+            join: nn::linear(path / "join", joined(poses, config.concatenated), config.hidden, linear),
+            out: nn::linear(path / "out", config.hidden, 3 * SMALL_PX * SMALL_PX, linear),
+            poses,
+            concatenated: config.concatenated,
+        }
+    }
+
+    /// Maps latents `[N, 8]` and pose indices `[N]` (int64) to `[N, 3, 32, 32]`, as [`Decoder::forward`] does.
+    pub fn forward(&self, latents: &Tensor, poses: &Tensor) -> Tensor {
+        let x = self.join.forward(&join(latents, poses, self.poses, self.concatenated)).relu();
+        self.out.forward(&x).view([-1, 3, SMALL_PX, SMALL_PX])
     }
 }
 

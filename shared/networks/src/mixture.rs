@@ -11,10 +11,31 @@ use tch::{Kind, Tensor, nn, nn::Module};
 pub struct MixtureNet {
     first: nn::Linear,
     second: nn::Linear,
-    means: nn::Linear,
-    log_variances: nn::Linear,
+    means: Head,
+    log_variances: Head,
     weights: [nn::Linear; 3],
     components: i64,
+}
+
+/// Head of all components' means or log-variances, with a hidden layer where the checkpoint has one.
+#[derive(Debug)]
+struct Head {
+    hidden: Option<nn::Linear>,
+    last: nn::Linear,
+}
+
+impl Head {
+    fn new(path: &nn::Path, name: &str, config: &MixtureConfig) -> Self {
+        let linear = nn::LinearConfig::default();
+        let (hidden, width) = (config.hidden, config.head_hidden);
+        let first = (width > 0).then(|| nn::linear(path / format!("{name}_hidden"), hidden, width, linear));
+        let inputs = if width > 0 { width } else { hidden };
+        Self { hidden: first, last: nn::linear(path / name, inputs, config.components * LATENT_DIM as i64, linear) }
+    }
+
+    fn forward(&self, x: &Tensor) -> Tensor {
+        self.hidden.as_ref().map_or_else(|| self.last.forward(x), |hidden| self.last.forward(&hidden.forward(x).relu()))
+    }
 }
 
 impl MixtureNet {
@@ -30,8 +51,8 @@ impl MixtureNet {
         Ok(Self {
             first: nn::linear(path / "first", 2 * d, h, linear),
             second: nn::linear(path / "second", h, h, linear),
-            means: nn::linear(path / "means", h, k * d, linear),
-            log_variances: nn::linear(path / "log_variances", h, k * d, linear),
+            means: Head::new(path, "means", config),
+            log_variances: Head::new(path, "log_variances", config),
             weights: [
                 nn::linear(path / "weight0", h, w, linear),
                 nn::linear(path / "weight1", w, w, linear),
@@ -61,17 +82,20 @@ impl MixtureNet {
         )
     }
 
-    /// Returns the mean negative log-likelihood of `targets` `[N, 8]` under the forecasts of the inputs (paper equation
-    /// 6).
+    /// Returns the mean negative log-likelihood of `targets` `[N * M, 8]`, M for each input, under the forecasts of the N
+    /// inputs (paper equation 6).
     pub fn negative_log_likelihood(&self, mean: &Tensor, log_variance: &Tensor, targets: &Tensor) -> Tensor {
         let (log_weights, means, log_variances) = self.forward(mean, log_variance);
-        let distance = (targets.unsqueeze(1) - means).square() / log_variances.exp();
+        // [N, M, 8] against [N, K, 8], as [N, M, K, 8].
+        let targets = targets.view([mean.size()[0], -1, 1, LATENT_DIM as i64]);
+        let log_variances = log_variances.unsqueeze(1);
+        let distance = (targets - means.unsqueeze(1)).square() / log_variances.exp();
         let log_density = (distance + &log_variances + (2.0 * std::f64::consts::PI).ln()).sum_dim_intlist(
             [-1_i64].as_slice(),
             false,
             Kind::Float,
         ) * -0.5;
-        -(log_weights + log_density).logsumexp([-1_i64].as_slice(), false).mean(Kind::Float)
+        -(log_weights.unsqueeze(1) + log_density).logsumexp([-1_i64].as_slice(), false).mean(Kind::Float)
     }
 
     /// Returns the forecast over the next latent for one posterior.
@@ -144,5 +168,14 @@ mod tests {
             .negative_log_likelihood(&row(&posterior.mean), &row(&posterior.log_variance), &row(&target))
             .double_value(&[]);
         assert!((loss + density.ln()).abs() < 1e-4, "{loss} against {}", -density.ln());
+
+        // Several targets of an input count with their mean.
+        let other = target.map(|v| 0.5 - v);
+        let of = |targets: &[[f32; 8]]| {
+            let targets = Tensor::from_slice(targets.as_flattened()).view([-1, 8]);
+            net.negative_log_likelihood(&row(&posterior.mean), &row(&posterior.log_variance), &targets)
+                .double_value(&[])
+        };
+        assert!((of(&[target, other]) - 0.5 * (loss + of(&[other]))).abs() < 1e-4);
     }
 }

@@ -3,7 +3,8 @@ use carff_base::geometry::OrientedBox;
 use carff_decision::Place;
 use carff_messages::forms::{AnyMessage, OwnedMessage};
 use carff_messages::{
-    Action, Belief, DatasetView, FrameMeta, Gaussian, Header, Intrinsics, Posterior, ProbeResult, ViewMeta,
+    Action, Belief, DatasetView, FrameMeta, Gaussian, Header, Intrinsics, Posterior, ProbeResult, Reason, Rule,
+    ViewMeta,
 };
 use carff_transport::TopicId;
 use std::io::Write as _;
@@ -67,20 +68,15 @@ fn messages(frame_id: u64) -> Vec<(TopicId, OwnedMessage)> {
         stage_latency_ns: 1,
     };
     let action = Action {
-        header: header(frame_id),
         action: 1,
-        reason: 0,
-        rule: 3,
         sample_count: 10,
         confidence: 0.5,
         hazard_probability: 0.25,
         is_decision: 1,
-        unknown_probability: 0.0,
         valid_until_ns: 77,
         based_on_frame: frame_id,
         latency_ns: 20,
-        target_speed_mps: 0.0,
-        look_gain_bits: 0.0,
+        ..Action::halt(header(frame_id), Reason::Belief, Rule::Calibrated)
     };
     vec![
         (TopicId::FRAME, OwnedMessage::new(Box::new(meta), pixels)),

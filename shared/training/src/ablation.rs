@@ -1,10 +1,11 @@
-//! The paper's encoder ablation (table 2): one training with one setting changed at a time.
+//! The paper's encoder ablation (table 2), trainings without state labels, and a training in one stage: one training
+//! with one setting changed at a time.
 //!
-//! Each variant has a folder with its run, its checkpoint and its row. A variant with a row is finished.
+//! Each variant has a folder for each seed, with its run, its checkpoint and its row. A variant with a row is finished.
 
 use crate::{Phases, Run, Training, TrainingConfig, TrainingError};
 use carff_checkpoint::shapes::{BackboneConfig, BackboneKind, EncoderConfig, VitConfig};
-use carff_evaluation::{ByObservability, EncoderTable, EvalOptions, Subject, encoder_rows, encoder_table};
+use carff_evaluation::{ByObservability, EncoderTable, EvalOptions, Share, Subject, encoder_rows, encoder_table};
 use serde::{Deserialize, Serialize};
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
@@ -25,14 +26,40 @@ pub enum Variant {
     Transformer,
     /// A decoder without the pose that learns the image: the mean image of a pose would give it the pose.
     NoPose,
+    /// No loss names a state; the decoder is asked for eight other poses of what each image shows.
+    EightPoses,
+    /// No loss names a state; the decoder is asked for one other pose (the paper's c'').
+    OnePose,
+    /// No loss names a state; the decoder is asked for the image's own pose.
+    OwnPose,
+    /// No loss names a state; the encoder learns through the field, in one stage (NeRF-VAE).
+    OneStage,
 }
 
 /// Channels of an added stem.
 const STEM_CHANNELS: i64 = 16;
 
+/// Weight of the KL term of trainings without state labels. With 0.01, some seeds do not leave the mean image.
+const UNLABELLED_KL: f64 = 1e-3;
+
+/// Steps of the training in one stage for each pass of the others, and passes of its decoder afterwards.
+const ONE_STAGE_STEPS: usize = 130;
+const ONE_STAGE_DECODER_EPOCHS: usize = 20;
+
 impl Variant {
     /// All variants, in the order of the table.
-    pub const ALL: [Self; 6] = [Self::Full, Self::Stem, Self::ConvNet, Self::Unfrozen, Self::Transformer, Self::NoPose];
+    pub const ALL: [Self; 10] = [
+        Self::Full,
+        Self::Stem,
+        Self::ConvNet,
+        Self::Unfrozen,
+        Self::Transformer,
+        Self::NoPose,
+        Self::EightPoses,
+        Self::OnePose,
+        Self::OwnPose,
+        Self::OneStage,
+    ];
 
     /// Name of the folder.
     pub fn name(self) -> &'static str {
@@ -43,6 +70,10 @@ impl Variant {
             Self::Unfrozen => "unfrozen",
             Self::Transformer => "transformer",
             Self::NoPose => "no-pose",
+            Self::EightPoses => "eight-poses",
+            Self::OnePose => "one-pose",
+            Self::OwnPose => "own-pose",
+            Self::OneStage => "one-stage",
         }
     }
 
@@ -56,6 +87,10 @@ impl Variant {
             Self::Unfrozen => "backbone not frozen",
             Self::Transformer => "another backbone: small vision transformer, from scratch",
             Self::NoPose => "no pose condition",
+            Self::EightPoses => "no state labels, eight other poses",
+            Self::OnePose => "no state labels, one other pose",
+            Self::OwnPose => "no state labels, own pose",
+            Self::OneStage => "no state labels, one stage with the field",
         }
     }
 
@@ -85,9 +120,25 @@ impl Variant {
                 config.decoder.pose_condition = false;
                 config.vae.residual = false;
             }
+            Self::EightPoses => unlabelled(&mut config, 8),
+            Self::OnePose => unlabelled(&mut config, 1),
+            Self::OwnPose => unlabelled(&mut config, 0),
+            Self::OneStage => {
+                unlabelled(&mut config, 0);
+                config.vae.one_stage_steps = ONE_STAGE_STEPS * config.vae.epochs;
+                config.vae.decoder_epochs = ONE_STAGE_DECODER_EPOCHS;
+            }
         }
         config
     }
+}
+
+/// Removes the state labels; the decoder is asked for `other_poses` of each image, or for its own pose.
+fn unlabelled(config: &mut TrainingConfig, other_poses: usize) {
+    config.vae.state_weight = 0.0;
+    config.vae.contrastive_weight = 0.0;
+    config.vae.kl_weight = UNLABELLED_KL;
+    config.vae.other_poses = other_poses;
 }
 
 /// A row of the table.
@@ -97,6 +148,8 @@ pub struct Row {
     pub variant: Variant,
     /// Description of the variant.
     pub description: String,
+    /// Seed of the training.
+    pub seed: u64,
     /// Scores of the variant.
     pub scores: EncoderTable,
 }
@@ -110,31 +163,31 @@ pub struct AblationTable {
     pub epochs: usize,
     /// Random poses in addition to those of the dataset, for every variant.
     pub free_poses: usize,
-    /// Seed of the training; each variant is trained once.
-    pub seed: u64,
-    /// One row for each variant.
+    /// One row for each variant and seed.
     pub rows: Vec<Row>,
 }
 
-/// Folders of a variant's run and checkpoint.
-pub fn folders(out: &Path, variant: Variant) -> (PathBuf, PathBuf) {
-    let dir = out.join(variant.name());
-    (dir.join("run"), dir.join("checkpoint"))
+/// Folder of a variant and a seed, with its run, its checkpoint and its row.
+pub fn folder(out: &Path, variant: Variant, seed: u64) -> PathBuf {
+    out.join(variant.name()).join(format!("seed-{seed}"))
 }
 
-/// Trains the VAE of one variant, or resumes its training, and scores it. A row that is there is read.
+/// Trains the VAE of one variant with the seed of the training file, or resumes its training, and scores it. A row that
+/// is there is read. `run` is in `run` of the variant's [`folder`].
 pub fn row(training: &Training, variant: Variant, run: &Run, options: EvalOptions) -> Result<Row, TrainingError> {
-    let path = training.out.join(variant.name()).join("row.json");
+    let seed = training.config.seed;
+    let folder = folder(training.out, variant, seed);
+    let path = folder.join("row.json");
     if let Ok(text) = std::fs::read_to_string(&path) {
         return serde_json::from_str(&text)
             .map_err(|e| TrainingError::Format { path, what: format!("{e}; remove the file to score it again") });
     }
-    let (_, out) = folders(training.out, variant);
+    let out = folder.join("checkpoint");
     let config = variant.apply(training.config);
     Training { config: &config, out: &out, device: options.device, ..*training }.run(Phases::Vae, run)?;
     let subject = Subject::load(&out, training.dataset, options, run.on_progress)?;
     let description = variant.description(training.config).to_owned();
-    let row = Row { variant, description, scores: encoder_table(&subject) };
+    let row = Row { variant, description, seed, scores: encoder_table(&subject) };
     write(&path, &to_json(&row, &path)?)?;
     Ok(row)
 }
@@ -148,24 +201,63 @@ pub fn write_table(table: &AblationTable, out: &Path) -> Result<(), TrainingErro
 
 fn markdown(table: &AblationTable) -> String {
     let mut text = format!(
-        "# Encoder ablation\n\nDataset `{}`, {} epochs and {} random poses for every variant, seed {}, one run each. \
-         Only the VAE is trained.\n\n",
-        table.dataset, table.epochs, table.free_poses, table.seed
+        "# Encoder ablation\n\nDataset `{}`, {} epochs and {} random poses for every variant. Only the VAE is trained.\n\n",
+        table.dataset, table.epochs, table.free_poses
     );
-    let rows: Vec<(String, &EncoderTable)> = table.rows.iter().map(|r| (r.description.clone(), &r.scores)).collect();
+    let rows: Vec<(String, &EncoderTable)> =
+        table.rows.iter().map(|r| (format!("{}, seed {}", r.description, r.seed), &r.scores)).collect();
     encoder_rows(&mut text, &rows);
     let _ = writeln!(text, "State accuracy up to visual equivalence, place fully visible:\n");
     let _ = writeln!(text, "| encoder | trained poses, % | held-out poses, % |\n|---|---|---|");
-    for row in &table.rows {
-        let share = |accuracy: Option<ByObservability>| {
-            let full = accuracy.map(|a| a.full).filter(|s| s.trials > 0);
-            full.map_or_else(|| "-".to_owned(), |s| format!("{:.1} of {} images", 100.0 * s.accuracy(), s.trials))
+    for (name, scores) in &rows {
+        let share = |accuracy| {
+            full(accuracy)
+                .map_or_else(|| "-".to_owned(), |s| format!("{:.1} of {} images", 100.0 * s.accuracy(), s.trials))
         };
-        let accuracy = &row.scores.state_accuracy;
+        let accuracy = &scores.state_accuracy;
         let [trained, held_out] = [accuracy.trained, accuracy.unseen].map(share);
-        let _ = writeln!(text, "| {} | {trained} | {held_out} |", row.description);
+        let _ = writeln!(text, "| {name} | {trained} | {held_out} |");
     }
+    over_seeds(&mut text, table);
     text
+}
+
+/// State accuracy on images that show the place fully; `None` where there are none.
+fn full(accuracy: Option<ByObservability>) -> Option<Share> {
+    accuracy.map(|a| a.full).filter(|s| s.trials > 0)
+}
+
+/// Name and figure of a column.
+type Column = (&'static str, fn(&EncoderTable) -> Option<f64>);
+
+/// Columns of the table over seeds, %.
+const OVER_SEEDS: [Column; 4] = [
+    ("SVM by pose", |t| Some(t.svm.trained_by_pose.accuracy)),
+    ("up to equivalence", |t| Some(t.svm.trained_by_pose.up_to_equivalence)),
+    ("state accuracy, trained poses", |t| full(t.state_accuracy.trained).map(|s| s.accuracy())),
+    ("state accuracy, held-out poses", |t| full(t.state_accuracy.unseen).map(|s| s.accuracy())),
+];
+
+/// Mean and range over the seeds of each variant, if any has several.
+fn over_seeds(text: &mut String, table: &AblationTable) {
+    let of = |variant| table.rows.iter().filter(move |r| r.variant == variant);
+    let several: Vec<Variant> = Variant::ALL.into_iter().filter(|&v| of(v).count() > 1).collect();
+    if several.is_empty() {
+        return;
+    }
+    let _ = writeln!(text, "\nMean over the seeds, and least to most, %:\n");
+    let _ = writeln!(text, "| encoder | seeds | {} |", OVER_SEEDS.map(|(name, _)| name).join(" | "));
+    let _ = writeln!(text, "|---|---|---|---|---|---|");
+    for variant in several {
+        let cells = OVER_SEEDS.map(|(_, figure)| {
+            let values: Vec<f64> = of(variant).filter_map(|r| figure(&r.scores)).map(|v| 100.0 * v).collect();
+            let least = values.iter().copied().fold(f64::INFINITY, f64::min);
+            let most = values.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+            format!("{:.1} ({least:.1} to {most:.1})", carff_base::statistics::mean(&values).unwrap_or(f64::NAN))
+        });
+        let description = of(variant).next().map_or("", |r| &r.description);
+        let _ = writeln!(text, "| {description} | {} | {} |", of(variant).count(), cells.join(" | "));
+    }
 }
 
 fn to_json(value: &impl Serialize, path: &Path) -> Result<String, TrainingError> {

@@ -130,6 +130,10 @@ pub struct VaeTraining {
     /// reconstructed at poses of the dataset. With one pose, most seeds end with a latent that shows no state. 0: each
     /// image is reconstructed at its own pose.
     pub other_poses: usize,
+    /// Steps in which the encoder learns together with a field, through the error of the field's rays, in place of
+    /// `epochs` with the decoder: one stage, as in NeRF-VAE (Kosiorek et al. 2021). The field that ships is trained
+    /// afterwards in any case. 0: two stages, as in the paper.
+    pub one_stage_steps: usize,
     /// Further passes that train only the decoder, over the images of the dataset's own poses. While the encoder
     /// learns, the decoder follows moving latents.
     pub decoder_epochs: usize,
@@ -172,6 +176,7 @@ impl Default for VaeTraining {
             epochs: 100,
             own_passes: 1,
             other_poses: 0,
+            one_stage_steps: 0,
             decoder_epochs: 0,
             batch: 30,
             decoder_batch: 30,
@@ -235,18 +240,27 @@ pub struct MdnTraining {
     pub learning_rate: f64,
     /// Standard deviation of the noise on the input mean, in units of the input posterior's own deviation.
     pub input_noise: f64,
+    /// Standard deviation of the noise on the input's log-variance.
+    pub variance_noise: f64,
+    /// Draws from the target posterior of each pair; the loss is the mean over their likelihoods.
+    pub target_draws: usize,
 }
 
 impl Default for MdnTraining {
     fn default() -> Self {
-        Self { steps: 4000, batch: 256, learning_rate: 1e-3, input_noise: 1.0 }
+        Self { steps: 4000, batch: 256, learning_rate: 1e-3, input_noise: 1.0, variance_noise: 0.0, target_draws: 1 }
     }
 }
 
 impl VaeTraining {
+    /// Passes that train encoder and decoder together.
+    pub fn joint_epochs(&self) -> usize {
+        if self.one_stage_steps > 0 { 0 } else { self.epochs }
+    }
+
     /// Total number of passes, including those of only the decoder.
     pub fn all_epochs(&self) -> usize {
-        self.epochs + self.decoder_epochs
+        self.joint_epochs() + self.decoder_epochs
     }
 }
 
@@ -282,6 +296,7 @@ impl TrainingConfig {
             ("vae.epochs", self.vae.epochs, 1, 10_000),
             ("vae.own_passes", self.vae.own_passes, 1, 100),
             ("vae.other_poses", self.vae.other_poses, 0, 64),
+            ("vae.one_stage_steps", self.vae.one_stage_steps, 0, 1_000_000),
             ("vae.decoder_epochs", self.vae.decoder_epochs, 0, 10_000),
             ("vae.batch", self.vae.batch, 2, 4096),
             ("vae.decoder_batch", self.vae.decoder_batch, 1, 4096),
@@ -292,6 +307,7 @@ impl TrainingConfig {
             ("calibration.horizon", self.calibration.horizon as usize, 1, 8),
             ("mdn.steps", self.mdn.steps, 1, 1_000_000),
             ("mdn.batch", self.mdn.batch, 2, 65_536),
+            ("mdn.target_draws", self.mdn.target_draws, 1, 256),
             ("free_poses.count", self.free_poses.count, 0, 10_000),
             ("free_poses.on_path", self.free_poses.on_path, 0, 10_000),
             ("free_poses.per_appearance", self.free_poses.per_appearance, 0, 10_000),
@@ -322,6 +338,7 @@ impl TrainingConfig {
             ("nerf.resampled_ramp", self.nerf.resampled_ramp, 1.0),
             ("mdn.learning_rate", self.mdn.learning_rate, 1.0),
             ("mdn.input_noise", self.mdn.input_noise, 10.0),
+            ("mdn.variance_noise", self.mdn.variance_noise, 10.0),
             ("augmentation.shift", self.augmentation.shift, 0.5),
             ("augmentation.zoom", self.augmentation.zoom, 0.5),
             ("augmentation.rotation_deg", self.augmentation.rotation_deg, 45.0),
@@ -338,6 +355,9 @@ impl TrainingConfig {
                         set `vae.residual` to false"
                     .into(),
             );
+        }
+        if self.vae.one_stage_steps > 0 && self.vae.decoder_epochs == 0 {
+            return Err("`vae.one_stage_steps` trains no decoder: set `vae.decoder_epochs` to 1 or more".into());
         }
         if self.vae.other_poses > 0 && !self.decoder.pose_condition {
             return Err("`vae.other_poses` asks the decoder for poses: set `decoder.pose_condition` to true".into());

@@ -77,10 +77,15 @@ impl Clouds {
             let variance = means.iter().map(|m| (m[d] - mean[d]).powi(2)).sum::<f32>() / n;
             1.0 / variance.sqrt().max(0.05)
         });
-        let bounds_m = posed.scenario.bounds.map(|corner| corner.map(|v| v as f32));
-        let point_width_m = if config.nerf.wide_pixels { middle_width_m(posed) } else { config.field.point_width_m };
-        FieldConfig { bounds_m, latent_mean: mean, latent_scale: scale, point_width_m, ..config.field.clone() }
+        FieldConfig { latent_mean: mean, latent_scale: scale, ..structure(config, posed) }
     }
+}
+
+/// Structure of the field for this scenario, with latents of unit scale.
+pub fn structure(config: &TrainingConfig, posed: &PosedImages) -> FieldConfig {
+    let bounds_m = posed.scenario.bounds.map(|corner| corner.map(|v| v as f32));
+    let point_width_m = if config.nerf.wide_pixels { middle_width_m(posed) } else { config.field.point_width_m };
+    FieldConfig { bounds_m, point_width_m, ..config.field.clone() }
 }
 
 /// Median over the dataset's images of the width of a pixel in the middle of the bounds, metres.
@@ -107,6 +112,28 @@ const RECORD_EVERY: usize = 100;
 /// Share of a new value in the running means.
 const NEW_SHARE: f64 = 0.02;
 
+/// Running means of the reports of a field's steps.
+#[derive(Default)]
+pub struct RunningMeans {
+    /// Loss.
+    pub loss: f64,
+    /// PSNR of the rays' colours, dB.
+    pub psnr_db: f64,
+}
+
+impl RunningMeans {
+    /// Adds the report of a step.
+    pub fn add(&mut self, report: &StepReport) {
+        self.loss += NEW_SHARE * (report.loss - self.loss);
+        self.psnr_db += NEW_SHARE * (report.psnr - self.psnr_db);
+    }
+
+    /// Record after `done` steps.
+    pub fn record(&self, done: usize) -> FieldRecord {
+        FieldRecord { step: done as u64, loss: self.loss, ray_psnr_db: self.psnr_db }
+    }
+}
+
 /// Training phase of a field.
 pub struct FieldPhase<'a> {
     context: Context<'a>,
@@ -119,8 +146,7 @@ pub struct FieldPhase<'a> {
     state_of: Vec<usize>,
     batch: RayBatch,
     last: StepReport,
-    loss: f64,
-    psnr_db: f64,
+    means: RunningMeans,
 }
 
 impl<'a> FieldPhase<'a> {
@@ -148,8 +174,7 @@ impl<'a> FieldPhase<'a> {
             state_of: chosen.iter().map(|&i| posed.labels[i].state).collect(),
             batch: RayBatch::default(),
             last: StepReport::default(),
-            loss: 0.0,
-            psnr_db: 0.0,
+            means: RunningMeans::default(),
         })
     }
 
@@ -192,12 +217,11 @@ impl Phase for FieldPhase<'_> {
             clouds.draw(state_of[view], resampled, &mut rng)
         });
         self.last = self.trainer.step(&self.batch);
-        self.loss += NEW_SHARE * (self.last.loss - self.loss);
-        self.psnr_db += NEW_SHARE * (self.last.psnr - self.psnr_db);
+        self.means.add(&self.last);
     }
 
     fn report(&mut self, done: usize) -> Result<Report<FieldRecord>, TrainingError> {
-        let (loss, psnr_db) = (self.loss, self.psnr_db);
+        let RunningMeans { loss, psnr_db } = self.means;
         let due = |every: usize| done == self.total() || done.is_multiple_of(every);
         let line = due(LINE_EVERY).then(|| {
             format!(
@@ -206,17 +230,22 @@ impl Phase for FieldPhase<'_> {
                 100.0 * self.trainer.field().occupancy().occupied_share(),
             )
         });
-        let record = due(RECORD_EVERY).then_some(FieldRecord { step: done as u64, loss, ray_psnr_db: psnr_db });
+        let record = due(RECORD_EVERY).then(|| self.means.record(done));
         Ok(Report { line, record })
     }
 
     fn state(&self) -> Tensors {
-        let mut all: Tensors = prefixed("trainer.", to_tensors(self.trainer.state().tensors)).collect();
-        all.extend(prefixed("field.", to_tensors(self.trainer.field().tensors())));
-        let structure = serde_json::to_string(self.trainer.field().config()).unwrap_or_default();
-        all.insert("structure".into(), Tensor::from_slice(structure.as_bytes()));
-        all
+        state_of(&self.trainer)
     }
+}
+
+/// State of a trainer and its field.
+pub fn state_of(trainer: &FieldTrainer) -> Tensors {
+    let mut all: Tensors = prefixed("trainer.", to_tensors(trainer.state().tensors)).collect();
+    all.extend(prefixed("field.", to_tensors(trainer.field().tensors())));
+    let structure = serde_json::to_string(trainer.field().config()).unwrap_or_default();
+    all.insert("structure".into(), Tensor::from_slice(structure.as_bytes()));
+    all
 }
 
 /// Several latents of each state, for the occupancy grid, which covers all states.
@@ -231,7 +260,7 @@ fn state_latents(clouds: &Clouds, seed: u64) -> Vec<Vec<[f32; LATENT_DIM]>> {
 }
 
 /// The chosen images with their cameras and the pixels that change among the states.
-fn views(posed: &PosedImages, chosen: &[usize]) -> Vec<TrainingView> {
+pub fn views(posed: &PosedImages, chosen: &[usize]) -> Vec<TrainingView> {
     chosen
         .iter()
         .map(|&i| {
@@ -275,7 +304,7 @@ fn to_rows(tensors: Tensors) -> Vec<(String, Vec<usize>, Vec<f32>)> {
 }
 
 /// A trainer of a saved state; `None` when the state does not fit this configuration.
-fn resumed(config: &TrainingConfig, settings: TrainerConfig, done: usize, state: &Tensors) -> Option<FieldTrainer> {
+pub fn resumed(config: &TrainingConfig, settings: TrainerConfig, done: usize, state: &Tensors) -> Option<FieldTrainer> {
     let field = saved_field(config, state)?;
     FieldTrainer::from_state(field, settings, done as u64, to_rows(part(state, "trainer."))).ok()
 }

@@ -20,6 +20,7 @@
 //! | `pipeline`, `calibrate` | from images to a checkpoint |
 //! | `run` | the loop of all phases, and the folder of a run |
 //! | `vae`, `field`, `mixture` | the training phases |
+//! | `one_stage` | encoder and field trained together, for comparison |
 //! | `features`, `records`, `curves` | files of a run: backbone features, metrics, curves |
 //! | `random_poses` | images from random poses for a dataset without a scenario file |
 //! | [`ablation`] | the encoder ablation |
@@ -36,6 +37,7 @@ mod field;
 mod known;
 mod memory;
 mod mixture;
+mod one_stage;
 mod pipeline;
 mod random_poses;
 mod records;

@@ -117,14 +117,19 @@ impl Phase for MixturePhase<'_> {
             let noise: [f32; LATENT_DIM] =
                 std::array::from_fn(|_| rng.sample::<f32, _>(StandardNormal) * settings.input_noise as f32);
             means.extend(input.at(&noise));
-            log_variances.extend(input.log_variance);
+            log_variances.extend(input.log_variance.map(|v| match settings.variance_noise {
+                0.0 => v,
+                noise => v + rng.sample::<f32, _>(StandardNormal) * noise as f32,
+            }));
             let possible = &self.possible[k];
             let state = possible[rng.random_range(0..possible.len())];
             let views = &self.targets[posed.scenario.next_state(state)];
             let copy = &self.posteriors[rng.random_range(0..self.posteriors.len())];
             let next = &copy[views[rng.random_range(0..views.len())]];
-            let unit: [f32; LATENT_DIM] = std::array::from_fn(|_| rng.sample(StandardNormal));
-            targets.extend(next.at(&unit));
+            for _ in 0..settings.target_draws {
+                let unit: [f32; LATENT_DIM] = std::array::from_fn(|_| rng.sample(StandardNormal));
+                targets.extend(next.at(&unit));
+            }
         }
         let net = &self.mdn.net;
         let rows = |values: &[f32]| Tensor::from_slice(values).view([-1, LATENT_DIM as i64]).to_device(net.device());

@@ -5,6 +5,7 @@ use crate::{
     calibrate::{calibrated_probing, choose_and_save_threshold},
     field::{Clouds, FieldPhase, saved_field},
     mixture::{Mdn, MixturePhase},
+    one_stage::OneStagePhase,
     places,
     records::{DoneRecord, names},
     run::{Context, Run, drive},
@@ -163,6 +164,9 @@ impl Training<'_> {
             finished => {
                 let inputs = Inputs::new(context, &mut vae)?;
                 if finished.is_err() {
+                    if config.vae.one_stage_steps > 0 {
+                        drive(&mut OneStagePhase::new(context, &vae, &inputs)?, run)?;
+                    }
                     drive(&mut VaePhase::new(context, &vae, &inputs), run)?;
                 }
                 inputs

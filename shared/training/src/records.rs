@@ -18,6 +18,8 @@ pub mod names {
     pub const RANDOM_POSES: &str = "free";
     /// Choice of the threshold.
     pub const THRESHOLD: &str = "threshold";
+    /// Encoder and field in one stage.
+    pub const ONE_STAGE: &str = "one-stage";
     /// End of the training.
     pub const DONE: &str = "done";
 }

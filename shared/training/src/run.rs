@@ -214,8 +214,8 @@ fn state_file(phase: &str) -> String {
 
 /// Removes all states, features, metrics and random poses of a run's folder.
 pub fn forget_run(dir: &Path) -> Result<(), TrainingError> {
-    use names::{FIELD, MIXTURE, RANDOM_POSES, VAE};
-    let states = [VAE, FIELD, MIXTURE, RANDOM_POSES].map(state_file);
+    use names::{FIELD, MIXTURE, ONE_STAGE, RANDOM_POSES, VAE};
+    let states = [VAE, FIELD, MIXTURE, RANDOM_POSES, ONE_STAGE].map(state_file);
     let others = [POSTERIORS, features::FEATURES, METRICS].map(str::to_owned);
     let gone = |path: PathBuf, removed: std::io::Result<()>| match removed {
         Err(source) if source.kind() != ErrorKind::NotFound => Err(TrainingError::File { path, source }),

@@ -2,17 +2,14 @@
 
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
-use carff_dataset::{Dataset, Equivalence, Image, PoseRole, PoseSplit};
-use carff_scenes::{Detail, Extras, Scenario};
-use carff_training::{Phases, Progress, Run, Training, TrainingConfig, TrainingError, render_random_poses};
-use std::collections::BTreeMap;
-use std::ops::ControlFlow;
-use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicBool, Ordering};
-use tch::Device;
+mod common;
 
-/// A block drives along a road, or does not; cameras show it, or are behind a wall.
-const SCENARIO: &str = include_str!("../../../tests/data/small-scenario.toml");
+use carff_dataset::{Dataset, Equivalence, Image, PoseRole, PoseSplit};
+use carff_scenes::Detail;
+use carff_training::{Phases, TrainingError, render_random_poses};
+use common::{Place, SCENARIO};
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
 
 const TRAINING: &str = r#"
 dataset = "set"
@@ -45,41 +42,14 @@ occupancy_warmup_steps = 100
 threads = 1
 "#;
 
-struct Place {
-    folder: tempfile::TempDir,
-    config: TrainingConfig,
-    scenario: Scenario,
+/// A field that renders other poses needs more than a few poses to learn from.
+fn place() -> Place {
+    Place::new(&SCENARIO.replace("count = 8", "count = 40").replace("count = 6", "count = 20"), TRAINING)
 }
 
-impl Place {
-    fn new() -> Self {
-        let folder = tempfile::tempdir().unwrap();
-        let file = folder.path().join("training.toml");
-        std::fs::write(&file, TRAINING).unwrap();
-        let config = TrainingConfig::load(&file).unwrap();
-        // A field that renders other poses needs more than a few poses to learn from.
-        let many = SCENARIO.replace("count = 8", "count = 40").replace("count = 6", "count = 20");
-        let scenario = Scenario::parse(Path::new("small.toml"), &many).unwrap();
-        scenario.render_dataset(&folder.path().join("set"), Extras::None, |_, _| ControlFlow::Continue(())).unwrap();
-        Self { folder, config, scenario }
-    }
-
-    fn at(&self, name: &str) -> PathBuf {
-        self.folder.path().join(name)
-    }
-
-    /// Renders the dataset in the run folder `name`, until `stop_at` (phase, steps done), or to the end.
-    fn make(&self, name: &str, stop_at: Option<(&str, usize)>) -> Result<Option<PathBuf>, TrainingError> {
-        let stop = AtomicBool::new(false);
-        let on_progress = |progress: &Progress| {
-            if stop_at.is_some_and(|(phase, done)| progress.phase == phase && progress.done >= done) {
-                stop.store(true, Ordering::Relaxed);
-            }
-        };
-        std::fs::create_dir_all(self.at(name)).unwrap();
-        let run = Run { dir: self.at(name), on_progress: &on_progress, stop: &stop };
-        render_random_poses(&self.config, &self.at("set"), &run)
-    }
+/// Renders the dataset in the run folder `name`, until `stop_at` (phase, steps done), or to the end.
+fn make(place: &Place, name: &str, stop_at: Option<(&str, usize)>) -> Result<Option<PathBuf>, TrainingError> {
+    place.run(name, stop_at, |run| render_random_poses(&place.config, &place.at("set"), run))
 }
 
 /// The files of a dataset by name.
@@ -96,9 +66,9 @@ fn files(dir: &Path) -> BTreeMap<String, Vec<u8>> {
 /// branches look the same from the poses behind the wall, and differ from other poses.
 #[test]
 fn free_poses_show_what_is_there() {
-    let mut place = Place::new();
+    let mut place = place();
     place.config.free_poses.field_steps = 800;
-    let set = Dataset::open(&place.make("run", None).unwrap().unwrap()).unwrap();
+    let set = Dataset::open(&make(&place, "run", None).unwrap().unwrap()).unwrap();
     let images = set.load_all_images().unwrap();
     assert_eq!((set.view_count(), set.state_count(), images.len()), (24, 4, 96));
     let error = |a: &Image, b: &Image| -> f64 {
@@ -125,14 +95,14 @@ fn free_poses_show_what_is_there() {
 /// difference.
 #[test]
 fn states_that_look_the_same_stay_the_same() {
-    let place = Place::new();
+    let place = place();
     let set = Dataset::open(&place.at("set")).unwrap();
     let of = |branch: usize| set.frames().iter().filter(move |f| (f.branch, f.timestamp) == (Some(branch), Some(0)));
     for from in of(0) {
         let to = of(1).find(|to| to.view == from.view).unwrap();
         std::fs::copy(&from.image_path, &to.image_path).unwrap();
     }
-    let made = files(&place.make("run", None).unwrap().unwrap());
+    let made = files(&make(&place, "run", None).unwrap().unwrap());
     let names: Vec<&String> = made.keys().filter(|name| name.contains("b0_t0")).collect();
     assert_eq!(names.len(), 24);
     for name in names {
@@ -143,36 +113,27 @@ fn states_that_look_the_same_stay_the_same() {
 /// A dataset whose boxes are the same in several states cannot be probed, and is refused before any work.
 #[test]
 fn a_set_without_boxes_is_refused_at_once() {
-    let place = Place::new();
+    let place = place();
     let path = place.at("set").join("transforms.json");
     let mut set: serde_json::Value = serde_json::from_str(&std::fs::read_to_string(&path).unwrap()).unwrap();
     for key in ["states", "candidates"] {
         set["scenario"].as_object_mut().unwrap().remove(key);
     }
     std::fs::write(&path, set.to_string()).unwrap();
-    let refused = place.make("run", None).unwrap_err().to_string();
+    let refused = make(&place, "run", None).unwrap_err().to_string();
     assert!(refused.contains("`scenario.states[].boxes`"), "{refused}");
     assert_eq!(std::fs::read_dir(place.at("run")).unwrap().count(), 0);
-    let stop = AtomicBool::new(false);
-    let run = Run { dir: place.at("run"), on_progress: &|_| {}, stop: &stop };
-    let (dataset, out) = (place.at("set"), place.at("out"));
-    let training = Training {
-        config: &place.config,
-        dataset: &dataset,
-        random_poses: &[],
-        scenario: None,
-        out: &out,
-        device: Device::Cpu,
-    };
-    assert!(training.run(Phases::All, &run).unwrap_err().to_string().contains("`scenario.states[].boxes`"));
+    let (set, out) = (place.at("set"), place.at("out"));
+    let refused = place.run("run", None, |run| place.training(&set, &out).run(Phases::All, run)).unwrap_err();
+    assert!(refused.to_string().contains("`scenario.states[].boxes`"));
     assert!(!out.exists());
 }
 
 /// The rendered images do not depend on the images of held-out poses, so that results on these are valid.
 #[test]
 fn unseen_poses_stay_unseen() {
-    let place = Place::new();
-    let before = files(&place.make("before", None).unwrap().unwrap());
+    let place = place();
+    let before = files(&make(&place, "before", None).unwrap().unwrap());
     let set = Dataset::open(&place.at("set")).unwrap();
     let unseen = PoseSplit::for_dataset(&set, place.config.split_seed).views(PoseRole::Unseen);
     let mut changed = 0;
@@ -183,22 +144,22 @@ fn unseen_poses_stay_unseen() {
         changed += 1;
     }
     assert!(changed >= 4, "{changed}");
-    assert!(files(&place.make("after", None).unwrap().unwrap()) == before);
+    assert!(files(&make(&place, "after", None).unwrap().unwrap()) == before);
 }
 
 /// After interruptions while its field trains and while its images are rendered, the dataset has the same bytes. A
 /// finished dataset is not rendered again, and a configuration without random poses gets none.
 #[test]
 fn making_free_poses_resumes() {
-    let mut place = Place::new();
-    let straight = place.make("straight", None).unwrap().unwrap();
+    let mut place = place();
+    let straight = make(&place, "straight", None).unwrap().unwrap();
     for stop_at in [("free", 80), ("images", 5)] {
-        assert!(matches!(place.make("halting", Some(stop_at)), Err(TrainingError::Stopped)), "{stop_at:?}");
+        assert!(matches!(make(&place, "halting", Some(stop_at)), Err(TrainingError::Stopped)), "{stop_at:?}");
     }
-    let halting = place.make("halting", None).unwrap().unwrap();
+    let halting = make(&place, "halting", None).unwrap().unwrap();
     assert!(files(&straight) == files(&halting));
     std::fs::remove_file(place.at("halting").join("free.state.safetensors")).unwrap();
-    assert_eq!(place.make("halting", None).unwrap(), Some(halting));
+    assert_eq!(make(&place, "halting", None).unwrap(), Some(halting));
     place.config.free_poses.field_steps = 0;
-    assert_eq!(place.make("none", None).unwrap(), None);
+    assert_eq!(make(&place, "none", None).unwrap(), None);
 }

@@ -2,16 +2,11 @@
 
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
-use carff_evaluation::{CheckpointFigures, Models};
-use carff_scenes::{Extras, Scenario};
-use carff_training::{FEATURES, Phases, Progress, Run, Training, TrainingConfig, TrainingError};
-use std::ops::ControlFlow;
-use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Mutex, MutexGuard, PoisonError};
+mod common;
 
-/// A block drives along a road, or does not; fourteen cameras show it, eight are behind a wall.
-const SCENARIO: &str = include_str!("../../../tests/data/small-scenario.toml");
+use carff_evaluation::{CheckpointFigures, Models};
+use carff_training::{FEATURES, Phases, TrainingError};
+use common::{Place, SCENARIO, alone};
 
 /// Networks so small that all three are trained in seconds.
 const TRAINING: &str = r#"
@@ -64,60 +59,19 @@ occupancy_warmup_steps = 100
 threads = 1
 "#;
 
-/// libtorch has one random generator per process: two trainings at once, or a training and the initialisation of a
-/// model, would change each other's draws.
-fn alone() -> MutexGuard<'static, ()> {
-    static ALONE: Mutex<()> = Mutex::new(());
-    ALONE.lock().unwrap_or_else(PoisonError::into_inner)
+fn place() -> Place {
+    Place::new(SCENARIO, TRAINING)
 }
 
-struct Place {
-    folder: tempfile::TempDir,
-    config: TrainingConfig,
-}
-
-impl Place {
-    fn new() -> Self {
-        let folder = tempfile::tempdir().unwrap();
-        let file = folder.path().join("training.toml");
-        std::fs::write(&file, TRAINING).unwrap();
-        let mut config = TrainingConfig::load(&file).unwrap();
-        let root = Path::new(env!("CARGO_MANIFEST_DIR")).ancestors().nth(2).unwrap();
-        config.pretrained_backbone = Some(root.join("configs/checkpoints/backbones/efficientnet-lite0.safetensors"));
-        let scenario = Scenario::parse(Path::new("small.toml"), SCENARIO).unwrap();
-        scenario.render_dataset(&folder.path().join("set"), Extras::None, |_, _| ControlFlow::Continue(())).unwrap();
-        Self { folder, config }
-    }
-
-    fn out(&self, name: &str) -> PathBuf {
-        self.folder.path().join(name)
-    }
-
-    /// Trains all phases, without another training in this process, until `stop_at` (phase, steps done), or to the end.
-    fn train(&self, name: &str, stop_at: Option<(&str, usize)>) -> Result<CheckpointFigures, TrainingError> {
-        self.train_phases(name, Phases::All, stop_at)
-    }
-
-    fn train_phases(
-        &self,
-        name: &str,
-        phases: Phases,
-        stop_at: Option<(&str, usize)>,
-    ) -> Result<CheckpointFigures, TrainingError> {
-        let _alone = alone();
-        let stop = AtomicBool::new(false);
-        let on_progress = |progress: &Progress| {
-            if stop_at.is_some_and(|(phase, done)| progress.phase == phase && progress.done >= done) {
-                stop.store(true, Ordering::Relaxed);
-            }
-        };
-        let dir = self.out(&format!("{name}-run"));
-        std::fs::create_dir_all(&dir).unwrap();
-        let run = Run { dir, on_progress: &on_progress, stop: &stop };
-        let (dataset, out, device) = (self.out("set"), self.out(name), tch::Device::Cpu);
-        Training { config: &self.config, dataset: &dataset, random_poses: &[], scenario: None, out: &out, device }
-            .run(phases, &run)
-    }
+/// Trains until `stop_at` (phase, steps done), or to the end, into the checkpoint `name`.
+fn train(
+    place: &Place,
+    name: &str,
+    phases: Phases,
+    stop_at: Option<(&str, usize)>,
+) -> Result<CheckpointFigures, TrainingError> {
+    let (set, out) = (place.at("set"), place.at(name));
+    place.run(&format!("{name}-run"), stop_at, |run| place.training(&set, &out).run(phases, run))
 }
 
 /// Training from images only gives a checkpoint that decides. Latents identify states, the field shows each state, and
@@ -128,8 +82,8 @@ impl Place {
 /// right state in 44 to 94 %.
 #[test]
 fn training_learns() {
-    let place = Place::new();
-    let figures = place.train("learnt", None).unwrap();
+    let place = place();
+    let figures = train(&place, "learnt", Phases::All, None).unwrap();
     // Chance is 25 %.
     assert!(figures.vae.unwrap().trained.full.accuracy > 0.95, "{figures:#?}");
     assert!(figures.samples.unwrap().trained.accuracy > 0.4, "{figures:#?}");
@@ -142,19 +96,19 @@ fn training_learns() {
     let mean_rate = kinds.iter().map(|count| count.rate().unwrap()).sum::<f64>() / 2.0;
     assert!(mean_rate > 0.7, "{planning:#?}");
     let _alone = alone();
-    assert_eq!(Models::load(&place.out("learnt")).unwrap().probe.states().len(), 4);
+    assert_eq!(Models::load(&place.at("learnt")).unwrap().probe.states().len(), 4);
 }
 
 /// Training of the decoder only leaves the encoder unchanged and improves the decoder.
 #[test]
 fn the_decoder_learns_alone() {
-    let mut place = Place::new();
+    let mut place = place();
     place.config.vae.epochs = 12;
     place.config.vae.learning_rate = 2e-3;
-    let before = place.train_phases("together", Phases::Vae, None).unwrap();
+    let before = train(&place, "together", Phases::Vae, None).unwrap();
     place.config.vae.decoder_epochs = 100;
-    let after = place.train_phases("alone", Phases::Vae, None).unwrap();
-    let read = |name: &str| std::fs::read(place.out(name).join("encoder.safetensors")).unwrap();
+    let after = train(&place, "alone", Phases::Vae, None).unwrap();
+    let read = |name: &str| std::fs::read(place.at(name).join("encoder.safetensors")).unwrap();
     assert!(read("together") == read("alone"), "the encoder has changed");
     let psnr_db = |figures: &CheckpointFigures| figures.vae.unwrap().changed_pixels_psnr_db.unwrap();
     assert!(psnr_db(&after) > psnr_db(&before) + 0.5, "{before:#?} {after:#?}");
@@ -164,22 +118,45 @@ fn the_decoder_learns_alone() {
 /// own epochs has the same bytes as an uninterrupted one.
 #[test]
 fn training_resumes() {
-    let mut place = Place::new();
+    let mut place = place();
     place.config.vae.epochs = 6;
     place.config.vae.decoder_epochs = 3;
     place.config.augmentation.own_copies = 2;
     place.config.nerf.wide_pixels = true;
     place.config.nerf.trainer.steps = 160;
-    place.train("straight", None).unwrap();
+    train(&place, "straight", Phases::All, None).unwrap();
     for stop_at in [("features", 40), ("vae", 3), ("vae", 7), ("mdn", 100), ("nerf", 60)] {
-        assert!(matches!(place.train("halting", Some(stop_at)), Err(TrainingError::Stopped)), "{stop_at:?}");
+        assert!(
+            matches!(train(&place, "halting", Phases::All, Some(stop_at)), Err(TrainingError::Stopped)),
+            "{stop_at:?}"
+        );
         // They are kept as long as an interrupted training would need them.
-        let kept = place.out("halting-run").join(FEATURES).is_file();
+        let kept = place.at("halting-run").join(FEATURES).is_file();
         assert_eq!(kept, ["features", "vae"].contains(&stop_at.0), "{stop_at:?}");
     }
-    place.train("halting", None).unwrap();
+    train(&place, "halting", Phases::All, None).unwrap();
     for file in ["encoder", "decoder", "mixture", "field"] {
-        let read = |name: &str| std::fs::read(place.out(name).join(format!("{file}.safetensors"))).unwrap();
+        let read = |name: &str| std::fs::read(place.at(name).join(format!("{file}.safetensors"))).unwrap();
         assert!(read("straight") == read("halting"), "{file} differs after interruptions");
     }
+}
+
+/// In one stage, the encoder learns through the field's rays only, and an interrupted training has the same bytes as an
+/// uninterrupted one.
+#[test]
+fn one_stage_learns_through_rays() {
+    let mut place = place();
+    place.config.vae.one_stage_steps = 130;
+    place.config.vae.decoder_epochs = 1;
+    place.config.vae.state_weight = 0.0;
+    place.config.vae.kl_weight = 0.0;
+    train(&place, "straight", Phases::Vae, None).unwrap();
+    let stopped = train(&place, "halting", Phases::Vae, Some(("one-stage", 100)));
+    assert!(matches!(stopped, Err(TrainingError::Stopped)));
+    train(&place, "halting", Phases::Vae, None).unwrap();
+    place.config.vae.reconstruction_weight = 0.0;
+    train(&place, "blind", Phases::Vae, None).unwrap();
+    let encoder = |name: &str| std::fs::read(place.at(name).join("encoder.safetensors")).unwrap();
+    assert!(encoder("straight") == encoder("halting"), "interruptions change the encoder");
+    assert!(encoder("straight") != encoder("blind"), "no gradient reaches the encoder");
 }

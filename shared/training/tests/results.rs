@@ -2,21 +2,16 @@
 
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
+mod common;
+
 use carff_dataset::Image;
 use carff_evaluation::{EvalOptions, Results, Subject, Table, evaluate};
-use carff_scenes::{Extras, Scenario};
 use carff_training::{
-    Phases, Run, Training, TrainingConfig,
-    ablation::{self, Variant},
+    Phases,
+    ablation::{self, AblationTable, Variant},
     training_curves,
 };
-use std::ops::ControlFlow;
-use std::path::{Path, PathBuf};
-use std::sync::atomic::AtomicBool;
-use std::sync::{Mutex, MutexGuard, PoisonError};
-
-/// A block drives along a road, or does not; fourteen cameras show it, eight are behind a wall.
-const SCENARIO: &str = include_str!("../../../tests/data/small-scenario.toml");
+use common::{Place, SCENARIO};
 
 /// Networks so small that they are partly trained within seconds.
 const TRAINING: &str = r#"
@@ -69,67 +64,26 @@ occupancy_warmup_steps = 40
 threads = 1
 "#;
 
-/// libtorch has one random generator per process: two trainings at once would change each other's draws.
-fn alone() -> MutexGuard<'static, ()> {
-    static ALONE: Mutex<()> = Mutex::new(());
-    ALONE.lock().unwrap_or_else(PoisonError::into_inner)
-}
-
-struct Place {
-    folder: tempfile::TempDir,
-    config: TrainingConfig,
-}
-
 const OPTIONS: EvalOptions = EvalOptions { device: tch::Device::Cpu, threads: 1, seed: 2 };
 
-impl Place {
-    fn new(scenario: &str) -> Self {
-        let folder = tempfile::tempdir().unwrap();
-        let file = folder.path().join("training.toml");
-        std::fs::write(&file, TRAINING).unwrap();
-        let mut config = TrainingConfig::load(&file).unwrap();
-        let root = Path::new(env!("CARGO_MANIFEST_DIR")).ancestors().nth(2).unwrap();
-        config.pretrained_backbone = Some(root.join("configs/checkpoints/backbones/efficientnet-lite0.safetensors"));
-        let scenario = Scenario::parse(Path::new("small.toml"), scenario).unwrap();
-        scenario.render_dataset(&folder.path().join("set"), Extras::None, |_, _| ControlFlow::Continue(())).unwrap();
-        Self { folder, config }
-    }
+fn train(place: &Place, phases: Phases) {
+    let (set, checkpoint) = (place.at("set"), place.at("checkpoint"));
+    place.run("run", None, |run| place.training(&set, &checkpoint).run(phases, run)).unwrap();
+}
 
-    fn at(&self, name: &str) -> PathBuf {
-        self.folder.path().join(name)
-    }
-
-    fn run<R>(&self, name: &str, work: impl FnOnce(&Run) -> R) -> R {
-        let _alone = alone();
-        let dir = self.at(name);
-        std::fs::create_dir_all(&dir).unwrap();
-        work(&Run { dir, on_progress: &|_| {}, stop: &AtomicBool::new(false) })
-    }
-
-    fn training<'a>(&'a self, dataset: &'a Path, out: &'a Path) -> Training<'a> {
-        Training { config: &self.config, dataset, random_poses: &[], scenario: None, out, device: tch::Device::Cpu }
-    }
-
-    fn train(&self, phases: Phases) {
-        self.run("run", |run| {
-            self.training(&self.at("set"), &self.at("checkpoint")).run(phases, run).unwrap();
-        });
-    }
-
-    fn results(&self, tables: &[Table]) -> Results {
-        let mut subject = Subject::load(&self.at("checkpoint"), &self.at("set"), OPTIONS, &|_| {}).unwrap();
-        subject.training_curves = training_curves(&self.at("run")).unwrap();
-        evaluate(&subject, tables, &self.at("results"), &|_| {}).unwrap()
-    }
+fn evaluated(place: &Place, tables: &[Table]) -> Results {
+    let mut subject = Subject::load(&place.at("checkpoint"), &place.at("set"), OPTIONS, &|_| {}).unwrap();
+    subject.training_curves = training_curves(&place.at("run")).unwrap();
+    evaluate(&subject, tables, &place.at("results"), &|_| {}).unwrap()
 }
 
 /// All tables exist with consistent counts, the file equals the results in memory, and the page shows every drawn
 /// image. The same seed gives the same figures. A request for one table gives only that table.
 #[test]
 fn every_table_is_made() {
-    let place = Place::new(SCENARIO);
-    place.train(Phases::All);
-    let results = place.results(&Table::ALL);
+    let place = Place::new(SCENARIO, TRAINING);
+    train(&place, Phases::All);
+    let results = evaluated(&place, &Table::ALL);
     let read: Results =
         serde_json::from_str(&std::fs::read_to_string(place.at("results/results.json")).unwrap()).unwrap();
     assert_eq!((&read.targets, &read.subject, &read.gallery), (&results.targets, &results.subject, &results.gallery));
@@ -173,7 +127,7 @@ fn every_table_is_made() {
         assert!(Image::load(&place.at("results").join(file)).unwrap().width_px > 100, "{file}");
     }
 
-    let again = place.results(&[Table::Recall]);
+    let again = evaluated(&place, &[Table::Recall]);
     assert_eq!(again.forecast, results.forecast);
     assert!(again.planning.is_none() && again.encoder.is_none() && again.gallery.is_none());
 }
@@ -185,9 +139,9 @@ fn what_cannot_be_is_said() {
     let single = SCENARIO
         .replace(r#"branches = ["with", "without"]"#, r#"branches = ["with"]"#)
         .replace(r#"hazard_branches = ["with"]"#, "");
-    let place = Place::new(&single);
-    place.train(Phases::Vae);
-    let results = place.results(&[Table::Psnr, Table::Encoder, Table::Recall, Table::Planning, Table::Frequencies]);
+    let place = Place::new(&single, TRAINING);
+    train(&place, Phases::Vae);
+    let results = evaluated(&place, &[Table::Psnr, Table::Encoder, Table::Recall, Table::Planning, Table::Frequencies]);
     let left_out: Vec<&str> = results.left_out.keys().map(String::as_str).collect();
     assert_eq!(left_out, ["frequencies", "planning", "psnr", "recall"]);
     assert!(results.left_out["psnr"].contains("--stage nerf"), "{:?}", results.left_out);
@@ -196,27 +150,32 @@ fn what_cannot_be_is_said() {
     assert!(page.contains("no branch in which the hazard action is right"), "{page}");
 }
 
-/// Every variant is trained and scored, an existing row is read again, and the table names all variants.
+/// Every variant is trained and scored, an existing row is read again, and the table names all variants, each with the
+/// range over its seeds.
 #[test]
 fn every_variant_has_a_row() {
-    let mut place = Place::new(SCENARIO);
+    let mut place = Place::new(SCENARIO, TRAINING);
     place.config.vae.epochs = 1;
-    let out = place.at("ablation");
+    let (set, out) = (place.at("set"), place.at("ablation"));
     let row = |variant: Variant| {
-        place.run(&format!("ablation/{}/run", variant.name()), |run| {
-            ablation::row(&place.training(&place.at("set"), &out), variant, run, OPTIONS).unwrap()
-        })
+        let run = format!("ablation/{}/seed-{}/run", variant.name(), place.config.seed);
+        place.run(&run, None, |run| ablation::row(&place.training(&set, &out), variant, run, OPTIONS).unwrap())
     };
-    let rows: Vec<_> = Variant::ALL.into_iter().map(row).collect();
+    let mut rows: Vec<_> = Variant::ALL.into_iter().map(row).collect();
     assert!(rows.iter().all(|r| r.scores.train.psnr_db > 5.0 && r.scores.svm.trained.images > 0));
-    let checkpoint = ablation::folders(&out, Variant::Full).1;
+    let checkpoint = ablation::folder(&out, Variant::Full, place.config.seed).join("checkpoint");
     std::fs::remove_dir_all(&checkpoint).unwrap();
     assert_eq!(row(Variant::Full).scores.train.images, rows[0].scores.train.images);
     assert!(!checkpoint.exists(), "read, not trained again");
-    let table = ablation::AblationTable { dataset: "set".into(), epochs: 1, free_poses: 0, seed: 3, rows };
+    let mut other = rows[0].clone();
+    other.seed += 1;
+    (rows[0].scores.svm.trained_by_pose.accuracy, other.scores.svm.trained_by_pose.accuracy) = (0.5, 0.75);
+    rows.push(other);
+    let table = AblationTable { dataset: "set".into(), epochs: 1, free_poses: 0, rows };
     ablation::write_table(&table, &out).unwrap();
     let page = std::fs::read_to_string(out.join("README.md")).unwrap();
     for variant in Variant::ALL {
         assert!(page.contains(variant.description(&place.config)), "{variant:?}");
     }
+    assert!(page.contains("| 2 | 62.5 (50.0 to 75.0) |"), "{page}");
 }

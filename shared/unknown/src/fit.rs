@@ -1,5 +1,7 @@
 //! Robust fits: gain and offset of an image against a rendered one, and least squares.
 
+use carff_base::linear::solve;
+
 /// Passes of the robust fit of gain and offset.
 const PASSES: usize = 5;
 /// Pixels beyond this many robust deviations do not count in the fit.
@@ -78,28 +80,7 @@ pub(crate) fn least_squares<const N: usize>(rows: impl Iterator<Item = ([f32; N]
     if count < FEWEST {
         return None;
     }
-    // Elimination with the largest pivot.
-    let least = 1e-9 * count;
-    for column in 0..N {
-        let pivot = (column..N).max_by(|&a, &b| matrix[a][column].abs().total_cmp(&matrix[b][column].abs()))?;
-        if matrix[pivot][column].abs() <= least {
-            return None;
-        }
-        matrix.swap(column, pivot);
-        right.swap(column, pivot);
-        let (pivot_row, pivot_right) = (matrix[column], right[column]);
-        for (row, right) in matrix.iter_mut().zip(&mut right).skip(column + 1) {
-            let factor = row[column] / pivot_row[column];
-            row.iter_mut().zip(pivot_row).for_each(|(term, of_pivot)| *term -= factor * of_pivot);
-            *right -= factor * pivot_right;
-        }
-    }
-    let mut found = [0.0; N];
-    for row in (0..N).rev() {
-        let known: f64 = (row + 1..N).map(|k| matrix[row][k] * found[k]).sum();
-        found[row] = (right[row] - known) / matrix[row][row];
-    }
-    Some(found.map(|v| v as f32))
+    solve(matrix, right, 1e-9 * count).map(|found| found.map(|v| v as f32))
 }
 
 #[cfg(test)]

@@ -2,7 +2,7 @@
 
 use carff_messages::{
     Action, Belief, DatasetView, Forecast, ForecastSource, FrameMeta, Gaussian, Header, Health, Intrinsics, Posterior,
-    ProbeResult, ViewMeta,
+    ProbeResult, Reason, Rule, ViewMeta,
 };
 
 fn header() -> Header {
@@ -34,20 +34,15 @@ pub(crate) fn belief() -> Belief {
 
 pub(crate) fn action() -> Action {
     Action {
-        header: header(),
         action: 1,
-        reason: 0,
-        rule: 3,
         sample_count: 10,
         confidence: 0.5,
         hazard_probability: 0.25,
         is_decision: 1,
-        unknown_probability: 0.0,
         valid_until_ns: 77,
         based_on_frame: 1,
         latency_ns: 20,
-        target_speed_mps: 0.0,
-        look_gain_bits: 0.0,
+        ..Action::halt(header(), Reason::Belief, Rule::Calibrated)
     }
 }
 

@@ -94,7 +94,7 @@ impl<'a> Inputs<'a> {
     }
 
     /// Number of copies of an image.
-    pub(super) fn copies_of(&self, image: usize) -> usize {
+    pub(crate) fn copies_of(&self, image: usize) -> usize {
         let augmentation = &self.context.config.augmentation;
         let more = if self.own[image].is_some() { augmentation.own_copies } else { 0 };
         augmentation.copies + 1 + more
@@ -112,7 +112,7 @@ impl<'a> Inputs<'a> {
     }
 
     /// Features of some images, each in its own copy.
-    pub(super) fn features(&self, vae: &Vae, chosen: &[(usize, usize)]) -> Tensor {
+    pub(crate) fn features(&self, vae: &Vae, chosen: &[(usize, usize)]) -> Tensor {
         if let Some(features) = &self.features {
             let copies = self.context.config.augmentation.copies + 1;
             let rows = chosen.iter().map(|&(i, copy)| feature_row(&self.own, self.own_count, copies, i, copy));
@@ -132,7 +132,7 @@ impl<'a> Inputs<'a> {
     }
 
     /// Posteriors of all images, in one copy.
-    pub(super) fn posteriors(&self, vae: &Vae, copy: usize) -> Vec<Gaussian> {
+    pub(crate) fn posteriors(&self, vae: &Vae, copy: usize) -> Vec<Gaussian> {
         let all: Vec<usize> = (0..self.context.posed.images.len()).collect();
         tch::no_grad(|| {
             all.chunks(FEATURE_BATCH * 4)

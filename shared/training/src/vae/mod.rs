@@ -14,14 +14,13 @@ use crate::{
     TrainingConfig, TrainingError,
     run::{Context, part, prefixed},
 };
-use carff_checkpoint::shapes::DecoderConfig;
 use carff_dataset::PoseRole;
 use carff_evaluation::{Centroids, Decoding, VaeFigures, state_accuracy};
 use carff_messages::{Gaussian, LATENT_DIM};
 use carff_networks::{
     ModelError,
     adam::Adam,
-    decoder::Decoder,
+    decoder::{Decoder, SmallDecoder},
     encoder::Encoder,
     weights::{self, Tensors},
 };
@@ -29,9 +28,6 @@ pub use inputs::Inputs;
 use std::path::Path;
 use tch::{Device, Tensor, nn, nn::VarStore};
 pub use train::VaePhase;
-
-/// Channels of the small decoder.
-const SMALL_CHANNELS: i64 = 32;
 
 /// Encoder, decoder, and what only training uses: the read-out and the small decoder of other poses.
 pub struct Vae {
@@ -41,7 +37,7 @@ pub struct Vae {
     pub decoder: Decoder,
     pub(super) read_out: nn::Linear,
     /// Present when the decoder is asked for other poses than the input's.
-    pub(super) small_decoder: Option<Decoder>,
+    pub(super) small_decoder: Option<SmallDecoder>,
     backbone: VarStore,
     head: VarStore,
     decoder_store: VarStore,
@@ -69,9 +65,9 @@ impl Vae {
             states as i64,
             nn::LinearConfig::default(),
         );
-        let small = DecoderConfig { channels: SMALL_CHANNELS, ..config.decoder.clone() };
         let path = small_store.root() / "small_decoder";
-        let small_decoder = (config.vae.other_poses > 0).then(|| Decoder::small(&path, &small, poses as i64));
+        let small_decoder =
+            (config.vae.other_poses > 0).then(|| SmallDecoder::new(&path, &config.decoder, poses as i64));
         let frozen = config.encoder.backbone.frozen;
         if frozen {
             backbone.freeze();
@@ -100,7 +96,7 @@ impl Vae {
         self.head.device()
     }
 
-    pub(super) fn stores(&self) -> Vec<&VarStore> {
+    pub(crate) fn stores(&self) -> Vec<&VarStore> {
         let mut stores = vec![&self.head, &self.decoder_store, &self.read_out_store, &self.small_store];
         if !self.frozen {
             stores.push(&self.backbone);
@@ -108,7 +104,7 @@ impl Vae {
         stores
     }
 
-    pub(super) fn state(&self, adam: &Adam) -> Tensors {
+    pub(crate) fn state(&self, adam: &Adam) -> Tensors {
         let mut all: Tensors = prefixed("adam.", adam.state()).collect();
         for store in self.stores() {
             all.extend(prefixed("weights.", weights::of_store(store)));
@@ -116,7 +112,7 @@ impl Vae {
         all
     }
 
-    pub(super) fn restore(&self, adam: Option<&mut Adam>, state: &Tensors) -> bool {
+    pub(crate) fn restore(&self, adam: Option<&mut Adam>, state: &Tensors) -> bool {
         let saved = part(state, "weights.");
         for store in self.stores() {
             let own: Tensors = weights::of_store(store)

@@ -4,7 +4,7 @@
 use super::{indices, losses::reconstruction_error};
 use crate::config::VaeTraining;
 use carff_evaluation::PosedImages;
-use carff_networks::decoder::{Decoder, SMALL_PX};
+use carff_networks::decoder::{SMALL_PX, SmallDecoder};
 use rand::Rng;
 use tch::{Device, Kind, Tensor};
 
@@ -52,7 +52,7 @@ impl OtherPoses {
     /// one row of `latents` each. `None` if no input's state is seen from another pose.
     pub fn error(
         &self,
-        decoder: &Decoder,
+        decoder: &SmallDecoder,
         latents: &Tensor,
         inputs: &[(usize, usize)],
         settings: &VaeTraining,

@@ -87,11 +87,12 @@ impl<'a> VaePhase<'a> {
 
     fn part(&self, epoch: usize) -> Part<'_> {
         let settings = self.settings();
-        if epoch >= settings.epochs {
-            let (before, epochs) = (settings.epochs, settings.decoder_epochs);
+        let joint = settings.joint_epochs();
+        if epoch >= joint {
+            let (before, epochs) = (joint, settings.decoder_epochs);
             Part { images: &self.own, own_passes: 1, before, epochs, decoder_only: true }
         } else {
-            let (own_passes, epochs) = (settings.own_passes, settings.epochs);
+            let (own_passes, epochs) = (settings.own_passes, joint);
             Part { images: &self.trained, own_passes, before: 0, epochs, decoder_only: false }
         }
     }
