@@ -21,10 +21,10 @@ use rand::Rng;
 use std::collections::VecDeque;
 use tch::{Kind, Tensor};
 
+/// Purpose of the random stream of the images.
+const STREAM: &str = "1stg";
 /// Latents of each state that the occupancy grid covers: the newest ones.
 const LATENTS_OF_STATE: usize = 16;
-/// Steps between two updates of these latents.
-const LATENTS_EVERY: usize = 50;
 /// Steps between two records.
 const RECORD_EVERY: usize = 100;
 
@@ -79,8 +79,8 @@ impl<'a> OneStagePhase<'a> {
         (image, rng.random_range(0..self.inputs.copies_of(image)))
     }
 
-    /// Keeps the newest latents of each state, and gives them to the occupancy grid from time to time.
-    fn keep(&mut self, step: usize, states: impl Iterator<Item = usize>, latents: &[[f32; LATENT_DIM]]) {
+    /// Keeps the newest latents of each state, and gives them to the occupancy grid.
+    fn keep(&mut self, states: impl Iterator<Item = usize>, latents: &[[f32; LATENT_DIM]]) {
         for (state, latent) in states.zip(latents) {
             let latest = &mut self.latest[state];
             if latest.len() == LATENTS_OF_STATE {
@@ -88,10 +88,7 @@ impl<'a> OneStagePhase<'a> {
             }
             latest.push_back(*latent);
         }
-        if step.is_multiple_of(LATENTS_EVERY) {
-            self.trainer
-                .set_state_latents(&self.latest.iter().map(|l| l.iter().copied().collect()).collect::<Vec<_>>());
-        }
+        self.trainer.set_state_latents(&self.latest.iter().map(|l| l.iter().copied().collect()).collect::<Vec<_>>());
     }
 }
 
@@ -110,6 +107,10 @@ impl Phase for OneStagePhase<'_> {
         let Some(trainer) = resumed(self.context.config, settings(self.context), done, state) else { return false };
         self.trainer = trainer;
         self.sampler.set_drawn(done as u64);
+        for (number, latest) in self.latest.iter_mut().enumerate() {
+            let Some(saved) = state.get(&latents_key(number)) else { return false };
+            *latest = rows(saved).into();
+        }
         self.vae.restore(Some(&mut self.adam), state)
     }
 
@@ -121,17 +122,15 @@ impl Phase for OneStagePhase<'_> {
             drawn.push(at);
             [0.0; LATENT_DIM]
         });
-        let mut rng = carff_base::random::stream(Key::named(names::ONE_STAGE, config.seed, step as u64));
+        let mut rng = carff_base::random::stream(Key::named(STREAM, config.seed, step as u64));
         let chosen: Vec<(usize, usize)> = drawn.iter().map(|&at| self.input(at, &mut rng)).collect();
         tch::manual_seed(config.seed as i64 ^ ((step as i64) << 20));
         let features = self.inputs.features(self.vae, &chosen);
         let (mean, log_variance) = self.vae.encoder.posterior(&features, settings.dropout);
         let latent = reparameterised(&mean, &log_variance, &Tensor::randn_like(&mean));
-        let mut values = vec![0.0_f32; latent.numel()];
-        latent.detach().contiguous().copy_data(&mut values, latent.numel());
-        batch.latents = values.as_chunks().0.to_vec();
+        batch.latents = rows(&latent);
         let states: Vec<usize> = drawn.iter().map(|&at| self.seen[at].0).collect();
-        self.keep(step, states.into_iter(), &batch.latents);
+        self.keep(states.into_iter(), &batch.latents);
 
         let report = self.trainer.step(&batch);
         // The encoder gets the field's gradient by each latent.
@@ -163,8 +162,24 @@ impl Phase for OneStagePhase<'_> {
     fn state(&self) -> Tensors {
         let mut all = self.vae.state(&self.adam);
         all.extend(state_of(&self.trainer));
+        all.extend(self.latest.iter().enumerate().map(|(number, latest)| {
+            let values: Vec<f32> = latest.iter().flatten().copied().collect();
+            (latents_key(number), Tensor::from_slice(&values).view([-1, LATENT_DIM as i64]))
+        }));
         all
     }
+}
+
+/// Name of a state's newest latents in the saved state.
+fn latents_key(state: usize) -> String {
+    format!("latents.{state}")
+}
+
+/// Latents of a tensor `[N, 8]`.
+fn rows(latents: &Tensor) -> Vec<[f32; LATENT_DIM]> {
+    let mut values = vec![0.0_f32; latents.numel()];
+    latents.detach().to_device(tch::Device::Cpu).contiguous().copy_data(&mut values, latents.numel());
+    values.as_chunks().0.to_vec()
 }
 
 fn settings(context: Context) -> TrainerConfig {
