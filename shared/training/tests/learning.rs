@@ -6,7 +6,7 @@ mod common;
 
 use carff_evaluation::{CheckpointFigures, Models};
 use carff_training::{FEATURES, Phases, TrainingError};
-use common::{Place, SCENARIO, alone};
+use common::{Place, SCENARIO, exclusive};
 
 /// Networks so small that all three are trained in seconds.
 const TRAINING: &str = r#"
@@ -95,13 +95,13 @@ fn training_learns() {
     assert!(kinds.iter().all(|count| count.trials >= 20), "{planning:#?}");
     let mean_rate = kinds.iter().map(|count| count.rate().unwrap()).sum::<f64>() / 2.0;
     assert!(mean_rate > 0.7, "{planning:#?}");
-    let _alone = alone();
+    let _exclusive = exclusive();
     assert_eq!(Models::load(&place.at("learnt")).unwrap().probe.states().len(), 4);
 }
 
 /// Training of the decoder only leaves the encoder unchanged and improves the decoder.
 #[test]
-fn the_decoder_learns_alone() {
+fn the_decoder_learns_by_itself() {
     let mut place = place();
     place.config.vae.epochs = 12;
     place.config.vae.learning_rate = 2e-3;

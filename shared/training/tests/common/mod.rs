@@ -18,7 +18,7 @@ pub const SCENARIO: &str = include_str!("../../../../tests/data/small-scenario.t
 
 /// libtorch has one random generator per process: two trainings at once, or a training and the initialisation of a
 /// model, would change each other's draws.
-pub fn alone() -> MutexGuard<'static, ()> {
+pub fn exclusive() -> MutexGuard<'static, ()> {
     static ALONE: Mutex<()> = Mutex::new(());
     ALONE.lock().unwrap_or_else(PoisonError::into_inner)
 }
@@ -50,7 +50,7 @@ impl Place {
     /// Works in the run folder `name`, without another training in this process, until `stop_at` (phase, steps done), or
     /// to the end.
     pub fn run<R>(&self, name: &str, stop_at: Option<(&str, usize)>, work: impl FnOnce(&Run) -> R) -> R {
-        let _alone = alone();
+        let _exclusive = exclusive();
         let stop = AtomicBool::new(false);
         let on_progress = |progress: &Progress| {
             if stop_at.is_some_and(|(phase, done)| progress.phase == phase && progress.done >= done) {
