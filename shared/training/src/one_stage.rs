@@ -164,7 +164,7 @@ impl Phase for OneStagePhase<'_> {
         all.extend(state_of(&self.trainer));
         all.extend(self.latest.iter().enumerate().map(|(number, latest)| {
             let values: Vec<f32> = latest.iter().flatten().copied().collect();
-            (latents_key(number), Tensor::from_slice(&values).view([-1, LATENT_DIM as i64]))
+            (latents_key(number), Tensor::from_slice(&values).view([latest.len() as i64, LATENT_DIM as i64]))
         }));
         all
     }
