@@ -117,19 +117,21 @@ static_assert(sizeof(CarffEgoPose) == 184, "CarffEgoPose");
 static_assert(offsetof(CarffEgoPose, header) == 0, "CarffEgoPose.header");
 static_assert(offsetof(CarffEgoPose, world_from_vehicle) == 56, "CarffEgoPose.world_from_vehicle");
 
-#define CARFF_EGO_MOTION_TYPE_NAME "carff.EgoMotion.v1"
+#define CARFF_EGO_MOTION_TYPE_NAME "carff.EgoMotion.v2"
 typedef struct CarffEgoMotion {
     CarffHeader header;
     double speed_mps;
     double to_conflict_m;
+    double through_conflict_m;
     double heading_rad;
 } CarffEgoMotion;
 
-static_assert(sizeof(CarffEgoMotion) == 80, "CarffEgoMotion");
+static_assert(sizeof(CarffEgoMotion) == 88, "CarffEgoMotion");
 static_assert(offsetof(CarffEgoMotion, header) == 0, "CarffEgoMotion.header");
 static_assert(offsetof(CarffEgoMotion, speed_mps) == 56, "CarffEgoMotion.speed_mps");
 static_assert(offsetof(CarffEgoMotion, to_conflict_m) == 64, "CarffEgoMotion.to_conflict_m");
-static_assert(offsetof(CarffEgoMotion, heading_rad) == 72, "CarffEgoMotion.heading_rad");
+static_assert(offsetof(CarffEgoMotion, through_conflict_m) == 72, "CarffEgoMotion.through_conflict_m");
+static_assert(offsetof(CarffEgoMotion, heading_rad) == 80, "CarffEgoMotion.heading_rad");
 
 #define CARFF_INTRINSICS_TYPE_NAME "carff.Intrinsics.v1"
 typedef struct CarffIntrinsics {
@@ -393,17 +395,19 @@ static_assert(offsetof(CarffOccupancy, unknown_probability) == 76, "CarffOccupan
 static_assert(offsetof(CarffOccupancy, probability) == 80, "CarffOccupancy.probability");
 static_assert(offsetof(CarffOccupancy, stage_latency_ns) == 4176, "CarffOccupancy.stage_latency_ns");
 
-#define CARFF_LOOK_GAIN_TYPE_NAME "carff.LookGain.v1"
+#define CARFF_LOOK_GAIN_TYPE_NAME "carff.LookGain.v2"
 typedef struct CarffLookGain {
     CarffHeader header;
     float gain_bits;
     float ahead_m;
+    float clear_m;
 } CarffLookGain;
 
-static_assert(sizeof(CarffLookGain) == 64, "CarffLookGain");
+static_assert(sizeof(CarffLookGain) == 72, "CarffLookGain");
 static_assert(offsetof(CarffLookGain, header) == 0, "CarffLookGain.header");
 static_assert(offsetof(CarffLookGain, gain_bits) == 56, "CarffLookGain.gain_bits");
 static_assert(offsetof(CarffLookGain, ahead_m) == 60, "CarffLookGain.ahead_m");
+static_assert(offsetof(CarffLookGain, clear_m) == 64, "CarffLookGain.clear_m");
 
 #define CARFF_VIEW_META_TYPE_NAME "carff.ViewMeta.v1"
 typedef struct CarffViewMeta {
@@ -433,7 +437,7 @@ static_assert(offsetof(CarffViewMeta, intrinsics) == 112, "CarffViewMeta.intrins
 static_assert(offsetof(CarffViewMeta, world_from_camera) == 144, "CarffViewMeta.world_from_camera");
 static_assert(offsetof(CarffViewMeta, stage_latency_ns) == 272, "CarffViewMeta.stage_latency_ns");
 
-#define CARFF_ACTION_TYPE_NAME "carff.Action.v3"
+#define CARFF_ACTION_TYPE_NAME "carff.Action.v4"
 typedef struct CarffAction {
     CarffHeader header;
     uint32_t action;
@@ -449,9 +453,10 @@ typedef struct CarffAction {
     uint64_t latency_ns;
     float target_speed_mps;
     float look_gain_bits;
+    float clear_m;
 } CarffAction;
 
-static_assert(sizeof(CarffAction) == 120, "CarffAction");
+static_assert(sizeof(CarffAction) == 128, "CarffAction");
 static_assert(offsetof(CarffAction, header) == 0, "CarffAction.header");
 static_assert(offsetof(CarffAction, action) == 56, "CarffAction.action");
 static_assert(offsetof(CarffAction, reason) == 60, "CarffAction.reason");
@@ -466,6 +471,7 @@ static_assert(offsetof(CarffAction, based_on_frame) == 96, "CarffAction.based_on
 static_assert(offsetof(CarffAction, latency_ns) == 104, "CarffAction.latency_ns");
 static_assert(offsetof(CarffAction, target_speed_mps) == 112, "CarffAction.target_speed_mps");
 static_assert(offsetof(CarffAction, look_gain_bits) == 116, "CarffAction.look_gain_bits");
+static_assert(offsetof(CarffAction, clear_m) == 120, "CarffAction.clear_m");
 
 #define CARFF_HEALTH_TYPE_NAME "carff.Health.v1"
 typedef struct CarffHealth {

@@ -39,6 +39,11 @@ impl<'a> Drive<'a> {
         self.drives.conflict_m()[0] - self.vehicle.at_m
     }
 
+    /// Way until the ego has left that place, metres.
+    pub(super) fn through_conflict_m(&self) -> f64 {
+        self.drives.conflict_m()[1] - self.vehicle.at_m
+    }
+
     /// Moves everyone for a frame's time, the ego towards a target speed. Returns the result at the drive's end.
     pub(super) fn step(&mut self, target_mps: f64, frame_s: f64) -> Option<EpisodeResult> {
         self.frames += 1;

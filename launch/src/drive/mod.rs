@@ -238,6 +238,7 @@ fn graph_text(args: &DriveArgs, scenario: &Path, drives: &ClosedLoop) -> anyhow:
             "rule": rule,
             "approach": approach,
             "advance_mps": drives.config().speed_mps,
+            "others_mps": drives.config().actor_speed_mps[1],
         },
         "launcher": { "keep_frames": 10_000_000 },
     }))?;

@@ -41,7 +41,7 @@ impl Vehicle {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use carff_decision::{Approach, Motion, Speeds};
+    use carff_decision::{Approach, Look, Motion, Speeds};
     use carff_messages::ActionCode;
 
     const SUBSTEP_S: f64 = 0.02;
@@ -70,11 +70,11 @@ mod tests {
     /// Wherever a controller has the vehicle stop ahead of the place where others drive, it stops ahead of it.
     #[test]
     fn a_stop_ahead_of_the_place_is_possible() {
-        let speeds = Speeds { advance_mps: 8.0, creep_mps: 1.5 };
+        let speeds = Speeds { advance_mps: 8.0, creep_mps: 1.5, others_mps: 0.0 };
         for (tenths_mps, tenths_m) in (1..80).flat_map(|v| (1..100).map(move |d| (v, d))) {
             let (speed_mps, to_conflict_m) = (f64::from(tenths_mps) / 10.0, f64::from(tenths_m) / 10.0);
-            let motion = Some(Motion { speed_mps, to_conflict_m });
-            if Approach::Stop.drive(true, 0.0, motion, speeds).0 != ActionCode::Halt {
+            let motion = Some(Motion { speed_mps, to_conflict_m, through_conflict_m: to_conflict_m + 6.0 });
+            if Approach::Stop.drive(true, Look::default(), motion, speeds).0 != ActionCode::Halt {
                 continue;
             }
             let mut vehicle = Vehicle::at_start(speed_mps);
@@ -83,5 +83,35 @@ mod tests {
             }
             assert!(vehicle.at_m <= to_conflict_m + 0.05, "{speed_mps} m/s, {to_conflict_m} m: {}", vehicle.at_m);
         }
+    }
+
+    /// Wherever a controller has the vehicle cross a lane that is clear up to somebody, it has left the lane before that
+    /// somebody arrives at the highest speed.
+    #[test]
+    fn a_crossing_is_over_in_time() {
+        let speeds = Speeds { advance_mps: 5.0, creep_mps: 1.5, others_mps: 6.0 };
+        let mut crossings = 0;
+        for (tenths_mps, tenths_m) in (0..=50).step_by(2).flat_map(|v| (10..200).step_by(3).map(move |d| (v, d))) {
+            let (speed_mps, to_conflict_m) = (f64::from(tenths_mps) / 10.0, f64::from(tenths_m) / 10.0);
+            let through_conflict_m = to_conflict_m + 7.0;
+            let motion = Some(Motion { speed_mps, to_conflict_m, through_conflict_m });
+            let crosses = |clear_m: &f64| {
+                let look = Look { gain_bits: 0.0, clear_m: *clear_m };
+                Approach::Look.drive(true, look, motion, speeds).0 == ActionCode::Advance
+            };
+            let Some(clear_m) = (0..400).map(|half| f64::from(half) / 2.0).find(crosses) else { continue };
+            crossings += usize::from(clear_m > 0.0);
+            let (mut vehicle, mut time_s) = (Vehicle::at_start(speed_mps), 0.0);
+            while vehicle.at_m < through_conflict_m {
+                vehicle.substep(speeds.advance_mps, SUBSTEP_S);
+                time_s += SUBSTEP_S;
+            }
+            let is_committed = clear_m == 0.0;
+            assert!(
+                is_committed || time_s * speeds.others_mps < clear_m,
+                "{speed_mps} m/s, {to_conflict_m} m: {time_s} s"
+            );
+        }
+        assert!(crossings > 1000, "{crossings}");
     }
 }

@@ -145,7 +145,8 @@ impl World {
     ) -> anyhow::Result<()> {
         let (at_m, time_s, speed_mps) = (drive.vehicle.at_m, drive.time_s, drive.vehicle.speed_mps);
         let [x, y, heading_rad] = self.drives.ego_pose(at_m);
-        topics.motions.send(EgoMotion { header, speed_mps, to_conflict_m: drive.to_conflict_m(), heading_rad })?;
+        let (to_conflict_m, through_conflict_m) = (drive.to_conflict_m(), drive.through_conflict_m());
+        topics.motions.send(EgoMotion { header, speed_mps, to_conflict_m, through_conflict_m, heading_rad })?;
         let mut truth = WorldTruth {
             header,
             episode: number,

@@ -4,7 +4,7 @@
 
 use carff_checkpoint::load_policy;
 use carff_config::{Contract, GraphConfig};
-use carff_decision::{Approach, Evidence, Motion, Policy, Speeds};
+use carff_decision::{Approach, Evidence, Look, Motion, Policy, Speeds};
 use carff_messages::{Action, Belief, EgoMotion, Message, Reason};
 use std::collections::{BTreeMap, VecDeque};
 use std::path::Path;
@@ -202,9 +202,9 @@ impl Judge {
         let is_fresh = |at_ns: u64| at_ns <= decided_ns && decided_ns - at_ns <= deadline_ns;
         let fresh = self.motions.iter().filter(|motion| is_fresh(motion.header.capture_time_ns));
         let used = fresh.filter(|_| approach != Approach::Stop);
-        let used = used.map(|m| Some(Motion { speed_mps: m.speed_mps, to_conflict_m: m.to_conflict_m }));
+        let used = used.map(|motion| Some(Motion::from(motion)));
         used.chain([None]).any(|motion| {
-            let (code, target_mps) = approach.drive(halts, action.look_gain_bits.into(), motion, speeds);
+            let (code, target_mps) = approach.drive(halts, Look::from(action), motion, speeds);
             (code.code(), target_mps as f32) == (action.action, action.target_speed_mps)
         })
     }
@@ -216,7 +216,7 @@ mod tests {
     use carff_messages::{ActionCode, Header, ProbeResult, Rule};
 
     const MS: u64 = 1_000_000;
-    const SPEEDS: Speeds = Speeds { advance_mps: 5.0, creep_mps: 1.5 };
+    const SPEEDS: Speeds = Speeds { advance_mps: 5.0, creep_mps: 1.5, others_mps: 5.0 };
 
     fn judge() -> Judge {
         judge_of(Policy::new(Rule::Calibrated, 0.3), Approach::Stop)
@@ -292,7 +292,8 @@ mod tests {
             let mut judge = judge_of(Policy::new(Rule::Calibrated, 0.3), approach);
             (1..=2).for_each(|step| judge.given(&belief(1, step, 0.9)));
             let header = Header::of_frame(1, moved_ms * MS, 1);
-            judge.moved(&EgoMotion { header, speed_mps: 1.0, to_conflict_m, heading_rad: 0.0 });
+            let through_conflict_m = to_conflict_m + 6.0;
+            judge.moved(&EgoMotion { header, speed_mps: 1.0, to_conflict_m, through_conflict_m, heading_rad: 0.0 });
             judge.next(Action { target_speed_mps, ..action(1, code, 120) }).is_ok()
         };
         let (look, stop) = (Approach::Look, Approach::Stop);

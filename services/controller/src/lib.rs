@@ -3,7 +3,7 @@
 //! `carff-decision` contains the decision rules; this crate decides when a rule is applied, and which action is valid
 //! in between.
 
-use carff_decision::{Approach, Decision, Evidence, Motion, Policy, Speeds};
+use carff_decision::{Approach, Decision, Evidence, Look, Motion, Policy, Speeds};
 use carff_messages::{Action, Belief, EgoMotion, Header, ImageCheck, LookGain, MAX_HORIZON, Message, Reason};
 
 /// Settings of a controller.
@@ -221,11 +221,11 @@ impl Controller {
         let deadline_ns = self.settings.deadline_ns;
         let is_fresh = |motion: &&EgoMotion| now_ns.saturating_sub(motion.header.capture_time_ns) <= deadline_ns;
         let motion = self.motion.as_ref().filter(is_fresh);
-        let motion = motion.map(|m| Motion { speed_mps: m.speed_mps, to_conflict_m: m.to_conflict_m });
+        let motion = motion.map(Motion::from);
         let is_of_frame = |look: &&LookGain| look.header.capture_time_ns == pending.header.capture_time_ns;
-        let look_gain_bits = self.look.as_ref().filter(is_of_frame).map_or(0.0, |look| look.gain_bits);
+        let look = self.look.as_ref().filter(is_of_frame).map(Look::from).unwrap_or_default();
         let Settings { approach, speeds, .. } = self.settings;
-        let (code, target_mps) = approach.drive(decision.halt, look_gain_bits.into(), motion, speeds);
+        let (code, target_mps) = approach.drive(decision.halt, look, motion, speeds);
         Action {
             header: pending.header.at_step(0),
             action: code.code(),
@@ -240,7 +240,8 @@ impl Controller {
             based_on_frame: pending.header.frame_id,
             latency_ns: now_ns.saturating_sub(pending.header.capture_time_ns),
             target_speed_mps: target_mps as f32,
-            look_gain_bits,
+            look_gain_bits: look.gain_bits as f32,
+            clear_m: look.clear_m as f32,
         }
     }
 

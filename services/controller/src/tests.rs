@@ -11,7 +11,7 @@ fn controller(rule: Rule) -> Controller {
 
 fn settings(policy: Policy) -> Settings {
     let (deadline_ns, period_ns) = (150 * MS, 50 * MS);
-    let speeds = Speeds { advance_mps: 5.0, creep_mps: 1.5 };
+    let speeds = Speeds { advance_mps: 5.0, creep_mps: 1.5, others_mps: 5.0 };
     Settings { policy, deadline_ns, period_ns, seed: 1, approach: Approach::Stop, speeds }
 }
 
@@ -271,27 +271,29 @@ fn the_unknown_halts_unless_ignored() {
     }
 }
 
-/// A vehicle whose motion is known creeps by its approach; a motion older than the deadline, and a look from another
-/// frame, do not count.
+/// A vehicle whose motion is known creeps by its approach, and crosses a lane that is clear far enough; a motion older
+/// than the deadline, and a look from another frame, do not count.
 #[test]
 fn approaches_use_what_is_fresh() {
     let policy = Policy::new(Rule::Calibrated, 0.3);
     let mut controller = Controller::new(Settings { approach: Approach::Look, ..settings(policy) });
-    let mut decide = |frame: u64, moved_at: u64, looked_at: u64| {
+    let mut decide = |frame: u64, moved_at: u64, looked_at: u64, clear_m: f32| {
         let header = |frame: u64| Header::of_frame(frame, frame * 100 * MS, 1);
         controller.on_motion(&EgoMotion {
             header: header(moved_at),
             speed_mps: 2.0,
             to_conflict_m: 20.0,
+            through_conflict_m: 26.0,
             ..EgoMotion::default()
         });
-        controller.on_look(&LookGain { header: header(looked_at), gain_bits: 0.8, ahead_m: 3.0 });
+        controller.on_look(&LookGain { header: header(looked_at), gain_bits: 0.8, ahead_m: 3.0, clear_m });
         controller.on_belief(&belief(frame, 1, 0.6, 6), frame * 100 * MS + MS);
         let action = controller.on_belief(&belief(frame, 2, 0.6, 6), frame * 100 * MS + 2 * MS).unwrap();
         action.validate().unwrap();
         (action.code().unwrap(), action.target_speed_mps, action.look_gain_bits)
     };
-    assert_eq!(decide(3, 3, 3), (ActionCode::Creep, 5.0, 0.8));
-    assert_eq!(decide(4, 4, 3), (ActionCode::Creep, 1.5, 0.0));
-    assert_eq!(decide(6, 4, 6), (ActionCode::Halt, 0.0, 0.8));
+    assert_eq!(decide(3, 3, 3, 5.0), (ActionCode::Creep, 5.0, 0.8));
+    assert_eq!(decide(4, 4, 3, 90.0), (ActionCode::Creep, 1.5, 0.0));
+    assert_eq!(decide(6, 4, 6, 90.0), (ActionCode::Halt, 0.0, 0.8));
+    assert_eq!(decide(7, 7, 7, 90.0), (ActionCode::Advance, 5.0, 0.8));
 }

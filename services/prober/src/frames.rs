@@ -9,7 +9,7 @@ use carff_decision::ImageEvidence;
 use carff_messages::{Belief, FrameMeta, Header, UnknownBox, Unknowns};
 use carff_runtime::StageContext;
 use carff_transport::{Image, Input, Publisher, Receiver, Sample, monotonic_now_ns, topics};
-use carff_unknown::Lanes;
+use carff_unknown::{Lanes, Sighting};
 use std::collections::VecDeque;
 
 /// Number of frames that are remembered: later steps of a frame's forecast may follow those of newer frames.
@@ -129,6 +129,11 @@ impl Frames {
 
     fn of(&self, header: &Header) -> Option<&Taken> {
         self.taken.iter().rev().find(|taken| taken.at_ns == header.capture_time_ns)
+    }
+
+    /// The clear lanes of a frame, if it is the one compared last.
+    pub fn sighting(&self, header: &Header) -> Option<&Sighting> {
+        self.images.sighting(header)
     }
 
     /// The ground on which something counts.

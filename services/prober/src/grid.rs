@@ -136,12 +136,10 @@ impl Grid {
 /// Reports whether a point is on the lane of a place that only states with the hazard take: in the place's box, extended
 /// along its heading.
 fn is_on_lane(layout: &ProbeLayout, [x, y]: [f64; 2]) -> bool {
-    layout.places().iter().any(|place| {
-        let mut states = place.occupied_in.iter().zip(layout.hazard_states());
-        let is_hazard = place.occupied_in.contains(&true) && states.all(|(taken, hazard)| !taken || *hazard);
+    layout.hazard_places().any(|place| {
         let of = &place.oriented_box;
         let aside_m = (y - of.center[1]) * of.yaw.cos() - (x - of.center[0]) * of.yaw.sin();
-        is_hazard && aside_m.abs() <= of.half_size[1]
+        aside_m.abs() <= of.half_size[1]
     })
 }
 

@@ -3,7 +3,7 @@
 use carff_checkpoint::{CheckpointPlanning, FieldProbe};
 use carff_decision::{ImageEvidence, ImageMemory, Place};
 use carff_messages::{FrameMeta, Header, LATENT_DIM, MAX_STATES, Unknowns};
-use carff_unknown::{Comparer, Known, Lanes, Seen};
+use carff_unknown::{Comparer, Known, Lanes, Seen, Sighting};
 use ndarray::ArrayView3;
 use std::collections::VecDeque;
 use std::path::Path;
@@ -19,6 +19,8 @@ pub struct Images {
     states: Vec<[f32; LATENT_DIM]>,
     /// The newest last.
     compared: VecDeque<Compared>,
+    /// The clear lanes of the image compared last, with its capture time; `None` for another place.
+    sighting: Option<(u64, Sighting)>,
     /// Evidence while no image of a take has been compared.
     nothing_yet: ImageEvidence,
     /// Comparisons of the take so far, and the take's first frame.
@@ -50,6 +52,7 @@ impl Images {
             comparer: Comparer::default(),
             states: probe.states().iter().map(|state| state.mean).collect(),
             compared: VecDeque::with_capacity(REMEMBERED),
+            sighting: None,
             nothing_yet: ImageEvidence::unexplained(hazards.len()),
             memory: learned.map(|learned| (ImageMemory::new(hazards, learned.settings), 0)),
         }))
@@ -89,7 +92,10 @@ impl Images {
         let camera = frame.camera();
         camera.validate().ok()?;
         let view = (&camera, image);
+        self.sighting = None;
         let (seen, comparison) = self.known.see(&mut self.comparer, probe.field(), &self.states, view, threads)?;
+        let sighting = self.known.sighting(&self.comparer, &comparison, &seen);
+        self.sighting = sighting.map(|sighting| (frame.header.capture_time_ns, sighting));
         let mut unknowns = Unknowns::of_frame(frame.header);
         (unknowns.noise, unknowns.explained) = (comparison.fit.noise, comparison.fit.explained);
         (unknowns.gain, unknowns.offset) = (comparison.fit.gain, comparison.fit.offset);
@@ -110,6 +116,11 @@ impl Images {
     /// The ground on which something counts.
     pub fn lanes(&self) -> &Lanes {
         &self.known.lanes
+    }
+
+    /// The clear lanes of a frame, if it is the one compared last.
+    pub fn sighting(&self, header: &Header) -> Option<&Sighting> {
+        self.sighting.as_ref().filter(|(at_ns, _)| *at_ns == header.capture_time_ns).map(|(_, sighting)| sighting)
     }
 
     /// The evidence of a compared frame; `None` also for a frame that shows nothing to compare.

@@ -1,16 +1,20 @@
-//! The value of a look from further on: the expected information of images from poses ahead of the vehicle.
+//! What a frame shows of the others' lanes, and the value of a look from further on: the expected information of images
+//! from poses ahead of the vehicle.
 
 use crate::Frames;
 use carff_checkpoint::FieldProbe;
 use carff_config::GraphConfig;
-use carff_decision::{Approach, look_gain_bits};
+use carff_decision::{Approach, Place, look_gain_bits};
 use carff_messages::{Belief, EgoMotion, LATENT_DIM, LookGain};
 use carff_runtime::StageContext;
 use carff_transport::{Publisher, Receiver, topics};
-use carff_unknown::{Lanes, Sight};
+use carff_unknown::{Crossing, Lanes, Sight};
 
 /// Ways ahead of the vehicle from where a look is judged, metres.
 const AHEAD_M: [f64; 4] = [1.5, 3.0, 4.5, 6.0];
+
+/// Longest way that counts as clear, metres: no lane of a field is longer.
+const MOST_CLEAR_M: f64 = 500.0;
 
 /// Publishes the value of a look from further on with each belief about the next step.
 #[derive(Debug)]
@@ -65,9 +69,21 @@ impl Outlook {
                 (gain_bits, ahead_m) = (gain, at_m);
             }
         }
-        let look = LookGain { header: belief.header, gain_bits: gain_bits as f32, ahead_m: ahead_m as f32 };
-        Ok(self.output.send(look)?)
+        let clear_m = clear_m(probe, frames, belief, &motion).min(MOST_CLEAR_M);
+        let (gain_bits, ahead_m, clear_m) = (gain_bits as f32, ahead_m as f32, clear_m as f32);
+        Ok(self.output.send(LookGain { header: belief.header, gain_bits, ahead_m, clear_m })?)
     }
+}
+
+/// The way along the lanes of the hazard's places that a belief's frame shows clear, metres: that of the least clear one.
+fn clear_m(probe: &FieldProbe, frames: &Frames, belief: &Belief, motion: &EgoMotion) -> f64 {
+    let Some((sighting, camera)) = frames.sighting(&belief.header).zip(frames.camera_of(&belief.header)) else {
+        return 0.0;
+    };
+    let ([x, y, _], heading_rad) = (camera.position_m(), motion.heading_rad);
+    let places = probe.layout().hazard_places();
+    let crossing = |place: &Place| Crossing { place: place.oriented_box, from_m: [x, y], heading_rad };
+    places.map(|place| sighting.clear_m(&crossing(place), &place.occupied_in)).reduce(f64::min).unwrap_or(0.0)
 }
 
 fn is_asked(graph: &GraphConfig) -> bool {

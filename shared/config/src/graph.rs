@@ -214,6 +214,10 @@ pub struct ControllerConfig {
     /// Highest target speed of `creep` where nothing can be learned from further on, m/s, 0.1 to 10. Default 1.5.
     #[schemars(range(min = 0.1, max = 10.0))]
     pub creep_mps: f64,
+    /// Highest speed of others, m/s, 0 to 60. With the approach `look`, the vehicle crosses their lane where the image
+    /// shows it clear so far that nobody arrives in time, even if the belief has the hazard. Default 0: never.
+    #[schemars(range(min = 0.0, max = 60.0))]
+    pub others_mps: f64,
 }
 
 impl Default for ControllerConfig {
@@ -226,6 +230,7 @@ impl Default for ControllerConfig {
             approach: Approach::Stop,
             advance_mps: 5.0,
             creep_mps: 1.5,
+            others_mps: 0.0,
         }
     }
 }
@@ -233,7 +238,7 @@ impl Default for ControllerConfig {
 impl ControllerConfig {
     /// Returns the speeds of the vehicle.
     pub fn speeds(&self) -> Speeds {
-        Speeds { advance_mps: self.advance_mps, creep_mps: self.creep_mps }
+        Speeds { advance_mps: self.advance_mps, creep_mps: self.creep_mps, others_mps: self.others_mps }
     }
 }
 

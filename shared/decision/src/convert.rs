@@ -1,7 +1,9 @@
 //! Conversions between a step of the belief and the messages that carry it.
 
-use crate::{Draw, Mixture, ProbeLayout, Probed, Reading, Resolved, Step};
-use carff_messages::{Belief, Forecast, Gaussian, MAX_COMPONENTS, MAX_PLACES, ProbeResult};
+use crate::{Draw, Look, Mixture, Motion, ProbeLayout, Probed, Reading, Resolved, Step};
+use carff_messages::{
+    Action, Belief, EgoMotion, Forecast, Gaussian, LookGain, MAX_COMPONENTS, MAX_PLACES, ProbeResult,
+};
 
 /// Returns the mixture and the draws of a valid forecast.
 pub fn mixture_and_draws(forecast: &Forecast) -> (Mixture, Vec<Draw>) {
@@ -30,6 +32,26 @@ pub fn set_mixture_and_draws(forecast: &mut Forecast, mixture: &Mixture, draws: 
     for (i, draw) in draws.iter().enumerate() {
         forecast.samples[i] = draw.latent;
         forecast.sample_component[i] = draw.component as u8;
+    }
+}
+
+impl From<&EgoMotion> for Motion {
+    fn from(message: &EgoMotion) -> Self {
+        let EgoMotion { speed_mps, to_conflict_m, through_conflict_m, .. } = *message;
+        Self { speed_mps, to_conflict_m, through_conflict_m }
+    }
+}
+
+impl From<&LookGain> for Look {
+    fn from(message: &LookGain) -> Self {
+        Self { gain_bits: message.gain_bits.into(), clear_m: message.clear_m.into() }
+    }
+}
+
+/// The look that an action rests on.
+impl From<&Action> for Look {
+    fn from(message: &Action) -> Self {
+        Self { gain_bits: message.look_gain_bits.into(), clear_m: message.clear_m.into() }
     }
 }
 

@@ -114,6 +114,14 @@ impl ProbeLayout {
         &self.places
     }
 
+    /// Returns the places that only states with the hazard take.
+    pub fn hazard_places(&self) -> impl Iterator<Item = &Place> {
+        self.places.iter().filter(|place| {
+            let mut states = place.occupied_in.iter().zip(&self.hazard_states);
+            place.occupied_in.contains(&true) && states.all(|(taken, hazard)| !taken || *hazard)
+        })
+    }
+
     /// Returns the number of known states.
     pub fn state_count(&self) -> usize {
         self.hazard_states.len()

@@ -29,7 +29,7 @@ mod rule;
 mod take;
 mod threshold;
 
-pub use approach::{Approach, Drive, Motion, Speeds, stopping_mps};
+pub use approach::{Approach, Drive, Look, Motion, Speeds, stopping_mps};
 pub use calibration::{ProbeCalibration, Reading, Resolved, resolve};
 pub use convert::{mixture_and_draws, set_mixture_and_draws};
 pub use evidence::{Evidence, SampleEvidence};

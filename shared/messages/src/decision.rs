@@ -26,13 +26,14 @@ const MAX_SPEED_MPS: f32 = 100.0;
 ///     latency_ns: 20_000,
 ///     target_speed_mps: 0.0,
 ///     look_gain_bits: 0.0,
+///     clear_m: 0.0,
 /// };
 /// assert!(action.validate().is_ok() && action.is_decision());
 /// assert_eq!(action.code(), Ok(ActionCode::Halt));
 /// ```
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, ZeroCopySend)]
-#[type_name("carff.Action.v3")]
+#[type_name("carff.Action.v4")]
 pub struct Action {
     /// Header of the frame that it is based on.
     pub header: Header,
@@ -62,6 +63,8 @@ pub struct Action {
     pub target_speed_mps: f32,
     /// Expected drop of the uncertainty about the hazard by a look from further on, bits, 0..=1; 0 if not computed.
     pub look_gain_bits: f32,
+    /// Way along the others' lane that the image shows clear, metres, 0..=1000; 0 if not computed.
+    pub clear_m: f32,
 }
 
 impl Action {
@@ -90,6 +93,7 @@ impl Action {
             latency_ns: 0,
             target_speed_mps: 0.0,
             look_gain_bits: 0.0,
+            clear_m: 0.0,
         }
     }
 
@@ -118,6 +122,7 @@ impl Action {
         probability("confidence", self.confidence)?;
         probability("unknown_probability", self.unknown_probability)?;
         probability("look_gain_bits", self.look_gain_bits)?;
+        within("clear_m", [&self.clear_m], 0.0, 1000.0)?;
         let limit = if self.action == ActionCode::Halt.code() { 0.0 } else { MAX_SPEED_MPS };
         within("target_speed_mps", [&self.target_speed_mps], 0.0, limit)?;
         probability("hazard_probability", self.hazard_probability)

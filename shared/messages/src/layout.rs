@@ -226,7 +226,8 @@ described!(Action {
     based_on_frame,
     latency_ns,
     target_speed_mps,
-    look_gain_bits
+    look_gain_bits,
+    clear_m
 });
 described!(Health {
     header,

@@ -47,14 +47,14 @@ described!(EgoPose { header, world_from_vehicle });
 /// ```
 /// use carff_messages::{EgoMotion, Header, Message};
 /// let header = Header::of_frame(0, 1, 0);
-/// let motion = EgoMotion { header, speed_mps: 4.0, to_conflict_m: 12.0, heading_rad: 1.57 };
+/// let motion = EgoMotion { header, speed_mps: 4.0, to_conflict_m: 12.0, through_conflict_m: 18.5, heading_rad: 1.57 };
 /// assert_eq!(motion.validate(), Ok(()));
 /// assert!(EgoMotion { speed_mps: -1.0, ..motion }.validate().is_err());
 /// ```
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Default, PartialEq, ZeroCopySend, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
-#[type_name("carff.EgoMotion.v1")]
+#[type_name("carff.EgoMotion.v2")]
 pub struct EgoMotion {
     /// Header; its capture time is the time of the motion.
     pub header: Header,
@@ -62,6 +62,8 @@ pub struct EgoMotion {
     pub speed_mps: f64,
     /// Way until the vehicle would be in the way of others, metres, -1000..=1000; negative within and behind the place.
     pub to_conflict_m: f64,
+    /// Way until the vehicle has left that place, metres, at least `to_conflict_m`.
+    pub through_conflict_m: f64,
     /// Heading about +Z, world space, radians.
     pub heading_rad: f64,
 }
@@ -69,28 +71,31 @@ pub struct EgoMotion {
 impl EgoMotion {
     fn check(&self) -> Result<(), Invalid> {
         self.header.validate()?;
-        let numbers = [self.speed_mps, self.to_conflict_m, self.heading_rad];
-        check::finite_f64("speed_mps, to_conflict_m, heading_rad", &numbers)?;
+        let numbers = [self.speed_mps, self.to_conflict_m, self.through_conflict_m, self.heading_rad];
+        check::finite_f64("speed_mps, to_conflict_m, through_conflict_m, heading_rad", &numbers)?;
         check::within("speed_mps", &[self.speed_mps as f32], 0.0, 100.0)?;
-        check::within("to_conflict_m", &[self.to_conflict_m as f32], -1000.0, 1000.0)
+        let ways_m = [self.to_conflict_m, self.through_conflict_m].map(|way_m| way_m as f32);
+        check::within("to_conflict_m and through_conflict_m", &ways_m, -1000.0, 1000.0)?;
+        let is_ahead = self.through_conflict_m >= self.to_conflict_m;
+        check::equals("through_conflict_m (1: not before to_conflict_m)", is_ahead.into(), 1)
     }
 }
 
 message!(EgoMotion);
-described!(EgoMotion { header, speed_mps, to_conflict_m, heading_rad });
+described!(EgoMotion { header, speed_mps, to_conflict_m, through_conflict_m, heading_rad });
 
-/// The value of a look from further on, of one frame.
+/// The clear part of the others' lane in one frame, and the value of a look from further on.
 ///
 /// ```
 /// use carff_messages::{Header, LookGain, Message};
-/// let gain = LookGain { header: Header::of_frame(0, 1, 0), gain_bits: 0.5, ahead_m: 3.0 };
+/// let gain = LookGain { header: Header::of_frame(0, 1, 0), gain_bits: 0.5, ahead_m: 3.0, clear_m: 12.5 };
 /// assert_eq!(gain.validate(), Ok(()));
 /// assert!(LookGain { gain_bits: 1.5, ..gain }.validate().is_err());
 /// ```
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Default, PartialEq, ZeroCopySend, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
-#[type_name("carff.LookGain.v1")]
+#[type_name("carff.LookGain.v2")]
 pub struct LookGain {
     /// Header of the frame.
     pub header: Header,
@@ -98,18 +103,22 @@ pub struct LookGain {
     pub gain_bits: f32,
     /// Way to the place from where the look shows most, metres, 0..=100.
     pub ahead_m: f32,
+    /// Way along the others' lane that the frame shows clear, from the place where the vehicle crosses it, metres,
+    /// 0..=1000; 0 if it was not compared.
+    pub clear_m: f32,
 }
 
 impl LookGain {
     fn check(&self) -> Result<(), Invalid> {
         self.header.validate()?;
         check::probability("gain_bits", self.gain_bits)?;
-        check::within("ahead_m", &[self.ahead_m], 0.0, 100.0)
+        check::within("ahead_m", &[self.ahead_m], 0.0, 100.0)?;
+        check::within("clear_m", &[self.clear_m], 0.0, 1000.0)
     }
 }
 
 message!(LookGain);
-described!(LookGain { header, gain_bits, ahead_m });
+described!(LookGain { header, gain_bits, ahead_m, clear_m });
 
 #[cfg(test)]
 mod tests {

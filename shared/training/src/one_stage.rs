@@ -18,7 +18,7 @@ use carff_field::{Field, FieldTrainer, RAYS_PER_GROUP, RayBatch, RaySampler, Tra
 use carff_messages::LATENT_DIM;
 use carff_networks::{adam::Adam, weights::Tensors};
 use rand::Rng;
-use std::collections::VecDeque;
+use std::{collections::VecDeque, iter};
 use tch::{Kind, Tensor};
 
 /// Purpose of the random stream of the images.
@@ -26,7 +26,7 @@ const STREAM: &str = "1stg";
 /// Latents of each state that the occupancy grid covers: the newest ones.
 const LATENTS_OF_STATE: usize = 16;
 /// Steps between two records.
-const RECORD_EVERY: usize = 100;
+const RECORD_EVERY: usize = 500;
 
 /// Training phase of encoder and field together. One step has `vae.batch` images, each with 32 rays.
 pub struct OneStagePhase<'a> {
@@ -38,7 +38,7 @@ pub struct OneStagePhase<'a> {
     sampler: RaySampler,
     /// State and pose of each of the sampler's images.
     seen: Vec<(usize, usize)>,
-    /// Images of each state from trained and random poses.
+    /// Images of each state from trained poses, each `vae.own_passes` times, and from random poses.
     of_state: Vec<Vec<usize>>,
     latest: Vec<VecDeque<[f32; LATENT_DIM]>>,
     means: RunningMeans,
@@ -51,7 +51,8 @@ impl<'a> OneStagePhase<'a> {
         let field = Field::new(structure(config, posed), config.seed)?;
         let chosen = posed.trained();
         let mut of_state = vec![Vec::new(); posed.scenario.state_count()];
-        for i in posed.trained_and_random() {
+        let further = iter::repeat_n(&chosen, config.vae.own_passes - 1).flatten().copied();
+        for i in posed.trained_and_random().into_iter().chain(further) {
             of_state[posed.labels[i].state].push(i);
         }
         Ok(Self {

@@ -19,6 +19,8 @@ pub struct Blob {
     pub pixels: usize,
     /// Place where it stands, x and y, metres: the nearest ground that it covers, on the lanes.
     pub foot_m: [f64; 2],
+    /// The nearest ground that each of its columns covers, x and y, metres.
+    pub feet_m: Vec<[f64; 2]>,
     /// Distance of that place from the camera, metres.
     pub distance_m: f64,
     /// Width across the view, metres.
@@ -97,22 +99,27 @@ fn foot(pixels: impl Iterator<Item = usize>, ground: &[Option<Ground>]) -> Optio
     pixels.filter_map(|p| ground[p]).min_by(|a, b| a.distance_m.total_cmp(&b.distance_m))
 }
 
-/// Returns those of the connected pixels whose column stands on the lanes. Each column stands for itself: a vehicle that
-/// fills the lanes is connected with its shadow next to them.
-fn on_lanes(pixels: &[usize], width: usize, ground: &[Option<Ground>]) -> Vec<usize> {
+/// Returns those of the connected pixels whose column stands on the lanes, column by column with its foot. Each column
+/// stands for itself: a vehicle that fills the lanes is connected with its shadow next to them.
+fn on_lanes(pixels: &[usize], width: usize, ground: &[Option<Ground>]) -> Vec<(Ground, Vec<usize>)> {
     let mut columns: BTreeMap<usize, Vec<usize>> = BTreeMap::new();
     for &pixel in pixels {
         columns.entry(pixel % width).or_default().push(pixel);
     }
-    let stands = |column: &Vec<usize>| foot(column.iter().copied(), ground).is_some_and(|foot| foot.on_lanes);
-    columns.into_values().filter(stands).flatten().collect()
+    let with_foot = |column: Vec<usize>| {
+        let foot = foot(column.iter().copied(), ground).filter(|foot| foot.on_lanes)?;
+        Some((foot, column))
+    };
+    columns.into_values().filter_map(with_foot).collect()
 }
 
 /// Describes connected pixels; `None` if no column of them stands on the lanes.
 fn blob(camera: &PinholeCamera, pixels: &[usize], relative: &[f32], ground: &[Option<Ground>]) -> Option<Blob> {
     let width = camera.width_px as usize;
-    let pixels = on_lanes(pixels, width, ground);
-    let foot = foot(pixels.iter().copied(), ground)?;
+    let standing = on_lanes(pixels, width, ground);
+    let foot = standing.iter().map(|(foot, _)| *foot).min_by(|a, b| a.distance_m.total_cmp(&b.distance_m))?;
+    let feet_m = standing.iter().map(|(foot, _)| foot.at_m).collect();
+    let pixels: Vec<usize> = standing.into_iter().flat_map(|(_, column)| column).collect();
     let mut strongest: Vec<f32> = pixels.iter().map(|&p| relative[p]).collect();
     strongest.sort_by(|a, b| b.total_cmp(a));
     let sum: f32 = strongest.iter().take(STRONGEST).map(|v| v * v).sum();
@@ -125,6 +132,7 @@ fn blob(camera: &PinholeCamera, pixels: &[usize], relative: &[f32], ground: &[Op
         strength: (sum / STRONGEST as f32).sqrt(),
         pixels: pixels.len(),
         foot_m: foot.at_m,
+        feet_m,
         distance_m: foot.distance_m,
         width_m,
         height_m: height_m.clamp(HEIGHT_SHARE[0] * width_m, HEIGHT_SHARE[1] * width_m),

@@ -188,6 +188,11 @@ impl Comparer {
         Comparison { camera, image, fit, ground, judged, residuals }
     }
 
+    /// The rendered depth of a state in the last comparison, metres, row by row.
+    pub(crate) fn depth_m(&self, state: usize) -> &[f32] {
+        self.buffer.images.get(state).map_or(&[], |image| &image.depth_m)
+    }
+
     /// The rendered states of the last comparison, RGB, 0..=1, row by row; pixels that were not compared are black.
     pub fn rendered(&self) -> impl Iterator<Item = &[f32]> {
         self.buffer.images.iter().map(|image| image.rgb.as_slice())

@@ -4,6 +4,7 @@ use crate::blobs::Blob;
 use crate::camera::CameraLimits;
 use crate::compare::{Comparer, Comparison, Kind, KnownScene};
 use crate::lanes::{ErrorMap, Lanes};
+use crate::sighting::Sighting;
 use carff_base::geometry::PinholeCamera;
 use carff_field::Field;
 use carff_messages::{LATENT_DIM, MAX_UNKNOWNS, UnknownBox};
@@ -23,6 +24,8 @@ const WITHIN: f64 = 0.97;
 /// Share of the known images' smallest explained share below which a view is of another place.
 const OF_LEAST_EXPLAINED: f32 = 0.8;
 
+/// Strength from which on a blob stands in the way of a vehicle that crosses, in limits.
+const SUSPICIOUS: f32 = 0.8;
 /// Residual of a view of another place, in limits: more than any object's.
 const ELSEWHERE: f32 = 100.0;
 
@@ -146,6 +149,20 @@ impl Known {
         // Before something unknown is suspected, the pose is: a camera that has turned a little leaves residuals, too.
         let Some(aligned) = comparer.align(&comparison, scene) else { return Some((seen, comparison)) };
         Some((self.judge(&aligned), aligned))
+    }
+
+    /// Describes what the last comparison shows of the lanes. `None` for a view of another place.
+    pub fn sighting(&self, comparer: &Comparer, comparison: &Comparison, seen: &Seen) -> Option<Sighting> {
+        let clear = (0..seen.ratios.len()).filter(|state| self.hazard_states.get(*state) == Some(&false));
+        let best = clear.max_by(|&a, &b| seen.ratios[a].total_cmp(&seen.ratios[b]))?;
+        let best_ratio = Some(seen.ratios[best]).filter(|ratio| *ratio > 0.0)?;
+        let blobs = Kind::ALL.into_iter().flat_map(|kind| {
+            let KindLimits { errors, limit } = self.clear.of(kind);
+            let blobs = comparison.blobs(best, kind, errors);
+            blobs.into_iter().filter(move |blob| blob.strength > SUSPICIOUS * limit)
+        });
+        let (blobs, depth_m) = (blobs.collect::<Vec<_>>(), comparer.depth_m(best));
+        Some(Sighting::new(comparison, &seen.ratios, best_ratio, &blobs, depth_m, self.lanes.ground_m))
     }
 
     /// Judges a comparison. No state explains a view of another place, and nothing has a box in it.

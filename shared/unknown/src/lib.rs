@@ -8,6 +8,7 @@
 //! | `lanes` | the ground on which something unknown counts |
 //! | `blobs` | connected residuals: their size, and the place on the ground where they stand |
 //! | `known` | the limits of the known, calibrated on images without anything unknown, and their file |
+//! | `sighting` | how far an image shows a lane clear |
 //! | `sight` | which of the known states would look the same from a pose ahead |
 //! | `camera` | the condition of a camera, from its images |
 
@@ -19,6 +20,7 @@ mod fit;
 mod known;
 mod lanes;
 mod sight;
+mod sighting;
 
 pub use blobs::Blob;
 pub use camera::{CameraCheck, CameraLimits, Measured, Measurement};
@@ -27,3 +29,4 @@ pub use fit::Fit;
 pub use known::{KindLimits, Known, KnownError, KnownLimits, Seen};
 pub use lanes::{ErrorMap, Ground, Lanes, OwnBox};
 pub use sight::Sight;
+pub use sighting::{Crossing, Sighting};

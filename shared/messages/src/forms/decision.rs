@@ -40,6 +40,9 @@ pub struct ActionForm {
     /// Expected drop of the uncertainty by a look from further on, bits; recordings before it have 0.
     #[serde(default)]
     pub look_gain_bits: f32,
+    /// Way along the others' lane that the image shows clear, metres; recordings before it have 0.
+    #[serde(default)]
+    pub clear_m: f32,
 }
 
 impl From<&Action> for ActionForm {
@@ -59,6 +62,7 @@ impl From<&Action> for ActionForm {
             latency_ns: action.latency_ns,
             target_speed_mps: action.target_speed_mps,
             look_gain_bits: action.look_gain_bits,
+            clear_m: action.clear_m,
         }
     }
 }
@@ -82,6 +86,7 @@ impl TryFrom<&ActionForm> for Action {
             latency_ns: form.latency_ns,
             target_speed_mps: form.target_speed_mps,
             look_gain_bits: form.look_gain_bits,
+            clear_m: form.clear_m,
         };
         action.validate()?;
         Ok(action)

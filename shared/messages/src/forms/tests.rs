@@ -144,6 +144,7 @@ fn messages_survive_their_forms() {
             latency_ns: 0,
             target_speed_mps: 1.0 / 3.0,
             look_gain_bits: probability(&mut next),
+            clear_m: probability(&mut next),
         };
         assert_eq!(there_and_back(&action), action);
 
