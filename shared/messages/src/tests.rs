@@ -183,7 +183,7 @@ fn layouts_are_fixed() {
     use std::mem::offset_of;
     assert_eq!(
         (offset_of!(Action, is_decision), offset_of!(Action, valid_until_ns), size_of::<Action>()),
-        (80, 88, 120)
+        (80, 88, 128)
     );
     assert_eq!((offset_of!(Health, pid), offset_of!(Health, received), size_of::<Health>()), (64, 72, 144));
     assert_eq!((offset_of!(Belief, resolved_state), offset_of!(Belief, resolved)), (15_128, 15_136));
