@@ -7,7 +7,7 @@ use carff_messages::ActionCode;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// Braking that a planned stop uses, and the hardest braking, m/s².
+/// Braking that a planned stop uses, chosen by times to goal (docs/RESULTS.md), and the hardest braking, m/s².
 const BRAKING_MPS2: f64 = 3.5;
 const HARDEST_MPS2: f64 = 6.0;
 /// Time until a vehicle brakes as planned, and as hard as it can, seconds.
