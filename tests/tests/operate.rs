@@ -237,8 +237,9 @@ fn a_recording_is_decided_again_as_it_was() {
     std::fs::write(graph.path("other.toml"), text.replacen("[run]\n", "[run]\nsamples = 4\n", 1)).unwrap();
     let other = replay(&graph, &["--verify", "--graph", "other.toml"]);
     assert_eq!(other.status.code(), Some(1), "{}", other.text);
-    let told = other.text.contains("first difference: frame ") && other.text.contains("10 entries in the recording, 4");
-    assert!(told, "{}", other.text);
+    let first = other.text.lines().find_map(|line| line.strip_prefix("first difference: frame ")).unwrap_or_default();
+    // The recorder may join between the forecast and the decision of a frame.
+    assert!(first.contains("10 entries in the recording, 4") || first.contains(", decision: `"), "{}", other.text);
     graph.assert_nothing_left();
 
     // Replay from the middle of the path: recorded beliefs lead to the recorded decisions, in their order.
