@@ -57,7 +57,7 @@ mod tests {
             let mut hearts = node.receiver(topics::health(Stage::Prober)).unwrap();
             let mut outputs = Outputs::new(&node);
 
-            let posterior = Posterior { header, gaussian: Gaussian::standard(), stage_latency_ns: 5 };
+            let posterior = Posterior { header, gaussian: Gaussian::standard(), take_start: 0, stage_latency_ns: 5 };
             outputs.publish(TopicId::POSTERIOR, AnyMessage::new(&posterior, &[])).unwrap();
             assert_eq!(posteriors.next().unwrap().as_deref(), Some(&posterior));
 

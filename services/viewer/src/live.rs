@@ -329,7 +329,7 @@ impl Assembly {
         let before = parts.moments.last().filter(|m| m.step + 1 == belief.header.step)?;
         let moment = moment(before, parts.fed_back, forecast, belief);
         parts.moments.push(moment);
-        let state = usize::try_from(belief.resolved_state).ok();
+        let state = usize::try_from(belief.resolved_state).ok().filter(|_| belief.fed_back().is_empty());
         parts.fed_back = state.map(|state| (belief.resolved, state));
         if !belief.is_final() {
             return None;

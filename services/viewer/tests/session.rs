@@ -4,7 +4,7 @@ use crate::common;
 
 use crate::common::{ABOVE_VIEW, HIDING_VIEW, copy_without, image, models, scenario};
 use carff_dataset::Image;
-use carff_decision::{Evidence, Plan, Sampling, Step, look_ahead};
+use carff_decision::{Evidence, Feedback, Plan, Sampling, Step, look_ahead};
 use carff_messages::ActionCode;
 use carff_scenes::{Detail, Extras};
 use carff_viewer::input::{Album, Input};
@@ -43,7 +43,8 @@ fn follows_the_stages_path() {
     let settings = Settings { samples: 7, horizon: 3, seed: 5, ..session.settings() };
     session.set_settings(settings);
     let input = image(0, 0, HIDING_VIEW);
-    let plan = Plan { samples: 7, sampling: Sampling::Stratified, horizon: 3, seed: 5, frame: HIDING_VIEW as u64 };
+    let (sampling, feedback, frame) = (Sampling::Stratified, Feedback::State, HIDING_VIEW as u64);
+    let plan = Plan { samples: 7, sampling, feedback, horizon: 3, seed: 5, frame };
     session.toggle(input).unwrap();
     let posterior = session.moment().unwrap().source;
     let mut probe = session.models().probe.clone();

@@ -10,7 +10,7 @@ use carff_dataset::{
     drives::DriveKind,
     sensor::{SensorNoise, apply_noise_into},
 };
-use carff_decision::{MemorySettings, Sampling};
+use carff_decision::{Feedback, MemorySettings, Sampling};
 use carff_messages::Gaussian;
 use carff_networks::{
     decoder::Decoder,
@@ -216,7 +216,8 @@ impl Subject {
     pub fn planner(&self, sampling: Sampling) -> Result<Planner<'_>, String> {
         let probe = self.probe.as_ref().map_err(Clone::clone)?;
         let net = self.mixture.as_ref().map_err(Clone::clone)?;
-        Ok(Planner { net, probe, sampling, horizon: self.trained.calibration.horizon })
+        let horizon = self.trained.calibration.horizon;
+        Ok(Planner { net, probe, sampling, feedback: Feedback::State, horizon })
     }
 
     /// The decoder.

@@ -208,6 +208,8 @@ described!(Belief {
     resolved_state,
     unknown_probability,
     resolved,
+    fed_back,
+    fed_back_count,
     encoder_ns,
     forecaster_ns,
     stage_latency_ns

@@ -8,7 +8,7 @@ use carff_base::random::tag;
 use carff_checkpoint::{Bound, CheckpointPlanning, PlanningMemory};
 use carff_dataset::{drives::DriveKind, sensor::SensorNoise};
 use carff_decision::{
-    CalibrationTrial, Evidence, ImageEvidence, MemorySettings, Sampling, bounded_threshold, choose_threshold,
+    CalibrationTrial, Evidence, Feedback, ImageEvidence, MemorySettings, Sampling, bounded_threshold, choose_threshold,
 };
 use carff_evaluation::{KnownStates, Models, Perception, Planner, Progress, TakeMemories, Trial};
 use carff_scenes::Scenario;
@@ -81,8 +81,8 @@ pub fn bound_threshold(input: BoundInput, on_progress: &dyn Fn(&Progress)) -> Re
         memory => memory.map(|memory| memory.settings),
     };
     let drives = drives(input, &models, known.as_ref(), settings, seed, on_progress)?;
-    let sampling = Sampling::Stratified;
-    let planner = Planner { net: &models.mixture, probe: &models.probe, sampling, horizon: HORIZON };
+    let (sampling, feedback) = (Sampling::Stratified, Feedback::State);
+    let planner = Planner { net: &models.mixture, probe: &models.probe, sampling, feedback, horizon: HORIZON };
     let (mut hazard, mut clear) = (Vec::new(), Vec::new());
     for (kind, trials) in drives {
         let evidence = planner.evidence(&trials, SAMPLES);

@@ -14,7 +14,7 @@ use crate::{
 use carff_checkpoint::CheckpointPlanning;
 use carff_checkpoint::{FORMAT_VERSION, Manifest, ScenarioIdentity, SplitRecord, files, save_field};
 use carff_dataset::{Observability, PoseRole, drives::eligible_inputs};
-use carff_decision::{Policy, Sampling};
+use carff_decision::{Feedback, Policy, Sampling};
 use carff_evaluation::{
     BirdsEye, CheckpointFigures, FieldRenderer, Input, Models, Perception, Planner, PlanningFigures, PosedImages,
     ProbingFigures, SampleFigures, SampleTrials, TrainedAndUnseen, ViewFigures, birds_eye, to_bytes, to_unit,
@@ -213,7 +213,8 @@ impl Training<'_> {
         let noise = config.calibration.sensor;
         let perception = Perception { encoder, noise, seed: config.seed + 1, known: None };
         let horizon = config.calibration.horizon;
-        let planner = Planner { net: mixture, probe, sampling: Sampling::Stratified, horizon };
+        let (sampling, feedback) = (Sampling::Stratified, Feedback::State);
+        let planner = Planner { net: mixture, probe, sampling, feedback, horizon };
         let table = |role| {
             let inputs = eligible_inputs(&posed.dataset, &posed.split.views(role))
                 .map_err(|e| TrainingError::Unfit(e.to_string()))?;

@@ -6,7 +6,7 @@ use crate::trials::{
 };
 use crate::{Progress, Subject};
 use carff_checkpoint::FieldProbe;
-use carff_decision::{Evidence, Memory, MemorySettings, Mixture, Sampling};
+use carff_decision::{Evidence, Memory, MemorySettings, Mixture, Sampling, is_likely};
 use carff_trials::reliability;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -162,9 +162,9 @@ fn kinds(watch: &Watch, found: &[f64]) -> [RightFrames; 4] {
             (false, true) if watch.hazard => (0, p >= SURE),
             (false, true) => (1, p <= 1.0 - SURE),
             (_, false) if (0.4..=0.6).contains(&frame.exact_with_memory) => (2, (0.4..=0.6).contains(&p)),
-            (true, _) if (p >= 0.5) != watch.hazard => {
+            (true, _) if is_likely(p) != watch.hazard => {
                 let later = found.iter().enumerate().skip(k + 1).take(CORRECTED_IN);
-                (3, later.clone().any(|(_, &p)| (p >= 0.5) == watch.hazard))
+                (3, later.clone().any(|(_, &p)| is_likely(p) == watch.hazard))
             }
             _ => continue,
         };
