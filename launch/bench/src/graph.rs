@@ -7,7 +7,7 @@ use carff_config::{GraphConfig, StagesConfig};
 use carff_messages::{Action, Belief, Forecast, FrameMeta, Health, HealthState, Posterior, Stage, Unknowns};
 use carff_runtime::StageArgs;
 use carff_transport::{
-    Image, Node, Receiver, Run, Stop, Waiter, Woken, monotonic_now_ns, remove_run_leftovers, run_id_of, topics,
+    ImagePayload, Node, Receiver, Run, Stop, Waiter, Woken, monotonic_now_ns, remove_run_leftovers, run_id_of, topics,
 };
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -288,13 +288,13 @@ fn measured(listener: &Listener, [from_ns, to_ns]: [u64; 2], used: Used) -> Meas
 
 /// Receives all messages of a run, by polling: wake-ups by each message would take a core from the stages.
 struct Listener {
-    frames_in: Receiver<Image<FrameMeta>>,
+    frames_in: Receiver<ImagePayload<FrameMeta>>,
     posteriors: Receiver<Posterior>,
     unknowns: Receiver<Unknowns>,
     forecasts: Receiver<Forecast>,
     beliefs: Receiver<Belief>,
     actions: Receiver<Action>,
-    views_in: Receiver<carff_transport::Image<carff_messages::ViewMeta>>,
+    views_in: Receiver<carff_transport::ImagePayload<carff_messages::ViewMeta>>,
     healths: Vec<Receiver<Health>>,
     frames: BTreeMap<u64, Frame>,
     views: u64,

@@ -1,6 +1,6 @@
 //! A recording as a sequence of files with limits.
 
-use crate::{About, LogLine, RecordingError, Writer};
+use crate::{LogLine, RecordingAbout, RecordingError, Writer};
 use carff_decision::Place;
 use carff_messages::forms::AnyMessage;
 use carff_transport::TopicId;
@@ -22,7 +22,7 @@ pub struct RotationLimits {
 #[derive(Debug)]
 pub struct RotatingWriter {
     first: PathBuf,
-    about: About,
+    about: RecordingAbout,
     places: Vec<Place>,
     limits: RotationLimits,
     writer: Writer,
@@ -36,7 +36,7 @@ impl RotatingWriter {
     /// Starts with the file `first`; later files have a number before the extension.
     pub fn create(
         first: &Path,
-        about: About,
+        about: RecordingAbout,
         places: Vec<Place>,
         limits: RotationLimits,
     ) -> Result<Self, RecordingError> {

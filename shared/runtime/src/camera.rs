@@ -6,7 +6,7 @@ use carff_base::geometry::PinholeCamera;
 use carff_config::Pose;
 use carff_dataset::{CameraCalibration, Dataset, RawImage, Rectifier};
 use carff_messages::{DatasetView, EgoPose, FrameMeta, Header, ImageMeta, MAX_IMAGE_BYTES, rgb_bytes};
-use carff_transport::{Image, Publisher, Receiver, monotonic_now_ns, topics};
+use carff_transport::{ImagePayload, Publisher, Receiver, monotonic_now_ns, topics};
 
 /// Assumed horizontal field of view of a camera without a calibration, degrees.
 const FIELD_OF_VIEW_DEG: f64 = 60.0;
@@ -42,9 +42,9 @@ const IDENTITY: Pose = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1
 #[derive(Debug)]
 pub struct FrameOutput {
     /// Opened at the size of the first image; a larger image opens it again.
-    publisher: Option<(usize, Publisher<Image<FrameMeta>>)>,
+    publisher: Option<(usize, Publisher<ImagePayload<FrameMeta>>)>,
     /// Publishes thinned images before rectification, where they are asked for.
-    raw: Option<Publisher<Image<FrameMeta>>>,
+    raw: Option<Publisher<ImagePayload<FrameMeta>>>,
     rectifier: Option<Rectifier>,
     world_from_camera: Pose,
     /// The camera's pose on the vehicle, and the vehicle's poses.
