@@ -10,7 +10,7 @@ use crate::{
     field::{Clouds, FieldPhase},
     places,
     records::names,
-    run::{Context, RANDOM_IMAGES, Run},
+    run::{Context, RANDOM_IMAGES, TrainingRun},
 };
 use carff_base::geometry::{PinholeCamera, cross, dot};
 use carff_base::random::Key;
@@ -58,7 +58,7 @@ const MOST_DRAWS: usize = 50;
 pub fn render_random_poses(
     config: &TrainingConfig,
     dataset: &Path,
-    run: &Run,
+    run: &TrainingRun,
 ) -> Result<Option<PathBuf>, TrainingError> {
     if config.free_poses.count == 0 || config.free_poses.field_steps == 0 {
         return Ok(None);

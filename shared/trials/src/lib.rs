@@ -40,4 +40,4 @@ pub use planning::{
 };
 pub use reliability::{Reliability, ReliabilityBin, ReliabilitySums, reliability};
 pub use render::{FieldRenderer, to_bytes, to_unit};
-pub use samples::{Input, SampleAccuracy, SampleTrials};
+pub use samples::{SampleAccuracy, SampleInput, SampleTrials};

@@ -2,7 +2,7 @@
 
 use crate::trials::{
     views::SUREST,
-    watches::{Watch, Watched},
+    watches::{Watch, WatchedFrame},
 };
 use crate::{Progress, Subject};
 use carff_checkpoint::FieldProbe;
@@ -85,7 +85,7 @@ pub fn memory(subject: &Subject, on_progress: &dyn Fn(&Progress)) -> Result<Memo
     let total = subject.watches.len();
     for (done, watch) in subject.watches.iter().enumerate() {
         let seed = subject.options.seed;
-        let mut probability = |mixture: &Mixture, frame: &Watched| hazard(&mut probe, mixture, frame, seed);
+        let mut probability = |mixture: &Mixture, frame: &WatchedFrame| hazard(&mut probe, mixture, frame, seed);
         let filtered = with_memory(&memory, watch);
         let none = watch.frames.iter().map(|f| probability(&f.forecast, f)).collect();
         let filter = watch.frames.iter().zip(&filtered).map(|(f, mixture)| probability(mixture, f)).collect();
@@ -119,7 +119,7 @@ pub fn with_memory(memory: &Memory, watch: &Watch) -> Vec<Mixture> {
 }
 
 /// Hazard probability of the next state, as the prober reads it.
-fn hazard(probe: &mut FieldProbe, mixture: &Mixture, frame: &Watched, seed: u64) -> f64 {
+fn hazard(probe: &mut FieldProbe, mixture: &Mixture, frame: &WatchedFrame, seed: u64) -> f64 {
     let draws = mixture.draw(SAMPLES, Sampling::Stratified, seed, frame.frame, 1);
     let step = probe.step(mixture.clone(), draws, 1.0, frame.image.as_ref());
     Evidence::of_steps(&[step]).hazard_or_unknown_probability()
@@ -182,7 +182,7 @@ mod tests {
     /// A watch with these exact probabilities without and with memory.
     fn watch(hazard: bool, exact: &[(f64, f64)]) -> Watch {
         let forecast = Mixture { weights: vec![1.0], components: vec![Gaussian::standard()] };
-        let frame = |(exact, exact_with_memory): &(f64, f64)| Watched {
+        let frame = |(exact, exact_with_memory): &(f64, f64)| WatchedFrame {
             timestamp: 0,
             frame: 0,
             forecast: forecast.clone(),
