@@ -14,9 +14,6 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
-/// Receivers start before their senders, the camera last.
-const START_ORDER: [Stage; 6] =
-    [Stage::Controller, Stage::Renderer, Stage::Prober, Stage::Forecaster, Stage::Encoder, Stage::Camera];
 /// Time between two checks of the stages while they start.
 const WATCH_NS: u64 = 50_000_000;
 /// Time between two readings of the messages.
@@ -197,7 +194,7 @@ fn listen(
         listener.drain()
     };
     let limit = Duration::from_millis(plan.graph.launcher.start_timeout_ms);
-    for batch in [&START_ORDER[..5], &START_ORDER[5..]] {
+    for batch in [&Stage::START_ORDER[..5], &Stage::START_ORDER[5..]] {
         for &stage in batch {
             stages.start(stage, args)?;
         }

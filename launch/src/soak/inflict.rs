@@ -1,7 +1,7 @@
 //! Injects the faults of a soak, and waits until the graph has recovered.
 
 use super::{
-    DISK_SIZE, NS_PER_MS, Soak,
+    DISK_SIZE, Soak,
     answer::Answer,
     graph::{Holdings, Victim},
     patience::Patience,
@@ -9,6 +9,7 @@ use super::{
     schedule::Fault,
     stand_in,
 };
+use crate::NS_PER_MS;
 use anyhow::{Context, ensure};
 use carff_config::{CameraSource, FaultKind};
 use carff_messages::{ImageCondition, Stage};

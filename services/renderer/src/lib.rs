@@ -4,7 +4,7 @@ use anyhow::Context;
 use carff_base::geometry::PinholeCamera;
 use carff_checkpoint::Manifest;
 use carff_config::ViewChoice;
-use carff_field::{Field, HypothesisBuffer, InstructionSet, RenderBuffer, RenderOptions};
+use carff_field::{Field, HypothesisBuffer, InstructionSet, RenderBuffer, RenderOptions, to_byte};
 use carff_messages::{Belief, Forecast, Header, LATENT_DIM, ViewKind, ViewMeta, row_major};
 use std::path::Path;
 
@@ -107,7 +107,7 @@ pub fn write(image: &RenderBuffer, rgb: &mut [u8]) -> anyhow::Result<()> {
     let wanted = image.rgb.len();
     (rgb.len() == wanted).then_some(()).with_context(|| format!("{} bytes for a view of {wanted}", rgb.len()))?;
     for (to, from) in rgb.iter_mut().zip(&image.rgb) {
-        *to = (from.clamp(0.0, 1.0) * 255.0 + 0.5) as u8;
+        *to = to_byte(*from);
     }
     Ok(())
 }

@@ -4,7 +4,9 @@
 use crate::slice::density_slice;
 use carff_base::geometry::PinholeCamera;
 use carff_dataset::Image;
-use carff_field::{Field, HypothesisBuffer, InstructionSet, LATENT_DIM, RenderBuffer, RenderOptions};
+use carff_field::{
+    Field, HypothesisBuffer, InstructionSet, LATENT_DIM, RenderBuffer, RenderOptions, to_byte, to_bytes,
+};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
@@ -284,7 +286,7 @@ impl Drop for RenderWorker {
 /// Returns the divisors of a view's sides, image by image. The first image has at most `budget_px` pixels, or is as
 /// coarse as possible (`coarsest_px` along the longer side). Each further image is at least twice as fine; the last one
 /// has full size.
-pub fn divisors(width_px: u32, height_px: u32, coarsest_px: u32, budget_px: f64) -> Vec<u32> {
+fn divisors(width_px: u32, height_px: u32, coarsest_px: u32, budget_px: f64) -> Vec<u32> {
     let pixels = |divisor: u32| f64::from(width_px / divisor) * f64::from(height_px / divisor);
     let longest_px = width_px.max(height_px);
     let allowed = DIVISORS.into_iter().take_while(|d| *d == 1 || longest_px / d >= coarsest_px);
@@ -426,18 +428,14 @@ impl Painter {
                 ..*camera
             };
             self.field.render(&band, latent, &self.options, &mut self.buffer);
-            rgb.extend(bytes(&self.buffer));
+            rgb.extend(self.buffer.rgb.iter().map(|&value| to_byte(value)));
         }
         Some(Image { width_px: camera.width_px, height_px: camera.height_px, rgb })
     }
 }
 
-fn bytes(rendered: &RenderBuffer) -> impl Iterator<Item = u8> {
-    rendered.rgb.iter().map(|v| (v.clamp(0.0, 1.0) * 255.0 + 0.5) as u8)
-}
-
 fn image_of(camera: &PinholeCamera, rendered: &RenderBuffer) -> Image {
-    Image { width_px: camera.width_px, height_px: camera.height_px, rgb: bytes(rendered).collect() }
+    Image { width_px: camera.width_px, height_px: camera.height_px, rgb: to_bytes(&rendered.rgb) }
 }
 
 #[cfg(test)]

@@ -27,8 +27,8 @@ pub use accuracy::{Centroids, state_accuracy};
 pub use carff_trials::{
     Accuracy, BirdsEye, ByKind, ByObservability, BySamples, CheckpointFigures, Count, DecodedQuality, EvaluationError,
     FieldRenderer, KnownStates, Perception, Planner, PlanningFigures, PlanningTable, ProbingFigures, SAMPLE_COUNTS,
-    SampleAccuracy, SampleFigures, SampleInput, SampleTrials, Share, TakeMemories, TrainedAndUnseen, Trial,
-    TrialOutcome, VaeFigures, ViewFigures, birds_eye, places, to_bytes, to_unit, trial_frame,
+    SAMPLES, SampleAccuracy, SampleFigures, SampleInput, SampleTrials, Share, TakeMemories, TrainedAndUnseen, Trial,
+    TrialOutcome, VaeFigures, ViewFigures, birds_eye, places, to_unit, trial_frame,
 };
 pub use decoded::{Decoding, changed_pixels};
 pub use posed::{Label, PosedImages};

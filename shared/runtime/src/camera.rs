@@ -8,8 +8,6 @@ use carff_dataset::{CameraCalibration, Dataset, RawImage, Rectifier};
 use carff_messages::{DatasetView, EgoPose, FrameMeta, Header, ImageMeta, MAX_IMAGE_BYTES, rgb_bytes};
 use carff_transport::{ImagePayload, Publisher, Receiver, monotonic_now_ns, topics};
 
-/// Assumed horizontal field of view of a camera without a calibration, degrees.
-const FIELD_OF_VIEW_DEG: f64 = 60.0;
 /// Longest side of a thinned image before rectification, pixels, and its most bytes.
 const RAW_SIDE_PX: u32 = 640;
 const RAW_BYTES: usize = rgb_bytes(RAW_SIDE_PX, RAW_SIDE_PX);
@@ -192,7 +190,7 @@ impl FrameOutput {
 
 fn assumed_camera(width_px: u32, height_px: u32) -> PinholeCamera {
     let [eye, ahead, up] = [[0.0; 3], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]];
-    PinholeCamera::look_at(eye, ahead, up, width_px, height_px, FIELD_OF_VIEW_DEG)
+    PinholeCamera::look_at(eye, ahead, up, width_px, height_px, PinholeCamera::ASSUMED_FOV_DEG)
 }
 
 /// Computes the map of a calibrated camera to the field of view of the dataset: of the graph file's calibration, or

@@ -1,7 +1,7 @@
 //! Training of the three models, from images to a checkpoint.
 //!
 //! ```no_run
-//! use carff_training::{Phases, TrainingRun, Training, TrainingConfig};
+//! use carff_training::{Phases, Training, TrainingConfig, TrainingRun};
 //! use std::{path::Path, sync::atomic::AtomicBool};
 //! # fn main() -> Result<(), carff_training::TrainingError> {
 //! let config = TrainingConfig::load(Path::new("configs/training/toy.toml"))?;

@@ -17,10 +17,9 @@ use carff_dataset::{Observability, PoseRole, drives::eligible_inputs};
 use carff_decision::{Policy, Sampling};
 use carff_evaluation::{
     BirdsEye, CheckpointFigures, FieldRenderer, Models, Perception, Planner, PlanningFigures, PosedImages,
-    ProbingFigures, SampleFigures, SampleInput, SampleTrials, TrainedAndUnseen, ViewFigures, birds_eye, to_bytes,
-    to_unit,
+    ProbingFigures, SampleFigures, SampleInput, SampleTrials, TrainedAndUnseen, ViewFigures, birds_eye, to_unit,
 };
-use carff_field::Field;
+use carff_field::{Field, to_bytes};
 use carff_messages::{Gaussian, LATENT_DIM};
 use carff_networks::stored::save_weights;
 use carff_scenes::Scenario;

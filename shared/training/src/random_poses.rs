@@ -15,8 +15,8 @@ use crate::{
 use carff_base::geometry::{PinholeCamera, cross, dot};
 use carff_base::random::Key;
 use carff_dataset::{DatasetWriter, FrameRecord, Image, ScenarioInfo};
-use carff_evaluation::{PosedImages, Progress, to_bytes};
-use carff_field::{Field, HypothesisBuffer, RenderOptions};
+use carff_evaluation::{PosedImages, Progress};
+use carff_field::{Field, HypothesisBuffer, RenderOptions, to_bytes};
 use carff_messages::{Gaussian, LATENT_DIM};
 use rand::Rng;
 use std::path::{Path, PathBuf};

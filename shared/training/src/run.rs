@@ -132,7 +132,7 @@ impl TrainingRun<'_> {
     }
 
     /// File of a phase's state.
-    pub fn state_path(&self, phase: &str) -> PathBuf {
+    fn state_path(&self, phase: &str) -> PathBuf {
         self.dir.join(state_file(phase))
     }
 
@@ -229,7 +229,7 @@ pub fn forget_run(dir: &Path) -> Result<(), TrainingError> {
 }
 
 /// Error of a state file that cannot be used.
-pub fn damaged(path: &Path) -> TrainingError {
+fn damaged(path: &Path) -> TrainingError {
     TrainingError::Format {
         path: path.into(),
         what: "this saved state belongs to another configuration or is damaged; remove the file to start anew".into(),

@@ -17,7 +17,7 @@ pub type LatentRow = [f32; LATENT_DIM];
 const SOLVER_TOLERANCE: f64 = 1e-3;
 
 /// Returns gamma = 1 / (dimensions * variance of all entries); 1 for a variance of 0.
-pub fn scale_gamma(rows: &[LatentRow]) -> f64 {
+fn scale_gamma(rows: &[LatentRow]) -> f64 {
     let values = || rows.iter().flatten().map(|&v| f64::from(v));
     let n = (rows.len() * LATENT_DIM).max(1) as f64;
     let mean = values().sum::<f64>() / n;

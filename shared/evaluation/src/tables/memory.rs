@@ -7,14 +7,10 @@ use crate::trials::{
 use crate::{Progress, Subject};
 use carff_checkpoint::FieldProbe;
 use carff_decision::{Evidence, Memory, MemorySettings, Mixture, Sampling};
-use carff_trials::reliability;
+use carff_trials::{RELIABILITY_BINS, SAMPLES, reliability};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
-/// Samples of a forecast.
-const SAMPLES: usize = 10;
-/// Bins of the calibration error.
-const BINS: usize = 10;
 /// A belief is sure of a hazard at or above this probability, and of none at or below its complement.
 const SURE: f64 = 0.95;
 /// The exact observer is sure beyond this probability.
@@ -106,7 +102,7 @@ pub fn memory(subject: &Subject, on_progress: &dyn Fn(&Progress)) -> Result<Memo
 }
 
 /// The forecast of each frame of a watch from all its images so far.
-pub fn with_memory(memory: &Memory, watch: &Watch) -> Vec<Mixture> {
+fn with_memory(memory: &Memory, watch: &Watch) -> Vec<Mixture> {
     let mut memory = memory.clone();
     memory.clear();
     let mut step = watch.frames.first().map_or(0, |frame| frame.timestamp);
@@ -143,7 +139,7 @@ fn figures(watches: &[Watch], found: &[Vec<f64>]) -> ObserverFigures {
         -(if hazard { p } else { 1.0 - p }).ln()
     };
     figures.log_loss = forecasts.iter().map(loss).sum::<f64>() / forecasts.len().max(1) as f64;
-    figures.calibration_error = reliability(&forecasts, BINS).expected_calibration_error;
+    figures.calibration_error = reliability(&forecasts, RELIABILITY_BINS).expected_calibration_error;
     figures
 }
 

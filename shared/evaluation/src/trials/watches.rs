@@ -4,12 +4,10 @@ use crate::Progress;
 use carff_dataset::{ScenarioInfo, drives::DriveKind};
 use carff_decision::{ImageEvidence, Mixture};
 use carff_networks::mixture::MixtureNet;
-use carff_scenes::{Scenario, ScenarioError};
+use carff_scenes::{FRAMES_PER_TIMESTAMP, Scenario, ScenarioError};
 use carff_trials::Perception;
 use rayon::prelude::*;
 
-/// Frames of a watch between two time steps: the cameras of the shipped graphs take six.
-const FRAMES_PER_TIMESTAMP: usize = 6;
 /// Largest number of frames of a watch; it names random draws.
 const MOST_FRAMES: u64 = 1000;
 
