@@ -48,7 +48,7 @@ impl<T: PartialEq> Asked<T> {
     }
 
     /// Returns whether a job is due; `None` if it must wait.
-    pub fn is_due(&mut self, job: T, not_within: Duration) -> Option<bool> {
+    fn is_due(&mut self, job: T, not_within: Duration) -> Option<bool> {
         if self.job.as_ref() == Some(&job) {
             return Some(false);
         }
