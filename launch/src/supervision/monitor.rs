@@ -9,7 +9,7 @@ use carff_messages::{
     Action, ActionCode, Belief, DatasetView, Forecast, FrameMeta, Gaussian, Header, Health, HealthState, ImageCheck,
     Observability, Posterior, Reason, Stage, UnknownBox, Unknowns, ViewMeta,
 };
-use carff_transport::{Image, Node, OpenError, ReceiveError, Receiver, topics};
+use carff_transport::{ImagePayload, Node, OpenError, ReceiveError, Receiver, topics};
 use std::collections::{BTreeMap, VecDeque};
 
 /// Record of a camera frame. Values from the dataset are -1 or `Unknown` without a dataset.
@@ -326,14 +326,14 @@ impl Records {
 /// Subscriptions to all topics of a run.
 #[derive(Debug)]
 pub struct Monitor {
-    frames: Receiver<Image<FrameMeta>>,
+    frames: Receiver<ImagePayload<FrameMeta>>,
     posteriors: Receiver<Posterior>,
     checks: Receiver<ImageCheck>,
     unknowns: Receiver<Unknowns>,
     forecasts: Receiver<Forecast>,
     beliefs: Receiver<Belief>,
     actions: Receiver<Action>,
-    views: Receiver<Image<ViewMeta>>,
+    views: Receiver<ImagePayload<ViewMeta>>,
     healths: Vec<Receiver<Health>>,
     spans: KeptSpans,
     /// Records of the run.

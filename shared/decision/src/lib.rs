@@ -30,7 +30,7 @@ mod rule;
 mod take;
 mod threshold;
 
-pub use approach::{Approach, Drive, Look, Motion, Speeds, stopping_mps};
+pub use approach::{ActionAndSpeed, Approach, Look, Motion, Speeds, stopping_mps};
 pub use calibration::{ProbeCalibration, Reading, Resolved, resolve};
 pub use convert::{mixture_and_draws, set_mixture_and_draws};
 pub use evidence::{Evidence, SampleEvidence};
@@ -42,5 +42,5 @@ pub use look_ahead::{Localiser, Plan, Probed, SceneProbe, Step, look_ahead, path
 pub use memory::{Memory, MemorySettings};
 pub use mixture::{Draw, Mixture, Sampling};
 pub use rule::{Decision, Policy, is_likely};
-pub use take::{Progress, StepLength, TakeFrame, TakeMemory};
+pub use take::{StepLength, TakeFrame, TakeMemory, TakeProgress};
 pub use threshold::{CalibrationTrial, bounded_threshold, choose_threshold, unchosen_threshold};

@@ -40,7 +40,7 @@ pub struct EvalOptions {
 /// Subject and seeds of an evaluation.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct About {
+pub struct CheckpointAbout {
     /// Version of the program.
     pub program_version: String,
     /// Name of the scenario.
@@ -250,13 +250,13 @@ impl Subject {
     }
 
     /// Description for the results.
-    pub fn about(&self) -> About {
+    pub fn about(&self) -> CheckpointAbout {
         let scenario = &self.manifest.scenario;
         let mut poses = ByRole::default();
         for role in ROLES {
             poses.set(role, self.posed.split.views(role).len());
         }
-        About {
+        CheckpointAbout {
             program_version: env!("CARGO_PKG_VERSION").to_owned(),
             scenario: scenario.name.clone(),
             branches: scenario.branches.clone(),

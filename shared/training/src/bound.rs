@@ -10,20 +10,17 @@ use carff_dataset::{drives::DriveKind, sensor::SensorNoise};
 use carff_decision::{
     CalibrationTrial, Evidence, Feedback, ImageEvidence, MemorySettings, Sampling, bounded_threshold, choose_threshold,
 };
-use carff_evaluation::{KnownStates, Models, Perception, Planner, Progress, TakeMemories, Trial};
-use carff_scenes::Scenario;
+use carff_evaluation::{KnownStates, Models, Perception, Planner, Progress, SAMPLES, TakeMemories, Trial};
+use carff_scenes::{FRAMES_PER_TIMESTAMP, Scenario};
 use carff_unknown::Known;
 use rayon::prelude::*;
 use std::path::Path;
 
 /// Part of the seed of these drives, so that they share no draws with training, limits or evaluation.
 const BOUND: u64 = tag("bounded");
-/// Frames of a drive between two time steps.
-const FRAMES_PER_TIMESTAMP: usize = 6;
 /// Largest number of frames of a drive; it names random draws.
 const MOST_FRAMES: usize = 1000;
-/// Samples and steps of a decision, as in the graph.
-const SAMPLES: usize = 10;
+/// Steps of a decision, as in the graph.
 const HORIZON: u32 = 2;
 
 /// Input of the bound.

@@ -39,7 +39,7 @@ impl TopicLimits {
 
 /// A topic: a name in the run, with the payload and the limits that all its users share.
 ///
-/// `P` is a message type, or [`crate::Image`] of the message type that describes the image.
+/// `P` is a message type, or [`crate::ImagePayload`] of the message type that describes the image.
 ///
 /// ```
 /// use carff_messages::EgoPose;

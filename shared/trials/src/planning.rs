@@ -23,8 +23,12 @@ use std::{cell::RefCell, collections::BTreeMap};
 /// Numbers of samples that the table has columns for.
 pub const SAMPLE_COUNTS: [usize; 3] = [2, 10, 35];
 
-/// Number of samples whose outcomes [`Planner::table`] returns.
-const OUTCOME_SAMPLES: usize = 10;
+/// Number of samples of a decision, as in the shipped graphs. [`Planner::table`] returns the outcomes with this number.
+pub const SAMPLES: usize = 10;
+/// Smallest number of trials of a planning table, where it has enough images.
+pub const LEAST_TRIALS: usize = 300;
+/// Largest number of trials of one image: images that differ only in sensor noise are not independent.
+pub const MOST_REPEATS: usize = 5;
 
 /// One trial: the posterior of an input view with one correct action.
 #[derive(Clone, Debug, PartialEq)]
@@ -392,7 +396,7 @@ impl Planner<'_> {
                     let right = policy.decide(&evidence).halt == (trial.kind == DriveKind::Hazard);
                     table.add(policy.rule, samples, trial.kind, right);
                 }
-                if samples == OUTCOME_SAMPLES {
+                if samples == SAMPLES {
                     let hazard_probability = evidence.hazard_or_unknown_probability() as f32;
                     outcomes.push(TrialOutcome { hazard_probability, kind: trial.kind });
                 }

@@ -4,7 +4,7 @@
 mod filmstrip;
 
 use crate::onnx::OnnxEncoder;
-use crate::planning::{KnownStates, Perception, Planner};
+use crate::planning::{KnownStates, LEAST_TRIALS, MOST_REPEATS, Perception, Planner};
 use crate::{Count, EvaluationError, PlanningTable, SAMPLE_COUNTS};
 use carff_checkpoint::{CheckpointPlanning, FieldProbe, Manifest, load_field_probe};
 use carff_dataset::{
@@ -24,11 +24,6 @@ use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::fmt::Write;
 use std::path::PathBuf;
-
-/// Smallest number of trials of a table, where it has enough images.
-const TRIALS: usize = 300;
-/// Largest number of trials of one image: images that differ only in sensor noise are not independent.
-const MOST_REPEATS: usize = 5;
 
 /// Settings of the run that is judged.
 #[derive(Debug)]
@@ -379,7 +374,7 @@ impl JudgedRun {
         let counts = RunViewCounts {
             hazard: of(DriveKind::Hazard),
             clear: of(DriveKind::Clear),
-            repeats: TRIALS.div_ceil(inputs.len().max(1)).min(MOST_REPEATS),
+            repeats: LEAST_TRIALS.div_ceil(inputs.len().max(1)).min(MOST_REPEATS),
         };
         let (probe, net) = (&self.probe, &self.forecaster);
         let known = self.known.as_ref().map(|known| KnownStates::new(known, probe, 1));
