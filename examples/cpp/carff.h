@@ -6,7 +6,7 @@
 #include <stddef.h>
 #include <stdint.h>
 
-#define CARFF_SCHEMA_VERSION 3
+#define CARFF_SCHEMA_VERSION 4
 #define CARFF_LATENT_DIM 8
 #define CARFF_MAX_COMPONENTS 8
 #define CARFF_MAX_SAMPLES 64
@@ -281,7 +281,7 @@ static_assert(offsetof(CarffProbeResult, confidence) == 4, "CarffProbeResult.con
 static_assert(offsetof(CarffProbeResult, hazard_likelihood) == 8, "CarffProbeResult.hazard_likelihood");
 static_assert(offsetof(CarffProbeResult, occupancies) == 12, "CarffProbeResult.occupancies");
 
-#define CARFF_BELIEF_TYPE_NAME "carff.Belief.v4"
+#define CARFF_BELIEF_TYPE_NAME "carff.Belief.v5"
 typedef struct CarffBelief {
     CarffHeader header;
     uint32_t horizon;
@@ -300,12 +300,14 @@ typedef struct CarffBelief {
     int32_t resolved_state;
     float unknown_probability;
     CarffGaussian resolved;
+    CarffGaussian fed_back[64];
+    uint64_t fed_back_count;
     uint64_t encoder_ns;
     uint64_t forecaster_ns;
     uint64_t stage_latency_ns;
 } CarffBelief;
 
-static_assert(sizeof(CarffBelief) == 15224, "CarffBelief");
+static_assert(sizeof(CarffBelief) == 19328, "CarffBelief");
 static_assert(offsetof(CarffBelief, header) == 0, "CarffBelief.header");
 static_assert(offsetof(CarffBelief, horizon) == 56, "CarffBelief.horizon");
 static_assert(offsetof(CarffBelief, state_count) == 60, "CarffBelief.state_count");
@@ -323,9 +325,11 @@ static_assert(offsetof(CarffBelief, sample_component) == 15064, "CarffBelief.sam
 static_assert(offsetof(CarffBelief, resolved_state) == 15128, "CarffBelief.resolved_state");
 static_assert(offsetof(CarffBelief, unknown_probability) == 15132, "CarffBelief.unknown_probability");
 static_assert(offsetof(CarffBelief, resolved) == 15136, "CarffBelief.resolved");
-static_assert(offsetof(CarffBelief, encoder_ns) == 15200, "CarffBelief.encoder_ns");
-static_assert(offsetof(CarffBelief, forecaster_ns) == 15208, "CarffBelief.forecaster_ns");
-static_assert(offsetof(CarffBelief, stage_latency_ns) == 15216, "CarffBelief.stage_latency_ns");
+static_assert(offsetof(CarffBelief, fed_back) == 15200, "CarffBelief.fed_back");
+static_assert(offsetof(CarffBelief, fed_back_count) == 19296, "CarffBelief.fed_back_count");
+static_assert(offsetof(CarffBelief, encoder_ns) == 19304, "CarffBelief.encoder_ns");
+static_assert(offsetof(CarffBelief, forecaster_ns) == 19312, "CarffBelief.forecaster_ns");
+static_assert(offsetof(CarffBelief, stage_latency_ns) == 19320, "CarffBelief.stage_latency_ns");
 
 #define CARFF_UNKNOWN_BOX_TYPE_NAME "carff.UnknownBox.v1"
 typedef struct CarffUnknownBox {

@@ -4,7 +4,7 @@ import ctypes
 from enum import IntEnum
 from typing import NamedTuple
 
-SCHEMA_VERSION = 3
+SCHEMA_VERSION = 4
 LATENT_DIM = 8
 MAX_COMPONENTS = 8
 MAX_SAMPLES = 64
@@ -267,6 +267,8 @@ class Belief(ctypes.Structure):
         ("resolved_state", ctypes.c_int32),
         ("unknown_probability", ctypes.c_float),
         ("resolved", Gaussian),
+        ("fed_back", (Gaussian * 64)),
+        ("fed_back_count", ctypes.c_uint64),
         ("encoder_ns", ctypes.c_uint64),
         ("forecaster_ns", ctypes.c_uint64),
         ("stage_latency_ns", ctypes.c_uint64),
@@ -274,7 +276,7 @@ class Belief(ctypes.Structure):
 
     @staticmethod
     def type_name() -> str:
-        return "carff.Belief.v4"
+        return "carff.Belief.v5"
 
 
 class UnknownBox(ctypes.Structure):
@@ -421,7 +423,7 @@ LAYOUTS = {
     ImageCheck: (80, 8, {"header": 0, "condition": 56, "luminance": 60, "sharpness": 64, "change": 68, "covered": 72, "repeats_s": 76}),
     Forecast: (2760, 8, {"header": 0, "source": 56, "component_count": 60, "sample_count": 64, "horizon": 68, "resolved_state": 72, "path_probability": 76, "images": 80, "weights": 88, "components": 120, "samples": 632, "sample_component": 2680, "encoder_ns": 2744, "stage_latency_ns": 2752}),
     ProbeResult: (204, 4, {"state": 0, "confidence": 4, "hazard_likelihood": 8, "occupancies": 12}),
-    Belief: (15224, 8, {"header": 0, "horizon": 56, "state_count": 60, "place_count": 64, "component_count": 68, "sample_count": 72, "is_final": 76, "state_probability": 80, "hazard_probability": 336, "path_probability": 340, "component_weights": 344, "components": 376, "samples": 2008, "sample_component": 15064, "resolved_state": 15128, "unknown_probability": 15132, "resolved": 15136, "encoder_ns": 15200, "forecaster_ns": 15208, "stage_latency_ns": 15216}),
+    Belief: (19328, 8, {"header": 0, "horizon": 56, "state_count": 60, "place_count": 64, "component_count": 68, "sample_count": 72, "is_final": 76, "state_probability": 80, "hazard_probability": 336, "path_probability": 340, "component_weights": 344, "components": 376, "samples": 2008, "sample_component": 15064, "resolved_state": 15128, "unknown_probability": 15132, "resolved": 15136, "fed_back": 15200, "fed_back_count": 19296, "encoder_ns": 19304, "forecaster_ns": 19312, "stage_latency_ns": 19320}),
     UnknownBox: (56, 8, {"center": 0, "half_size": 24, "probability": 48, "place": 52}),
     Unknowns: (824, 8, {"header": 0, "box_count": 56, "state_count": 60, "probability": 64, "residual": 68, "noise": 72, "gain": 76, "offset": 88, "explained": 100, "ratios": 104, "prior": 360, "boxes": 368, "stage_latency_ns": 816}),
     Occupancy: (4184, 8, {"header": 0, "columns": 56, "rows": 60, "cell_m": 64, "low_corner_m": 68, "unknown_probability": 76, "probability": 80, "stage_latency_ns": 4176}),
