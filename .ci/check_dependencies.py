@@ -3,7 +3,8 @@
 
 The rules of deny.toml cover licences, banned crates, duplicate versions and sources, for each of its targets. This program
 also checks the direction of dependencies between our crates, which of them may use libtorch, and that each fetched library
-has a hash for each target. House rules: no unfinished code, no paths of one machine, `unsafe` in named modules only.
+has a hash for each target. House rules: no unfinished code, no paths of one machine, `unsafe` in named modules only, one
+meaning for each name of a public type.
 
 Usage: python3 .ci/check_dependencies.py      (from anywhere; exit code 1 and one line per finding)
 """
@@ -260,6 +261,35 @@ def check_sources() -> None:
     print(f"files: {count}")
 
 
+PUBLIC_TYPE = re.compile(r"^ *pub (?:struct|enum|union|trait|type) (\w+)", re.MULTILINE)
+# Names of public types in several crates, each with the one meaning that it has in all of them.
+SHARED_TYPE_NAMES = {
+    "Encoder": "the network from an image to a posterior, in ONNX Runtime and in libtorch",
+    "MixtureNet": "the mixture density network, in native code and in libtorch",
+}
+
+
+def check_type_names() -> None:
+    """Checks that one name of a public type has one meaning: it is in one crate. Tests and examples may repeat names."""
+    files = [Path(f) for f in run("git", "ls-files", "--cached", "--others", "--exclude-standard").splitlines()]
+    crates = {file.parent for file in files if file.name == "Cargo.toml"}
+    users: dict[str, set[str]] = {}
+    for file in files:
+        if file.suffix != ".rs" or {"tests", "examples", "benches"} & set(file.parts) or not (ROOT / file).is_file():
+            continue
+        crate = next(folder for folder in file.parents if folder in crates)
+        text = (ROOT / file).read_text(encoding="utf-8").split("#[cfg(test)]\nmod ")[0]
+        for name in PUBLIC_TYPE.findall(text):
+            users.setdefault(name, set()).add(str(crate))
+    for name, found in sorted(users.items()):
+        if len(found) > 1 and name not in SHARED_TYPE_NAMES:
+            find(f"`{name}` is a public type of {' and '.join(sorted(found))}: one name has one meaning")
+    for name in SHARED_TYPE_NAMES:
+        if len(users.get(name, ())) < 2:
+            find(f".ci/check_dependencies.py: `{name}` is no longer a public type of two crates")
+    print(f"public types: {len(users)}")
+
+
 # The crates whose files of integration tests are a program each, with the reason.
 SEPARATE_TESTS = {"shared/training": "libtorch has one stream of random numbers per process"}
 
@@ -294,6 +324,7 @@ def main() -> None:
     check_libraries(targets)
     check_sources()
     check_test_programs()
+    check_type_names()
     for text in findings:
         print(f"error: {text}", file=sys.stderr)
     if findings:

@@ -25,3 +25,7 @@ pub mod shell;
 #[cfg(feature = "recording")]
 pub mod soak;
 pub mod supervision;
+
+/// Nanoseconds of a millisecond, and of a second.
+pub(crate) const NS_PER_MS: u64 = 1_000_000;
+pub(crate) const NS_PER_S: u64 = 1_000_000_000;

@@ -31,7 +31,7 @@ pub struct Quantiles {
 
 impl Quantiles {
     /// Quantiles of times in nanoseconds.
-    pub fn of_ns<'a>(times_ns: impl IntoIterator<Item = &'a u64>) -> Self {
+    fn of_ns<'a>(times_ns: impl IntoIterator<Item = &'a u64>) -> Self {
         let times_ms: Vec<f64> = times_ns.into_iter().map(|&ns| ns as f64 / 1e6).collect();
         let at = |share: f64| percentile(&times_ms, share);
         Self { count: times_ms.len(), max: at(1.0), p50: at(0.5), p99: at(0.99) }

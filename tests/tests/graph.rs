@@ -62,6 +62,12 @@ fn the_shipped_graph_drives() {
             }
         }
     }
+    let live = &report["planning"]["live"];
+    for rule in ["underconfident", "overconfident", "paper", "calibrated"] {
+        let agreement = &live["rules"][rule];
+        assert!(number(&agreement["compared"], rule) > 0.0, "{live:#}");
+        assert_eq!(agreement["agrees_with_library"], agreement["compared"], "{rule}: {live:#}");
+    }
     let trials = |kind: &str| number(&report["planning"]["all_views"]["calibrated"]["10"][kind]["trials"], kind);
     assert!(trials("hazard") + trials("clear") >= 300.0, "{report:#}");
 }

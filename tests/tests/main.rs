@@ -6,6 +6,7 @@ mod controller;
 mod drive;
 mod graph;
 mod logs;
+mod look_ahead;
 mod memory;
 mod operate;
 mod own_stage;

@@ -10,7 +10,7 @@ use carff_observe::attach;
 use carff_tests::{
     Process, TestGraph, decisions, eventually, image_set, program, project_root, scenario_set, shipped_checkpoint,
 };
-use carff_transport::{Image as ImageTopic, Node, Topic, monotonic_now_ns, topics};
+use carff_transport::{ImagePayload, Node, Topic, monotonic_now_ns, topics};
 use rustix::process::Signal;
 use serde_json::Value;
 use std::path::{Path, PathBuf};
@@ -103,7 +103,7 @@ fn another_process_is_the_camera() {
 /// still waits for its camera. A limit of frames ends the run.
 #[test]
 fn foreign_frames_are_validated() {
-    static OTHER: Topic<ImageTopic<ViewMeta>> = Topic::new("camera/frame", topics::IMAGES, 500);
+    static OTHER: Topic<ImagePayload<ViewMeta>> = Topic::new("camera/frame", topics::IMAGES, 500);
     let graph = TestGraph::new(&scenario_set(), &shipped_checkpoint(), &external());
     let mut launcher = Process::start(&mut graph.launch(&graph.file(), &["--frames", "3"]));
     launcher.wait_for("invitation", |text| text.contains("waiting for another process"));

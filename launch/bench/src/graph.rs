@@ -7,16 +7,13 @@ use carff_config::{GraphConfig, StagesConfig};
 use carff_messages::{Action, Belief, Forecast, FrameMeta, Health, HealthState, Posterior, Stage, Unknowns};
 use carff_runtime::StageArgs;
 use carff_transport::{
-    Image, Node, Receiver, Run, Stop, Waiter, Woken, monotonic_now_ns, remove_run_leftovers, run_id_of, topics,
+    ImagePayload, Node, Receiver, Run, Stop, Waiter, Woken, monotonic_now_ns, remove_run_leftovers, run_id_of, topics,
 };
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
-/// Receivers start before their senders, the camera last.
-const START_ORDER: [Stage; 6] =
-    [Stage::Controller, Stage::Renderer, Stage::Prober, Stage::Forecaster, Stage::Encoder, Stage::Camera];
 /// Time between two checks of the stages while they start.
 const WATCH_NS: u64 = 50_000_000;
 /// Time between two readings of the messages.
@@ -197,7 +194,7 @@ fn listen(
         listener.drain()
     };
     let limit = Duration::from_millis(plan.graph.launcher.start_timeout_ms);
-    for batch in [&START_ORDER[..5], &START_ORDER[5..]] {
+    for batch in [&Stage::START_ORDER[..5], &Stage::START_ORDER[5..]] {
         for &stage in batch {
             stages.start(stage, args)?;
         }
@@ -288,13 +285,13 @@ fn measured(listener: &Listener, [from_ns, to_ns]: [u64; 2], used: Used) -> Meas
 
 /// Receives all messages of a run, by polling: wake-ups by each message would take a core from the stages.
 struct Listener {
-    frames_in: Receiver<Image<FrameMeta>>,
+    frames_in: Receiver<ImagePayload<FrameMeta>>,
     posteriors: Receiver<Posterior>,
     unknowns: Receiver<Unknowns>,
     forecasts: Receiver<Forecast>,
     beliefs: Receiver<Belief>,
     actions: Receiver<Action>,
-    views_in: Receiver<carff_transport::Image<carff_messages::ViewMeta>>,
+    views_in: Receiver<carff_transport::ImagePayload<carff_messages::ViewMeta>>,
     healths: Vec<Receiver<Health>>,
     frames: BTreeMap<u64, Frame>,
     views: u64,

@@ -4,7 +4,6 @@
 //! times depend on the machine and on its load. Each benchmark prints a table. It can also write its figures as JSON,
 //! with a description of the machine, and compare them with an earlier run.
 
-mod birds_eye;
 mod graph;
 mod graph_loop;
 mod helper;
@@ -16,7 +15,6 @@ mod scale;
 pub mod stats;
 mod tensors;
 
-pub use birds_eye::birds_eye;
 pub use tensors::{EncoderArgs, FieldArgs, TensorBench};
 
 use report::Report;

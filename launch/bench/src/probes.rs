@@ -3,7 +3,7 @@
 use crate::helper::{Helper, end_with_parent, say_ready};
 use anyhow::Context;
 use carff_messages::{Action, Belief, FrameMeta};
-use carff_transport::{Image, Node, Receiver, Run, Stop, Waiter, Woken, topics};
+use carff_transport::{ImagePayload, Node, Receiver, Run, Stop, Waiter, Woken, topics};
 use std::sync::Barrier;
 
 /// Arguments of the probes' process.
@@ -88,7 +88,7 @@ pub(crate) fn run(args: &ProbesArgs) -> anyhow::Result<()> {
 
 /// A probe that receives frames, beliefs and actions.
 struct Probe {
-    frames: Receiver<Image<FrameMeta>>,
+    frames: Receiver<ImagePayload<FrameMeta>>,
     beliefs: Receiver<Belief>,
     actions: Receiver<Action>,
 }

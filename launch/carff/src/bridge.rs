@@ -6,7 +6,7 @@ use crate::session::{Session, Sessions, WaitArgs};
 use anyhow::Context;
 use carff_checkpoint::Manifest;
 use carff_observe::find;
-use carff_recording::{Encoded, Encoder, Format};
+use carff_recording::{Encoded, Format, MessageEncoder};
 use carff_transport::TopicId;
 use clap::Args;
 use clap_complete::engine::ArgValueCandidates;
@@ -84,7 +84,7 @@ fn serve(
 ) -> anyhow::Result<()> {
     session.listen(topics.iter().copied())?;
     let places = Manifest::load(&session.attached.live.checkpoint).map(|m| m.places).unwrap_or_default();
-    let mut encoder = Encoder::new(places, wall_offset_ns());
+    let mut encoder = MessageEncoder::new(places, wall_offset_ns());
     let open = RefCell::new(open);
     let going = session.follow(
         |topic, message| {

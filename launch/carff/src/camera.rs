@@ -14,8 +14,8 @@ use carff_observe::{AttachError, Attached, RunLock, RunRecord, attach};
 use carff_plots::Board;
 use carff_runtime::StageArgs;
 use carff_transport::{
-    Image as ImageTopic, Node, Receiver, Run, Sample, Stop, Waiter, Woken, monotonic_now_ns, remove_run_leftovers,
-    run_id_of, runtime_dir, topics,
+    ImagePayload, Node, Receiver, Run, Sample, Stop, Waiter, Woken, monotonic_now_ns, remove_run_leftovers, run_id_of,
+    runtime_dir, topics,
 };
 use clap::ValueHint;
 use image::imageops::{FilterType, resize};
@@ -99,8 +99,8 @@ pub fn run(command: &CameraCommand) -> anyhow::Result<ExitCode> {
 
 /// A camera that is watched: of a living run, or of a run that this command owns. Dropping it ends the latter.
 struct Watched {
-    frames: Receiver<ImageTopic<FrameMeta>>,
-    raw: Receiver<ImageTopic<FrameMeta>>,
+    frames: Receiver<ImagePayload<FrameMeta>>,
+    raw: Receiver<ImagePayload<FrameMeta>>,
     node: Option<Node>,
     own: Option<Own>,
 }
@@ -270,7 +270,7 @@ impl Own {
     }
 }
 
-fn note(seen: &mut Option<Seen>, frame: &Sample<ImageTopic<FrameMeta>>) {
+fn note(seen: &mut Option<Seen>, frame: &Sample<ImagePayload<FrameMeta>>) {
     let now_ns = monotonic_now_ns();
     let seen = seen.get_or_insert_with(|| Seen {
         arrived_ns: Vec::new(),
@@ -285,7 +285,7 @@ fn note(seen: &mut Option<Seen>, frame: &Sample<ImageTopic<FrameMeta>>) {
     (seen.meta, seen.frame) = (**frame, image_of(frame));
 }
 
-fn image_of(frame: &Sample<ImageTopic<FrameMeta>>) -> Image {
+fn image_of(frame: &Sample<ImagePayload<FrameMeta>>) -> Image {
     Image { width_px: frame.width_px, height_px: frame.height_px, rgb: frame.bytes().to_vec() }
 }
 

@@ -7,7 +7,7 @@ use crate::spans::{recorded_spans, trace_events};
 use anyhow::{Context, ensure};
 use carff_base::files::{check_distinct, check_writable};
 use carff_checkpoint::Manifest;
-use carff_recording::{About, Entry, Reader};
+use carff_recording::{Entry, Reader, RecordingAbout};
 use carff_transport::TopicId;
 use clap::Args;
 use serde_json::Value;
@@ -150,7 +150,7 @@ struct States(Vec<String>);
 
 impl States {
     /// Takes the names from the recording, or from its checkpoint; states of neither have a number.
-    fn of(about: Option<&About>) -> Self {
+    fn of(about: Option<&RecordingAbout>) -> Self {
         let stored = about.map(|about| about.states.clone()).filter(|states| !states.is_empty());
         let trained = || Manifest::load(Path::new(&about?.checkpoint)).ok().map(|m| m.scenario.state_names());
         // Many readers of tables do not know quoted commas.
@@ -234,7 +234,7 @@ mod tests {
     use carff_recording::Writer;
 
     fn recording(path: &Path) {
-        let mut writer = Writer::create(path, &About::default(), &[]).unwrap();
+        let mut writer = Writer::create(path, &RecordingAbout::default(), &[]).unwrap();
         for frame in 0..3_u64 {
             let at_ns = frame * 50_000_000;
             let header = Header { publish_time_ns: at_ns + 1, ..Header::of_frame(frame, at_ns, 1) };
@@ -282,7 +282,7 @@ mod tests {
         assert_eq!(spans(&path, &folder.path().join("trace.json")).unwrap(), 6);
 
         let empty = folder.path().join("empty.mcap");
-        Writer::create(&empty, &About::default(), &[]).unwrap().finish().unwrap();
+        Writer::create(&empty, &RecordingAbout::default(), &[]).unwrap().finish().unwrap();
         let error = film::export(&empty, &folder.path().join("none.mp4")).unwrap_err().to_string();
         assert!(error.contains("no camera frame") && !folder.path().join("none.mp4").exists(), "{error}");
         let error = super::tables(&empty, folder.path()).unwrap_err().to_string();
@@ -303,7 +303,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("r.mcap");
         let states = ["no actor, t0", "no actor, t1", "truck, t0", "truck, t1"].map(str::to_owned).to_vec();
-        let about = About { states, wall_offset_ns: 1_700_000_000_000_000_000, ..About::default() };
+        let about = RecordingAbout { states, wall_offset_ns: 1_700_000_000_000_000_000, ..RecordingAbout::default() };
         let mut writer = Writer::create(&path, &about, &[]).unwrap();
         for frame in 0..2_u64 {
             let header = Header { publish_time_ns: 250_000_000, ..Header::of_frame(frame, 50_000_000, 1) };

@@ -3,7 +3,7 @@
 //! [`python`] and [`c`] write them as source text. Both texts contain sizes and offsets as this compiler lays them out,
 //! and check them: Python when the module is imported, C and C++ when the header is compiled.
 
-use carff_messages::layout::{Field, Layout};
+use carff_messages::layout::{Layout, LayoutField};
 use carff_messages::{
     ActionCode, ForecastSource, HealthState, LATENT_DIM, MAX_COMPONENTS, MAX_HORIZON, MAX_IMAGE_BYTES, MAX_PLACES,
     MAX_SAMPLES, MAX_SIDE_PX, MAX_STATES, Observability, Reason, Rule, SCHEMA_VERSION, Stage, ViewKind,
@@ -32,7 +32,7 @@ fn short(layout: &Layout) -> &str {
 }
 
 /// Returns the type of a field's elements in Python.
-fn python_type(field: &Field) -> String {
+fn python_type(field: &LayoutField) -> String {
     let element = match field.kind.type_name.as_str() {
         "u8" => "ctypes.c_uint8",
         "u32" => "ctypes.c_uint32",
@@ -46,7 +46,7 @@ fn python_type(field: &Field) -> String {
 }
 
 /// Returns the declaration of a field in C.
-fn c_field(field: &Field) -> String {
+fn c_field(field: &LayoutField) -> String {
     let element = match field.kind.type_name.as_str() {
         "u8" => "uint8_t".to_owned(),
         "u32" => "uint32_t".to_owned(),
@@ -162,7 +162,7 @@ pub fn c() -> String {
             let _ = writeln!(text, "    {};", c_field(field));
         }
         let _ = write!(text, "}} Carff{name};\n\nstatic_assert(sizeof(Carff{name}) == {size}, \"Carff{name}\");\n");
-        for Field { name: field, offset_bytes, .. } in &layout.fields {
+        for LayoutField { name: field, offset_bytes, .. } in &layout.fields {
             let _ = writeln!(
                 text,
                 "static_assert(offsetof(Carff{name}, {field}) == {offset_bytes}, \"Carff{name}.{field}\");"

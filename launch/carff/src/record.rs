@@ -9,7 +9,7 @@ use crate::{complete, provenance};
 use anyhow::Context;
 use carff_checkpoint::Manifest;
 use carff_observe::LiveRun;
-use carff_recording::{About, LogLine, RecordingQueue, RotatingWriter, RotationLimits};
+use carff_recording::{LogLine, RecordingAbout, RecordingQueue, RotatingWriter, RotationLimits};
 use carff_transport::TopicId;
 use carff_transport::monotonic_now_ns;
 use clap::Args;
@@ -153,10 +153,10 @@ pub(crate) fn wall_offset_ns() -> u64 {
     wall_ns.saturating_sub(monotonic_now_ns())
 }
 
-fn about(live: &LiveRun, states: Vec<String>) -> anyhow::Result<About> {
+fn about(live: &LiveRun, states: Vec<String>) -> anyhow::Result<RecordingAbout> {
     let origin = provenance::of(Some(live.started_unix_s), Some(&live.checkpoint));
     let origin = origin.into_iter().map(|(name, value)| (name.to_owned(), value)).collect();
-    Ok(About {
+    Ok(RecordingAbout {
         run: live.name.clone(),
         run_id: live.run_id,
         graph: live.graph.display().to_string(),

@@ -6,7 +6,7 @@ use anyhow::{Context, anyhow};
 use carff_base::files::check_writable;
 use carff_launch::lab::AblateArgs;
 use carff_training::ablation::{AblationTable, Variant, folder, row, write_table};
-use carff_training::{Progress, Run, Training, TrainingConfig, TrainingError};
+use carff_training::{Progress, Training, TrainingConfig, TrainingError, TrainingRun};
 use std::process::ExitCode;
 
 fn variant(name: &str) -> anyhow::Result<Variant> {
@@ -31,7 +31,7 @@ pub fn run(args: &AblateArgs) -> anyhow::Result<ExitCode> {
     refuse_another_configuration(&args.out, &config, &dataset)?;
     let display = Display::default();
     let report = |progress: &Progress| display.show(progress);
-    let run = Run { dir: args.out.clone(), on_progress: &report, stop: stop.flag() };
+    let run = TrainingRun { dir: args.out.clone(), on_progress: &report, stop: stop.flag() };
     let made = with_random_poses(rendered, &config, &dataset, &run);
     display.finish();
     let random_poses = match made {
@@ -52,7 +52,7 @@ pub fn run(args: &AblateArgs) -> anyhow::Result<ExitCode> {
         refuse_another_configuration(&dir, &variant.apply(&config), &dataset)?;
         let display = Display::default();
         let report = |progress: &Progress| display.show(progress);
-        let run = Run { dir, on_progress: &report, stop: stop.flag() };
+        let run = TrainingRun { dir, on_progress: &report, stop: stop.flag() };
         let training = Training {
             config: &config,
             dataset: &dataset,

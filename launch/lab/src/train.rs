@@ -10,7 +10,7 @@ use carff_scenes::{
     config::{BystanderPlace, VariationRole},
 };
 use carff_training::{
-    FreePoses, Phases, Progress, Run, Training, TrainingConfig, TrainingError, forget_run, render_random_poses,
+    FreePoses, Phases, Progress, Training, TrainingConfig, TrainingError, TrainingRun, forget_run, render_random_poses,
 };
 use carff_transport::{INTERRUPTED, Stop};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
@@ -52,7 +52,7 @@ pub fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
     let stop = stop_on_signals(&dir)?;
     let display = Display::default();
     let report = |progress: &Progress| display.show(progress);
-    let run = Run { dir: dir.clone(), on_progress: &report, stop: stop.flag() };
+    let run = TrainingRun { dir: dir.clone(), on_progress: &report, stop: stop.flag() };
     let phases = match args.stage {
         None => Phases::All,
         Some(StageName::Vae) => Phases::Vae,
@@ -170,7 +170,7 @@ pub fn with_random_poses(
     rendered: Vec<PathBuf>,
     config: &TrainingConfig,
     dataset: &Path,
-    run: &Run,
+    run: &TrainingRun,
 ) -> Result<Vec<PathBuf>, TrainingError> {
     if rendered.is_empty() {
         return Ok(render_random_poses(config, dataset, run)?.into_iter().collect());

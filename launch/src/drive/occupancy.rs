@@ -6,12 +6,10 @@ use carff_base::geometry::OrientedBox;
 use carff_checkpoint::{OccupancyRates, StepRates};
 use carff_messages::{MAX_HORIZON, Occupancy};
 use carff_scenes::{ClosedLoop, Episode};
-use carff_trials::{Reliability, ReliabilitySums};
+use carff_trials::{RELIABILITY_BINS, Reliability, ReliabilitySums};
 use serde::Serialize;
 use std::collections::{BTreeMap, VecDeque};
 
-/// Number of bins of a forecast's probability.
-const BINS: usize = 10;
 /// Number of frames whose grids may still arrive.
 const FRAMES: usize = 32;
 /// Smallest probability in a logarithm.
@@ -37,7 +35,7 @@ struct OfStep {
 impl Default for OfStep {
     fn default() -> Self {
         let line = LineSums::default();
-        Self { sums: ReliabilitySums::new(BINS), log_loss: 0.0, taken: 0, grids: 0, line }
+        Self { sums: ReliabilitySums::new(RELIABILITY_BINS), log_loss: 0.0, taken: 0, grids: 0, line }
     }
 }
 

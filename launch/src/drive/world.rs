@@ -10,7 +10,7 @@ use carff_base::random::Key;
 use carff_dataset::sensor::{SensorNoise, apply_noise_into};
 use carff_messages::{Action, DatasetView, EgoMotion, FrameMeta, Header, ImageMeta, Occupancy, Reason};
 use carff_scenes::{ClosedLoop, Episode};
-use carff_transport::{Image, Node, Publisher, Receiver, Run, Stop, Waiter, Woken, monotonic_now_ns, topics};
+use carff_transport::{ImagePayload, Node, Publisher, Receiver, Run, Stop, Waiter, Woken, monotonic_now_ns, topics};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 /// Longest wait for a frame's decision in lock-step, nanoseconds. The ego is then to halt.
@@ -42,7 +42,7 @@ pub(super) struct World {
 
 /// The topics of the world.
 struct Topics {
-    frames: Publisher<Image<FrameMeta>>,
+    frames: Publisher<ImagePayload<FrameMeta>>,
     motions: Publisher<EgoMotion>,
     truths: Publisher<WorldTruth>,
     actions: Receiver<Action>,

@@ -226,7 +226,7 @@ impl fmt::Display for Comparison {
 mod tests {
     use super::*;
     use carff_messages::Header;
-    use carff_recording::{About, Writer};
+    use carff_recording::{RecordingAbout, Writer};
 
     fn a_belief(frame: u64, hazard: f32) -> Belief {
         let mut belief =
@@ -238,7 +238,7 @@ mod tests {
 
     /// Writes a recording with `frames` frames, the last one first, and each belief ahead of its frame.
     fn recorded(path: &Path, frames: u64) {
-        let mut writer = Writer::create(path, &About::default(), &[]).unwrap();
+        let mut writer = Writer::create(path, &RecordingAbout::default(), &[]).unwrap();
         for frame in (0..frames).rev() {
             writer.write(TopicId::BELIEF, AnyMessage::new(&a_belief(frame, 0.25), &[])).unwrap();
             let mut meta = FrameMeta {

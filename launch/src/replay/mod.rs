@@ -8,7 +8,7 @@ use crate::supervision::{Ended, Feed};
 use anyhow::{Context, bail, ensure};
 use carff::terminal::Terminal;
 use carff_messages::Stage;
-use carff_recording::{About, Reader};
+use carff_recording::{Reader, RecordingAbout};
 use carff_transport::TopicId;
 use clap::Args;
 use compare::{COMPARED, Carried, Replayed};
@@ -116,7 +116,7 @@ pub fn run(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
             args.recording.display()
         ),
     };
-    let recorded = |folder: fn(&About) -> &String| about.as_ref().map(|about| PathBuf::from(folder(about)));
+    let recorded = |folder: fn(&RecordingAbout) -> &String| about.as_ref().map(|about| PathBuf::from(folder(about)));
     let launch = LaunchArgs {
         graph,
         dataset: args.dataset.clone().or_else(|| recorded(|about| &about.dataset)),
@@ -156,7 +156,7 @@ pub fn run(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
 
 /// Checks that the recording has the topics of the replay. Returns its metadata, and the topics that it sends: of all
 /// topics, those that it has.
-fn check(args: &ReplayArgs, topics: &BTreeSet<TopicId>) -> anyhow::Result<(Option<About>, BTreeSet<TopicId>)> {
+fn check(args: &ReplayArgs, topics: &BTreeSet<TopicId>) -> anyhow::Result<(Option<RecordingAbout>, BTreeSet<TopicId>)> {
     let mut reader = Reader::open(&args.recording)?;
     let mut sent = topics.clone();
     // No stage of the graph publishes the motion of the vehicle, on which an approach rests.

@@ -1,7 +1,7 @@
 //! Injects the faults of a soak, and waits until the graph has recovered.
 
 use super::{
-    DISK_SIZE, NS_PER_MS, Soak,
+    DISK_SIZE, Soak,
     answer::Answer,
     graph::{Holdings, Victim},
     patience::Patience,
@@ -9,8 +9,9 @@ use super::{
     schedule::Fault,
     stand_in,
 };
+use crate::NS_PER_MS;
 use anyhow::{Context, ensure};
-use carff_config::{CameraSource, Kind};
+use carff_config::{CameraSource, FaultKind};
 use carff_messages::{ImageCondition, Stage};
 use carff_transport::{INTERRUPTED, SHARED_MEMORY_DIR, monotonic_now_ns};
 use carff_unknown::Known;
@@ -34,20 +35,20 @@ impl Soak<'_> {
     pub(super) fn inflict(&mut self, fault: &Fault) -> anyhow::Result<bool> {
         let pids = self.pids();
         match fault.kind {
-            Kind::Kill => {
+            FaultKind::Kill => {
                 let pid = self.pid_of(fault, &pids)?;
                 self.kill(fault.target, pid);
                 self.recover(Some(pid))?;
             }
-            Kind::Stop => self.hold_still(fault, &pids, fault.hold_ms)?,
-            Kind::Drop => {
+            FaultKind::Stop => self.hold_still(fault, &pids, fault.hold_ms)?,
+            FaultKind::Drop => {
                 let hold_ms = (DROPPED_FRAMES * 1000.0 / self.graph.config.run.frame_rate_hz) as u64;
                 self.hold_still(&Fault { target: Some(Stage::Camera), ..*fault }, &pids, hold_ms)?;
             }
-            Kind::Stall => {
+            FaultKind::Stall => {
                 self.hold_still(&Fault { target: Some(Stage::Camera), ..*fault }, &pids, fault.hold_ms)?;
             }
-            Kind::Slow => {
+            FaultKind::Slow => {
                 let victim = Victim::new(self.pid_of(fault, &pids)?)?;
                 self.excuse(fault.target, fault.hold_ms);
                 for _ in 0..fault.hold_ms.div_ceil(SLOW_MS.0 + SLOW_MS.1) {
@@ -58,33 +59,38 @@ impl Soak<'_> {
                 }
                 self.recover(None)?;
             }
-            Kind::Nan | Kind::Garbage | Kind::Schema | Kind::ForeignRun => self.lie(fault)?,
-            Kind::DeviceLoss => {
+            FaultKind::Nan | FaultKind::Garbage | FaultKind::Schema | FaultKind::ForeignRun => self.lie(fault)?,
+            FaultKind::DeviceLoss => {
                 if self.graph.config.camera.source != CameraSource::Drives {
                     return Ok(false);
                 }
                 self.lose_device(fault, &pids)?;
             }
-            Kind::Burst | Kind::Late | Kind::Duplicate | Kind::Reorder | Kind::Resolution | Kind::Corrupt => {
+            FaultKind::Burst
+            | FaultKind::Late
+            | FaultKind::Duplicate
+            | FaultKind::Reorder
+            | FaultKind::Resolution
+            | FaultKind::Corrupt => {
                 self.injector(fault.kind.name(), fault)?;
                 self.recover(None)?;
             }
-            Kind::Black
-            | Kind::White
-            | Kind::Frozen
-            | Kind::Covered
-            | Kind::Unfocused
-            | Kind::Underexposed
-            | Kind::Overexposed
-            | Kind::ClockStall
-            | Kind::ClockJump => {
+            FaultKind::Black
+            | FaultKind::White
+            | FaultKind::Frozen
+            | FaultKind::Covered
+            | FaultKind::Unfocused
+            | FaultKind::Underexposed
+            | FaultKind::Overexposed
+            | FaultKind::ClockStall
+            | FaultKind::ClockJump => {
                 let Some(condition) = stand_in::condition(fault.kind).filter(|&c| self.names(c)) else {
                     return Ok(false);
                 };
                 self.stand_in(fault, condition, &pids)?;
             }
-            Kind::ProbeStorm => self.storm(fault)?,
-            Kind::FullMemory => {
+            FaultKind::ProbeStorm => self.storm(fault)?,
+            FaultKind::FullMemory => {
                 if !self.args.own_memory {
                     return Ok(false);
                 }
@@ -93,15 +99,15 @@ impl Soak<'_> {
                 drop(filler);
                 self.recover(None)?;
             }
-            Kind::FullDisk => {
+            FaultKind::FullDisk => {
                 if !self.args.own_memory {
                     return Ok(false);
                 }
                 self.fill_disk()?;
             }
-            Kind::Checkpoint => self.damage_checkpoint(fault, &pids)?,
-            Kind::StartStop => self.cycle(Signal::INT)?,
-            Kind::KillLauncher => self.cycle(Signal::KILL)?,
+            FaultKind::Checkpoint => self.damage_checkpoint(fault, &pids)?,
+            FaultKind::StartStop => self.cycle(Signal::INT)?,
+            FaultKind::KillLauncher => self.cycle(Signal::KILL)?,
         }
         Ok(true)
     }

@@ -5,9 +5,9 @@ use super::seen::{LINGER, LOOK_NS, seen};
 use super::stand_in;
 use anyhow::Context;
 use carff_base::random::{Key, stream};
-use carff_config::Kind;
+use carff_config::FaultKind;
 use carff_messages::{Belief, Forecast, FrameMeta, Header, Posterior};
-use carff_transport::{Image, Node, Publisher, Run, Stop, Waiter, Woken, monotonic_now_ns, topics};
+use carff_transport::{ImagePayload, Node, Publisher, Run, Stop, Waiter, Woken, monotonic_now_ns, topics};
 use rand::Rng;
 use rustix::process::{Signal, set_parent_process_death_signal};
 use std::time::Duration;
@@ -42,7 +42,7 @@ pub fn run(args: &InjectArgs) -> anyhow::Result<()> {
         "probe" => return probe(&node, args.count),
         "nan" | "garbage" | "schema" | "foreign_run" => rogue(&node, args)?,
         what => {
-            let kind = Kind::ALL.iter().copied().find(|kind| kind.name() == what);
+            let kind = FaultKind::ALL.iter().copied().find(|kind| kind.name() == what);
             match kind.filter(|&kind| stand_in::condition(kind).is_some()) {
                 Some(kind) => return stand_in::run(&node, kind, args.seed),
                 None => frames(&node, args)?,
@@ -183,7 +183,7 @@ fn rescaled((meta, bytes): &(FrameMeta, Vec<u8>), halves: [u32; 2]) -> (FrameMet
     (meta, scaled)
 }
 
-fn send(output: &mut Publisher<Image<FrameMeta>>, (meta, bytes): &(FrameMeta, Vec<u8>)) -> anyhow::Result<()> {
+fn send(output: &mut Publisher<ImagePayload<FrameMeta>>, (meta, bytes): &(FrameMeta, Vec<u8>)) -> anyhow::Result<()> {
     let mut loan = output.loan(bytes.len())?;
     loan.bytes_mut().copy_from_slice(bytes);
     Ok(output.send_image_unchecked(loan, *meta)?)

@@ -2,6 +2,7 @@
 //!
 //! All checks of actions use the times that the controller wrote into them.
 
+use crate::NS_PER_MS;
 use carff_checkpoint::load_policy;
 use carff_config::{Contract, GraphConfig};
 use carff_decision::{Approach, Evidence, Look, Motion, Policy, Speeds};
@@ -13,7 +14,6 @@ use std::path::Path;
 const FRAMES: usize = 64;
 /// Number of motions of the vehicle that are remembered: more than the controller's deadline has.
 const MOTIONS: usize = 1024;
-const NS_PER_MS: f64 = 1e6;
 
 /// Limits on the graph's actions.
 #[derive(Clone, Copy, Debug)]
@@ -124,7 +124,7 @@ impl Judge {
             let gap_ns = published_ns.saturating_sub(last.header.publish_time_ns);
             self.worst_gap_ns = self.worst_gap_ns.max(gap_ns);
             if gap_ns > self.terms.period_ns + self.terms.slack_ns {
-                return wrong(format!("no action for {:.1} ms", gap_ns as f64 / NS_PER_MS));
+                return wrong(format!("no action for {:.1} ms", gap_ns as f64 / NS_PER_MS as f64));
             }
         }
         let moves = |action: &Action| action.code().is_ok_and(|code| !code.is_safe());
@@ -140,7 +140,7 @@ impl Judge {
                 let late_ns = published_ns.saturating_sub(decision.valid_until_ns);
                 self.worst_safe_action_ns = self.worst_safe_action_ns.max(late_ns);
                 if late_ns > self.terms.slack_ns {
-                    return wrong(format!("the safe action came {:.1} ms late", late_ns as f64 / NS_PER_MS));
+                    return wrong(format!("the safe action came {:.1} ms late", late_ns as f64 / NS_PER_MS as f64));
                 }
             }
             return Ok(());

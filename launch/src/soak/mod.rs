@@ -23,6 +23,7 @@ mod watch;
 pub use inject::{InjectArgs, run as inject};
 pub use schedule::{Fault, fault};
 
+use crate::{NS_PER_MS, NS_PER_S};
 use anyhow::{Context, ensure};
 use carff_base::files::check_writable;
 use carff_config::SoakConfig;
@@ -40,8 +41,6 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, ExitCode, Stdio};
 use watch::{Notes, Watcher};
 
-const NS_PER_MS: u64 = 1_000_000;
-const NS_PER_S: u64 = 1_000_000_000;
 /// Size of the soak's private shared memory, so that filling it harms no other process.
 const MEMORY_SIZE: &str = "size=256m";
 /// Size of the disk that fills under a recorder.

@@ -2,12 +2,11 @@
 
 use super::SoakArgs;
 use super::watch::Notes;
+use crate::NS_PER_S;
 use carff_base::statistics::percentile;
 use carff_config::Contract;
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
-
-const NS_PER_S: f64 = 1e9;
 
 /// All counts of a soak.
 #[derive(Clone, Debug, Default)]
@@ -53,7 +52,7 @@ impl Lives {
             let first_ns = points.first()?.0;
             let points: Vec<(f64, f64)> = points
                 .iter()
-                .map(|&(at_ns, bytes)| ((at_ns - first_ns) as f64 / NS_PER_S, bytes as f64))
+                .map(|&(at_ns, bytes)| ((at_ns - first_ns) as f64 / NS_PER_S as f64, bytes as f64))
                 .filter(|(at_s, _)| *at_s >= warm_up_s as f64)
                 .collect();
             let (first, last) = (points.first()?, points.last()?);

@@ -1,7 +1,7 @@
 //! The schedule of faults: a pure function of the soak file and the seed.
 
 use carff_base::random::{Key, stream};
-use carff_config::{Kind, SoakConfig};
+use carff_config::{FaultKind, SoakConfig};
 use carff_messages::Stage;
 use rand::Rng;
 use std::fmt;
@@ -19,7 +19,7 @@ pub struct Fault {
     /// Pause before the fault, milliseconds.
     pub pause_ms: u64,
     /// Kind of fault.
-    pub kind: Kind,
+    pub kind: FaultKind,
     /// The affected stage, for faults on a stage; `None` is the launcher.
     pub target: Option<Stage>,
     /// Duration, for faults that last, milliseconds.
@@ -48,19 +48,19 @@ impl fmt::Display for Fault {
 /// Returns the fault of a number.
 pub fn fault(config: &SoakConfig, seed: u64, number: u64) -> Fault {
     let mut random = stream(Key { seed, frame: number, step: STREAM, sample: 0 });
-    let sum: u32 = Kind::ALL.iter().map(|&kind| config.faults.of(kind)).sum();
+    let sum: u32 = FaultKind::ALL.iter().map(|&kind| config.faults.of(kind)).sum();
     let mut at = random.random_range(0..sum);
-    let drawn = Kind::ALL.iter().copied().find(|&kind| {
+    let drawn = FaultKind::ALL.iter().copied().find(|&kind| {
         let weight = config.faults.of(kind);
         let here = at < weight;
         at = at.saturating_sub(weight);
         here
     });
     // The sum of the weights is above 0, so one of them was chosen.
-    let kind = drawn.unwrap_or(Kind::Kill);
+    let kind = drawn.unwrap_or(FaultKind::Kill);
     let pause_ms = random.random_range(config.pace.min_pause_ms..=config.pace.max_pause_ms);
     // The launcher can be stopped as well.
-    let targets = Stage::ALL.len() + usize::from(kind == Kind::Stop);
+    let targets = Stage::ALL.len() + usize::from(kind == FaultKind::Stop);
     let target = Stage::ALL.get(random.random_range(0..targets)).copied();
     let hold_ms = random.random_range(MIN_HOLD_MS..=config.pace.max_hold_ms);
     Fault { number, pause_ms, kind, target, hold_ms, count: random.random_range(1..=8), seed: random.random() }
@@ -93,13 +93,13 @@ mod tests {
     fn weights_and_limits_hold() {
         let config = config("kill = 30\nstop = 10\n");
         let faults = first(&config, 1, 4000);
-        let kills = faults.iter().filter(|f| f.kind == Kind::Kill).count();
-        assert!(faults.iter().all(|f| matches!(f.kind, Kind::Kill | Kind::Stop)));
+        let kills = faults.iter().filter(|f| f.kind == FaultKind::Kill).count();
+        assert!(faults.iter().all(|f| matches!(f.kind, FaultKind::Kill | FaultKind::Stop)));
         assert!((2850..3150).contains(&kills), "{kills}");
         for f in &faults {
             assert!((config.pace.min_pause_ms..=config.pace.max_pause_ms).contains(&f.pause_ms));
             assert!((MIN_HOLD_MS..=config.pace.max_hold_ms).contains(&f.hold_ms));
-            assert!(f.target.is_some() || f.kind == Kind::Stop);
+            assert!(f.target.is_some() || f.kind == FaultKind::Stop);
         }
         for stage in Stage::ALL {
             assert!(faults.iter().any(|f| f.target == Some(stage)));

@@ -2,7 +2,7 @@
 
 use anyhow::ensure;
 use carff_messages::FrameMeta;
-use carff_transport::{Image, Receiver, Waiter, Woken, monotonic_now_ns};
+use carff_transport::{ImagePayload, Receiver, Waiter, Woken, monotonic_now_ns};
 use std::time::Duration;
 
 /// Longest sleep between two checks, nanoseconds.
@@ -14,7 +14,7 @@ pub(super) const LINGER: Duration = Duration::from_millis(300);
 
 /// Returns the next frames of the camera, in order: about three.
 pub(super) fn seen(
-    input: &mut Receiver<Image<FrameMeta>>,
+    input: &mut Receiver<ImagePayload<FrameMeta>>,
     waiter: &Waiter,
 ) -> anyhow::Result<Vec<(FrameMeta, Vec<u8>)>> {
     let mut seen = Vec::new();

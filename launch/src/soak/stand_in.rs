@@ -4,7 +4,7 @@ use super::graph::Victim;
 use super::seen::{LINGER, seen};
 use anyhow::Context;
 use carff_base::random::Key;
-use carff_config::Kind;
+use carff_config::FaultKind;
 use carff_dataset::{Corruption, Image};
 use carff_messages::{Header, ImageCondition, Stage};
 use carff_transport::{Node, Stop, Waiter, Woken, monotonic_now_ns, topics};
@@ -23,23 +23,23 @@ const JUMP_NS: [u64; 2] = [3_000_000_000, 60_000_000_000];
 const PERIOD_NS: [u64; 2] = [1_000_000, 1_000_000_000];
 
 /// Returns the condition of the images of a fault; `None` if the fault does not stand in for the camera.
-pub(super) fn condition(kind: Kind) -> Option<ImageCondition> {
+pub(super) fn condition(kind: FaultKind) -> Option<ImageCondition> {
     Some(match kind {
-        Kind::Black => ImageCondition::Black,
-        Kind::White => ImageCondition::White,
-        Kind::Frozen => ImageCondition::Frozen,
-        Kind::Covered => ImageCondition::Covered,
-        Kind::Unfocused => ImageCondition::Unfocused,
-        Kind::Underexposed => ImageCondition::Underexposed,
-        Kind::Overexposed => ImageCondition::Overexposed,
-        Kind::ClockStall | Kind::ClockJump => ImageCondition::Clock,
+        FaultKind::Black => ImageCondition::Black,
+        FaultKind::White => ImageCondition::White,
+        FaultKind::Frozen => ImageCondition::Frozen,
+        FaultKind::Covered => ImageCondition::Covered,
+        FaultKind::Unfocused => ImageCondition::Unfocused,
+        FaultKind::Underexposed => ImageCondition::Underexposed,
+        FaultKind::Overexposed => ImageCondition::Overexposed,
+        FaultKind::ClockStall | FaultKind::ClockJump => ImageCondition::Clock,
         _ => return None,
     })
 }
 
 /// Stops the camera, prints the number of the first bad frame, waits for a line, and publishes bad frames at the
 /// camera's rate until SIGTERM. The camera then continues.
-pub(super) fn run(node: &Node, kind: Kind, seed: u64) -> anyhow::Result<()> {
+pub(super) fn run(node: &Node, kind: FaultKind, seed: u64) -> anyhow::Result<()> {
     let waiter = Waiter::new(Stop::on_signals()?);
     let mut frames = node.receiver(&topics::FRAME)?;
     let mut healths = node.receiver(topics::health(Stage::Camera))?;
@@ -108,22 +108,22 @@ fn period_ns(headers: &[Header]) -> u64 {
 }
 
 /// Returns the image of a bad camera that looks at an image. Bad clocks and a frozen camera leave it unchanged.
-fn spoilt(kind: Kind, image: &Image) -> anyhow::Result<Image> {
+fn spoilt(kind: FaultKind, image: &Image) -> anyhow::Result<Image> {
     let mapped = |value: &dyn Fn(u8) -> f32| {
         let rgb = image.rgb.iter().map(|&v| value(v).round() as u8).collect();
         Image { rgb, ..*image }
     };
     Ok(match kind {
-        Kind::Black => mapped(&|_| 0.0),
-        Kind::White => mapped(&|_| 255.0),
-        Kind::Underexposed => mapped(&|v| DARK * f32::from(v)),
-        Kind::Overexposed => mapped(&|v| 255.0 - BRIGHT * (255.0 - f32::from(v))),
-        Kind::Covered => {
+        FaultKind::Black => mapped(&|_| 0.0),
+        FaultKind::White => mapped(&|_| 255.0),
+        FaultKind::Underexposed => mapped(&|v| DARK * f32::from(v)),
+        FaultKind::Overexposed => mapped(&|v| 255.0 - BRIGHT * (255.0 - f32::from(v))),
+        FaultKind::Covered => {
             let mut covered = image.clone();
             covered.paste(&Image::filled(image.width_px.div_ceil(2), image.height_px, [COVERED; 3]), 0, 0);
             covered
         }
-        Kind::Unfocused => {
+        FaultKind::Unfocused => {
             let severity = *Corruption::DefocusBlur.severities().end();
             let key = Key { seed: 0, frame: 0, step: 0, sample: 0 };
             let blur = |image: Image, _| Corruption::DefocusBlur.apply(&image, severity, key);
@@ -134,8 +134,8 @@ fn spoilt(kind: Kind, image: &Image) -> anyhow::Result<Image> {
 }
 
 /// Changes the brightness of every second image by one step, so that only a frozen camera repeats its images.
-fn flicker(kind: Kind, frame_id: u64, rgb: &mut [u8]) {
-    if kind != Kind::Frozen && frame_id.is_multiple_of(2) {
+fn flicker(kind: FaultKind, frame_id: u64, rgb: &mut [u8]) {
+    if kind != FaultKind::Frozen && frame_id.is_multiple_of(2) {
         for value in rgb {
             *value = value.saturating_add(1);
         }
@@ -144,13 +144,13 @@ fn flicker(kind: Kind, frame_id: u64, rgb: &mut [u8]) {
 
 /// Returns the capture time of a frame: the one before for a clock that stands still, and far from now, forward or back,
 /// for a clock that has jumped.
-fn capture_time_ns(kind: Kind, before_ns: u64, now_ns: u64, seed: u64) -> u64 {
+fn capture_time_ns(kind: FaultKind, before_ns: u64, now_ns: u64, seed: u64) -> u64 {
     let [least_ns, most_ns] = JUMP_NS;
     let jump_ns = least_ns + seed % (most_ns - least_ns);
     match kind {
-        Kind::ClockStall => before_ns,
-        Kind::ClockJump if seed & (1 << 62) == 0 => now_ns.saturating_sub(jump_ns),
-        Kind::ClockJump => now_ns + jump_ns,
+        FaultKind::ClockStall => before_ns,
+        FaultKind::ClockJump if seed & (1 << 62) == 0 => now_ns.saturating_sub(jump_ns),
+        FaultKind::ClockJump => now_ns + jump_ns,
         _ => now_ns,
     }
 }
@@ -180,7 +180,7 @@ mod tests {
     }
 
     /// Returns the conditions of a good image at 20 Hz and the bad ones after it, over half a second.
-    fn conditions(kind: Kind, seed: u64) -> Vec<ImageCondition> {
+    fn conditions(kind: FaultKind, seed: u64) -> Vec<ImageCondition> {
         let mut check = CameraCheck::new(Some(limits()), Some(300 * MS));
         let (good, bad) = (scene(), spoilt(kind, &scene()).unwrap());
         let mut captured_ns = 0;
@@ -205,14 +205,14 @@ mod tests {
     /// Each bad camera has its condition from its first image on; a frozen one after the limit.
     #[test]
     fn bad_cameras_have_their_condition() {
-        for kind in Kind::ALL.iter().copied().filter(|&kind| condition(kind).is_some()) {
+        for kind in FaultKind::ALL.iter().copied().filter(|&kind| condition(kind).is_some()) {
             let wanted = condition(kind).unwrap();
-            let good = if kind == Kind::Frozen { 6 } else { 1 };
+            let good = if kind == FaultKind::Frozen { 6 } else { 1 };
             for seed in [7, u64::MAX / 2 + 3, u64::MAX] {
                 let found = conditions(kind, seed);
                 assert!(found[..good].iter().all(|&c| c == ImageCondition::Usable), "{}: {found:?}", kind.name());
                 assert!(found[good + 1..].iter().all(|&c| c == wanted), "{}: {found:?}", kind.name());
-                assert!(kind == Kind::Frozen || found[good] == wanted, "{}: {found:?}", kind.name());
+                assert!(kind == FaultKind::Frozen || found[good] == wanted, "{}: {found:?}", kind.name());
             }
         }
     }

@@ -2,6 +2,7 @@
 
 use super::answer::Answer;
 use super::judge::{Judge, Terms};
+use crate::NS_PER_MS;
 use anyhow::Context;
 use carff_messages::{Action, Belief, EgoMotion, Health, HealthState, ImageCheck, Reason, Stage};
 use carff_transport::{Input, Node, Receiver, Waiter, monotonic_now_ns, topics};
@@ -13,7 +14,6 @@ const EVIDENCE: usize = 400;
 const LOOK_NS: u64 = 20_000_000;
 /// A longer pause of the soak itself counts for no stage.
 const STALL_NS: u64 = 100_000_000;
-const NS_PER_MS: f64 = 1e6;
 
 /// Subscriptions to a running graph.
 pub(super) struct Watcher {
@@ -121,7 +121,7 @@ impl Watcher {
             if action.is_decision() && action.reason() == Ok(Reason::Belief) {
                 self.decided_ns = action.header.publish_time_ns;
                 if notes.calm {
-                    notes.latency_ms.push((self.decided_ns - action.header.capture_time_ns) as f64 / NS_PER_MS);
+                    notes.latency_ms.push((self.decided_ns - action.header.capture_time_ns) as f64 / NS_PER_MS as f64);
                 }
             }
             if let Err(violation) = notes.judge.acted(&action) {

@@ -2,6 +2,7 @@
 //! a clock), and who publishes them ([`ForeignCamera`]).
 
 use super::monitor::Records;
+use crate::NS_PER_S;
 use carff_config::GraphConfig;
 use carff_messages::{Header, Health, HealthState, Stage};
 use carff_transport::{Node, Publisher, Run, monotonic_now_ns, topics};
@@ -14,7 +15,6 @@ const BEAT_NS: u64 = 100_000_000;
 const RECENT: usize = 32;
 /// Share of the expected rate below which the camera is slow.
 const SLOW_SHARE: f64 = 0.8;
-const NS_PER_S: f64 = 1e9;
 
 /// Frames of a camera that the launcher has not started.
 #[derive(Clone, Debug)]
@@ -35,7 +35,7 @@ impl ExternalCamera {
     }
 
     /// Takes the number of valid frames so far.
-    pub fn saw(&mut self, frames: u64, now_ns: u64) {
+    fn saw(&mut self, frames: u64, now_ns: u64) {
         let new = frames.saturating_sub(std::mem::replace(&mut self.seen, frames));
         let quiet = |last_ns: &u64| now_ns.saturating_sub(*last_ns) > self.quiet_ns;
         if new > 0 && self.recent_ns.back().is_some_and(quiet) {
@@ -63,7 +63,7 @@ impl ExternalCamera {
     /// Returns the rate of the newest frames; `None` before there are enough of them.
     pub fn rate_hz(&self) -> Option<f64> {
         let (first, last) = (self.recent_ns.front()?, self.recent_ns.back()?);
-        let span_s = (last - first) as f64 / NS_PER_S;
+        let span_s = (last - first) as f64 / NS_PER_S as f64;
         (self.recent_ns.len() >= 4 && span_s > 0.0).then(|| (self.recent_ns.len() - 1) as f64 / span_s)
     }
 

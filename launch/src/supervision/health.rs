@@ -9,6 +9,7 @@
 //!                                                 \-> lost                        beyond them
 //! ```
 
+use crate::NS_PER_MS;
 use carff_messages::{Health, HealthState};
 use std::fmt;
 
@@ -50,7 +51,6 @@ pub enum Ailment {
 
 impl fmt::Display for Ailment {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        const NS_PER_MS: u64 = 1_000_000;
         match self {
             Self::NotReady { limit_ns } => write!(f, "was not ready within {} ms", limit_ns / NS_PER_MS),
             Self::Silent { for_ns } => write!(f, "hangs: no heartbeat for {} ms", for_ns / NS_PER_MS),

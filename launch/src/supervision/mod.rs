@@ -16,6 +16,7 @@ mod process;
 pub mod restart;
 mod service_manager;
 
+use crate::NS_PER_MS;
 use anyhow::{Context, anyhow, bail, ensure};
 use carff::spans::KeptSpans;
 use carff::terminal::Terminal;
@@ -37,9 +38,6 @@ use std::sync::Arc;
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-/// Start order of the stages: subscribers before publishers, the camera last.
-const START_ORDER: [Stage; 6] =
-    [Stage::Controller, Stage::Renderer, Stage::Prober, Stage::Forecaster, Stage::Encoder, Stage::Camera];
 /// Polling interval of messages and children: short enough that the smallest buffer (8 images) holds 400 images a
 /// second.
 const WATCH_NS: u64 = 20_000_000;
@@ -161,7 +159,7 @@ impl<'a> Supervisor<'a> {
 
     /// Starts everything and watches it to its end.
     pub(crate) fn drive(&mut self, run: &Run, stop: &Stop, feed: Option<Feed>) -> anyhow::Result<Ended> {
-        let (camera, listeners) = START_ORDER.split_last().context("there are stages")?;
+        let (camera, listeners) = Stage::START_ORDER.split_last().context("there are stages")?;
         let wanted = |stage: &Stage| feed.as_ref().is_none_or(|feed| !feed.without.contains(stage));
         let listeners: Vec<Stage> = listeners.iter().copied().filter(wanted).collect();
         for &stage in &listeners {
@@ -254,7 +252,6 @@ impl<'a> Supervisor<'a> {
     }
 
     fn limits(&self, stage: Stage) -> HealthLimits {
-        const NS_PER_MS: u64 = 1_000_000;
         let (graph, launcher) = (self.graph, &self.graph.launcher);
         let hang_ns = launcher.hang_timeout_ms * NS_PER_MS;
         let frame_ns = 1e9 / graph.run.frame_rate_hz;

@@ -3,13 +3,13 @@
 use carff::conditions::Conditions;
 use carff::spans::KeptSpans;
 use carff_config::GraphConfig;
-use carff_decision::ImageEvidence;
+use carff_decision::{Evidence, ImageEvidence};
 use carff_messages::forms::AnyMessage;
 use carff_messages::{
     Action, ActionCode, Belief, DatasetView, Forecast, FrameMeta, Gaussian, Header, Health, HealthState, ImageCheck,
     Observability, Posterior, Reason, Stage, UnknownBox, Unknowns, ViewMeta,
 };
-use carff_transport::{Image, Node, OpenError, ReceiveError, Receiver, topics};
+use carff_transport::{ImagePayload, Node, OpenError, ReceiveError, Receiver, topics};
 use std::collections::{BTreeMap, VecDeque};
 
 /// Record of a camera frame. Values from the dataset are -1 or `Unknown` without a dataset.
@@ -39,6 +39,10 @@ pub struct FrameHistory {
     pub posterior: Option<Gaussian>,
     /// Evidence of the image, if it was compared with the known states.
     pub image: Option<ImageEvidence>,
+    /// Evidence of the belief's steps that have arrived.
+    pub(crate) evidence: Evidence,
+    /// Number of these steps, and the number of the last one; 0 until it has arrived.
+    pub(crate) steps: [u32; 2],
     /// Decision based on the frame.
     pub action: Option<ActionCode>,
     /// Reason of the decision; also set if a belief about the frame was refused.
@@ -69,12 +73,28 @@ impl FrameHistory {
             take_start: 0,
             posterior: None,
             image: None,
+            evidence: Evidence::NONE,
+            steps: [0; 2],
             action: None,
             reason: None,
             hazard_probability: 0.0,
             unknown_probability: 0.0,
             confidence: 0.0,
             latency_ns: 0,
+        }
+    }
+
+    /// Returns the evidence of the whole belief; `None` if a step of it did not arrive.
+    pub fn evidence(&self) -> Option<Evidence> {
+        let [arrived, last] = self.steps;
+        (last > 0 && arrived == last).then_some(self.evidence)
+    }
+
+    fn take_belief(&mut self, belief: &Belief) {
+        self.evidence.add_belief(belief);
+        self.steps[0] += 1;
+        if belief.is_final() {
+            self.steps[1] = belief.header.step;
         }
     }
 }
@@ -261,6 +281,9 @@ impl Records {
         Self::note_time(&mut self.prober_ns, belief.stage_latency_ns, self.wanted.keep);
         self.give_up("samples", belief.sample_count < self.wanted.samples);
         self.give_up("horizon", belief.header.step == 1 && belief.horizon < self.wanted.horizon);
+        if let Some(frame) = self.frames.get_mut(&belief.header.frame_id) {
+            frame.take_belief(belief);
+        }
     }
 
     fn take_view(&mut self, view: &ViewMeta) {
@@ -303,14 +326,14 @@ impl Records {
 /// Subscriptions to all topics of a run.
 #[derive(Debug)]
 pub struct Monitor {
-    frames: Receiver<Image<FrameMeta>>,
+    frames: Receiver<ImagePayload<FrameMeta>>,
     posteriors: Receiver<Posterior>,
     checks: Receiver<ImageCheck>,
     unknowns: Receiver<Unknowns>,
     forecasts: Receiver<Forecast>,
     beliefs: Receiver<Belief>,
     actions: Receiver<Action>,
-    views: Receiver<Image<ViewMeta>>,
+    views: Receiver<ImagePayload<ViewMeta>>,
     healths: Vec<Receiver<Health>>,
     spans: KeptSpans,
     /// Records of the run.

@@ -10,9 +10,6 @@ use carff_dataset::{Image, RawImage, Rectifier, image_files};
 use carff_messages::{DatasetView, FrameMeta};
 use std::path::Path;
 
-/// Assumed horizontal field of view, because plain images do not contain it, degrees.
-const FIELD_OF_VIEW_DEG: f64 = 60.0;
-
 /// The images of a folder, in memory.
 #[derive(Debug)]
 pub struct FolderSource {
@@ -100,7 +97,8 @@ impl Source for FolderSource {
         self.shown += 1;
         let (view, image) = &self.images[self.current];
         let [eye, ahead, up] = [[0.0; 3], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
-        let assumed = PinholeCamera::look_at(eye, ahead, up, image.width_px, image.height_px, FIELD_OF_VIEW_DEG);
+        let fov_deg = PinholeCamera::ASSUMED_FOV_DEG;
+        let assumed = PinholeCamera::look_at(eye, ahead, up, image.width_px, image.height_px, fov_deg);
         let camera = self.camera.unwrap_or(assumed);
         // Images of a folder need not follow each other: each is a take of its own.
         let take_start = (self.shown - 1) as u64;

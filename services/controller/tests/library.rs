@@ -6,8 +6,8 @@ use carff_base::geometry::OrientedBox;
 use carff_base::random::{Key, uniform};
 use carff_controller::{Controller, Settings};
 use carff_decision::{
-    Approach, Draw, Evidence, Mixture, Place, Policy, ProbeLayout, Probed, Reading, Resolved, Sampling, Speeds, Step,
-    set_mixture_and_draws,
+    Approach, Draw, Evidence, Feedback, Mixture, Place, Policy, ProbeLayout, Probed, Reading, Resolved, Sampling,
+    Speeds, Step, set_mixture_and_draws,
 };
 use carff_messages::{
     Action, ActionCode, Forecast, ForecastSource, Gaussian, Header, MAX_HORIZON, Message, Reason, Rule,
@@ -77,7 +77,7 @@ fn steps(next: &mut impl FnMut() -> f32) -> Vec<Step> {
 }
 
 /// Sends the steps of one frame through messages and a controller, and returns its action.
-fn act(policy: Policy, layout: &ProbeLayout, steps: &[Step]) -> Action {
+fn act(policy: Policy, layout: &ProbeLayout, steps: &[Step], feedback: Feedback) -> Action {
     let mut controller = Controller::new(Settings {
         policy,
         deadline_ns: 150 * MS,
@@ -93,7 +93,7 @@ fn act(policy: Policy, layout: &ProbeLayout, steps: &[Step]) -> Action {
         forecast.path_probability = step.path_probability;
         set_mixture_and_draws(&mut forecast, &step.mixture, &step.draws);
         forecast.validate().unwrap();
-        let belief = step.to_belief(&forecast, layout, Some(&Gaussian::standard()));
+        let belief = step.to_belief(&forecast, layout, Some(&Gaussian::standard()), feedback);
         belief.validate().unwrap();
         action = controller.on_belief(&belief, 110 * MS);
     }
@@ -112,7 +112,8 @@ fn controller_and_library_agree() {
         for (policy, halts) in Policy::all(0.3).into_iter().zip(&mut halts) {
             let policy = Policy { ignores_unknown, ..policy };
             let decision = policy.decide(&evidence);
-            let action = act(policy, &layout, &steps);
+            let feedback = if trial % 3 == 0 { Feedback::Latent } else { Feedback::State };
+            let action = act(policy, &layout, &steps, feedback);
             let code = if decision.halt { ActionCode::Halt } else { ActionCode::Advance };
             assert_eq!((action.code(), action.reason()), (Ok(code), Ok(Reason::Belief)), "{policy:?} {steps:?}");
             assert_eq!(action.confidence, decision.confidence as f32);
@@ -137,7 +138,7 @@ fn steps_round_trip_through_messages() {
         let header = Header::of_frame(1, 100 * MS, 1).at_step(1);
         let mut forecast = Forecast::empty(header, ForecastSource::Observed, steps.len() as u32);
         set_mixture_and_draws(&mut forecast, &step.mixture, &step.draws);
-        let belief = step.to_belief(&forecast, &layout, Some(&Gaussian::standard()));
+        let belief = step.to_belief(&forecast, &layout, Some(&Gaussian::standard()), Feedback::Latent);
         assert_eq!(&Step::of_messages(&forecast, &belief), step);
     }
 }

@@ -2,7 +2,9 @@
 
 use carff_checkpoint::{CheckpointPlanning, Manifest};
 use carff_config::GraphConfig;
-use carff_decision::{Memory, Mixture, Sampling, TakeMemory, path_probability, set_mixture_and_draws};
+use carff_decision::{
+    Draw, Memory, Mixture, Sampling, TakeMemory, continue_samples, path_probability, set_mixture_and_draws,
+};
 use carff_inference::MixtureNet;
 use carff_messages::{Belief, Forecast, ForecastSource, Gaussian, Header, Posterior};
 use std::path::Path;
@@ -72,19 +74,32 @@ impl Forecaster {
         forecast
     }
 
-    /// Returns the forecast from a belief's resolved state: the next step. `None` if the belief was the frame's last.
+    /// Returns the forecast from what a belief feeds back, its samples or its resolved state: the next step. `None` if the
+    /// belief was the frame's last.
     pub fn from_feedback(&self, belief: &Belief) -> Option<Forecast> {
         if belief.is_final() || belief.header.step >= belief.horizon {
             return None;
         }
-        let state = usize::try_from(belief.resolved_state).ok()?;
         let header: Header = belief.header.at_step(belief.header.step + 1);
         let mut forecast = Forecast::empty(header, ForecastSource::Probed, belief.horizon);
         forecast.encoder_ns = belief.encoder_ns;
-        forecast.resolved_state = belief.resolved_state;
-        forecast.path_probability = path_probability(belief.path_probability, belief.state_probability[state]);
-        self.fill(&mut forecast, &self.net.forecast(&belief.resolved));
+        if belief.fed_back().is_empty() {
+            let state = usize::try_from(belief.resolved_state).ok()?;
+            forecast.resolved_state = belief.resolved_state;
+            forecast.path_probability = path_probability(belief.path_probability, belief.state_probability[state]);
+            self.fill(&mut forecast, &self.net.forecast(&belief.resolved));
+        } else {
+            forecast.path_probability = belief.path_probability;
+            let (mixture, draws) = self.from_samples(belief.fed_back(), header);
+            set_mixture_and_draws(&mut forecast, &mixture, &draws);
+        }
         Some(forecast)
+    }
+
+    fn from_samples(&self, inputs: &[Gaussian], header: Header) -> (Mixture, Vec<Draw>) {
+        let forecasts: Vec<Mixture> = inputs.iter().map(|input| self.net.forecast(input)).collect();
+        let Header { seed, frame_id, step, .. } = header;
+        continue_samples(&forecasts, self.samples, self.sampling, seed, frame_id, step)
     }
 
     fn fill(&self, forecast: &mut Forecast, mixture: &Mixture) {

@@ -8,13 +8,13 @@ use std::collections::btree_map::Entry;
 
 /// Publishes the messages that arrive.
 #[derive(Debug)]
-pub struct Outputs<'a> {
+pub struct TopicOutputs<'a> {
     // Dropped before the node, which the caller owns.
     publishers: BTreeMap<TopicId, Box<dyn AnyPublisher>>,
     node: &'a Node,
 }
 
-impl<'a> Outputs<'a> {
+impl<'a> TopicOutputs<'a> {
     /// Publishes in the run of a node.
     pub fn new(node: &'a Node) -> Self {
         Self { publishers: BTreeMap::new(), node }
@@ -55,9 +55,9 @@ mod tests {
             let mut posteriors = node.receiver(&topics::POSTERIOR).unwrap();
             let mut views = node.receiver(&topics::VIEW).unwrap();
             let mut hearts = node.receiver(topics::health(Stage::Prober)).unwrap();
-            let mut outputs = Outputs::new(&node);
+            let mut outputs = TopicOutputs::new(&node);
 
-            let posterior = Posterior { header, gaussian: Gaussian::standard(), stage_latency_ns: 5 };
+            let posterior = Posterior { header, gaussian: Gaussian::standard(), take_start: 0, stage_latency_ns: 5 };
             outputs.publish(TopicId::POSTERIOR, AnyMessage::new(&posterior, &[])).unwrap();
             assert_eq!(posteriors.next().unwrap().as_deref(), Some(&posterior));
 

@@ -2,7 +2,7 @@
 
 use crate::address::AddressArgs;
 use crate::clock::ClockDifference;
-use crate::outputs::Outputs;
+use crate::outputs::TopicOutputs;
 use crate::wire::{Tag, decode, settle};
 use crate::{note, topics};
 use anyhow::{Context, anyhow};
@@ -87,7 +87,7 @@ fn receive(args: &ReceiveArgs, node: &Node, stop: &Stop) -> anyhow::Result<()> {
     let mut end = End {
         run: &args.run,
         node,
-        outputs: Outputs::new(node),
+        outputs: TopicOutputs::new(node),
         clock: ClockDifference::default(),
         told_sender: None,
         tally: Tally::default(),
@@ -112,7 +112,7 @@ struct End<'a> {
     /// The run's name on the sending machine.
     run: &'a str,
     node: &'a Node,
-    outputs: Outputs<'a>,
+    outputs: TopicOutputs<'a>,
     clock: ClockDifference,
     told_sender: Option<u64>,
     tally: Tally,

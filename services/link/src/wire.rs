@@ -150,7 +150,8 @@ mod tests {
     /// Messages of all kinds come out unchanged, bit for bit, with their tag.
     #[test]
     fn every_message_survives() {
-        let posterior = Posterior { header: header(), gaussian: Gaussian::standard(), stage_latency_ns: 5 };
+        let posterior =
+            Posterior { header: header(), gaussian: Gaussian::standard(), take_start: 0, stage_latency_ns: 5 };
         let mut forecast = Forecast::empty(header().at_step(1), ForecastSource::ALL[0], 2);
         (forecast.component_count, forecast.sample_count, forecast.weights[0]) = (1, 1, 1.0);
         forecast.samples[0] = view().latent;
@@ -160,7 +161,7 @@ mod tests {
             height_px: 3,
             intrinsics: view().intrinsics,
             world_from_camera: view().world_from_camera,
-            dataset_view: carff_messages::DatasetView::UNKNOWN,
+            ..FrameMeta::default()
         };
         survives(TopicId::FRAME, frame, &[7; 18]);
         survives(TopicId::POSTERIOR, posterior, &[]);

@@ -8,7 +8,7 @@ use carff_config::CompareImages;
 use carff_decision::ImageEvidence;
 use carff_messages::{Belief, FrameMeta, Header, UnknownBox, Unknowns};
 use carff_runtime::StageContext;
-use carff_transport::{Image, Input, Publisher, Receiver, Sample, monotonic_now_ns, topics};
+use carff_transport::{ImagePayload, Input, Publisher, Receiver, Sample, monotonic_now_ns, topics};
 use carff_unknown::{Lanes, Sighting};
 use std::collections::VecDeque;
 
@@ -25,12 +25,12 @@ const REMEMBERED: usize = 16;
 #[derive(Debug)]
 pub struct Frames {
     images: Images,
-    input: Receiver<Image<FrameMeta>>,
+    input: Receiver<ImagePayload<FrameMeta>>,
     output: Publisher<Unknowns>,
     /// True if a belief rests on the comparison of the frame before.
     is_late: bool,
     /// The frame that is compared after its last belief.
-    pending: Option<Sample<Image<FrameMeta>>>,
+    pending: Option<Sample<ImagePayload<FrameMeta>>>,
     /// The last frames, the newest last.
     taken: VecDeque<Taken>,
     /// Boxes of something unknown in the last comparison.
@@ -99,13 +99,18 @@ impl Frames {
 
     /// Compares the frame that waits for its belief, after its last one.
     pub fn after(&mut self, probe: &FieldProbe, belief: &Belief, threads: usize) -> anyhow::Result<()> {
-        let is_last = |frame: &mut Sample<Image<FrameMeta>>| {
+        let is_last = |frame: &mut Sample<ImagePayload<FrameMeta>>| {
             belief.is_final() && frame.header.capture_time_ns == belief.header.capture_time_ns
         };
         self.pending.take_if(is_last).map_or(Ok(()), |frame| self.compare(probe, &frame, threads))
     }
 
-    fn compare(&mut self, probe: &FieldProbe, frame: &Sample<Image<FrameMeta>>, threads: usize) -> anyhow::Result<()> {
+    fn compare(
+        &mut self,
+        probe: &FieldProbe,
+        frame: &Sample<ImagePayload<FrameMeta>>,
+        threads: usize,
+    ) -> anyhow::Result<()> {
         let started_ns = monotonic_now_ns();
         self.boxes.clear();
         if let Some(mut unknowns) = self.images.compare(probe, frame, frame.image(), threads) {

@@ -11,7 +11,7 @@ pub use images::Images;
 pub use outlook::Outlook;
 
 use carff_checkpoint::{CheckpointPlanning, FieldProbe, Manifest, load_field_probe};
-use carff_decision::{ImageEvidence, mixture_and_draws};
+use carff_decision::{Feedback, ImageEvidence, mixture_and_draws};
 use carff_messages::{Belief, Forecast};
 use std::path::Path;
 
@@ -28,9 +28,14 @@ pub fn load(checkpoint: &Path) -> anyhow::Result<(FieldProbe, Grid)> {
 }
 
 /// Probes the mixture and the samples of a valid forecast. `image` is the evidence of the frame's image, if it was
-/// compared.
-pub fn believe(probe: &mut FieldProbe, forecast: &Forecast, image: Option<&ImageEvidence>) -> Belief {
+/// compared; `feedback` is the input of the next step.
+pub fn believe(
+    probe: &mut FieldProbe,
+    forecast: &Forecast,
+    image: Option<&ImageEvidence>,
+    feedback: Feedback,
+) -> Belief {
     let (mixture, draws) = mixture_and_draws(forecast);
     let step = probe.step(mixture, draws, forecast.path_probability, image);
-    step.to_belief(forecast, probe.layout(), probe.state_posterior(step.resolved.state))
+    step.to_belief(forecast, probe.layout(), probe.state_posterior(step.resolved.state), feedback)
 }

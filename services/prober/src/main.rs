@@ -33,7 +33,7 @@ fn run(stage: &mut StageContext) -> anyhow::Result<()> {
         let evidence = frames.as_ref().map_or(Ok(None), |frames| frames.evidence(&forecast.header));
         match evidence {
             Ok(evidence) => {
-                let mut belief = believe(&mut probe, &forecast, evidence);
+                let mut belief = believe(&mut probe, &forecast, evidence, stage.graph.run.feedback);
                 if let (Some(outlook), Some(frames), 1) = (&mut outlook, &frames, belief.header.step) {
                     outlook.publish(&probe, frames, &belief, stage.threads)?;
                 }

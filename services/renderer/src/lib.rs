@@ -4,7 +4,7 @@ use anyhow::Context;
 use carff_base::geometry::PinholeCamera;
 use carff_checkpoint::Manifest;
 use carff_config::ViewChoice;
-use carff_field::{Field, HypothesisBuffer, InstructionSet, RenderBuffer, RenderOptions};
+use carff_field::{Field, HypothesisBuffer, InstructionSet, RenderBuffer, RenderOptions, to_byte};
 use carff_messages::{Belief, Forecast, Header, LATENT_DIM, ViewKind, ViewMeta, row_major};
 use std::path::Path;
 
@@ -17,7 +17,7 @@ pub fn load(checkpoint: &Path) -> anyhow::Result<Field> {
 
 /// A hypothesis to render.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Hypothesis {
+pub struct RenderedHypothesis {
     /// Index: a mixture component's, or the number of components plus a sample's.
     pub index: u32,
     /// Latent of the hypothesis.
@@ -30,10 +30,10 @@ pub struct Hypothesis {
 
 /// Returns at most `count` hypotheses of a forecast and its belief, the most probable first: the component means, then
 /// the samples.
-pub fn hypotheses(forecast: &Forecast, belief: &Belief, count: usize) -> Vec<Hypothesis> {
+pub fn hypotheses(forecast: &Forecast, belief: &Belief, count: usize) -> Vec<RenderedHypothesis> {
     let components = forecast.component_count as usize;
-    let mut all: Vec<Hypothesis> = (0..components)
-        .map(|i| Hypothesis {
+    let mut all: Vec<RenderedHypothesis> = (0..components)
+        .map(|i| RenderedHypothesis {
             index: i as u32,
             latent: forecast.components[i].mean,
             state: belief.components[i].state,
@@ -43,7 +43,7 @@ pub fn hypotheses(forecast: &Forecast, belief: &Belief, count: usize) -> Vec<Hyp
     all.sort_by(|a, b| b.probability.total_cmp(&a.probability));
     let samples = forecast.samples();
     let share = 1.0 / samples.len().max(1) as f32;
-    all.extend(samples.iter().zip(belief.samples()).enumerate().map(|(i, (latent, probe))| Hypothesis {
+    all.extend(samples.iter().zip(belief.samples()).enumerate().map(|(i, (latent, probe))| RenderedHypothesis {
         index: (components + i) as u32,
         latent: *latent,
         state: probe.state,
@@ -93,7 +93,7 @@ impl Pairing {
 pub fn render(
     field: &Field,
     camera: &PinholeCamera,
-    hypotheses: &[Hypothesis],
+    hypotheses: &[RenderedHypothesis],
     threads: usize,
     buffer: &mut HypothesisBuffer,
 ) {
@@ -107,13 +107,18 @@ pub fn write(image: &RenderBuffer, rgb: &mut [u8]) -> anyhow::Result<()> {
     let wanted = image.rgb.len();
     (rgb.len() == wanted).then_some(()).with_context(|| format!("{} bytes for a view of {wanted}", rgb.len()))?;
     for (to, from) in rgb.iter_mut().zip(&image.rgb) {
-        *to = (from.clamp(0.0, 1.0) * 255.0 + 0.5) as u8;
+        *to = to_byte(*from);
     }
     Ok(())
 }
 
 /// Describes a rendered view.
-pub fn meta(forecast: &Forecast, hypothesis: &Hypothesis, choice: ViewChoice, camera: &PinholeCamera) -> ViewMeta {
+pub fn meta(
+    forecast: &Forecast,
+    hypothesis: &RenderedHypothesis,
+    choice: ViewChoice,
+    camera: &PinholeCamera,
+) -> ViewMeta {
     ViewMeta {
         header: forecast.header,
         hypothesis: hypothesis.index,

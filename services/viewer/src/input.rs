@@ -1,6 +1,6 @@
 //! Input images: from a dataset, from a file, or from a running camera.
 
-use crate::models::Models;
+use crate::models::SessionModels;
 use carff_base::geometry::PinholeCamera;
 use carff_checkpoint::{CheckpointError, ScenarioIdentity};
 use carff_dataset::{Dataset, DatasetError, Image, Observability};
@@ -9,7 +9,7 @@ use std::sync::Arc;
 
 /// An image with its metadata.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Input {
+pub struct ChosenImage {
     /// Name of the image in the window.
     pub title: String,
     /// Pixels of the image.
@@ -37,7 +37,7 @@ pub struct Truth {
     pub observability: Option<Observability>,
 }
 
-impl Input {
+impl ChosenImage {
     /// Creates an input without metadata, for example from a file.
     pub fn of_image(title: impl Into<String>, image: Image) -> Arc<Self> {
         Arc::new(Self { title: title.into(), image, camera: None, truth: None, frame: 0, seed: None })
@@ -78,7 +78,7 @@ pub struct Album {
 
 impl Album {
     /// Opens a dataset of the checkpoint's scenario.
-    pub fn open(dir: &Path, models: &Models) -> Result<Self, AlbumError> {
+    pub fn open(dir: &Path, models: &SessionModels) -> Result<Self, AlbumError> {
         let dataset = Dataset::open(dir)?;
         let nothing = || AlbumError::NoScenario { path: dir.to_owned() };
         let scenario = dataset.scenario().ok_or_else(nothing)?;
@@ -133,10 +133,15 @@ impl Album {
     }
 
     /// Returns the image of a state from a view, or `None` if the dataset has none.
-    pub fn input(&self, state: usize, view: usize, models: &Models) -> Result<Option<Arc<Input>>, AlbumError> {
+    pub fn input(
+        &self,
+        state: usize,
+        view: usize,
+        models: &SessionModels,
+    ) -> Result<Option<Arc<ChosenImage>>, AlbumError> {
         let Some(index) = self.frame(state, view) else { return Ok(None) };
         let frame = &self.dataset.frames()[index];
-        Ok(Some(Arc::new(Input {
+        Ok(Some(Arc::new(ChosenImage {
             title: format!("{}, view {view}", models.state_name(Some(state))),
             image: self.dataset.load_image(index)?,
             camera: Some(frame.camera),

@@ -11,7 +11,7 @@ const MOST_TIMES: usize = 600;
 
 /// A decision with its reason.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Decision {
+pub struct ShownDecision {
     /// Basis of the decision: an image or a frame, and the number of steps.
     pub rests_on: String,
     /// The action.
@@ -28,14 +28,14 @@ pub struct Decision {
 
 /// Durations of one kind, by frame number or count.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Times {
+pub struct OperationTimes {
     /// Name of the measured operation.
     pub name: &'static str,
     /// `[number, milliseconds]`, oldest first.
     pub values: VecDeque<[f64; 2]>,
 }
 
-impl Times {
+impl OperationTimes {
     /// Returns p50, p99 and maximum, milliseconds.
     pub fn spread(&self) -> Option<Spread> {
         Spread::of(&self.values.iter().map(|v| v[1]).collect::<Vec<_>>())
@@ -45,13 +45,13 @@ impl Times {
 /// The newest decisions and durations.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Journal {
-    decisions: VecDeque<Decision>,
-    times: Vec<Times>,
+    decisions: VecDeque<ShownDecision>,
+    times: Vec<OperationTimes>,
 }
 
 impl Journal {
     /// Adds a decision.
-    pub fn decided(&mut self, decision: Decision) {
+    pub fn decided(&mut self, decision: ShownDecision) {
         if self.decisions.len() >= MOST_DECISIONS {
             self.decisions.pop_front();
         }
@@ -61,7 +61,7 @@ impl Journal {
     /// Adds a duration. `at` is the frame's number, or the count of earlier durations.
     pub fn took(&mut self, name: &'static str, at: f64, milliseconds: f64) {
         let index = self.times.iter().position(|t| t.name == name).unwrap_or_else(|| {
-            self.times.push(Times { name, values: VecDeque::new() });
+            self.times.push(OperationTimes { name, values: VecDeque::new() });
             self.times.len() - 1
         });
         let values = &mut self.times[index].values;
@@ -78,12 +78,12 @@ impl Journal {
     }
 
     /// Returns the decisions, oldest first.
-    pub fn decisions(&self) -> impl DoubleEndedIterator<Item = &Decision> + ExactSizeIterator {
+    pub fn decisions(&self) -> impl DoubleEndedIterator<Item = &ShownDecision> + ExactSizeIterator {
         self.decisions.iter()
     }
 
     /// Returns the durations by kind.
-    pub fn times(&self) -> &[Times] {
+    pub fn times(&self) -> &[OperationTimes] {
         &self.times
     }
 }
@@ -100,7 +100,7 @@ mod tests {
             journal.took_next("encoder", i as f64);
             let rests_on = i.to_string();
             let (reason, hazard_probability) = (String::new(), 0.5);
-            journal.decided(Decision {
+            journal.decided(ShownDecision {
                 rests_on,
                 action: ActionCode::Halt,
                 confidence: 0.5,

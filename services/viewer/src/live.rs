@@ -1,8 +1,8 @@
 //! Watches a running graph frame by frame. It attaches as a probe, so it never delays a stage.
 
-use crate::input::{Input, Truth};
-use crate::journal::{Decision, Journal};
-use crate::session::{Forecast, Moment};
+use crate::input::{ChosenImage, Truth};
+use crate::journal::{Journal, ShownDecision};
+use crate::session::{Moment, ShownForecast};
 use carff_dataset::Image;
 use carff_decision::Step;
 use carff_messages::{
@@ -43,7 +43,7 @@ pub enum LiveError {
 
 /// State of a watched run.
 #[derive(Clone, Debug)]
-pub struct Watched {
+pub struct WatchedRun {
     /// The run at the last join.
     pub run: LiveRun,
     /// Ok while joined, else the reason why not. The feed retries every second.
@@ -60,7 +60,7 @@ pub struct Watched {
 
 /// Watches a run on its own thread until the feed is dropped.
 pub struct LiveFeed {
-    watched: Arc<Mutex<Watched>>,
+    watched: Arc<Mutex<WatchedRun>>,
     stopped: Arc<AtomicBool>,
     thread: Option<JoinHandle<()>>,
 }
@@ -77,7 +77,7 @@ impl LiveFeed {
             .spawn(move || match Watcher::join(run.as_deref()) {
                 Err(error) => drop(answer.send(Err(error))),
                 Ok(watcher) => {
-                    let watched = Arc::new(Mutex::new(Watched::of(watcher.attached.live.clone())));
+                    let watched = Arc::new(Mutex::new(WatchedRun::of(watcher.attached.live.clone())));
                     if answer.send(Ok(watched.clone())).is_ok() {
                         watch(watcher, &watched, &theirs, &wake);
                     }
@@ -90,7 +90,7 @@ impl LiveFeed {
     }
 
     /// Returns the current state of the run.
-    pub fn watched(&self) -> MutexGuard<'_, Watched> {
+    pub fn watched(&self) -> MutexGuard<'_, WatchedRun> {
         locked(&self.watched)
     }
 
@@ -111,18 +111,18 @@ impl Drop for LiveFeed {
 }
 
 /// Locks the state. It is consistent at any time, so a poisoned lock is harmless.
-fn locked(watched: &Mutex<Watched>) -> MutexGuard<'_, Watched> {
+fn locked(watched: &Mutex<WatchedRun>) -> MutexGuard<'_, WatchedRun> {
     watched.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-impl Watched {
+impl WatchedRun {
     fn of(run: LiveRun) -> Self {
         Self { run, joined: Ok(()), frames: 0, journal: Journal::default(), health: BTreeMap::new(), newest: None }
     }
 }
 
 /// Watches until it is stopped, and rejoins when the run ends and comes back.
-fn watch(first: Watcher, watched: &Mutex<Watched>, stopped: &AtomicBool, wake: &dyn Fn()) {
+fn watch(first: Watcher, watched: &Mutex<WatchedRun>, stopped: &AtomicBool, wake: &dyn Fn()) {
     let name = first.attached.live.name.clone();
     let mut watcher = Some(first);
     let mut looked = Instant::now();
@@ -147,7 +147,7 @@ fn watch(first: Watcher, watched: &Mutex<Watched>, stopped: &AtomicBool, wake: &
                 }
                 None => match Watcher::join(Some(&name)) {
                     Ok(joined) => {
-                        *locked(watched) = Watched::of(joined.attached.live.clone());
+                        *locked(watched) = WatchedRun::of(joined.attached.live.clone());
                         watcher = Some(joined);
                         wake();
                     }
@@ -163,7 +163,7 @@ fn watch(first: Watcher, watched: &Mutex<Watched>, stopped: &AtomicBool, wake: &
 /// Subscriptions to a run's topics.
 struct Watcher {
     attached: Attached,
-    frames: Receiver<carff_transport::Image<FrameMeta>>,
+    frames: Receiver<carff_transport::ImagePayload<FrameMeta>>,
     posteriors: Receiver<Posterior>,
     forecasts: Receiver<carff_messages::Forecast>,
     unknowns: Receiver<Unknowns>,
@@ -195,7 +195,7 @@ impl Watcher {
     }
 
     /// Reads all waiting messages; returns whether the window has news.
-    fn drain(&mut self, watched: &Mutex<Watched>) -> Result<bool, ReceiveError> {
+    fn drain(&mut self, watched: &Mutex<WatchedRun>) -> Result<bool, ReceiveError> {
         let mut is_new = false;
         // Topics are read in the order of the data flow, so that each message finds its frame.
         while let Some(frame) = self.frames.next()? {
@@ -246,7 +246,7 @@ impl Watcher {
 }
 
 /// Returns an entry for the first action on a frame, and for a safe action that differs from the last one.
-fn decision(action: &Action, last_safe: &mut Option<(ActionCode, Reason)>) -> Option<Decision> {
+fn decision(action: &Action, last_safe: &mut Option<(ActionCode, Reason)>) -> Option<ShownDecision> {
     let (code, reason) = (action.code().ok()?, action.reason().ok()?);
     let decided = action.is_decision();
     if reason == Reason::Belief {
@@ -262,7 +262,7 @@ fn decision(action: &Action, last_safe: &mut Option<(ActionCode, Reason)>) -> Op
         u64::MAX => "no frame".to_owned(),
         frame => format!("frame {frame}"),
     };
-    Some(Decision {
+    Some(ShownDecision {
         rests_on,
         action: code,
         confidence: action.confidence,
@@ -279,7 +279,7 @@ struct Assembly {
 }
 
 struct Parts {
-    input: Arc<Input>,
+    input: Arc<ChosenImage>,
     unknowns: Arc<[UnknownBox]>,
     forecasts: BTreeMap<u32, carff_messages::Forecast>,
     moments: Vec<Moment>,
@@ -288,7 +288,7 @@ struct Parts {
 }
 
 impl Assembly {
-    fn frame(&mut self, frame_id: u64, input: Input) {
+    fn frame(&mut self, frame_id: u64, input: ChosenImage) {
         let parts = Parts {
             input: Arc::new(input),
             unknowns: Arc::default(),
@@ -329,7 +329,7 @@ impl Assembly {
         let before = parts.moments.last().filter(|m| m.step + 1 == belief.header.step)?;
         let moment = moment(before, parts.fed_back, forecast, belief);
         parts.moments.push(moment);
-        let state = usize::try_from(belief.resolved_state).ok();
+        let state = usize::try_from(belief.resolved_state).ok().filter(|_| belief.fed_back().is_empty());
         parts.fed_back = state.map(|state| (belief.resolved, state));
         if !belief.is_final() {
             return None;
@@ -345,7 +345,7 @@ impl Assembly {
 }
 
 /// Returns the input image of a frame.
-fn input(meta: &FrameMeta, bytes: &[u8]) -> Input {
+fn input(meta: &FrameMeta, bytes: &[u8]) -> ChosenImage {
     let view = &meta.dataset_view;
     let observability = Observability::of_code(view.observability).ok().flatten();
     let index = |value: i32| usize::try_from(value).ok();
@@ -353,7 +353,7 @@ fn input(meta: &FrameMeta, bytes: &[u8]) -> Input {
         (Some(branch), Some(timestamp), Some(view)) => Some(Truth { branch, timestamp, view, observability }),
         _ => None,
     };
-    Input {
+    ChosenImage {
         title: format!("frame {}", meta.header.frame_id),
         image: Image { width_px: meta.width_px, height_px: meta.height_px, rgb: bytes.to_vec() },
         camera: Some(meta.camera()),
@@ -379,7 +379,10 @@ fn moment(
     let path = before.steps().cloned().collect();
     let path_probability = forecast.path_probability;
     let before = Moment { source, source_state, path_probability, path, ..before.clone() };
-    Moment { belief: Some(step), ..Moment::of_forecast(&before, forecast.header.step, Forecast { mixture, draws }) }
+    Moment {
+        belief: Some(step),
+        ..Moment::of_forecast(&before, forecast.header.step, ShownForecast { mixture, draws })
+    }
 }
 
 #[cfg(test)]

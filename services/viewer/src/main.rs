@@ -2,10 +2,10 @@
 
 use anyhow::{Context, bail};
 use carff_observe::{First, Theme, ViewArgs};
-use carff_viewer::app::{Command, Options, Viewer, Waker, icon};
-use carff_viewer::input::{Album, Input};
+use carff_viewer::app::{Options, Viewer, Waker, WindowCommand, icon};
+use carff_viewer::input::{Album, ChosenImage};
 use carff_viewer::live::LiveFeed;
-use carff_viewer::models::Models;
+use carff_viewer::models::SessionModels;
 use carff_viewer::session::Session;
 use clap::Parser;
 use eframe::egui::{ThemePreference, ViewportBuilder};
@@ -69,9 +69,9 @@ fn run(args: ViewArgs) -> anyhow::Result<()> {
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
     let threads = args.threads.unwrap_or(if live.is_some() { 1 } else { cores }).max(1);
     let checkpoint = args.checkpoint.or_else(|| watched.as_ref().map(|run| run.checkpoint.clone()));
-    let models = Models::load(&checkpoint.unwrap_or_else(|| SHIPPED.into()), MODEL_THREADS)?;
+    let models = SessionModels::load(&checkpoint.unwrap_or_else(|| SHIPPED.into()), MODEL_THREADS)?;
     let album = album(args.dataset.as_deref(), watched.map(|run| run.dataset), &models)?;
-    let image = args.image.as_deref().map(Input::load_png).transpose()?;
+    let image = args.image.as_deref().map(ChosenImage::load_png).transpose()?;
     let after = Duration::try_from_secs_f32(args.after).context("--after: must be a number of seconds, 0 or more")?;
     let options = Options {
         threads,
@@ -91,14 +91,14 @@ fn run(args: ViewArgs) -> anyhow::Result<()> {
     } else if !is_live {
         viewer.begin();
     }
-    let first: Vec<Command> = args
+    let first: Vec<WindowCommand> = args
         .first
         .into_iter()
         .map(|first| match first {
-            First::Toggle => Command::Toggle,
-            First::Predict => Command::Predict,
-            First::Probe => Command::Probe,
-            First::ProbeAndPredict => Command::ProbeAndPredict,
+            First::Toggle => WindowCommand::Toggle,
+            First::Predict => WindowCommand::Predict,
+            First::Probe => WindowCommand::Probe,
+            First::ProbeAndPredict => WindowCommand::ProbeAndPredict,
         })
         .collect();
     let title = format!("CARFF viewer: {}", viewer.session.models().manifest.scenario.name);
@@ -125,7 +125,11 @@ fn run(args: ViewArgs) -> anyhow::Result<()> {
 }
 
 /// Returns the dataset to choose images from, or the reason why there is none. A dataset that the user named must open.
-fn album(asked: Option<&Path>, of_run: Option<PathBuf>, models: &Models) -> anyhow::Result<Result<Album, String>> {
+fn album(
+    asked: Option<&Path>,
+    of_run: Option<PathBuf>,
+    models: &SessionModels,
+) -> anyhow::Result<Result<Album, String>> {
     if let Some(dir) = asked {
         return Ok(Ok(Album::open(dir, models)?));
     }

@@ -14,7 +14,7 @@ use carff_networks::{
 use std::path::{Path, PathBuf};
 
 /// The models of a checkpoint.
-pub struct Models {
+pub struct SessionModels {
     /// The checkpoint's folder.
     pub dir: PathBuf,
     /// Contents and training of the checkpoint.
@@ -32,7 +32,7 @@ pub struct Models {
     encoder: Encoder,
 }
 
-impl Models {
+impl SessionModels {
     /// Reads a checkpoint; `threads` is the number of threads of encoder and forecaster.
     pub fn load(dir: &Path, threads: usize) -> Result<Self, CheckpointError> {
         carff_networks::allocator::keep_large_blocks();

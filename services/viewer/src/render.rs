@@ -4,7 +4,9 @@
 use crate::slice::density_slice;
 use carff_base::geometry::PinholeCamera;
 use carff_dataset::Image;
-use carff_field::{Field, HypothesisBuffer, InstructionSet, LATENT_DIM, RenderBuffer, RenderOptions};
+use carff_field::{
+    Field, HypothesisBuffer, InstructionSet, LATENT_DIM, RenderBuffer, RenderOptions, to_byte, to_bytes,
+};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
@@ -64,7 +66,7 @@ pub enum Job {
 
 /// Resolution and urgency of a view.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Pace {
+pub enum RenderPace {
     /// The camera is moving: one coarse image at once.
     Moving,
     /// The scene changes by itself: one image, always of the same resolution.
@@ -81,7 +83,7 @@ pub struct View {
     /// Pose and final size of the image.
     pub camera: PinholeCamera,
     /// Resolution and urgency of the view.
-    pub pace: Pace,
+    pub pace: RenderPace,
     /// Remaining divisors of the sides, one image each; empty: not started.
     pub divisors: Vec<u32>,
     number: u64,
@@ -89,7 +91,7 @@ pub struct View {
 
 impl View {
     /// Returns a view that has not been started.
-    pub fn new(latent: [f32; LATENT_DIM], camera: PinholeCamera, pace: Pace) -> Self {
+    pub fn new(latent: [f32; LATENT_DIM], camera: PinholeCamera, pace: RenderPace) -> Self {
         Self { latent, camera, pace, divisors: Vec::new(), number: 0 }
     }
 }
@@ -171,7 +173,7 @@ struct Desk {
 impl Desk {
     fn put(&mut self, job: Job) {
         self.turns += 1;
-        let in_a_hurry = matches!(&job, Job::View(view) if view.pace == Pace::Moving);
+        let in_a_hurry = matches!(&job, Job::View(view) if view.pace == RenderPace::Moving);
         let turn = if in_a_hurry { 0 } else { self.turns };
         match self.waiting.iter_mut().find(|(_, other)| other.kind() == job.kind()) {
             Some((earlier, other)) => (*earlier, *other) = (turn.min(*earlier), job),
@@ -284,7 +286,7 @@ impl Drop for RenderWorker {
 /// Returns the divisors of a view's sides, image by image. The first image has at most `budget_px` pixels, or is as
 /// coarse as possible (`coarsest_px` along the longer side). Each further image is at least twice as fine; the last one
 /// has full size.
-pub fn divisors(width_px: u32, height_px: u32, coarsest_px: u32, budget_px: f64) -> Vec<u32> {
+fn divisors(width_px: u32, height_px: u32, coarsest_px: u32, budget_px: f64) -> Vec<u32> {
     let pixels = |divisor: u32| f64::from(width_px / divisor) * f64::from(height_px / divisor);
     let longest_px = width_px.max(height_px);
     let allowed = DIVISORS.into_iter().take_while(|d| *d == 1 || longest_px / d >= coarsest_px);
@@ -386,8 +388,8 @@ impl Painter {
             std::mem::take(&mut view.divisors)
         } else {
             let (may_take_ms, coarsest_px) = match view.pace {
-                Pace::Steady => (STEADY_MS, COARSEST_STEADY_PX),
-                Pace::Moving | Pace::Resting => (COARSE_MS, COARSEST_PX),
+                RenderPace::Steady => (STEADY_MS, COARSEST_STEADY_PX),
+                RenderPace::Moving | RenderPace::Resting => (COARSE_MS, COARSEST_PX),
             };
             divisors(width_px, height_px, coarsest_px, may_take_ms * 1e6 / self.pixel_ns)
         };
@@ -402,7 +404,8 @@ impl Painter {
         self.pixel_ns += NEWEST_WEIGHT * (pixel_ns - self.pixel_ns);
         let is_final = left.is_empty();
         let drawn = Drawn::View { latent: view.latent, image, camera: view.camera, is_final, took_ms };
-        let rest = (!is_final && view.pace == Pace::Resting).then_some(Job::View(View { divisors: left, ..view }));
+        let rest =
+            (!is_final && view.pace == RenderPace::Resting).then_some(Job::View(View { divisors: left, ..view }));
         (vec![drawn], rest)
     }
 
@@ -425,18 +428,14 @@ impl Painter {
                 ..*camera
             };
             self.field.render(&band, latent, &self.options, &mut self.buffer);
-            rgb.extend(bytes(&self.buffer));
+            rgb.extend(self.buffer.rgb.iter().map(|&value| to_byte(value)));
         }
         Some(Image { width_px: camera.width_px, height_px: camera.height_px, rgb })
     }
 }
 
-fn bytes(rendered: &RenderBuffer) -> impl Iterator<Item = u8> {
-    rendered.rgb.iter().map(|v| (v.clamp(0.0, 1.0) * 255.0 + 0.5) as u8)
-}
-
 fn image_of(camera: &PinholeCamera, rendered: &RenderBuffer) -> Image {
-    Image { width_px: camera.width_px, height_px: camera.height_px, rgb: bytes(rendered).collect() }
+    Image { width_px: camera.width_px, height_px: camera.height_px, rgb: to_bytes(&rendered.rgb) }
 }
 
 #[cfg(test)]
@@ -496,7 +495,7 @@ mod tests {
     fn a_view_ends_as_the_whole_image() {
         let (worker, until_idle) = worker();
         let camera = camera(70, 45);
-        worker.ask(Job::View(View::new([0.3; LATENT_DIM], camera, Pace::Resting)));
+        worker.ask(Job::View(View::new([0.3; LATENT_DIM], camera, RenderPace::Resting)));
         let drawn = until_idle(&worker);
         let Some(Drawn::View { image, is_final: true, .. }) = drawn.last() else { panic!("{}", drawn.len()) };
         let mut whole = RenderBuffer::new();
@@ -512,7 +511,7 @@ mod tests {
     fn the_newest_view_wins() {
         let (worker, until_idle) = worker();
         for i in 0..20 {
-            worker.ask(Job::View(View::new([0.1 * i as f32; LATENT_DIM], camera(100 + i, 75), Pace::Resting)));
+            worker.ask(Job::View(View::new([0.1 * i as f32; LATENT_DIM], camera(100 + i, 75), RenderPace::Resting)));
         }
         let finals: Vec<u32> = until_idle(&worker)
             .iter()
@@ -534,7 +533,7 @@ mod tests {
         worker.ask(Job::BirdsEye { latent: latents[1], camera: small });
         worker.ask(Job::Slice { latent: latents[1], height_m: 1.0, longest_px: 20 });
         for _ in 0..5 {
-            worker.ask(Job::View(View::new(latents[2], camera(64, 48), Pace::Moving)));
+            worker.ask(Job::View(View::new(latents[2], camera(64, 48), RenderPace::Moving)));
         }
         let drawn = until_idle(&worker);
         let count = |is: fn(&Drawn) -> bool| drawn.iter().filter(|d| is(d)).count();
@@ -561,12 +560,12 @@ mod tests {
         let slice = |height_m| Job::Slice { latent, height_m, longest_px: 8 };
         desk.put(slice(1.0));
         desk.put(Job::BirdsEye { latent, camera: camera(8, 8) });
-        desk.put(view(Pace::Resting));
+        desk.put(view(RenderPace::Resting));
         desk.put(slice(2.0));
         assert_eq!(desk.take(), Some(slice(2.0)));
         desk.put(slice(3.0));
-        desk.put(view(Pace::Moving));
-        assert_eq!(desk.take(), Some(view(Pace::Moving)));
+        desk.put(view(RenderPace::Moving));
+        assert_eq!(desk.take(), Some(view(RenderPace::Moving)));
         assert!(matches!(desk.take(), Some(Job::BirdsEye { .. })));
         desk.put_back(slice(4.0));
         assert_eq!((desk.take(), desk.take()), (Some(slice(3.0)), None));

@@ -8,9 +8,9 @@
 //! The session calls the same functions as the stages.
 
 use crate::history::History;
-use crate::input::Input;
-use crate::journal::{Decision, Journal};
-use crate::models::Models;
+use crate::input::ChosenImage;
+use crate::journal::{Journal, ShownDecision};
+use crate::models::SessionModels;
 use carff_decision::{Draw, Evidence, Mixture, Probed, Resolved, Sampling, Step, path_probability};
 use carff_messages::{ActionCode, Gaussian, LATENT_DIM, MAX_HORIZON, MAX_SAMPLES, UnknownBox};
 use std::sync::Arc;
@@ -18,7 +18,7 @@ use std::time::Instant;
 
 /// Settings of the look-ahead.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Settings {
+pub struct SessionSettings {
     /// Number of latents drawn per step, 1..=64.
     pub samples: usize,
     /// Distribution of the draws over the components.
@@ -53,7 +53,7 @@ pub struct Found {
 
 /// A forecast: the mixture over the next latent, and its samples.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Forecast {
+pub struct ShownForecast {
     /// The mixture.
     pub mixture: Mixture,
     /// The drawn latents.
@@ -64,7 +64,7 @@ pub struct Forecast {
 #[derive(Clone, Debug)]
 pub struct Moment {
     /// The input image.
-    pub input: Arc<Input>,
+    pub input: Arc<ChosenImage>,
     /// Boxes in which a running graph's prober finds what no known state explains.
     pub unknowns: Arc<[UnknownBox]>,
     /// Number of steps after the image.
@@ -74,7 +74,7 @@ pub struct Moment {
     /// The known state; `None` for an image's posterior.
     pub source_state: Option<usize>,
     /// The forecast; `None` at step 0.
-    pub forecast: Option<Forecast>,
+    pub forecast: Option<ShownForecast>,
     /// The belief from all scenes of the forecast; `None` before it is probed.
     pub belief: Option<Step>,
     /// The shown scene.
@@ -91,7 +91,7 @@ pub struct Moment {
 
 impl Moment {
     /// Returns a moment with only an image's posterior.
-    pub fn of_posterior(input: Arc<Input>, posterior: Gaussian) -> Self {
+    pub fn of_posterior(input: Arc<ChosenImage>, posterior: Gaussian) -> Self {
         Self {
             input,
             unknowns: Arc::default(),
@@ -109,7 +109,7 @@ impl Moment {
     }
 
     /// Returns a moment with a forecast's scenes; it shows the most probable component.
-    pub fn of_forecast(before: &Self, step: u32, forecast: Forecast) -> Self {
+    pub fn of_forecast(before: &Self, step: u32, forecast: ShownForecast) -> Self {
         let weights = &forecast.mixture.weights;
         let heaviest = (0..weights.len()).max_by(|&a, &b| weights[a].total_cmp(&weights[b]));
         Self {
@@ -179,17 +179,17 @@ pub enum SessionError {
 
 /// The models, the history, and the journal.
 pub struct Session {
-    models: Models,
+    models: SessionModels,
     history: History<Moment>,
-    settings: Settings,
+    settings: SessionSettings,
     /// Decisions and durations.
     pub journal: Journal,
 }
 
 impl Session {
     /// Creates a session without an image.
-    pub fn new(models: Models) -> Self {
-        let settings = Settings {
+    pub fn new(models: SessionModels) -> Self {
+        let settings = SessionSettings {
             samples: 10,
             sampling: Sampling::Stratified,
             horizon: models.trained.calibration.horizon.clamp(2, MAX_HORIZON),
@@ -199,18 +199,18 @@ impl Session {
     }
 
     /// Returns the models.
-    pub fn models(&self) -> &Models {
+    pub fn models(&self) -> &SessionModels {
         &self.models
     }
 
     /// Returns the settings.
-    pub fn settings(&self) -> Settings {
+    pub fn settings(&self) -> SessionSettings {
         self.settings
     }
 
     /// Sets the settings within their limits; they apply to later forecasts.
-    pub fn set_settings(&mut self, settings: Settings) {
-        self.settings = Settings {
+    pub fn set_settings(&mut self, settings: SessionSettings) {
+        self.settings = SessionSettings {
             samples: settings.samples.clamp(1, MAX_SAMPLES),
             horizon: settings.horizon.clamp(1, MAX_HORIZON),
             ..settings
@@ -232,7 +232,7 @@ impl Session {
     }
 
     /// **Toggle**: shows the scene of an image's posterior.
-    pub fn toggle(&mut self, input: Arc<Input>) -> Result<(), SessionError> {
+    pub fn toggle(&mut self, input: Arc<ChosenImage>) -> Result<(), SessionError> {
         let started = Instant::now();
         let Some(posterior) = self.models.encode(&input.image) else {
             let (width_px, height_px) = (input.image.width_px, input.image.height_px);
@@ -278,14 +278,14 @@ impl Session {
     }
 
     /// Returns one step's forecast, as the forecaster stage computes it for the same frame number.
-    fn forecast(&mut self, source: &Gaussian, input: &Input, step: u32) -> Result<Forecast, SessionError> {
+    fn forecast(&mut self, source: &Gaussian, input: &ChosenImage, step: u32) -> Result<ShownForecast, SessionError> {
         let started = Instant::now();
         let net = self.models.mixture.as_ref().map_err(|why| SessionError::NoMixture(why.clone()))?;
         let mixture = net.forecast(source);
-        let Settings { samples, sampling, seed, .. } = self.settings;
+        let SessionSettings { samples, sampling, seed, .. } = self.settings;
         let draws = mixture.draw(samples, sampling, input.seed.unwrap_or(seed), input.frame, step);
         self.journal.took_next("forecaster", ms(started));
-        Ok(Forecast { mixture, draws })
+        Ok(ShownForecast { mixture, draws })
     }
 
     /// **Probe**: probes the shown scene and, in a forecast, all others; the result is the belief.
@@ -302,7 +302,7 @@ impl Session {
             let steps: Vec<Step> = moment.steps().cloned().collect();
             let evidence = Evidence::of_steps(&steps);
             let decided = self.models.policy.decide(&evidence);
-            self.journal.decided(Decision {
+            self.journal.decided(ShownDecision {
                 rests_on: format!("{}, {}", moment.input.title, steps_ahead(moment.step)),
                 action: if decided.halt { ActionCode::Halt } else { ActionCode::Advance },
                 confidence: decided.confidence as f32,
@@ -444,7 +444,7 @@ impl Session {
 }
 
 /// Returns the latent of a scene; `None` if the scene does not exist.
-fn latent(models: &Models, moment: &Moment, selection: Selection) -> Option<[f32; LATENT_DIM]> {
+fn latent(models: &SessionModels, moment: &Moment, selection: Selection) -> Option<[f32; LATENT_DIM]> {
     let forecast = moment.forecast.as_ref();
     match selection {
         Selection::Source => Some(moment.source.mean),
@@ -455,7 +455,7 @@ fn latent(models: &Models, moment: &Moment, selection: Selection) -> Option<[f32
 }
 
 /// Probes the shown scene, unless it has been probed with the others.
-fn find(models: &mut Models, moment: &mut Moment) {
+fn find(models: &mut SessionModels, moment: &mut Moment) {
     let Some(latent) = latent(models, moment, moment.selection) else {
         moment.found = None;
         return;

@@ -4,12 +4,12 @@ use crate::common;
 
 use crate::common::{ABOVE_VIEW, HIDING_VIEW, copy_without, image, models, scenario};
 use carff_dataset::Image;
-use carff_decision::{Evidence, Plan, Sampling, Step, look_ahead};
+use carff_decision::{Evidence, Feedback, Plan, Sampling, Step, look_ahead};
 use carff_messages::ActionCode;
 use carff_scenes::{Detail, Extras};
-use carff_viewer::input::{Album, Input};
-use carff_viewer::models::Models;
-use carff_viewer::session::{Moment, Selection, Session, SessionError, Settings};
+use carff_viewer::input::{Album, ChosenImage};
+use carff_viewer::models::SessionModels;
+use carff_viewer::session::{Moment, Selection, Session, SessionError, SessionSettings};
 use std::ops::ControlFlow;
 
 fn session() -> Session {
@@ -40,10 +40,11 @@ fn toggle_shows_what_the_image_shows() {
 #[test]
 fn follows_the_stages_path() {
     let mut session = session();
-    let settings = Settings { samples: 7, horizon: 3, seed: 5, ..session.settings() };
+    let settings = SessionSettings { samples: 7, horizon: 3, seed: 5, ..session.settings() };
     session.set_settings(settings);
     let input = image(0, 0, HIDING_VIEW);
-    let plan = Plan { samples: 7, sampling: Sampling::Stratified, horizon: 3, seed: 5, frame: HIDING_VIEW as u64 };
+    let (sampling, feedback, frame) = (Sampling::Stratified, Feedback::State, HIDING_VIEW as u64);
+    let plan = Plan { samples: 7, sampling, feedback, horizon: 3, seed: 5, frame };
     session.toggle(input).unwrap();
     let posterior = session.moment().unwrap().source;
     let mut probe = session.models().probe.clone();
@@ -110,7 +111,7 @@ fn history_and_horizon() {
     assert!(session.back() && !session.back());
     assert_eq!(session.moment().unwrap().step, 0);
     assert!(session.forward() && session.forward() && !session.forward());
-    session.set_settings(Settings { horizon: 3, ..session.settings() });
+    session.set_settings(SessionSettings { horizon: 3, ..session.settings() });
     session.probe_and_predict().unwrap();
     assert_eq!(session.moment().unwrap().step, 3);
     assert_eq!(session.history().entries().len(), 4);
@@ -122,7 +123,7 @@ fn history_and_horizon() {
 fn predicting_again_draws_again() {
     let mut session = session();
     session.toggle(image(1, 0, HIDING_VIEW)).unwrap();
-    let draws = |session: &mut Session, settings: Settings| {
+    let draws = |session: &mut Session, settings: SessionSettings| {
         session.set_settings(settings);
         session.predict().unwrap();
         session.moment().unwrap().forecast.clone().unwrap()
@@ -130,9 +131,9 @@ fn predicting_again_draws_again() {
     let settings = session.settings();
     let first = draws(&mut session, settings);
     assert_eq!(first, draws(&mut session, settings));
-    let other = draws(&mut session, Settings { seed: 2, ..settings });
+    let other = draws(&mut session, SessionSettings { seed: 2, ..settings });
     assert!(other.mixture == first.mixture && other.draws != first.draws);
-    assert_eq!(draws(&mut session, Settings { samples: 1000, ..settings }).draws.len(), 64);
+    assert_eq!(draws(&mut session, SessionSettings { samples: 1000, ..settings }).draws.len(), 64);
     assert_eq!((session.history().entries().len(), session.scenes().len()), (2, 1 + first.mixture.weights.len() + 64));
 }
 
@@ -144,7 +145,7 @@ fn errors_say_what_to_do() {
     assert_eq!(session.probe(), Err(SessionError::NoInput));
     assert!(session.shown().is_none() && session.scenes().is_empty());
     let broken = Image { width_px: 4, height_px: 4, rgb: vec![0; 5] };
-    let error = session.toggle(Input::of_image("broken.png", broken)).unwrap_err();
+    let error = session.toggle(ChosenImage::of_image("broken.png", broken)).unwrap_err();
     assert!(error.to_string().contains("broken.png"), "{error}");
     session.toggle(image(0, 0, ABOVE_VIEW)).unwrap();
     assert_eq!(session.select(Selection::Sample(0)), Err(SessionError::NoScene));
@@ -156,7 +157,7 @@ fn errors_say_what_to_do() {
 #[test]
 fn a_checkpoint_without_forecaster_toggles() {
     let folder = copy_without(&["mixture.safetensors"]);
-    let mut session = Session::new(Models::load(folder.path(), 1).unwrap());
+    let mut session = Session::new(SessionModels::load(folder.path(), 1).unwrap());
     session.toggle(image(0, 0, ABOVE_VIEW)).unwrap();
     session.probe().unwrap();
     let error = session.predict().unwrap_err();
@@ -212,7 +213,7 @@ fn albums_are_leafed_through() {
     let manifest = std::fs::read_to_string(common::checkpoint().join("manifest.json")).unwrap();
     let of_two = manifest.replacen("\"poses\": 100", "\"poses\": 2", 1);
     std::fs::write(folder.path().join("manifest.json"), of_two).unwrap();
-    let models = Models::load(folder.path(), 1).unwrap();
+    let models = SessionModels::load(folder.path(), 1).unwrap();
     let set = tempfile::tempdir().unwrap();
     let scenario = scenario().with_free_cameras(2, 3).unwrap();
     scenario.render_dataset(set.path(), Extras::default(), |_, _| ControlFlow::Continue(())).unwrap();

@@ -62,6 +62,8 @@ pub struct PinholeCamera {
 impl PinholeCamera {
     /// Field of view of [`Self::above`], degrees.
     pub const ABOVE_FOV_DEG: f64 = 60.0;
+    /// Assumed horizontal field of view of a camera without a calibration, degrees.
+    pub const ASSUMED_FOV_DEG: f64 = 60.0;
 
     /// Returns a camera that looks straight down on a region (two opposite corners, metres) and sees its longer side from
     /// edge to edge. The image's up direction is +Y.

@@ -30,7 +30,7 @@ pub use planning::{
     Bound, CheckpointPlanning, CheckpointPlanningError, OccupancyRates, PlanningMemory, StepRates, load_policy,
 };
 pub use probe::{FieldProbe, PreparedField, load_field_probe, load_probing};
-pub use tensors::{Row, read_tensors};
+pub use tensors::{StoredTensor, read_tensors};
 
 use carff_dataset::{ScenarioInfo, sensor::SensorNoise};
 use carff_decision::{Place, ProbeCalibration, ProbingError};

@@ -8,10 +8,10 @@ use safetensors::{
 use std::path::Path;
 
 /// Name, shape and values of a tensor.
-pub type Row = (String, Vec<usize>, Vec<f32>);
+pub type StoredTensor = (String, Vec<usize>, Vec<f32>);
 
 /// Reads the tensors of a safetensors file whose names are `wanted`, as `f32`. The error does not name the file.
-pub fn read_tensors(path: &Path, wanted: impl Fn(&str) -> bool) -> Result<Vec<Row>, String> {
+pub fn read_tensors(path: &Path, wanted: impl Fn(&str) -> bool) -> Result<Vec<StoredTensor>, String> {
     let bytes = std::fs::read(path).map_err(|e| e.to_string())?;
     if let Some(what) = carff_base::errors::stand_in(&bytes[..bytes.len().min(64)]) {
         return Err(what.into());

@@ -10,7 +10,7 @@ use crate::launcher::{LauncherConfig, OverloadConfig};
 use crate::ranges;
 use crate::stages::{StageConfig, StagesConfig};
 use carff_dataset::{CalibrationError, CameraCalibration};
-use carff_decision::{Approach, Sampling, Speeds, StepLength};
+use carff_decision::{Approach, Feedback, Sampling, Speeds, StepLength};
 use carff_messages::{Rule, Stage};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -76,6 +76,10 @@ pub struct RunConfig {
     /// Sampling of the mixture: `stratified` over the components, or `independent`. Default `stratified`.
     #[serde(default)]
     pub sampling: Sampling,
+    /// Input of each further step of the look-ahead: `state`, the stored posterior of the most probable known state, or
+    /// `latent`, each probed sample itself. Default `state`.
+    #[serde(default)]
+    pub feedback: Feedback,
     /// Memory of earlier frames: `filter` carries the belief from frame to frame, where the checkpoint has learned it
     /// (`carff checkpoint memory`); with `none`, each image counts by itself. Default `none`.
     #[serde(default)]

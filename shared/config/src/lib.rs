@@ -37,5 +37,5 @@ pub use graph::{
     ViewChoice, is_stream,
 };
 pub use launcher::{LauncherConfig, OverloadConfig, Reduction, WhenLost};
-pub use soak::{Contract, Kind, Pace, SoakConfig, Weights};
+pub use soak::{Contract, FaultKind, Pace, SoakConfig, Weights};
 pub use stages::{Backend, LogFormat, LogLevel, RestartPolicy, StageConfig, StagesConfig};

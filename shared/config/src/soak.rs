@@ -32,9 +32,9 @@ macro_rules! weights {
 
         /// Kinds of faults.
         #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
-        pub enum Kind { $($(#[$doc])* $kind),+ }
+        pub enum FaultKind { $($(#[$doc])* $kind),+ }
 
-        impl Kind {
+        impl FaultKind {
             /// All of them.
             pub const ALL: &[Self] = &[$(Self::$kind),+];
 
@@ -46,8 +46,8 @@ macro_rules! weights {
 
         impl Weights {
             /// The weight of a kind.
-            pub fn of(&self, kind: Kind) -> u32 {
-                match kind { $(Kind::$kind => self.$field),+ }
+            pub fn of(&self, kind: FaultKind) -> u32 {
+                match kind { $(FaultKind::$kind => self.$field),+ }
             }
         }
     };
@@ -205,7 +205,7 @@ impl SoakConfig {
     }
 
     fn check(&self, source: &Source<'_>) -> Result<(), ConfigError> {
-        if Kind::ALL.iter().all(|&kind| self.faults.of(kind) == 0) {
+        if FaultKind::ALL.iter().all(|&kind| self.faults.of(kind) == 0) {
             return Err(source.range("faults", "without a weight".into(), "at least one weight above 0".into()));
         }
         let Pace { min_pause_ms, max_pause_ms, .. } = self.pace;

@@ -123,7 +123,7 @@ impl StagesConfig {
         }
         let other = Stage::ALL.into_iter().find(|&s| s != Stage::Encoder && self.of(s).backend.is_some());
         other.map_or(Ok(()), |stage| {
-            let found = format!("{:?}", self.of(stage).backend.unwrap_or_default()).to_lowercase();
+            let found = self.of(stage).backend.unwrap_or_default().name().to_owned();
             Err(source.range(
                 &format!("stages.{stage}.backend"),
                 found,
@@ -154,6 +154,16 @@ pub enum Backend {
     Onnx,
     /// libtorch.
     Tch,
+}
+
+impl Backend {
+    /// Returns the name in the graph file.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Onnx => "onnx",
+            Self::Tch => "tch",
+        }
+    }
 }
 
 /// The launcher's answer to a stage that dies.

@@ -19,7 +19,7 @@ fn wrong_files_have_golden_messages() {
         (
             format!("{HEAD}horizn = 2\n"),
             "graph.toml:5: `run.horizn`: unknown field `horizn`, expected one of `name`, `seed`, `dataset`, `scenario`, \
-             `checkpoint`, `horizon`, `samples`, `sampling`, `memory`, `frame_rate_hz`, `busy_polling`; did you mean `horizon`?",
+             `checkpoint`, `horizon`, `samples`, `sampling`, `feedback`, `memory`, `frame_rate_hz`, `busy_polling`; did you mean `horizon`?",
         ),
         (
             format!("{HEAD}[camera]\nsource = \"free-drives\"\n"),

@@ -80,7 +80,7 @@ impl Equivalence {
     }
 
     /// Returns the number of states that look like `state` from `view`, including itself: at least 1.
-    pub fn class_size(&self, view: usize, state: usize) -> usize {
+    fn class_size(&self, view: usize, state: usize) -> usize {
         self.alike(view, state).count().max(1)
     }
 

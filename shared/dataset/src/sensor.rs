@@ -115,7 +115,7 @@ struct Noise<R> {
 }
 
 impl Noise<()> {
-    #[allow(clippy::new_ret_no_self)]
+    #[allow(clippy::new_ret_no_self, reason = "the type of the random stream has no name")]
     fn new(noise: &SensorNoise, key: Key) -> Noise<impl Rng> {
         let mut rng = carff_base::random::stream(Key { seed: key.seed ^ STREAM, ..key });
         let mut normal = |sigma: f32| sigma * rng.sample::<f32, _>(StandardNormal);

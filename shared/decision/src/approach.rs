@@ -76,7 +76,7 @@ pub struct Speeds {
 }
 
 /// An action with its target speed, m/s.
-pub type Drive = (ActionCode, f64);
+pub type ActionAndSpeed = (ActionCode, f64);
 
 impl Approach {
     /// Returns the action of a vehicle by its rule's decision to halt or not. Without a known motion, the vehicle halts or
@@ -95,7 +95,7 @@ impl Approach {
     /// let clear = Look { clear_m: 21.0, ..look };
     /// assert_eq!(Approach::Look.drive(true, clear, far, speeds), (ActionCode::Advance, 5.0));
     /// ```
-    pub fn drive(self, halt: bool, look: Look, motion: Option<Motion>, speeds: Speeds) -> Drive {
+    pub fn drive(self, halt: bool, look: Look, motion: Option<Motion>, speeds: Speeds) -> ActionAndSpeed {
         if !halt || motion.is_some_and(Motion::is_committed) {
             return (ActionCode::Advance, speeds.advance_mps);
         }

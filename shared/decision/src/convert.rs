@@ -1,6 +1,6 @@
 //! Conversions between a step of the belief and the messages that carry it.
 
-use crate::{Draw, Look, Mixture, Motion, ProbeLayout, Probed, Reading, Resolved, Step};
+use crate::{Draw, Feedback, Look, Mixture, Motion, ProbeLayout, Probed, Reading, Resolved, Step};
 use carff_messages::{
     Action, Belief, EgoMotion, Forecast, Gaussian, LookGain, MAX_COMPONENTS, MAX_PLACES, ProbeResult,
 };
@@ -57,8 +57,14 @@ impl From<&Action> for Look {
 
 impl Step {
     /// Returns the belief message of this step, which answers `forecast`. `posterior` represents the resolved state;
-    /// without one there is nothing to look ahead from, and the belief is the frame's last.
-    pub fn to_belief(&self, forecast: &Forecast, layout: &ProbeLayout, posterior: Option<&Gaussian>) -> Belief {
+    /// without one there is no state to look ahead from: where states are fed back, the belief is then the frame's last.
+    pub fn to_belief(
+        &self,
+        forecast: &Forecast,
+        layout: &ProbeLayout,
+        posterior: Option<&Gaussian>,
+        feedback: Feedback,
+    ) -> Belief {
         let mut belief = Belief::empty(forecast.header, forecast.horizon);
         belief.encoder_ns = forecast.encoder_ns;
         belief.forecaster_ns = forecast.stage_latency_ns;
@@ -74,12 +80,18 @@ impl Step {
         copy(&mut belief.components, &self.components, |probed| probed.into());
         copy(&mut belief.samples, &self.samples, |probed| probed.into());
         copy(&mut belief.sample_component, &self.draws, |draw| draw.component as u8);
-        match posterior {
-            Some(posterior) => {
-                belief.resolved_state = self.resolved.state as i32;
-                belief.resolved = *posterior;
+        if let Some(posterior) = posterior {
+            belief.resolved_state = self.resolved.state as i32;
+            belief.resolved = *posterior;
+        }
+        match feedback {
+            Feedback::State if posterior.is_none() => belief.is_final = 1,
+            Feedback::Latent if !belief.is_final() => {
+                let inputs = self.fed_back();
+                belief.fed_back_count = inputs.len() as u64;
+                copy(&mut belief.fed_back, &inputs, |input| *input);
             }
-            None => belief.is_final = 1,
+            _ => {}
         }
         belief
     }

@@ -77,11 +77,6 @@ impl ImageEvidence {
         Self { prior: Some(hazard_probability.clamp(0.0, 1.0)), ..self }
     }
 
-    /// Returns the hazard probability before the image, where earlier images have one.
-    pub fn prior(&self) -> Option<f64> {
-        self.prior
-    }
-
     /// Returns the hazard probability before the image: of earlier images, else of equally probable states.
     pub fn prior_or_even(&self, hazard_states: &[bool]) -> f64 {
         self.prior.unwrap_or_else(|| share_of_hazards(hazard_states))
@@ -293,15 +288,15 @@ mod tests {
         let hidden = || ImageEvidence::new(&[50.0; 4]);
         for (seen, low, high) in [([1e-3, 1e-3, 80.0, 80.0], 0.0, 0.01), ([80.0, 80.0, 1e-3, 1e-3], 0.99, 1.0)] {
             let mut memory = ImageMemory::new(STATES.to_vec(), settings);
-            assert_eq!(memory.see(ImageEvidence::new(&seen)).prior(), Some(0.5));
+            assert_eq!(memory.see(ImageEvidence::new(&seen)).prior, Some(0.5));
             let (hazard, _) = memory.see(hidden()).weigh(low, &STATES);
             assert!((f64::from(low)..=high).contains(&hazard), "{hazard}");
             memory.clear();
-            assert_eq!(memory.see(hidden()).prior(), Some(0.5));
+            assert_eq!(memory.see(hidden()).prior, Some(0.5));
         }
         let weak = || ImageEvidence::new(&[2.0, 2.0, 1.0, 1.0]);
         let mut memory = ImageMemory::new(STATES.to_vec(), settings);
         (0..10).for_each(|_| drop(memory.see(weak())));
-        assert!((memory.see(hidden()).prior().unwrap() - 2.0 / 3.0).abs() < 1e-6);
+        assert!((memory.see(hidden()).prior.unwrap() - 2.0 / 3.0).abs() < 1e-6);
     }
 }

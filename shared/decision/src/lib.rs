@@ -8,7 +8,7 @@
 //! |---|---|
 //! | `mixture` | mixtures over the scene latent, and draws from them |
 //! | `layout`, `calibration` | from densities at the places of a scenario to the state that a latent shows |
-//! | `look_ahead` | one step of the belief, and the autoregressive loop |
+//! | `look_ahead`, `feedback` | one step of the belief, and the autoregressive loop |
 //! | `memory`, `take` | the belief over the frames of a take |
 //! | `image_evidence` | the known states weighed by how well they explain the image |
 //! | `evidence`, `rule`, `threshold` | from the steps of a frame to an action |
@@ -19,6 +19,7 @@ mod approach;
 mod calibration;
 mod convert;
 mod evidence;
+mod feedback;
 mod image_evidence;
 mod layout;
 mod look;
@@ -29,10 +30,11 @@ mod rule;
 mod take;
 mod threshold;
 
-pub use approach::{Approach, Drive, Look, Motion, Speeds, stopping_mps};
+pub use approach::{ActionAndSpeed, Approach, Look, Motion, Speeds, stopping_mps};
 pub use calibration::{ProbeCalibration, Reading, Resolved, resolve};
 pub use convert::{mixture_and_draws, set_mixture_and_draws};
 pub use evidence::{Evidence, SampleEvidence};
+pub use feedback::{Feedback, ForecastInput, continue_samples};
 pub use image_evidence::{ImageEvidence, ImageMemory};
 pub use layout::{Place, ProbeLayout, ProbingError};
 pub use look::look_gain_bits;
@@ -40,5 +42,5 @@ pub use look_ahead::{Localiser, Plan, Probed, SceneProbe, Step, look_ahead, path
 pub use memory::{Memory, MemorySettings};
 pub use mixture::{Draw, Mixture, Sampling};
 pub use rule::{Decision, Policy, is_likely};
-pub use take::{Progress, StepLength, TakeFrame, TakeMemory};
+pub use take::{StepLength, TakeFrame, TakeMemory, TakeProgress};
 pub use threshold::{CalibrationTrial, bounded_threshold, choose_threshold, unchosen_threshold};

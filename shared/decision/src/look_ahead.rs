@@ -1,6 +1,9 @@
 //! One step of the belief, and the autoregressive loop over steps (paper section 3.2).
 
-use crate::{Draw, ImageEvidence, Mixture, ProbeCalibration, ProbeLayout, Reading, Resolved, Sampling, resolve};
+use crate::{
+    Draw, Feedback, ForecastInput, ImageEvidence, Mixture, ProbeCalibration, ProbeLayout, Reading, Resolved, Sampling,
+    continue_samples, resolve,
+};
 use carff_messages::{Gaussian, LATENT_DIM};
 
 /// Finds out which places of a scenario are taken in the scenes of latents (paper section 3.2: by the density of the
@@ -113,6 +116,18 @@ impl<L: Localiser> SceneProbe<L> {
     }
 }
 
+impl Step {
+    /// Returns the samples as inputs of the next step: each latent, with the variance of the component that it was drawn
+    /// from.
+    pub fn fed_back(&self) -> Vec<Gaussian> {
+        let input = |draw: &Draw| Gaussian {
+            mean: draw.latent,
+            log_variance: self.mixture.components[draw.component].log_variance,
+        };
+        self.draws.iter().map(input).collect()
+    }
+}
+
 /// Returns the probability of the path that follows a state, from that of the path to its step (both 0..=1).
 pub fn path_probability(before: f32, state_probability: f32) -> f32 {
     (before * state_probability).clamp(0.0, 1.0)
@@ -121,8 +136,9 @@ pub fn path_probability(before: f32, state_probability: f32) -> f32 {
 /// The depth and breadth of a look-ahead, and the names of its random streams.
 ///
 /// ```
-/// use carff_decision::{Plan, Sampling};
-/// let plan = Plan { samples: 10, sampling: Sampling::Stratified, horizon: 2, seed: 1, frame: 0 };
+/// use carff_decision::{Feedback, Plan, Sampling};
+/// let (sampling, feedback) = (Sampling::Stratified, Feedback::State);
+/// let plan = Plan { samples: 10, sampling, feedback, horizon: 2, seed: 1, frame: 0 };
 /// assert_eq!(plan.horizon, 2);
 /// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -131,6 +147,8 @@ pub struct Plan {
     pub samples: usize,
     /// The way in which they are spread over the components.
     pub sampling: Sampling,
+    /// Input of each further step.
+    pub feedback: Feedback,
     /// Number of steps.
     pub horizon: u32,
     /// The run's seed.
@@ -139,29 +157,41 @@ pub struct Plan {
     pub frame: u64,
 }
 
-/// Looks ahead from one posterior: each step's resolved state feeds the next. `forecast` receives the input and the
-/// known state that it represents (`None` at the first step); `image` weighs every step, as in [`SceneProbe::step`].
+/// Looks ahead from one posterior: each step feeds the next. `forecast` receives the input and its origin; `image` weighs
+/// every step, as in [`SceneProbe::step`].
 pub fn look_ahead<L: Localiser>(
-    mut forecast: impl FnMut(&Gaussian, Option<usize>) -> Mixture,
+    mut forecast: impl FnMut(&Gaussian, ForecastInput) -> Mixture,
     probe: &mut SceneProbe<L>,
     posterior: &Gaussian,
     image: Option<&ImageEvidence>,
     plan: Plan,
 ) -> Vec<Step> {
-    let mut steps = Vec::with_capacity(plan.horizon as usize);
-    let mut input = (*posterior, None);
-    let mut path = 1.0;
-    for k in 1..=plan.horizon {
-        let mixture = forecast(&input.0, input.1);
-        let draws = mixture.draw(plan.samples, plan.sampling, plan.seed, plan.frame, k);
+    let Plan { samples, sampling, feedback, horizon, seed, frame } = plan;
+    let drawn = |mixture: Mixture, step| {
+        let draws = mixture.draw(samples, sampling, seed, frame, step);
+        (mixture, draws)
+    };
+    let mut steps: Vec<Step> = Vec::with_capacity(horizon as usize);
+    let mut next = Some((drawn(forecast(posterior, ForecastInput::Image), 1), 1.0)).filter(|_| horizon > 0);
+    while let Some(((mixture, draws), path)) = next {
         let step = probe.step(mixture, draws, path, image);
-        let state = step.resolved.state;
-        path = path_probability(path, step.resolved.state_probability(state));
+        let number = steps.len() as u32 + 2;
+        next = match feedback {
+            _ if number > horizon => None,
+            Feedback::State => {
+                let state = step.resolved.state;
+                let path = path_probability(path, step.resolved.state_probability(state));
+                let input = probe.state_posterior(state);
+                input.map(|input| (drawn(forecast(input, ForecastInput::State(state)), number), path))
+            }
+            Feedback::Latent => {
+                let inputs = step.fed_back();
+                let forecasts: Vec<Mixture> =
+                    inputs.iter().map(|input| forecast(input, ForecastInput::Sample)).collect();
+                Some((continue_samples(&forecasts, samples, sampling, seed, frame, number), path))
+            }
+        };
         steps.push(step);
-        match probe.state_posterior(state) {
-            Some(next) => input = (*next, Some(state)),
-            None => break,
-        }
     }
     steps
 }

@@ -50,17 +50,25 @@ impl Mixture {
         let offset = carff_base::random::uniform(Key { seed, frame, step, sample: u32::MAX });
         (0..count)
             .map(|i| {
+                let key = Key { seed, frame, step, sample: i as u32 };
                 let position = match sampling {
                     Sampling::Stratified => (i as f64 + offset) / count as f64,
-                    Sampling::Independent => {
-                        carff_base::random::uniform(Key { seed, frame, step, sample: i as u32 | 0x8000_0000 })
-                    }
+                    Sampling::Independent => Self::independent_position(key),
                 };
-                let component = self.component_at(position);
-                let unit = carff_base::random::gaussians(Key { seed, frame, step, sample: i as u32 });
-                Draw { latent: self.components[component].at(&unit), component }
+                self.draw_at(position, key)
             })
             .collect()
+    }
+
+    /// Returns the random position of a sample among the components' shares, 0..1, where samples are independent.
+    pub(crate) fn independent_position(key: Key) -> f64 {
+        carff_base::random::uniform(Key { sample: key.sample | 0x8000_0000, ..key })
+    }
+
+    /// Draws one latent from the component whose share of the weights holds `position` in 0..1.
+    pub(crate) fn draw_at(&self, position: f64, key: Key) -> Draw {
+        let component = self.component_at(position);
+        Draw { latent: self.components[component].at(&carff_base::random::gaussians(key)), component }
     }
 
     /// The component whose share of the weights holds `position` in 0..1.

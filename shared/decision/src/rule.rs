@@ -70,7 +70,6 @@ impl Policy {
         if !valid(hazard) || !valid(unknown) || evidence.sample_count() == 0 {
             return Decision { halt: true, confidence: 0.0 };
         }
-        let unknown = if self.ignores_unknown { 0.0 } else { unknown };
         match self.rule {
             Rule::Underconfident => Decision { halt: true, confidence: 1.0 },
             Rule::Overconfident => Decision { halt: false, confidence: 1.0 },
@@ -78,11 +77,11 @@ impl Policy {
                 // Samples disagree when some show the hazard and some do not. A sample that shows no known state
                 // disagrees with every other.
                 let share = evidence.hazard_share();
-                let halt = share > 0.0 || evidence.has_unknown() || is_likely(unknown);
+                let halt = share > 0.0 || evidence.has_unknown() || is_likely(unknown) && !self.ignores_unknown;
                 Decision { halt, confidence: if halt { share.max(1.0 - share) } else { 1.0 - share } }
             }
             Rule::Calibrated => {
-                let p = (hazard + unknown).min(1.0);
+                let p = if self.ignores_unknown { hazard } else { evidence.hazard_or_unknown_probability() };
                 let halt = p >= self.threshold;
                 Decision { halt, confidence: if halt { p } else { 1.0 - p } }
             }

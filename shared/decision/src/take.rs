@@ -55,12 +55,12 @@ impl From<&Posterior> for TakeFrame {
 pub struct TakeMemory {
     memory: Memory,
     step: StepLength,
-    progress: Option<Progress>,
+    progress: Option<TakeProgress>,
 }
 
 /// Progress of a take.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Progress {
+pub struct TakeProgress {
     /// Capture time of the first image that was seen, nanoseconds.
     pub first_ns: u64,
     /// Time steps that the belief has been moved by.
@@ -80,17 +80,17 @@ impl TakeMemory {
     /// Returns the forecast from all images of the take so far, given that of its newest image, and their number: 1 if
     /// the memory starts anew.
     pub fn see(&mut self, frame: TakeFrame, image: &Mixture) -> (Mixture, u64) {
-        let fits = |p: &Progress| p.last.take_start == frame.take_start && !self.is_gap(p.last, frame);
+        let fits = |p: &TakeProgress| p.last.take_start == frame.take_start && !self.is_gap(p.last, frame);
         let mut progress = if let Some(progress) = self.progress.filter(fits) {
             progress
         } else {
             self.memory.clear();
             let first_ns = frame.capture_time_ns;
-            Progress { first_ns, steps: self.steps(first_ns, frame), last: frame, images: 0 }
+            TakeProgress { first_ns, steps: self.steps(first_ns, frame), last: frame, images: 0 }
         };
         let steps = self.steps(progress.first_ns, frame);
         (progress.steps..steps).for_each(|_| self.memory.advance());
-        progress = Progress { steps, last: frame, images: progress.images + 1, ..progress };
+        progress = TakeProgress { steps, last: frame, images: progress.images + 1, ..progress };
         self.progress = Some(progress);
         (self.memory.see(image), progress.images)
     }

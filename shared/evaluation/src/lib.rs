@@ -26,9 +26,9 @@ mod trials;
 pub use accuracy::{Centroids, state_accuracy};
 pub use carff_trials::{
     Accuracy, BirdsEye, ByKind, ByObservability, BySamples, CheckpointFigures, Count, DecodedQuality, EvaluationError,
-    FieldRenderer, Input, KnownStates, Perception, Planner, PlanningFigures, PlanningTable, ProbingFigures,
-    SAMPLE_COUNTS, SampleAccuracy, SampleFigures, SampleTrials, Share, TakeMemories, TrainedAndUnseen, Trial,
-    TrialOutcome, VaeFigures, ViewFigures, birds_eye, places, to_bytes, to_unit, trial_frame,
+    FieldRenderer, KnownStates, Perception, Planner, PlanningFigures, PlanningTable, ProbingFigures, SAMPLE_COUNTS,
+    SAMPLES, SampleAccuracy, SampleFigures, SampleInput, SampleTrials, Share, TakeMemories, TrainedAndUnseen, Trial,
+    TrialOutcome, VaeFigures, ViewFigures, birds_eye, places, to_unit, trial_frame,
 };
 pub use decoded::{Decoding, changed_pixels};
 pub use posed::{Label, PosedImages};
@@ -40,7 +40,7 @@ pub use stats::{
     pairs::PairMeans,
     ssim::ssim,
 };
-pub use subject::{About, DecisiveImage, EvalOptions, Novelty, OtherPlace, Subject};
+pub use subject::{CheckpointAbout, DecisiveImage, EvalOptions, Novelty, OtherPlace, Subject};
 pub use tables::{
     encoder::{EncoderTable, SvmScore, SvmTable, encoder_table},
     field::{FieldImages, ImageTable, NovelViews},
@@ -54,7 +54,7 @@ pub use tables::{
 pub use trials::{
     Models,
     views::{ByTrialKind, TrialFigures},
-    watches::{Watch, WatchPlan, Watched, watches},
+    watches::{Watch, WatchPlan, WatchedFrame, watches},
 };
 
 /// One line of progress.

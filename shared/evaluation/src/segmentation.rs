@@ -82,7 +82,7 @@ impl Segmenter {
     }
 
     /// Returns the class of each pixel of some views, RGB in 0..=1, row by row and view by view.
-    pub fn classes(&self, rgb: &[f32]) -> Vec<u8> {
+    fn classes(&self, rgb: &[f32]) -> Vec<u8> {
         tch::no_grad(|| {
             let classes = self.logits(&Tensor::from_slice(rgb)).argmax(1, false).to_kind(Kind::Uint8).contiguous();
             let mut out = vec![0; classes.numel()];

@@ -10,7 +10,7 @@ use carff_dataset::{
     drives::DriveKind,
     sensor::{SensorNoise, apply_noise_into},
 };
-use carff_decision::{MemorySettings, Sampling};
+use carff_decision::{Feedback, MemorySettings, Sampling};
 use carff_messages::Gaussian;
 use carff_networks::{
     decoder::Decoder,
@@ -40,7 +40,7 @@ pub struct EvalOptions {
 /// Subject and seeds of an evaluation.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct About {
+pub struct CheckpointAbout {
     /// Version of the program.
     pub program_version: String,
     /// Name of the scenario.
@@ -216,7 +216,8 @@ impl Subject {
     pub fn planner(&self, sampling: Sampling) -> Result<Planner<'_>, String> {
         let probe = self.probe.as_ref().map_err(Clone::clone)?;
         let net = self.mixture.as_ref().map_err(Clone::clone)?;
-        Ok(Planner { net, probe, sampling, horizon: self.trained.calibration.horizon })
+        let horizon = self.trained.calibration.horizon;
+        Ok(Planner { net, probe, sampling, feedback: Feedback::State, horizon })
     }
 
     /// The decoder.
@@ -249,13 +250,13 @@ impl Subject {
     }
 
     /// Description for the results.
-    pub fn about(&self) -> About {
+    pub fn about(&self) -> CheckpointAbout {
         let scenario = &self.manifest.scenario;
         let mut poses = ByRole::default();
         for role in ROLES {
             poses.set(role, self.posed.split.views(role).len());
         }
-        About {
+        CheckpointAbout {
             program_version: env!("CARGO_PKG_VERSION").to_owned(),
             scenario: scenario.name.clone(),
             branches: scenario.branches.clone(),

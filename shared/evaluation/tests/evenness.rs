@@ -3,7 +3,7 @@
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
 use carff_dataset::Observability;
-use carff_decision::{Evidence, Plan, Sampling, look_ahead};
+use carff_decision::{Evidence, Feedback, Plan, Sampling, look_ahead};
 use carff_evaluation::Models;
 use carff_scenes::{Detail, Scenario};
 use std::path::Path;
@@ -28,6 +28,7 @@ fn hidden_views_give_an_even_belief() {
         let plan = Plan {
             samples: 10,
             sampling: Sampling::Stratified,
+            feedback: Feedback::State,
             horizon: 2,
             seed: 1,
             frame: (view * 2 + branch) as u64,

@@ -9,8 +9,10 @@
 //! `render` and `train`.
 
 #![deny(unsafe_code)]
-// Bodies must be inlined into their versions for each instruction set, or they would be compiled for the wrong one.
-#![allow(clippy::inline_always)]
+#![allow(
+    clippy::inline_always,
+    reason = "a body that is not inlined into its version for an instruction set is compiled for the wrong one"
+)]
 
 mod config;
 mod kernels;
@@ -28,7 +30,7 @@ pub use march::samples::RayLimits;
 pub use model::field::Field;
 pub use model::points::PreparedPoints;
 pub use model::tensors::NamedTensor;
-pub use render::buffers::{HypothesisBuffer, RenderBuffer};
+pub use render::buffers::{HypothesisBuffer, RenderBuffer, to_byte, to_bytes};
 pub use space::contraction::Contraction;
 pub use space::occupancy::OccupancyGrid;
 pub use train::batch::{RayBatch, StepReport};

@@ -1,7 +1,7 @@
 //! The mixture density network in native code.
 
 use crate::InferenceError;
-use crate::weights::Weights;
+use crate::weights::StoredWeights;
 use carff_checkpoint::{CheckpointError, Forecasts, Manifest, files, shapes::MixtureConfig};
 use carff_decision::Mixture;
 use carff_messages::{Gaussian, LATENT_DIM};
@@ -32,7 +32,7 @@ impl MixtureNet {
         let config = &manifest.mixture;
         let refused = |(key, value, allowed)| wrong(InferenceError::Setting { key, value, allowed });
         config.check().map_err(refused)?;
-        let mut weights = Weights::read(&path).map_err(wrong)?;
+        let mut weights = StoredWeights::read(&path).map_err(wrong)?;
         let (d, k, h, w) = (LATENT_DIM as i64, config.components, config.hidden, config.weight_hidden);
         let mut layer = |name: &str, from, to| Linear::take(&mut weights, name, from, to).map_err(wrong);
         let net = Self {
@@ -101,7 +101,7 @@ struct Linear {
 }
 
 impl Linear {
-    fn take(weights: &mut Weights, name: &str, from: i64, to: i64) -> Result<Self, InferenceError> {
+    fn take(weights: &mut StoredWeights, name: &str, from: i64, to: i64) -> Result<Self, InferenceError> {
         let mut take = |part, shape: &[i64]| weights.take(&format!("mixture.{name}.{part}"), shape);
         Ok(Self {
             weights: take("weight", &[to, from])?.into_raw_vec_and_offset().0,

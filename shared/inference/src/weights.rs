@@ -6,16 +6,16 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 /// Tensors by name.
-pub type Tensors = BTreeMap<String, ArrayD<f32>>;
+pub type Arrays = BTreeMap<String, ArrayD<f32>>;
 
 /// The tensors of a file that no layer has taken yet.
 #[derive(Debug)]
-pub struct Weights {
+pub struct StoredWeights {
     path: PathBuf,
-    tensors: Tensors,
+    tensors: Arrays,
 }
 
-impl Weights {
+impl StoredWeights {
     /// Reads a file. Counters of batch normalisation are left out.
     ///
     /// # Errors
@@ -25,7 +25,7 @@ impl Weights {
         let wrong = |what: String| InferenceError::Weights { path: path.into(), what };
         let rows =
             carff_checkpoint::read_tensors(path, |name| !name.ends_with("num_batches_tracked")).map_err(wrong)?;
-        let mut tensors = Tensors::new();
+        let mut tensors = Arrays::new();
         for (name, shape, values) in rows {
             if values.iter().any(|v| !v.is_finite()) {
                 return Err(wrong(format!("NaN or infinite values in `{name}`")));
@@ -37,7 +37,7 @@ impl Weights {
     }
 
     /// Changes the tensors, for example their names.
-    pub fn change(&mut self, change: impl FnOnce(Tensors) -> Tensors) {
+    pub fn change(&mut self, change: impl FnOnce(Arrays) -> Arrays) {
         self.tensors = change(std::mem::take(&mut self.tensors));
     }
 

@@ -54,7 +54,7 @@ macro_rules! codes {
 }
 
 codes! {
-    /// The stages of the graph, in start order: consumers before producers.
+    /// The stages of the graph, in the order of the data flow.
     #[derive(Serialize, Deserialize)]
     #[serde(rename_all = "lowercase")]
     Stage: u32, "stage" {
@@ -71,6 +71,12 @@ codes! {
         /// Belief to action.
         Controller = 6 "controller",
     }
+}
+
+impl Stage {
+    /// Order in which the stages start: receivers before their senders, the camera last.
+    pub const START_ORDER: [Self; 6] =
+        [Self::Controller, Self::Renderer, Self::Prober, Self::Forecaster, Self::Encoder, Self::Camera];
 }
 
 codes! {

@@ -10,6 +10,14 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// An ideal pinhole camera's intrinsics, pixels.
+///
+/// ```
+/// use carff_messages::Intrinsics;
+/// // 128 x 128 pixels with a field of view of 90 degrees.
+/// let intrinsics = Intrinsics { fl_x_px: 64.0, fl_y_px: 64.0, cx_px: 64.0, cy_px: 64.0 };
+/// // A point 2 m ahead and 1 m to the right is in column 96.
+/// assert_eq!(intrinsics.cx_px + intrinsics.fl_x_px * 1.0 / 2.0, 96.0);
+/// ```
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Default, PartialEq, ZeroCopySend, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]

@@ -103,7 +103,7 @@ pub struct Forecast {
     pub sample_count: u32,
     /// Number of steps in the look-ahead of this frame, 1..=8.
     pub horizon: u32,
-    /// The state that the previous step resolved to; -1 at step 1.
+    /// The state that the previous step resolved to; -1 at step 1, and where the previous step's samples are the input.
     pub resolved_state: i32,
     /// Probability of the path up to the input, 0..=1; 1 at step 1.
     pub path_probability: f32,
@@ -225,7 +225,7 @@ impl ProbeResult {
 /// ```
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, ZeroCopySend)]
-#[type_name("carff.Belief.v4")]
+#[type_name("carff.Belief.v5")]
 pub struct Belief {
     /// Header, at the step of the forecast.
     pub header: Header,
@@ -255,12 +255,16 @@ pub struct Belief {
     pub samples: [ProbeResult; MAX_SAMPLES],
     /// Component that each sample was drawn from.
     pub sample_component: [u8; MAX_SAMPLES],
-    /// The most probable state, fed back as the next step's input; -1 for none of the known ones.
+    /// The most probable state; -1 for none of the known ones.
     pub resolved_state: i32,
     /// Probability that something is there which no known state explains, 0..=1; 0 if the image was not compared.
     pub unknown_probability: f32,
-    /// That state's stored posterior.
+    /// That state's stored posterior: the next step's input where no sample is fed back.
     pub resolved: Gaussian,
+    /// Inputs of the next step, one a sample, where the samples themselves are fed back.
+    pub fed_back: [Gaussian; MAX_SAMPLES],
+    /// Number of these inputs, 0..=64.
+    pub fed_back_count: u64,
     /// Duration of the encoding of this frame, nanoseconds.
     pub encoder_ns: u64,
     /// Duration of the forecast of this step, nanoseconds.
@@ -290,6 +294,8 @@ impl Belief {
             resolved_state: -1,
             unknown_probability: 0.0,
             resolved: Gaussian::standard(),
+            fed_back: [Gaussian::standard(); MAX_SAMPLES],
+            fed_back_count: 0,
             encoder_ns: 0,
             forecaster_ns: 0,
             stage_latency_ns: 0,
@@ -304,6 +310,11 @@ impl Belief {
     /// Returns true for the frame's last step.
     pub fn is_final(&self) -> bool {
         self.is_final == 1
+    }
+
+    /// Returns the inputs of the next step, where the samples themselves are fed back.
+    pub fn fed_back(&self) -> &[Gaussian] {
+        &self.fed_back[..(self.fed_back_count as usize).min(MAX_SAMPLES)]
     }
 
     /// Returns the results of the used samples.
@@ -342,6 +353,10 @@ impl Belief {
             at_most("sample_component", component.into(), components as u64 - 1)?;
         }
         in_range("resolved_state", self.resolved_state.into(), -1, i64::from(self.state_count) - 1)?;
+        at_most("fed_back_count", self.fed_back_count, MAX_SAMPLES as u64)?;
+        for input in self.fed_back() {
+            input.check()?;
+        }
         self.resolved.check()
     }
 }

@@ -37,12 +37,12 @@ pub struct Layout {
     pub alignment_bytes: usize,
     /// Fields of a structure, in the order of their offsets; empty for a number.
     #[serde(skip_serializing_if = "Vec::is_empty")]
-    pub fields: Vec<Field>,
+    pub fields: Vec<LayoutField>,
 }
 
 /// A field of a structure.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
-pub struct Field {
+pub struct LayoutField {
     /// Name of the field.
     pub name: &'static str,
     /// Offset in the structure, bytes.
@@ -68,7 +68,7 @@ pub trait Described {
 
 impl Layout {
     /// Returns the layout of a type as the transport describes it.
-    pub fn of<T: ZeroCopySend>(fields: Vec<Field>) -> Self {
+    pub fn of<T: ZeroCopySend>(fields: Vec<LayoutField>) -> Self {
         let detail = TypeDetail::new::<T>(TypeVariant::FixedSize);
         Self {
             type_name: detail.type_name().to_string(),
@@ -81,8 +81,8 @@ impl Layout {
 
 /// Returns a field; `_get` gives its type.
 #[doc(hidden)]
-pub fn field<S, T: Described>(name: &'static str, offset_bytes: usize, _get: fn(&S) -> &T) -> Field {
-    Field { name, offset_bytes, shape: T::shape(), kind: T::layout() }
+pub fn field<S, T: Described>(name: &'static str, offset_bytes: usize, _get: fn(&S) -> &T) -> LayoutField {
+    LayoutField { name, offset_bytes, shape: T::shape(), kind: T::layout() }
 }
 
 macro_rules! numbers {
@@ -208,6 +208,8 @@ described!(Belief {
     resolved_state,
     unknown_probability,
     resolved,
+    fed_back,
+    fed_back_count,
     encoder_ns,
     forecaster_ns,
     stage_latency_ns

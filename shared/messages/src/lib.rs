@@ -51,7 +51,7 @@ use serde::{Deserialize, Serialize};
 use std::fmt::Debug;
 
 /// Version of all layouts in this crate. A process drops messages of another version.
-pub const SCHEMA_VERSION: u32 = 3;
+pub const SCHEMA_VERSION: u32 = 4;
 /// Dimensions of the scene latent.
 pub const LATENT_DIM: usize = 8;
 /// Maximum number of components of a mixture.

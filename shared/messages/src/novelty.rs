@@ -78,6 +78,13 @@ impl ImageCheck {
 message!(ImageCheck);
 
 /// A box in which something stands that no known state explains.
+///
+/// ```
+/// use carff_messages::UnknownBox;
+/// let unknown = UnknownBox { center: [-4.0, 1.5, 0.6], half_size: [0.5, 0.5, 0.6], probability: 0.9, place: -1 };
+/// let low_corner_m = [0, 1, 2].map(|axis| unknown.center[axis] - unknown.half_size[axis]);
+/// assert_eq!(low_corner_m, [-4.5, 1.0, 0.0]);
+/// ```
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Default, PartialEq, ZeroCopySend, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]

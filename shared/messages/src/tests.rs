@@ -62,7 +62,7 @@ fn one_wrong_field_is_enough() {
         wrong(&mut message);
         assert!(message.validate().is_err(), "forecast {i}");
     }
-    let wrong_beliefs: [fn(&mut Belief); 11] = [
+    let wrong_beliefs: [fn(&mut Belief); 13] = [
         |m| m.state_count = 65,
         |m| m.place_count = 49,
         |m| m.is_final = 0,
@@ -74,6 +74,8 @@ fn one_wrong_field_is_enough() {
         |m| m.samples[9].occupancies[2] = -1.0,
         |m| m.components[1].confidence = 1.5,
         |m| m.resolved.mean[0] = f32::NEG_INFINITY,
+        |m| m.fed_back_count = 65,
+        |m| (m.fed_back_count, m.fed_back[63].mean[7]) = (64, f32::NAN),
     ];
     for (i, wrong) in wrong_beliefs.iter().enumerate() {
         let mut message = belief();
@@ -187,4 +189,5 @@ fn layouts_are_fixed() {
     );
     assert_eq!((offset_of!(Health, pid), offset_of!(Health, received), size_of::<Health>()), (64, 72, 144));
     assert_eq!((offset_of!(Belief, resolved_state), offset_of!(Belief, resolved)), (15_128, 15_136));
+    assert_eq!((offset_of!(Belief, fed_back_count), size_of::<Belief>()), (19_296, 19_328));
 }

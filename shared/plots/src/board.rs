@@ -1,7 +1,7 @@
 //! A board: images side by side, a decision, and a belief as bars, in one image of a film.
 
 use crate::PlotError;
-use crate::canvas::{Area, Canvas, FAINT_INK, Font, INK};
+use crate::canvas::{Canvas, FAINT_INK, Font, INK, PixelArea};
 use carff_dataset::Image;
 use plotters::prelude::RGBColor;
 
@@ -95,7 +95,7 @@ impl Board {
             canvas.text(&format!("{:>3.0} %", 100.0 * bar.share), x + name_px + 4, y, TEXT, INK)?;
             let width = (bar.share.clamp(0.0, 1.0) * BAR_PX as f32).round() as u32;
             let colour = bar.hazard.map_or(UNKNOWN, |hazard| if hazard { HAZARD } else { CLEAR });
-            let area = Area { x: x + name_px + 52, y: y + 2, width, height: TEXT.line_px() - 4 };
+            let area = PixelArea { x: x + name_px + 52, y: y + 2, width, height: TEXT.line_px() - 4 };
             canvas.fill(area, colour);
             y += TEXT.line_px() + 2;
         }

@@ -118,7 +118,7 @@ impl Font {
 
 /// Rectangle in pixels of the finished image: left, top, width, height.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Area {
+pub struct PixelArea {
     /// Left edge.
     pub x: u32,
     /// Top edge.
@@ -162,7 +162,7 @@ impl Canvas {
     }
 
     /// Fills a rectangle, clipped to the page.
-    pub fn fill(&mut self, area: Area, RGBColor(r, g, b): RGBColor) {
+    pub fn fill(&mut self, area: PixelArea, RGBColor(r, g, b): RGBColor) {
         let row = (self.width_px * OVERSAMPLING) as usize * 3;
         let (left, right) = (area.x.min(self.width_px), (area.x + area.width).min(self.width_px));
         let [left, right] = [left, right].map(|x| (x * OVERSAMPLING) as usize * 3);
@@ -241,7 +241,7 @@ mod tests {
     #[test]
     fn fills_exactly() {
         let mut canvas = Canvas::new(20, 10).unwrap();
-        canvas.fill(Area { x: 3, y: 2, width: 5, height: 4 }, INK);
+        canvas.fill(PixelArea { x: 3, y: 2, width: 5, height: 4 }, INK);
         let image = canvas.finish();
         assert_eq!(inked(&image), Some([3, 2, 7, 5]));
         assert_eq!(image.pixel(7, 5), Some([INK.0, INK.1, INK.2]));

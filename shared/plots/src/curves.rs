@@ -1,7 +1,7 @@
 //! Line charts in a grid.
 
 use crate::PlotError;
-use crate::canvas::{Area, Canvas, FAINT_INK, Font, INK, OVERSAMPLING, PAPER, drawing};
+use crate::canvas::{Canvas, FAINT_INK, Font, INK, OVERSAMPLING, PAPER, PixelArea, drawing};
 use carff_dataset::Image;
 use plotters::coord::Shift;
 use plotters::coord::ranged1d::{KeyPointHint, NoDefaultFormatting, Ranged, ValueFormatter};
@@ -134,7 +134,7 @@ fn legend(canvas: &mut Canvas, series: &[Series], left: u32, top: u32, width: u3
             (x, y) = (left, y + LEGEND.line_px());
         }
         let middle = y + LEGEND.line_px() / 2 - 1;
-        let swatch = Area { x, y: middle, width: SWATCH, height: 3 };
+        let swatch = PixelArea { x, y: middle, width: SWATCH, height: 3 };
         canvas.fill(swatch, *colour);
         canvas.text(&one.name, x + SWATCH + 5, y, LEGEND, FAINT_INK)?;
         x += SWATCH + 5 + text + LEGEND_GAP;

@@ -1,6 +1,6 @@
 //! Filmstrips: rows of captioned images.
 
-use crate::canvas::{Area, Canvas, FAINT_INK, Font, INK};
+use crate::canvas::{Canvas, FAINT_INK, Font, INK, PixelArea};
 use crate::{MAX_SIDE_PX, PlotError};
 use carff_dataset::Image;
 use plotters::style::RGBColor;
@@ -109,7 +109,7 @@ fn enlarged(image: &Image, factor: u32) -> Image {
 /// One line of text with its position.
 struct Line {
     text: String,
-    area: Area,
+    area: PixelArea,
     font: Font,
     colour: RGBColor,
 }
@@ -118,7 +118,7 @@ struct Line {
 struct Tile {
     row: usize,
     cell: usize,
-    area: Area,
+    area: PixelArea,
 }
 
 /// Positions of all texts and images.
@@ -127,7 +127,7 @@ struct Layout {
     height: u32,
     lines: Vec<Line>,
     tiles: Vec<Tile>,
-    fills: Vec<(Area, RGBColor)>,
+    fills: Vec<(PixelArea, RGBColor)>,
 }
 
 impl Layout {
@@ -149,7 +149,7 @@ impl Layout {
         layout.height +=
             layout.paragraph(&heading(subtitle, SUBTITLE, FAINT_INK), MARGIN, layout.height, text_width)?;
         for (index, row) in rows.iter().enumerate() {
-            let rule = Area { x: MARGIN, y: layout.height + ROW_GAP, width: text_width, height: 1 };
+            let rule = PixelArea { x: MARGIN, y: layout.height + ROW_GAP, width: text_width, height: 1 };
             layout.fills.push((rule, RULE));
             layout.height += 2 * ROW_GAP + 1;
             layout.height += layout.row(index, row, tile_width)?;
@@ -165,9 +165,10 @@ impl Layout {
         for (at, cell) in row.cells.iter().enumerate() {
             let x = MARGIN + CAPTION_WIDTH + GAP + at as u32 * (tile_width + GAP);
             let factor = scale(&cell.image);
-            let area = Area { x, y: top, width: cell.image.width_px * factor, height: cell.image.height_px * factor };
+            let area =
+                PixelArea { x, y: top, width: cell.image.width_px * factor, height: cell.image.height_px * factor };
             if let Some([r, g, b]) = cell.emphasis {
-                let frame = Area {
+                let frame = PixelArea {
                     x: area.x - FRAME,
                     y: area.y - FRAME,
                     width: area.width + 2 * FRAME,
@@ -188,7 +189,7 @@ impl Layout {
         let mut height = 0;
         for (text, font, colour) in lines {
             for text in font.wrapped(text, width)? {
-                let area = Area { x, y: y + height, width: font.width_px(&text)?, height: font.line_px() };
+                let area = PixelArea { x, y: y + height, width: font.width_px(&text)?, height: font.line_px() };
                 self.lines.push(Line { text, area, font: *font, colour: *colour });
                 height += area.height;
             }
@@ -226,7 +227,7 @@ mod tests {
         ]
     }
 
-    fn apart(a: Area, b: Area) -> bool {
+    fn apart(a: PixelArea, b: PixelArea) -> bool {
         a.x + a.width <= b.x || b.x + b.width <= a.x || a.y + a.height <= b.y || b.y + b.height <= a.y
     }
 
@@ -236,7 +237,7 @@ mod tests {
         let layout = Layout::new("Title", &"a long subtitle ".repeat(30), &odd_rows()).unwrap();
         let texts = layout.lines.iter().map(|l| l.area);
         let tiles = layout.tiles.iter().map(|t| t.area);
-        let all: Vec<Area> = texts.chain(tiles).collect();
+        let all: Vec<PixelArea> = texts.chain(tiles).collect();
         assert!(layout.tiles.len() == 6 && layout.lines.len() > 20);
         for (i, a) in all.iter().enumerate() {
             assert!(a.x + a.width <= layout.width && a.y + a.height <= layout.height, "{a:?}");

@@ -1,6 +1,6 @@
 //! Contact sheets with a legend: names of rows and columns, and the meaning of the frames' colours.
 
-use crate::canvas::{Area, Canvas, FAINT_INK, Font, INK, PAPER};
+use crate::canvas::{Canvas, FAINT_INK, Font, INK, PAPER, PixelArea};
 use crate::{MAX_SIDE_PX, PlotError};
 use carff_dataset::{ContactSheet, Image};
 use plotters::style::RGBColor;
@@ -49,7 +49,7 @@ fn heading(sheet: &ContactSheet, title: &str, width: u32) -> Result<Image, PlotE
         if x > MARGIN && x + needed > width {
             (x, y) = (MARGIN, y + TEXT.line_px());
         }
-        swatches.push((Area { x, y: y + 3, width: SWATCH_PX, height: SWATCH_PX }, *colour));
+        swatches.push((PixelArea { x, y: y + 3, width: SWATCH_PX, height: SWATCH_PX }, *colour));
         texts.push(((*meaning).to_owned(), x + SWATCH_PX + 5, y, TEXT, FAINT_INK));
         x += needed + 14;
     }

@@ -11,7 +11,7 @@ pub(crate) const METADATA: &str = "carff";
 
 /// Metadata of a recorded run.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct About {
+pub struct RecordingAbout {
     /// Name of the run.
     pub run: String,
     /// Id of the run.
@@ -32,7 +32,7 @@ pub struct About {
     pub origin: BTreeMap<String, String>,
 }
 
-impl About {
+impl RecordingAbout {
     pub(crate) fn to_metadata(&self) -> BTreeMap<String, String> {
         let known = [
             ("format", FORMAT.to_owned()),

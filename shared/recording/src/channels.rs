@@ -71,13 +71,13 @@ impl LogLine {
 ///
 /// No channel mixes sources: each camera, horizon step and hypothesis has its own.
 #[derive(Debug)]
-pub struct Encoder {
+pub struct MessageEncoder {
     places: Vec<Place>,
     wall_offset_ns: u64,
     events: Events,
 }
 
-impl Encoder {
+impl MessageEncoder {
     /// Creates an encoder. `places` are the places of the checkpoint. `wall_offset_ns` is the difference of wall-clock
     /// time (nanoseconds since 1970) and monotonic time.
     pub fn new(places: Vec<Place>, wall_offset_ns: u64) -> Self {

@@ -29,8 +29,8 @@ mod summary;
 mod transforms;
 mod writer;
 
-pub use about::About;
-pub use channels::{Encoded, Encoder, Format};
+pub use about::RecordingAbout;
+pub use channels::{Encoded, Format, MessageEncoder};
 pub use images::{ImageError, ImageOrigin, ImageReader};
 pub use queue::{QueueCounts, RecordingQueue};
 pub use reader::{Entry, Reader};

@@ -51,12 +51,12 @@ impl Item {
 /// ```
 /// use carff_messages::forms::OwnedMessage;
 /// use carff_messages::{Gaussian, Header, Posterior};
-/// use carff_recording::{About, RotationLimits, RecordingQueue, RotatingWriter};
+/// use carff_recording::{RecordingAbout, RotationLimits, RecordingQueue, RotatingWriter};
 /// use carff_transport::TopicId;
 /// # let folder = tempfile::tempdir()?;
 /// # let path = folder.path().join("run.mcap");
 /// let limits = RotationLimits { files: Some(3), file_bytes: Some(1 << 30), ..RotationLimits::default() };
-/// let writer = RotatingWriter::create(&path, About::default(), Vec::new(), limits)?;
+/// let writer = RotatingWriter::create(&path, RecordingAbout::default(), Vec::new(), limits)?;
 /// let queue = RecordingQueue::start(writer, 64 << 20)?;
 /// let header = Header::of_frame(7, 1_000, 42);
 /// let posterior = Posterior { header, gaussian: Gaussian::standard(), take_start: 0, stage_latency_ns: 0 };

@@ -5,7 +5,7 @@
 
 use crate::about::METADATA;
 use crate::channels::Content;
-use crate::{About, MessageError, RecordingError};
+use crate::{MessageError, RecordingAbout, RecordingError};
 use carff_messages::forms::{FormError, OwnedMessage, read};
 use carff_messages::{FrameMeta, MAX_IMAGE_BYTES, SCHEMA_VERSION, ViewMeta};
 use carff_transport::TopicId;
@@ -63,7 +63,7 @@ pub struct Reader {
     path: PathBuf,
     file: BufReader<File>,
     file_bytes: u64,
-    about: Option<About>,
+    about: Option<RecordingAbout>,
     has_other_format: bool,
     schemas: BTreeMap<u16, String>,
     channels: BTreeMap<u16, (String, Option<Content>)>,
@@ -132,7 +132,7 @@ impl Reader {
     }
 
     /// Returns the metadata of the run; `None` if the tool that rewrote the file dropped it.
-    pub fn about(&self) -> Option<&About> {
+    pub fn about(&self) -> Option<&RecordingAbout> {
         self.about.as_ref()
     }
 
@@ -291,7 +291,7 @@ impl Reader {
                 channels.insert(c.id, (c.topic, content));
             }
             Record::Metadata(m) if m.name == METADATA && about.is_none() => {
-                *about = About::from_metadata(&m.metadata);
+                *about = RecordingAbout::from_metadata(&m.metadata);
                 *has_other_format |= about.is_none();
             }
             Record::Message { header, .. } => found.push(header),

@@ -1,6 +1,6 @@
 //! A recording as a sequence of files with limits.
 
-use crate::{About, LogLine, RecordingError, Writer};
+use crate::{LogLine, RecordingAbout, RecordingError, Writer};
 use carff_decision::Place;
 use carff_messages::forms::AnyMessage;
 use carff_transport::TopicId;
@@ -19,10 +19,28 @@ pub struct RotationLimits {
 }
 
 /// Writes a sequence of files.
+///
+/// ```
+/// use carff_messages::forms::AnyMessage;
+/// use carff_messages::{EgoPose, Header};
+/// use carff_recording::{RecordingAbout, RotatingWriter, RotationLimits};
+/// use carff_transport::TopicId;
+/// # let folder = tempfile::tempdir()?;
+/// # let path = folder.path().join("drive.mcap");
+/// let limits = RotationLimits { file_ns: Some(1_000_000_000), ..RotationLimits::default() };
+/// let mut writer = RotatingWriter::create(&path, RecordingAbout::default(), Vec::new(), limits)?;
+/// for second in 1..=3 {
+///     let header = Header { publish_time_ns: second * 1_000_000_000, ..Header::of_frame(second, 1, 42) };
+///     let ego = EgoPose { header, ..EgoPose::default() };
+///     writer.write(TopicId::EGO_POSE, AnyMessage::new(&ego, &[]))?;
+/// }
+/// assert_eq!(writer.files(), 3);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 #[derive(Debug)]
 pub struct RotatingWriter {
     first: PathBuf,
-    about: About,
+    about: RecordingAbout,
     places: Vec<Place>,
     limits: RotationLimits,
     writer: Writer,
@@ -36,7 +54,7 @@ impl RotatingWriter {
     /// Starts with the file `first`; later files have a number before the extension.
     pub fn create(
         first: &Path,
-        about: About,
+        about: RecordingAbout,
         places: Vec<Place>,
         limits: RotationLimits,
     ) -> Result<Self, RecordingError> {

@@ -10,8 +10,8 @@ use carff_transport::TopicId;
 use std::io::Write as _;
 use std::path::Path;
 
-fn about() -> About {
-    About {
+fn about() -> RecordingAbout {
+    RecordingAbout {
         run: "r".into(),
         run_id: u64::MAX - 1,
         graph: "g.toml".into(),

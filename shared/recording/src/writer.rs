@@ -1,7 +1,7 @@
 //! Writes one file of a recording.
 
 use crate::about::METADATA;
-use crate::{About, Encoded, Encoder, LogLine, RecordingError};
+use crate::{Encoded, LogLine, MessageEncoder, RecordingAbout, RecordingError};
 use carff_decision::Place;
 use carff_messages::forms::AnyMessage;
 use carff_transport::TopicId;
@@ -21,11 +21,11 @@ const CHUNK_BYTES: u64 = 1 << 20;
 /// ```
 /// use carff_messages::forms::AnyMessage;
 /// use carff_messages::{Gaussian, Header, Posterior};
-/// use carff_recording::{About, Reader, Writer};
+/// use carff_recording::{RecordingAbout, Reader, Writer};
 /// use carff_transport::TopicId;
 /// # let folder = tempfile::tempdir()?;
 /// # let path = folder.path().join("run.mcap");
-/// let mut writer = Writer::create(&path, &About { run: "crossing".into(), ..About::default() }, &[])?;
+/// let mut writer = Writer::create(&path, &RecordingAbout { run: "crossing".into(), ..RecordingAbout::default() }, &[])?;
 /// let header = Header::of_frame(7, 1_000, 42);
 /// let posterior = Posterior { header, gaussian: Gaussian::standard(), take_start: 0, stage_latency_ns: 0 };
 /// writer.write(TopicId::POSTERIOR, AnyMessage::new(&posterior, &[]))?;
@@ -42,7 +42,7 @@ pub struct Writer {
     path: PathBuf,
     inner: mcap::Writer<NoSeek<BufWriter<File>>>,
     channels: BTreeMap<String, u16>,
-    encoder: Encoder,
+    encoder: MessageEncoder,
 }
 
 impl std::fmt::Debug for Writer {
@@ -54,7 +54,7 @@ impl std::fmt::Debug for Writer {
 impl Writer {
     /// Creates the file, which must not exist. `places` are the places of the checkpoint: their boxes are recorded with
     /// each belief.
-    pub fn create(path: &Path, about: &About, places: &[Place]) -> Result<Self, RecordingError> {
+    pub fn create(path: &Path, about: &RecordingAbout, places: &[Place]) -> Result<Self, RecordingError> {
         let file = File::create_new(path).map_err(|source| match source.kind() {
             std::io::ErrorKind::AlreadyExists => RecordingError::Exists { path: path.to_owned() },
             _ => RecordingError::Io { path: path.to_owned(), source },
@@ -74,7 +74,7 @@ impl Writer {
             path: path.to_owned(),
             inner,
             channels: BTreeMap::new(),
-            encoder: Encoder::new(places.to_vec(), about.wall_offset_ns),
+            encoder: MessageEncoder::new(places.to_vec(), about.wall_offset_ns),
         };
         writer.flush()?;
         Ok(writer)

@@ -6,10 +6,8 @@ use carff_base::geometry::PinholeCamera;
 use carff_config::Pose;
 use carff_dataset::{CameraCalibration, Dataset, RawImage, Rectifier};
 use carff_messages::{DatasetView, EgoPose, FrameMeta, Header, ImageMeta, MAX_IMAGE_BYTES, rgb_bytes};
-use carff_transport::{Image, Publisher, Receiver, monotonic_now_ns, topics};
+use carff_transport::{ImagePayload, Publisher, Receiver, monotonic_now_ns, topics};
 
-/// Assumed horizontal field of view of a camera without a calibration, degrees.
-const FIELD_OF_VIEW_DEG: f64 = 60.0;
 /// Longest side of a thinned image before rectification, pixels, and its most bytes.
 const RAW_SIDE_PX: u32 = 640;
 const RAW_BYTES: usize = rgb_bytes(RAW_SIDE_PX, RAW_SIDE_PX);
@@ -42,9 +40,9 @@ const IDENTITY: Pose = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1
 #[derive(Debug)]
 pub struct FrameOutput {
     /// Opened at the size of the first image; a larger image opens it again.
-    publisher: Option<(usize, Publisher<Image<FrameMeta>>)>,
+    publisher: Option<(usize, Publisher<ImagePayload<FrameMeta>>)>,
     /// Publishes thinned images before rectification, where they are asked for.
-    raw: Option<Publisher<Image<FrameMeta>>>,
+    raw: Option<Publisher<ImagePayload<FrameMeta>>>,
     rectifier: Option<Rectifier>,
     world_from_camera: Pose,
     /// The camera's pose on the vehicle, and the vehicle's poses.
@@ -192,7 +190,7 @@ impl FrameOutput {
 
 fn assumed_camera(width_px: u32, height_px: u32) -> PinholeCamera {
     let [eye, ahead, up] = [[0.0; 3], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]];
-    PinholeCamera::look_at(eye, ahead, up, width_px, height_px, FIELD_OF_VIEW_DEG)
+    PinholeCamera::look_at(eye, ahead, up, width_px, height_px, PinholeCamera::ASSUMED_FOV_DEG)
 }
 
 /// Computes the map of a calibrated camera to the field of view of the dataset: of the graph file's calibration, or

@@ -8,7 +8,7 @@ use carff_base::errors::sentence;
 use carff_config::{GraphConfig, LogFormat, LogLevel};
 use carff_messages::{Header, HealthState, ImageMeta, Message, Stage};
 use carff_transport::{
-    Image, Input, Node, Payload, Publisher, Receiver, Run, Stop, Topic, Waiter, Woken, monotonic_now_ns,
+    ImagePayload, Input, Node, Payload, Publisher, Receiver, Run, Stop, Topic, Waiter, Woken, monotonic_now_ns,
 };
 use rustix::process::{Signal, getppid, set_parent_process_death_signal};
 use std::io::Write;
@@ -126,9 +126,9 @@ impl StageContext {
     /// Opens a topic of images of at most `max_bytes` each for sending.
     pub fn image_output<M: ImageMeta>(
         &self,
-        topic: &Topic<Image<M>>,
+        topic: &Topic<ImagePayload<M>>,
         max_bytes: usize,
-    ) -> anyhow::Result<Publisher<Image<M>>> {
+    ) -> anyhow::Result<Publisher<ImagePayload<M>>> {
         Ok(self.node.image_publisher(topic, max_bytes)?)
     }
 

@@ -37,6 +37,9 @@ use crate::error::ScenarioError;
 use crate::movers::Pose;
 use crate::scenario::{Placement, Scenario};
 
+/// Frames between two time steps of the drives of training and evaluation, as the cameras of the shipped graphs take.
+pub const FRAMES_PER_TIMESTAMP: usize = 6;
+
 /// Name of the random stream.
 const STREAM: u32 = Key::named("drvf", 0, 0).step;
 /// Maximum number of drawn drives.

@@ -36,7 +36,7 @@ mod watches;
 pub use cameras::ScenarioCamera;
 pub use closed_loop::{ClosedLoop, Episode};
 pub use error::ScenarioError;
-pub use free_drives::{FreeDrive, FreeFrame};
+pub use free_drives::{FRAMES_PER_TIMESTAMP, FreeDrive, FreeFrame};
 pub use free_views::{FreePose, FreeView};
 pub use scenario::{
     ActorView, Detail, Extras, FULL_FRACTION, FULL_PIXELS, NONE_FRACTION, NONE_MEAN_DIFFERENCE, Rendering, Scenario,

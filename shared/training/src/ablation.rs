@@ -3,7 +3,7 @@
 //!
 //! Each variant has a folder for each seed, with its run, its checkpoint and its row. A variant with a row is finished.
 
-use crate::{Phases, Run, Training, TrainingConfig, TrainingError};
+use crate::{Phases, Training, TrainingConfig, TrainingError, TrainingRun};
 use carff_checkpoint::shapes::{BackboneConfig, BackboneKind, EncoderConfig, VitConfig};
 use carff_evaluation::{ByObservability, EncoderTable, EvalOptions, Share, Subject, encoder_rows, encoder_table};
 use serde::{Deserialize, Serialize};
@@ -143,7 +143,7 @@ fn unlabelled(config: &mut TrainingConfig, other_poses: usize) {
 
 /// A row of the table.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Row {
+pub struct AblationRow {
     /// The variant.
     pub variant: Variant,
     /// Description of the variant.
@@ -164,7 +164,7 @@ pub struct AblationTable {
     /// Random poses in addition to those of the dataset, for every variant.
     pub free_poses: usize,
     /// One row for each variant and seed.
-    pub rows: Vec<Row>,
+    pub rows: Vec<AblationRow>,
 }
 
 /// Folder of a variant and a seed, with its run, its checkpoint and its row.
@@ -174,7 +174,12 @@ pub fn folder(out: &Path, variant: Variant, seed: u64) -> PathBuf {
 
 /// Trains the VAE of one variant with the seed of the training file, or resumes its training, and scores it. A row that
 /// is there is read. `run` is in `run` of the variant's [`folder`].
-pub fn row(training: &Training, variant: Variant, run: &Run, options: EvalOptions) -> Result<Row, TrainingError> {
+pub fn row(
+    training: &Training,
+    variant: Variant,
+    run: &TrainingRun,
+    options: EvalOptions,
+) -> Result<AblationRow, TrainingError> {
     let seed = training.config.seed;
     let folder = folder(training.out, variant, seed);
     let path = folder.join("row.json");
@@ -187,7 +192,7 @@ pub fn row(training: &Training, variant: Variant, run: &Run, options: EvalOption
     Training { config: &config, out: &out, device: options.device, ..*training }.run(Phases::Vae, run)?;
     let subject = Subject::load(&out, training.dataset, options, run.on_progress)?;
     let description = variant.description(training.config).to_owned();
-    let row = Row { variant, description, seed, scores: encoder_table(&subject) };
+    let row = AblationRow { variant, description, seed, scores: encoder_table(&subject) };
     write(&path, &to_json(&row, &path)?)?;
     Ok(row)
 }

@@ -8,22 +8,19 @@ use carff_base::random::tag;
 use carff_checkpoint::{Bound, CheckpointPlanning, PlanningMemory};
 use carff_dataset::{drives::DriveKind, sensor::SensorNoise};
 use carff_decision::{
-    CalibrationTrial, Evidence, ImageEvidence, MemorySettings, Sampling, bounded_threshold, choose_threshold,
+    CalibrationTrial, Evidence, Feedback, ImageEvidence, MemorySettings, Sampling, bounded_threshold, choose_threshold,
 };
-use carff_evaluation::{KnownStates, Models, Perception, Planner, Progress, TakeMemories, Trial};
-use carff_scenes::Scenario;
+use carff_evaluation::{KnownStates, Models, Perception, Planner, Progress, SAMPLES, TakeMemories, Trial};
+use carff_scenes::{FRAMES_PER_TIMESTAMP, Scenario};
 use carff_unknown::Known;
 use rayon::prelude::*;
 use std::path::Path;
 
 /// Part of the seed of these drives, so that they share no draws with training, limits or evaluation.
 const BOUND: u64 = tag("bounded");
-/// Frames of a drive between two time steps.
-const FRAMES_PER_TIMESTAMP: usize = 6;
 /// Largest number of frames of a drive; it names random draws.
 const MOST_FRAMES: usize = 1000;
-/// Samples and steps of a decision, as in the graph.
-const SAMPLES: usize = 10;
+/// Steps of a decision, as in the graph.
 const HORIZON: u32 = 2;
 
 /// Input of the bound.
@@ -81,8 +78,8 @@ pub fn bound_threshold(input: BoundInput, on_progress: &dyn Fn(&Progress)) -> Re
         memory => memory.map(|memory| memory.settings),
     };
     let drives = drives(input, &models, known.as_ref(), settings, seed, on_progress)?;
-    let sampling = Sampling::Stratified;
-    let planner = Planner { net: &models.mixture, probe: &models.probe, sampling, horizon: HORIZON };
+    let (sampling, feedback) = (Sampling::Stratified, Feedback::State);
+    let planner = Planner { net: &models.mixture, probe: &models.probe, sampling, feedback, horizon: HORIZON };
     let (mut hazard, mut clear) = (Vec::new(), Vec::new());
     for (kind, trials) in drives {
         let evidence = planner.evidence(&trials, SAMPLES);

@@ -15,7 +15,7 @@ use carff_dataset::{
     drives::{DriveKind, eligible_inputs},
 };
 use carff_decision::{
-    CalibrationTrial, Evidence, Plan, ProbeCalibration, ProbeLayout, Sampling, choose_threshold, look_ahead,
+    CalibrationTrial, Evidence, Feedback, Plan, ProbeCalibration, ProbeLayout, Sampling, choose_threshold, look_ahead,
     unchosen_threshold,
 };
 use carff_evaluation::{Models, Perception, Progress, Trial, trial_frame};
@@ -160,9 +160,10 @@ fn calibration_trials(context: Context, models: &Models) -> Result<Vec<Trial>, T
 fn judged(context: Context, models: &mut Models, trials: &[Trial]) -> Vec<CalibrationTrial> {
     let settings = &context.config.calibration;
     let Models { mixture, probe, .. } = models;
-    let (samples, horizon, sampling) = (settings.samples, settings.horizon, Sampling::Stratified);
+    let (samples, horizon) = (settings.samples, settings.horizon);
+    let (sampling, feedback) = (Sampling::Stratified, Feedback::State);
     let judge = |trial: &Trial| {
-        let plan = Plan { samples, sampling, horizon, seed: trial.seed, frame: trial.frame };
+        let plan = Plan { samples, sampling, feedback, horizon, seed: trial.seed, frame: trial.frame };
         let steps = look_ahead(|input, _| mixture.forecast(input), probe, &trial.posterior, None, plan);
         let hazard_probability = Evidence::of_steps(&steps).hazard_probability();
         CalibrationTrial { hazard_probability, halt_is_right: trial.kind == DriveKind::Hazard }

@@ -7,7 +7,7 @@ use crate::{
     TrainingError,
     config::TrainingConfig,
     records::{FieldRecord, names},
-    run::{Context, Phase, Report, drive, part, prefixed},
+    run::{Context, Phase, PhaseReport, drive, part, prefixed},
     unambiguous::unambiguous_by_state,
 };
 use carff_base::random::Key;
@@ -220,7 +220,7 @@ impl Phase for FieldPhase<'_> {
         self.means.add(&self.last);
     }
 
-    fn report(&mut self, done: usize) -> Result<Report<FieldRecord>, TrainingError> {
+    fn report(&mut self, done: usize) -> Result<PhaseReport<FieldRecord>, TrainingError> {
         let RunningMeans { loss, psnr_db } = self.means;
         let due = |every: usize| done == self.total() || done.is_multiple_of(every);
         let line = due(LINE_EVERY).then(|| {
@@ -231,7 +231,7 @@ impl Phase for FieldPhase<'_> {
             )
         });
         let record = due(RECORD_EVERY).then(|| self.means.record(done));
-        Ok(Report { line, record })
+        Ok(PhaseReport { line, record })
     }
 
     fn state(&self) -> Tensors {

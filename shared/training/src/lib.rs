@@ -1,12 +1,12 @@
 //! Training of the three models, from images to a checkpoint.
 //!
 //! ```no_run
-//! use carff_training::{Phases, Run, Training, TrainingConfig};
+//! use carff_training::{Phases, Training, TrainingConfig, TrainingRun};
 //! use std::{path::Path, sync::atomic::AtomicBool};
 //! # fn main() -> Result<(), carff_training::TrainingError> {
 //! let config = TrainingConfig::load(Path::new("configs/training/toy.toml"))?;
 //! let stop = AtomicBool::new(false);
-//! let run = Run { dir: "runs/toy".into(), on_progress: &|p| println!("{}", p.line), stop: &stop };
+//! let run = TrainingRun { dir: "runs/toy".into(), on_progress: &|p| println!("{}", p.line), stop: &stop };
 //! let (dataset, out, device) = (config.dataset.as_path(), config.out.as_path(), tch::Device::Cpu);
 //! let training = Training { config: &config, dataset, random_poses: &[], scenario: None, out, device };
 //! println!("{}", training.run(Phases::All, &run)?.summary());
@@ -56,5 +56,5 @@ pub use known::{KnownInput, calibrate_known};
 pub use memory::{LearnedMemory, MemoryInput, learn_memory};
 pub use pipeline::{Phases, Training};
 pub use random_poses::render_random_poses;
-pub use run::{Run, forget_run};
+pub use run::{TrainingRun, forget_run};
 pub use vae::losses;

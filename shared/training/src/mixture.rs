@@ -9,7 +9,7 @@ use crate::{
     TrainingError,
     config::TrainingConfig,
     records::{MixtureRecord, names},
-    run::{Context, Phase, Report, cosine, part, prefixed},
+    run::{Context, Phase, PhaseReport, cosine, part, prefixed},
     unambiguous::{possible_states, unambiguous_by_state},
 };
 use carff_base::random::Key;
@@ -138,14 +138,14 @@ impl Phase for MixturePhase<'_> {
         self.sum += loss.double_value(&[]);
     }
 
-    fn report(&mut self, done: usize) -> Result<Report<MixtureRecord>, TrainingError> {
+    fn report(&mut self, done: usize) -> Result<PhaseReport<MixtureRecord>, TrainingError> {
         let steps = if done.is_multiple_of(RECORD_EVERY) { RECORD_EVERY } else { done % RECORD_EVERY };
         if steps < RECORD_EVERY && done < self.total() {
-            return Ok(Report { line: None, record: None });
+            return Ok(PhaseReport { line: None, record: None });
         }
         let mean = std::mem::take(&mut self.sum) / steps as f64;
         let record = MixtureRecord { step: done as u64, negative_log_likelihood: mean };
-        Ok(Report { line: Some(format!("negative log-likelihood {mean:.3}")), record: Some(record) })
+        Ok(PhaseReport { line: Some(format!("negative log-likelihood {mean:.3}")), record: Some(record) })
     }
 
     fn state(&self) -> Tensors {

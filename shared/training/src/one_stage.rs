@@ -7,7 +7,7 @@ use crate::{
     TrainingError,
     field::{RunningMeans, resumed, state_of, structure, views},
     records::{FieldRecord, names},
-    run::{Context, Phase, Report, cosine},
+    run::{Context, Phase, PhaseReport, cosine},
     vae::{
         Inputs, Vae,
         losses::{kl_divergence, reparameterised},
@@ -145,9 +145,9 @@ impl Phase for OneStagePhase<'_> {
         self.means.add(&report);
     }
 
-    fn report(&mut self, done: usize) -> Result<Report<FieldRecord>, TrainingError> {
+    fn report(&mut self, done: usize) -> Result<PhaseReport<FieldRecord>, TrainingError> {
         if done != self.total() && !done.is_multiple_of(RECORD_EVERY) {
-            return Ok(Report { line: None, record: None });
+            return Ok(PhaseReport { line: None, record: None });
         }
         let figures = self.vae.figures(self.context, &self.inputs.posteriors(self.vae, 0), false)?;
         let line = format!(
@@ -157,7 +157,7 @@ impl Phase for OneStagePhase<'_> {
             100.0 * figures.trained.full.accuracy,
             100.0 * figures.unseen.full.accuracy,
         );
-        Ok(Report { line: Some(line), record: Some(self.means.record(done)) })
+        Ok(PhaseReport { line: Some(line), record: Some(self.means.record(done)) })
     }
 
     fn state(&self) -> Tensors {

@@ -8,18 +8,18 @@ use crate::{
     one_stage::OneStagePhase,
     places,
     records::{DoneRecord, names},
-    run::{Context, Run, drive},
+    run::{Context, TrainingRun, drive},
     vae::{Inputs, Vae, VaePhase},
 };
 use carff_checkpoint::CheckpointPlanning;
 use carff_checkpoint::{FORMAT_VERSION, Manifest, ScenarioIdentity, SplitRecord, files, save_field};
 use carff_dataset::{Observability, PoseRole, drives::eligible_inputs};
-use carff_decision::{Policy, Sampling};
+use carff_decision::{Feedback, Policy, Sampling};
 use carff_evaluation::{
-    BirdsEye, CheckpointFigures, FieldRenderer, Input, Models, Perception, Planner, PlanningFigures, PosedImages,
-    ProbingFigures, SampleFigures, SampleTrials, TrainedAndUnseen, ViewFigures, birds_eye, to_bytes, to_unit,
+    BirdsEye, CheckpointFigures, FieldRenderer, Models, Perception, Planner, PlanningFigures, PosedImages,
+    ProbingFigures, SampleFigures, SampleInput, SampleTrials, TrainedAndUnseen, ViewFigures, birds_eye, to_unit,
 };
-use carff_field::Field;
+use carff_field::{Field, to_bytes};
 use carff_messages::{Gaussian, LATENT_DIM};
 use carff_networks::stored::save_weights;
 use carff_scenes::Scenario;
@@ -67,7 +67,7 @@ pub struct Training<'a> {
 impl Training<'_> {
     /// Trains `phases` and writes the trained models to the checkpoint. Finished phases are read from their saved
     /// states. A single phase requires that the phases before it are finished.
-    pub fn run(&self, phases: Phases, run: &Run) -> Result<CheckpointFigures, TrainingError> {
+    pub fn run(&self, phases: Phases, run: &TrainingRun) -> Result<CheckpointFigures, TrainingError> {
         let config = self.config;
         carff_networks::allocator::keep_large_blocks();
         tch::set_num_threads(config.threads);
@@ -213,7 +213,8 @@ impl Training<'_> {
         let noise = config.calibration.sensor;
         let perception = Perception { encoder, noise, seed: config.seed + 1, known: None };
         let horizon = config.calibration.horizon;
-        let planner = Planner { net: mixture, probe, sampling: Sampling::Stratified, horizon };
+        let (sampling, feedback) = (Sampling::Stratified, Feedback::State);
+        let planner = Planner { net: mixture, probe, sampling, feedback, horizon };
         let table = |role| {
             let inputs = eligible_inputs(&posed.dataset, &posed.split.views(role))
                 .map_err(|e| TrainingError::Unfit(e.to_string()))?;
@@ -277,7 +278,7 @@ fn sample_figures(context: Context, models: &mut Models, role: PoseRole) -> Samp
     for i in posed.with_roles(&[role]).into_iter().filter(full) {
         let image = config.augmentation.inputs(posed, &[i], 0, seed);
         let label = posed.labels[i];
-        inputs.extend(models.encoder.encode(&image).into_iter().map(|posterior| Input {
+        inputs.extend(models.encoder.encode(&image).into_iter().map(|posterior| SampleInput {
             state: label.state,
             view: label.view,
             posterior,
@@ -340,7 +341,7 @@ fn copy(from: &Path, to: &Path) -> std::io::Result<()> {
 }
 
 /// Draws rendered images above true ones, one column for each.
-fn write_strip(run: &Run, name: &str, view: &carff_evaluation::BirdsEye) -> Result<(), TrainingError> {
+fn write_strip(run: &TrainingRun, name: &str, view: &carff_evaluation::BirdsEye) -> Result<(), TrainingError> {
     let (Some(first), columns) = (view.images.first(), view.images.len()) else { return Ok(()) };
     let (w, h) = (first.width_px as usize, first.height_px as usize);
     let mut sheet = carff_dataset::Image {

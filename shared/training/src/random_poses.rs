@@ -10,13 +10,13 @@ use crate::{
     field::{Clouds, FieldPhase},
     places,
     records::names,
-    run::{Context, RANDOM_IMAGES, Run},
+    run::{Context, RANDOM_IMAGES, TrainingRun},
 };
 use carff_base::geometry::{PinholeCamera, cross, dot};
 use carff_base::random::Key;
 use carff_dataset::{DatasetWriter, FrameRecord, Image, ScenarioInfo};
-use carff_evaluation::{PosedImages, Progress, to_bytes};
-use carff_field::{Field, HypothesisBuffer, RenderOptions};
+use carff_evaluation::{PosedImages, Progress};
+use carff_field::{Field, HypothesisBuffer, RenderOptions, to_bytes};
 use carff_messages::{Gaussian, LATENT_DIM};
 use rand::Rng;
 use std::path::{Path, PathBuf};
@@ -58,7 +58,7 @@ const MOST_DRAWS: usize = 50;
 pub fn render_random_poses(
     config: &TrainingConfig,
     dataset: &Path,
-    run: &Run,
+    run: &TrainingRun,
 ) -> Result<Option<PathBuf>, TrainingError> {
     if config.free_poses.count == 0 || config.free_poses.field_steps == 0 {
         return Ok(None);

@@ -47,14 +47,14 @@ pub trait Phase {
     fn step(&mut self, step: usize);
 
     /// Figures after `done` steps.
-    fn report(&mut self, done: usize) -> Result<Report<Self::Record>, TrainingError>;
+    fn report(&mut self, done: usize) -> Result<PhaseReport<Self::Record>, TrainingError>;
 
     /// State to save.
     fn state(&self) -> Tensors;
 }
 
 /// Figures after a step; both parts may be absent.
-pub struct Report<R> {
+pub struct PhaseReport<R> {
     /// Line of progress.
     pub line: Option<String>,
     /// Record of the metrics file.
@@ -63,7 +63,7 @@ pub struct Report<R> {
 
 /// Runs a phase to its end, or resumes it from its saved state. The state is saved at intervals, at the end, and when
 /// the user stops the run.
-pub fn drive(phase: &mut impl Phase, run: &Run) -> Result<(), TrainingError> {
+pub fn drive(phase: &mut impl Phase, run: &TrainingRun) -> Result<(), TrainingError> {
     let (name, total) = (phase.name(), phase.total());
     let first = match run.load(name)? {
         Some((done, state)) if phase.restore(done, &state) => done,
@@ -101,11 +101,11 @@ pub struct Context<'a> {
     /// Images of the scenario.
     pub posed: &'a PosedImages,
     /// Folder and progress.
-    pub run: &'a Run<'a>,
+    pub run: &'a TrainingRun<'a>,
 }
 
 /// Folder, progress and stop flag of one training.
-pub struct Run<'a> {
+pub struct TrainingRun<'a> {
     /// Folder of the states and metrics.
     pub dir: PathBuf,
     /// Called after each step.
@@ -114,7 +114,7 @@ pub struct Run<'a> {
     pub stop: &'a AtomicBool,
 }
 
-impl Run<'_> {
+impl TrainingRun<'_> {
     /// Adds one record to the metrics file, under the name of its phase.
     pub fn record(&self, phase: &str, record: &impl Serialize) -> Result<(), TrainingError> {
         let path = self.dir.join(METRICS);
@@ -132,7 +132,7 @@ impl Run<'_> {
     }
 
     /// File of a phase's state.
-    pub fn state_path(&self, phase: &str) -> PathBuf {
+    fn state_path(&self, phase: &str) -> PathBuf {
         self.dir.join(state_file(phase))
     }
 
@@ -229,7 +229,7 @@ pub fn forget_run(dir: &Path) -> Result<(), TrainingError> {
 }
 
 /// Error of a state file that cannot be used.
-pub fn damaged(path: &Path) -> TrainingError {
+fn damaged(path: &Path) -> TrainingError {
     TrainingError::Format {
         path: path.into(),
         what: "this saved state belongs to another configuration or is damaged; remove the file to start anew".into(),

@@ -5,7 +5,7 @@
 
 use carff_dataset::{Dataset, ImportOptions, import};
 use carff_scenes::{Extras, Scenario};
-use carff_training::{Phases, Progress, Run, Training, TrainingConfig, TrainingError};
+use carff_training::{Phases, Progress, Training, TrainingConfig, TrainingError, TrainingRun};
 use std::ops::ControlFlow;
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
@@ -101,7 +101,7 @@ fn an_imported_set_trains_the_field() {
         device: tch::Device::Cpu,
     };
     let train = |phases: Phases| {
-        let run = Run { dir: folder.path().to_owned(), on_progress: &on_progress, stop: &stop };
+        let run = TrainingRun { dir: folder.path().to_owned(), on_progress: &on_progress, stop: &stop };
         training.run(phases, &run)
     };
     for phases in [Phases::Vae, Phases::Mixture] {

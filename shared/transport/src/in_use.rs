@@ -42,14 +42,6 @@ pub struct Ports {
 type Members = BTreeMap<u128, Member>;
 
 impl Node {
-    /// Returns the living processes of the run by name, including this one. A process is one member per name.
-    pub fn members(&self) -> Result<Vec<Member>, OpenError> {
-        let mut members: Vec<Member> = self.members_by_id()?.into_values().collect();
-        members.sort();
-        members.dedup();
-        Ok(members)
-    }
-
     fn members_by_id(&self) -> Result<Members, OpenError> {
         let failed =
             |cause: String| OpenError::Node { run: self.run().name().to_owned(), path: self.run().folder(), cause };

@@ -55,7 +55,7 @@ pub use error::{CleanupError, OpenError, ReceiveError, RunNameError, SendError, 
 pub use folder::{mapping_processes, runtime_dir, runtime_dirs};
 pub use in_use::{Member, OpenTopic, Ports};
 pub use node::{Node, make_private_dir};
-pub use payload::{Image, Payload};
+pub use payload::{ImagePayload, Payload};
 pub use publisher::{ImageLoan, Publisher};
 pub use receiver::{Receiver, Sample};
 pub use registry::{AnyPublisher, AnyReceiver, AnyTopic, Received, TopicId, UnknownTopic, graph_bytes};

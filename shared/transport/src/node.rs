@@ -1,7 +1,7 @@
 //! A process's membership in a run.
 
 use crate::folder::Kept;
-use crate::payload::{Image, Opened, Payload, Unopened};
+use crate::payload::{ImagePayload, Opened, Payload, Unopened};
 use crate::retry::retry;
 use crate::run::CLEANUP_PATIENCE;
 use crate::space::{MANAGEMENT_BYTES, SHARED_MEMORY_DIR, check_open_files, check_space};
@@ -96,9 +96,9 @@ impl Node {
     /// Opens a topic of images of at most `max_bytes` each to send on.
     pub fn image_publisher<M: ImageMeta>(
         &self,
-        topic: &Topic<Image<M>>,
+        topic: &Topic<ImagePayload<M>>,
         max_bytes: usize,
-    ) -> Result<Publisher<Image<M>>, OpenError> {
+    ) -> Result<Publisher<ImagePayload<M>>, OpenError> {
         self.sized_publisher(topic, max_bytes)
     }
 

@@ -19,9 +19,9 @@ use std::marker::PhantomData;
 
 /// The payload of an image topic: RGB bytes, with `M` to describe them.
 #[derive(Debug)]
-pub struct Image<M>(PhantomData<M>);
+pub struct ImagePayload<M>(PhantomData<M>);
 
-/// The payload of a topic: a [`Message`] by itself, or an [`Image`] that a message describes.
+/// The payload of a topic: a [`Message`] by itself, or an [`ImagePayload`] that a message describes.
 pub trait Payload: Debug + 'static {
     /// The message, which carries the header.
     type Message: Message;
@@ -117,7 +117,7 @@ impl<M: Message> Payload for M {
     }
 }
 
-impl<M: ImageMeta> Payload for Image<M> {
+impl<M: ImageMeta> Payload for ImagePayload<M> {
     type Message = M;
     type Body = [u8];
     type UserHeader = M;

@@ -1,6 +1,6 @@
 //! Sending: stamp, write in place, wake.
 
-use crate::payload::{Image, Payload, Port};
+use crate::payload::{ImagePayload, Payload, Port};
 use crate::{Counters, Run, SendError, Service, Topic, monotonic_now_ns};
 use carff_messages::{Header, ImageMeta, Invalid, Message, SCHEMA_VERSION};
 use iceoryx2::port::notifier::Notifier;
@@ -140,7 +140,7 @@ impl<M: ImageMeta> ImageLoan<M> {
     }
 }
 
-impl<M: ImageMeta> Publisher<Image<M>> {
+impl<M: ImageMeta> Publisher<ImagePayload<M>> {
     /// Returns memory for an image of `bytes` bytes, in the segment that the receivers read from.
     pub fn loan(&self, bytes: usize) -> Result<ImageLoan<M>, SendError> {
         self.check_room(bytes)?;

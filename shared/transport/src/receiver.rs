@@ -1,6 +1,6 @@
 //! Receiving: in place, validated, the newest or one by one.
 
-use crate::payload::{Image, Payload};
+use crate::payload::{ImagePayload, Payload};
 use crate::wait::Input;
 use crate::{Counters, ReceiveError, Run, Service, Topic, descriptors};
 use carff_messages::check::equals;
@@ -47,7 +47,7 @@ impl<P: Payload> Sample<P> {
     }
 }
 
-impl<M: ImageMeta> Sample<Image<M>> {
+impl<M: ImageMeta> Sample<ImagePayload<M>> {
     /// Returns the image as (height, width, channel), borrowed from shared memory.
     #[allow(clippy::missing_panics_doc, reason = "an empty view needs no bytes")]
     pub fn image(&self) -> ArrayView3<'_, u8> {

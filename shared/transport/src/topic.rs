@@ -39,7 +39,15 @@ impl TopicLimits {
 
 /// A topic: a name in the run, with the payload and the limits that all its users share.
 ///
-/// `P` is a message type, or [`crate::Image`] of the message type that describes the image.
+/// `P` is a message type, or [`crate::ImagePayload`] of the message type that describes the image.
+///
+/// ```
+/// use carff_messages::EgoPose;
+/// use carff_transport::{Topic, topics};
+/// // The pose of another vehicle, which comes at least every 200 ms.
+/// const LEADER_POSE: Topic<EgoPose> = Topic::new("leader/pose", topics::MESSAGES, 200);
+/// assert_eq!(LEADER_POSE.deadline.as_millis(), 200);
+/// ```
 #[derive(Debug)]
 pub struct Topic<P> {
     /// Name within the run.

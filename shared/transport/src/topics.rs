@@ -13,7 +13,7 @@
 //! ```
 
 use crate::in_use::OpenTopic;
-use crate::payload::Image;
+use crate::payload::ImagePayload;
 use crate::topic::{Topic, TopicLimits};
 use crate::{AnyTopic, TopicId};
 use carff_messages::{
@@ -44,7 +44,7 @@ const ONE_IMAGE: TopicLimits =
     TopicLimits { max_subscribers: 1, max_publishers: 2, max_nodes: 4, history: 0, buffer: 1, borrowed: 1, loaned: 1 };
 
 /// Images of a real camera before rectification, for `carff camera check`; published only for it.
-pub const RAW: Topic<Image<FrameMeta>> = Topic::new("camera/raw", ONE_IMAGE, 500);
+pub const RAW: Topic<ImagePayload<FrameMeta>> = Topic::new("camera/raw", ONE_IMAGE, 500);
 
 /// Declares the topics of the graph's messages, each with its [`TopicId`]: name, payload, limits, and deadline in
 /// milliseconds.
@@ -84,7 +84,7 @@ flow! {
     /// Motions of the vehicle, from its planner or a simulator. Approaches other than `stop` use the newest one.
     EGO_MOTION: EgoMotion = "ego/motion", STATUS, 500;
     /// Images from camera to encoder and prober.
-    FRAME: Image<FrameMeta> = "camera/frame", IMAGES, 500;
+    FRAME: ImagePayload<FrameMeta> = "camera/frame", IMAGES, 500;
     /// Posteriors from encoder to forecaster.
     POSTERIOR: Posterior = "encoder/posterior", REMEMBERED, 500;
     /// Checks of images from encoder to controller.
@@ -100,7 +100,7 @@ flow! {
     /// Values of a look from further on, from prober to controller; published with `controller.approach = "look"`.
     LOOK: LookGain = "prober/look", MESSAGES, 500;
     /// Views from renderer to viewers, recorder and probes.
-    VIEW: Image<ViewMeta> = "renderer/view", IMAGES, 5000;
+    VIEW: ImagePayload<ViewMeta> = "renderer/view", IMAGES, 5000;
     /// Actions from controller to vehicle.
     ACTION: Action = "controller/action", STATUS, 200;
 }

@@ -4,7 +4,9 @@
 
 use crate::common::{TestRun, frame, posterior};
 use carff_messages::{FrameMeta, Header, ImageMeta, Invalid, Posterior, ZeroCopySend, message};
-use carff_transport::{HeaderOnly, Image, Node, OpenTopic, Topic, TopicId, TopicLimits, monotonic_now_ns, topics};
+use carff_transport::{
+    HeaderOnly, ImagePayload, Node, OpenTopic, Topic, TopicId, TopicLimits, monotonic_now_ns, topics,
+};
 
 /// A message that no program of this workspace knows.
 #[repr(C)]
@@ -49,9 +51,9 @@ message!(Late);
 
 const FEW: TopicLimits = TopicLimits { max_subscribers: 3, max_nodes: 5, buffer: 4, ..topics::MESSAGES };
 const NOTE: Topic<Note> = Topic::new("stranger/note", FEW, 500);
-const IMAGE: Topic<Image<Note>> = Topic::new("stranger/image", topics::IMAGES, 500);
+const IMAGE: Topic<ImagePayload<Note>> = Topic::new("stranger/image", topics::IMAGES, 500);
 const OPINION: Topic<Posterior> = Topic::new("stranger/posterior", FEW, 500);
-const EYE: Topic<Image<FrameMeta>> = Topic::new("stranger/frame", topics::IMAGES, 500);
+const EYE: Topic<ImagePayload<FrameMeta>> = Topic::new("stranger/frame", topics::IMAGES, 500);
 const LATE: Topic<Late> = Topic::new("stranger/late", FEW, 500);
 
 fn found(node: &Node, name: &str) -> (TopicId, OpenTopic) {

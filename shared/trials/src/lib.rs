@@ -35,9 +35,9 @@ pub use figures::{
 };
 pub use places::places;
 pub use planning::{
-    ByKind, BySamples, Compared, Count, KnownStates, Perception, Planner, PlanningTable, SAMPLE_COUNTS, TakeMemories,
-    Trial, TrialOutcome, trial_frame,
+    ByKind, BySamples, Compared, Count, KnownStates, LEAST_TRIALS, MOST_REPEATS, Perception, Planner, PlanningTable,
+    SAMPLE_COUNTS, SAMPLES, TakeMemories, Trial, TrialOutcome, trial_frame,
 };
-pub use reliability::{Reliability, ReliabilityBin, ReliabilitySums, reliability};
-pub use render::{FieldRenderer, to_bytes, to_unit};
-pub use samples::{Input, SampleAccuracy, SampleTrials};
+pub use reliability::{RELIABILITY_BINS, Reliability, ReliabilityBin, ReliabilitySums, reliability};
+pub use render::{FieldRenderer, to_unit};
+pub use samples::{SampleAccuracy, SampleInput, SampleTrials};

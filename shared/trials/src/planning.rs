@@ -10,8 +10,8 @@ use carff_dataset::{
     sensor::{SensorNoise, apply_noise_into},
 };
 use carff_decision::{
-    Evidence, ImageEvidence, ImageMemory, Memory, MemorySettings, Mixture, Plan, Policy, Sampling, StepLength,
-    TakeFrame, TakeMemory, look_ahead,
+    Evidence, Feedback, ForecastInput, ImageEvidence, ImageMemory, Memory, MemorySettings, Mixture, Plan, Policy,
+    Sampling, StepLength, TakeFrame, TakeMemory, look_ahead,
 };
 use carff_field::Field;
 use carff_messages::{Gaussian, LATENT_DIM, Rule};
@@ -23,8 +23,12 @@ use std::{cell::RefCell, collections::BTreeMap};
 /// Numbers of samples that the table has columns for.
 pub const SAMPLE_COUNTS: [usize; 3] = [2, 10, 35];
 
-/// Number of samples whose outcomes [`Planner::table`] returns.
-const OUTCOME_SAMPLES: usize = 10;
+/// Number of samples of a decision, as in the shipped graphs. [`Planner::table`] returns the outcomes with this number.
+pub const SAMPLES: usize = 10;
+/// Smallest number of trials of a planning table, where it has enough images.
+pub const LEAST_TRIALS: usize = 300;
+/// Largest number of trials of one image: images that differ only in sensor noise are not independent.
+pub const MOST_REPEATS: usize = 5;
 
 /// One trial: the posterior of an input view with one correct action.
 #[derive(Clone, Debug, PartialEq)]
@@ -331,8 +335,20 @@ pub struct Planner<'a> {
     pub probe: &'a FieldProbe,
     /// Spread of the samples over the mixture's components.
     pub sampling: Sampling,
+    /// Input of each further step.
+    pub feedback: Feedback,
     /// Steps that are looked ahead.
     pub horizon: u32,
+}
+
+/// Returns the evidence of one trial's look-ahead.
+fn evidence_of(
+    probe: &mut FieldProbe,
+    trial: &Trial,
+    plan: Plan,
+    forecast: impl FnMut(&Gaussian, ForecastInput) -> Mixture,
+) -> Evidence {
+    Evidence::of_steps(&look_ahead(forecast, probe, &trial.posterior, trial.image.as_ref(), plan))
 }
 
 impl Planner<'_> {
@@ -341,14 +357,33 @@ impl Planner<'_> {
         let posteriors: Vec<Gaussian> = trials.iter().map(|t| t.posterior).collect();
         let first = if posteriors.is_empty() { Vec::new() } else { self.net.forecast_all(&posteriors) };
         let later = self.net.forecast_all(self.probe.states());
-        let Self { sampling, horizon, .. } = *self;
-        let of_trial = |probe: &mut FieldProbe, (trial, mixture): (&Trial, &Mixture)| {
-            let plan = Plan { samples, sampling, horizon, seed: trial.seed, frame: trial.frame };
-            let mixture = trial.remembered.as_ref().unwrap_or(mixture);
-            let forecast = |_: &Gaussian, state: Option<usize>| state.map_or(mixture, |s| &later[s]).clone();
-            Evidence::of_steps(&look_ahead(forecast, probe, &trial.posterior, trial.image.as_ref(), plan))
+        let Self { sampling, feedback, horizon, .. } = *self;
+        let plan = |trial: &Trial| Plan { samples, sampling, feedback, horizon, seed: trial.seed, frame: trial.frame };
+        let known = |mixture: &Mixture, trial: &Trial, input| match input {
+            ForecastInput::State(state) => later[state].clone(),
+            ForecastInput::Image | ForecastInput::Sample => trial.remembered.as_ref().unwrap_or(mixture).clone(),
         };
-        trials.par_iter().zip(&first).map_init(|| self.probe.clone(), of_trial).collect()
+        let trials = || trials.iter().zip(&first);
+        match feedback {
+            Feedback::State => {
+                let of_trial = |probe: &mut FieldProbe, (trial, mixture): (&Trial, &Mixture)| {
+                    evidence_of(probe, trial, plan(trial), |_, input| known(mixture, trial, input))
+                };
+                let trials: Vec<_> = trials().collect();
+                trials.into_par_iter().map_init(|| self.probe.clone(), of_trial).collect()
+            }
+            // A network of libtorch belongs to one thread.
+            Feedback::Latent => {
+                let mut probe = self.probe.clone();
+                let of_trial = |(trial, mixture): (&Trial, &Mixture)| {
+                    evidence_of(&mut probe, trial, plan(trial), |latent, input| match input {
+                        ForecastInput::Sample => self.net.forecast(latent),
+                        input => known(mixture, trial, input),
+                    })
+                };
+                trials().map(of_trial).collect()
+            }
+        }
     }
 
     /// Runs every trial with every rule and number of samples. Outcomes, in the order of the trials, are those of 10
@@ -361,7 +396,7 @@ impl Planner<'_> {
                     let right = policy.decide(&evidence).halt == (trial.kind == DriveKind::Hazard);
                     table.add(policy.rule, samples, trial.kind, right);
                 }
-                if samples == OUTCOME_SAMPLES {
+                if samples == SAMPLES {
                     let hazard_probability = evidence.hazard_or_unknown_probability() as f32;
                     outcomes.push(TrialOutcome { hazard_probability, kind: trial.kind });
                 }

@@ -75,6 +75,9 @@ impl ReliabilitySums {
     }
 }
 
+/// Number of bins of a reliability diagram and of its calibration error.
+pub const RELIABILITY_BINS: usize = 10;
+
 /// Returns the reliability of forecasts: pairs of a probability in 0..=1 and whether the event happened.
 ///
 /// ```

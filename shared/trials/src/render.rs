@@ -2,7 +2,7 @@
 
 use carff_base::geometry::PinholeCamera;
 use carff_dataset::{Image, PIXEL_TOLERANCE};
-use carff_field::{Field, RenderBuffer, RenderOptions};
+use carff_field::{Field, RenderBuffer, RenderOptions, to_bytes};
 use carff_messages::LATENT_DIM;
 
 /// Smallest difference of a channel in 0..=1 above which a pixel counts as changed.
@@ -32,11 +32,6 @@ impl FieldRenderer {
         let rgb = to_bytes(self.values(field, camera, latent));
         Image { width_px: camera.width_px, height_px: camera.height_px, rgb }
     }
-}
-
-/// Rounds values in 0..=1 to bytes; values outside are clamped.
-pub fn to_bytes(values: &[f32]) -> Vec<u8> {
-    values.iter().map(|v| (v.clamp(0.0, 1.0) * 255.0 + 0.5) as u8).collect()
 }
 
 /// Values in 0..=1 of an image's bytes.

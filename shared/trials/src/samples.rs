@@ -44,7 +44,7 @@ impl SampleAccuracy {
 
 /// One input view and its posterior.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Input {
+pub struct SampleInput {
     /// State that it shows.
     pub state: usize,
     /// Camera pose.
@@ -72,7 +72,7 @@ pub struct SampleTrials<'a> {
 
 impl SampleTrials<'_> {
     /// Accuracy of probed samples from each input whose state has a next one.
-    pub fn accuracy(&self, probe: &mut FieldProbe, inputs: &[Input]) -> SampleAccuracy {
+    pub fn accuracy(&self, probe: &mut FieldProbe, inputs: &[SampleInput]) -> SampleAccuracy {
         let mut table = SampleAccuracy::default();
         for input in inputs {
             let true_next = self.scenario.next_state(input.state);

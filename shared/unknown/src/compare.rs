@@ -42,14 +42,14 @@ pub struct KnownScene<'a> {
 
 /// Kinds of residuals.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Kind {
+pub enum ResidualKind {
     /// The image has a value that the state does not have there.
     Unexpected,
     /// The state has a value that the image does not have there: a vehicle that is not there.
     Missing,
 }
 
-impl Kind {
+impl ResidualKind {
     /// Both kinds.
     pub const ALL: [Self; 2] = [Self::Unexpected, Self::Missing];
 }
@@ -81,19 +81,19 @@ impl Comparison {
     }
 
     /// Returns the residual of each pixel of a state, in deviations; 0 where it was not compared.
-    pub fn residual(&self, state: usize, kind: Kind) -> &[f32] {
+    pub fn residual(&self, state: usize, kind: ResidualKind) -> &[f32] {
         self.residuals.get(state).map_or(&[], |residuals| &residuals[kind as usize])
     }
 
     /// Returns the residuals on the lanes with the ground points where they were found, for one state.
-    pub fn on_lanes(&self, state: usize, kind: Kind) -> impl Iterator<Item = ([f64; 2], f32)> + '_ {
+    pub fn on_lanes(&self, state: usize, kind: ResidualKind) -> impl Iterator<Item = ([f64; 2], f32)> + '_ {
         let residual = self.residual(state, kind).iter();
         let pixels = residual.zip(&self.ground).zip(&self.judged);
         pixels.filter_map(|((r, ground), judged)| Some((ground.filter(|g| g.on_lanes && *judged)?.at_m, *r)))
     }
 
     /// Returns the blobs of a state that stand on the lanes, the strongest first.
-    pub fn blobs(&self, state: usize, kind: Kind, errors: &ErrorMap) -> Vec<Blob> {
+    pub fn blobs(&self, state: usize, kind: ResidualKind, errors: &ErrorMap) -> Vec<Blob> {
         match self.residual(state, kind) {
             [] => Vec::new(),
             residual => blobs(&self.camera, residual, &self.judged, &self.ground, errors),
@@ -156,7 +156,7 @@ impl Comparer {
         let moved = align(View { rgb: &last.image, width, height }, &shown.rgb, &still)?;
         let aligned = self.compared(last.camera, moved, last.ground.clone(), last.judged.clone(), scene);
         let left = |of: &Comparison| 1.0 - of.fit.explained;
-        let on_lanes = |of: &Comparison| of.on_lanes(0, Kind::Unexpected).count();
+        let on_lanes = |of: &Comparison| of.on_lanes(0, ResidualKind::Unexpected).count();
         let is_better = left(&aligned) < BETTER * left(last) && 2 * on_lanes(&aligned) >= on_lanes(last);
         is_better.then_some(aligned)
     }
@@ -184,7 +184,7 @@ impl Comparer {
         let own: Vec<Vec<usize>> = (0..images.len()).map(|s| scene.lanes.own_pixels(&camera, s, &pixels)).collect();
         explain_own(&mut energies, &own, scene.hazard_states);
         let residual = |energy: &[ByKind], kind| median_residual(energy, kind, &judged, width, fit.noise);
-        let residuals = energies.iter().map(|energy| Kind::ALL.map(|kind| residual(energy, kind))).collect();
+        let residuals = energies.iter().map(|energy| ResidualKind::ALL.map(|kind| residual(energy, kind))).collect();
         Comparison { camera, image, fit, ground, judged, residuals }
     }
 
@@ -350,7 +350,7 @@ fn explain_own(energies: &mut [Vec<ByKind>], own: &[Vec<usize>], hazard_states: 
 
 /// Root of the median over 3 x 3 pixels (the lower one of an even number), of the mean over channels, in deviations: a
 /// speck or a thin line that the field misses is not an object.
-fn median_residual(energy: &[ByKind], kind: Kind, judged: &[bool], width: usize, noise: f32) -> Vec<f32> {
+fn median_residual(energy: &[ByKind], kind: ResidualKind, judged: &[bool], width: usize, noise: f32) -> Vec<f32> {
     let of_pixel = |i: usize| {
         let (mut near, mut count) = ([0.0; 9], 0);
         for at in neighbours(i, judged, width) {
@@ -454,7 +454,8 @@ mod tests {
         let fit = Fit { gain: [1.0; 3], offset: [0.0; 3], noise: LEAST_NOISE, explained: 1.0 };
         let judged = vec![true; width * width];
         let pixels = Pixels { image: &seen, judged: &judged, told_apart: &vec![true; width * width], width };
-        let out = median_residual(&energy(pixels, &rendered, &fit), Kind::Unexpected, &judged, width, fit.noise);
+        let out =
+            median_residual(&energy(pixels, &rendered, &fit), ResidualKind::Unexpected, &judged, width, fit.noise);
         assert!(out[22 * width + 6] > 20.0);
         let elsewhere =
             (0..width * width).filter(|i| !(2..11).contains(&(i % width)) || !(18..27).contains(&(i / width)));
@@ -477,7 +478,7 @@ mod tests {
         let residual = |states: &[&[f32]]| {
             let pixels = Pixels { image: &road, judged: &judged, told_apart: &told_apart(states), width };
             let energy = energy(pixels, &with_it, &fit);
-            Kind::ALL.map(|kind| median_residual(&energy, kind, &judged, width, fit.noise)[7 * width + 7])
+            ResidualKind::ALL.map(|kind| median_residual(&energy, kind, &judged, width, fit.noise)[7 * width + 7])
         };
         let [unexpected, missing] = residual(&[&with_it, &road]);
         assert!(unexpected < 1e-3 && missing > 20.0, "{unexpected} {missing}");

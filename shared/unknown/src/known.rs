@@ -2,7 +2,7 @@
 
 use crate::blobs::Blob;
 use crate::camera::CameraLimits;
-use crate::compare::{Comparer, Comparison, Kind, KnownScene};
+use crate::compare::{Comparer, Comparison, KnownScene, ResidualKind};
 use crate::lanes::{ErrorMap, Lanes};
 use crate::sighting::Sighting;
 use carff_base::geometry::PinholeCamera;
@@ -156,7 +156,7 @@ impl Known {
         let clear = (0..seen.ratios.len()).filter(|state| self.hazard_states.get(*state) == Some(&false));
         let best = clear.max_by(|&a, &b| seen.ratios[a].total_cmp(&seen.ratios[b]))?;
         let best_ratio = Some(seen.ratios[best]).filter(|ratio| *ratio > 0.0)?;
-        let blobs = Kind::ALL.into_iter().flat_map(|kind| {
+        let blobs = ResidualKind::ALL.into_iter().flat_map(|kind| {
             let KindLimits { errors, limit } = self.clear.of(kind);
             let blobs = comparison.blobs(best, kind, errors);
             blobs.into_iter().filter(move |blob| blob.strength > SUSPICIOUS * limit)
@@ -203,7 +203,7 @@ impl Known {
             return Err(format(format!("`format_version` is {found}, this program reads {FORMAT_VERSION}")));
         }
         for limits in [&known.clear, &known.hazard] {
-            if !Kind::ALL.iter().all(|kind| limits.of(*kind).is_valid()) {
+            if !ResidualKind::ALL.iter().all(|kind| limits.of(*kind).is_valid()) {
                 return Err(format("`errors` and `limit` must be positive numbers".to_owned()));
             }
         }
@@ -232,19 +232,19 @@ impl KnownLimits {
         let (for_errors, for_limit) = images.split_at(images.len() / 2);
         let mut points = [Vec::new(), Vec::new()];
         for comparison in for_errors {
-            let of = |s: usize| Kind::ALL.into_iter().flat_map(move |kind| comparison.on_lanes(s, kind));
+            let of = |s: usize| ResidualKind::ALL.into_iter().flat_map(move |kind| comparison.on_lanes(s, kind));
             let Some(best) = best(states, |s| of(s).map(|(_, r)| r * r).sum()) else { continue };
-            for kind in Kind::ALL {
+            for kind in ResidualKind::ALL {
                 points[kind as usize].extend(comparison.on_lanes(best, kind));
             }
         }
-        let errors = Kind::ALL.map(|kind| ErrorMap::fit(lanes, &points[kind as usize]));
+        let errors = ResidualKind::ALL.map(|kind| ErrorMap::fit(lanes, &points[kind as usize]));
         let mut strengths = [Vec::new(), Vec::new()];
         for comparison in for_limit {
-            let of_kind = |s: usize, kind: Kind| {
+            let of_kind = |s: usize, kind: ResidualKind| {
                 comparison.blobs(s, kind, &errors[kind as usize]).first().map_or(0.0, |blob| blob.strength)
             };
-            let of = |s: usize| Kind::ALL.map(|kind| of_kind(s, kind));
+            let of = |s: usize| ResidualKind::ALL.map(|kind| of_kind(s, kind));
             let Some(best) = best(states, |s| of(s).into_iter().fold(0.0, f32::max)) else { continue };
             strengths.iter_mut().zip(of(best)).for_each(|(all, strength)| all.push(strength));
         }
@@ -259,10 +259,10 @@ impl KnownLimits {
     }
 
     /// Returns the limits of one kind.
-    pub fn of(&self, kind: Kind) -> &KindLimits {
+    pub fn of(&self, kind: ResidualKind) -> &KindLimits {
         match kind {
-            Kind::Unexpected => &self.unexpected,
-            Kind::Missing => &self.missing,
+            ResidualKind::Unexpected => &self.unexpected,
+            ResidualKind::Missing => &self.missing,
         }
     }
 
@@ -276,7 +276,7 @@ impl KnownLimits {
 
     /// Returns the blobs of a state, of the kind that has the strongest one: an object covers what a state has there.
     fn judge(&self, comparison: &Comparison, state: usize) -> InLimits {
-        let [unexpected, missing] = Kind::ALL.map(|kind| -> InLimits {
+        let [unexpected, missing] = ResidualKind::ALL.map(|kind| -> InLimits {
             let KindLimits { errors, limit } = self.of(kind);
             let in_limits = |blob: Blob| (blob.strength / limit, blob);
             comparison.blobs(state, kind, errors).into_iter().map(in_limits).collect()

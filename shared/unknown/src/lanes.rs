@@ -40,7 +40,7 @@ pub struct OwnBox {
 
 impl Lanes {
     /// Reports whether a point of the ground is on an area, within the bounds.
-    pub fn contain(&self, x: f64, y: f64) -> bool {
+    fn contain(&self, x: f64, y: f64) -> bool {
         let [low, high] = self.bounds_m;
         let inside = x >= low[0] && x <= high[0] && y >= low[1] && y <= high[1];
         inside && self.areas.iter().any(|area| area.contains([x, y, area.center[2]]))

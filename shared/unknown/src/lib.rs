@@ -24,7 +24,7 @@ mod sighting;
 
 pub use blobs::Blob;
 pub use camera::{CameraCheck, CameraLimits, Measured, Measurement};
-pub use compare::{Comparer, Comparison, Kind, KnownScene};
+pub use compare::{Comparer, Comparison, KnownScene, ResidualKind};
 pub use fit::Fit;
 pub use known::{KindLimits, Known, KnownError, KnownLimits, Seen};
 pub use lanes::{ErrorMap, Ground, Lanes, OwnBox};

@@ -8,7 +8,7 @@ mod valid;
 use carff_base::geometry::PinholeCamera;
 use carff_checkpoint::CheckpointPlanning;
 use carff_checkpoint::Manifest;
-use carff_config::{GraphConfig, Kind, SoakConfig};
+use carff_config::{FaultKind, GraphConfig, SoakConfig};
 use carff_dataset::{CameraCalibration, Dataset, Image, ImportOptions, Rectifier, import};
 use carff_field::FieldConfig;
 use carff_messages::forms::AnyMessage;
@@ -16,7 +16,7 @@ use carff_messages::{
     Action, Belief, Forecast, FrameMeta, Health, ImageMeta, MAX_IMAGE_BYTES, Message, Posterior, ViewMeta,
 };
 use carff_observe::RunRecord;
-use carff_recording::{About, ImageReader, Reader as RecordingReader, RecordingError, Writer};
+use carff_recording::{ImageReader, Reader as RecordingReader, RecordingAbout, RecordingError, Writer};
 use carff_scenes::Scenario;
 use carff_training::TrainingConfig;
 use carff_transport::TopicId;
@@ -199,7 +199,7 @@ fn soak(bytes: &[u8], _: &Path) -> Verdict {
         assert!(e.to_string().starts_with("soak.toml:"), "{e}");
         words(e)
     })?;
-    let weight: u64 = Kind::ALL.iter().map(|kind| u64::from(soak.faults.of(*kind))).sum();
+    let weight: u64 = FaultKind::ALL.iter().map(|kind| u64::from(soak.faults.of(*kind))).sum();
     assert!(weight > 0 && soak.pace.min_pause_ms <= soak.pace.max_pause_ms, "{soak:?}");
     assert!(soak.contract.p99_drift_percent.is_finite(), "{soak:?}");
     Ok(())
@@ -367,7 +367,7 @@ fn recording(bytes: &[u8], folder: &Path) -> Verdict {
 fn small_recording(folder: &Path) -> Vec<Vec<u8>> {
     let path = folder.join("run.mcap");
     let write = || {
-        let about = About { run: "r".into(), run_id: 5, ..About::default() };
+        let about = RecordingAbout { run: "r".into(), run_id: 5, ..RecordingAbout::default() };
         let mut writer = Writer::create(&path, &about, &[])?;
         let posterior = valid::posterior();
         writer.write(TopicId::POSTERIOR, AnyMessage::new(&posterior, &[]))?;

@@ -3,7 +3,9 @@
 use super::{Receiver, Sender, Size, Waiting};
 use anyhow::Context;
 use carff_messages::{DatasetView, FrameMeta, Header, Intrinsics};
-use carff_transport::{Image, Node, Publisher, Run, Stop, Waiter, monotonic_now_ns, remove_run_leftovers, topics};
+use carff_transport::{
+    ImagePayload, Node, Publisher, Run, Stop, Waiter, monotonic_now_ns, remove_run_leftovers, topics,
+};
 use std::path::Path;
 
 /// Returns the run of both processes, named after their common folder.
@@ -20,7 +22,7 @@ pub(crate) fn clean_up(folder: &Path) -> anyhow::Result<()> {
 
 pub(crate) struct TypedSender {
     // Dropped before the node.
-    publisher: Publisher<Image<FrameMeta>>,
+    publisher: Publisher<ImagePayload<FrameMeta>>,
     _node: Node,
     meta: FrameMeta,
 }
@@ -49,7 +51,7 @@ impl Sender for TypedSender {
 
 pub(crate) struct TypedReceiver {
     // Dropped before the node.
-    receiver: Option<carff_transport::Receiver<Image<FrameMeta>>>,
+    receiver: Option<carff_transport::Receiver<ImagePayload<FrameMeta>>>,
     polled: bool,
     node: Node,
     waiter: Waiter,

@@ -10,7 +10,7 @@ use crate::stats::Times;
 use anyhow::{Context, ensure};
 use carff_messages::{DatasetView, FrameMeta, Header, Intrinsics};
 use carff_transport::{
-    Image, Node, Publisher, Receiver, Run, Stop, Waiter, Woken, monotonic_now_ns, remove_run_leftovers, topics,
+    ImagePayload, Node, Publisher, Receiver, Run, Stop, Waiter, Woken, monotonic_now_ns, remove_run_leftovers, topics,
 };
 
 /// Number of relays of the longest chain.
@@ -60,7 +60,7 @@ fn route(place: usize, length: usize, relays: u64) -> To {
 
 /// A publisher and its node. The node must outlive it.
 struct Output {
-    publisher: Publisher<Image<FrameMeta>>,
+    publisher: Publisher<ImagePayload<FrameMeta>>,
     _node: Node,
 }
 
@@ -79,7 +79,7 @@ impl Output {
 
 /// A receiver and its node.
 struct Incoming {
-    receiver: Receiver<Image<FrameMeta>>,
+    receiver: Receiver<ImagePayload<FrameMeta>>,
     _node: Node,
 }
 

@@ -2,9 +2,9 @@
 //! thread, as in the stages by default.
 
 use super::{Axis, Law, Row};
-use crate::birds_eye;
 use crate::stats::{Contender, Times, alternate, timed};
 use anyhow::ensure;
+use carff_base::geometry::PinholeCamera;
 use carff_checkpoint::{FieldProbe, Manifest, PreparedField, load_field_probe};
 use carff_decision::{Draw, Mixture, Place, ProbeCalibration, ProbeLayout};
 use carff_field::{Field, LATENT_DIM, RenderBuffer, RenderOptions};
@@ -31,7 +31,8 @@ pub(crate) fn views(checkpoint: &Path, quick: bool) -> anyhow::Result<Axis> {
     let (sides, rounds): (&[u32], _) = if quick { (&SIDES_PX_QUICK, 2) } else { (&SIDES_PX, 40) };
     let options = RenderOptions { threads: 1, ..RenderOptions::default() };
     let rows = measured(sides, rounds, |side_px| {
-        let camera = birds_eye(field.config(), side_px);
+        let bounds_m = field.config().bounds_m.map(|corner| corner.map(f64::from));
+        let camera = PinholeCamera::above(bounds_m, side_px, side_px);
         let (field, states) = (&field, &states);
         let (mut buffer, mut turn) = (RenderBuffer::new(), 0);
         Ok(move || {

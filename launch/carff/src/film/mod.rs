@@ -210,7 +210,8 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let (recording, file) = (folder.path().join("r.mcap"), folder.path().join("film.mp4"));
         let states = ["actor, t0", "no actor"].map(str::to_owned).to_vec();
-        let about = carff_recording::About { states: states.clone(), ..carff_recording::About::default() };
+        let about =
+            carff_recording::RecordingAbout { states: states.clone(), ..carff_recording::RecordingAbout::default() };
         let mut writer = carff_recording::Writer::create(&recording, &about, &[]).unwrap();
         let [camera_px, view_px] = [[64, 48], [40, 40]];
         let image = |[width_px, height_px]: [u32; 2], level: u8| Image::filled(width_px, height_px, [level, 60, 90]);

@@ -19,14 +19,14 @@ const WIDTH: usize = 50;
 
 /// The frame to trace.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Frame {
+pub enum TracedFrame {
     /// The next frame.
     Next,
     /// The frame with this number.
     Number(u64),
 }
 
-impl FromStr for Frame {
+impl FromStr for TracedFrame {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
@@ -42,7 +42,7 @@ impl FromStr for Frame {
 pub struct TraceArgs {
     /// Number of the frame, or `next`.
     #[arg(default_value = "next")]
-    pub frame: Frame,
+    pub frame: TracedFrame,
     /// Write the times of all frames to this file, in the trace event format, for ui.perfetto.dev.
     #[arg(long)]
     pub perfetto: Option<PathBuf>,
@@ -73,8 +73,8 @@ fn recorded(args: &TraceArgs, recording: &std::path::Path) -> anyhow::Result<()>
     let range = range(&spans);
     let file = recording.display();
     let frame = match args.frame {
-        Frame::Number(number) => number,
-        Frame::Next => range.with_context(|| format!("{file} has no frame of the camera"))?.0,
+        TracedFrame::Number(number) => number,
+        TracedFrame::Next => range.with_context(|| format!("{file} has no frame of the camera"))?.0,
     };
     let spans = of_frame(&spans, frame);
     if spans.is_empty() {
@@ -123,7 +123,7 @@ pub(super) fn run(args: &TraceArgs) -> anyhow::Result<()> {
         return recorded(args, recording);
     }
     args.perfetto.as_deref().map_or(Ok(()), check_writable)?;
-    if let (Frame::Number(frame), None) = (args.frame, &args.perfetto) {
+    if let (TracedFrame::Number(frame), None) = (args.frame, &args.perfetto) {
         let spans = kept_of_run(args.session.run.as_deref(), frame)?;
         if !spans.is_empty() {
             print_way(frame, spans);
@@ -134,8 +134,8 @@ pub(super) fn run(args: &TraceArgs) -> anyhow::Result<()> {
     session.listen(TopicId::FLOW)?;
     session.take(|_, _| Ok(()))?;
     let wanted = std::cell::Cell::new(match args.frame {
-        Frame::Next => None,
-        Frame::Number(number) => Some(number),
+        TracedFrame::Next => None,
+        TracedFrame::Number(number) => Some(number),
     });
     let (mut all, mut missed): (Vec<Span>, Option<u64>) = (Vec::new(), None);
     let mut decided_ns: Option<u64> = None;
@@ -285,7 +285,8 @@ mod tests {
         use carff_messages::{FrameMeta, Header};
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("r.mcap");
-        let mut writer = carff_recording::Writer::create(&path, &carff_recording::About::default(), &[]).unwrap();
+        let mut writer =
+            carff_recording::Writer::create(&path, &carff_recording::RecordingAbout::default(), &[]).unwrap();
         for frame in 5..8 {
             let header = Header { publish_time_ns: frame + 1, ..Header::of_frame(frame, frame, 1) };
             let mut meta = FrameMeta { header, width_px: 2, height_px: 1, ..FrameMeta::default() };
@@ -294,17 +295,17 @@ mod tests {
         }
         writer.finish().unwrap();
         let args = |frame| TraceArgs { frame, perfetto: None, recording: None, session: SessionArgs::default() };
-        recorded(&args(Frame::Number(6)), &path).unwrap();
-        recorded(&args(Frame::Next), &path).unwrap();
-        let error = recorded(&args(Frame::Number(9)), &path).unwrap_err().to_string();
+        recorded(&args(TracedFrame::Number(6)), &path).unwrap();
+        recorded(&args(TracedFrame::Next), &path).unwrap();
+        let error = recorded(&args(TracedFrame::Number(9)), &path).unwrap_err().to_string();
         assert!(error.contains("frame 9") && error.contains("5 to 7"), "{error}");
     }
 
     /// A frame is a number or `next`.
     #[test]
     fn frames_are_numbers_or_next() {
-        assert_eq!("next".parse(), Ok(Frame::Next));
-        assert_eq!("17".parse(), Ok(Frame::Number(17)));
-        assert!("x".parse::<Frame>().is_err());
+        assert_eq!("next".parse(), Ok(TracedFrame::Next));
+        assert_eq!("17".parse(), Ok(TracedFrame::Number(17)));
+        assert!("x".parse::<TracedFrame>().is_err());
     }
 }

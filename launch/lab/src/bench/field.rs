@@ -6,9 +6,9 @@ use super::{best, round_and_round};
 use crate::reference::{Precision, Rays, ReferenceField, Samples, huber_sum};
 use anyhow::Context;
 use carff_base::geometry::{PinholeCamera, Ray};
+use carff_bench::FieldArgs;
 use carff_bench::report::{Report, number, table};
 use carff_bench::stats::{Contender, Ratio, Times, alternate, timed};
-use carff_bench::{FieldArgs, birds_eye};
 use carff_checkpoint::{FieldProbe, Manifest, load_field_probe};
 use carff_decision::{Draw, Mixture};
 use carff_field::{
@@ -159,7 +159,8 @@ impl Bench {
 
     /// Renders bird's-eye views of every state.
     fn rendering(&self, field: &Field, fast: &Field, states: &[[f32; LATENT_DIM]], report: &mut Report) {
-        let camera = birds_eye(field.config(), self.side_px);
+        let bounds_m = field.config().bounds_m.map(|corner| corner.map(f64::from));
+        let camera = PinholeCamera::above(bounds_m, self.side_px, self.side_px);
         let rays: Vec<Ray> = (0..self.side_px * self.side_px)
             .map(|i| camera.ray(f64::from(i % self.side_px) + 0.5, f64::from(i / self.side_px) + 0.5))
             .collect();

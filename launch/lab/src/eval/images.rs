@@ -8,12 +8,10 @@ use carff_evaluation::{
     DecisiveImage, MaskedView, Novelty, OtherPlace, Perception, Progress, Subject, Watch, WatchPlan,
 };
 use carff_scenes::config::{BystanderPlace, VariationRole};
-use carff_scenes::{Detail, FreePose, Scenario, UnknownView};
+use carff_scenes::{Detail, FRAMES_PER_TIMESTAMP, FreePose, Scenario, UnknownView};
 use ndarray::Axis;
 use std::path::PathBuf;
 
-/// Frames of a free drive between two states.
-const FRAMES_PER_TIMESTAMP: usize = 6;
 /// Views with masks of each state, and deviation of their cameras' positions along x and y, metres.
 const VIEWS_PER_STATE: usize = 12;
 const VIEW_SHIFT_M: f64 = 0.4;

@@ -1,8 +1,8 @@
 //! What each command does, and when it has an effect.
 
-use super::{Choice, Command, Viewer, shots};
+use super::{Choice, Viewer, WindowCommand, shots};
 use crate::camera::OrbitCamera;
-use crate::input::Input;
+use crate::input::ChosenImage;
 use crate::session::Selection;
 use carff_dataset::Observability;
 use eframe::egui::{self, Context, ViewportCommand};
@@ -10,101 +10,103 @@ use std::sync::Arc;
 
 impl Viewer {
     /// Returns an error with the reason if a command would have no effect now.
-    pub fn can(&self, command: Command) -> Result<(), String> {
+    pub fn can(&self, command: WindowCommand) -> Result<(), String> {
         let is = |there: bool, why: &str| if there { Ok(()) } else { Err(why.to_owned()) };
         let history = self.session.history();
         match command {
-            Command::Toggle => {
+            WindowCommand::Toggle => {
                 let any = self.album.is_ok() || self.session.moment().is_some();
                 is(any, "no image yet: drop a PNG image here, pass --dataset, or attach to a run")
             }
-            Command::Predict => self.session.can_predict().map_err(|e| e.to_string()),
-            Command::Probe => is(self.session.moment().is_some(), "no image yet: press Toggle"),
-            Command::ProbeAndPredict => self.session.can_advance().map_err(|e| e.to_string()),
-            Command::Back => is(history.has_back(), "this is the beginning"),
-            Command::Forward => is(history.has_forward(), "this is the end"),
-            Command::ImageBefore | Command::ImageAfter => is(self.album.is_ok(), "no dataset to choose from"),
-            Command::Follow => is(self.live.is_some(), "no running graph is attached"),
-            Command::CameraImage => {
+            WindowCommand::Predict => self.session.can_predict().map_err(|e| e.to_string()),
+            WindowCommand::Probe => is(self.session.moment().is_some(), "no image yet: press Toggle"),
+            WindowCommand::ProbeAndPredict => self.session.can_advance().map_err(|e| e.to_string()),
+            WindowCommand::Back => is(history.has_back(), "this is the beginning"),
+            WindowCommand::Forward => is(history.has_forward(), "this is the end"),
+            WindowCommand::ImageBefore | WindowCommand::ImageAfter => {
+                is(self.album.is_ok(), "no dataset to choose from")
+            }
+            WindowCommand::Follow => is(self.live.is_some(), "no running graph is attached"),
+            WindowCommand::CameraImage => {
                 let known = self.session.moment().is_some_and(|m| m.input.camera.is_some());
                 is(known, "the camera pose of this image is unknown")
             }
-            Command::SaveView => is(self.view.is_some(), "no scene has been rendered yet"),
+            WindowCommand::SaveView => is(self.view.is_some(), "no scene has been rendered yet"),
             _ => Ok(()),
         }
     }
 
     /// Runs a command.
-    pub fn run(&mut self, command: Command, ctx: &Context) {
+    pub fn run(&mut self, command: WindowCommand, ctx: &Context) {
         if let Err(why) = self.can(command) {
             self.say(why, true);
             return;
         }
         let done = match command {
-            Command::Toggle => self.toggle(),
-            Command::Predict => self.predict(),
-            Command::Probe => {
+            WindowCommand::Toggle => self.toggle(),
+            WindowCommand::Predict => self.predict(),
+            WindowCommand::Probe => {
                 self.is_following = false;
                 self.session.probe().map_err(|e| e.to_string())
             }
-            Command::ProbeAndPredict => {
+            WindowCommand::ProbeAndPredict => {
                 self.is_following = false;
                 self.session.probe_and_predict().map_err(|e| e.to_string())
             }
-            Command::Back => {
+            WindowCommand::Back => {
                 self.session.back();
                 Ok(())
             }
-            Command::Forward => {
+            WindowCommand::Forward => {
                 self.session.forward();
                 Ok(())
             }
-            Command::SceneBefore => self.select_by(-1),
-            Command::SceneAfter => self.select_by(1),
-            Command::ImageBefore => self.leaf(false),
-            Command::ImageAfter => self.leaf(true),
-            Command::Follow => {
+            WindowCommand::SceneBefore => self.select_by(-1),
+            WindowCommand::SceneAfter => self.select_by(1),
+            WindowCommand::ImageBefore => self.leaf(false),
+            WindowCommand::ImageAfter => self.leaf(true),
+            WindowCommand::Follow => {
                 self.is_following = !self.is_following;
                 Ok(())
             }
-            Command::CameraCorner => {
+            WindowCommand::CameraCorner => {
                 self.camera = OrbitCamera::over_corner(self.session.models().bounds_m());
                 Ok(())
             }
-            Command::CameraAbove => {
+            WindowCommand::CameraAbove => {
                 self.camera = OrbitCamera::above(self.session.models().bounds_m());
                 Ok(())
             }
-            Command::CameraImage => {
+            WindowCommand::CameraImage => {
                 if let Some(camera) = self.session.moment().and_then(|m| m.input.camera) {
                     let ground_m = self.session.models().bounds_m()[0][2];
                     self.camera = OrbitCamera::from_pinhole(&camera, ground_m);
                 }
                 Ok(())
             }
-            Command::Boxes => {
+            WindowCommand::Boxes => {
                 self.overlays.boxes = !self.overlays.boxes;
                 Ok(())
             }
-            Command::Densities => {
+            WindowCommand::Densities => {
                 self.overlays.densities = !self.overlays.densities;
                 Ok(())
             }
-            Command::Screenshot => {
+            WindowCommand::Screenshot => {
                 shots::request(ctx);
                 Ok(())
             }
-            Command::SaveView => self.save_view(),
-            Command::Theme => {
+            WindowCommand::SaveView => self.save_view(),
+            WindowCommand::Theme => {
                 let theme = if ctx.theme() == egui::Theme::Dark { egui::Theme::Light } else { egui::Theme::Dark };
                 ctx.set_theme(theme);
                 Ok(())
             }
-            Command::Help => {
+            WindowCommand::Help => {
                 self.shows_help = !self.shows_help;
                 Ok(())
             }
-            Command::Quit => {
+            WindowCommand::Quit => {
                 ctx.send_viewport_cmd(ViewportCommand::Close);
                 Ok(())
             }
@@ -151,7 +153,7 @@ impl Viewer {
     }
 
     /// Shows the scene of an image.
-    pub fn toggle_input(&mut self, input: Arc<Input>) -> Result<(), String> {
+    pub fn toggle_input(&mut self, input: Arc<ChosenImage>) -> Result<(), String> {
         self.is_following = false;
         self.session.toggle(input).map_err(|e| e.to_string())
     }

@@ -4,7 +4,7 @@ use eframe::egui::{InputState, Key, Modifiers};
 
 /// A command of the window.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Command {
+pub enum WindowCommand {
     /// Shows the scene of the chosen image's posterior.
     Toggle,
     /// Forecasts one step.
@@ -50,11 +50,11 @@ pub enum Command {
 }
 
 /// A command with its key and its help text.
-pub type Entry = (Command, Modifiers, Key, &'static str);
+pub type Shortcut = (WindowCommand, Modifiers, Key, &'static str);
 
-impl Command {
+impl WindowCommand {
     /// All commands with keys and help texts, by topic, in the order of the help.
-    pub const ALL: [(&'static str, &'static [Entry]); 4] = [
+    pub const ALL: [(&'static str, &'static [Shortcut]); 4] = [
         (
             "Look ahead",
             &[
@@ -137,8 +137,8 @@ mod tests {
     /// Every command has its own key, and every key has a name.
     #[test]
     fn keys_are_unique() {
-        let all: Vec<_> = Command::ALL.iter().flat_map(|(_, commands)| *commands).collect();
-        let keys: BTreeSet<String> = all.iter().map(|(_, m, k, _)| Command::key_name(*m, *k)).collect();
+        let all: Vec<_> = WindowCommand::ALL.iter().flat_map(|(_, commands)| *commands).collect();
+        let keys: BTreeSet<String> = all.iter().map(|(_, m, k, _)| WindowCommand::key_name(*m, *k)).collect();
         assert_eq!(keys.len(), all.len());
         assert!(keys.contains("Ctrl+Q") && keys.contains("Shift+S") && keys.contains("["));
     }

@@ -2,7 +2,7 @@
 
 use super::{Latent, REST, Viewer};
 use crate::camera::OrbitCamera;
-use crate::render::{Drawn, Job, Pace, View};
+use crate::render::{Drawn, Job, RenderPace, View};
 use crate::session::{Found, Scene};
 use carff_base::geometry::PinholeCamera;
 use eframe::egui::Context;
@@ -48,7 +48,7 @@ impl<T: PartialEq> Asked<T> {
     }
 
     /// Returns whether a job is due; `None` if it must wait.
-    pub fn is_due(&mut self, job: T, not_within: Duration) -> Option<bool> {
+    fn is_due(&mut self, job: T, not_within: Duration) -> Option<bool> {
         if self.job.as_ref() == Some(&job) {
             return Some(false);
         }
@@ -120,15 +120,15 @@ impl Viewer {
         let (of_view, of_rest) =
             if self.is_following { (FOLLOW_VIEW, FOLLOW_REST) } else { (Duration::ZERO, Duration::ZERO) };
         let pace = match (self.is_moving(), self.is_following) {
-            (true, _) => Pace::Moving,
-            (false, true) => Pace::Steady,
-            (false, false) => Pace::Resting,
+            (true, _) => RenderPace::Moving,
+            (false, true) => RenderPace::Steady,
+            (false, false) => RenderPace::Resting,
         };
-        if pace == Pace::Moving {
+        if pace == RenderPace::Moving {
             ctx.request_repaint_after(REST);
         }
         let camera = self.camera.pinhole(self.view_px[0], self.view_px[1]);
-        let not_within = if pace == Pace::Steady { of_view } else { Duration::ZERO };
+        let not_within = if pace == RenderPace::Steady { of_view } else { Duration::ZERO };
         let mut is_late = false;
         let mut due = |due: Option<bool>| {
             is_late |= due.is_none();
@@ -145,7 +145,7 @@ impl Viewer {
         if due(self.asked_slice.is_due((latent, height_m), of_view)) {
             self.worker.ask(Job::Slice { latent, height_m, longest_px: SLICE_PX });
         }
-        if pace != Pace::Moving {
+        if pace != RenderPace::Moving {
             let latents: Vec<Latent> = self.session.scenes().iter().map(|s| s.latent).collect();
             let camera = self.camera.pinhole(THUMBNAIL_PX[0], THUMBNAIL_PX[1]);
             // Images of a followed graph are always finished; otherwise the last one would never be.

@@ -1,6 +1,6 @@
 //! The help window: keys and mouse actions.
 
-use super::{Command, theme};
+use super::{WindowCommand, theme};
 use eframe::egui::{Align2, Context, Grid, Window};
 
 const MOUSE: [(&str, &str); 4] = [
@@ -21,14 +21,14 @@ pub fn show(ctx: &Context, is_open: &mut bool) {
         .show(ctx, |ui| {
             ui.spacing_mut().interact_size.y = 16.0;
             ui.horizontal_top(|ui| {
-                let (left, right) = Command::ALL.split_at(Command::ALL.len() / 2);
+                let (left, right) = WindowCommand::ALL.split_at(WindowCommand::ALL.len() / 2);
                 for (column, topics) in [left, right].into_iter().enumerate() {
                     Grid::new(("keys", column)).num_columns(2).spacing([18.0, 4.0]).show(ui, |ui| {
                         for (topic, commands) in topics {
                             ui.label(theme::strong(*topic).color(palette.accent));
                             ui.end_row();
                             for (_, modifiers, key, what) in *commands {
-                                ui.monospace(Command::key_name(*modifiers, *key));
+                                ui.monospace(WindowCommand::key_name(*modifiers, *key));
                                 ui.label(*what);
                                 ui.end_row();
                             }

@@ -1,6 +1,6 @@
 //! The pane on the left: the input image and its choice, its posterior, and the look-ahead.
 
-use super::{Choice, Command, Viewer, theme};
+use super::{Choice, Viewer, WindowCommand, theme};
 use carff_dataset::Observability;
 use carff_decision::Sampling;
 use carff_messages::{Gaussian, HealthState, MAX_HORIZON, MAX_SAMPLES};
@@ -16,7 +16,7 @@ const IMAGE_SHARE: f32 = 0.26;
 const LEAST_IMAGE: f32 = 96.0;
 
 impl Viewer {
-    pub(super) fn input_pane(&mut self, ui: &mut Ui, commands: &mut Vec<Command>) {
+    pub(super) fn input_pane(&mut self, ui: &mut Ui, commands: &mut Vec<WindowCommand>) {
         let height = (ui.available_height() * IMAGE_SHARE).max(LEAST_IMAGE);
         ScrollArea::vertical().auto_shrink(false).show(ui, |ui| {
             ui.label(theme::heading("Image"));
@@ -74,7 +74,7 @@ impl Viewer {
         });
     }
 
-    fn chooser(&mut self, ui: &mut Ui, commands: &mut Vec<Command>) {
+    fn chooser(&mut self, ui: &mut Ui, commands: &mut Vec<WindowCommand>) {
         let Ok(album) = &self.album else { return };
         let (views, steps) = (album.view_count(), album.steps());
         let branches = self.session.models().manifest.scenario.branches.clone();
@@ -95,9 +95,9 @@ impl Viewer {
             }
         });
         ui.horizontal(|ui| {
-            self.command_button(ui, Command::ImageBefore, Button::new("‹"), commands);
+            self.command_button(ui, WindowCommand::ImageBefore, Button::new("‹"), commands);
             ui.add(Slider::new(&mut choice.view, 0..=views.saturating_sub(1)).text("view"));
-            self.command_button(ui, Command::ImageAfter, Button::new("›"), commands);
+            self.command_button(ui, WindowCommand::ImageAfter, Button::new("›"), commands);
         });
         ui.horizontal(|ui| {
             ui.weak("browse");

@@ -1,7 +1,7 @@
 //! The pane at the bottom: decisions and durations.
 
 use super::{Viewer, theme};
-use crate::journal::{Decision, Journal};
+use crate::journal::{Journal, ShownDecision};
 use eframe::egui::{Align, Color32, Grid, Layout, ScrollArea, Ui, vec2};
 use egui_plot::{GridMark, Line, Plot, PlotPoints};
 
@@ -56,7 +56,7 @@ fn decisions(ui: &mut Ui, journal: &Journal) {
                 ui.label(theme::small(name).color(palette.weak));
             }
             ui.end_row();
-            for Decision { rests_on, action, confidence, hazard_probability, reason, latency_ms } in
+            for ShownDecision { rests_on, action, confidence, hazard_probability, reason, latency_ms } in
                 journal.decisions().rev()
             {
                 let halts = action.is_safe();

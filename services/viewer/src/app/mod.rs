@@ -15,14 +15,14 @@ mod textures;
 mod theme;
 mod top_bar;
 
-pub use commands::Command;
+pub use commands::WindowCommand;
 pub use shots::ShotError;
 pub use theme::icon;
 
 use crate::camera::OrbitCamera;
-use crate::input::{Album, Input};
+use crate::input::{Album, ChosenImage};
 use crate::live::LiveFeed;
-use crate::render::{Pace, RenderWorker};
+use crate::render::{RenderPace, RenderWorker};
 use crate::session::Session;
 use carff_base::geometry::PinholeCamera;
 use carff_dataset::{Image, Observability};
@@ -134,7 +134,7 @@ pub struct Viewer {
     /// Size of the view in the window, pixels.
     view_px: [u32; 2],
     moved: Option<Instant>,
-    asked_view: Asked<(Latent, PinholeCamera, Pace)>,
+    asked_view: Asked<(Latent, PinholeCamera, RenderPace)>,
     asked_birds_eye: Asked<(Latent, PinholeCamera)>,
     asked_slice: Asked<(Latent, f32)>,
     asked_thumbnails: Asked<(Vec<Latent>, PinholeCamera)>,
@@ -213,7 +213,7 @@ impl Viewer {
         self.take_files(ctx);
         let mut commands = Vec::new();
         if !ctx.wants_keyboard_input() {
-            commands = ctx.input_mut(Command::pressed);
+            commands = ctx.input_mut(WindowCommand::pressed);
         }
         self.lay_out(ctx, &mut commands);
         for command in commands {
@@ -223,7 +223,7 @@ impl Viewer {
         self.take_shot(ctx);
     }
 
-    fn lay_out(&mut self, ctx: &Context, commands: &mut Vec<Command>) {
+    fn lay_out(&mut self, ctx: &Context, commands: &mut Vec<WindowCommand>) {
         let palette = theme::palette(ctx);
         let frame = theme::pane(palette);
         let Vec2 { x: width, y: height } = ctx.content_rect().size();
@@ -306,7 +306,8 @@ impl Viewer {
         let paths: Vec<PathBuf> =
             ctx.input(|input| input.raw.dropped_files.iter().filter_map(|file| file.path.clone()).collect());
         if let Some(path) = paths.first() {
-            let done = Input::load_png(path).map_err(|e| e.to_string()).and_then(|input| self.toggle_input(input));
+            let done =
+                ChosenImage::load_png(path).map_err(|e| e.to_string()).and_then(|input| self.toggle_input(input));
             if let Err(why) = done {
                 self.say(why, true);
             }

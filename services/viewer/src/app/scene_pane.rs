@@ -1,6 +1,6 @@
 //! The pane in the middle: the shown scene from the user's camera, with the results of probing.
 
-use super::{Command, Viewer, theme};
+use super::{Viewer, WindowCommand, theme};
 use crate::camera::FOV_DEG;
 use carff_base::geometry::{OrientedBox, PinholeCamera};
 use carff_messages::UnknownBox;
@@ -23,7 +23,7 @@ const NARROW: f32 = 540.0;
 const FINEST_PX: [u32; 2] = [96, 1536];
 
 impl Viewer {
-    pub(super) fn scene_pane(&mut self, ui: &mut Ui, commands: &mut Vec<Command>) {
+    pub(super) fn scene_pane(&mut self, ui: &mut Ui, commands: &mut Vec<WindowCommand>) {
         let rect = ui.available_rect_before_wrap();
         let response = ui.allocate_rect(rect, Sense::click_and_drag());
         self.move_camera(ui, &response);
@@ -159,16 +159,16 @@ impl Viewer {
             .on_hover_text("Longest side of the finest image (drag): coarser images come first");
     }
 
-    fn view_bar(&mut self, ui: &mut Ui, commands: &mut Vec<Command>) {
+    fn view_bar(&mut self, ui: &mut Ui, commands: &mut Vec<WindowCommand>) {
         let is_narrow = ui.available_width() < NARROW;
         let palette = theme::palette(ui.ctx());
         let frame = theme::pane(palette).fill(palette.pane.gamma_multiply(0.86)).corner_radius(8);
         frame.inner_margin(eframe::egui::Margin::symmetric(8, 4)).show(ui, |ui| {
             ui.horizontal(|ui| {
                 for (command, name) in [
-                    (Command::CameraCorner, "Corner"),
-                    (Command::CameraAbove, "Above"),
-                    (Command::CameraImage, "Image"),
+                    (WindowCommand::CameraCorner, "Corner"),
+                    (WindowCommand::CameraAbove, "Above"),
+                    (WindowCommand::CameraImage, "Image"),
                 ] {
                     self.command_button(ui, command, Button::new(name), commands);
                 }

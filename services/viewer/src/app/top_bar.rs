@@ -1,6 +1,6 @@
 //! The bar at the top: the three main commands, the history, and the source of images.
 
-use super::{Command, Viewer, theme};
+use super::{Viewer, WindowCommand, theme};
 use crate::live::LiveFeed;
 use crate::session::steps_ahead;
 use eframe::egui::{Align, Button, ComboBox, Layout, RichText, Theme, Ui, vec2};
@@ -12,18 +12,18 @@ const RIGHT_WIDTH: f32 = 290.0;
 const LIVE_WIDTH: f32 = 72.0;
 
 impl Viewer {
-    pub(super) fn top_bar(&mut self, ui: &mut Ui, commands: &mut Vec<Command>) {
+    pub(super) fn top_bar(&mut self, ui: &mut Ui, commands: &mut Vec<WindowCommand>) {
         ui.horizontal(|ui| {
             let palette = theme::palette(ui.ctx());
             ui.label(theme::heading("CARFF").color(palette.accent));
             ui.add_space(10.0);
             for (command, name) in [
-                (Command::Toggle, "Toggle"),
-                (Command::Predict, "Predict"),
-                (Command::Probe, "Probe"),
-                (Command::ProbeAndPredict, "Probe and predict"),
+                (WindowCommand::Toggle, "Toggle"),
+                (WindowCommand::Predict, "Predict"),
+                (WindowCommand::Probe, "Probe"),
+                (WindowCommand::ProbeAndPredict, "Probe and predict"),
             ] {
-                let is_main = command == Command::ProbeAndPredict;
+                let is_main = command == WindowCommand::ProbeAndPredict;
                 let text = if is_main { theme::strong(name).color(palette.on_accent) } else { RichText::new(name) };
                 let mut button = Button::new(text).min_size(vec2(72.0, 28.0));
                 if is_main {
@@ -32,13 +32,13 @@ impl Viewer {
                 self.command_button(ui, command, button, commands);
             }
             ui.add_space(10.0);
-            self.command_button(ui, Command::Back, Button::new("◀").min_size(vec2(28.0, 28.0)), commands);
+            self.command_button(ui, WindowCommand::Back, Button::new("◀").min_size(vec2(28.0, 28.0)), commands);
             self.crumbs(ui);
-            self.command_button(ui, Command::Forward, Button::new("▶").min_size(vec2(28.0, 28.0)), commands);
+            self.command_button(ui, WindowCommand::Forward, Button::new("▶").min_size(vec2(28.0, 28.0)), commands);
             ui.with_layout(Layout::right_to_left(Align::Center), |ui| {
                 let theme_sign = if ui.ctx().theme() == Theme::Dark { "☀" } else { "☾" };
                 for (command, sign) in
-                    [(Command::Help, "?"), (Command::Theme, theme_sign), (Command::Screenshot, "PNG")]
+                    [(WindowCommand::Help, "?"), (WindowCommand::Theme, theme_sign), (WindowCommand::Screenshot, "PNG")]
                 {
                     self.command_button(ui, command, Button::new(sign).min_size(vec2(28.0, 28.0)), commands);
                 }
@@ -51,15 +51,16 @@ impl Viewer {
     pub(super) fn command_button(
         &self,
         ui: &mut Ui,
-        command: Command,
+        command: WindowCommand,
         button: Button<'_>,
-        commands: &mut Vec<Command>,
+        commands: &mut Vec<WindowCommand>,
     ) {
         let can = self.can(command);
-        let mut all = Command::ALL.iter().flat_map(|(_, commands)| *commands);
-        let (key, what) = all
-            .find(|(c, ..)| *c == command)
-            .map_or_else(Default::default, |(_, modifiers, key, what)| (Command::key_name(*modifiers, *key), *what));
+        let mut all = WindowCommand::ALL.iter().flat_map(|(_, commands)| *commands);
+        let (key, what) =
+            all.find(|(c, ..)| *c == command).map_or_else(Default::default, |(_, modifiers, key, what)| {
+                (WindowCommand::key_name(*modifiers, *key), *what)
+            });
         let response = ui.add_enabled(can.is_ok(), button).on_hover_text(format!("{what}  [{key}]"));
         let response = match can {
             Ok(()) => response,
@@ -93,7 +94,7 @@ impl Viewer {
     }
 
     /// Shows the source of images: files, or a running graph.
-    fn source(&mut self, ui: &mut Ui, commands: &mut Vec<Command>) {
+    fn source(&mut self, ui: &mut Ui, commands: &mut Vec<WindowCommand>) {
         let palette = theme::palette(ui.ctx());
         let live = self.live.as_ref().map(|live| {
             let watched = live.watched();
@@ -129,7 +130,7 @@ impl Viewer {
                 (true, false) => ("● held", palette.hazard),
             };
             let button = Button::new(theme::strong(sign).color(color)).min_size(vec2(64.0, 28.0));
-            self.command_button(ui, Command::Follow, button, commands);
+            self.command_button(ui, WindowCommand::Follow, button, commands);
         }
         match wanted {
             Some(Some(run)) => self.attach(run),

@@ -2,8 +2,8 @@
 #![allow(clippy::unwrap_used, reason = "a failure here fails a test")]
 
 use carff_scenes::{Detail, Scenario};
-use carff_viewer::input::Input;
-use carff_viewer::models::Models;
+use carff_viewer::input::ChosenImage;
+use carff_viewer::models::SessionModels;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -19,8 +19,8 @@ pub fn checkpoint() -> PathBuf {
     root().join("configs/checkpoints/approaching-intersection")
 }
 
-pub fn models() -> Models {
-    Models::load(&checkpoint(), 1).unwrap()
+pub fn models() -> SessionModels {
+    SessionModels::load(&checkpoint(), 1).unwrap()
 }
 
 pub fn scenario() -> Scenario {
@@ -28,12 +28,12 @@ pub fn scenario() -> Scenario {
 }
 
 /// Returns the image of a state from a camera of the scenario.
-pub fn image(branch: usize, timestamp: usize, view: usize) -> Arc<Input> {
+pub fn image(branch: usize, timestamp: usize, view: usize) -> Arc<ChosenImage> {
     let scenario = scenario();
     let camera = scenario.cameras()[view].camera;
     let image = scenario.render(branch, timestamp, &camera, Detail::default()).unwrap().image;
-    let input = Input::of_image(format!("b{branch} t{timestamp} v{view}"), image);
-    Arc::new(Input { camera: Some(camera), frame: view as u64, ..(*input).clone() })
+    let input = ChosenImage::of_image(format!("b{branch} t{timestamp} v{view}"), image);
+    Arc::new(ChosenImage { camera: Some(camera), frame: view as u64, ..(*input).clone() })
 }
 
 /// Copies the shipped checkpoint without some files; large files are linked.

@@ -6,14 +6,15 @@ use crate::{EvaluationError, Progress, Subject};
 use carff_base::random::Key;
 use carff_dataset::{Image, Observability, PoseRole};
 use carff_decision::Sampling;
-use carff_field::Field;
+use carff_field::{Field, to_bytes};
 use carff_messages::LATENT_DIM;
 use carff_plots::{Marks, Panel, Series, StripCell, StripRow};
+use carff_trials::SAMPLES;
 use carff_trials::hypotheses::{birds_eye_camera, hypotheses};
 use carff_trials::render::FieldRenderer;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
-use tch::{Kind, Tensor};
+use tch::Tensor;
 
 /// The images that were drawn.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -37,9 +38,8 @@ pub struct GalleryImage {
 const MOST_LATENTS: usize = 1200;
 const PERPLEXITY: f32 = 30.0;
 const EPOCHS: usize = 1000;
-/// Rows of the grids, samples of a belief, and shown hypotheses of a belief.
+/// Rows of the grids, and shown hypotheses of a belief.
 const ROWS: usize = 8;
-const SAMPLES: usize = 10;
 const HYPOTHESES: usize = 4;
 /// Points along the longer side of a density slice.
 const SLICE_PX: u32 = 160;
@@ -299,11 +299,11 @@ fn reconstructions(subject: &Subject, path: &Path) -> Result<bool, EvaluationErr
 /// Image of a `[1, 3, H, W]` tensor in 0..=1.
 fn image_of(tensor: &Tensor) -> Image {
     let size = tensor.size();
-    let bytes = (tensor.get(0).permute([1, 2, 0]).clamp(0.0, 1.0) * 255.0 + 0.5).to_kind(Kind::Uint8).contiguous();
-    let mut rgb = vec![0_u8; bytes.numel()];
-    let count = rgb.len();
-    bytes.copy_data(&mut rgb, count);
-    Image { width_px: size[3] as u32, height_px: size[2] as u32, rgb }
+    let pixels = tensor.get(0).permute([1, 2, 0]).contiguous();
+    let mut values = vec![0.0_f32; pixels.numel()];
+    let count = values.len();
+    pixels.copy_data(&mut values, count);
+    Image { width_px: size[3] as u32, height_px: size[2] as u32, rgb: to_bytes(&values) }
 }
 
 fn latents(subject: &Subject, path: &Path) -> Result<bool, EvaluationError> {

@@ -20,7 +20,7 @@ use crate::tables::{
     robustness::{self, Robustness},
     trials::{self, Baseline, ByPart},
 };
-use crate::{About, ByRole, EvaluationError, Progress, Subject};
+use crate::{ByRole, CheckpointAbout, EvaluationError, Progress, Subject};
 pub use gallery::Gallery;
 pub use page::encoder_rows;
 use serde::{Deserialize, Serialize};
@@ -91,7 +91,7 @@ impl Table {
 #[serde(deny_unknown_fields)]
 pub struct Results {
     /// Subject of the evaluation.
-    pub subject: About,
+    pub subject: CheckpointAbout,
     /// Targets and measured figures.
     pub targets: Vec<Target>,
     /// Images of the field.

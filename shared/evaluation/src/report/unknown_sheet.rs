@@ -7,7 +7,7 @@ use carff_dataset::Image;
 use carff_decision::ImageEvidence;
 use carff_plots::{StripCell, StripRow};
 use carff_trials::Compared;
-use carff_unknown::Kind;
+use carff_unknown::ResidualKind;
 use std::path::Path;
 
 /// Largest number of objects.
@@ -102,7 +102,7 @@ fn rendered(compared: &Compared) -> Image {
 
 /// The residual of the best state, the larger one of both kinds, black to white.
 fn residual(compared: &Compared) -> Image {
-    let [unexpected, missing] = Kind::ALL.map(|kind| compared.comparison.residual(compared.best, kind));
+    let [unexpected, missing] = ResidualKind::ALL.map(|kind| compared.comparison.residual(compared.best, kind));
     let larger = unexpected.iter().zip(missing).map(|(a, b)| a.max(*b));
     let grey = larger.flat_map(|r| [(255.0 * (r / WHITE_DEVIATIONS).clamp(0.0, 1.0)) as u8; 3]);
     of_size(compared, grey.collect())

@@ -11,13 +11,13 @@ use ndarray::{Array1, Array2};
 use rand::seq::SliceRandom;
 
 /// Latent: one row of the machines' input.
-pub type Row = [f32; LATENT_DIM];
+pub type LatentRow = [f32; LATENT_DIM];
 
 /// Tolerance of the solver, as in scikit-learn.
 const SOLVER_TOLERANCE: f64 = 1e-3;
 
 /// Returns gamma = 1 / (dimensions * variance of all entries); 1 for a variance of 0.
-pub fn scale_gamma(rows: &[Row]) -> f64 {
+fn scale_gamma(rows: &[LatentRow]) -> f64 {
     let values = || rows.iter().flatten().map(|&v| f64::from(v));
     let n = (rows.len() * LATENT_DIM).max(1) as f64;
     let mean = values().sum::<f64>() / n;
@@ -27,11 +27,11 @@ pub fn scale_gamma(rows: &[Row]) -> f64 {
 
 /// Fits machines on rows with their states, and returns a state for each of `asked`. A pair whose machine cannot be
 /// fitted does not vote. With only one state, the result is that state.
-pub fn fit_and_name(rows: &[Row], states: &[usize], asked: &[Row]) -> Vec<usize> {
+pub fn fit_and_name(rows: &[LatentRow], states: &[usize], asked: &[LatentRow]) -> Vec<usize> {
     let mut known: Vec<usize> = states.to_vec();
     known.sort_unstable();
     known.dedup();
-    let table = |rows: &[Row]| Array2::from_shape_fn((rows.len(), LATENT_DIM), |(i, d)| f64::from(rows[i][d]));
+    let table = |rows: &[LatentRow]| Array2::from_shape_fn((rows.len(), LATENT_DIM), |(i, d)| f64::from(rows[i][d]));
     let gamma = scale_gamma(rows);
     let asked_table = table(asked);
     let mut votes = vec![vec![0_usize; known.len()]; asked.len()];
@@ -60,12 +60,12 @@ pub fn fit_and_name(rows: &[Row], states: &[usize], asked: &[Row]) -> Vec<usize>
 }
 
 /// State of each row from machines that were fitted without the row's fold.
-pub fn cross_validated(rows: &[Row], states: &[usize], fold_of: &[usize]) -> Vec<usize> {
+pub fn cross_validated(rows: &[LatentRow], states: &[usize], fold_of: &[usize]) -> Vec<usize> {
     let folds = fold_of.iter().max().map_or(0, |f| f + 1);
     let mut named = vec![0; rows.len()];
     for fold in 0..folds {
         let (out, within): (Vec<usize>, Vec<usize>) = (0..rows.len()).partition(|&i| fold_of[i] == fold);
-        let pick = |of: &[usize]| of.iter().map(|&i| rows[i]).collect::<Vec<Row>>();
+        let pick = |of: &[usize]| of.iter().map(|&i| rows[i]).collect::<Vec<LatentRow>>();
         let labels: Vec<usize> = within.iter().map(|&i| states[i]).collect();
         for (&i, name) in out.iter().zip(fit_and_name(&pick(&within), &labels, &pick(&out))) {
             named[i] = name;
@@ -106,7 +106,7 @@ mod tests {
     use super::*;
 
     /// A cloud of `count` points about `centre`, reproducible for equal seeds.
-    fn cloud(centre: f32, count: usize, seed: u64) -> Vec<Row> {
+    fn cloud(centre: f32, count: usize, seed: u64) -> Vec<LatentRow> {
         (0..count)
             .map(|i| {
                 let unit =
@@ -146,7 +146,7 @@ mod tests {
             (row[0], row[1]) = (2.0 * angle.cos(), 2.0 * angle.sin());
             row
         });
-        let rows: Vec<Row> = ring.chain(cloud(0.0, 40, 3)).collect();
+        let rows: Vec<LatentRow> = ring.chain(cloud(0.0, 40, 3)).collect();
         let states: Vec<usize> = (0..80).map(|i| i / 40).collect();
         assert_eq!(right(&cross_validated(&rows, &states, &stratified_folds(&states, 10, 1)), &states), 80);
     }

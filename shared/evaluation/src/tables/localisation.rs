@@ -4,11 +4,9 @@ use crate::segmentation::{SegmentedField, Segmenter, occupants, view_camera};
 use crate::{ByRole, Progress, ROLES, Subject, role_name};
 use carff_decision::{Localiser, Sampling, SceneProbe};
 use carff_messages::LATENT_DIM;
+use carff_trials::SAMPLES;
 use serde::{Deserialize, Serialize};
 use std::time::Instant;
-
-/// Samples of each image.
-const SAMPLES: usize = 10;
 
 /// Figures of both methods on the poses of each role.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]

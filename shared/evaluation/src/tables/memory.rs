@@ -2,19 +2,15 @@
 
 use crate::trials::{
     views::SUREST,
-    watches::{Watch, Watched},
+    watches::{Watch, WatchedFrame},
 };
 use crate::{Progress, Subject};
 use carff_checkpoint::FieldProbe;
-use carff_decision::{Evidence, Memory, MemorySettings, Mixture, Sampling};
-use carff_trials::reliability;
+use carff_decision::{Evidence, Memory, MemorySettings, Mixture, Sampling, is_likely};
+use carff_trials::{RELIABILITY_BINS, SAMPLES, reliability};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
-/// Samples of a forecast.
-const SAMPLES: usize = 10;
-/// Bins of the calibration error.
-const BINS: usize = 10;
 /// A belief is sure of a hazard at or above this probability, and of none at or below its complement.
 const SURE: f64 = 0.95;
 /// The exact observer is sure beyond this probability.
@@ -85,7 +81,7 @@ pub fn memory(subject: &Subject, on_progress: &dyn Fn(&Progress)) -> Result<Memo
     let total = subject.watches.len();
     for (done, watch) in subject.watches.iter().enumerate() {
         let seed = subject.options.seed;
-        let mut probability = |mixture: &Mixture, frame: &Watched| hazard(&mut probe, mixture, frame, seed);
+        let mut probability = |mixture: &Mixture, frame: &WatchedFrame| hazard(&mut probe, mixture, frame, seed);
         let filtered = with_memory(&memory, watch);
         let none = watch.frames.iter().map(|f| probability(&f.forecast, f)).collect();
         let filter = watch.frames.iter().zip(&filtered).map(|(f, mixture)| probability(mixture, f)).collect();
@@ -106,7 +102,7 @@ pub fn memory(subject: &Subject, on_progress: &dyn Fn(&Progress)) -> Result<Memo
 }
 
 /// The forecast of each frame of a watch from all its images so far.
-pub fn with_memory(memory: &Memory, watch: &Watch) -> Vec<Mixture> {
+fn with_memory(memory: &Memory, watch: &Watch) -> Vec<Mixture> {
     let mut memory = memory.clone();
     memory.clear();
     let mut step = watch.frames.first().map_or(0, |frame| frame.timestamp);
@@ -119,7 +115,7 @@ pub fn with_memory(memory: &Memory, watch: &Watch) -> Vec<Mixture> {
 }
 
 /// Hazard probability of the next state, as the prober reads it.
-fn hazard(probe: &mut FieldProbe, mixture: &Mixture, frame: &Watched, seed: u64) -> f64 {
+fn hazard(probe: &mut FieldProbe, mixture: &Mixture, frame: &WatchedFrame, seed: u64) -> f64 {
     let draws = mixture.draw(SAMPLES, Sampling::Stratified, seed, frame.frame, 1);
     let step = probe.step(mixture.clone(), draws, 1.0, frame.image.as_ref());
     Evidence::of_steps(&[step]).hazard_or_unknown_probability()
@@ -143,7 +139,7 @@ fn figures(watches: &[Watch], found: &[Vec<f64>]) -> ObserverFigures {
         -(if hazard { p } else { 1.0 - p }).ln()
     };
     figures.log_loss = forecasts.iter().map(loss).sum::<f64>() / forecasts.len().max(1) as f64;
-    figures.calibration_error = reliability(&forecasts, BINS).expected_calibration_error;
+    figures.calibration_error = reliability(&forecasts, RELIABILITY_BINS).expected_calibration_error;
     figures
 }
 
@@ -162,9 +158,9 @@ fn kinds(watch: &Watch, found: &[f64]) -> [RightFrames; 4] {
             (false, true) if watch.hazard => (0, p >= SURE),
             (false, true) => (1, p <= 1.0 - SURE),
             (_, false) if (0.4..=0.6).contains(&frame.exact_with_memory) => (2, (0.4..=0.6).contains(&p)),
-            (true, _) if (p >= 0.5) != watch.hazard => {
+            (true, _) if is_likely(p) != watch.hazard => {
                 let later = found.iter().enumerate().skip(k + 1).take(CORRECTED_IN);
-                (3, later.clone().any(|(_, &p)| (p >= 0.5) == watch.hazard))
+                (3, later.clone().any(|(_, &p)| is_likely(p) == watch.hazard))
             }
             _ => continue,
         };
@@ -182,7 +178,7 @@ mod tests {
     /// A watch with these exact probabilities without and with memory.
     fn watch(hazard: bool, exact: &[(f64, f64)]) -> Watch {
         let forecast = Mixture { weights: vec![1.0], components: vec![Gaussian::standard()] };
-        let frame = |(exact, exact_with_memory): &(f64, f64)| Watched {
+        let frame = |(exact, exact_with_memory): &(f64, f64)| WatchedFrame {
             timestamp: 0,
             frame: 0,
             forecast: forecast.clone(),

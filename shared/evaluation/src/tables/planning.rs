@@ -10,23 +10,17 @@ use carff_dataset::{
 use carff_decision::{Policy, Sampling};
 use carff_messages::Rule;
 use carff_plots::{Panel, Series};
-use carff_trials::{ByKind, PlanningTable, Trial};
-use carff_trials::{Reliability, reliability};
+use carff_trials::{
+    ByKind, LEAST_TRIALS, MOST_REPEATS, PlanningTable, RELIABILITY_BINS, Reliability, Trial, reliability,
+};
 use rand::Rng;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
 /// Trials of each kind in the paper's protocol.
 const ONE_IMAGE_TRIALS: usize = 30;
-/// Smallest number of trials of each kind over all views.
-const TRIALS: usize = 300;
-/// Largest number of trials of one image outside the trained poses: images that differ only in sensor noise are not
-/// independent.
-const MOST_REPEATS: usize = 5;
 /// First frame number of free drives, which share no random draws with images of the dataset.
 const FIRST_FREE: u64 = 1 << 40;
-/// Bins of the reliability diagram.
-const BINS: usize = 10;
 
 /// Every rule with 2, 10 and 35 samples. The keys are those of the launch report.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -151,7 +145,7 @@ impl Protocol<'_> {
         let [hazard, clear] = [DriveKind::Hazard, DriveKind::Clear]
             .map(|kind| inputs.iter().copied().filter(|i| i.kind == kind).collect::<Vec<EligibleInput>>());
         let repeats = |of: &[EligibleInput]| {
-            let wanted = TRIALS.div_ceil(of.len().max(1));
+            let wanted = LEAST_TRIALS.div_ceil(of.len().max(1));
             if role == PoseRole::Rest { wanted } else { wanted.min(MOST_REPEATS) }
         };
         let counts = ViewCounts {
@@ -228,7 +222,7 @@ impl Protocol<'_> {
             let (_, outcomes) = planner.table(&self.take(&inputs, 1)?, &[]);
             let forecasts: Vec<(f64, bool)> =
                 outcomes.iter().map(|o| (f64::from(o.hazard_probability), o.kind == DriveKind::Hazard)).collect();
-            found.set(role, reliability(&forecasts, BINS));
+            found.set(role, reliability(&forecasts, RELIABILITY_BINS));
         }
         Ok(found)
     }

@@ -8,13 +8,11 @@ use carff_checkpoint::CheckpointPlanning;
 use carff_dataset::{Corruption, Image, drives::DriveKind};
 use carff_decision::{Policy, Sampling};
 use carff_messages::{Header, ImageCheck, Rule};
-use carff_trials::Count;
+use carff_trials::{Count, SAMPLES};
 use carff_unknown::{CameraCheck, Known, Measurement};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
-/// Samples of each step.
-const SAMPLES: usize = 10;
 /// First frame number of these images, which share no random draws with other trials.
 const FIRST: u64 = 1 << 42;
 /// First frame number of free drives.

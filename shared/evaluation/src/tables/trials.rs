@@ -8,12 +8,9 @@ use crate::{Progress, Subject};
 use carff_dataset::PoseRole;
 use carff_decision::{CalibrationTrial, Evidence, Policy, Sampling, choose_threshold};
 use carff_messages::Rule;
-use carff_trials::Trial;
+use carff_trials::{SAMPLES, Trial};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
-
-/// Samples of each step.
-const SAMPLES: usize = 10;
 
 /// Figures by part of the trials: `rest` (trained poses), `unseen` (held-out poses), `free` (poses of no dataset).
 pub type ByPart = BTreeMap<String, ByTrialKind>;

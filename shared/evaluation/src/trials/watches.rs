@@ -4,12 +4,10 @@ use crate::Progress;
 use carff_dataset::{ScenarioInfo, drives::DriveKind};
 use carff_decision::{ImageEvidence, Mixture};
 use carff_networks::mixture::MixtureNet;
-use carff_scenes::{Scenario, ScenarioError};
+use carff_scenes::{FRAMES_PER_TIMESTAMP, Scenario, ScenarioError};
 use carff_trials::Perception;
 use rayon::prelude::*;
 
-/// Frames of a watch between two time steps: the cameras of the shipped graphs take six.
-const FRAMES_PER_TIMESTAMP: usize = 6;
 /// Largest number of frames of a watch; it names random draws.
 const MOST_FRAMES: u64 = 1000;
 
@@ -21,12 +19,12 @@ pub struct Watch {
     /// True in a hazard branch.
     pub hazard: bool,
     /// Its frames, in order.
-    pub frames: Vec<Watched>,
+    pub frames: Vec<WatchedFrame>,
 }
 
 /// One frame of a watch.
 #[derive(Clone, Debug)]
-pub struct Watched {
+pub struct WatchedFrame {
     /// Time step.
     pub timestamp: usize,
     /// Frame number, which names random draws.
@@ -75,7 +73,7 @@ pub fn watches(
             let (frame, timestamp) = (number * MOST_FRAMES + k as u64, drive.timestamp_of(k));
             let Some(trial) = perception.trial((camera, image), DriveKind::Clear, frame) else { continue };
             let forecast = net.forecast(&trial.posterior);
-            frames.push(Watched { timestamp, frame, forecast, image: trial.image, exact, exact_with_memory });
+            frames.push(WatchedFrame { timestamp, frame, forecast, image: trial.image, exact, exact_with_memory });
         }
         all.push(Watch { number, hazard: info.is_hazard(drive.branch()), frames });
         on_progress(&Progress { phase: "watches", done: all.len(), total: count, line: String::new() });

@@ -3,7 +3,7 @@
 //! A 32-bit lane of the instruction holds two neighbouring inputs of one sample, and two weights: the products of both
 //! are added to the lane's f32 sum.
 
-#![allow(unsafe_code)]
+#![allow(unsafe_code, reason = "instructions that only some processors have")]
 
 #[cfg(target_arch = "x86_64")]
 use super::block::{Blocks, BlocksMut, LANES};

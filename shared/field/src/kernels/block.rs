@@ -100,7 +100,7 @@ impl<'a> BlocksMut<'a> {
 
     /// A view to read from.
     #[inline(always)]
-    pub fn as_blocks(&self) -> Blocks<'_> {
+    fn as_blocks(&self) -> Blocks<'_> {
         Blocks { data: self.data, rows: self.rows }
     }
 

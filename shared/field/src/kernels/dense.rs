@@ -4,8 +4,7 @@
 //! slices that are arguments of the compiled function does the compiler know that they do not overlap, and without that
 //! it does not vectorise the sums.
 
-// See above.
-#![allow(clippy::too_many_arguments)]
+#![allow(clippy::too_many_arguments, reason = "only slices that are arguments are known not to overlap")]
 
 use super::block::LANES;
 use super::math::fma;

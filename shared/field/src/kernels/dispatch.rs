@@ -1,6 +1,6 @@
 //! The kernels compiled for each instruction set, chosen at run time.
 
-#![allow(unsafe_code)]
+#![allow(unsafe_code, reason = "calls of functions compiled for an instruction set that was found at run time")]
 
 use super::activation;
 use super::adam::{self, AdamStep};
@@ -106,17 +106,17 @@ macro_rules! dispatched {
         $(#[$doc])*
         // Inlined, the portable version would lose what its arguments promise: that slices do not overlap.
         #[inline(never)]
-        #[allow(clippy::too_many_arguments)]
+        #[allow(clippy::too_many_arguments, reason = "the arguments of the body")]
         pub(crate) fn $name(set: InstructionSet, $($arg: $ty),*) $(-> $result)? {
             #[cfg(target_arch = "x86_64")]
             #[target_feature(enable = "avx2,fma")]
-            #[allow(clippy::too_many_arguments)]
+            #[allow(clippy::too_many_arguments, reason = "the arguments of the body")]
             fn avx2($($arg: $ty),*) $(-> $result)? {
                 $module::$body::<true $($generic)*>($($arg),*)
             }
             #[cfg(target_arch = "x86_64")]
             #[target_feature(enable = $wide)]
-            #[allow(clippy::too_many_arguments)]
+            #[allow(clippy::too_many_arguments, reason = "the arguments of the body")]
             fn avx512($($arg: $ty),*) $(-> $result)? {
                 $module::$body::<true $($generic)*>($($arg),*)
             }

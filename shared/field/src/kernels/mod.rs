@@ -2,8 +2,10 @@
 //!
 //! Callers go through [`dispatch`], which picks the version for the processor at run time.
 
-// Loops over lanes by index: that is the form which vectorises, and all of a loop's arrays read alike.
-#![allow(clippy::needless_range_loop)]
+#![allow(
+    clippy::needless_range_loop,
+    reason = "loops over lanes by index are the form that vectorises, and all of a loop's arrays read alike"
+)]
 
 pub(crate) mod activation;
 pub(crate) mod adam;

@@ -1,6 +1,6 @@
 //! Prefetching of table entries.
 
-#![allow(unsafe_code)]
+#![allow(unsafe_code, reason = "the prefetch instruction")]
 
 /// Asks for an entry's cache line ahead of its use; does nothing on processors without such an instruction.
 #[inline(always)]

@@ -35,6 +35,16 @@ pub struct RenderBuffer {
     pub(super) pool: Pool,
 }
 
+/// Rounds a value in 0..=1 to a byte; a value outside is clamped.
+pub fn to_byte(value: f32) -> u8 {
+    (value.clamp(0.0, 1.0) * 255.0 + 0.5) as u8
+}
+
+/// Rounds values in 0..=1 to bytes; values outside are clamped.
+pub fn to_bytes(values: &[f32]) -> Vec<u8> {
+    values.iter().map(|&value| to_byte(value)).collect()
+}
+
 /// Images of one camera under several latents. Rendering reuses their memory and threads.
 #[derive(Debug, Default)]
 pub struct HypothesisBuffer {

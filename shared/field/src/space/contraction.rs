@@ -37,7 +37,7 @@ impl Contraction {
 
     /// Maps box units to the unit cube.
     #[inline(always)]
-    pub fn contract_normalized(u: [f32; 3]) -> [f32; 3] {
+    fn contract_normalized(u: [f32; 3]) -> [f32; 3] {
         u.map(Self::contract_axis)
     }
 

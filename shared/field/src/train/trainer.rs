@@ -44,6 +44,7 @@ pub struct FieldTrainer {
     pub(super) state_latents: Vec<Vec<[f32; LATENT_DIM]>>,
     /// Largest recent density of each occupancy cell, 1/metre.
     pub(super) cell_density: Vec<f32>,
+    /// Factor by which steps along rays are stretched; 1 once the occupancy grid keeps rays short.
     pub(super) step_scale: f32,
     pub(super) table_moments: [Vec<f32>; 2],
     pub(super) network_moments: [Vec<f32>; 2],
@@ -91,18 +92,13 @@ impl FieldTrainer {
         &self.field
     }
 
-    /// Returns the factor by which steps along rays are stretched; 1 once the occupancy grid keeps rays short.
-    pub fn step_scale(&self) -> f32 {
-        self.step_scale
-    }
-
     /// Returns the number of steps done.
     pub fn step_count(&self) -> u64 {
         self.step
     }
 
     /// Returns the learning rate of the current step as a share of the peak.
-    pub fn learning_rate_factor(&self) -> f32 {
+    fn learning_rate_factor(&self) -> f32 {
         let c = &self.config;
         let rise = ((self.step + 1) as f32 / c.warmup_steps.max(1) as f32).min(1.0);
         let start = c.steps as f32 * c.decay_start;

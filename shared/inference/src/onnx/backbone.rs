@@ -3,7 +3,7 @@
 use super::graph::{Builder, Name, float, int, text};
 use super::{Convolution, Features};
 use crate::InferenceError;
-use crate::weights::{Tensors, Weights};
+use crate::weights::{Arrays, StoredWeights};
 use carff_checkpoint::backbones::{efficientnet, vit};
 use carff_checkpoint::shapes::{BackboneConfig, BackboneKind, VitConfig};
 use ndarray::{ArrayD, Axis, concatenate};
@@ -15,7 +15,7 @@ const CONV_NET: [i64; 5] = [3, 32, 64, 96, 112];
 pub fn features(
     graph: &mut Builder,
     config: &BackboneConfig,
-    weights: &mut Weights,
+    weights: &mut StoredWeights,
     published: bool,
     image: &str,
 ) -> Result<Features, InferenceError> {
@@ -42,7 +42,12 @@ pub fn is_beyond_the_features(kind: BackboneKind, name: &str) -> bool {
     }
 }
 
-fn conv_net(graph: &mut Builder, weights: &mut Weights, image: &str, side: i64) -> Result<Features, InferenceError> {
+fn conv_net(
+    graph: &mut Builder,
+    weights: &mut StoredWeights,
+    image: &str,
+    side: i64,
+) -> Result<Features, InferenceError> {
     let mut x = graph.scaled(image, 4.0, -2.0);
     for (i, width) in CONV_NET.windows(2).enumerate() {
         let convolution = graph.convolution(weights, &format!("{i}.conv"), [width[1], width[0], 3, 3], 2)?;
@@ -59,7 +64,7 @@ fn conv_net(graph: &mut Builder, weights: &mut Weights, image: &str, side: i64) 
 
 fn efficient_net(
     graph: &mut Builder,
-    weights: &mut Weights,
+    weights: &mut StoredWeights,
     published: bool,
     image: &str,
     side_px: i64,
@@ -102,14 +107,17 @@ fn efficient_net(
 }
 
 /// Converts timm's names to published names.
-fn published_names(tensors: Tensors) -> Tensors {
+fn published_names(tensors: Arrays) -> Arrays {
     let in_timm = tensors.contains_key("conv_stem.weight");
     let renamed = |name: &str| if in_timm { efficientnet::published_name(name) } else { None };
     tensors.into_iter().map(|(name, t)| (renamed(&name).unwrap_or(name), t)).collect()
 }
 
 /// Weight and bias of a convolution, with its batch normalisation folded in.
-fn folded(weights: &mut Weights, layer: &efficientnet::Layer) -> Result<(ArrayD<f32>, ArrayD<f32>), InferenceError> {
+fn folded(
+    weights: &mut StoredWeights,
+    layer: &efficientnet::Layer,
+) -> Result<(ArrayD<f32>, ArrayD<f32>), InferenceError> {
     let channels = layer.shape[0];
     let weight = weights.take(&format!("{}.weight", layer.convolution), &layer.shape)?;
     let mut norm = |part: &str| weights.take(&format!("{}.{part}", layer.norm), &[channels]);
@@ -125,7 +133,10 @@ fn folded(weights: &mut Weights, layer: &efficientnet::Layer) -> Result<(ArrayD<
 }
 
 /// Weight and bias of a convolution that was trained with its normalisation folded in.
-fn trained(weights: &mut Weights, layer: &efficientnet::Layer) -> Result<(ArrayD<f32>, ArrayD<f32>), InferenceError> {
+fn trained(
+    weights: &mut StoredWeights,
+    layer: &efficientnet::Layer,
+) -> Result<(ArrayD<f32>, ArrayD<f32>), InferenceError> {
     let weight = weights.take(&format!("{}.weight", layer.convolution), &layer.shape)?;
     Ok((weight, weights.take(&format!("{}.bias", layer.convolution), &layer.shape[..1])?))
 }
@@ -133,7 +144,7 @@ fn trained(weights: &mut Weights, layer: &efficientnet::Layer) -> Result<(ArrayD
 fn transformer(
     graph: &mut Builder,
     config: &VitConfig,
-    weights: &mut Weights,
+    weights: &mut StoredWeights,
     published: bool,
     image: &str,
     side_px: i64,
@@ -191,7 +202,7 @@ fn transformer(
 /// The layers of a transformer's blocks.
 struct Layers<'a> {
     graph: &'a mut Builder,
-    weights: &'a mut Weights,
+    weights: &'a mut StoredWeights,
     width: i64,
     heads: i64,
     tokens: i64,
@@ -249,9 +260,9 @@ impl Layers<'_> {
 
 /// Converts published tensors to timm's names and form: queries, keys and values are concatenated, `LayerScale` is
 /// folded, and the class token has a position.
-fn timm_form(tensors: Tensors) -> Tensors {
+fn timm_form(tensors: Arrays) -> Arrays {
     let root = vit::root(tensors.keys().map(String::as_str)).to_owned();
-    let mut own: Tensors = tensors.into_iter().map(|(name, t)| (vit::timm_name(&name, &root), t)).collect();
+    let mut own: Arrays = tensors.into_iter().map(|(name, t)| (vit::timm_name(&name, &root), t)).collect();
     let mut block = 0;
     while own.contains_key(&format!("blocks.{block}.norm1.weight")) {
         for part in ["weight", "bias"] {
@@ -267,7 +278,7 @@ fn timm_form(tensors: Tensors) -> Tensors {
 }
 
 /// Concatenates a block's queries, keys and values.
-fn join_queries(tensors: &mut Tensors, block: usize, part: &str) {
+fn join_queries(tensors: &mut Arrays, block: usize, part: &str) {
     let names = ["query", "key", "value"].map(|q| format!("blocks.{block}.attention.attention.{q}.{part}"));
     let parts: Vec<_> = names.iter().filter_map(|name| Some(tensors.get(name)?.view())).collect();
     if parts.len() == 3
@@ -279,7 +290,7 @@ fn join_queries(tensors: &mut Tensors, block: usize, part: &str) {
 }
 
 /// Multiplies a layer's outputs by a `LayerScale` factor, and removes the factor.
-fn fold_scale(tensors: &mut Tensors, factor: &str, layer: &str) {
+fn fold_scale(tensors: &mut Arrays, factor: &str, layer: &str) {
     let Some(factors) = tensors.get(factor).cloned() else { return };
     let parts = ["weight", "bias"].map(|part| format!("{layer}.{part}"));
     let fits = |name: &String| tensors.get(name).is_some_and(|t| t.shape().first() == Some(&factors.len()));
@@ -295,7 +306,7 @@ fn fold_scale(tensors: &mut Tensors, factor: &str, layer: &str) {
 }
 
 /// Adds a position of zero for the class token if only patches have positions (a square number of them).
-fn add_class_position(tensors: &mut Tensors) {
+fn add_class_position(tensors: &mut Arrays) {
     let Some(positions) = tensors.get("pos_embed") else { return };
     if let [1, patches, width] = *positions.shape()
         && patches > 0

@@ -1,8 +1,8 @@
 //! Builds a graph of operators, from its input to its outputs.
 
 use super::proto::{
-    Attribute, AttributeType, DataType, Dimension, Extent, Graph, Model, Node, OperatorSet, Shape, Tensor, TensorType,
-    Value, ValueType,
+    Attribute, AttributeType, DataType, Dimension, Extent, Graph, GraphNode, Model, OperatorSet, Shape, Tensor,
+    TensorType, Value, ValueType,
 };
 use ndarray::ArrayD;
 use prost::Message as _;
@@ -30,7 +30,7 @@ impl Builder {
     pub fn outputs(&mut self, operator: &str, inputs: &[&str], attributes: Vec<Attribute>, count: usize) -> Vec<Name> {
         let name = format!("{operator}_{}", self.graph.node.len());
         let output: Vec<Name> = (0..count).map(|i| format!("{name}_{i}")).collect();
-        self.graph.node.push(Node {
+        self.graph.node.push(GraphNode {
             input: inputs.iter().map(|&i| i.to_owned()).collect(),
             output: output.clone(),
             name,

@@ -10,7 +10,7 @@ mod graph;
 mod proto;
 
 use crate::InferenceError;
-use crate::weights::Weights;
+use crate::weights::StoredWeights;
 use carff_checkpoint::{Manifest, files, shapes::EncoderConfig};
 use carff_messages::LATENT_DIM;
 use graph::{Builder, Name, described, int, ints, text};
@@ -24,11 +24,11 @@ const LATENT: i64 = LATENT_DIM as i64;
 /// Returns the encoder of a checkpoint as the bytes of an ONNX file. Equal weights give equal bytes.
 pub fn encoder_onnx(dir: &Path, manifest: &Manifest) -> Result<Vec<u8>, InferenceError> {
     let config = &manifest.encoder;
-    let mut head = Weights::read(&dir.join(files::ENCODER))?;
+    let mut head = StoredWeights::read(&dir.join(files::ENCODER))?;
     let file = dir.join(files::BACKBONE);
     // The encoder's own file contains a trained backbone.
     let published = config.backbone.frozen && file.is_file();
-    let mut backbone = if published { Weights::read(&file)? } else { head.part("backbone.") };
+    let mut backbone = if published { StoredWeights::read(&file)? } else { head.part("backbone.") };
     let mut head = Head { weights: head.part("encoder."), others: head, config };
 
     let mut graph = Builder::default();
@@ -66,8 +66,8 @@ struct Features {
 
 /// The encoder's trained layers around the backbone.
 struct Head<'a> {
-    weights: Weights,
-    others: Weights,
+    weights: StoredWeights,
+    others: StoredWeights,
     config: &'a EncoderConfig,
 }
 
@@ -152,7 +152,7 @@ impl Builder {
     /// A convolution with symmetric padding that keeps the size, up to the stride.
     fn convolution(
         &mut self,
-        weights: &mut Weights,
+        weights: &mut StoredWeights,
         layer: &str,
         shape: [i64; 4],
         stride: i64,

@@ -180,10 +180,13 @@ pub struct BeliefForm {
     pub components: Vec<ProbeForm>,
     /// Result for each sample.
     pub samples: Vec<ProbeForm>,
-    /// The most probable state, fed back as the next step's input, if it is a known one.
+    /// The most probable state, if it is a known one.
     pub resolved_state: Option<u32>,
-    /// That state's stored posterior.
+    /// That state's stored posterior: the next step's input where no sample is fed back.
     pub resolved: Gaussian,
+    /// Inputs of the next step, one a sample, where the samples themselves are fed back; recordings before it have none.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub fed_back: Vec<Gaussian>,
     /// Duration of the encoding of this frame, nanoseconds.
     pub encoder_ns: u64,
     /// Duration of the forecast of this step, nanoseconds.
@@ -219,6 +222,7 @@ impl From<&Belief> for BeliefForm {
                 .collect(),
             resolved_state: index(b.resolved_state),
             resolved: b.resolved,
+            fed_back: b.fed_back().to_vec(),
             encoder_ns: b.encoder_ns,
             forecaster_ns: b.forecaster_ns,
             stage_latency_ns: b.stage_latency_ns,
@@ -250,6 +254,8 @@ impl TryFrom<&BeliefForm> for Belief {
         belief.sample_component = begin("samples", &drawn_from, 0)?;
         belief.resolved_state = signed(form.resolved_state);
         belief.resolved = form.resolved;
+        belief.fed_back = begin("fed_back", &form.fed_back, Gaussian::standard())?;
+        belief.fed_back_count = form.fed_back.len() as u64;
         belief.encoder_ns = form.encoder_ns;
         belief.forecaster_ns = form.forecaster_ns;
         belief.stage_latency_ns = form.stage_latency_ns;

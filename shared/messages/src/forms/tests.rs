@@ -75,6 +75,8 @@ fn belief(next: &mut impl FnMut() -> f32) -> Belief {
     belief.components[..2].fill_with(|| probe(-1));
     belief.resolved_state = 5;
     belief.resolved = gaussian(next);
+    belief.fed_back[..7].fill_with(|| gaussian(next));
+    belief.fed_back_count = 7;
     (belief.encoder_ns, belief.forecaster_ns, belief.stage_latency_ns) = (1, 2, 3);
     belief
 }

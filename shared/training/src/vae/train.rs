@@ -9,7 +9,7 @@ use crate::{
     TrainingError,
     config::VaeTraining,
     records::{VaeRecord, names},
-    run::{Context, Phase, Report, cosine},
+    run::{Context, Phase, PhaseReport, cosine},
 };
 use carff_base::random::Key;
 use carff_evaluation::PosedImages;
@@ -214,7 +214,7 @@ impl Phase for VaePhase<'_> {
         };
     }
 
-    fn report(&mut self, done: usize) -> Result<Report<VaeRecord>, TrainingError> {
+    fn report(&mut self, done: usize) -> Result<PhaseReport<VaeRecord>, TrainingError> {
         let image_quality = done == self.total() || done.is_multiple_of(QUALITY_EVERY);
         let figures = self.vae.figures(self.context, &self.inputs.posteriors(self.vae, 0), image_quality)?;
         let Means { loss, reconstruction, kl, state } = self.means;
@@ -230,7 +230,7 @@ impl Phase for VaePhase<'_> {
             figures.psnr_db.map_or(String::new(), |p| format!("  psnr {p:.2} dB")),
         );
         let record = VaeRecord { epoch: done as u64, loss, reconstruction, kl, state, figures };
-        Ok(Report { line: Some(line), record: Some(record) })
+        Ok(PhaseReport { line: Some(line), record: Some(record) })
     }
 
     fn state(&self) -> Tensors {

@@ -7,7 +7,7 @@
 )]
 
 use carff_scenes::{Extras, Scenario};
-use carff_training::{Progress, Run, Training, TrainingConfig};
+use carff_training::{Progress, Training, TrainingConfig, TrainingRun};
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -49,7 +49,7 @@ impl Place {
 
     /// Works in the run folder `name`, without another training in this process, until `stop_at` (phase, steps done), or
     /// to the end.
-    pub fn run<R>(&self, name: &str, stop_at: Option<(&str, usize)>, work: impl FnOnce(&Run) -> R) -> R {
+    pub fn run<R>(&self, name: &str, stop_at: Option<(&str, usize)>, work: impl FnOnce(&TrainingRun) -> R) -> R {
         let _exclusive = exclusive();
         let stop = AtomicBool::new(false);
         let on_progress = |progress: &Progress| {
@@ -58,7 +58,7 @@ impl Place {
             }
         };
         std::fs::create_dir_all(self.at(name)).unwrap();
-        work(&Run { dir: self.at(name), on_progress: &on_progress, stop: &stop })
+        work(&TrainingRun { dir: self.at(name), on_progress: &on_progress, stop: &stop })
     }
 
     pub fn training<'a>(&'a self, dataset: &'a Path, out: &'a Path) -> Training<'a> {

@@ -4,7 +4,7 @@
 mod filmstrip;
 
 use crate::onnx::OnnxEncoder;
-use crate::planning::{KnownStates, Perception, Planner};
+use crate::planning::{KnownStates, LEAST_TRIALS, MOST_REPEATS, Perception, Planner};
 use crate::{Count, EvaluationError, PlanningTable, SAMPLE_COUNTS};
 use carff_checkpoint::{CheckpointPlanning, FieldProbe, Manifest, load_field_probe};
 use carff_dataset::{
@@ -13,8 +13,8 @@ use carff_dataset::{
     sensor::SensorNoise,
 };
 use carff_decision::{
-    Evidence, ImageEvidence, Memory, Mixture, Plan, Policy, Sampling, Step, StepLength, TakeFrame, TakeMemory,
-    look_ahead,
+    Evidence, Feedback, ForecastInput, ImageEvidence, Memory, Mixture, Plan, Policy, Sampling, Step, StepLength,
+    TakeFrame, TakeMemory, look_ahead,
 };
 use carff_inference::MixtureNet;
 use carff_messages::{Gaussian, Rule};
@@ -24,11 +24,6 @@ use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::fmt::Write;
 use std::path::PathBuf;
-
-/// Smallest number of trials of a table, where it has enough images.
-const TRIALS: usize = 300;
-/// Largest number of trials of one image: images that differ only in sensor noise are not independent.
-const MOST_REPEATS: usize = 5;
 
 /// Settings of the run that is judged.
 #[derive(Debug)]
@@ -51,6 +46,8 @@ pub struct RunSettings {
     pub samples: usize,
     /// Spread of the samples over the mixture's components.
     pub sampling: Sampling,
+    /// Input of each further step.
+    pub feedback: Feedback,
     /// Steps that are looked ahead.
     pub horizon: u32,
     /// True if images were compared with the known states.
@@ -88,6 +85,8 @@ pub struct DecidedFrame {
     pub posterior: Option<Gaussian>,
     /// Evidence of the image, if it was compared with the known states.
     pub image: Option<ImageEvidence>,
+    /// Evidence of the graph's belief, where every step of it was recorded.
+    pub evidence: Option<Evidence>,
     /// True if the action was not an advance.
     pub halted: bool,
     /// Hazard probability of the decision.
@@ -194,6 +193,19 @@ pub struct LiveAgreement {
     pub compared: usize,
     /// Decisions that are those of the library.
     pub agrees_with_library: usize,
+    /// For each rule: its decision on the graph's belief against its decision on the library's.
+    #[serde(default)]
+    pub rules: BTreeMap<String, RuleAgreement>,
+}
+
+/// Decisions of one rule on the beliefs of the graph, against those on the library's.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RuleAgreement {
+    /// Compared decisions.
+    pub compared: usize,
+    /// Decisions with equal action and confidence.
+    pub agrees_with_library: usize,
 }
 
 /// Images behind the tables of views.
@@ -297,14 +309,14 @@ impl JudgedRun {
     /// Looks ahead from the posterior of a frame, with the random numbers of the run: with the run's number of samples,
     /// these are the samples of the run. `None` when no posterior was recorded.
     fn look_ahead(&self, probe: &mut FieldProbe, frame: &DecidedFrame, samples: usize) -> Option<Vec<Step>> {
-        let RunSettings { sampling, horizon, seed, .. } = self.settings;
-        let plan = Plan { samples, sampling, horizon, seed, frame: frame.frame };
+        let RunSettings { sampling, feedback, horizon, seed, .. } = self.settings;
+        let plan = Plan { samples, sampling, feedback, horizon, seed, frame: frame.frame };
         let remembered = match &self.remembered {
             Some(all) => Some(all.get(&frame.frame)?),
             None => None,
         };
-        let forecast = |input: &Gaussian, state: Option<usize>| match (state, remembered) {
-            (None, Some(remembered)) => remembered.clone(),
+        let forecast = |input: &Gaussian, source| match (source, remembered) {
+            (ForecastInput::Image, Some(remembered)) => remembered.clone(),
             _ => self.forecaster.forecast(input),
         };
         Some(look_ahead(forecast, probe, &frame.posterior?, frame.image.as_ref(), plan))
@@ -329,7 +341,13 @@ impl JudgedRun {
             for samples in SAMPLE_COUNTS {
                 let Some(steps) = self.look_ahead(&mut probe, frame, samples) else { continue };
                 let evidence = Evidence::of_steps(&steps);
+                let believed = frame.evidence.filter(|_| samples == live.samples);
                 for policy in self.policies() {
+                    if let Some(believed) = &believed {
+                        let rule = live.rules.entry(policy.rule.name().to_owned()).or_default();
+                        rule.compared += 1;
+                        rule.agrees_with_library += usize::from(policy.decide(believed) == policy.decide(&evidence));
+                    }
                     let mut halted = policy.decide(&evidence).halt;
                     if policy.rule == self.settings.rule && samples == live.samples {
                         // The table counts the action of the graph, not the action of the library.
@@ -350,18 +368,18 @@ impl JudgedRun {
         encoder: &OnnxEncoder,
         views: &[usize],
     ) -> Result<(PlanningTable, RunViewCounts), EvaluationError> {
-        let RunSettings { sampling, horizon, noise, seed, .. } = self.settings;
+        let RunSettings { sampling, feedback, horizon, noise, seed, .. } = self.settings;
         let inputs = eligible_inputs(&self.dataset, views)?;
         let of = |kind| inputs.iter().filter(|i: &&EligibleInput| i.kind == kind).count();
         let counts = RunViewCounts {
             hazard: of(DriveKind::Hazard),
             clear: of(DriveKind::Clear),
-            repeats: TRIALS.div_ceil(inputs.len().max(1)).min(MOST_REPEATS),
+            repeats: LEAST_TRIALS.div_ceil(inputs.len().max(1)).min(MOST_REPEATS),
         };
         let (probe, net) = (&self.probe, &self.forecaster);
         let known = self.known.as_ref().map(|known| KnownStates::new(known, probe, 1));
         let trials = Perception { encoder, noise, seed, known }.trials(&self.dataset, &inputs, counts.repeats)?;
-        let (table, _) = Planner { net, probe, sampling, horizon }.table(&trials, &self.policies());
+        let (table, _) = Planner { net, probe, sampling, feedback, horizon }.table(&trials, &self.policies());
         Ok((table, counts))
     }
 }
@@ -431,6 +449,7 @@ pub(crate) mod tests {
             observability: Some(Observability::None),
             posterior: None,
             image: None,
+            evidence: None,
             halted: true,
             hazard_probability: 0.5,
             other_reason: None,
