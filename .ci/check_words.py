@@ -4,6 +4,7 @@
 - Banned words, and words for which the glossary (ARCHITECTURE.md) has another.
 - Sentences of documents that open with What, Who, Which, Whether or Of.
 - First doc lines of public Rust items that open with What, Which, Who, How, Whether, Where, When or Of.
+- Sentences of the main pages that are too long. Code, tables and headings do not count.
 
 Documents are Markdown files, and the comments of TOML files, the Makefile and Python programs. Of Rust files, docs and
 strings are checked.
@@ -46,6 +47,9 @@ TERMS = {
     "telling view": (r"\btelling (?:views?|images?|pictures?)\b", "unambiguous view"),
 }
 OPENING = r"(?:^|(?<=[.!?] )|(?<=[.!?]\n))(?:What|Who|Which|Whether|Of)\b(?![^.?!]*\?)"
+# Longest sentence of the main pages, words.
+LONGEST = 30
+MAIN_PAGES = re.compile(r"(?:README|ARCHITECTURE)\.md|docs/book/src/.*\.md")
 FIRST_LINE = re.compile(r"(?:What|Which|Who|How|Whether|Where|When|Of)\b")
 
 # (file, matched text): reason. An entry that matches nothing is a finding.
@@ -57,6 +61,9 @@ ALLOWED: dict[tuple[str, str], str] = {
 FENCE = re.compile(r"^```.*?^```|<!--.*?-->", re.MULTILINE | re.DOTALL)
 INLINE = re.compile(r"`[^`\n]*(?:\n[^`\n]*)?`|\]\([^)]*\)|https?://\S+")
 HEADING = re.compile(r"^#.*$", re.MULTILINE)
+TABLE_ROW = re.compile(r"^\s*\|.*$", re.MULTILINE)
+# The end of a sentence, or of the paragraph or list item that it is in.
+SENTENCE_END = re.compile(r"[.!?][)*_\"]*(?=\s|$)|\n[ \t]*(?=\n)|\n(?=\s*(?:[-*]|\d+\.)\s)")
 TOKEN = re.compile(
     r"""(?P<doc>//[/!](?!/)[^\n]*)|(?P<comment>//[^\n]*)|/\*.*?\*/|(?P<raw>r(?P<hash>\#*)".*?"(?P=hash))"""
     r"""|(?P<text>"(?:[^"\\]|\\.)*")|'(?:\\.[^']*|[^'\\])'""",
@@ -136,6 +143,19 @@ def first_lines(text: str) -> list[tuple[int, str]]:
     return found
 
 
+def long_sentences(prose: str) -> list[tuple[int, int, str]]:
+    """Returns line, number of words and first words of each sentence of a page that is too long."""
+    prose, found, start = TABLE_ROW.sub(blank, HEADING.sub(blank, prose)), [], 0
+    for end in [*(m.end() for m in SENTENCE_END.finditer(prose)), len(prose)]:
+        sentence = prose[start:end]
+        words = [word for word in sentence.replace(GAP, " ").split() if re.search(r"\w", word)]
+        if len(words) > LONGEST:
+            line = prose.count("\n", 0, start + len(sentence) - len(sentence.lstrip())) + 1
+            found.append((line, len(words), " ".join(words[:6])))
+        start = end
+    return found
+
+
 def findings_of(path: str, text: str) -> list[tuple[int, str, str, str]]:
     """Returns line, kind, matched text and advice of each finding of a file."""
     if path.endswith(".rs"):
@@ -157,6 +177,9 @@ def findings_of(path: str, text: str) -> list[tuple[int, str, str, str]]:
     else:
         for match in re.finditer(OPENING, HEADING.sub(blank, prose) if path.endswith(".md") else prose, re.MULTILINE):
             found.append((prose.count("\n", 0, match.start()) + 1, "opening", match[0], "a subject that is named"))
+    if MAIN_PAGES.fullmatch(path):
+        for number, words, first in long_sentences(prose):
+            found.append((number, "long sentence", first, f"at most {LONGEST} words, not {words}, in a sentence"))
     return sorted(found)
 
 
