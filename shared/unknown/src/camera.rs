@@ -1,7 +1,7 @@
 //! The condition of a camera, from its images: no network and no pose is needed.
 
 use carff_messages::{ImageCheck, ImageCondition};
-use ndarray::ArrayView3;
+use ndarray::{Array2, ArrayView3, s};
 use serde::{Deserialize, Serialize};
 
 /// Cells along each side of the grid in which covered parts are found.
@@ -69,26 +69,26 @@ impl Measured {
         let deviation = (luminance.iter().map(|v| (v - mean).powi(2)).sum::<f32>() / luminance.len() as f32).sqrt();
         Self {
             luminance: (mean / 255.0).clamp(0.0, 1.0),
-            sharpness: detail(&luminance, width) / deviation.max(1.0),
-            covered: covered(&luminance, width),
+            sharpness: detail(&luminance) / deviation.max(1.0),
+            covered: covered(&luminance),
         }
     }
 }
 
-/// Luminance of each pixel, 0..=255.
-fn luminances(image: ArrayView3<'_, u8>) -> Vec<f32> {
-    let pixels = image.rows().into_iter();
-    pixels.map(|p| 0.299 * f32::from(p[0]) + 0.587 * f32::from(p[1]) + 0.114 * f32::from(p[2])).collect()
+/// Luminance of each pixel (height, width), 0..=255.
+fn luminances(image: ArrayView3<'_, u8>) -> Array2<f32> {
+    let (height, width, _) = image.dim();
+    Array2::from_shape_fn((height, width), |(y, x)| {
+        let [r, g, b] = [0, 1, 2].map(|channel| f32::from(image[[y, x, channel]]));
+        0.299 * r + 0.587 * g + 0.114 * b
+    })
 }
 
 /// Mean absolute Laplacian over cells of 2 x 2 pixels, which averages the sensor's noise.
-fn detail(luminance: &[f32], width: usize) -> f32 {
-    let height = luminance.len() / width;
+fn detail(luminance: &Array2<f32>) -> f32 {
+    let (height, width) = luminance.dim();
     let (w, h) = (width / 2, height / 2);
-    let at = |x: usize, y: usize| {
-        let i = 2 * y * width + 2 * x;
-        0.25 * (luminance[i] + luminance[i + 1] + luminance[i + width] + luminance[i + width + 1])
-    };
+    let at = |x: usize, y: usize| 0.25 * luminance.slice(s![2 * y..2 * y + 2, 2 * x..2 * x + 2]).iter().sum::<f32>();
     let (mut sum, mut n) = (0.0, 0);
     for y in 1..h.saturating_sub(1) {
         for x in 1..w.saturating_sub(1) {
@@ -100,16 +100,16 @@ fn detail(luminance: &[f32], width: usize) -> f32 {
 }
 
 /// Share of the cells that are dark and without detail.
-fn covered(luminance: &[f32], width: usize) -> f32 {
-    let height = luminance.len() / width;
+fn covered(luminance: &Array2<f32>) -> f32 {
+    let (height, width) = luminance.dim();
     let (columns, rows) = (CELLS.min(width), CELLS.min(height));
     let is_covered = |cell: usize| {
         let (cx, cy) = (cell % columns, cell / columns);
         let (x, y) = (cx * width / columns..(cx + 1) * width / columns, cy * height / rows..(cy + 1) * height / rows);
-        let values = || y.clone().flat_map(|y| x.clone().map(move |x| luminance[y * width + x]));
-        let n = (x.len() * y.len()).max(1) as f32;
-        let mean = values().sum::<f32>() / n;
-        let deviation = (values().map(|v| (v - mean).powi(2)).sum::<f32>() / n).sqrt();
+        let cell = luminance.slice(s![y, x]);
+        let n = cell.len().max(1) as f32;
+        let mean = cell.iter().sum::<f32>() / n;
+        let deviation = (cell.iter().map(|v| (v - mean).powi(2)).sum::<f32>() / n).sqrt();
         mean < DARK * 255.0 && deviation < FLAT
     };
     (0..columns * rows).filter(|&cell| is_covered(cell)).count() as f32 / (columns * rows) as f32
@@ -160,7 +160,7 @@ pub struct CameraCheck {
 
 #[derive(Clone, Debug)]
 struct Before {
-    luminance: Vec<f32>,
+    luminance: Array2<f32>,
     capture_time_ns: u64,
     same_since_ns: u64,
 }
@@ -205,8 +205,8 @@ impl CameraCheck {
     }
 
     /// Capture time since which the image repeats; its own for another image.
-    fn same_since_ns(&self, luminance: &[f32], capture_time_ns: u64, check: &mut ImageCheck) -> u64 {
-        let Some(before) = self.before.as_ref().filter(|before| before.luminance.len() == luminance.len()) else {
+    fn same_since_ns(&self, luminance: &Array2<f32>, capture_time_ns: u64, check: &mut ImageCheck) -> u64 {
+        let Some(before) = self.before.as_ref().filter(|before| before.luminance.dim() == luminance.dim()) else {
             return capture_time_ns;
         };
         let sum: f32 = luminance.iter().zip(&before.luminance).map(|(a, b)| (a - b).abs()).sum();
