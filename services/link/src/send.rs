@@ -184,8 +184,8 @@ impl Way {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use carff_observe::RunRecord;
-    use carff_transport::{Node, make_private_dir, remove_run_leftovers, runtime_dir};
+    use carff_observe::{RunLock, RunRecord};
+    use carff_transport::{Node, remove_run_leftovers, runtime_dir};
 
     /// A run is joined after its launcher has joined it, and not while the launcher still clears up.
     #[test]
@@ -194,17 +194,14 @@ mod tests {
         let run = Run::new(&name, 7).unwrap();
         let (graph, dataset, checkpoint) = ("g.toml".to_owned(), "d".to_owned(), "c".to_owned());
         let record = RunRecord { pid: std::process::id(), run_id: 7, graph, dataset, checkpoint, started_unix_s: 0 };
-        make_private_dir(&runtime_dir()).unwrap();
-        let path = RunRecord::path(&runtime_dir(), &name);
         assert!(join(&name).unwrap().is_none());
-        std::fs::write(&path, record.to_bytes().unwrap()).unwrap();
+        let lock = RunLock::take(&runtime_dir(), &name, &record, "--run").unwrap();
         assert!(join(&name).unwrap().is_none());
         assert!(!run.folder().exists());
         let launcher = Node::open(&run, "launcher").unwrap();
         let joined = join(&name).unwrap().unwrap();
         assert_eq!(joined.live.run_id, 7);
-        drop((joined, launcher));
-        std::fs::remove_file(path).unwrap();
+        drop((joined, launcher, lock));
         remove_run_leftovers(&run).unwrap();
     }
 }

@@ -76,7 +76,7 @@ mod tests {
     use carff_messages::forms::Readable;
     use carff_messages::{
         ActionCode, Belief, Forecast, ForecastSource, FrameMeta, Gaussian, Header, HealthState, Posterior, Reason,
-        Rule, Stage, ViewKind, ViewMeta,
+        Rule, SCHEMA_VERSION, Stage, ViewKind, ViewMeta,
     };
 
     const TAG: Tag = Tag { sender: u64::MAX, sequence: 3, sent_ns: 1 << 60 };
@@ -161,7 +161,8 @@ mod tests {
             height_px: 3,
             intrinsics: view().intrinsics,
             world_from_camera: view().world_from_camera,
-            ..FrameMeta::default()
+            dataset_view: carff_messages::DatasetView::UNKNOWN,
+            take_start: 5,
         };
         survives(TopicId::FRAME, frame, &[7; 18]);
         survives(TopicId::POSTERIOR, posterior, &[]);
@@ -189,7 +190,7 @@ mod tests {
             ("\"width_px\":3", "\"width_px\":4294967295"),
             ("\"probability\":0.1", "\"probability\":7.1"),
             ("\"probability\":0.1", "\"probability\":1e999"),
-            ("\"schema_version\":2", "\"schema_version\":3"),
+            (format!("\"schema_version\":{SCHEMA_VERSION}").as_str(), "\"schema_version\":1"),
             ("\"sequence\":3", "\"sequence\":-3"),
             ("\"tag\"", "\"more\":1,\"tag\""),
         ] {
