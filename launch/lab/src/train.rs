@@ -4,7 +4,7 @@ use anyhow::{Context, bail};
 use carff_base::files::check_writable;
 use carff_checkpoint::Manifest;
 use carff_launch::dataset::render;
-use carff_launch::lab::{StageName, TrainArgs};
+use carff_launch::lab::{PhaseName, TrainArgs};
 use carff_scenes::{
     ClosedLoop, Extras, Scenario,
     config::{BystanderPlace, VariationRole},
@@ -53,11 +53,11 @@ pub fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
     let display = Display::default();
     let report = |progress: &Progress| display.show(progress);
     let run = TrainingRun { dir: dir.clone(), on_progress: &report, stop: stop.flag() };
-    let phases = match args.stage {
+    let phases = match args.phase {
         None => Phases::All,
-        Some(StageName::Vae) => Phases::Vae,
-        Some(StageName::Nerf) => Phases::Field,
-        Some(StageName::Mdn) => Phases::Mixture,
+        Some(PhaseName::Vae) => Phases::Vae,
+        Some(PhaseName::Nerf) => Phases::Field,
+        Some(PhaseName::Mdn) => Phases::Mixture,
     };
     let result = with_random_poses(rendered, &config, &dataset, &run).and_then(|random_poses| {
         let (random_poses, scenario) = (&random_poses, scenario.as_ref());

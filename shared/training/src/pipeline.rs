@@ -186,7 +186,7 @@ impl Training<'_> {
         if matches!(phases, Phases::Vae | Phases::Mixture) {
             return Err(TrainingError::Unfit(
                 "the dataset has one state: there is nothing to encode or to forecast; train the field, with \
-                 `--stage nerf`"
+                 `--phase nerf`"
                     .into(),
             ));
         }

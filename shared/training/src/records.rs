@@ -24,6 +24,17 @@ pub mod names {
     pub const DONE: &str = "done";
 }
 
+/// A line of the metrics file: a record under the name of its phase.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct MetricsLine<R> {
+    /// Name of the phase, one of [`names`]; the key is `stage` in files of earlier versions.
+    #[serde(alias = "stage")]
+    pub phase: String,
+    /// The record; its keys are beside `phase`.
+    #[serde(flatten)]
+    pub record: R,
+}
+
 /// Record with a place on the x axis of its curves.
 pub trait Record: Serialize + for<'de> Deserialize<'de> {
     /// Epoch or step.

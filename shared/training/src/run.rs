@@ -2,7 +2,7 @@
 
 use crate::{
     TrainingConfig, TrainingError, curves, features,
-    records::{METRICS, names},
+    records::{METRICS, MetricsLine, names},
 };
 use carff_evaluation::{PosedImages, Progress};
 use carff_messages::{Gaussian, LATENT_DIM};
@@ -118,9 +118,8 @@ impl TrainingRun<'_> {
     /// Adds one record to the metrics file, under the name of its phase.
     pub fn record(&self, phase: &str, record: &impl Serialize) -> Result<(), TrainingError> {
         let path = self.dir.join(METRICS);
-        let mut line = serde_json::to_value(record)
+        let line = serde_json::to_string(&MetricsLine { phase: phase.to_owned(), record })
             .map_err(|e| TrainingError::Format { path: path.clone(), what: e.to_string() })?;
-        line["stage"] = phase.into();
         let failed = |source| TrainingError::File { path: path.clone(), source };
         let mut file = OpenOptions::new().create(true).append(true).open(&path).map_err(failed)?;
         writeln!(file, "{line}").map_err(failed)
