@@ -54,8 +54,8 @@ pub struct Training<'a> {
     pub config: &'a TrainingConfig,
     /// Folder of the dataset.
     pub dataset: &'a Path,
-    /// Folders of the datasets of random poses.
-    pub random_poses: &'a [PathBuf],
+    /// Folders of the datasets of free poses.
+    pub free_poses: &'a [PathBuf],
     /// Scenario of the dataset, from which calibration poses are rendered; `None` for any other dataset.
     pub scenario: Option<&'a Scenario>,
     /// Folder of the checkpoint.
@@ -73,8 +73,8 @@ impl Training<'_> {
         tch::set_num_threads(config.threads);
         tch::manual_seed(config.seed as i64);
         let mut posed = PosedImages::open(self.dataset, config.split_seed)?;
-        for dir in self.random_poses {
-            posed.add_random_poses(dir)?;
+        for dir in self.free_poses {
+            posed.add_free_poses(dir)?;
         }
         let context = Context { config, posed: &posed, run };
         let (manifest, figures) = if posed.scenario.state_count() == 1 {

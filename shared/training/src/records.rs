@@ -14,8 +14,8 @@ pub mod names {
     pub const FIELD: &str = "nerf";
     /// Mixture density network.
     pub const MIXTURE: &str = "mdn";
-    /// Field that renders random poses.
-    pub const RANDOM_POSES: &str = "free";
+    /// Field that renders free poses.
+    pub const FREE_POSES: &str = "free";
     /// Choice of the threshold.
     pub const THRESHOLD: &str = "threshold";
     /// Encoder and field in one stage.

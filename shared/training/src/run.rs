@@ -20,8 +20,8 @@ use std::{
 };
 use tch::{Kind, Tensor};
 
-/// Folder of the images from random poses in a run's folder.
-pub const RANDOM_IMAGES: &str = "free-poses";
+/// Folder of the images from free poses in a run's folder.
+pub const FREE_IMAGES: &str = "free-poses";
 
 /// File of the posteriors in a run's folder.
 const POSTERIORS: &str = "posteriors.safetensors";
@@ -211,10 +211,10 @@ fn state_file(phase: &str) -> String {
     format!("{phase}.state.safetensors")
 }
 
-/// Removes all states, features, metrics and random poses of a run's folder.
+/// Removes all states, features, metrics and free poses of a run's folder.
 pub fn forget_run(dir: &Path) -> Result<(), TrainingError> {
-    use names::{FIELD, MIXTURE, ONE_STAGE, RANDOM_POSES, VAE};
-    let states = [VAE, FIELD, MIXTURE, RANDOM_POSES, ONE_STAGE].map(state_file);
+    use names::{FIELD, FREE_POSES, MIXTURE, ONE_STAGE, VAE};
+    let states = [VAE, FIELD, MIXTURE, FREE_POSES, ONE_STAGE].map(state_file);
     let others = [POSTERIORS, features::FEATURES, METRICS].map(str::to_owned);
     let gone = |path: PathBuf, removed: std::io::Result<()>| match removed {
         Err(source) if source.kind() != ErrorKind::NotFound => Err(TrainingError::File { path, source }),
@@ -223,7 +223,7 @@ pub fn forget_run(dir: &Path) -> Result<(), TrainingError> {
     for path in states.into_iter().chain(others).map(|name| dir.join(name)) {
         gone(path.clone(), std::fs::remove_file(&path))?;
     }
-    let images = dir.join(RANDOM_IMAGES);
+    let images = dir.join(FREE_IMAGES);
     gone(images.clone(), std::fs::remove_dir_all(&images))
 }
 

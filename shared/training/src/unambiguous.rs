@@ -22,7 +22,7 @@ const OF_BEST: f64 = 0.9;
 
 type Latent = [f32; LATENT_DIM];
 
-/// Per state, the unambiguous images of trained and random poses. Every state that has an image gets one.
+/// Per state, the unambiguous images of trained and free poses. Every state that has an image gets one.
 pub fn unambiguous_by_state(posed: &PosedImages, posteriors: &[Gaussian]) -> Vec<Vec<usize>> {
     let images = posed.trained_and_random();
     let (means, states) = means_and_states(posed, posteriors, &images);
@@ -30,7 +30,7 @@ pub fn unambiguous_by_state(posed: &PosedImages, posteriors: &[Gaussian]) -> Vec
     chosen.into_iter().map(|of_state| of_state.into_iter().map(|k| images[k]).collect()).collect()
 }
 
-/// For each image of trained and random poses, its state and those of the views with the nearest posteriors: what its
+/// For each image of trained and free poses, its state and those of the views with the nearest posteriors: what its
 /// view may show, each as often as it is likely.
 pub fn possible_states(posed: &PosedImages, posteriors: &[Gaussian]) -> Vec<Vec<usize>> {
     let images = posed.trained_and_random();

@@ -95,7 +95,7 @@ fn an_imported_set_trains_the_field() {
     let training = Training {
         config: &config,
         dataset: &dataset,
-        random_poses: &[],
+        free_poses: &[],
         scenario: None,
         out: &out,
         device: tch::Device::Cpu,

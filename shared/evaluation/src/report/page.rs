@@ -370,7 +370,7 @@ fn planning(page: &mut String, table: &PlanningResults) {
         planning_part(page, title, of_part, &text);
     }
     if let Some(free) = &table.free_drives {
-        planning_part(page, "Free drives", free, "Rendered from random poses that were not trained on.");
+        planning_part(page, "Free drives", free, "Rendered from free poses that were not trained on.");
     }
 }
 
