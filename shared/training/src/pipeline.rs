@@ -245,7 +245,7 @@ fn new_manifest(context: Context, states: Vec<Gaussian>) -> Result<Manifest, Tra
     let Context { config, posed, .. } = context;
     let training = serde_json::to_value(config).map_err(|e| TrainingError::Format {
         path: config.out.join(files::MANIFEST),
-        what: format!("`training`: {e}"),
+        what: format!("`training` cannot be written: {e}; correct the training file"),
     })?;
     Ok(Manifest {
         format_version: FORMAT_VERSION,

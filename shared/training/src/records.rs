@@ -30,7 +30,7 @@ pub struct MetricsLine<R> {
     /// Name of the phase, one of [`names`]; the key is `stage` in files of earlier versions.
     #[serde(alias = "stage")]
     pub phase: String,
-    /// The record; its keys are beside `phase`.
+    /// The record; its keys stand next to `phase`.
     #[serde(flatten)]
     pub record: R,
 }

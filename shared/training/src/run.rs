@@ -199,10 +199,10 @@ impl TrainingRun<'_> {
                     Err(damaged(&self.state_path(phase)))
                 }
             }
-            Some((done, _)) => {
-                Err(TrainingError::Unfit(format!("stage {phase} stopped at {done} of {total}: finish it first")))
+            unfinished => {
+                let done = unfinished.map_or(0, |(done, _)| done);
+                Err(TrainingError::Unfinished { phase: phase.to_owned(), done, total })
             }
-            None => Err(TrainingError::Unfit(format!("stage {phase} is not trained yet: run it first"))),
         }
     }
 }

@@ -4,6 +4,7 @@
 //! view may show. A view is unambiguous if its neighbours are of its own state. No image is compared with another: the
 //! search needs neither images without noise nor the same pose in every state.
 
+use crate::TrainingError;
 use carff_evaluation::PosedImages;
 use carff_messages::{Gaussian, LATENT_DIM};
 use rayon::prelude::*;
@@ -28,6 +29,13 @@ pub fn unambiguous_by_state(posed: &PosedImages, posteriors: &[Gaussian]) -> Vec
     let (means, states) = means_and_states(posed, posteriors, &images);
     let chosen = unambiguous(&neighbours(&means, count(&states)), &states, posed.scenario.state_count());
     chosen.into_iter().map(|of_state| of_state.into_iter().map(|k| images[k]).collect()).collect()
+}
+
+/// Error of a state without a view.
+pub fn no_view(state: usize) -> TrainingError {
+    TrainingError::Unfit(format!(
+        "state {state} has no view from a trained pose; add images of it, or choose another `split_seed`"
+    ))
 }
 
 /// For each image of trained and free poses, its state and those of the views with the nearest posteriors: what its
