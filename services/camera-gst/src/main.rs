@@ -37,7 +37,9 @@ enum Ended {
 
 fn run(stage: &mut StageContext) -> anyhow::Result<()> {
     gst::init().context("GStreamer cannot start: install it as the README of services/camera-gst states")?;
-    let text = stage.graph.camera.pipeline.clone().context("`camera.pipeline` is missing in the graph file: set it, for example to `v4l2src ! videoconvert ! appsink`")?;
+    let text = stage.graph.camera.pipeline.clone().context(
+        "`camera.pipeline` is missing in the graph file: set it, for example to `v4l2src ! videoconvert ! appsink`",
+    )?;
     let mut output = FrameOutput::open(stage, None)?;
     let mut is_ready = false;
     loop {
@@ -45,7 +47,9 @@ fn run(stage: &mut StageContext) -> anyhow::Result<()> {
         let is_live = pipeline.is_live;
         match pipeline.watch(stage, &mut output, &mut is_ready) {
             Ok(Ended::Stopped) => return Ok(()),
-            Ok(Ended::EndOfStream) if !is_ready => bail!("`camera.pipeline` ended before its first image: check its source"),
+            Ok(Ended::EndOfStream) if !is_ready => {
+                bail!("`camera.pipeline` ended before its first image: check its source")
+            }
             Ok(Ended::EndOfStream) if stage.graph.camera.repeat => continue,
             Ok(Ended::EndOfStream) if !is_live => {
                 stage.wait_until(&[], monotonic_now_ns() + stage.graph.camera.linger_ms * 1_000_000)?;
@@ -78,9 +82,11 @@ struct Pipeline {
 impl Pipeline {
     /// Builds the pipeline and starts it. Its sink keeps only the newest image.
     fn new(text: &str) -> anyhow::Result<Self> {
-        let built = gst::parse::launch(text).map_err(|e| anyhow!("`camera.pipeline` is wrong: {}; try it with gst-launch-1.0", e.message()))?;
-        let pipeline =
-            built.downcast::<gst::Pipeline>().map_err(|_| anyhow!("`camera.pipeline` has only one element: end it with `! videoconvert ! appsink`"))?;
+        let built = gst::parse::launch(text)
+            .map_err(|e| anyhow!("`camera.pipeline` is wrong: {}; try it with gst-launch-1.0", e.message()))?;
+        let pipeline = built
+            .downcast::<gst::Pipeline>()
+            .map_err(|_| anyhow!("`camera.pipeline` has only one element: end it with `! videoconvert ! appsink`"))?;
         let sinks = pipeline.iterate_sinks().into_iter().filter_map(Result::ok);
         let sink = sinks
             .filter_map(|sink| sink.downcast::<AppSink>().ok())
@@ -100,7 +106,11 @@ impl Pipeline {
                 started.sink.set_property("sync", false);
             }
             Ok(_) => {}
-            Err(_) => return Err(started.error().unwrap_or_else(|| anyhow!("`camera.pipeline` does not start: try it with gst-launch-1.0"))),
+            Err(_) => {
+                return Err(started
+                    .error()
+                    .unwrap_or_else(|| anyhow!("`camera.pipeline` does not start: try it with gst-launch-1.0")));
+            }
         }
         Ok(started)
     }
@@ -124,7 +134,10 @@ impl Pipeline {
             }
             let patience = if *is_ready { PATIENCE } else { START };
             if newest.elapsed() > patience {
-                bail!("no image from `camera.pipeline` for {} s: check that its source is connected and delivers", patience.as_secs());
+                bail!(
+                    "no image from `camera.pipeline` for {} s: check that its source is connected and delivers",
+                    patience.as_secs()
+                );
             }
         }
         Ok(Ended::Stopped)
@@ -140,7 +153,8 @@ impl Pipeline {
         let captured_ns = self.capture_time_ns(sample);
         let buffer = sample.buffer().with_context(|| lacking("an image"))?;
         let info = VideoInfo::from_caps(sample.caps().with_context(|| lacking("a format"))?)?;
-        let frame = VideoFrameRef::from_buffer_ref_readable(buffer, &info).with_context(|| lacking("readable pixels"))?;
+        let frame =
+            VideoFrameRef::from_buffer_ref_readable(buffer, &info).with_context(|| lacking("readable pixels"))?;
         let step = usize::try_from(frame.plane_stride()[0]).with_context(|| lacking("rows from the top"))?;
         let data = frame.plane_data(0).with_context(|| lacking("pixels"))?;
         let raw = RawImage::new([frame.width(), frame.height()], step, PixelFormat::Rgb8, data)?;

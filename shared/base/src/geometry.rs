@@ -37,7 +37,8 @@ pub enum CameraError {
     NotPositive(&'static str),
     /// The rotation part must be orthonormal and right-handed.
     #[error(
-        "the rotation part of `transform_matrix` is not a rotation: its columns must be perpendicular, of length 1 and right-handed"
+        "the rotation part of `transform_matrix` is not a rotation: its columns must be perpendicular, of \
+         length 1 and right-handed"
     )]
     NotARotation,
 }

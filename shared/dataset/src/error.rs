@@ -22,7 +22,10 @@ pub enum DatasetError {
         path: PathBuf,
     },
     /// The operating system reported an error.
-    #[error("{}: {source}; check that the path is right, who may read and write it, and the free space", path.display())]
+    #[error(
+        "{}: {source}; check that the path is right, who may read and write it, and the free space",
+        path.display()
+    )]
     Io {
         /// Path of the file or folder.
         path: PathBuf,

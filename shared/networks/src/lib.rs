@@ -39,7 +39,8 @@ pub enum ModelError {
     },
     /// Tensors that the model needs are missing, unknown or of another shape.
     #[error(
-        "the weights do not fit the model: {0}; use weights of this network, or the settings that they were trained with"
+        "the weights do not fit the model: {0}; use weights of this network, or the settings that they were trained \
+         with"
     )]
     Mismatch(String),
     /// A setting is out of range.

@@ -111,7 +111,8 @@ pub enum SendError {
     },
     /// No memory is available, or the connection is broken.
     #[error(
-        "cannot send on `{topic}`: {cause}; if shared memory is full, free some (`carff doctor`), else restart this process"
+        "cannot send on `{topic}`: {cause}; if shared memory is full, free some (`carff doctor`), else restart this \
+         process"
     )]
     Failed {
         /// Name of the topic.

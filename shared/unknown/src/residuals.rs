@@ -20,7 +20,7 @@ impl ResidualKind {
 }
 
 /// Both residuals of a pixel, or their squares.
-pub type ByKind = [f32; 2];
+pub type BothResiduals = [f32; 2];
 
 /// Pixels of a 3 x 3 neighbourhood that were compared.
 fn neighbours(i: usize, judged: &[bool], width: usize) -> impl Iterator<Item = usize> {
@@ -71,9 +71,9 @@ fn beyond(value: f32, others: impl Iterator<Item = f32>) -> f32 {
 /// It also forgives a vehicle that the state has and the image does not show: the vehicle's edges, windows and wheels
 /// span the road's values. So where the states do not look alike, the distance of the rendered value from the range of
 /// the image's neighbours counts too, as the second kind.
-pub fn energy(pixels: Pixels, rendered: &[f32], fit: &Fit) -> Vec<ByKind> {
+pub fn energy(pixels: Pixels, rendered: &[f32], fit: &Fit) -> Vec<BothResiduals> {
     let Pixels { image, judged, told_apart, width } = pixels;
-    let of_channel = |i: usize, c: usize| -> ByKind {
+    let of_channel = |i: usize, c: usize| -> BothResiduals {
         let expected = |n: usize| fit.gain[c] * rendered[n * 3 + c] + fit.offset[c];
         let seen = |n: usize| image[n * 3 + c];
         let unexpected = beyond(seen(i), neighbours(i, judged, width).map(expected));
@@ -86,7 +86,7 @@ pub fn energy(pixels: Pixels, rendered: &[f32], fit: &Fit) -> Vec<ByKind> {
 
 /// Lets each state explain the pixels of the vehicle itself as the other states do that have it elsewhere, but agree about
 /// the hazard: the vehicle's place varies. `energies` and `own` have one entry a state, and `own` is sorted.
-pub fn explain_own(energies: &mut [Vec<ByKind>], own: &[Vec<usize>], hazard_states: &[bool]) {
+pub fn explain_own(energies: &mut [Vec<BothResiduals>], own: &[Vec<usize>], hazard_states: &[bool]) {
     let before = energies.to_vec();
     for (state, pixels) in own.iter().enumerate() {
         for &i in pixels {
@@ -94,7 +94,7 @@ pub fn explain_own(energies: &mut [Vec<ByKind>], own: &[Vec<usize>], hazard_stat
                 hazard_states.get(*other) == hazard_states.get(state) && own[*other].binary_search(&i).is_err()
             };
             let others = (0..own.len()).filter(elsewhere).map(|other| before[other][i]);
-            let smaller = |a: ByKind, b: ByKind| if b[0] + b[1] < a[0] + a[1] { b } else { a };
+            let smaller = |a: BothResiduals, b: BothResiduals| if b[0] + b[1] < a[0] + a[1] { b } else { a };
             energies[state][i] = others.fold(before[state][i], smaller);
         }
     }
@@ -102,7 +102,13 @@ pub fn explain_own(energies: &mut [Vec<ByKind>], own: &[Vec<usize>], hazard_stat
 
 /// Root of the median over 3 x 3 pixels (the lower one of an even number), of the mean over channels, in deviations: a
 /// speck or a thin line that the field misses is not an object.
-pub fn median_residual(energy: &[ByKind], kind: ResidualKind, judged: &[bool], width: usize, noise: f32) -> Vec<f32> {
+pub fn median_residual(
+    energy: &[BothResiduals],
+    kind: ResidualKind,
+    judged: &[bool],
+    width: usize,
+    noise: f32,
+) -> Vec<f32> {
     let of_pixel = |i: usize| {
         let (mut near, mut count) = ([0.0; 9], 0);
         for at in neighbours(i, judged, width) {
