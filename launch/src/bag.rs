@@ -64,7 +64,11 @@ pub(crate) fn extract(recording: &Path, out: &Path, args: &BagArgs) -> anyhow::R
         extracted.images += 1;
     }
     extracted.without_pose = extracted.images - poses.len();
-    ensure!(!poses.is_empty(), "{}: no image has a pose at its time", recording.display());
+    ensure!(
+        !poses.is_empty(),
+        "{}: no image has a pose at its time: name another topic with --pose-topic",
+        recording.display()
+    );
     let count = poses.len().min(args.images as usize);
     let chosen: Vec<_> = (0..count).map(|i| poses[i * poses.len() / count]).collect();
     reader.rewind()?;
@@ -108,7 +112,8 @@ fn decoded(reader: &ImageReader, calibration: &CameraCalibration) -> anyhow::Res
     let [width_px, height_px] = calibration.size_px();
     if (image.width_px, image.height_px) != (width_px, height_px) {
         bail!(
-            "an image of `{}` has {} x {} pixels, but the calibration is for {width_px} x {height_px}",
+            "an image of `{}` has {} x {} pixels, but the calibration is for {width_px} x {height_px}: \
+             pass this camera's with --calibration",
             reader.topic(),
             image.width_px,
             image.height_px

@@ -171,7 +171,7 @@ fn latency_ms(frame: &FrameHistory) -> f64 {
     frame.latency_ns as f64 / 1e6
 }
 
-/// Image file of a view, or its number; null for a random pose.
+/// Image file of a view, or its number; null for a free pose.
 fn source(view: i32, images: &[PathBuf]) -> serde_json::Value {
     let view = usize::try_from(view).ok();
     match view.and_then(|view| images.get(view)) {

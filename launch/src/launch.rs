@@ -231,7 +231,10 @@ fn stage_programs(args: &LaunchArgs, run: &Run, files: [&Path; 3]) -> anyhow::Re
     stage_args.parent_pid = Some(std::process::id());
     let folder = match &args.stages {
         Some(folder) => folder.clone(),
-        None => std::env::current_exe()?.parent().context("this program has no folder")?.to_owned(),
+        None => std::env::current_exe()?
+            .parent()
+            .context("this program has no folder: start it by its whole path, or pass --stages")?
+            .to_owned(),
     };
     Ok((folder, stage_args))
 }
@@ -254,7 +257,7 @@ fn provide_dataset(graph: &GraphConfig, args: &LaunchArgs, dataset: &Path, termi
     }
     ensure!(
         args.dataset.is_none() || !dataset.exists(),
-        "{} contains no dataset (no transforms.json)",
+        "{} contains no dataset (no transforms.json): name another folder with --dataset, or omit it",
         dataset.display()
     );
     match graph.scenario_path() {

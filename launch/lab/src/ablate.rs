@@ -1,7 +1,7 @@
 //! `carff ablate`: one training with one setting changed at a time, as one table.
 
 use crate::eval;
-use crate::train::{Display, datasets, refuse_another_configuration, stop_on_signals, stopped, with_random_poses};
+use crate::train::{Display, datasets, refuse_another_configuration, stop_on_signals, stopped, with_free_poses};
 use anyhow::{Context, anyhow};
 use carff_base::files::check_writable;
 use carff_launch::lab::AblateArgs;
@@ -32,16 +32,16 @@ pub fn run(args: &AblateArgs) -> anyhow::Result<ExitCode> {
     let display = Display::default();
     let report = |progress: &Progress| display.show(progress);
     let run = TrainingRun { dir: args.out.clone(), on_progress: &report, stop: stop.flag() };
-    let made = with_random_poses(rendered, &config, &dataset, &run);
+    let made = with_free_poses(rendered, &config, &dataset, &run);
     display.finish();
-    let random_poses = match made {
+    let free_poses = match made {
         Err(TrainingError::Stopped) => return Ok(stopped(&args.out)),
         made => made?,
     };
     let mut table = AblationTable {
         dataset: dataset.display().to_string(),
         epochs: config.vae.epochs,
-        free_poses: if random_poses.is_empty() { 0 } else { config.free_poses.count },
+        free_poses: if free_poses.is_empty() { 0 } else { config.free_poses.count },
         rows: Vec::new(),
     };
     for (variant, seed) in variants.iter().flat_map(|&v| (0..args.seeds).map(move |k| (v, config.seed + k))) {
@@ -56,7 +56,7 @@ pub fn run(args: &AblateArgs) -> anyhow::Result<ExitCode> {
         let training = Training {
             config: &config,
             dataset: &dataset,
-            random_poses: &random_poses,
+            free_poses: &free_poses,
             scenario: None,
             out: &args.out,
             device: options.device,

@@ -4,13 +4,13 @@ use anyhow::{Context, bail};
 use carff_base::files::check_writable;
 use carff_checkpoint::Manifest;
 use carff_launch::dataset::render;
-use carff_launch::lab::{StageName, TrainArgs};
+use carff_launch::lab::{PhaseName, TrainArgs};
 use carff_scenes::{
     ClosedLoop, Extras, Scenario,
     config::{BystanderPlace, VariationRole},
 };
 use carff_training::{
-    FreePoses, Phases, Progress, Training, TrainingConfig, TrainingError, TrainingRun, forget_run, render_random_poses,
+    FreePoses, Phases, Progress, Training, TrainingConfig, TrainingError, TrainingRun, forget_run, render_free_poses,
 };
 use carff_transport::{INTERRUPTED, Stop};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
@@ -53,15 +53,15 @@ pub fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
     let display = Display::default();
     let report = |progress: &Progress| display.show(progress);
     let run = TrainingRun { dir: dir.clone(), on_progress: &report, stop: stop.flag() };
-    let phases = match args.stage {
+    let phases = match args.phase {
         None => Phases::All,
-        Some(StageName::Vae) => Phases::Vae,
-        Some(StageName::Nerf) => Phases::Field,
-        Some(StageName::Mdn) => Phases::Mixture,
+        Some(PhaseName::Vae) => Phases::Vae,
+        Some(PhaseName::Nerf) => Phases::Field,
+        Some(PhaseName::Mdn) => Phases::Mixture,
     };
-    let result = with_random_poses(rendered, &config, &dataset, &run).and_then(|random_poses| {
-        let (random_poses, scenario) = (&random_poses, scenario.as_ref());
-        Training { config: &config, dataset: &dataset, random_poses, scenario, out: &out, device }.run(phases, &run)
+    let result = with_free_poses(rendered, &config, &dataset, &run).and_then(|free_poses| {
+        let (free_poses, scenario) = (&free_poses, scenario.as_ref());
+        Training { config: &config, dataset: &dataset, free_poses, scenario, out: &out, device }.run(phases, &run)
     });
     display.finish();
     match result {
@@ -96,14 +96,14 @@ pub fn stopped(dir: &Path) -> ExitCode {
     ExitCode::from(INTERRUPTED)
 }
 
-/// Folders of the dataset and of the datasets of random poses. Missing ones are rendered from the training
+/// Folders of the dataset and of the datasets of free poses. Missing ones are rendered from the training
 /// file's scenario.
 pub fn datasets(config: &TrainingConfig, given: Option<&Path>) -> anyhow::Result<(PathBuf, Vec<PathBuf>)> {
     let dataset = given.unwrap_or(&config.dataset).to_owned();
     if !dataset.join("transforms.json").is_file() && given.is_none() {
         render(&scenario(config)?, &dataset, Extras::None)?;
     }
-    Ok((dataset, rendered_random_poses(config, given)?))
+    Ok((dataset, rendered_free_poses(config, given)?))
 }
 
 fn scenario(config: &TrainingConfig) -> anyhow::Result<Scenario> {
@@ -116,8 +116,8 @@ fn scenario(config: &TrainingConfig) -> anyhow::Result<Scenario> {
     }
 }
 
-/// Folders of the datasets of random poses, rendered where they are missing; none for a dataset without a scenario file.
-fn rendered_random_poses(config: &TrainingConfig, given: Option<&Path>) -> anyhow::Result<Vec<PathBuf>> {
+/// Folders of the datasets of free poses, rendered where they are missing; none for a dataset without a scenario file.
+fn rendered_free_poses(config: &TrainingConfig, given: Option<&Path>) -> anyhow::Result<Vec<PathBuf>> {
     let FreePoses { count, on_path, per_appearance, seed, .. } = config.free_poses;
     if count == 0 || given.is_some() || config.scenario.is_none() {
         return Ok(Vec::new());
@@ -164,16 +164,16 @@ fn rendered(
     Ok(dir)
 }
 
-/// Folders of the datasets of random poses: the rendered ones, else one that a field renders if the training file requests
+/// Folders of the datasets of free poses: the rendered ones, else one that a field renders if the training file requests
 /// it.
-pub fn with_random_poses(
+pub fn with_free_poses(
     rendered: Vec<PathBuf>,
     config: &TrainingConfig,
     dataset: &Path,
     run: &TrainingRun,
 ) -> Result<Vec<PathBuf>, TrainingError> {
     if rendered.is_empty() {
-        return Ok(render_random_poses(config, dataset, run)?.into_iter().collect());
+        return Ok(render_free_poses(config, dataset, run)?.into_iter().collect());
     }
     Ok(rendered)
 }

@@ -63,7 +63,7 @@ pub fn examine(args: &DoctorArgs) -> anyhow::Result<Vec<Finding>> {
     let mut findings = vec![checks::processor(&name, &features), checks::cores(cores, &stages)];
     findings.extend(gather::available_memory().map(checks::memory));
     findings.extend([checks::clock(&gather::clock()), checks::governor(&gather::governors())]);
-    let here = std::env::current_dir().context("the current folder does not exist")?;
+    let here = std::env::current_dir().context("the current folder does not exist: change to another one")?;
     findings.extend(gather::free_bytes(&here).map(|bytes| checks::disk(&here, bytes)));
 
     let view_bytes = carff_messages::rgb_bytes(renderer.width_px, renderer.height_px);
@@ -78,7 +78,8 @@ pub fn examine(args: &DoctorArgs) -> anyhow::Result<Vec<Finding>> {
     findings.extend(checks::bound_cores(&gather::online(), &stages));
     findings.push(checks::remove_ipc(&gather::logind()));
 
-    let folder = std::env::current_exe()?.parent().context("this program has no folder")?.to_owned();
+    let folder =
+        std::env::current_exe()?.parent().context("this program has no folder: start it by its whole path")?.to_owned();
     let (library, version) = gather::libtorch(&folder);
     let needed = stages.encoder_backend() == Backend::Tch;
     findings.push(checks::libtorch(library.as_deref(), version.as_deref(), needed));

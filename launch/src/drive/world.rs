@@ -56,7 +56,8 @@ impl World {
     /// Drives all episodes, or until it is stopped.
     pub(super) fn run(self, run: &Run, stop: &Stop) -> anyhow::Result<()> {
         let node = Node::open(run, "world")?;
-        let camera = self.drives.scenario().cameras().first().context("the scenario has no camera")?.camera;
+        let camera =
+            self.drives.scenario().cameras().first().context("the scenario has no camera: add one to its file")?.camera;
         let bytes = (camera.width_px * camera.height_px) as usize * 3;
         let mut topics = Topics {
             frames: node.image_publisher(&topics::FRAME, bytes)?,

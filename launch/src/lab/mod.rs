@@ -10,7 +10,7 @@ pub use ablate::AblateArgs;
 pub use backbone::{BackboneCommand, ImportArgs};
 pub use checkpoint::{BoundArgs, CheckpointCommand, KnownArgs, MemoryArgs, OnnxArgs};
 pub use eval::{EvalArgs, TableName};
-pub use train::{StageName, TrainArgs};
+pub use train::{PhaseName, TrainArgs};
 
 use std::process::ExitCode;
 

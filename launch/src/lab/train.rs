@@ -13,9 +13,9 @@ pub struct TrainArgs {
     /// Folder for the finished checkpoint, instead of the training file's.
     #[arg(long)]
     pub out: Option<PathBuf>,
-    /// Train only one model; the models before it must be finished.
-    #[arg(long, value_enum)]
-    pub stage: Option<StageName>,
+    /// Run only one training phase; the phases before it must be finished.
+    #[arg(long, alias = "stage", value_enum)]
+    pub phase: Option<PhaseName>,
     /// Device of the VAE and the mixture density network: `auto`, `cpu` or `cuda:N`. The field is trained on the CPU.
     #[arg(long, default_value = "auto")]
     pub device: String,
@@ -27,9 +27,9 @@ pub struct TrainArgs {
     pub force: bool,
 }
 
-/// A model to train.
+/// A training phase.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
-pub enum StageName {
+pub enum PhaseName {
     /// The pose-conditional VAE.
     Vae,
     /// The latent-conditioned field.

@@ -169,7 +169,7 @@ fn check(args: &ReplayArgs, topics: &BTreeSet<TopicId>) -> anyhow::Result<(Optio
     reader.select(sent.iter().copied())?;
     ensure!(
         !args.verify || COMPARED.iter().any(|topic| reader.has(*topic)),
-        "{} has nothing to compare: it has no messages on {}",
+        "{} has nothing to compare: it has no messages on {}; record these topics, or omit --verify",
         args.recording.display(),
         COMPARED.map(|topic| format!("`{topic}`")).join(", ")
     );

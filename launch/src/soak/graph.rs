@@ -135,7 +135,10 @@ impl Graph {
             if patience.ran_out() {
                 let _ = child.kill();
                 let _ = child.wait();
-                bail!("the launcher was not up within {} ms", self.config.launcher.start_timeout_ms);
+                bail!(
+                    "the launcher was not up within {} ms: raise `launcher.start_timeout_ms`, or end other programs",
+                    self.config.launcher.start_timeout_ms
+                );
             }
             std::thread::sleep(Duration::from_millis(10));
         }

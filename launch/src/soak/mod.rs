@@ -48,6 +48,9 @@ const DISK_SIZE: &str = "size=4m";
 /// Interval between two measurements of the processes' memory.
 const MEMORY_PERIOD_NS: u64 = 5 * NS_PER_S;
 
+/// Error of a fault that is inflicted before the first graph runs.
+const NOT_WATCHED: &str = "no graph is watched: start one before a fault is inflicted";
+
 /// Soak a graph.
 #[derive(Clone, Debug, clap::Args)]
 pub struct SoakArgs {
@@ -230,11 +233,11 @@ impl Soak<'_> {
     }
 
     fn watcher(&mut self) -> anyhow::Result<&mut Watcher> {
-        self.watcher.as_mut().context("nobody watches")
+        self.watcher.as_mut().context(NOT_WATCHED)
     }
 
     fn look(&mut self) -> anyhow::Result<()> {
-        let watcher = self.watcher.as_mut().context("nobody watches")?;
+        let watcher = self.watcher.as_mut().context(NOT_WATCHED)?;
         watcher.look(&mut self.notes)?;
         let now_ns = monotonic_now_ns();
         if now_ns >= self.memory_ns {

@@ -70,7 +70,10 @@ impl FlightRecorder {
                 let output = std::fs::read_to_string(self.folder.path().join("recorder.log")).unwrap_or_default();
                 bail!("the recorder ended at its start ({status}): {output}");
             }
-            ensure!(!patience.ran_out(), "the recorder did not start within {LIMIT_MS} ms");
+            ensure!(
+                !patience.ran_out(),
+                "the recorder did not start within {LIMIT_MS} ms: end other programs, or use a faster machine"
+            );
             std::thread::sleep(Duration::from_millis(5));
         }
         Ok(())

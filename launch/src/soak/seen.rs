@@ -26,6 +26,6 @@ pub(super) fn seen(
             seen.push((*frame, frame.bytes().to_vec()));
         }
     }
-    ensure!(!seen.is_empty(), "no frames to send again");
+    ensure!(!seen.is_empty(), "no frame of the camera arrived in time: check with `carff probe top` that it publishes");
     Ok(seen)
 }

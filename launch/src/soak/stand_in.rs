@@ -45,7 +45,10 @@ pub(super) fn run(node: &Node, kind: FaultKind, seed: u64) -> anyhow::Result<()>
     let mut healths = node.receiver(topics::health(Stage::Camera))?;
     let seen = seen(&mut frames, &waiter)?;
     let period_ns = period_ns(&seen.iter().map(|(meta, _)| meta.header).collect::<Vec<_>>());
-    let (mut meta, rgb) = seen.into_iter().next_back().context("no frames to replace")?;
+    let (mut meta, rgb) = seen
+        .into_iter()
+        .next_back()
+        .context("no frame of the camera arrived: check with `carff probe top` that it publishes")?;
     let image = spoilt(kind, &Image { width_px: meta.width_px, height_px: meta.height_px, rgb })?;
     let mut output = node.image_publisher(&topics::FRAME, image.rgb.len())?;
     let pid = loop {

@@ -202,7 +202,9 @@ impl<'a> Supervisor<'a> {
         match self.feed.take_if(|feed| feed.is_finished()) {
             None => Ok(false),
             Some(feed) => {
-                feed.join().map_err(|_| anyhow!("the feed failed"))??;
+                feed.join().map_err(|_| {
+                    anyhow!("the thread that sends the recording has failed: report it, with the lines above")
+                })??;
                 Ok(true)
             }
         }

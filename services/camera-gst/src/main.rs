@@ -36,8 +36,10 @@ enum Ended {
 }
 
 fn run(stage: &mut StageContext) -> anyhow::Result<()> {
-    gst::init().context("GStreamer cannot start")?;
-    let text = stage.graph.camera.pipeline.clone().context("`camera.pipeline` is missing in the graph file")?;
+    gst::init().context("GStreamer cannot start: install it as the README of services/camera-gst states")?;
+    let text = stage.graph.camera.pipeline.clone().context(
+        "`camera.pipeline` is missing in the graph file: set it, for example to `v4l2src ! videoconvert ! appsink`",
+    )?;
     let mut output = FrameOutput::open(stage, None)?;
     let mut is_ready = false;
     loop {
@@ -45,7 +47,9 @@ fn run(stage: &mut StageContext) -> anyhow::Result<()> {
         let is_live = pipeline.is_live;
         match pipeline.watch(stage, &mut output, &mut is_ready) {
             Ok(Ended::Stopped) => return Ok(()),
-            Ok(Ended::EndOfStream) if !is_ready => bail!("`camera.pipeline` ended before its first image"),
+            Ok(Ended::EndOfStream) if !is_ready => {
+                bail!("`camera.pipeline` ended before its first image: check its source")
+            }
             Ok(Ended::EndOfStream) if stage.graph.camera.repeat => continue,
             Ok(Ended::EndOfStream) if !is_live => {
                 stage.wait_until(&[], monotonic_now_ns() + stage.graph.camera.linger_ms * 1_000_000)?;
@@ -62,6 +66,11 @@ fn run(stage: &mut StageContext) -> anyhow::Result<()> {
     }
 }
 
+/// Returns the error of a buffer that lacks a part.
+fn lacking(part: &str) -> String {
+    format!("`camera.pipeline` delivered a buffer without {part}: put `videoconvert` before the appsink")
+}
+
 /// A playing pipeline. Dropping it stops it.
 struct Pipeline {
     pipeline: gst::Pipeline,
@@ -73,9 +82,11 @@ struct Pipeline {
 impl Pipeline {
     /// Builds the pipeline and starts it. Its sink keeps only the newest image.
     fn new(text: &str) -> anyhow::Result<Self> {
-        let built = gst::parse::launch(text).map_err(|e| anyhow!("`camera.pipeline` is wrong: {}", e.message()))?;
-        let pipeline =
-            built.downcast::<gst::Pipeline>().map_err(|_| anyhow!("`camera.pipeline` has only one element"))?;
+        let built = gst::parse::launch(text)
+            .map_err(|e| anyhow!("`camera.pipeline` is wrong: {}; try it with gst-launch-1.0", e.message()))?;
+        let pipeline = built
+            .downcast::<gst::Pipeline>()
+            .map_err(|_| anyhow!("`camera.pipeline` has only one element: end it with `! videoconvert ! appsink`"))?;
         let sinks = pipeline.iterate_sinks().into_iter().filter_map(Result::ok);
         let sink = sinks
             .filter_map(|sink| sink.downcast::<AppSink>().ok())
@@ -86,7 +97,7 @@ impl Pipeline {
         sink.set_drop(true);
         // The system's clock is the monotonic one, which all headers use.
         pipeline.use_clock(Some(&gst::SystemClock::obtain()));
-        let bus = pipeline.bus().context("the pipeline has no bus")?;
+        let bus = pipeline.bus().context("`camera.pipeline` has no bus: install GStreamer again")?;
         let mut started = Self { pipeline, sink, bus, is_live: false };
         match started.pipeline.set_state(gst::State::Playing) {
             // Live images are taken when they come; those of a file at their time.
@@ -95,7 +106,11 @@ impl Pipeline {
                 started.sink.set_property("sync", false);
             }
             Ok(_) => {}
-            Err(_) => return Err(started.error().unwrap_or_else(|| anyhow!("`camera.pipeline` does not start"))),
+            Err(_) => {
+                return Err(started
+                    .error()
+                    .unwrap_or_else(|| anyhow!("`camera.pipeline` does not start: try it with gst-launch-1.0")));
+            }
         }
         Ok(started)
     }
@@ -119,7 +134,10 @@ impl Pipeline {
             }
             let patience = if *is_ready { PATIENCE } else { START };
             if newest.elapsed() > patience {
-                bail!("no image from `camera.pipeline` for {} s", patience.as_secs());
+                bail!(
+                    "no image from `camera.pipeline` for {} s: check that its source is connected and delivers",
+                    patience.as_secs()
+                );
             }
         }
         Ok(Ended::Stopped)
@@ -133,11 +151,12 @@ impl Pipeline {
         is_ready: &mut bool,
     ) -> anyhow::Result<()> {
         let captured_ns = self.capture_time_ns(sample);
-        let buffer = sample.buffer().context("a sample without an image")?;
-        let info = VideoInfo::from_caps(sample.caps().context("a sample without a format")?)?;
-        let frame = VideoFrameRef::from_buffer_ref_readable(buffer, &info).context("an image cannot be read")?;
-        let step = usize::try_from(frame.plane_stride()[0]).context("an image with rows from the bottom")?;
-        let data = frame.plane_data(0).context("an image without pixels")?;
+        let buffer = sample.buffer().with_context(|| lacking("an image"))?;
+        let info = VideoInfo::from_caps(sample.caps().with_context(|| lacking("a format"))?)?;
+        let frame =
+            VideoFrameRef::from_buffer_ref_readable(buffer, &info).with_context(|| lacking("readable pixels"))?;
+        let step = usize::try_from(frame.plane_stride()[0]).with_context(|| lacking("rows from the top"))?;
+        let data = frame.plane_data(0).with_context(|| lacking("pixels"))?;
         let raw = RawImage::new([frame.width(), frame.height()], step, PixelFormat::Rgb8, data)?;
         if !*is_ready {
             output.check(&raw)?;

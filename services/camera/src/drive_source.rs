@@ -114,7 +114,8 @@ impl Source for DriveSource {
     }
 
     fn write(&mut self, frame_id: u64, pixels: &mut [u8]) -> anyhow::Result<()> {
-        let image = self.images.get(&self.current).context("no frame has been advanced to")?;
+        let image =
+            self.images.get(&self.current).context("no frame is current: `advance` must come before `write`")?;
         let key = Key { seed: self.seed, frame: frame_id, step: 0, sample: 0 };
         Ok(apply_noise_into(&image.rgb, pixels, &self.noise, key)?)
     }

@@ -65,7 +65,7 @@ impl FreeDriveSource {
             self.frame_in_drive = 0;
         }
         let (scenario, frame) = (&self.scenario, self.frame_in_drive);
-        let drive = self.drive.as_ref().context("no drive is planned")?;
+        let drive = self.drive.as_ref().context("no drive is planned: give the scenario room for a drive")?;
         Ok(Some(self.pool.install(|| scenario.free_frame(drive, frame))?))
     }
 }
@@ -94,7 +94,7 @@ impl Source for FreeDriveSource {
     }
 
     fn write(&mut self, frame_id: u64, image: &mut [u8]) -> anyhow::Result<()> {
-        let frame = self.current.as_ref().context("no frame has been advanced to")?;
+        let frame = self.current.as_ref().context("no frame is current: `advance` must come before `write`")?;
         let key = Key { seed: self.seed, frame: frame_id, step: 0, sample: 0 };
         Ok(apply_noise_into(&frame.image.rgb, image, &self.noise, key)?)
     }

@@ -55,7 +55,7 @@ impl Schedule {
 pub fn run(stage: &mut StageContext, source: &mut dyn Recorded) -> anyhow::Result<()> {
     let calibration = if stage.graph.camera.calibration.is_some() { None } else { source.calibration()? };
     let mut output = FrameOutput::open(stage, calibration)?;
-    source.next()?.context("the recording contains no image")?;
+    source.next()?.context("the recording contains no image: set another `camera.file` or `camera.topic`")?;
     source.with_image(&mut |raw| output.check(raw))?;
     source.rewind()?;
     // A camera that is restarted during a run continues after the last frame of its predecessor.

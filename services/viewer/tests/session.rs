@@ -161,7 +161,7 @@ fn a_checkpoint_without_forecaster_toggles() {
     session.toggle(image(0, 0, ABOVE_VIEW)).unwrap();
     session.probe().unwrap();
     let error = session.predict().unwrap_err();
-    assert!(error.to_string().contains("carff train --stage mdn"), "{error}");
+    assert!(error.to_string().contains("carff train --phase mdn"), "{error}");
 }
 
 /// A newer frame of the graph replaces the shown one: the step and a chosen sample stay in view. Scenes are marked as

@@ -36,7 +36,10 @@ pub enum CameraError {
     #[error("`{0}` must be greater than zero")]
     NotPositive(&'static str),
     /// The rotation part must be orthonormal and right-handed.
-    #[error("the rotation part of `transform_matrix` is not a rotation")]
+    #[error(
+        "the rotation part of `transform_matrix` is not a rotation: its columns must be perpendicular, of \
+         length 1 and right-handed"
+    )]
     NotARotation,
 }
 

@@ -9,7 +9,7 @@ use std::path::Path;
 /// Reads the field of a checkpoint.
 pub fn load_field(dir: &Path, manifest: &Manifest) -> Result<Field, CheckpointError> {
     let path = dir.join(files::FIELD);
-    let missing = || CheckpointError::Missing { path: dir.into(), part: "field", stage: "nerf" };
+    let missing = || CheckpointError::Missing { path: dir.into(), part: "field", phase: "nerf" };
     let config = manifest.field.clone().ok_or_else(missing)?;
     if !path.is_file() {
         return Err(missing());

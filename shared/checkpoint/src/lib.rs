@@ -83,14 +83,14 @@ pub enum CheckpointError {
         given: String,
     },
     /// A part is missing: its training phase has not run.
-    #[error("checkpoint {path} has no {part}: run `carff train --stage {stage}`")]
+    #[error("checkpoint {path} has no {part}: run `carff train --phase {phase}`")]
     Missing {
         /// Path of the checkpoint.
         path: PathBuf,
         /// Name of the missing part.
         part: &'static str,
         /// Training phase of the part.
-        stage: &'static str,
+        phase: &'static str,
     },
     /// A weights file cannot be read or written, or does not fit.
     #[error("checkpoint {path}: {what}")]

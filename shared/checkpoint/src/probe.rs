@@ -54,7 +54,7 @@ pub fn load_field_probe(dir: &Path, manifest: &Manifest) -> Result<FieldProbe, C
 
 /// Returns the probe layout of a checkpoint and its calibration.
 pub fn load_probing(dir: &Path, manifest: &Manifest) -> Result<(ProbeLayout, ProbeCalibration), CheckpointError> {
-    let missing = || CheckpointError::Missing { path: dir.into(), part: "probe calibration", stage: "nerf" };
+    let missing = || CheckpointError::Missing { path: dir.into(), part: "probe calibration", phase: "nerf" };
     let calibration = manifest.probing.clone().ok_or_else(missing)?;
     let layout = ProbeLayout::new(manifest.places.clone(), manifest.scenario.hazard_states())
         .map_err(|source| CheckpointError::Probing { path: dir.into(), source })?;

@@ -13,7 +13,8 @@ pub enum DatasetError {
     },
     /// The folder has no transforms file.
     #[error(
-        "{}: contains none of transforms.json, transforms_train.json, transforms_val.json, transforms_test.json",
+        "{}: contains none of transforms.json, transforms_train.json, transforms_val.json, transforms_test.json; name a \
+         folder that does, or make one with `carff dataset render` or `import`",
         path.display()
     )]
     NoTransforms {
@@ -21,7 +22,10 @@ pub enum DatasetError {
         path: PathBuf,
     },
     /// The operating system reported an error.
-    #[error("{}: {source}", path.display())]
+    #[error(
+        "{}: {source}; check that the path is right, who may read and write it, and the free space",
+        path.display()
+    )]
     Io {
         /// Path of the file or folder.
         path: PathBuf,
@@ -29,7 +33,7 @@ pub enum DatasetError {
         source: std::io::Error,
     },
     /// A file exceeds the limit.
-    #[error("{}: {bytes} bytes, at most {limit} are allowed", path.display())]
+    #[error("{}: {bytes} bytes, at most {limit} are allowed; split the dataset, or scale its images", path.display())]
     TooLarge {
         /// Path of the file.
         path: PathBuf,
@@ -39,7 +43,7 @@ pub enum DatasetError {
         limit: u64,
     },
     /// The file is not JSON. The source names line and column.
-    #[error("{}: not valid JSON: {source}", path.display())]
+    #[error("{}: not valid JSON: {source}; correct the file, or make it again", path.display())]
     Json {
         /// Path of the file.
         path: PathBuf,
@@ -70,7 +74,7 @@ pub enum DatasetError {
     #[error("{} images or masks cannot be used:{}", .0.len(), listed(.0))]
     Several(Vec<DatasetError>),
     /// The dataset has no frame of this index.
-    #[error("frame {index} does not exist; the dataset has {count} frames")]
+    #[error("frame {index} does not exist; the dataset has {count} frames, counted from 0")]
     NoSuchFrame {
         /// Requested index.
         index: usize,

@@ -78,6 +78,14 @@ impl Image {
         Some(10.0 * (255.0_f64 * 255.0 * self.rgb.len() as f64 / sum).log10())
     }
 
+    /// Returns the indices of the pixels in which a channel differs from `other` by more than `tolerance`, of 255, row by
+    /// row. Both images have the same size; pixels that only one of them has are left out.
+    pub fn differing_pixels(&self, other: &Image, tolerance: u8) -> impl Iterator<Item = usize> {
+        let pixels = self.rgb.chunks_exact(3).zip(other.rgb.chunks_exact(3)).enumerate();
+        let differs = move |(a, b): (&[u8], &[u8])| a.iter().zip(b).any(|(a, b)| a.abs_diff(*b) > tolerance);
+        pixels.filter_map(move |(i, pair)| differs(pair).then_some(i))
+    }
+
     /// Reads a PNG or JPEG image with eight bits per channel; the content decides, not the name. Grey becomes RGB with
     /// equal channels. An opaque alpha channel is dropped.
     ///
@@ -124,12 +132,9 @@ pub fn looks_same(a: &Image, b: &Image) -> bool {
 
 /// Returns [`looks_same`] for the pixels whose index `counts`.
 pub(crate) fn looks_same_where(a: &Image, b: &Image, counts: impl Fn(usize) -> bool) -> bool {
-    let pixels = a.rgb.chunks_exact(3).zip(b.rgb.chunks_exact(3)).enumerate();
-    let differ = |(i, (a, b)): &(usize, (&[u8], &[u8]))| {
-        a.iter().zip(*b).any(|(a, b)| a.abs_diff(*b) > PIXEL_TOLERANCE) && counts(*i)
-    };
+    let differing = a.differing_pixels(b, PIXEL_TOLERANCE).filter(|&i| counts(i));
     (a.width_px, a.height_px) == (b.width_px, b.height_px)
-        && pixels.filter(differ).take(MAX_DIFFERENT_PIXELS + 1).count() <= MAX_DIFFERENT_PIXELS
+        && differing.take(MAX_DIFFERENT_PIXELS + 1).count() <= MAX_DIFFERENT_PIXELS
 }
 
 /// Reads width and height from the header of a PNG or JPEG file, pixels.

@@ -50,10 +50,10 @@ pub enum RawError {
         encoding: String,
     },
     /// The image has no pixels, or more than a frame may have.
-    #[error("an image of {0}x{1} pixels; a camera's image has 1 to {MAX_SIDE_PX} pixels a side")]
+    #[error("an image of {0}x{1} pixels; a camera's image has 1 to {MAX_SIDE_PX} pixels a side: scale it")]
     Size(u32, u32),
     /// The rows are shorter than the width.
-    #[error("rows of {step} bytes, but {width_px} pixels need {needed}")]
+    #[error("rows of {step} bytes, but {width_px} pixels need {needed}: correct the image's `step` or width")]
     Step {
         /// Length of a row, bytes.
         step: usize,
@@ -63,7 +63,7 @@ pub enum RawError {
         needed: usize,
     },
     /// Bytes are missing.
-    #[error("{found} bytes, but its size needs {needed}: the image is cut off")]
+    #[error("{found} bytes, but its size needs {needed}: the image is cut off, send it whole")]
     CutOff {
         /// Number of bytes.
         found: usize,

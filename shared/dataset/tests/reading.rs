@@ -306,7 +306,7 @@ fn golden_errors() {
         ),
         (
             at("/frames/3/transform_matrix", json!(sheared)),
-            format!("{f3}key `transform_matrix`: the rotation part of `transform_matrix` is not a rotation; a camera-to-world matrix is a rotation and a translation over the row 0 0 0 1"),
+            format!("{f3}key `transform_matrix`: the rotation part of `transform_matrix` is not a rotation: its columns must be perpendicular, of length 1 and right-handed; a camera-to-world matrix is a rotation and a translation over the row 0 0 0 1"),
         ),
         (at("/fl_x", json!("wide")), "SET/transforms.json: top level: key `fl_x`: must be a finite number, found a text".into()),
         (without("", "w"), "SET/transforms.json: frame 0 (images/b0_t0_v0.png): key `w`: is missing while `h` is given".into()),

@@ -21,14 +21,14 @@ pub struct Label {
     pub view: usize,
     /// Visibility of the actor's place; full where the dataset does not name it.
     pub observability: Observability,
-    /// Role of the pose in the split; `None` for a random pose.
+    /// Role of the pose in the split; `None` for a free pose.
     pub role: Option<PoseRole>,
 }
 
-/// Images, labels, split and equivalences of one scenario. The images of random poses follow those of the dataset;
+/// Images, labels, split and equivalences of one scenario. The images of free poses follow those of the dataset;
 /// their views are numbered after the dataset's views.
 pub struct PosedImages {
-    /// Dataset without the random poses.
+    /// Dataset without the free poses.
     pub dataset: Dataset,
     /// Scenario of the dataset.
     pub scenario: ScenarioInfo,
@@ -42,7 +42,7 @@ pub struct PosedImages {
     pub equivalence: Equivalence,
     /// Visual equivalence as the images show it, which training may use. Noise hides it.
     pub seen_equivalence: Equivalence,
-    /// Number of the first view of each dataset of random poses, and its equivalence.
+    /// Number of the first view of each dataset of free poses, and its equivalence.
     random_equivalences: Vec<(usize, Equivalence)>,
     /// Mean image of each pose over the states in which a pixel is valid, `[V, 3, 128, 128]`, 0..=1.
     pub pose_means: Tensor,
@@ -86,9 +86,9 @@ impl PosedImages {
         })
     }
 
-    /// Adds the images of a dataset of random poses of the same scenario, in which the dynamic vehicle may look
+    /// Adds the images of a dataset of free poses of the same scenario, in which the dynamic vehicle may look
     /// different. Several calls add several datasets.
-    pub fn add_random_poses(&mut self, dir: &Path) -> Result<(), EvaluationError> {
+    pub fn add_free_poses(&mut self, dir: &Path) -> Result<(), EvaluationError> {
         let unfit = |what: &str| EvaluationError::Unfit(format!("{}: {what}", dir.display()));
         let free = Dataset::open(dir)?;
         if !free.scenario().is_some_and(|scenario| same_places(&self.scenario, scenario)) {
@@ -102,7 +102,7 @@ impl PosedImages {
         Ok(())
     }
 
-    /// Number of poses, including random poses.
+    /// Number of poses, including free poses.
     pub fn view_count(&self) -> usize {
         self.labels.iter().map(|l| l.view + 1).max().unwrap_or(0)
     }
@@ -123,7 +123,7 @@ impl PosedImages {
         self.with_roles(&[PoseRole::Rest, PoseRole::Calibration])
     }
 
-    /// Images of [`Self::trained`] and of random poses.
+    /// Images of [`Self::trained`] and of free poses.
     pub fn trained_and_random(&self) -> Vec<usize> {
         (0..self.labels.len()).filter(|&i| self.labels[i].role != Some(PoseRole::Unseen)).collect()
     }
@@ -133,7 +133,7 @@ impl PosedImages {
         self.equivalence.alike(view, state).collect()
     }
 
-    /// States whose images from a view of the dataset or of a random pose look the same, including `state`.
+    /// States whose images from a view of the dataset or of a free pose look the same, including `state`.
     pub fn seen_alike(&self, view: usize, state: usize) -> Vec<usize> {
         match self.random_equivalences.iter().rev().find(|(first, _)| view >= *first) {
             Some((first, free)) => free.alike(view - first, state).collect(),

@@ -281,8 +281,8 @@ fn as_tensor(rgb: &[u8], image: &Image) -> Tensor {
 /// Turns a part that is not trained yet into the reason to leave tables out. A damaged part is an error.
 fn or_why<T>(part: Result<T, CheckpointError>) -> Result<Result<T, String>, CheckpointError> {
     match part {
-        Err(CheckpointError::Missing { part, stage, .. }) => {
-            Ok(Err(format!("the checkpoint has no {part} (`carff train --stage {stage}` makes it)")))
+        Err(CheckpointError::Missing { part, phase, .. }) => {
+            Ok(Err(format!("the checkpoint has no {part} (`carff train --phase {phase}` makes it)")))
         }
         other => other.map(Ok),
     }

@@ -38,7 +38,7 @@ pub enum InferenceError {
         what: String,
     },
     /// A weights file cannot be read, or does not fit.
-    #[error("{path}: {what}")]
+    #[error("{path}: {what}; copy the checkpoint again, or make it with `carff train`")]
     Weights {
         /// Path of the file.
         path: PathBuf,
@@ -46,7 +46,7 @@ pub enum InferenceError {
         what: String,
     },
     /// A file could not be written.
-    #[error("{path}: {source}")]
+    #[error("{path}: {source}; check that its folder is writable and has free space")]
     File {
         /// Path of the file.
         path: PathBuf,
@@ -67,7 +67,7 @@ pub enum InferenceError {
     #[error("ONNX Runtime: {0}; `stages.encoder.backend = \"tch\"` computes the same encoder with libtorch")]
     Runtime(String),
     /// The image has no pixels.
-    #[error("an image of shape {0:?} cannot be encoded")]
+    #[error("an image of shape {0:?} cannot be encoded: it needs rows, columns and three channels")]
     Image(Vec<usize>),
 }
 

@@ -26,7 +26,7 @@ impl MixtureNet {
     pub fn load(dir: &Path, manifest: &Manifest) -> Result<Self, CheckpointError> {
         let path = dir.join(files::MIXTURE);
         if !path.is_file() {
-            return Err(CheckpointError::Missing { path: dir.into(), part: "mixture density network", stage: "mdn" });
+            return Err(CheckpointError::Missing { path: dir.into(), part: "mixture density network", phase: "mdn" });
         }
         let wrong = |e: InferenceError| CheckpointError::Weights { path: dir.into(), what: e.to_string() };
         let config = &manifest.mixture;

@@ -22,7 +22,7 @@ pub mod weights;
 #[derive(Debug, thiserror::Error)]
 pub enum ModelError {
     /// A file could not be read or written.
-    #[error("{path}: {source}")]
+    #[error("{path}: {source}; check that the path is right, who may read and write it, and the free space")]
     File {
         /// Path of the file.
         path: std::path::PathBuf,
@@ -38,7 +38,10 @@ pub enum ModelError {
         what: String,
     },
     /// Tensors that the model needs are missing, unknown or of another shape.
-    #[error("the weights do not fit the model: {0}")]
+    #[error(
+        "the weights do not fit the model: {0}; use weights of this network, or the settings that they were trained \
+         with"
+    )]
     Mismatch(String),
     /// A setting is out of range.
     #[error("`{key}` = {value}: {allowed}")]
@@ -51,6 +54,6 @@ pub enum ModelError {
         allowed: &'static str,
     },
     /// libtorch reported an error.
-    #[error("libtorch: {0}")]
+    #[error("libtorch refused an operation: {0}; if a device has too little memory, pass `--device cpu`")]
     Torch(#[from] tch::TchError),
 }

@@ -56,7 +56,7 @@ pub fn load_decoder(dir: &Path, manifest: &Manifest) -> Result<Decoder, Checkpoi
 pub fn load_mixture(dir: &Path, manifest: &Manifest) -> Result<MixtureNet, CheckpointError> {
     let path = dir.join(files::MIXTURE);
     if !path.is_file() {
-        return Err(CheckpointError::Missing { path: dir.into(), part: "mixture density network", stage: "mdn" });
+        return Err(CheckpointError::Missing { path: dir.into(), part: "mixture density network", phase: "mdn" });
     }
     let wrong = in_checkpoint(dir);
     let store = VarStore::new(Device::Cpu);

@@ -164,7 +164,7 @@ impl ImageReader {
 
 /// Reason why one image of a recording cannot be used.
 #[derive(Debug, thiserror::Error)]
-#[error("an image of channel `{topic}` cannot be used: {cause}")]
+#[error("an image of channel `{topic}` cannot be used: {cause}; omit it, or record the channel again")]
 pub struct ImageError {
     /// Channel of the image.
     topic: String,
@@ -264,7 +264,7 @@ fn with_image<R>(
             messages::CompressedImage::decode(message.clone()).map_err(|e| MessageError(e.to_string()))?.data
         }
         Kind::RosCalibration | Kind::FoxgloveCalibration => {
-            return Err(MessageError("it is a calibration".to_owned()));
+            return Err(MessageError("it is a calibration: choose a channel of images".to_owned()));
         }
     };
     let image = Image::decode(&compressed, source).map_err(|e| MessageError(e.to_string()))?;

@@ -46,7 +46,7 @@ use std::path::PathBuf;
 #[derive(Debug, thiserror::Error)]
 pub enum RecordingError {
     /// The file cannot be opened, read or written.
-    #[error("{path}: {source}")]
+    #[error("{path}: {source}; check that the path is right, who may read and write it, and the free space")]
     Io {
         /// Path of the file.
         path: PathBuf,
@@ -54,7 +54,7 @@ pub enum RecordingError {
         source: std::io::Error,
     },
     /// The file is not an MCAP file, or is damaged.
-    #[error("{path} is damaged, or is not an MCAP file: {cause}")]
+    #[error("{path} is damaged, or is not an MCAP file: {cause}; record it again, or repair it with `mcap recover`")]
     Mcap {
         /// Path of the file.
         path: PathBuf,

@@ -260,6 +260,88 @@ fn cabin(half: Vec3, front: f32, rear: f32, side: f32) -> Form {
     Form::Cut { half, planes }
 }
 
+/// A panel of a vehicle's body: its extent along, up and across, metres from the centre on the ground.
+struct Panel {
+    x: [f32; 2],
+    z: [f32; 2],
+    y: [f32; 2],
+    /// Width of the cut-off edges, metres.
+    edge: f32,
+}
+
+/// The parts in which the kinds of vehicles differ, metres.
+struct Shape {
+    panels: Vec<Panel>,
+    /// Height of the lights.
+    lights_z: f32,
+    /// Height of the cabin's lower edge.
+    belt: f32,
+    /// Centre of the cabin along the vehicle.
+    cabin_x: f32,
+    cabin_half: Vec3,
+    /// Lean of the front and rear glass.
+    front: f32,
+    rear: f32,
+    pillars: [f32; 3],
+}
+
+/// Returns the parts of a vehicle of this size (length, width, height), whose body starts at the height `low`, metres.
+fn shape(kind: VehicleKind, [l, w, h]: [f32; 3], low: f32) -> Shape {
+    let (half_l, half_w) = (l / 2.0, w / 2.0);
+    let across = [-half_w, half_w];
+    match kind {
+        VehicleKind::Pickup => {
+            let (belt, bed, floor, wall) = (0.54 * h, -0.1 * l, 0.36 * h, 0.1);
+            let side = |y| Panel { x: [-half_l + 0.02, bed + 0.1], z: [floor - 0.1, belt], y, edge: 0.025 };
+            let cabin_half = Vec3::new(0.19 * l, 0.95 * half_w, (h - belt) / 2.0);
+            Shape {
+                panels: vec![
+                    Panel { x: [bed, half_l], z: [low, belt], y: across, edge: 0.13 },
+                    Panel { x: [-half_l, bed + 0.1], z: [low, floor], y: across, edge: 0.06 },
+                    side([-half_w, -half_w + wall]),
+                    side([half_w - wall, half_w]),
+                    Panel { x: [-half_l, -half_l + wall], z: [floor - 0.1, belt], y: across, edge: 0.025 },
+                ],
+                lights_z: 0.43 * h,
+                belt,
+                cabin_x: bed + cabin_half.x + 0.02,
+                cabin_half,
+                front: 0.13 * l,
+                rear: 0.03 * l,
+                pillars: [-0.03 * l, -cabin_half.x + 0.1, 9.0],
+            }
+        }
+        VehicleKind::Van => {
+            let belt = 0.5 * h;
+            let cabin_half = Vec3::new(0.475 * l, 0.97 * half_w, (h - belt) / 2.0);
+            Shape {
+                panels: vec![Panel { x: [-half_l, half_l], z: [low, belt], y: across, edge: 0.14 }],
+                lights_z: 0.36 * h,
+                belt,
+                cabin_x: -half_l + cabin_half.x + 0.03,
+                cabin_half,
+                front: 0.14 * l,
+                rear: 0.02 * l,
+                pillars: [0.12 * l, -0.14 * l, -0.4 * l],
+            }
+        }
+        VehicleKind::Car | VehicleKind::Block => {
+            let belt = 0.58 * h;
+            let cabin_half = Vec3::new(0.345 * l, 0.92 * half_w, (h - belt) / 2.0);
+            Shape {
+                panels: vec![Panel { x: [-half_l, half_l], z: [low, belt], y: across, edge: 0.17 }],
+                lights_z: 0.44 * h,
+                belt,
+                cabin_x: -half_l + cabin_half.x + 0.12,
+                cabin_half,
+                front: 0.19 * l,
+                rear: 0.12 * l,
+                pillars: [0.0, -0.21 * l, 9.0],
+            }
+        }
+    }
+}
+
 /// Returns the solids of a vehicle whose centre is on the ground at x, y (metres), rotated by `yaw` (radians).
 pub(crate) fn vehicle_bodies(vehicle: &VehicleConfig, [x, y, yaw]: [f64; 3], object: u16) -> Vec<Body> {
     let [l, w, h] = vehicle.size_m.map(|v| v as f32);
@@ -277,65 +359,26 @@ pub(crate) fn vehicle_bodies(vehicle: &VehicleConfig, [x, y, yaw]: [f64; 3], obj
     }
     let radius = (0.2 * h).clamp(0.28, 0.45);
     let axles = [0.315 * l, -0.30 * l];
-    let low = 0.62 * radius;
-    let paint = |center: Vec3, lights_z: f32| {
-        Material::Paint(Paint {
+    let half_w = w / 2.0;
+    let shape = shape(vehicle.kind, [l, w, h], 0.62 * radius);
+    for Panel { x: [x0, x1], z: [z0, z1], y: [y0, y1], edge } in shape.panels {
+        let center = Vec3::new(f32::midpoint(x0, x1), f32::midpoint(y0, y1), f32::midpoint(z0, z1));
+        let paint = Paint {
             colour,
             offset: center,
             half_length: l / 2.0,
-            half_width: w / 2.0,
+            half_width: half_w,
             axles,
             arch_radius: 1.22 * radius,
-            lights_z,
-        })
-    };
-    // A panel of the body from x0 to x1 and z0 to z1, over the given share of the width.
-    let mut panel = |x0: f32, x1: f32, z0: f32, z1: f32, y0: f32, y1: f32, edge: f32, lights_z: f32| {
-        let center = Vec3::new(f32::midpoint(x0, x1), f32::midpoint(y0, y1), f32::midpoint(z0, z1));
+            lights_z: shape.lights_z,
+        };
         let half = Vec3::new((x1 - x0) / 2.0, (y1 - y0) / 2.0, (z1 - z0) / 2.0);
-        add(chamfered(half, edge), center, paint(center, lights_z));
-    };
-    let (half_l, half_w) = (l / 2.0, w / 2.0);
-    let glass = |half: Vec3, pillars: [f32; 3]| Material::Cabin(Cabin { colour, half, pillars });
-    let (cabin_x, cabin_half, front, rear, pillars);
-    let belt;
-    match vehicle.kind {
-        VehicleKind::Pickup => {
-            belt = 0.54 * h;
-            let bed = -0.1 * l;
-            let floor = 0.36 * h;
-            let lights = 0.43 * h;
-            panel(bed, half_l, low, belt, -half_w, half_w, 0.13, lights);
-            panel(-half_l, bed + 0.1, low, floor, -half_w, half_w, 0.06, lights);
-            let wall = 0.1;
-            for (y0, y1) in [(-half_w, -half_w + wall), (half_w - wall, half_w)] {
-                panel(-half_l + 0.02, bed + 0.1, floor - 0.1, belt, y0, y1, 0.025, lights);
-            }
-            panel(-half_l, -half_l + wall, floor - 0.1, belt, -half_w, half_w, 0.025, lights);
-            cabin_half = Vec3::new(0.19 * l, 0.95 * half_w, (h - belt) / 2.0);
-            cabin_x = bed + cabin_half.x + 0.02;
-            (front, rear) = (0.13 * l, 0.03 * l);
-            pillars = [-0.03 * l, -cabin_half.x + 0.1, 9.0];
-        }
-        VehicleKind::Van => {
-            belt = 0.5 * h;
-            panel(-half_l, half_l, low, belt, -half_w, half_w, 0.14, 0.36 * h);
-            cabin_half = Vec3::new(0.475 * l, 0.97 * half_w, (h - belt) / 2.0);
-            cabin_x = -half_l + cabin_half.x + 0.03;
-            (front, rear) = (0.14 * l, 0.02 * l);
-            pillars = [0.12 * l, -0.14 * l, -0.4 * l];
-        }
-        VehicleKind::Car | VehicleKind::Block => {
-            belt = 0.58 * h;
-            panel(-half_l, half_l, low, belt, -half_w, half_w, 0.17, 0.44 * h);
-            cabin_half = Vec3::new(0.345 * l, 0.92 * half_w, (h - belt) / 2.0);
-            cabin_x = -half_l + cabin_half.x + 0.12;
-            (front, rear) = (0.19 * l, 0.12 * l);
-            pillars = [0.0, -0.21 * l, 9.0];
-        }
+        add(chamfered(half, edge), center, Material::Paint(paint));
     }
-    let center = Vec3::new(cabin_x, 0.0, belt + cabin_half.z - 0.02);
-    add(cabin(cabin_half, front, rear, 0.13 * half_w), center, glass(cabin_half, pillars));
+    let (half, pillars) = (shape.cabin_half, shape.pillars);
+    let center = Vec3::new(shape.cabin_x, 0.0, shape.belt + half.z - 0.02);
+    let glass = Material::Cabin(Cabin { colour, half, pillars });
+    add(cabin(half, shape.front, shape.rear, 0.13 * half_w), center, glass);
     for (axle, side) in axles.into_iter().flat_map(|axle| [(axle, -1.0), (axle, 1.0)]) {
         let wheel = Form::Cylinder { axis: 1, radius, half_length: 0.11 };
         add(wheel, Vec3::new(axle, side * (half_w - 0.085), radius), Material::Wheel { rim: 0.62 * radius });

@@ -76,7 +76,7 @@ impl Scenario {
             branch,
             timestamp,
             camera,
-            visible_px: visible_px(&image, &without),
+            visible_px: image.differing_pixels(&without, VISIBLE_DIFFERENCE).count() as u32,
             image,
             without,
             observability: self.free_observability(&placement, timestamp, &camera),
@@ -117,10 +117,4 @@ impl Scenario {
         };
         movers(self.config()).enumerate().filter_map(of).collect()
     }
-}
-
-/// Returns the number of pixels in which a channel differs by more than [`VISIBLE_DIFFERENCE`].
-fn visible_px(a: &Image, b: &Image) -> u32 {
-    let differs = |(a, b): &(&[u8], &[u8])| a.iter().zip(*b).any(|(a, b)| a.abs_diff(*b) > VISIBLE_DIFFERENCE);
-    a.rgb.chunks_exact(3).zip(b.rgb.chunks_exact(3)).filter(differs).count() as u32
 }

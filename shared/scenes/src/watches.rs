@@ -70,7 +70,6 @@ impl Scenario {
 
 /// Returns [`carff_dataset::looks_same`] for images that are [`SMALLER`]: fewer pixels may differ.
 fn same_when_small(a: &Image, b: &Image) -> bool {
-    let differ = |(a, b): &(&[u8], &[u8])| a.iter().zip(*b).any(|(a, b)| a.abs_diff(*b) > PIXEL_TOLERANCE);
     let allowed = MAX_DIFFERENT_PIXELS / (SMALLER * SMALLER) as usize;
-    a.rgb.chunks_exact(3).zip(b.rgb.chunks_exact(3)).filter(differ).take(allowed + 1).count() <= allowed
+    a.differing_pixels(b, PIXEL_TOLERANCE).take(allowed + 1).count() <= allowed
 }

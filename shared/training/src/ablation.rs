@@ -161,7 +161,7 @@ pub struct AblationTable {
     pub dataset: String,
     /// Passes over the training images, for every variant.
     pub epochs: usize,
-    /// Random poses in addition to those of the dataset, for every variant.
+    /// Free poses in addition to those of the dataset, for every variant.
     pub free_poses: usize,
     /// One row for each variant and seed.
     pub rows: Vec<AblationRow>,
@@ -206,7 +206,7 @@ pub fn write_table(table: &AblationTable, out: &Path) -> Result<(), TrainingErro
 
 fn markdown(table: &AblationTable) -> String {
     let mut text = format!(
-        "# Encoder ablation\n\nDataset `{}`, {} epochs and {} random poses for every variant. Only the VAE is trained.\n\n",
+        "# Encoder ablation\n\nDataset `{}`, {} epochs and {} free poses for every variant. Only the VAE is trained.\n\n",
         table.dataset, table.epochs, table.free_poses
     );
     let rows: Vec<(String, &EncoderTable)> =

@@ -38,7 +38,7 @@ pub struct TrainingConfig {
     /// Shape of the mixture density network.
     #[serde(default)]
     pub mixture: MixtureConfig,
-    /// Random poses in addition to those of the dataset.
+    /// Free poses in addition to those of the dataset.
     #[serde(default)]
     pub free_poses: FreePoses,
     /// Augmentation of the encoder's training images.
@@ -84,7 +84,7 @@ impl Default for CalibrationConfig {
     }
 }
 
-/// Random poses in addition to those of the dataset. Only encoder and forecaster train on them, so that they do not
+/// Free poses in addition to those of the dataset. Only encoder and forecaster train on them, so that they do not
 /// memorise poses; decoder, field and all figures use the dataset's poses. For a dataset that was rendered from the
 /// scenario file, the poses are drawn from the ranges of the scenario's cameras and rendered. For any other dataset
 /// they are drawn between its poses, and a field that is trained only for this purpose renders their images.
@@ -123,10 +123,10 @@ pub struct VaeTraining {
     /// Passes over the training images.
     pub epochs: usize,
     /// Number of times that each pass uses the images of the dataset's own poses, which are few compared with those of
-    /// random poses: once for encoder and decoder, and further times for the encoder only.
+    /// free poses: once for encoder and decoder, and further times for the encoder only.
     pub own_passes: usize,
     /// Number of other poses at which each input's state is reconstructed from its latent, as small images: the encoder
-    /// sees pose c, the decoder is asked for pose c'' (paper section 3.1, with one pose). Images of random poses are
+    /// sees pose c, the decoder is asked for pose c'' (paper section 3.1, with one pose). Images of free poses are
     /// reconstructed at poses of the dataset. With one pose, most seeds end with a latent that shows no state. 0: each
     /// image is reconstructed at its own pose.
     pub other_poses: usize,

@@ -2,11 +2,12 @@
 
 use crate::{
     TrainingError,
-    records::{FieldRecord, METRICS, MixtureRecord, Record, VaeRecord, names},
+    records::{FieldRecord, METRICS, MetricsLine, MixtureRecord, Record, VaeRecord, names},
 };
 use carff_evaluation::{Accuracy, ByObservability};
 use carff_plots::{Panel, Series};
-use serde_json::Value;
+use serde::Deserialize;
+use serde_json::{Map, Value};
 use std::{
     collections::BTreeMap,
     path::{Path, PathBuf},
@@ -151,14 +152,11 @@ impl Metrics {
                 path: self.path.clone(),
                 what: format!("line {number}: {what}; remove the file to draw curves from now on"),
             };
-            let mut line = line.clone();
-            let stage = line.as_object_mut().and_then(|map| map.remove("stage"));
-            match stage.as_ref().and_then(Value::as_str) {
-                Some(stage) if stage == phase => {}
-                Some(_) => continue,
-                None => return Err(wrong("missing field `stage`".into())),
+            let line = MetricsLine::<Map<String, Value>>::deserialize(line).map_err(|e| wrong(e.to_string()))?;
+            if line.phase != phase {
+                continue;
             }
-            let record: R = serde_json::from_value(line).map_err(|e| wrong(e.to_string()))?;
+            let record: R = serde_json::from_value(line.record.into()).map_err(|e| wrong(e.to_string()))?;
             rows.split_off(&record.x());
             rows.insert(record.x(), record);
         }
@@ -197,9 +195,7 @@ mod tests {
 
     /// A line of the metrics file.
     fn line(phase: &str, record: &impl serde::Serialize) -> String {
-        let mut line = serde_json::to_value(record).unwrap();
-        line["stage"] = phase.into();
-        line.to_string() + "\n"
+        serde_json::to_string(&MetricsLine { phase: phase.to_owned(), record }).unwrap() + "\n"
     }
 
     fn vae(epoch: u64, loss: f64, kl: f64) -> String {
@@ -210,11 +206,11 @@ mod tests {
 
     fn metrics() -> String {
         let mut text = [vae(1, 4.0, 1.0), vae(2, 3.0, 2.0), vae(3, 9.0, 3.0)].concat();
-        text += "{\"stage\":\"vae\",\"epoch\":4,\"lo\n";
+        text += "{\"phase\":\"vae\",\"epoch\":4,\"lo\n";
         text += &vae(2, 2.5, f64::NAN);
-        text += "{\"stage\":\"threshold\",\"threshold\":0.5}\n";
+        text += "{\"phase\":\"threshold\",\"threshold\":0.5}\n";
         text += &line("nerf", &FieldRecord { step: 100, loss: 0.01, ray_psnr_db: 17.0 });
-        text + "{\"stage\":\"nerf\",\"step\":200,\"loss\":0.0"
+        text + "{\"phase\":\"nerf\",\"step\":200,\"loss\":0.0"
     }
 
     fn written(text: &str) -> tempfile::TempDir {
@@ -241,10 +237,20 @@ mod tests {
         assert!(panels.iter().all(|p| p.title != "Mixture density network" && p.title != "VAE: images, trained poses"));
     }
 
+    /// A file of an earlier version, whose lines name their phase `stage`, has the same curves. A key too many is an
+    /// error.
+    #[test]
+    fn an_earlier_file_is_read() {
+        let curves = |text: &str| training_curves(written(text).path());
+        let earlier = curves(&metrics().replace("\"phase\"", "\"stage\"")).unwrap();
+        assert_eq!(format!("{earlier:?}"), format!("{:?}", curves(&metrics()).unwrap()));
+        assert!(curves(&metrics().replace("\"ray_psnr_db\"", "\"more\":1,\"ray_psnr_db\"")).is_err());
+    }
+
     /// A record with a renamed key is an error that names file and line, never a missing point.
     #[test]
     fn a_renamed_key_is_an_error() {
-        for key in ["stage", "epoch", "kl", "accuracy", "calibration", "ray_psnr_db"] {
+        for key in ["phase", "epoch", "kl", "accuracy", "calibration", "ray_psnr_db"] {
             let text = metrics().replace(&format!("\"{key}\""), "\"renamed\"");
             let error = training_curves(written(&text).path()).expect_err(key).to_string();
             assert!(error.contains(METRICS) && error.contains("line "), "{key}: {error}");
@@ -256,7 +262,7 @@ mod tests {
     fn the_image_is_in_the_run_folder() {
         let dir = tempfile::tempdir().unwrap();
         draw(dir.path()).unwrap();
-        std::fs::write(dir.path().join(METRICS), "{\"stage\":\"thr").unwrap();
+        std::fs::write(dir.path().join(METRICS), "{\"phase\":\"thr").unwrap();
         draw(dir.path()).unwrap();
         assert!(!dir.path().join("curves.png").exists());
         std::fs::write(dir.path().join(METRICS), metrics()).unwrap();

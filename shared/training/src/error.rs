@@ -28,10 +28,13 @@ pub enum TrainingError {
     #[error(transparent)]
     Plot(#[from] carff_plots::PlotError),
     /// libtorch refused an operation.
-    #[error("libtorch: {0}")]
+    #[error("libtorch refused an operation: {0}; if a device has too little memory, pass `--device cpu`")]
     Torch(#[from] tch::TchError),
     /// A file could not be read or written.
-    #[error("{path}: {source}{}", carff_base::names::beside(path))]
+    #[error(
+        "{path}: {source}{}; check that the path is right, who may read and write it, and the free space",
+        carff_base::names::beside(path)
+    )]
     File {
         /// The file.
         path: std::path::PathBuf,
@@ -61,6 +64,16 @@ pub enum TrainingError {
     /// The dataset lacks something that this training needs.
     #[error("the dataset cannot train this model: {0}")]
     Unfit(String),
+    /// A phase that the requested one continues is not finished.
+    #[error("training phase {phase} has {done} of {total} steps: finish it with `carff train --phase {phase}`")]
+    Unfinished {
+        /// Name of the phase.
+        phase: String,
+        /// Steps done.
+        done: usize,
+        /// Number of steps.
+        total: usize,
+    },
     /// The user asked to stop; the state is saved.
     #[error("stopped; the same command resumes from the saved state")]
     Stopped,

@@ -8,7 +8,7 @@ use crate::{
     config::TrainingConfig,
     records::{FieldRecord, names},
     run::{Context, Phase, PhaseReport, drive, part, prefixed},
-    unambiguous::unambiguous_by_state,
+    unambiguous::{no_view, unambiguous_by_state},
 };
 use carff_base::random::Key;
 use carff_dataset::PIXEL_TOLERANCE;
@@ -36,7 +36,7 @@ impl Clouds {
             .map(|views| views.into_iter().map(|i| posteriors[i]).collect())
             .collect();
         match by_state.iter().position(Vec::is_empty) {
-            Some(state) => Err(TrainingError::Unfit(format!("state {state} has no view from a trained pose"))),
+            Some(state) => Err(no_view(state)),
             None => Ok(Self { by_state }),
         }
     }

@@ -8,7 +8,7 @@
 //! let stop = AtomicBool::new(false);
 //! let run = TrainingRun { dir: "runs/toy".into(), on_progress: &|p| println!("{}", p.line), stop: &stop };
 //! let (dataset, out, device) = (config.dataset.as_path(), config.out.as_path(), tch::Device::Cpu);
-//! let training = Training { config: &config, dataset, random_poses: &[], scenario: None, out, device };
+//! let training = Training { config: &config, dataset, free_poses: &[], scenario: None, out, device };
 //! println!("{}", training.run(Phases::All, &run)?.summary());
 //! # Ok(())
 //! # }
@@ -22,7 +22,7 @@
 //! | `vae`, `field`, `mixture` | the training phases |
 //! | `one_stage` | encoder and field trained together, for comparison |
 //! | `features`, `records`, `curves` | files of a run: backbone features, metrics, curves |
-//! | `random_poses` | images from random poses for a dataset without a scenario file |
+//! | `free_poses` | images from free poses for a dataset without a scenario file |
 //! | [`ablation`] | the encoder ablation |
 
 pub mod ablation;
@@ -34,12 +34,12 @@ mod curves;
 mod error;
 mod features;
 mod field;
+mod free_poses;
 mod known;
 mod memory;
 mod mixture;
 mod one_stage;
 mod pipeline;
-mod random_poses;
 mod records;
 mod run;
 mod unambiguous;
@@ -52,9 +52,9 @@ pub use config::{CalibrationConfig, FieldTraining, FreePoses, MdnTraining, Train
 pub use curves::training_curves;
 pub use error::TrainingError;
 pub use features::FEATURES;
+pub use free_poses::render_free_poses;
 pub use known::{KnownInput, calibrate_known};
 pub use memory::{LearnedMemory, MemoryInput, learn_memory};
 pub use pipeline::{Phases, Training};
-pub use random_poses::render_random_poses;
 pub use run::{TrainingRun, forget_run};
 pub use vae::losses;

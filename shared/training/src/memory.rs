@@ -63,7 +63,9 @@ pub fn learn_memory(input: MemoryInput, on_progress: &dyn Fn(&Progress)) -> Resu
         .flat_map(|repeated_share| DISTRUSTS.map(|distrust| MemorySettings { repeated_share, distrust }));
     let scored: Vec<(MemorySettings, f64)> = candidates.map(|settings| (settings, of(settings))).collect();
     let best = scored.into_iter().min_by(|a, b| a.1.total_cmp(&b.1));
-    let (settings, log_loss) = best.ok_or_else(|| TrainingError::Insufficient("there are no drives".into()))?;
+    let (settings, log_loss) = best.ok_or_else(|| {
+        TrainingError::Insufficient("there are no drives to learn from: give more with --drives".into())
+    })?;
     let old = CheckpointPlanning::load(input.checkpoint)?;
     let planning =
         CheckpointPlanning { memory: Some(PlanningMemory { settings, hazard_threshold: None, bound: None }), ..old };

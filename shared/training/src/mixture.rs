@@ -10,7 +10,7 @@ use crate::{
     config::TrainingConfig,
     records::{MixtureRecord, names},
     run::{Context, Phase, PhaseReport, cosine, part, prefixed},
-    unambiguous::{possible_states, unambiguous_by_state},
+    unambiguous::{no_view, possible_states, unambiguous_by_state},
 };
 use carff_base::random::Key;
 use carff_messages::{Gaussian, LATENT_DIM};
@@ -75,7 +75,7 @@ impl<'a> MixturePhase<'a> {
         let posed = context.posed;
         let targets = unambiguous_by_state(posed, &posteriors[0]);
         if let Some(state) = targets.iter().position(Vec::is_empty) {
-            return Err(TrainingError::Unfit(format!("state {state} has no view from a trained pose")));
+            return Err(no_view(state));
         }
         Ok(Self {
             context,

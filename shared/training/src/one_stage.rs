@@ -38,7 +38,7 @@ pub struct OneStagePhase<'a> {
     sampler: RaySampler,
     /// State and pose of each of the sampler's images.
     seen: Vec<(usize, usize)>,
-    /// Images of each state from trained poses, each `vae.own_passes` times, and from random poses.
+    /// Images of each state from trained poses, each `vae.own_passes` times, and from free poses.
     of_state: Vec<Vec<usize>>,
     latest: Vec<VecDeque<[f32; LATENT_DIM]>>,
     means: RunningMeans,

@@ -54,8 +54,8 @@ pub struct Training<'a> {
     pub config: &'a TrainingConfig,
     /// Folder of the dataset.
     pub dataset: &'a Path,
-    /// Folders of the datasets of random poses.
-    pub random_poses: &'a [PathBuf],
+    /// Folders of the datasets of free poses.
+    pub free_poses: &'a [PathBuf],
     /// Scenario of the dataset, from which calibration poses are rendered; `None` for any other dataset.
     pub scenario: Option<&'a Scenario>,
     /// Folder of the checkpoint.
@@ -73,8 +73,8 @@ impl Training<'_> {
         tch::set_num_threads(config.threads);
         tch::manual_seed(config.seed as i64);
         let mut posed = PosedImages::open(self.dataset, config.split_seed)?;
-        for dir in self.random_poses {
-            posed.add_random_poses(dir)?;
+        for dir in self.free_poses {
+            posed.add_free_poses(dir)?;
         }
         let context = Context { config, posed: &posed, run };
         let (manifest, figures) = if posed.scenario.state_count() == 1 {
@@ -186,7 +186,7 @@ impl Training<'_> {
         if matches!(phases, Phases::Vae | Phases::Mixture) {
             return Err(TrainingError::Unfit(
                 "the dataset has one state: there is nothing to encode or to forecast; train the field, with \
-                 `--stage nerf`"
+                 `--phase nerf`"
                     .into(),
             ));
         }
@@ -245,7 +245,7 @@ fn new_manifest(context: Context, states: Vec<Gaussian>) -> Result<Manifest, Tra
     let Context { config, posed, .. } = context;
     let training = serde_json::to_value(config).map_err(|e| TrainingError::Format {
         path: config.out.join(files::MANIFEST),
-        what: format!("`training`: {e}"),
+        what: format!("`training` cannot be written: {e}; correct the training file"),
     })?;
     Ok(Manifest {
         format_version: FORMAT_VERSION,

@@ -14,14 +14,25 @@ pub mod names {
     pub const FIELD: &str = "nerf";
     /// Mixture density network.
     pub const MIXTURE: &str = "mdn";
-    /// Field that renders random poses.
-    pub const RANDOM_POSES: &str = "free";
+    /// Field that renders free poses.
+    pub const FREE_POSES: &str = "free";
     /// Choice of the threshold.
     pub const THRESHOLD: &str = "threshold";
     /// Encoder and field in one stage.
     pub const ONE_STAGE: &str = "one-stage";
     /// End of the training.
     pub const DONE: &str = "done";
+}
+
+/// A line of the metrics file: a record under the name of its phase.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct MetricsLine<R> {
+    /// Name of the phase, one of [`names`]; the key is `stage` in files of earlier versions.
+    #[serde(alias = "stage")]
+    pub phase: String,
+    /// The record; its keys stand next to `phase`.
+    #[serde(flatten)]
+    pub record: R,
 }
 
 /// Record with a place on the x axis of its curves.

@@ -2,7 +2,7 @@
 
 use crate::{
     TrainingConfig, TrainingError, curves, features,
-    records::{METRICS, names},
+    records::{METRICS, MetricsLine, names},
 };
 use carff_evaluation::{PosedImages, Progress};
 use carff_messages::{Gaussian, LATENT_DIM};
@@ -20,8 +20,8 @@ use std::{
 };
 use tch::{Kind, Tensor};
 
-/// Folder of the images from random poses in a run's folder.
-pub const RANDOM_IMAGES: &str = "free-poses";
+/// Folder of the images from free poses in a run's folder.
+pub const FREE_IMAGES: &str = "free-poses";
 
 /// File of the posteriors in a run's folder.
 const POSTERIORS: &str = "posteriors.safetensors";
@@ -118,9 +118,8 @@ impl TrainingRun<'_> {
     /// Adds one record to the metrics file, under the name of its phase.
     pub fn record(&self, phase: &str, record: &impl Serialize) -> Result<(), TrainingError> {
         let path = self.dir.join(METRICS);
-        let mut line = serde_json::to_value(record)
+        let line = serde_json::to_string(&MetricsLine { phase: phase.to_owned(), record })
             .map_err(|e| TrainingError::Format { path: path.clone(), what: e.to_string() })?;
-        line["stage"] = phase.into();
         let failed = |source| TrainingError::File { path: path.clone(), source };
         let mut file = OpenOptions::new().create(true).append(true).open(&path).map_err(failed)?;
         writeln!(file, "{line}").map_err(failed)
@@ -200,10 +199,10 @@ impl TrainingRun<'_> {
                     Err(damaged(&self.state_path(phase)))
                 }
             }
-            Some((done, _)) => {
-                Err(TrainingError::Unfit(format!("stage {phase} stopped at {done} of {total}: finish it first")))
+            unfinished => {
+                let done = unfinished.map_or(0, |(done, _)| done);
+                Err(TrainingError::Unfinished { phase: phase.to_owned(), done, total })
             }
-            None => Err(TrainingError::Unfit(format!("stage {phase} is not trained yet: run it first"))),
         }
     }
 }
@@ -212,10 +211,10 @@ fn state_file(phase: &str) -> String {
     format!("{phase}.state.safetensors")
 }
 
-/// Removes all states, features, metrics and random poses of a run's folder.
+/// Removes all states, features, metrics and free poses of a run's folder.
 pub fn forget_run(dir: &Path) -> Result<(), TrainingError> {
-    use names::{FIELD, MIXTURE, ONE_STAGE, RANDOM_POSES, VAE};
-    let states = [VAE, FIELD, MIXTURE, RANDOM_POSES, ONE_STAGE].map(state_file);
+    use names::{FIELD, FREE_POSES, MIXTURE, ONE_STAGE, VAE};
+    let states = [VAE, FIELD, MIXTURE, FREE_POSES, ONE_STAGE].map(state_file);
     let others = [POSTERIORS, features::FEATURES, METRICS].map(str::to_owned);
     let gone = |path: PathBuf, removed: std::io::Result<()>| match removed {
         Err(source) if source.kind() != ErrorKind::NotFound => Err(TrainingError::File { path, source }),
@@ -224,7 +223,7 @@ pub fn forget_run(dir: &Path) -> Result<(), TrainingError> {
     for path in states.into_iter().chain(others).map(|name| dir.join(name)) {
         gone(path.clone(), std::fs::remove_file(&path))?;
     }
-    let images = dir.join(RANDOM_IMAGES);
+    let images = dir.join(FREE_IMAGES);
     gone(images.clone(), std::fs::remove_dir_all(&images))
 }
 

@@ -4,6 +4,7 @@
 //! view may show. A view is unambiguous if its neighbours are of its own state. No image is compared with another: the
 //! search needs neither images without noise nor the same pose in every state.
 
+use crate::TrainingError;
 use carff_evaluation::PosedImages;
 use carff_messages::{Gaussian, LATENT_DIM};
 use rayon::prelude::*;
@@ -22,7 +23,7 @@ const OF_BEST: f64 = 0.9;
 
 type Latent = [f32; LATENT_DIM];
 
-/// Per state, the unambiguous images of trained and random poses. Every state that has an image gets one.
+/// Per state, the unambiguous images of trained and free poses. Every state that has an image gets one.
 pub fn unambiguous_by_state(posed: &PosedImages, posteriors: &[Gaussian]) -> Vec<Vec<usize>> {
     let images = posed.trained_and_random();
     let (means, states) = means_and_states(posed, posteriors, &images);
@@ -30,7 +31,14 @@ pub fn unambiguous_by_state(posed: &PosedImages, posteriors: &[Gaussian]) -> Vec
     chosen.into_iter().map(|of_state| of_state.into_iter().map(|k| images[k]).collect()).collect()
 }
 
-/// For each image of trained and random poses, its state and those of the views with the nearest posteriors: what its
+/// Error of a state without a view.
+pub fn no_view(state: usize) -> TrainingError {
+    TrainingError::Unfit(format!(
+        "state {state} has no view from a trained pose; add images of it, or choose another `split_seed`"
+    ))
+}
+
+/// For each image of trained and free poses, its state and those of the views with the nearest posteriors: what its
 /// view may show, each as often as it is likely.
 pub fn possible_states(posed: &PosedImages, posteriors: &[Gaussian]) -> Vec<Vec<usize>> {
     let images = posed.trained_and_random();

@@ -1,4 +1,4 @@
-//! Contracts of random poses that a field renders: their images, their inputs, and interruptions.
+//! Contracts of free poses that a field renders: their images, their inputs, and interruptions.
 
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
@@ -6,7 +6,7 @@ mod common;
 
 use carff_dataset::{Dataset, Equivalence, Image, PoseRole, PoseSplit};
 use carff_scenes::Detail;
-use carff_training::{Phases, TrainingError, render_random_poses};
+use carff_training::{Phases, TrainingError, render_free_poses};
 use common::{Place, SCENARIO};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -49,7 +49,7 @@ fn place() -> Place {
 
 /// Renders the dataset in the run folder `name`, until `stop_at` (phase, steps done), or to the end.
 fn make(place: &Place, name: &str, stop_at: Option<(&str, usize)>) -> Result<Option<PathBuf>, TrainingError> {
-    place.run(name, stop_at, |run| render_random_poses(&place.config, &place.at("set"), run))
+    place.run(name, stop_at, |run| render_free_poses(&place.config, &place.at("set"), run))
 }
 
 /// The files of a dataset by name.
@@ -62,7 +62,7 @@ fn files(dir: &Path) -> BTreeMap<String, Vec<u8>> {
     all
 }
 
-/// Every state is rendered from each random pose at the encoder's size, near to its true image. The second step's
+/// Every state is rendered from each free pose at the encoder's size, near to its true image. The second step's
 /// branches look the same from the poses behind the wall, and differ from other poses.
 #[test]
 fn free_poses_show_what_is_there() {
@@ -148,7 +148,7 @@ fn unseen_poses_stay_unseen() {
 }
 
 /// After interruptions while its field trains and while its images are rendered, the dataset has the same bytes. A
-/// finished dataset is not rendered again, and a configuration without random poses gets none.
+/// finished dataset is not rendered again, and a configuration without free poses gets none.
 #[test]
 fn making_free_poses_resumes() {
     let mut place = place();

@@ -72,7 +72,7 @@ occupancy_warmup_steps = 100
 threads = 1
 "#;
 
-/// An imported dataset trains the same with `--stage nerf` and with all phases. Its field renders held-out poses better
+/// An imported dataset trains the same with `--phase nerf` and with all phases. Its field renders held-out poses better
 /// than their mean colours. Phases without work refuse it.
 #[test]
 fn an_imported_set_trains_the_field() {
@@ -95,7 +95,7 @@ fn an_imported_set_trains_the_field() {
     let training = Training {
         config: &config,
         dataset: &dataset,
-        random_poses: &[],
+        free_poses: &[],
         scenario: None,
         out: &out,
         device: tch::Device::Cpu,
@@ -106,7 +106,7 @@ fn an_imported_set_trains_the_field() {
     };
     for phases in [Phases::Vae, Phases::Mixture] {
         let error = train(phases).unwrap_err();
-        assert!(matches!(error, TrainingError::Unfit(_)) && error.to_string().contains("--stage nerf"), "{error}");
+        assert!(matches!(error, TrainingError::Unfit(_)) && error.to_string().contains("--phase nerf"), "{error}");
     }
     let figures = train(Phases::Field).unwrap();
     let views = figures.views.unwrap();

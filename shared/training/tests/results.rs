@@ -144,7 +144,7 @@ fn what_cannot_be_is_said() {
     let results = evaluated(&place, &[Table::Psnr, Table::Encoder, Table::Recall, Table::Planning, Table::Frequencies]);
     let left_out: Vec<&str> = results.left_out.keys().map(String::as_str).collect();
     assert_eq!(left_out, ["frequencies", "planning", "psnr", "recall"]);
-    assert!(results.left_out["psnr"].contains("--stage nerf"), "{:?}", results.left_out);
+    assert!(results.left_out["psnr"].contains("--phase nerf"), "{:?}", results.left_out);
     assert!(results.encoder.is_some());
     let page = std::fs::read_to_string(place.at("results/README.md")).unwrap();
     assert!(page.contains("no branch in which the hazard action is right"), "{page}");

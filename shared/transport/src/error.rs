@@ -77,7 +77,7 @@ pub enum OpenError {
         max: usize,
     },
     /// Any other error.
-    #[error("cannot open topic `{topic}`: {cause}")]
+    #[error("cannot open topic `{topic}`: {cause}; `carff doctor` checks what shared memory needs")]
     Topic {
         /// Name of the topic.
         topic: String,
@@ -90,7 +90,7 @@ pub enum OpenError {
 #[derive(Debug, thiserror::Error)]
 pub enum SendError {
     /// The sender built an invalid message, which receivers would drop.
-    #[error("refused to send an invalid message on `{topic}`: {source}")]
+    #[error("refused to send an invalid message on `{topic}`: {source}; correct this field where the message is made")]
     Invalid {
         /// Name of the topic.
         topic: String,
@@ -98,7 +98,9 @@ pub enum SendError {
         source: Invalid,
     },
     /// The image exceeds the publisher's limit, or its size does not match its description.
-    #[error("an image of {found} bytes on `{topic}`, which was opened for at most {max}")]
+    #[error(
+        "an image of {found} bytes on `{topic}`, which was opened for at most {max}: open it for the largest image"
+    )]
     Size {
         /// Name of the topic.
         topic: String,
@@ -108,7 +110,10 @@ pub enum SendError {
         max: usize,
     },
     /// No memory is available, or the connection is broken.
-    #[error("cannot send on `{topic}`: {cause}")]
+    #[error(
+        "cannot send on `{topic}`: {cause}; if shared memory is full, free some (`carff doctor`), else restart this \
+         process"
+    )]
     Failed {
         /// Name of the topic.
         topic: String,
@@ -119,7 +124,7 @@ pub enum SendError {
 
 /// Reason why receiving failed. An invalid message is not an error: it is dropped and counted.
 #[derive(Debug, thiserror::Error)]
-#[error("cannot receive on `{topic}`: {cause}")]
+#[error("cannot receive on `{topic}`: {cause}; restart this process, and check shared memory with `carff doctor`")]
 pub struct ReceiveError {
     /// Name of the topic.
     pub topic: String,
@@ -131,7 +136,7 @@ pub struct ReceiveError {
 #[derive(Debug, thiserror::Error)]
 pub enum WaitError {
     /// The system reported an error.
-    #[error("cannot wait for input: {0}")]
+    #[error("cannot wait for input: {0}; restart this process, and check its limits with `carff doctor`")]
     Poll(#[from] std::io::Error),
     /// Receiving from an input failed.
     #[error(transparent)]
@@ -150,7 +155,9 @@ pub enum CleanupError {
         source: std::io::Error,
     },
     /// The run's nodes could not be listed.
-    #[error("cannot list the processes of run `{run}`: {cause}")]
+    #[error(
+        "cannot list the processes of run `{run}`: {cause}; check the folders of shared memory with `carff doctor`"
+    )]
     List {
         /// Name of the run.
         run: String,

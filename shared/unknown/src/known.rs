@@ -2,8 +2,9 @@
 
 use crate::blobs::Blob;
 use crate::camera::CameraLimits;
-use crate::compare::{Comparer, Comparison, KnownScene, ResidualKind};
+use crate::compare::{Comparer, Comparison, KnownScene};
 use crate::lanes::{ErrorMap, Lanes};
+use crate::residuals::ResidualKind;
 use crate::sighting::Sighting;
 use carff_base::geometry::PinholeCamera;
 use carff_field::Field;

@@ -3,6 +3,7 @@
 //! | module | content |
 //! |---|---|
 //! | `compare` | every known state, rendered from the camera's own pose and compared with the image |
+//! | `residuals` | how far each pixel of an image is from what a state renders there |
 //! | `align` | errors of pose and lens, and veils, that a comparison takes out of an image |
 //! | `fit` | robust fits of an image to a rendered one |
 //! | `lanes` | the ground on which something unknown counts |
@@ -19,14 +20,16 @@ mod compare;
 mod fit;
 mod known;
 mod lanes;
+mod residuals;
 mod sight;
 mod sighting;
 
 pub use blobs::Blob;
 pub use camera::{CameraCheck, CameraLimits, Measured, Measurement};
-pub use compare::{Comparer, Comparison, KnownScene, ResidualKind};
+pub use compare::{Comparer, Comparison, KnownScene};
 pub use fit::Fit;
 pub use known::{KindLimits, Known, KnownError, KnownLimits, Seen};
 pub use lanes::{ErrorMap, Ground, Lanes, OwnBox};
+pub use residuals::ResidualKind;
 pub use sight::Sight;
 pub use sighting::{Crossing, Sighting};

@@ -1,20 +1,18 @@
 //! Compares the field's kernels with the same model in tensor operations and with the machine's limits.
 
+mod rendering;
+
+use super::best;
 use super::inputs::{Piece, TRAINING_RAYS, pieces, random_latent, random_point, training_batch};
 use super::limits::{matrix_product, triad};
-use super::{best, round_and_round};
-use crate::reference::{Precision, Rays, ReferenceField, Samples, huber_sum};
+use crate::reference::{Precision, ReferenceField, huber_sum};
 use anyhow::Context;
-use carff_base::geometry::{PinholeCamera, Ray};
 use carff_bench::FieldArgs;
 use carff_bench::report::{Report, number, table};
 use carff_bench::stats::{Contender, Ratio, Times, alternate, timed};
 use carff_checkpoint::{FieldProbe, Manifest, load_field_probe};
 use carff_decision::{Draw, Mixture};
-use carff_field::{
-    Field, FieldConfig, FieldTrainer, HypothesisBuffer, InstructionSet, LATENT_DIM, RayLimits, RaySamples,
-    RenderBuffer, RenderOptions, TrainerConfig,
-};
+use carff_field::{Field, FieldConfig, FieldTrainer, InstructionSet, LATENT_DIM, RaySamples, TrainerConfig};
 use std::time::Instant;
 use tch::{Kind, Tensor, nn::OptimizerConfig};
 
@@ -155,173 +153,6 @@ impl Bench {
         report.set("field.limit.f32_gflops", limit);
         report.set("field.limit.bf16_gflops", rates[3].median().max(rates[4].median()));
         report.set("field.limit.bandwidth_gb_s", rates[5].median());
-    }
-
-    /// Renders bird's-eye views of every state.
-    fn rendering(&self, field: &Field, fast: &Field, states: &[[f32; LATENT_DIM]], report: &mut Report) {
-        let bounds_m = field.config().bounds_m.map(|corner| corner.map(f64::from));
-        let camera = PinholeCamera::above(bounds_m, self.side_px, self.side_px);
-        let rays: Vec<Ray> = (0..self.side_px * self.side_px)
-            .map(|i| camera.ray(f64::from(i % self.side_px) + 0.5, f64::from(i / self.side_px) + 0.5))
-            .collect();
-        let options = RenderOptions { threads: self.threads, ..RenderOptions::default() };
-        let limits = RayLimits {
-            max_samples: options.max_samples_per_ray,
-            min_transmittance: options.min_transmittance,
-            step_scale: 1.0,
-            use_occupancy: true,
-        };
-        let samples: Vec<RaySamples> = states
-            .iter()
-            .map(|z| {
-                let mut samples = RaySamples::default();
-                field.samples_along(&rays, z, &limits, &mut samples);
-                samples
-            })
-            .collect();
-        let count = samples.iter().map(|s| s.ray.len()).sum::<usize>() as f64 / states.len() as f64;
-        let kept = |s: &RaySamples| s.weight.iter().filter(|w| **w > options.min_weight).count();
-        let kept = samples.iter().map(kept).sum::<usize>() as f64 / states.len() as f64;
-
-        let tensor_rays = Rays::new(&rays, field.config().direction_degree);
-        let tensor_samples: Vec<Samples> = samples.iter().map(Samples::new).collect();
-        let latents: Vec<Tensor> = states.iter().map(|z| Tensor::from_slice(z)).collect();
-        let references: Vec<ReferenceField> = self.precisions.iter().map(|p| ReferenceField::new(field, *p)).collect();
-        let min_weight = f64::from(options.min_weight);
-        let frame = |reference: &ReferenceField, state: usize, chunk: i64| {
-            drop(std::hint::black_box(reference.render(
-                &tensor_rays,
-                &tensor_samples[state],
-                &latents[state],
-                min_weight,
-                chunk,
-            )));
-        };
-        let hypotheses: Vec<[f32; LATENT_DIM]> = (0..HYPOTHESES).map(|i| states[i % states.len()]).collect();
-        let mut together = HypothesisBuffer::default();
-        let mut buffer = RenderBuffer::new();
-        let mut exact = RenderBuffer::new();
-        let mut contenders = vec![
-            round_and_round(states.len(), |s| fast.render(&camera, &states[s], &options, &mut buffer)),
-            round_and_round(states.len(), |s| field.render(&camera, &states[s], &options, &mut exact)),
-        ];
-        let mut chunks = Vec::new();
-        for reference in &references {
-            let chunk = best(&[1 << 13, 1 << 12, 1 << 14, 1 << 16, 1 << 22], |chunk| frame(reference, 0, chunk));
-            chunks.push(chunk.min(count as i64));
-            contenders.push(round_and_round(states.len(), move |s| frame(reference, s, chunk)));
-        }
-        contenders.push(timed(|| fast.render_hypotheses(&camera, &hypotheses, &options, &mut together)));
-        let mut seconds = alternate(self.rounds, &mut contenders);
-        drop(contenders);
-        println!(
-            "bird's-eye view {0} x {0}: {1:.0} samples, {2:.0} of them with colour, a frame",
-            self.side_px, count, kept
-        );
-        let shared = Times::new(seconds.pop().unwrap_or_default()).median() / HYPOTHESES as f64;
-        let in_f32 = seconds.remove(1);
-        let native = self.versus("render", count, &chunks, &seconds, report);
-        println!("(tensor operations receive the positions of the samples, so that they need not march)");
-        if fast.instruction_set().is_bf16() {
-            bf16_against_f32([fast, field], states, &camera, [&seconds[0], &in_f32], report);
-        }
-        let changing =
-            together.images[0].changing.iter().filter(|c| **c).count() as f64 / f64::from(self.side_px * self.side_px);
-        println!(
-            "{HYPOTHESES} hypotheses together: {} ms, {} frames a second, each; {} of the rays meet what changes\n",
-            number(shared * 1e3),
-            number(1.0 / shared),
-            percent(changing)
-        );
-        report.set("field.render_fps", 1.0 / shared);
-        report.set("field.render_alone_fps", 1.0 / native);
-        report.set("field.render_changing_rays", changing);
-        report.set("field.render_samples", count);
-        report.set("field.render_colored_samples", kept);
-        self.breakdown(fast, states, &camera, &samples, report);
-    }
-
-    /// Splits the time of rendering on one thread into parts, by leaving parts out.
-    fn breakdown(
-        &self,
-        field: &Field,
-        states: &[[f32; LATENT_DIM]],
-        camera: &PinholeCamera,
-        samples: &[RaySamples],
-        report: &mut Report,
-    ) {
-        let (z, samples) = (&states[0], &samples[0]);
-        let rays: Vec<Ray> = (0..self.side_px * self.side_px)
-            .map(|i| camera.ray(f64::from(i % self.side_px) + 0.5, f64::from(i / self.side_px) + 0.5))
-            .collect();
-        let points: Vec<[f32; 3]> = samples
-            .ray
-            .iter()
-            .zip(&samples.distance_m)
-            .map(|(ray, t)| {
-                let ray = &rays[*ray as usize];
-                std::array::from_fn(|i| ray.origin[i] + t * ray.direction[i])
-            })
-            .collect();
-        let latents: Vec<[f32; LATENT_DIM]> = vec![*z; 9];
-        let (mut one, mut nine) = (vec![0.0; points.len()], vec![0.0; points.len() * 9]);
-        let (mut buffer, mut without_color) = (RenderBuffer::new(), RenderBuffer::new());
-        let mut nothing = RenderBuffer::new();
-        let options = RenderOptions::default();
-        // No sample has a weight above 1: then only the heaviest sample of each ray has a colour.
-        let one_color = RenderOptions { min_weight: 2.0, ..options };
-        let colored = samples.weight.iter().filter(|w| **w > options.min_weight).count() as f64;
-        let up: Vec<Ray> = rays
-            .iter()
-            .map(|r| Ray {
-                origin: [r.origin[0], r.origin[1], 1e6],
-                direction: r.direction.map(|v| v * 1e-9),
-                spread: r.spread,
-            })
-            .collect();
-        let seconds = alternate(
-            self.rounds,
-            &mut [
-                timed(|| field.render(camera, z, &options, &mut buffer)),
-                timed(|| field.render(camera, z, &one_color, &mut without_color)),
-                // In pieces, as in rendering, so that the features stay in the cache.
-                timed(|| {
-                    for (points, out) in points.chunks(512).zip(one.chunks_mut(512)) {
-                        field.density(points, z, out);
-                    }
-                }),
-                timed(|| {
-                    for (points, out) in points.chunks(512).zip(nine.chunks_mut(512 * 9)) {
-                        field.density_by_latent(points, &latents, out);
-                    }
-                }),
-                timed(|| {
-                    field.render_rays(&up, z, &RenderOptions { max_samples_per_ray: 1, ..options }, &mut nothing);
-                }),
-            ],
-        );
-        let [all, one_color, density, ninefold, rays_only] =
-            [0, 1, 2, 3, 4].map(|i| Times::new(seconds[i].clone()).median());
-        // One more latent costs the layers after the first, for the density only; the rest is in proportion.
-        let (each, more) = (Operations::of(field.config()), (ninefold - density) / 8.0);
-        let network = more * each.whole / each.rest;
-        let features = density - more * (each.first + each.rest) / each.rest;
-        let color = (all - one_color) * colored / (colored - rays.len() as f64).max(1.0);
-        let parts = [
-            ("features", features),
-            ("density_network", network),
-            ("color_network", color),
-            ("rays_and_background", rays_only),
-            ("marching_and_the_rest", all - color - features - network - rays_only),
-        ];
-        let mut rows = vec![["parts of a frame's time (one thread)", "ms", "share"].map(str::to_owned)];
-        for (name, part) in parts {
-            rows.push([name.replace('_', " "), number(part * 1e3), percent(part / all)]);
-            report.set(&format!("field.render_parts_ms.{name}"), part * 1e3);
-        }
-        rows.push(["all".to_owned(), number(all * 1e3), percent(1.0)]);
-        report.set("field.render_one_thread_ms", all * 1e3);
-        println!("{}", table(&rows));
     }
 
     /// Probes ten hypotheses as the prober does (one thread), and computes only their densities.
@@ -474,29 +305,4 @@ fn precisions(field: &Field) -> Vec<Precision> {
 
 fn percent(share: f64) -> String {
     format!("{:.1} %", share * 100.0)
-}
-
-/// Prints and records speed and image quality of kernels with bf16 products against those in f32.
-fn bf16_against_f32(
-    fields: [&Field; 2],
-    states: &[[f32; LATENT_DIM]],
-    camera: &PinholeCamera,
-    [in_bf16, in_f32]: [&[f64]; 2],
-    report: &mut Report,
-) {
-    let options = RenderOptions::default();
-    let mut buffer = RenderBuffer::new();
-    let ratio = Ratio::new(in_f32, in_bf16);
-    let mut images = [Vec::new(), Vec::new()];
-    for z in states {
-        for (field, all) in fields.into_iter().zip(&mut images) {
-            field.render(camera, z, &options, &mut buffer);
-            all.extend_from_slice(&buffer.rgb);
-        }
-    }
-    let db = carff_base::statistics::psnr_db(&images[0], &images[1]).unwrap_or(f64::INFINITY);
-    println!("native kernels with bf16 products are {ratio} as fast as in f32; {} dB against it", number(db));
-    report.set("field.render_f32_ms", Times::new(in_f32.to_vec()).median() * 1e3);
-    report.set("field.render_bf16_vs_f32", ratio.of_medians);
-    report.set("field.render_bf16_psnr_db", db);
 }

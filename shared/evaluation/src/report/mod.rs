@@ -1,10 +1,12 @@
 //! The results of a checkpoint on a dataset: `results.json`, the images, and one page.
 
 mod gallery;
+mod images_page;
 mod localisation_page;
 mod markdown;
 mod memory_page;
 mod page;
+mod planning_page;
 mod robustness_page;
 mod targets;
 mod trials_page;

@@ -2,16 +2,16 @@
 
 use super::{
     Results,
+    images_page::images,
     localisation_page::localisation,
     markdown::{db, head, percent, row},
     memory_page::memory,
+    planning_page::planning,
     robustness_page::robustness,
     trials_page::trials,
 };
 use crate::stats::draws::Frequencies;
-use crate::tables::planning::{PlanningResults, ViewCounts};
-use crate::{ByRole, EncoderTable, FieldImages, FrequencyTable, ImageTable, PairMeans, SAMPLE_COUNTS, Share, SvmScore};
-use carff_trials::{Count, PlanningTable};
+use crate::{ByRole, EncoderTable, FrequencyTable, Share, SvmScore};
 use std::fmt::Write;
 
 /// Returns the page as Markdown. Writing into a `String` cannot fail, so results of `write!` are dropped.
@@ -89,98 +89,6 @@ fn targets(page: &mut String, results: &Results) {
         row(page, &[t.what.clone(), t.paper.clone(), t.wanted.clone(), t.found.clone(), verdict.into()]);
     }
     page.push('\n');
-}
-
-fn images(page: &mut String, table: &ImageTable) {
-    let _ = writeln!(page, "## Images of the field\n");
-    if let Some(toggled) = &table.toggled {
-        let _ = writeln!(
-            page,
-            "PSNR from above, in dB, of each rendered state (row) against every true state (column). *Matching* is the \
-             diagonal; *un-matching* is the rest, without pairs of states that look the same from above.\n\n### Known \
-             states, toggled\n\nRendered with the latent of the state: {} renderings.\n",
-            toggled.renderings
-        );
-        matrix(page, &table.states, toggled);
-        means(page, toggled, table.mean_image_db);
-    }
-    if let Some(predicted) = &table.predicted {
-        let _ = writeln!(
-            page,
-            "### Forecast states\n\nRendered with latents drawn from the forecast of the previous step, from \
-             unambiguous images of trained poses: {} renderings. Missing rows are first steps, which are never \
-             forecast.\n",
-            predicted.renderings
-        );
-        matrix(page, &table.states, predicted);
-        means(page, predicted, table.mean_image_db);
-    } else if table.toggled.is_some() {
-        let _ = writeln!(
-            page,
-            "No forecast states: there is no forecast, or no unambiguous image of a state with a next step.\n"
-        );
-    }
-    if !table.novel_views.is_empty() {
-        let _ = writeln!(
-            page,
-            "### Dataset poses\n\nThe field from the poses of the dataset, with the latent of the state. Its \
-             training did not use the held-out poses. The mean image of a pose over all states is made of true images: \
-             it has the background, but no state. Where little changes, the possible gain is small. On held-out poses, \
-             the mean image uses data that the field never had.\n"
-        );
-        head(page, &["poses", "images", "PSNR, dB", "mean image, dB", "gain, dB", "SSIM", "inside the actors, dB"]);
-        for (part, v) in table.novel_views.iter() {
-            row(
-                page,
-                &[
-                    part.into(),
-                    v.images.to_string(),
-                    db(Some(v.psnr_db)),
-                    db(Some(v.mean_image_db)),
-                    format!("{:+.1}", v.gain_db),
-                    format!("{:.3}", v.ssim),
-                    db(v.actor_db),
-                ],
-            );
-        }
-        page.push('\n');
-    }
-}
-
-fn matrix(page: &mut String, states: &[String], table: &FieldImages) {
-    let mut cells = vec!["rendered \\ true"];
-    cells.extend(states.iter().map(String::as_str));
-    head(page, &cells);
-    for (r, values) in table.psnr_db.iter().enumerate() {
-        let Some(values) = values else { continue };
-        let value = |(t, v): (usize, &f64)| if r == t { format!("**{v:.1}**") } else { format!("{v:.1}") };
-        let mut cells = vec![states.get(r).cloned().unwrap_or_default()];
-        cells.extend(values.iter().enumerate().map(value));
-        row(page, &cells);
-    }
-    page.push('\n');
-}
-
-fn means(page: &mut String, table: &FieldImages, mean_image_db: Option<f64>) {
-    head(page, &["branch", "matching, dB", "un-matching, dB", "difference, dB"]);
-    let mut line = |name: &str, m: &PairMeans| {
-        row(page, &[name.into(), db(m.matching_db), db(m.unmatching_db), db(m.margin_db)]);
-    };
-    for (branch, m) in &table.by_branch {
-        line(branch, m);
-    }
-    line("all", &table.all);
-    let gain = table.all.matching_db.zip(mean_image_db).map(|(a, b)| format!("{:+.1}", a - b));
-    let _ = writeln!(
-        page,
-        "\nMatching pairs: SSIM {}, {} dB inside the dynamic actors' pixels, {} dB over the pixels that change among \
-         states; {} dB over the mean image of all states, which has {} dB.\n",
-        table.ssim.map_or_else(|| "-".into(), |s| format!("{s:.3}")),
-        db(table.actor_db),
-        db(table.changed_db),
-        gain.unwrap_or_else(|| "-".into()),
-        db(mean_image_db)
-    );
 }
 
 /// Writes the encoder table with one row for each named encoder.
@@ -322,88 +230,6 @@ fn capital(text: &str) -> String {
     letters.next().map_or_else(String::new, |first| first.to_uppercase().collect::<String>() + letters.as_str())
 }
 
-fn planning(page: &mut String, table: &PlanningResults) {
-    let _ = writeln!(
-        page,
-        "## Planning\n\nTwo kinds of trial have one correct action. *Hazard*: a hazard branch with a hidden actor; \
-         halting is correct. *Clear*: another branch with a visible place; advancing is correct. Correct actions out \
-         of trials, with 95 % Wilson intervals. {}\n",
-        table.threshold.map_or_else(
-            || "The checkpoint has no threshold, so there is no calibrated rule.".to_owned(),
-            |t| format!(
-                "The calibrated rule halts at a hazard probability of {t:.3} or more. The threshold was chosen on the \
-                         calibration poses when the checkpoint was made."
-            ),
-        )
-    );
-    let one = [("hazard", table.one_image_views.hazard), ("clear", table.one_image_views.clear)]
-        .map(|(kind, image)| image.map(|v| format!("{kind}: pose {}, branch {}, t{}", v.view, v.branch, v.timestamp)));
-    let one: Vec<String> = one.into_iter().flatten().collect();
-    let of_views = |v: &ViewCounts| {
-        format!(
-            "{} hazard images with {} trials each, and {} clear images with {} trials each, with fresh sensor noise. \
-             Images that differ only in noise are not independent trials.",
-            v.hazard, v.hazard_repeats, v.clear, v.clear_repeats
-        )
-    };
-    let parts = [
-        (
-            "The paper's protocol: one image, 30 trials",
-            &table.one_image,
-            format!("Drawn by seed ({}).", one.join("; ")),
-        ),
-        ("All views of trained poses", &table.all_views, of_views(&table.views.all_views)),
-        (
-            "All views of trained poses, independent draws",
-            &table.all_views_independent,
-            "The images above with independent draws, as in the paper; the running graph draws stratified samples."
-                .to_owned(),
-        ),
-        ("Unseen views", &table.unseen_views, of_views(&table.views.unseen_views)),
-        (
-            "Calibration views",
-            &table.calibration_views,
-            format!("These poses chose the threshold. {}", of_views(&table.views.calibration_views)),
-        ),
-    ];
-    for (title, of_part, text) in parts {
-        planning_part(page, title, of_part, &text);
-    }
-    if let Some(free) = &table.free_drives {
-        planning_part(page, "Free drives", free, "Rendered from random poses that were not trained on.");
-    }
-}
-
-fn planning_part(page: &mut String, title: &str, table: &PlanningTable, text: &str) {
-    let _ = writeln!(page, "### {title}\n\n{text}\n");
-    if table.is_empty() {
-        let _ = writeln!(page, "No image of these poses is a trial.\n");
-        return;
-    }
-    head(page, &["rule", "n", "hazard: halts", "clear: advances"]);
-    for (rule, by_samples) in table.rules() {
-        // Two rules ignore the samples.
-        let any = rule.ends_with("confident");
-        let counts = if any { &SAMPLE_COUNTS[..1] } else { &SAMPLE_COUNTS[..] };
-        for samples in counts.iter().filter(|_| !by_samples.is_empty()) {
-            let counts = by_samples.get(samples).copied().unwrap_or_default();
-            let samples = if any { "any".to_owned() } else { samples.to_string() };
-            row(page, &[rule.into(), samples, count(counts.hazard), count(counts.clear)]);
-        }
-    }
-    page.push('\n');
-}
-
-fn count(count: Option<Count>) -> String {
-    count.filter(|c| c.trials > 0).map_or_else(
-        || "-".to_owned(),
-        |c| {
-            let [low, high] = c.interval.map(|v| 100.0 * v);
-            format!("{}/{} ({low:.0} to {high:.0} %)", c.success, c.trials)
-        },
-    )
-}
-
 fn reliability(page: &mut String, results: &Results) {
     if results.hazard_reliability.is_empty() {
         return;
@@ -466,7 +292,8 @@ fn group_rows(page: &mut String, group: &Frequencies) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::ByObservability;
+    use crate::tables::planning::PlanningResults;
+    use crate::{ByObservability, FieldImages, ImageTable, PairMeans};
     use carff_dataset::drives::DriveKind;
     use carff_messages::Rule;
     use std::collections::BTreeMap;

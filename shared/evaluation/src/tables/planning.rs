@@ -42,7 +42,7 @@ pub struct PlanningResults {
     pub calibration_views: PlanningTable,
     /// Every eligible image of held-out poses.
     pub unseen_views: PlanningTable,
-    /// Drives from random poses, one image each. Absent where they were not rendered.
+    /// Drives from free poses, one image each. Absent where they were not rendered.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub free_drives: Option<PlanningTable>,
     /// Images behind each table of views.

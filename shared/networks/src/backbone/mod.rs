@@ -40,7 +40,10 @@ pub fn build(
     }
     let tensors = pretrained.map(weights::read).transpose()?;
     let in_file = |e: ModelError| match (e, pretrained) {
-        (ModelError::Mismatch(what), Some(file)) => ModelError::Format { path: file.into(), what },
+        (ModelError::Mismatch(what), Some(file)) => ModelError::Format {
+            path: file.into(),
+            what: format!("{what}; use weights of this backbone, or set `[backbone]` to theirs"),
+        },
         (e, _) => e,
     };
     Ok(match config.kind {

@@ -140,8 +140,11 @@ impl Vae {
         image_quality: bool,
     ) -> Result<VaeFigures, TrainingError> {
         let Context { config, posed, .. } = context;
-        let centroids = Centroids::fit(posed, posteriors)
-            .ok_or_else(|| TrainingError::Unfit("some state has no image from a pose that is trained on".into()))?;
+        let centroids = Centroids::fit(posed, posteriors).ok_or_else(|| {
+            TrainingError::Unfit(
+                "some state has no image from a trained pose; add images, or choose another `split_seed`".into(),
+            )
+        })?;
         let accuracy = |role| {
             let table = state_accuracy(posed, posteriors, &centroids, &posed.with_roles(&[role]));
             table.map(Into::into)

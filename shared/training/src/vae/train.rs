@@ -26,7 +26,7 @@ pub struct VaePhase<'a> {
     vae: &'a Vae,
     inputs: &'a Inputs<'a>,
     adam: Adam,
-    /// Images of trained and random poses, and those of the dataset's own poses.
+    /// Images of trained and free poses, and those of the dataset's own poses.
     trained: Vec<usize>,
     own: Vec<usize>,
     /// For each image, the distribution over the equivalent states of its view, `[N, S]`.
@@ -47,7 +47,7 @@ struct Means {
 
 /// Terms of one batch.
 struct Losses {
-    /// Absent for a batch with images of random poses.
+    /// Absent for a batch with images of free poses.
     reconstruction: Option<Tensor>,
     kl: Tensor,
     state: Option<Tensor>,
@@ -148,7 +148,7 @@ impl<'a> VaePhase<'a> {
     }
 
     /// Weighted squared error of the decoder on the first images of a batch, each at its own pose. `None` for a batch
-    /// with images of random poses: the decoder knows only the dataset's poses, and learns from batches of them.
+    /// with images of free poses: the decoder knows only the dataset's poses, and learns from batches of them.
     fn own_poses(&self, latents: &Tensor, images: &[usize]) -> Option<Tensor> {
         let (posed, device, settings) = (self.context.posed, latents.device(), self.settings());
         if images.iter().any(|&i| posed.labels[i].role.is_none()) {
@@ -242,7 +242,7 @@ impl Phase for VaePhase<'_> {
 /// between poses do not hide those between states. Poses of the dataset, the only ones that the decoder knows, share
 /// batches: from a few images of a pose at a time the decoder learned only the mean images. Images of a batch are
 /// shuffled, so that a decoder that takes the first ones sees all states. All `own_passes` over the dataset's poses
-/// except the first are for the encoder only, among the random poses.
+/// except the first are for the encoder only, among the free poses.
 fn batches(
     posed: &PosedImages,
     trained: &[usize],
@@ -307,7 +307,7 @@ mod tests {
     use super::*;
 
     /// A pass uses each image of the dataset's own poses `own_passes` times, once in batches of only such images, and
-    /// each image of a random pose once. Images of one pose share a batch.
+    /// each image of a free pose once. Images of one pose share a batch.
     #[test]
     fn a_pass_takes_own_images_own_passes_times() {
         let poses =

@@ -62,6 +62,6 @@ impl Place {
     }
 
     pub fn training<'a>(&'a self, dataset: &'a Path, out: &'a Path) -> Training<'a> {
-        Training { config: &self.config, dataset, random_poses: &[], scenario: None, out, device: tch::Device::Cpu }
+        Training { config: &self.config, dataset, free_poses: &[], scenario: None, out, device: tch::Device::Cpu }
     }
 }

@@ -76,7 +76,7 @@ impl Artist<'_> {
             },
             caption: vec![
                 format!("camera, t{timestamp}"),
-                view.map_or("random pose".to_owned(), |view| format!("view {view}")),
+                view.map_or("free pose".to_owned(), |view| format!("view {view}")),
             ],
             emphasis: Some(if right { RIGHT } else { WRONG }),
         };

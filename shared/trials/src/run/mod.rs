@@ -77,7 +77,7 @@ pub struct DecidedFrame {
     pub branch: usize,
     /// Time step of the branch.
     pub timestamp: usize,
-    /// Camera pose; `None` for a random pose.
+    /// Camera pose; `None` for a free pose.
     pub view: Option<usize>,
     /// Visibility of the actor's place, where known.
     pub observability: Option<Observability>,
@@ -402,7 +402,7 @@ impl RunPlanning {
         };
         let tables = [
             ("drives of this run", self.drives.as_ref(), String::new()),
-            ("free drives of this run, from random poses", self.free_drives.as_ref(), String::new()),
+            ("free drives of this run, from free poses", self.free_drives.as_ref(), String::new()),
             ("every eligible view of trained poses", Some(&self.all_views), times(&self.views.all_views)),
             ("every eligible view of held-out poses", Some(&self.unseen_views), times(&self.views.unseen_views)),
         ];

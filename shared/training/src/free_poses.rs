@@ -1,4 +1,4 @@
-//! Images from random poses for a dataset without a scenario file: a field renders them.
+//! Images from free poses for a dataset without a scenario file: a field renders them.
 //!
 //! An encoder memorises the poses of a dataset of a hundred poses. A field that is trained only on the trained poses,
 //! with one latent for each state, renders every state from any pose between them. This field is not part of the
@@ -10,7 +10,7 @@ use crate::{
     field::{Clouds, FieldPhase},
     places,
     records::names,
-    run::{Context, RANDOM_IMAGES, TrainingRun},
+    run::{Context, FREE_IMAGES, TrainingRun},
 };
 use carff_base::geometry::{PinholeCamera, cross, dot};
 use carff_base::random::Key;
@@ -45,7 +45,7 @@ const NEAR_SHARE: f64 = 0.1;
 const LEAST_NEAR: f32 = 0.5;
 
 /// Largest difference in any channel, of 255, between states that differ only by thin fog. Of the poses of
-/// blender-intersection, 34 of 100 hide the actor at first. Of 100 random poses, 22 look the same with a tolerance of
+/// blender-intersection, 34 of 100 hide the actor at first. Of 100 free poses, 22 look the same with a tolerance of
 /// 12, and 27 with this one.
 const HAZE: u8 = 24;
 
@@ -54,8 +54,8 @@ const MOST_DRAWS: usize = 50;
 
 /// Renders the dataset of `config.free_poses` into the run's folder unless it is there, and returns its folder. It has
 /// images of all states from the same poses, no larger than the encoder's input. An interrupted call is resumed. `None`
-/// where the configuration turns random poses off, where the dataset has one state, or where no pose is found.
-pub fn render_random_poses(
+/// where the configuration turns free poses off, where the dataset has one state, or where no pose is found.
+pub fn render_free_poses(
     config: &TrainingConfig,
     dataset: &Path,
     run: &TrainingRun,
@@ -69,7 +69,7 @@ pub fn render_random_poses(
     }
     // Refuses a dataset without places to probe before an hour of work.
     places(&posed.scenario)?;
-    let dir = run.dir.join(RANDOM_IMAGES);
+    let dir = run.dir.join(FREE_IMAGES);
     let there = dir.join("transforms.json").is_file() || render(Context { config, posed: &posed, run }, &dir)?;
     Ok(there.then_some(dir))
 }
@@ -80,7 +80,7 @@ fn render(context: Context, dir: &Path) -> Result<bool, TrainingError> {
     let codes = codes(posed, config.seed);
     let of_images: Vec<Gaussian> = posed.labels.iter().map(|label| codes[label.state]).collect();
     let clouds = Clouds::new(posed, &of_images)?;
-    let field = FieldPhase::new(context, &clouds, names::RANDOM_POSES, config.free_poses.field_steps)?.trained()?;
+    let field = FieldPhase::new(context, &clouds, names::FREE_POSES, config.free_poses.field_steps)?.trained()?;
     let latents: Vec<[f32; LATENT_DIM]> = codes.iter().map(|code| code.mean).collect();
     let options = RenderOptions { threads: config.threads.max(1) as usize, ..RenderOptions::default() };
     // The first hypothesis is rendered separately, and the others share its static parts: it is rendered twice, since
@@ -93,7 +93,7 @@ fn render(context: Context, dir: &Path) -> Result<bool, TrainingError> {
         return Ok(false);
     }
     let scenario = ScenarioInfo { bev_view: None, ..posed.scenario.clone() };
-    let identity = format!("{RANDOM_IMAGES} {:?} {}", config.free_poses, config.seed);
+    let identity = format!("{FREE_IMAGES} {:?} {}", config.free_poses, config.seed);
     let (writer, notes) = DatasetWriter::go_on::<usize>(dir, &identity)?;
     let total = cameras.len();
     let mut records = Vec::with_capacity(total * latents.len());
@@ -267,7 +267,7 @@ mod tests {
         PinholeCamera::look_at(eye, target, [0.0, 0.0, 1.0], 640, 480, 60.0)
     }
 
-    /// A random pose is valid, deviates from the line by at most half of its length along each axis, and from the
+    /// A free pose is valid, deviates from the line by at most half of its length along each axis, and from the
     /// direction by the largest rotation; its intrinsics are those of the first pose.
     #[test]
     fn between_two_poses_is_a_pose() {
