@@ -61,6 +61,36 @@ fn stages_and_library_look_ahead_alike() {
     }
 }
 
+/// The largest latents that a message may carry give valid messages again: no stage ends because of its input.
+#[test]
+fn the_largest_latents_are_answered() {
+    const LARGEST: f32 = 1e4;
+    let checkpoint = shipped_checkpoint();
+    let (mut probe, _) = carff_prober::load(&checkpoint).unwrap();
+    let graph = TestGraph::new(Path::new("none"), &checkpoint, "horizon = 2\n");
+    let run = GraphConfig::load(&graph.file()).unwrap();
+    let forecaster = Forecaster::load(&checkpoint, &run).unwrap();
+    for signs in 0..=u8::MAX {
+        let latent: [f32; 8] = std::array::from_fn(|i| if signs >> i & 1 == 1 { LARGEST } else { -LARGEST });
+        for log_variance in [-30.0, 30.0] {
+            let gaussian = Gaussian { mean: latent, log_variance: [log_variance; 8] };
+            let header = Header::of_frame(signs.into(), 1, 7);
+            let posterior = Posterior { header, gaussian, take_start: 0, stage_latency_ns: 0 };
+            posterior.validate().unwrap();
+            let mut forecast = forecaster.from_observation(&posterior);
+            forecast.validate().unwrap();
+            forecast.samples = [latent; carff_messages::MAX_SAMPLES];
+            forecast.components = [gaussian; carff_messages::MAX_COMPONENTS];
+            forecast.validate().unwrap();
+            for feedback in [Feedback::State, Feedback::Latent] {
+                let belief = carff_prober::believe(&mut probe, &forecast, None, feedback);
+                belief.validate().unwrap();
+                forecaster.from_feedback(&belief).unwrap().validate().unwrap();
+            }
+        }
+    }
+}
+
 fn check(step: &Step, forecast: &Forecast, belief: &Belief, feedback: Feedback) {
     let found = Step::of_messages(forecast, belief);
     assert_eq!((&found.mixture, &found.draws), (&step.mixture, &step.draws));

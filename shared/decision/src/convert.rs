@@ -2,7 +2,8 @@
 
 use crate::{Draw, Feedback, Look, Mixture, Motion, ProbeLayout, Probed, Reading, Resolved, Step};
 use carff_messages::{
-    Action, Belief, EgoMotion, Forecast, Gaussian, LookGain, MAX_COMPONENTS, MAX_PLACES, ProbeResult,
+    Action, Belief, EgoMotion, Forecast, Gaussian, LATENT_DIM, LookGain, MAX_ABS_LATENT, MAX_COMPONENTS, MAX_PLACES,
+    ProbeResult,
 };
 
 /// Returns the mixture and the draws of a valid forecast.
@@ -21,18 +22,23 @@ pub fn mixture_and_draws(forecast: &Forecast) -> (Mixture, Vec<Draw>) {
     (mixture, draws)
 }
 
-/// Writes a mixture and its draws into a forecast.
+/// Writes a mixture and its draws into a forecast, with latents beyond [`MAX_ABS_LATENT`] set to it.
 pub fn set_mixture_and_draws(forecast: &mut Forecast, mixture: &Mixture, draws: &[Draw]) {
     forecast.component_count = mixture.components.len() as u32;
     forecast.sample_count = draws.len() as u32;
     for (i, (weight, component)) in mixture.weights.iter().zip(&mixture.components).enumerate() {
         forecast.weights[i] = *weight;
-        forecast.components[i] = *component;
+        forecast.components[i] = Gaussian { mean: limited(component.mean), ..*component };
     }
     for (i, draw) in draws.iter().enumerate() {
-        forecast.samples[i] = draw.latent;
+        forecast.samples[i] = limited(draw.latent);
         forecast.sample_component[i] = draw.component as u8;
     }
+}
+
+/// Returns a latent that a message may carry.
+fn limited(latent: [f32; LATENT_DIM]) -> [f32; LATENT_DIM] {
+    latent.map(|v| v.clamp(-MAX_ABS_LATENT, MAX_ABS_LATENT))
 }
 
 impl From<&EgoMotion> for Motion {

@@ -1,9 +1,9 @@
 //! Messages about latents: the posterior, the forecast with its samples, and the belief.
 
-use crate::check::{at_most, distribution, equals, finite, in_range, probability, within};
+use crate::check::{at_most, distribution, equals, in_range, probability, within};
 use crate::{
-    ForecastSource, Header, Invalid, LATENT_DIM, MAX_COMPONENTS, MAX_HORIZON, MAX_PLACES, MAX_SAMPLES, MAX_STATES,
-    message,
+    ForecastSource, Header, Invalid, LATENT_DIM, MAX_ABS_LATENT, MAX_COMPONENTS, MAX_HORIZON, MAX_PLACES, MAX_SAMPLES,
+    MAX_STATES, message,
 };
 use iceoryx2::prelude::ZeroCopySend;
 use schemars::JsonSchema;
@@ -25,7 +25,7 @@ const MAX_ABS_LOG_VARIANCE: f32 = 30.0;
 #[serde(deny_unknown_fields)]
 #[type_name("carff.Gaussian.v1")]
 pub struct Gaussian {
-    /// Mean of the latent.
+    /// Mean of the latent, -1e4..=1e4.
     pub mean: [f32; LATENT_DIM],
     /// Natural logarithm of the variance.
     pub log_variance: [f32; LATENT_DIM],
@@ -43,7 +43,7 @@ impl Gaussian {
     }
 
     fn check(&self) -> Result<(), Invalid> {
-        finite("gaussian.mean", &self.mean)?;
+        within("gaussian.mean", &self.mean, -MAX_ABS_LATENT, MAX_ABS_LATENT)?;
         within("gaussian.log_variance", &self.log_variance, -MAX_ABS_LOG_VARIANCE, MAX_ABS_LOG_VARIANCE)
     }
 }
@@ -113,7 +113,7 @@ pub struct Forecast {
     pub weights: [f32; MAX_COMPONENTS],
     /// Mixture components.
     pub components: [Gaussian; MAX_COMPONENTS],
-    /// Drawn latents.
+    /// Drawn latents, -1e4..=1e4.
     pub samples: [[f32; LATENT_DIM]; MAX_SAMPLES],
     /// Component that each sample was drawn from.
     pub sample_component: [u8; MAX_SAMPLES],
@@ -159,7 +159,7 @@ impl Forecast {
             component.check()?;
         }
         for sample in &self.samples[..samples] {
-            finite("samples", sample)?;
+            within("samples", sample, -MAX_ABS_LATENT, MAX_ABS_LATENT)?;
         }
         for &component in &self.sample_component[..samples] {
             at_most("sample_component", component.into(), components as u64 - 1)?;

@@ -52,6 +52,9 @@ use std::fmt::Debug;
 
 /// Version of all layouts in this crate. A process drops messages of another version.
 pub const SCHEMA_VERSION: u32 = 4;
+/// Maximum absolute value of a latent in a valid message. The prior has deviation 1; larger values would overflow in the
+/// networks, and end the stage that sends their result.
+pub const MAX_ABS_LATENT: f32 = 1e4;
 /// Dimensions of the scene latent.
 pub const LATENT_DIM: usize = 8;
 /// Maximum number of components of a mixture.

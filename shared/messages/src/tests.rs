@@ -62,7 +62,7 @@ fn one_wrong_field_is_enough() {
         wrong(&mut message);
         assert!(message.validate().is_err(), "forecast {i}");
     }
-    let wrong_beliefs: [fn(&mut Belief); 13] = [
+    let wrong_beliefs: [fn(&mut Belief); 14] = [
         |m| m.state_count = 65,
         |m| m.place_count = 49,
         |m| m.is_final = 0,
@@ -74,6 +74,7 @@ fn one_wrong_field_is_enough() {
         |m| m.samples[9].occupancies[2] = -1.0,
         |m| m.components[1].confidence = 1.5,
         |m| m.resolved.mean[0] = f32::NEG_INFINITY,
+        |m| m.resolved.mean[3] = -1.1e4,
         |m| m.fed_back_count = 65,
         |m| (m.fed_back_count, m.fed_back[63].mean[7]) = (64, f32::NAN),
     ];

@@ -32,8 +32,16 @@ fn header() -> Header {
     }
 }
 
+/// Returns a latent's value with full precision.
+fn latent(next: &mut impl FnMut() -> f32) -> f32 {
+    probability(next).mul_add(2e4, -1e4)
+}
+
 fn gaussian(next: &mut impl FnMut() -> f32) -> Gaussian {
-    Gaussian { mean: std::array::from_fn(|_| next()), log_variance: std::array::from_fn(|_| probability(next) * -9.7) }
+    Gaussian {
+        mean: std::array::from_fn(|_| latent(next)),
+        log_variance: std::array::from_fn(|_| probability(next) * -9.7),
+    }
 }
 
 fn there_and_back<M: Readable>(message: &M) -> M {
@@ -98,7 +106,7 @@ fn messages_survive_their_forms() {
         forecast.weights[..2].copy_from_slice(&[0.25, 0.75]);
         forecast.components[..2].fill_with(|| gaussian(&mut next));
         for i in 0..5 {
-            forecast.samples[i].fill_with(&mut next);
+            forecast.samples[i].fill_with(|| latent(&mut next));
             forecast.sample_component[i] = (i % 2) as u8;
         }
         assert_eq!(there_and_back(&forecast), forecast);
