@@ -9,6 +9,8 @@ import numpy as np
 
 # Only a hanging graph exceeds it.
 PATIENCE_S = 300.0
+# Topics of a moving vehicle: a graph by itself publishes nothing on them.
+VEHICLE = {"ego/pose", "ego/motion", "prober/look"}
 
 
 def raises(error: type, text: str, call) -> None:
@@ -44,7 +46,11 @@ def in_shared_memory(array: np.ndarray, prefix: str) -> bool:
 
 def read(node: carff.Node) -> None:
     """Every topic is read, as views of shared memory that cannot be written."""
+    assert VEHICLE < {topic.name for topic in carff.TOPICS}
     for topic in carff.TOPICS:
+        if topic.name in VEHICLE:
+            assert not node.receiver(topic).wait(0.01), topic.name
+            continue
         received = one(node, topic.name)
         assert in_shared_memory(received.message, node.run.prefix), topic.name
         assert not received.message.flags.writeable

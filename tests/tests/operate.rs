@@ -76,7 +76,7 @@ fn probes_show_what_runs() {
     let topics: Value = serde_json::from_str(&probe(&graph, &["list"], &["--json", "--seconds", "2"])).unwrap();
     let topic = |name: &str| topics.as_array().unwrap().iter().find(|t| t["topic"] == name).unwrap().clone();
     assert_eq!(topic("encoder/posterior")["publishers"], serde_json::json!(["encoder"]));
-    assert_eq!(topic("prober/belief")["type"], "carff.Belief.v4");
+    assert_eq!(topic("prober/belief")["type"], "carff.Belief.v5");
     let listeners = topic("prober/belief")["subscribers"].to_string();
     assert!(listeners.contains("controller") && listeners.contains("forecaster"), "{listeners}");
     assert!(topic("controller/action")["rate_hz"].as_f64().unwrap() > 0.0, "{topics:#}");

@@ -1,6 +1,7 @@
 //! Recordings as other tools rewrite them.
 
 use super::*;
+use carff_messages::SCHEMA_VERSION;
 use mcap::records::{MessageHeader, Metadata};
 use mcap::{Compression, WriteOptions};
 use std::collections::BTreeMap;
@@ -251,7 +252,7 @@ fn other_versions_are_named() {
         let mut messages = copied(&original);
         for (.., data) in messages.iter_mut().filter(|m| m.0 == channel) {
             let mut form: serde_json::Value = serde_json::from_slice(data).unwrap();
-            form["header"]["schema_version"] = 2.into();
+            form["header"]["schema_version"] = (SCHEMA_VERSION - 1).into();
             *data = serde_json::to_vec(&form).unwrap();
         }
         let path = folder.path().join("old.mcap");
@@ -263,8 +264,10 @@ fn other_versions_are_named() {
                     Err(error) => break error.to_string(),
                 }
             };
-            assert!(error.contains(channel) && error.contains("version 2 of the messages"), "{error}");
-            assert!(error.contains("reads version 3") && error.contains("the version of carff"), "{error}");
+            let earlier = format!("version {} of the messages", SCHEMA_VERSION - 1);
+            assert!(error.contains(channel) && error.contains(&earlier), "{error}");
+            let own = format!("reads version {SCHEMA_VERSION}");
+            assert!(error.contains(&own) && error.contains("the version of carff"), "{error}");
         }
     }
 }
