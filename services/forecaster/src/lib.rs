@@ -90,13 +90,13 @@ impl Forecaster {
             self.fill(&mut forecast, &self.net.forecast(&belief.resolved));
         } else {
             forecast.path_probability = belief.path_probability;
-            let (mixture, draws) = self.from_samples(belief.fed_back(), header);
+            let (mixture, draws) = self.continued(belief.fed_back(), header);
             set_mixture_and_draws(&mut forecast, &mixture, &draws);
         }
         Some(forecast)
     }
 
-    fn from_samples(&self, inputs: &[Gaussian], header: Header) -> (Mixture, Vec<Draw>) {
+    fn continued(&self, inputs: &[Gaussian], header: Header) -> (Mixture, Vec<Draw>) {
         let forecasts: Vec<Mixture> = inputs.iter().map(|input| self.net.forecast(input)).collect();
         let Header { seed, frame_id, step, .. } = header;
         continue_samples(&forecasts, self.samples, self.sampling, seed, frame_id, step)

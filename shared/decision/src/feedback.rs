@@ -90,10 +90,12 @@ fn merge(mixtures: &[Mixture]) -> (Mixture, Vec<Vec<usize>>) {
     let mut sums = vec![[[0.0_f64; LATENT_DIM]; 2]; middles.len()];
     for ((weight, component), &to) in all.iter().zip(&into) {
         weights[to] += weight;
-        for i in 0..LATENT_DIM {
-            let mean = f64::from(component.mean[i]);
-            sums[to][0][i] += weight * mean;
-            sums[to][1][i] += weight * (f64::from(component.log_variance[i]).exp() + mean * mean);
+        let [first, second] = &mut sums[to];
+        let moments = first.iter_mut().zip(second).zip(component.mean.iter().zip(component.log_variance));
+        for ((first, second), (&mean, log_variance)) in moments {
+            let mean = f64::from(mean);
+            *first += weight * mean;
+            *second += weight * (f64::from(log_variance).exp() + mean * mean);
         }
     }
     let component = |(weight, [first, second]): (&f64, &[[f64; LATENT_DIM]; 2])| {

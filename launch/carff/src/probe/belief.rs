@@ -134,7 +134,7 @@ mod tests {
         belief.resolved_state = 0;
         let states = [("truck, t0", true), ("no actor, t0", false)]
             .map(|(name, is_hazard)| State { name: name.into(), is_hazard });
-        let text = image(&[belief], &states, "advance", false);
+        let text = image(std::slice::from_ref(&belief), &states, "advance", false);
         let line = |name: &str| text.lines().find(|l| l.contains(name)).unwrap_or_default().to_owned();
         assert!(line("truck").starts_with("> truck, t0") && line("truck").ends_with("\u{2022}\u{2022}"), "{text}");
         assert!(line("truck").contains(&"\u{2588}".repeat(20)) && line("no actor").contains("0.250"), "{text}");
@@ -156,14 +156,14 @@ mod tests {
         belief.state_probability[..4].copy_from_slice(&[0.25, 0.25, 0.25, 0.125]);
         // Only a harmless state has a sample, which contradicts the scenario.
         belief.samples[0] = ProbeResult { state: 0, hazard_likelihood: 0.9, ..ProbeResult::NONE };
-        let text = image(&[belief], &states(&scenario), "advance", true);
+        let text = image(std::slice::from_ref(&belief), &states(&scenario), "advance", true);
         let line = |text: &str, name: &str| text.lines().find(|l| l.contains(name)).unwrap_or_default().to_owned();
         for (name, colour) in [("no actor, t0", "32"), ("no actor, t1", "32"), ("truck, t0", "31"), ("truck, t1", "31")]
         {
             assert!(line(&text, name).contains(&format!("\x1b[{colour}m")), "{name}: {text:?}");
         }
         assert!(!line(&text, "unknown").contains('\x1b'), "{text:?}");
-        let without_manifest = image(&[belief], &[], "advance", true);
+        let without_manifest = image(std::slice::from_ref(&belief), &[], "advance", true);
         assert!(line(&without_manifest, "state 3").contains("0.125") && !without_manifest.contains('\x1b'));
     }
 
