@@ -17,7 +17,7 @@ pub struct Augmentation {
     /// Augmented copies of each image, in addition to one with only sensor noise. With a frozen backbone their features
     /// are computed once and kept.
     pub copies: usize,
-    /// Further copies of the training images of the dataset's own poses, which are few compared with those of random
+    /// Further copies of the training images of the dataset's own poses, which are few compared with those of free
     /// poses: the first copy is unchanged, the others are augmented.
     pub own_copies: usize,
     /// Sensor noise and colour errors, on every copy.
