@@ -93,7 +93,7 @@ mod tests {
             width_px: 3,
             height_px: 2,
             probability: 0.1,
-            latent: [0.1, -0.7, 1e-30, 3.3, 0.0, 5.5e8, -2.0, 1.0 / 3.0],
+            latent: [0.1, -0.7, 1e-30, 3.3, 0.0, 5.5e3, -2.0, 1.0 / 3.0],
             intrinsics: carff_messages::Intrinsics { fl_x_px: 0.1, fl_y_px: 1.0 / 3.0, cx_px: 1.5, cy_px: 1.0 },
             world_from_camera: std::array::from_fn(|i| (i as f64).sqrt() / 7.0),
             ..ViewMeta::default()
