@@ -63,7 +63,7 @@ impl From<&Action> for Look {
 
 impl Step {
     /// Returns the belief message of this step, which answers `forecast`. `posterior` represents the resolved state;
-    /// without one there is no state to look ahead from: where states are fed back, the belief is then the frame's last.
+    /// where states are fed back, a belief without one is the frame's last.
     pub fn to_belief(
         &self,
         forecast: &Forecast,

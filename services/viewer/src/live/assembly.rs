@@ -77,7 +77,7 @@ impl Assembly {
         for moment in &mut moments {
             moment.unknowns = unknowns.clone();
         }
-        // Older frames are no longer needed.
+        // Beliefs about older frames are not shown.
         self.frames.retain(|id, _| *id > frame_id);
         Some(moments)
     }

@@ -31,7 +31,7 @@ pub fn images(page: &mut String, table: &ImageTable) {
     } else if table.toggled.is_some() {
         let _ = writeln!(
             page,
-            "No forecast states: there is no forecast, or no unambiguous image of a state with a next step.\n"
+            "No forecast states: no forecast in the checkpoint, or no unambiguous image of a state with a next step.\n"
         );
     }
     if !table.novel_views.is_empty() {

@@ -14,7 +14,7 @@ pub fn planning(page: &mut String, table: &PlanningResults) {
          halting is correct. *Clear*: another branch with a visible place; advancing is correct. Correct actions out \
          of trials, with 95 % Wilson intervals. {}\n",
         table.threshold.map_or_else(
-            || "The checkpoint has no threshold, so there is no calibrated rule.".to_owned(),
+            || "The checkpoint has no threshold, so the calibrated rule is left out.".to_owned(),
             |t| format!(
                 "The calibrated rule halts at a hazard probability of {t:.3} or more. The threshold was chosen on the \
                          calibration poses when the checkpoint was made."
