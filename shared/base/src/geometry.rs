@@ -265,26 +265,17 @@ impl OrientedBox {
 
     /// Returns true if a ray hits the box in front of its origin.
     pub fn is_met_by(&self, ray: &Ray) -> bool {
-        let (s, c) = self.yaw.sin_cos();
-        let turned = |v: [f64; 3]| [c * v[0] + s * v[1], -s * v[0] + c * v[1], v[2]];
-        let origin = turned(sub(ray.origin.map(f64::from), self.center));
-        let direction = turned(ray.direction.map(f64::from));
-        let (mut near, mut far) = (0.0_f64, f64::INFINITY);
-        for axis in 0..3 {
-            let [a, b] = [-1.0, 1.0].map(|side| (side * self.half_size[axis] - origin[axis]) / direction[axis]);
-            // Along a face both values are infinite or NaN, and `min` and `max` ignore NaN.
-            near = near.max(a.min(b));
-            far = far.min(a.max(b));
-        }
-        near <= far
+        self.turned().is_met_by(ray)
     }
 
     /// Returns true if a world point is inside the box (including its faces).
     pub fn contains(&self, point_m: [f64; 3]) -> bool {
-        let (s, c) = self.yaw.sin_cos();
-        let d = sub(point_m, self.center);
-        let l = [c * d[0] + s * d[1], -s * d[0] + c * d[1], d[2]];
-        (0..3).all(|i| l[i].abs() <= self.half_size[i])
+        self.turned().contains(point_m)
+    }
+
+    /// Returns the box with its rotation worked out, for many rays or points.
+    pub fn turned(&self) -> TurnedBox {
+        TurnedBox { center: self.center, half_size: self.half_size, sin_cos: self.yaw.sin_cos() }
     }
 
     /// Returns the gap between the footprints of two boxes on the ground, metres, along the axis of either box that
@@ -310,6 +301,42 @@ impl OrientedBox {
             (between[0] * axis[0] + between[1] * axis[1]).abs() - reach(self, axis) - reach(other, axis)
         };
         axes(self).into_iter().chain(axes(other)).map(gap).fold(f64::NEG_INFINITY, f64::max)
+    }
+}
+
+/// A box with its rotation worked out ([`OrientedBox::turned`]).
+#[derive(Clone, Copy, Debug)]
+pub struct TurnedBox {
+    center: [f64; 3],
+    half_size: [f64; 3],
+    sin_cos: (f64, f64),
+}
+
+impl TurnedBox {
+    /// Returns a vector along the box's own axes.
+    fn along_axes(&self, v: [f64; 3]) -> [f64; 3] {
+        let (s, c) = self.sin_cos;
+        [c * v[0] + s * v[1], -s * v[0] + c * v[1], v[2]]
+    }
+
+    /// As [`OrientedBox::is_met_by`].
+    pub fn is_met_by(&self, ray: &Ray) -> bool {
+        let origin = self.along_axes(sub(ray.origin.map(f64::from), self.center));
+        let direction = self.along_axes(ray.direction.map(f64::from));
+        let (mut near, mut far) = (0.0_f64, f64::INFINITY);
+        for axis in 0..3 {
+            let [a, b] = [-1.0, 1.0].map(|side| (side * self.half_size[axis] - origin[axis]) / direction[axis]);
+            // Along a face both values are infinite or NaN, and `min` and `max` ignore NaN.
+            near = near.max(a.min(b));
+            far = far.min(a.max(b));
+        }
+        near <= far
+    }
+
+    /// As [`OrientedBox::contains`].
+    pub fn contains(&self, point_m: [f64; 3]) -> bool {
+        let l = self.along_axes(sub(point_m, self.center));
+        (0..3).all(|i| l[i].abs() <= self.half_size[i])
     }
 }
 

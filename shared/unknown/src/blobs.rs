@@ -56,7 +56,7 @@ pub(crate) fn blobs(
         .zip(ground)
         .zip(judged)
         .map(|((r, ground), judged)| match ground {
-            Some(ground) if *judged => r / errors.at(ground.at_m),
+            Some(ground) if *judged && *r > 0.0 => r / errors.at(ground.at_m),
             _ => 0.0,
         })
         .collect();

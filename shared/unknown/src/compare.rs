@@ -4,7 +4,7 @@ use crate::align::{View, align};
 use crate::blobs::{Blob, blobs};
 use crate::fit::{Fit, LEAST_NOISE, fit, median, noise};
 use crate::lanes::{ErrorMap, Ground, Lanes};
-use crate::residuals::{BothResiduals, Pixels, ResidualKind, energy, explain_own, median_residual, told_apart};
+use crate::residuals::{BothResiduals, Pixels, ResidualKind, explain_own, median_residual};
 use carff_base::geometry::PinholeCamera;
 use carff_field::{Field, HypothesisBuffer, RenderOptions};
 use carff_messages::LATENT_DIM;
@@ -160,11 +160,11 @@ impl Comparer {
         };
         let fit = fitted(&image, &images[0].rgb, &still(&|i| is_sample(i, width)), &still(&|i| judged[i]));
         let rendered: Vec<&[f32]> = self.rendered().collect();
-        let pixels = Pixels { image: &image, judged: &judged, told_apart: &told_apart(&rendered), width };
+        let pixels = Pixels::new(&image, &judged, &rendered, width);
         let mut energies: Vec<Vec<BothResiduals>> =
-            rendered.iter().map(|rendered| energy(pixels, rendered, &fit)).collect();
+            rendered.iter().map(|rendered| pixels.energy(rendered, &fit)).collect();
         let pixels: Vec<usize> = (0..judged.len()).filter(|&i| judged[i]).collect();
-        let own: Vec<Vec<usize>> = (0..images.len()).map(|s| scene.lanes.own_pixels(&camera, s, &pixels)).collect();
+        let own = scene.lanes.own_pixels(&camera, images.len(), &pixels);
         explain_own(&mut energies, &own, scene.hazard_states);
         let residual = |energy: &[BothResiduals], kind| median_residual(energy, kind, &judged, width, fit.noise);
         let residuals = energies.iter().map(|energy| ResidualKind::ALL.map(|kind| residual(energy, kind))).collect();

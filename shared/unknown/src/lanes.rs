@@ -1,6 +1,6 @@
 //! The ground on which something unknown counts, and the field's own errors there.
 
-use carff_base::geometry::{OrientedBox, PinholeCamera};
+use carff_base::geometry::{OrientedBox, PinholeCamera, TurnedBox};
 use serde::{Deserialize, Serialize};
 
 /// Side of a cell of the error map, as a share of the bounds' longer side.
@@ -39,18 +39,20 @@ pub struct OwnBox {
 }
 
 impl Lanes {
-    /// Reports whether a point of the ground is on an area, within the bounds.
-    fn contain(&self, x: f64, y: f64) -> bool {
+    /// Returns the test whether a point of the ground is on an area, within the bounds.
+    fn judged_ground(&self) -> impl Fn([f64; 2]) -> bool {
+        let areas: Vec<(TurnedBox, f64)> = self.areas.iter().map(|area| (area.turned(), area.center[2])).collect();
         let [low, high] = self.bounds_m;
-        let inside = x >= low[0] && x <= high[0] && y >= low[1] && y <= high[1];
-        inside && self.areas.iter().any(|area| area.contains([x, y, area.center[2]]))
+        move |[x, y]| {
+            let inside = x >= low[0] && x <= high[0] && y >= low[1] && y <= high[1];
+            inside && areas.iter().any(|(area, z)| area.contains([x, y, *z]))
+        }
     }
 
-    /// Returns those of the pixels (by index, row by row) that look at the vehicle itself, or past its margin, in a
-    /// state.
-    pub fn own_pixels(&self, camera: &PinholeCamera, state: usize, pixels: &[usize]) -> Vec<usize> {
+    /// For each of some states, returns those of the pixels (by index, row by row) that look at the vehicle itself, or
+    /// past its margin, in this state.
+    pub fn own_pixels(&self, camera: &PinholeCamera, states: usize, pixels: &[usize]) -> Vec<Vec<usize>> {
         let [x, y, z] = camera.position_m();
-        let stands = |own: &&OwnBox| own.states.get(state) == Some(&true);
         let holds_camera = |own: &OrientedBox| {
             let top_m = own.center[2] + own.half_size[2] + ABOVE_ROOF_M;
             z < top_m && own.contains([x, y, own.center[2]])
@@ -58,22 +60,30 @@ impl Lanes {
         // Every pixel of a camera inside a box looks past that box: a camera next to the vehicle has no margin, and one
         // on it sees none of it beyond the nearest distance.
         let outside = |own: &OwnBox| [own.with_margin(), own.oriented_box].into_iter().find(|own| !holds_camera(own));
-        let boxes: Vec<OrientedBox> = self.own.iter().filter(stands).filter_map(outside).collect();
-        if boxes.is_empty() {
-            return Vec::new();
-        }
+        let boxes = self.own.iter().filter_map(|own| Some((outside(own)?.turned(), &own.states)));
+        let boxes: Vec<(TurnedBox, &Vec<bool>)> = boxes.collect();
         let width = camera.width_px.max(1) as usize;
-        let shows_it = |&pixel: &usize| {
+        let mut of_states = vec![Vec::new(); states];
+        for &pixel in if boxes.is_empty() { &[] } else { pixels } {
             let ray = camera.ray((pixel % width) as f64 + 0.5, (pixel / width) as f64 + 0.5);
-            boxes.iter().any(|own| own.is_met_by(&ray))
-        };
-        pixels.iter().copied().filter(shows_it).collect()
+            let mut shows_it = vec![false; states];
+            for (_, stands) in boxes.iter().filter(|(own, _)| own.is_met_by(&ray)) {
+                shows_it.iter_mut().zip(*stands).for_each(|(shows, stands)| *shows |= stands);
+            }
+            of_states
+                .iter_mut()
+                .zip(shows_it)
+                .filter(|(_, shows)| *shows)
+                .for_each(|(of_state, _)| of_state.push(pixel));
+        }
+        of_states
     }
 
     /// Returns the points of the ground that the pixels of a camera look at, row by row: distance along the ray and
     /// position, metres. `None` where a pixel looks at no ground that is judged: above the horizon, or too near.
     pub fn ground_points(&self, camera: &PinholeCamera) -> Vec<Option<Ground>> {
         let (width, height) = (camera.width_px, camera.height_px);
+        let is_judged = self.judged_ground();
         let pixels = (0..height).flat_map(|y| (0..width).map(move |x| (x, y)));
         pixels
             .map(|(x, y)| {
@@ -83,7 +93,7 @@ impl Lanes {
                 let is_below = direction[2] < 0.0 && distance_m.is_finite() && distance_m >= self.nearest_m;
                 is_below.then(|| {
                     let at_m = [0, 1].map(|i| origin[i] + distance_m * direction[i]);
-                    Ground { distance_m, at_m, on_lanes: self.contain(at_m[0], at_m[1]) }
+                    Ground { distance_m, at_m, on_lanes: is_judged(at_m) }
                 })
             })
             .collect()
@@ -199,9 +209,9 @@ mod tests {
     /// A point counts on an area and within the bounds, at any height of the area's box.
     #[test]
     fn lanes_are_areas_within_the_bounds() {
-        let lanes = lanes();
-        assert!(lanes.contain(7.0, -1.9));
-        assert!(!lanes.contain(9.0, 0.0) && !lanes.contain(0.0, 2.1));
+        let is_judged = lanes().judged_ground();
+        assert!(is_judged([7.0, -1.9]));
+        assert!(!is_judged([9.0, 0.0]) && !is_judged([0.0, 2.1]));
     }
 
     /// A camera that looks down at the lane sees it in the middle, and no ground above the horizon.
@@ -225,7 +235,7 @@ mod tests {
         let share = |from_m: [f64; 3], state: usize| {
             let camera = PinholeCamera::look_at(from_m, [0.0, 0.0, 0.0], [0.0, 1.0, 0.0], 32, 32, 90.0);
             let all: Vec<usize> = (0..32 * 32).collect();
-            lanes.own_pixels(&camera, state, &all).len() as f64 / all.len() as f64
+            lanes.own_pixels(&camera, 2, &all)[state].len() as f64 / all.len() as f64
         };
         // Seen from above: 5 m x 3 m at the height of the roof, of 17 m x 17 m.
         let above = share([0.0, 0.0, 10.0], 0);

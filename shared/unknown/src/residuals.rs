@@ -2,6 +2,8 @@
 
 use crate::fit::Fit;
 
+/// Values of a pixel.
+const CHANNELS: usize = 3;
 /// Difference of the states' rendered values, of 1, from which on a pixel shows which of them it is.
 const TOLD_APART: f32 = 0.05;
 
@@ -31,57 +33,105 @@ fn neighbours(i: usize, judged: &[bool], width: usize) -> impl Iterator<Item = u
     all.filter(|&n| judged[n])
 }
 
+/// Smallest and largest value of the compared pixels around each pixel, by channel.
+#[derive(Debug)]
+struct Ranges {
+    low: Vec<f32>,
+    high: Vec<f32>,
+}
+
+impl Ranges {
+    /// Finds the ranges of an image, RGB, row by row. Pixels that are not compared do not count.
+    fn of(image: &[f32], judged: &[bool], width: usize) -> Self {
+        Self {
+            low: over_neighbours(image, judged, width, f32::INFINITY, |a, b| if b < a { b } else { a }),
+            high: over_neighbours(image, judged, width, f32::NEG_INFINITY, |a, b| if b > a { b } else { a }),
+        }
+    }
+
+    /// Distance of a value from its range.
+    fn beyond(&self, i: usize, value: f32) -> f32 {
+        (value - self.high[i]).max(self.low[i] - value).max(0.0)
+    }
+}
+
+/// Joins the values of each pixel's 3 x 3 neighbourhood, by channel. Pixels that are not compared count as `missing`.
+fn over_neighbours(
+    image: &[f32],
+    judged: &[bool],
+    width: usize,
+    missing: f32,
+    pick: impl Fn(f32, f32) -> f32,
+) -> Vec<f32> {
+    let mut values = image.to_vec();
+    for (pixel, _) in values.chunks_exact_mut(CHANNELS).zip(judged).filter(|(_, judged)| !**judged) {
+        pixel.fill(missing);
+    }
+    let row = (width * CHANNELS).max(1);
+    let mut of_rows = values.clone();
+    values.chunks(row).zip(of_rows.chunks_mut(row)).for_each(|(from, to)| join(from, CHANNELS, to, &pick));
+    values.copy_from_slice(&of_rows);
+    join(&of_rows, row, &mut values, &pick);
+    values
+}
+
+/// Joins each value of `to` with those of `from` that are `step` before and after it.
+fn join(from: &[f32], step: usize, to: &mut [f32], pick: impl Fn(f32, f32) -> f32) {
+    let step = step.min(to.len());
+    to.iter_mut().zip(&from[step..]).for_each(|(to, v)| *to = pick(*to, *v));
+    to[step..].iter_mut().zip(from).for_each(|(to, v)| *to = pick(*to, *v));
+}
+
 /// The image and the pixels of it that count.
-#[derive(Clone, Copy)]
+#[derive(Debug)]
 pub struct Pixels<'a> {
-    /// The image, 0..=1, RGB, row by row.
-    pub image: &'a [f32],
-    /// True for pixels that were compared.
-    pub judged: &'a [bool],
+    image: &'a [f32],
+    judged: &'a [bool],
+    width: usize,
     /// True where the rendered states do not look alike.
-    pub told_apart: &'a [bool],
-    /// Width of the image, pixels.
-    pub width: usize,
+    told_apart: Vec<bool>,
+    seen: Ranges,
+}
+
+impl<'a> Pixels<'a> {
+    /// Describes an image, 0..=1, RGB, row by row. `judged` is true for pixels that were compared with the rendered
+    /// `states`.
+    pub fn new(image: &'a [f32], judged: &'a [bool], states: &[&[f32]], width: usize) -> Self {
+        Self { image, judged, width, told_apart: told_apart(states), seen: Ranges::of(image, judged, width) }
+    }
+
+    /// Squared distance of each pixel from the range of its neighbours' rendered values, summed over the channels. The
+    /// range forgives what a blurred edge, or a pose that is off by half a pixel, changes.
+    ///
+    /// It also forgives a vehicle that the state has and the image does not show: the vehicle's edges, windows and
+    /// wheels span the road's values. So where the states do not look alike, the distance of the rendered value from the
+    /// range of the image's neighbours counts too, as the second kind.
+    pub fn energy(&self, rendered: &[f32], fit: &Fit) -> Vec<BothResiduals> {
+        let in_image = |pixel: &[f32]| [0, 1, 2].map(|c| fit.gain[c] * pixel[c] + fit.offset[c]);
+        let expected: Vec<f32> = rendered.chunks_exact(CHANNELS).flat_map(in_image).collect();
+        let ranges = Ranges::of(&expected, self.judged, self.width);
+        let of_pixel = |pixel: usize| {
+            let values = pixel * CHANNELS..(pixel + 1) * CHANNELS;
+            let both = |i: usize| {
+                let missing = if self.told_apart[pixel] { self.seen.beyond(i, expected[i]) } else { 0.0 };
+                [ranges.beyond(i, self.image[i]), missing]
+            };
+            values.map(both).fold([0.0; 2], |sum, both| [0, 1].map(|kind| sum[kind] + both[kind].powi(2)))
+        };
+        (0..self.judged.len()).map(|i| if self.judged[i] { of_pixel(i) } else { [0.0; 2] }).collect()
+    }
 }
 
 /// Returns true for each pixel at which the rendered states differ by more than their errors.
-pub fn told_apart(states: &[&[f32]]) -> Vec<bool> {
+fn told_apart(states: &[&[f32]]) -> Vec<bool> {
     let Some(first) = states.first() else { return Vec::new() };
-    let differs = |i: usize| {
-        let (low, high) = range(states.iter().map(|state| state[i]));
-        high - low > TOLD_APART
-    };
-    (0..first.len() / 3).map(|pixel| (pixel * 3..pixel * 3 + 3).any(differs)).collect()
-}
-
-/// Smallest and largest value.
-fn range(values: impl Iterator<Item = f32>) -> (f32, f32) {
-    values.fold((f32::INFINITY, f32::NEG_INFINITY), |(low, high), v| (low.min(v), high.max(v)))
-}
-
-/// Distance of a value from the range of some others.
-fn beyond(value: f32, others: impl Iterator<Item = f32>) -> f32 {
-    let (low, high) = range(others);
-    (value - high).max(low - value).max(0.0)
-}
-
-/// Squared distance of each pixel from the range of its neighbours' rendered values, summed over the channels. The
-/// range forgives what a blurred edge, or a pose that is off by half a pixel, changes.
-///
-/// It also forgives a vehicle that the state has and the image does not show: the vehicle's edges, windows and wheels
-/// span the road's values. So where the states do not look alike, the distance of the rendered value from the range of
-/// the image's neighbours counts too, as the second kind.
-pub fn energy(pixels: Pixels, rendered: &[f32], fit: &Fit) -> Vec<BothResiduals> {
-    let Pixels { image, judged, told_apart, width } = pixels;
-    let of_channel = |i: usize, c: usize| -> BothResiduals {
-        let expected = |n: usize| fit.gain[c] * rendered[n * 3 + c] + fit.offset[c];
-        let seen = |n: usize| image[n * 3 + c];
-        let unexpected = beyond(seen(i), neighbours(i, judged, width).map(expected));
-        let missing = if told_apart[i] { beyond(expected(i), neighbours(i, judged, width).map(seen)) } else { 0.0 };
-        [unexpected.powi(2), missing.powi(2)]
-    };
-    let of_pixel = |i: usize| (0..3).map(|c| of_channel(i, c)).fold([0.0; 2], |a, b| [a[0] + b[0], a[1] + b[1]]);
-    (0..judged.len()).map(|i| if judged[i] { of_pixel(i) } else { [0.0; 2] }).collect()
+    let (mut low, mut high) = (first.to_vec(), first.to_vec());
+    for state in &states[1..] {
+        low.iter_mut().zip(*state).for_each(|(low, v)| *low = low.min(*v));
+        high.iter_mut().zip(*state).for_each(|(high, v)| *high = high.max(*v));
+    }
+    let differs = |(low, high): (&[f32], &[f32])| low.iter().zip(high).any(|(low, high)| high - low > TOLD_APART);
+    low.chunks_exact(CHANNELS).zip(high.chunks_exact(CHANNELS)).map(differs).collect()
 }
 
 /// Lets each state explain the pixels of the vehicle itself as the other states do that have it elsewhere, but agree about
@@ -115,11 +165,17 @@ pub fn median_residual(
             near[count] = energy[at][kind as usize];
             count += 1;
         }
-        let near = &mut near[..count];
-        near.sort_unstable_by(f32::total_cmp);
-        (near[(count - 1) / 2] / 3.0).sqrt() / noise
+        (lower_median(near, count) / 3.0).sqrt() / noise
     };
     (0..judged.len()).map(|i| if judged[i] { of_pixel(i) } else { 0.0 }).collect()
+}
+
+/// Returns the lower median of the first `count` values (at least one), of which none is below zero. The others are 0.
+fn lower_median(mut values: [f32; 9], count: usize) -> f32 {
+    if values == [0.0; 9] {
+        return 0.0;
+    }
+    *values[..count].select_nth_unstable_by((count - 1) / 2, f32::total_cmp).1
 }
 
 #[cfg(test)]
@@ -148,13 +204,30 @@ mod tests {
             .collect();
         let fit = Fit { gain: [1.0; 3], offset: [0.0; 3], noise: LEAST_NOISE, explained: 1.0 };
         let judged = vec![true; width * width];
-        let pixels = Pixels { image: &seen, judged: &judged, told_apart: &vec![true; width * width], width };
-        let out =
-            median_residual(&energy(pixels, &rendered, &fit), ResidualKind::Unexpected, &judged, width, fit.noise);
+        let energy = Pixels::new(&seen, &judged, &[&rendered], width).energy(&rendered, &fit);
+        let out = median_residual(&energy, ResidualKind::Unexpected, &judged, width, fit.noise);
         assert!(out[22 * width + 6] > 20.0);
         let elsewhere =
             (0..width * width).filter(|i| !(2..11).contains(&(i % width)) || !(18..27).contains(&(i / width)));
         assert!(elsewhere.map(|i| out[i]).fold(0.0, f32::max) < 1e-3);
+    }
+
+    /// The range of a pixel is that of its compared neighbours, to the edges of the image.
+    #[test]
+    fn ranges_are_those_of_the_neighbours() {
+        let (width, height) = (7, 5);
+        let value = |i: usize| (i * 37 % 101) as f32;
+        let image: Vec<f32> = (0..width * height * CHANNELS).map(value).collect();
+        let judged: Vec<bool> = (0..width * height).map(|i| i % 4 != 1).collect();
+        let ranges = Ranges::of(&image, &judged, width);
+        for pixel in (0..width * height).filter(|pixel| judged[*pixel]) {
+            for c in 0..CHANNELS {
+                let near = || neighbours(pixel, &judged, width).map(|n| image[n * CHANNELS + c]);
+                let i = pixel * CHANNELS + c;
+                assert_eq!(ranges.low[i], near().fold(f32::INFINITY, f32::min));
+                assert_eq!(ranges.high[i], near().fold(f32::NEG_INFINITY, f32::max));
+            }
+        }
     }
 
     /// A vehicle that a state has and the image does not show is a residual, where another state looks different; a
@@ -171,8 +244,7 @@ mod tests {
         let fit = Fit { gain: [1.0; 3], offset: [0.0; 3], noise: LEAST_NOISE, explained: 1.0 };
         let judged = vec![true; width * width];
         let residual = |states: &[&[f32]]| {
-            let pixels = Pixels { image: &road, judged: &judged, told_apart: &told_apart(states), width };
-            let energy = energy(pixels, &with_it, &fit);
+            let energy = Pixels::new(&road, &judged, states, width).energy(&with_it, &fit);
             ResidualKind::ALL.map(|kind| median_residual(&energy, kind, &judged, width, fit.noise)[7 * width + 7])
         };
         let [unexpected, missing] = residual(&[&with_it, &road]);
