@@ -146,7 +146,7 @@ impl Frames {
         self.images.lanes()
     }
 
-    /// The evidence that a forecast's belief rests on; `None` if the compared frame shows nothing to compare.
+    /// The evidence that a forecast's belief rests on; `None` if the compared frame has no valid pose.
     ///
     /// # Errors
     ///

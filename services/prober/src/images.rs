@@ -36,7 +36,7 @@ struct Compared {
     frame_id: u64,
     /// Number of the first frame of its take.
     take_start: u64,
-    /// `None` for a frame without a valid pose, or whose camera sees no lane.
+    /// `None` for a frame without a valid pose.
     evidence: Option<ImageEvidence>,
 }
 
@@ -58,7 +58,7 @@ impl Images {
         }))
     }
 
-    /// Compares a frame with the known states. `None` without a valid pose, or where the camera sees no lane.
+    /// Compares a frame with the known states. `None` without a valid pose.
     pub fn compare(
         &mut self,
         probe: &FieldProbe,
@@ -123,13 +123,13 @@ impl Images {
         self.sighting.as_ref().filter(|(at_ns, _)| *at_ns == header.capture_time_ns).map(|(_, sighting)| sighting)
     }
 
-    /// The evidence of a compared frame; `None` also for a frame that shows nothing to compare.
+    /// The evidence of a compared frame; `None` also for a frame without a valid pose.
     pub fn evidence(&self, header: &Header) -> Option<&ImageEvidence> {
         self.compared.iter().rev().find(|compared| compared.at_ns == header.capture_time_ns)?.evidence.as_ref()
     }
 
-    /// The evidence of the frame of a take that was compared last before frame `frame_id`; `None` if it shows nothing to
-    /// compare. Without a comparison in the take, or after a pause, something unknown is nearly certain.
+    /// The evidence of the frame of a take that was compared last before frame `frame_id`; `None` if it has no valid
+    /// pose. Without a comparison in the take, or after a pause, something unknown is nearly certain.
     pub fn evidence_before(&self, frame_id: u64, take_start: u64) -> Option<&ImageEvidence> {
         let counts = |compared: &&Compared| {
             compared.take_start == take_start && ImageEvidence::counts_later(compared.frame_id, frame_id)

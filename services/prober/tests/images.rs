@@ -27,9 +27,13 @@ fn frame(id: u64, at_ms: u64) -> FrameMeta {
 
 /// An image of a known state, as the field renders it.
 fn image_of(probe: &FieldProbe, state: usize) -> Array3<u8> {
+    image_from(&frame(1, 0).camera(), probe, state)
+}
+
+fn image_from(camera: &PinholeCamera, probe: &FieldProbe, state: usize) -> Array3<u8> {
     let mut rendered = RenderBuffer::new();
     let options = RenderOptions::default();
-    probe.field().render(&frame(1, 0).camera(), &probe.states()[state].mean, &options, &mut rendered);
+    probe.field().render(camera, &probe.states()[state].mean, &options, &mut rendered);
     Array3::from_shape_fn((SIDE, SIDE, 3), |(y, x, c)| {
         (rendered.rgb[(y * SIDE + x) * 3 + c].clamp(0.0, 1.0) * 255.0) as u8
     })
@@ -63,7 +67,26 @@ fn a_patch_on_the_lane_is_unknown() {
     assert!(images.evidence(&header(2, 200)).is_some());
     assert!(images.evidence(&header(3, 210)).is_none());
 
-    // A pose that is not a pose, and a camera that sees no lane, give no comparison.
+    // By a wrong pose the camera sees no lane: the image is then a view of another place.
+    let sky = PinholeCamera::look_at([-8.0, -12.0, 9.0], [-8.0, -60.0, 60.0], [0.0, 0.0, 1.0], 128, 128, 60.0);
+    for (id, image) in [(3, &known), (4, &patched)] {
+        let frame =
+            FrameMeta { header: frame(id, 100 * id).header, ..FrameMeta::of_camera(&sky, DatasetView::UNKNOWN) };
+        let wrong = images.compare(&probe, &frame, image.view(), 1).unwrap();
+        wrong.validate().unwrap();
+        assert!(wrong.probability > 0.9 && wrong.ratios().iter().all(|ratio| *ratio == 0.0), "{wrong:?}");
+    }
+
+    // By a right pose without lanes, every state explains the image.
+    let building = PinholeCamera::look_at([-14.0, -4.0, 9.0], [-14.0, -14.0, 5.5], [0.0, 0.0, 1.0], 128, 128, 25.0);
+    let own = image_from(&building, &probe, 0);
+    let meta = FrameMeta { header: frame(6, 600).header, ..FrameMeta::of_camera(&building, DatasetView::UNKNOWN) };
+    let right = images.compare(&probe, &meta, own.view(), 1).unwrap();
+    let ground = images.lanes().ground_points(&building);
+    assert!(ground.iter().flatten().all(|ground| !ground.on_lanes));
+    assert!(right.probability < 0.05 && right.boxes().is_empty(), "{right:?}");
+
+    // A pose that is not a pose gives no comparison.
     let lost = FrameMeta { world_from_camera: [0.0; 16], ..frame(5, 500) };
     assert!(images.compare(&probe, &lost, known.view(), 1).is_none());
     assert!(images.evidence(&lost.header).is_none());

@@ -115,11 +115,12 @@ impl Work {
         all
     }
 
-    /// Compares an image with sensor noise.
+    /// Compares an image with sensor noise; `None` if the camera sees no lane.
     fn compare(&mut self, camera: &PinholeCamera, image: &Image, number: usize) -> Option<Comparison> {
         let noisy = noisy(image, Key::named("knwn", self.seed, number as u64));
         let Self { lanes, states, hazard_states, field, threads, comparer, .. } = self;
-        comparer.compare(KnownScene { field, states, hazard_states, lanes }, camera, noisy.view()?, *threads)
+        let scene = KnownScene { field, states, hazard_states, lanes };
+        comparer.compare(scene, camera, noisy.view()?, *threads).filter(Comparison::sees_lanes)
     }
 }
 

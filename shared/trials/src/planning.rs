@@ -204,12 +204,12 @@ impl<'a> KnownStates<'a> {
         Self { known, field: probe.field(), states, threads, comparer: RefCell::default() }
     }
 
-    /// Evidence of an image for the known states; `None` if the camera sees no lane.
+    /// Evidence of an image for the known states; `None` for an image without pixels.
     pub fn evidence(&self, camera: &PinholeCamera, image: &Image) -> Option<ImageEvidence> {
         self.compare(camera, image).map(|compared| ImageEvidence::new(&compared.seen.ratios))
     }
 
-    /// Compares an image; `None` if the camera sees no lane.
+    /// Compares an image; `None` for an image without pixels.
     pub fn compare(&self, camera: &PinholeCamera, image: &Image) -> Option<Compared> {
         let mut comparer = self.comparer.borrow_mut();
         let (seen, comparison) =

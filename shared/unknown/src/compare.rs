@@ -62,6 +62,11 @@ impl Comparison {
         self.residuals.len()
     }
 
+    /// Reports whether the camera sees a lane by its pose.
+    pub fn sees_lanes(&self) -> bool {
+        self.judged.contains(&true)
+    }
+
     /// Returns the residual of each pixel of a state, in deviations; 0 where it was not compared.
     pub fn residual(&self, state: usize, kind: ResidualKind) -> &[f32] {
         self.residuals.get(state).map_or(&[], |residuals| &residuals[kind as usize])
@@ -93,7 +98,8 @@ pub struct Comparer {
 }
 
 impl Comparer {
-    /// Compares an image (height, width, channel) with each state. `None` if the camera sees no lane.
+    /// Compares an image (height, width, channel) with each state. A camera that sees no lane by its pose only shows
+    /// whether the view is of this place. `None` without states.
     pub fn compare(
         &mut self,
         scene: KnownScene,
@@ -106,7 +112,7 @@ impl Comparer {
         let (width, height) = (small.width_px as usize, small.height_px as usize);
         let ground = lanes.ground_points(&small);
         let seen: Vec<bool> = ground.iter().map(|g| g.is_some_and(|g| g.on_lanes)).collect();
-        if !seen.contains(&true) || states.is_empty() {
+        if states.is_empty() {
             return None;
         }
         let judged = grown(&seen, width, MARGIN_PX);
@@ -158,7 +164,11 @@ impl Comparer {
             let is_still = |&i: &usize| counts(i) && !images[0].changing[i] && !image[i * 3].is_nan();
             (0..judged.len()).filter(is_still).collect()
         };
-        let fit = fitted(&image, &images[0].rgb, &still(&|i| is_sample(i, width)), &still(&|i| judged[i]));
+        let samples = still(&|i| is_sample(i, width));
+        let mut fit = fitted(&image, &images[0].rgb, &samples, &still(&|i| judged[i]));
+        if samples.is_empty() && !judged.contains(&true) {
+            fit.explained = 0.0;
+        }
         let rendered: Vec<&[f32]> = self.rendered().collect();
         let pixels = Pixels::new(&image, &judged, &rendered, width);
         let mut energies: Vec<Vec<BothResiduals>> =

@@ -23,7 +23,7 @@ pub struct Fit {
     /// Robust deviation of a pixel, of 1.
     pub noise: f32,
     /// Share of the view's variation that the still parts of the field explain, at most 1; 0 or below for a view of
-    /// another place, or from another pose. 1 where the view shows no still part.
+    /// another place, or from another pose. 1 where the view shows lanes, but no still part.
     pub explained: f32,
 }
 

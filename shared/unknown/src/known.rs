@@ -131,8 +131,8 @@ impl Known {
         }
     }
 
-    /// Compares an image with the known states; one that leaves something unexplained is aligned first. `None` if the
-    /// camera sees no lane.
+    /// Compares an image with the known states; one that leaves something unexplained is aligned first. `None`
+    /// without states.
     pub fn see(
         &self,
         comparer: &mut Comparer,
@@ -152,8 +152,11 @@ impl Known {
         Some((self.judge(&aligned), aligned))
     }
 
-    /// Describes what the last comparison shows of the lanes. `None` for a view of another place.
+    /// Describes what the last comparison shows of the lanes. `None` for a view of another place, or without lanes.
     pub fn sighting(&self, comparer: &Comparer, comparison: &Comparison, seen: &Seen) -> Option<Sighting> {
+        if !comparison.sees_lanes() {
+            return None;
+        }
         let clear = (0..seen.ratios.len()).filter(|state| self.hazard_states.get(*state) == Some(&false));
         let best = clear.max_by(|&a, &b| seen.ratios[a].total_cmp(&seen.ratios[b]))?;
         let best_ratio = Some(seen.ratios[best]).filter(|ratio| *ratio > 0.0)?;
@@ -380,8 +383,20 @@ mod tests {
         comparison.fit.explained = 0.4;
         let elsewhere = known.judge(&comparison);
         assert!(elsewhere.boxes.is_empty() && elsewhere.ratios == [0.0], "{elsewhere:?}");
-        // A camera that looks away sees no lane.
+    }
+
+    /// An image is not explained if by its pose the camera sees no lane, and nothing by which to recognise the place.
+    #[test]
+    fn a_pose_that_shows_nothing_explains_nothing() {
+        let config = FieldConfig { log2_table_size: 10, occupancy_resolution: 16, ..FieldConfig::default() };
+        let field = Field::new(config, 4).unwrap();
+        assert_eq!(field.changing().occupied_share(), 1.0, "no still part");
         let away = PinholeCamera::look_at([0.0, -8.0, 6.0], [0.0, -60.0, 40.0], [0.0, 0.0, 1.0], 96, 96, 60.0);
-        assert!(known.see(&mut Comparer::default(), &field, &states, (&away, image.view()), 1).is_none());
+        let (known, mut comparer) = (known(), Comparer::default());
+        let image = ndarray::Array3::from_elem((96, 96, 3), 90);
+        let (seen, comparison) =
+            known.see(&mut comparer, &field, &[[0.0; LATENT_DIM]], (&away, image.view()), 1).unwrap();
+        assert!(seen.ratios == [0.0] && seen.residual > 1.0 && seen.boxes.is_empty(), "{seen:?}");
+        assert!(!comparison.sees_lanes() && known.sighting(&comparer, &comparison, &seen).is_none());
     }
 }

@@ -209,7 +209,8 @@ mod tests {
     /// A point counts on an area and within the bounds, at any height of the area's box.
     #[test]
     fn lanes_are_areas_within_the_bounds() {
-        let is_judged = lanes().judged_ground();
+        let lanes = lanes();
+        let is_judged = lanes.judged_ground();
         assert!(is_judged([7.0, -1.9]));
         assert!(!is_judged([9.0, 0.0]) && !is_judged([0.0, 2.1]));
     }
