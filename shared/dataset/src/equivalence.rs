@@ -5,6 +5,9 @@ use rayon::prelude::*;
 use crate::dataset::Dataset;
 use crate::image::{Image, looks_same, looks_same_where};
 
+/// Largest difference of nearly equal pixels, of 255: less than a camera's noise.
+const NEARLY: u8 = 2;
+
 /// Visual equivalence of states, per view.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Equivalence {
@@ -19,17 +22,29 @@ impl Equivalence {
     pub fn from_dataset(dataset: &Dataset, images: &[Image]) -> Self {
         Self::between(dataset, images, |a, b| {
             let (of_a, of_b) = (&dataset.frames()[a], &dataset.frames()[b]);
-            Some(of_a.alike_states.as_ref()?.contains(&of_b.state?))
+            let known = of_a.alike_states.as_ref().zip(of_b.state).map(|(alike, state)| alike.contains(&state));
+            known.unwrap_or_else(|| looks_same_where(&images[a], &images[b], dataset.valid_in_all(&[a, b])))
         })
     }
 
     /// Compares all pairs of states in each view, in the pixels that are valid in both images. `images` are those of
     /// [`Dataset::load_all_images`]. A state without an image in a view is only equivalent to itself.
-    pub fn from_images(dataset: &Dataset, images: &[Image]) -> Self {
-        Self::between(dataset, images, |_, _| None)
+    ///
+    /// In rendered images, most pixels of a view are nearly equal in all states. Where they are not,
+    /// `in_noise(image, image, counts)` compares.
+    pub fn from_images(
+        dataset: &Dataset,
+        images: &[Image],
+        in_noise: impl Fn(&Image, &Image, &dyn Fn(usize) -> bool) -> bool + Sync,
+    ) -> Self {
+        Self::between(dataset, images, |a, b| {
+            let valid = dataset.valid_in_all(&[a, b]);
+            let (a, b) = (&images[a], &images[b]);
+            if is_mostly_equal(a, b, &valid) { looks_same_where(a, b, valid) } else { in_noise(a, b, &valid) }
+        })
     }
 
-    fn between(dataset: &Dataset, images: &[Image], known: impl Fn(usize, usize) -> Option<bool> + Sync) -> Self {
+    fn between(dataset: &Dataset, images: &[Image], alike: impl Fn(usize, usize) -> bool + Sync) -> Self {
         let (views, states) = (dataset.view_count(), dataset.state_count());
         let mut frames = vec![vec![None; states]; views];
         for (i, frame) in dataset.frames().iter().enumerate().take(images.len()) {
@@ -37,8 +52,7 @@ impl Equivalence {
                 frames[view][state] = Some(i);
             }
         }
-        let compared = |a: usize, b: usize| looks_same_where(&images[a], &images[b], dataset.valid_in_all(&[a, b]));
-        Self::of(states, &frames, |&a, &b| known(a, b).unwrap_or_else(|| compared(a, b)))
+        Self::of(states, &frames, |&a, &b| alike(a, b))
     }
 
     /// Compares all pairs of states in each view; `images` has a row of `states` images per view.
@@ -94,6 +108,17 @@ impl Equivalence {
         }
         (count > 0).then(|| sum / count as f64)
     }
+}
+
+/// Returns true if at least half of the pixels that count are nearly equal.
+fn is_mostly_equal(a: &Image, b: &Image, counts: impl Fn(usize) -> bool) -> bool {
+    let (mut equal, mut all) = (0, 0);
+    let pixels = a.rgb.chunks_exact(3).zip(b.rgb.chunks_exact(3)).enumerate();
+    for (_, (a, b)) in pixels.filter(|(i, _)| counts(*i)) {
+        equal += usize::from(a.iter().zip(b).all(|(a, b)| a.abs_diff(*b) <= NEARLY));
+        all += 1;
+    }
+    2 * equal >= all
 }
 
 #[cfg(test)]

@@ -25,6 +25,11 @@ pub struct Label {
     pub role: Option<PoseRole>,
 }
 
+/// Whether two images of a camera show the same.
+fn in_noise(a: &Image, b: &Image, counts: &dyn Fn(usize) -> bool) -> bool {
+    a.view().zip(b.view()).is_some_and(|(a, b)| carff_unknown::shows_same(a, b, counts))
+}
+
 /// Images, labels, split and equivalences of one scenario. The images of free poses follow those of the dataset;
 /// their views are numbered after the dataset's views.
 pub struct PosedImages {
@@ -40,7 +45,7 @@ pub struct PosedImages {
     pub split: PoseSplit,
     /// Visual equivalence of states, for each view of the dataset: the truth, for evaluation.
     pub equivalence: Equivalence,
-    /// Visual equivalence as the images show it, which training may use. Noise hides it.
+    /// Visual equivalence as the images show it, which training may use.
     pub seen_equivalence: Equivalence,
     /// Number of the first view of each dataset of free poses, and its equivalence.
     random_equivalences: Vec<(usize, Equivalence)>,
@@ -64,7 +69,7 @@ impl PosedImages {
             index[label.view * states + label.state] = Some(i);
         }
         let equivalence = Equivalence::from_dataset(&dataset, &images);
-        let seen_equivalence = Equivalence::from_images(&dataset, &images);
+        let seen_equivalence = Equivalence::from_images(&dataset, &images, in_noise);
         let means: Vec<Tensor> = (0..dataset.view_count())
             .map(|view| {
                 let of_view: Vec<usize> = (0..states).filter_map(|state| index[view * states + state]).collect();
@@ -97,7 +102,7 @@ impl PosedImages {
         let images = free.load_all_images()?;
         let first_view = self.view_count();
         self.labels.extend(labels(&free, first_view, |_| None).map_err(|what| unfit(&what))?);
-        self.random_equivalences.push((first_view, Equivalence::from_images(&free, &images)));
+        self.random_equivalences.push((first_view, Equivalence::from_images(&free, &images, in_noise)));
         self.images.extend(images);
         Ok(())
     }

@@ -205,7 +205,7 @@ fn reduced_camera(camera: &PinholeCamera) -> PinholeCamera {
 }
 
 /// Means over the cells of a grid of `width` x `height`, 0..=1.
-fn reduced(image: ArrayView3<'_, u8>, width: usize, height: usize) -> Vec<f32> {
+pub(crate) fn reduced(image: ArrayView3<'_, u8>, width: usize, height: usize) -> Vec<f32> {
     let (rows, columns, _) = image.dim();
     let cell = |i: usize, n: usize, all: usize| {
         let start = (i * all / n).min(all.saturating_sub(1));

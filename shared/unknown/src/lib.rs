@@ -12,8 +12,10 @@
 //! | `sighting` | how far an image shows a lane clear |
 //! | `sight` | which of the known states would look the same from a pose ahead |
 //! | `camera` | the condition of a camera, from its images |
+//! | `alike` | whether two images of a camera from one pose show the same |
 
 mod align;
+mod alike;
 mod blobs;
 mod camera;
 mod compare;
@@ -24,6 +26,7 @@ mod residuals;
 mod sight;
 mod sighting;
 
+pub use alike::shows_same;
 pub use blobs::Blob;
 pub use camera::{CameraCheck, CameraLimits, Measured, Measurement};
 pub use compare::{Comparer, Comparison, KnownScene};

@@ -44,8 +44,8 @@ impl Ranges {
     /// Finds the ranges of an image, RGB, row by row. Pixels that are not compared do not count.
     fn of(image: &[f32], judged: &[bool], width: usize) -> Self {
         Self {
-            low: over_neighbours(image, judged, width, f32::INFINITY, |a, b| if b < a { b } else { a }),
-            high: over_neighbours(image, judged, width, f32::NEG_INFINITY, |a, b| if b > a { b } else { a }),
+            low: with_neighbours(image, judged, width, f32::INFINITY, |a, b| if b < a { b } else { a }),
+            high: with_neighbours(image, judged, width, f32::NEG_INFINITY, |a, b| if b > a { b } else { a }),
         }
     }
 
@@ -56,7 +56,7 @@ impl Ranges {
 }
 
 /// Joins the values of each pixel's 3 x 3 neighbourhood, by channel. Pixels that are not compared count as `missing`.
-fn over_neighbours(
+pub(crate) fn with_neighbours(
     image: &[f32],
     judged: &[bool],
     width: usize,
