@@ -27,21 +27,15 @@ impl Equivalence {
         })
     }
 
-    /// Compares all pairs of states in each view, in the pixels that are valid in both images. `images` are those of
-    /// [`Dataset::load_all_images`]. A state without an image in a view is only equivalent to itself.
-    ///
-    /// In rendered images, most pixels of a view are nearly equal in all states. Where they are not,
-    /// `in_noise(image, image, counts)` compares.
+    /// Compares all pairs of states in each view by `alike(image, image, counts)`, where `counts` is true for the pixels
+    /// that are valid in both images. `images` are those of [`Dataset::load_all_images`]. A state without an image in a
+    /// view is only equivalent to itself.
     pub fn from_images(
         dataset: &Dataset,
         images: &[Image],
-        in_noise: impl Fn(&Image, &Image, &dyn Fn(usize) -> bool) -> bool + Sync,
+        alike: impl Fn(&Image, &Image, &dyn Fn(usize) -> bool) -> bool + Sync,
     ) -> Self {
-        Self::between(dataset, images, |a, b| {
-            let valid = dataset.valid_in_all(&[a, b]);
-            let (a, b) = (&images[a], &images[b]);
-            if is_mostly_equal(a, b, &valid) { looks_same_where(a, b, valid) } else { in_noise(a, b, &valid) }
-        })
+        Self::between(dataset, images, |a, b| alike(&images[a], &images[b], &dataset.valid_in_all(&[a, b])))
     }
 
     fn between(dataset: &Dataset, images: &[Image], alike: impl Fn(usize, usize) -> bool + Sync) -> Self {
@@ -110,8 +104,17 @@ impl Equivalence {
     }
 }
 
+/// Returns true if a dataset's images are those of a camera: of most pairs of states in a view, less than half of the
+/// pixels are nearly equal. Rendered images of one pose are equal wherever nothing changes.
+pub fn has_noise(dataset: &Dataset, images: &[Image]) -> bool {
+    let near = Equivalence::from_images(dataset, images, is_mostly_equal);
+    let of_view = |view: usize| (0..near.states).flat_map(move |a| (0..a).map(move |b| (view, a, b)));
+    let pairs: Vec<(usize, usize, usize)> = (0..dataset.view_count()).flat_map(of_view).collect();
+    2 * pairs.iter().filter(|(view, a, b)| near.same(*view, *a, *b)).count() < pairs.len()
+}
+
 /// Returns true if at least half of the pixels that count are nearly equal.
-fn is_mostly_equal(a: &Image, b: &Image, counts: impl Fn(usize) -> bool) -> bool {
+fn is_mostly_equal(a: &Image, b: &Image, counts: &dyn Fn(usize) -> bool) -> bool {
     let (mut equal, mut all) = (0, 0);
     let pixels = a.rgb.chunks_exact(3).zip(b.rgb.chunks_exact(3)).enumerate();
     for (_, (a, b)) in pixels.filter(|(i, _)| counts(*i)) {

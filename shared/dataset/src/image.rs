@@ -131,7 +131,7 @@ pub fn looks_same(a: &Image, b: &Image) -> bool {
 }
 
 /// Returns [`looks_same`] for the pixels whose index `counts`.
-pub(crate) fn looks_same_where(a: &Image, b: &Image, counts: impl Fn(usize) -> bool) -> bool {
+pub fn looks_same_where(a: &Image, b: &Image, counts: impl Fn(usize) -> bool) -> bool {
     let differing = a.differing_pixels(b, PIXEL_TOLERANCE).filter(|&i| counts(i));
     (a.width_px, a.height_px) == (b.width_px, b.height_px)
         && differing.take(MAX_DIFFERENT_PIXELS + 1).count() <= MAX_DIFFERENT_PIXELS

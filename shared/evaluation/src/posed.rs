@@ -3,6 +3,7 @@
 use crate::EvaluationError;
 use carff_dataset::{
     Dataset, Equivalence, Frame, Image, NamedBox, Observability, PoseRole, PoseSplit, ScenarioInfo, StateInfo,
+    has_noise, looks_same_where,
 };
 use carff_networks::decoder::IMAGE_PX;
 use std::path::Path;
@@ -25,9 +26,12 @@ pub struct Label {
     pub role: Option<PoseRole>,
 }
 
-/// Whether two images of a camera show the same.
-fn in_noise(a: &Image, b: &Image, counts: &dyn Fn(usize) -> bool) -> bool {
-    a.view().zip(b.view()).is_some_and(|(a, b)| carff_unknown::shows_same(a, b, counts))
+/// Equivalence as the images show it: exactly, or through the noise of a camera.
+fn seen_equivalence(dataset: &Dataset, images: &[Image], noisy: bool) -> Equivalence {
+    Equivalence::from_images(dataset, images, |a, b, counts| match a.view().zip(b.view()) {
+        Some((a, b)) if noisy => carff_unknown::shows_same(a, b, counts),
+        _ => looks_same_where(a, b, counts),
+    })
 }
 
 /// Images, labels, split and equivalences of one scenario. The images of free poses follow those of the dataset;
@@ -47,6 +51,8 @@ pub struct PosedImages {
     pub equivalence: Equivalence,
     /// Visual equivalence as the images show it, which training may use.
     pub seen_equivalence: Equivalence,
+    /// True for images of a camera. A field that was trained on them differs a little between all states.
+    noisy: bool,
     /// Number of the first view of each dataset of free poses, and its equivalence.
     random_equivalences: Vec<(usize, Equivalence)>,
     /// Mean image of each pose over the states in which a pixel is valid, `[V, 3, 128, 128]`, 0..=1.
@@ -69,7 +75,8 @@ impl PosedImages {
             index[label.view * states + label.state] = Some(i);
         }
         let equivalence = Equivalence::from_dataset(&dataset, &images);
-        let seen_equivalence = Equivalence::from_images(&dataset, &images, in_noise);
+        let noisy = has_noise(&dataset, &images);
+        let seen_equivalence = seen_equivalence(&dataset, &images, noisy);
         let means: Vec<Tensor> = (0..dataset.view_count())
             .map(|view| {
                 let of_view: Vec<usize> = (0..states).filter_map(|state| index[view * states + state]).collect();
@@ -86,6 +93,7 @@ impl PosedImages {
             split,
             equivalence,
             seen_equivalence,
+            noisy,
             random_equivalences: Vec::new(),
             index,
         })
@@ -102,7 +110,7 @@ impl PosedImages {
         let images = free.load_all_images()?;
         let first_view = self.view_count();
         self.labels.extend(labels(&free, first_view, |_| None).map_err(|what| unfit(&what))?);
-        self.random_equivalences.push((first_view, Equivalence::from_images(&free, &images, in_noise)));
+        self.random_equivalences.push((first_view, seen_equivalence(&free, &images, self.noisy)));
         self.images.extend(images);
         Ok(())
     }
