@@ -11,7 +11,7 @@ const SIDE_PX: usize = 64;
 /// Residual that noise does not exceed, in deviations.
 const WITHIN: f32 = 2.0;
 
-/// Returns true if two images (height, width, channel) from one pose show the same, as far as a camera's noise tells:
+/// Returns true if two images (height, width, channel) from one pose show the same, as far as a camera's noise shows:
 /// up to gain and offset of each channel, and a small affine motion of the view. `counts` is true for the pixels that
 /// count, by index row by row. Images of different sizes do not show the same.
 ///
@@ -98,7 +98,7 @@ mod tests {
         })
     }
 
-    /// Two photos of a place from nearly one pose show the same, whatever the exposure; a vehicle in one of them is a
+    /// Two photos of a place from nearly one pose show the same, at any exposure; a vehicle in one of them is a
     /// difference, unless it is where no pixel counts.
     #[test]
     fn photos_of_one_place_show_the_same() {
