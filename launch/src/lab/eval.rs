@@ -52,6 +52,8 @@ pub enum TableName {
     Planning,
     /// Six kinds of trial, with baselines on the same images.
     Trials,
+    /// Hazard probability and decisions of horizons 1, 2, 4 and 8.
+    Horizon,
     /// Unknown objects, other places, corrupted images, and the bound.
     Robustness,
     /// Density probing and segmentation of rendered views, on the same samples.

@@ -41,6 +41,7 @@ fn write_dataset(folder: &Path) {
         candidates: Vec::new(),
         static_boxes: Vec::new(),
         hazard_branches: vec![0],
+        hazard_from_timestamp: 0,
         hazard_action: "halt".into(),
         clear_action: "advance".into(),
     };

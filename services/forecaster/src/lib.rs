@@ -3,7 +3,7 @@
 use carff_checkpoint::{CheckpointPlanning, Manifest};
 use carff_config::GraphConfig;
 use carff_decision::{
-    Draw, Memory, Mixture, Sampling, TakeMemory, continue_samples, path_probability, set_mixture_and_draws,
+    Draw, Memory, Mixture, ProbeLayout, Sampling, TakeMemory, continue_samples, path_probability, set_mixture_and_draws,
 };
 use carff_inference::MixtureNet;
 use carff_messages::{Belief, Forecast, ForecastSource, Gaussian, Header, Posterior};
@@ -13,6 +13,7 @@ use std::path::Path;
 #[derive(Debug)]
 pub struct Forecaster {
     net: MixtureNet,
+    layout: ProbeLayout,
     samples: usize,
     sampling: Sampling,
     horizon: u32,
@@ -28,6 +29,7 @@ impl Forecaster {
     pub fn load(checkpoint: &Path, graph: &GraphConfig) -> anyhow::Result<Self> {
         let manifest = Manifest::load(checkpoint)?;
         let net = MixtureNet::load(checkpoint, &manifest)?;
+        let layout = ProbeLayout::new(manifest.places.clone(), manifest.scenario.hazard_states())?;
         let run = &graph.run;
         let learned = if graph.remembers() { CheckpointPlanning::load(checkpoint)?.memory } else { None };
         let memory = learned.zip(graph.step_length(manifest.step_s)).map(|(learned, step)| {
@@ -36,6 +38,7 @@ impl Forecaster {
         });
         Ok(Self {
             net,
+            layout,
             samples: run.samples as usize,
             sampling: run.sampling,
             horizon: run.horizon,
@@ -86,7 +89,8 @@ impl Forecaster {
         if belief.fed_back().is_empty() {
             let state = usize::try_from(belief.resolved_state).ok()?;
             forecast.resolved_state = belief.resolved_state;
-            forecast.path_probability = path_probability(belief.path_probability, belief.state_probability[state]);
+            forecast.path_probability =
+                path_probability(belief.path_probability, &self.layout, &belief.state_probability, state);
             self.fill(&mut forecast, &self.net.forecast(&belief.resolved));
         } else {
             forecast.path_probability = belief.path_probability;

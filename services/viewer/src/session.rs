@@ -339,7 +339,8 @@ impl Session {
                 hazard_probability: reading.hazard_likelihood,
             },
         };
-        let path_probability = path_probability(moment.path_probability, resolved.state_probability(state));
+        let layout = self.models.probe.layout();
+        let path_probability = path_probability(moment.path_probability, layout, &resolved.state_probabilities, state);
         let step = moment.step + 1;
         let forecast = self.forecast(&source, &moment.input, step)?;
         let path = moment.steps().cloned().collect();

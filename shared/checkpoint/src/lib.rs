@@ -33,7 +33,7 @@ pub use probe::{FieldProbe, PreparedField, load_field_probe, load_probing};
 pub use tensors::{StoredTensor, read_tensors};
 
 use carff_dataset::{ScenarioInfo, sensor::SensorNoise};
-use carff_decision::{Place, ProbeCalibration, ProbingError};
+use carff_decision::{Feedback, Place, ProbeCalibration, ProbingError};
 use carff_field::FieldConfig;
 use carff_messages::{Gaussian, MAX_PLACES, MAX_STATES};
 use serde::{Deserialize, Serialize};
@@ -130,6 +130,9 @@ pub struct ScenarioIdentity {
     pub timestamps: usize,
     /// Branches in which the hazard action is right.
     pub hazard_branches: Vec<usize>,
+    /// First time step at which a hazard branch is a hazard.
+    #[serde(default, skip_serializing_if = "shapes::is_zero")]
+    pub hazard_from_timestamp: usize,
     /// Number of fixed camera poses.
     pub poses: usize,
 }
@@ -142,6 +145,7 @@ impl ScenarioIdentity {
             branches: scenario.branches.clone(),
             timestamps: scenario.timestamps,
             hazard_branches: scenario.hazard_branches.clone(),
+            hazard_from_timestamp: scenario.hazard_from_timestamp,
             poses,
         }
     }
@@ -156,9 +160,25 @@ impl ScenarioIdentity {
         self.branches.iter().flat_map(|b| (0..self.timestamps).map(move |t| format!("{b}, t{t}"))).collect()
     }
 
-    /// Returns for each state whether its right action is the hazard action.
+    /// Returns for each state whether it is a hazard: it belongs to a hazard branch, at or after its first such time step.
+    ///
+    /// ```
+    /// use carff_checkpoint::ScenarioIdentity;
+    /// let identity = ScenarioIdentity {
+    ///     name: "open-branch".into(),
+    ///     branches: vec!["crosses".into(), "turns".into()],
+    ///     timestamps: 2,
+    ///     hazard_branches: vec![0],
+    ///     hazard_from_timestamp: 1,
+    ///     poses: 100,
+    /// };
+    /// assert_eq!(identity.hazard_states(), [false, true, false, false]);
+    /// ```
     pub fn hazard_states(&self) -> Vec<bool> {
-        (0..self.state_count()).map(|s| self.hazard_branches.contains(&(s / self.timestamps.max(1)))).collect()
+        let steps = self.timestamps.max(1);
+        let is_hazard =
+            |s: usize| self.hazard_branches.contains(&(s / steps)) && s % steps >= self.hazard_from_timestamp;
+        (0..self.state_count()).map(is_hazard).collect()
     }
 }
 
@@ -227,6 +247,9 @@ pub struct TrainedWith {
 pub struct CalibratedWith {
     /// Noise of the sensor.
     pub sensor: SensorNoise,
+    /// Input of each further step of the look-ahead.
+    #[serde(default)]
+    pub feedback: Feedback,
     /// Steps of the look-ahead, 1..=[`MAX_HORIZON`](carff_messages::MAX_HORIZON).
     pub horizon: u32,
 }
@@ -300,6 +323,10 @@ impl Manifest {
                 self.scenario.branches.len()
             ));
         }
+        let (from, steps) = (self.scenario.hazard_from_timestamp, self.scenario.timestamps);
+        if from > 0 && from >= steps {
+            return Err(format!("`scenario.hazard_from_timestamp` is {from}, there are {steps} time steps"));
+        }
         if self.states.len() != states {
             return Err(format!("`states` has {} entries, the scenario {states}", self.states.len()));
         }
@@ -345,6 +372,10 @@ impl Manifest {
         }
         if trained.hazard_branches != given.hazard_branches {
             return Err(show("scenario.hazard_branches", &trained.hazard_branches, &given.hazard_branches));
+        }
+        if trained.hazard_from_timestamp != given.hazard_from_timestamp {
+            let [trained, given] = [trained, given].map(|identity| identity.hazard_from_timestamp);
+            return Err(show("scenario.hazard_from_timestamp", &trained, &given));
         }
         if trained.poses != given.poses {
             return Err(show("scenario.poses", &trained.poses, &given.poses));

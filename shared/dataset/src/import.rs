@@ -84,6 +84,7 @@ pub fn import(from: &Path, out: &Path, options: &ImportOptions) -> Result<Import
         candidates: Vec::new(),
         static_boxes: Vec::new(),
         hazard_branches: Vec::new(),
+        hazard_from_timestamp: 0,
         hazard_action: "none".to_owned(),
         clear_action: "none".to_owned(),
     };

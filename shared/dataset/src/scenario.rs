@@ -106,6 +106,8 @@ pub struct ScenarioInfo {
     pub static_boxes: Vec<NamedBox>,
     /// Branches in which the hazard action is right.
     pub hazard_branches: Vec<usize>,
+    /// First time step at which a hazard branch is a hazard.
+    pub hazard_from_timestamp: usize,
     /// Action in a hazard branch.
     pub hazard_action: String,
     /// Action in all other branches.
@@ -143,7 +145,7 @@ impl ScenarioInfo {
         branch * self.timestamps..(branch + 1) * self.timestamps
     }
 
-    /// Returns true if the hazard action is right in this branch.
+    /// Returns true if the hazard action is right in this branch. The hazard itself may begin at a later time step.
     pub fn is_hazard(&self, branch: usize) -> bool {
         self.hazard_branches.contains(&branch)
     }

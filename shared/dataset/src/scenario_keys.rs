@@ -95,6 +95,7 @@ pub(crate) fn read_scenario(path: &Path, dir: &Path, value: &Value) -> Result<Sc
         static_boxes.push(read_box(&at, at.object(value)?)?);
     }
     let hazard_branches = read_hazard_branches(&place, map, branches.len())?;
+    let hazard_from_timestamp = place.index(map, "hazard_from_timestamp", timestamps)?.unwrap_or(0);
     let (mut hazard_action, mut clear_action) = ("halt".to_owned(), "advance".to_owned());
     if let Some(actions) = present(map, "actions") {
         let at = place.within("scenario.actions".to_owned());
@@ -124,6 +125,7 @@ pub(crate) fn read_scenario(path: &Path, dir: &Path, value: &Value) -> Result<Sc
         candidates,
         static_boxes,
         hazard_branches,
+        hazard_from_timestamp,
         hazard_action,
         clear_action,
     })

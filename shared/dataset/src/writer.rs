@@ -327,9 +327,15 @@ struct ScenarioFile<'a> {
     bev_view: Option<usize>,
     states: Vec<StateFile<'a>>,
     hazard_branches: &'a [usize],
+    #[serde(skip_serializing_if = "is_zero")]
+    hazard_from_timestamp: usize,
     actions: Actions<'a>,
     candidates: &'a [Candidate],
     static_boxes: &'a [NamedBox],
+}
+
+fn is_zero(number: &usize) -> bool {
+    *number == 0
 }
 
 #[derive(Serialize)]
@@ -364,6 +370,7 @@ impl<'a> ScenarioFile<'a> {
                 .map(|(scene_id, s)| StateFile { scene_id, branch: s.branch, timestamp: s.timestamp, boxes: &s.boxes })
                 .collect(),
             hazard_branches: &scenario.hazard_branches,
+            hazard_from_timestamp: scenario.hazard_from_timestamp,
             actions: Actions { hazard: &scenario.hazard_action, clear: &scenario.clear_action },
             candidates: &scenario.candidates,
             static_boxes: &scenario.static_boxes,

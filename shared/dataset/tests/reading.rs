@@ -45,7 +45,7 @@ fn whole() -> Value {
                 {"scene_id": 3, "boxes": []},
             ],
             "candidates": [place], "static_boxes": [],
-            "hazard_branches": [0], "actions": {"hazard": "stop", "clear": "go"},
+            "hazard_branches": [0], "hazard_from_timestamp": 1, "actions": {"hazard": "stop", "clear": "go"},
         },
     })
 }
@@ -85,6 +85,7 @@ fn whole_set() {
     assert_eq!(dataset.frame_index(2, 1), Some(5));
     let scenario = dataset.scenario().unwrap();
     assert_eq!((scenario.name.as_str(), scenario.bev_view, scenario.timestamps), ("small", Some(0), 2));
+    assert_eq!((&scenario.hazard_branches[..], scenario.hazard_from_timestamp), (&[0][..], 1));
     assert_eq!((scenario.hazard_action.as_str(), scenario.clear_action.as_str()), ("stop", "go"));
     assert!(scenario.is_hazard(0) && !scenario.is_hazard(1));
     assert_eq!(scenario.states[1].boxes[0].oriented_box.yaw, 0.5);
@@ -352,6 +353,10 @@ fn golden_errors() {
             at("/scenario/hazard_branches", json!([2])),
             "SET/transforms.json: scenario: key `hazard_branches`: must be branch indices from 0 to 1, found 2".into(),
         ),
+        (
+            at("/scenario/hazard_from_timestamp", json!(2)),
+            "SET/transforms.json: scenario: key `hazard_from_timestamp`: must be a whole number from 0 to 1, found 2".into(),
+        ),
         (at("/scenario/bev_view", json!(2)), "SET/transforms.json: scenario: key `bev_view`: is 2, but the views are 0 to 1".into()),
         (
             at("/scenario/states/1/scene_id", json!(0)),
@@ -436,6 +441,7 @@ fn written_scenario() -> ScenarioInfo {
         candidates: vec![Candidate { branch: None, timestamp: Some(0), named_box: named_box.clone() }],
         static_boxes: vec![NamedBox { role: None, dynamic: false, ..named_box }],
         hazard_branches: vec![0],
+        hazard_from_timestamp: 0,
         hazard_action: "halt".into(),
         clear_action: "advance".into(),
     }
@@ -460,6 +466,26 @@ fn write(dir: &Path, views: usize, paint: impl Fn(usize, usize) -> Image) {
         }
     }
     writer.finish(&records, Some(&written_scenario())).unwrap();
+}
+
+/// The time step at which the hazard begins is read back.
+#[test]
+fn the_begin_of_the_hazard_is_kept() {
+    let dir = tempfile::tempdir().unwrap();
+    let writer = DatasetWriter::create(dir.path()).unwrap();
+    let camera = PinholeCamera::look_at([1.0, 0.0, 4.0], [0.0; 3], [0.0, 0.0, 1.0], 8, 8, 60.0);
+    writer.write_image("a.png", &Image::filled(8, 8, [9; 3])).unwrap();
+    let record = |at| {
+        let record = FrameRecord::new("a.png", camera);
+        FrameRecord { branch_and_timestamp: Some(at), view: Some(0), ..record }
+    };
+    let records = [(0, 0), (0, 1), (1, 0), (1, 1)].map(record);
+    let state = |branch, timestamp| StateInfo { branch, timestamp, boxes: vec![] };
+    let states = vec![state(0, 0), state(0, 1), state(1, 0), state(1, 1)];
+    let scenario =
+        ScenarioInfo { timestamps: 2, hazard_from_timestamp: 1, bev_view: None, states, ..written_scenario() };
+    writer.finish(&records, Some(&scenario)).unwrap();
+    assert_eq!(Dataset::open(dir.path()).unwrap().scenario(), Some(&scenario));
 }
 
 /// A written dataset is read back: frames, cameras, scenario, images.
@@ -609,6 +635,7 @@ fn degraded_copies_keep_the_truth() {
         candidates: Vec::new(),
         static_boxes: Vec::new(),
         hazard_branches: vec![0],
+        hazard_from_timestamp: 0,
         hazard_action: "halt".into(),
         clear_action: "advance".into(),
     };

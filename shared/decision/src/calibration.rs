@@ -168,7 +168,8 @@ pub struct Resolved {
     pub unknown_probability: f32,
     /// Probability of a hazard state, 0..=1.
     pub hazard_probability: f32,
-    /// The most probable state; of equally probable ones, a hazard state first.
+    /// The most probable state; of equally probable ones, a hazard state first. States that probing cannot distinguish
+    /// count together.
     pub state: usize,
 }
 
@@ -215,8 +216,11 @@ pub fn resolve(
 }
 
 /// Returns the most probable state; of equally probable ones (to a millionth), a hazard state first, then the first.
+/// States that probing cannot distinguish have the sum of their probabilities: one scene under several names is as
+/// probable as under one.
 pub(crate) fn most_probable(layout: &ProbeLayout, probability: impl Fn(usize) -> f64) -> usize {
-    let key = |s: usize| (probability(s) * 1e6).round() as i64 * 2 + i64::from(layout.hazard_states()[s]);
+    let of_scene = |s: usize| layout.alike(s).iter().map(|&alike| probability(alike)).sum::<f64>();
+    let key = |s: usize| (of_scene(s) * 1e6).round() as i64 * 2 + i64::from(layout.hazard_states()[s]);
     (0..layout.state_count()).max_by_key(|&s| (key(s), std::cmp::Reverse(s))).unwrap_or(0)
 }
 
@@ -325,6 +329,31 @@ mod tests {
         let r = resolve(&p, &[0.2, 0.8], &[hazard, clear], &samples, &[1, 1, 1, 0]);
         assert!((r.hazard_probability - 0.2).abs() < 0.02, "{}", r.hazard_probability);
         assert_eq!(r.state, 2);
+    }
+
+    /// A scene that two states share is as probable as both: it is resolved, and the path through it keeps the whole
+    /// probability.
+    #[test]
+    fn states_of_one_scene_count_together() {
+        let place = |x: f64, occupied_in: Vec<bool>| Place {
+            name: "actor".into(),
+            oriented_box: OrientedBox { center: [x, 0.0, 1.0], half_size: [1.0, 0.5, 0.5], yaw: 0.0 },
+            occupied_in,
+        };
+        // Two states with something at place 0, and one without anything.
+        let places = vec![place(0.0, vec![true, true, false]), place(5.0, vec![false, false, false])];
+        let p = ProbeLayout::new(places, vec![false; 3]).unwrap();
+        assert_eq!((p.alike(1), p.alike(2), p.alike(3)), (&[0, 1][..], &[2][..], &[][..]));
+        let reading = Reading {
+            state: Some(2),
+            confidence: 0.4,
+            hazard_likelihood: 0.0,
+            state_probabilities: vec![0.3, 0.3, 0.4],
+        };
+        let r = resolve(&p, &[1.0], &[reading], &[], &[]);
+        assert_eq!(r.state, 0);
+        let path = |state| crate::path_probability(0.5, &p, &r.state_probabilities, state);
+        assert!((path(0) - 0.3).abs() < 1e-6 && (path(2) - 0.2).abs() < 1e-6);
     }
 
     /// A hazard state is resolved among equally probable states.

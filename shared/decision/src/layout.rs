@@ -78,13 +78,15 @@ pub struct Place {
 pub struct ProbeLayout {
     places: Vec<Place>,
     hazard_states: Vec<bool>,
+    /// Per state, the states that take the same places, itself included.
+    alike: Vec<Vec<usize>>,
     points: Vec<[f32; 3]>,
     /// Per place, the length of a column that one of its points stands for, metres.
     point_lengths_m: Vec<f32>,
 }
 
 impl ProbeLayout {
-    /// Sets up the points. `hazard_states` is true for each state whose right action is the hazard action.
+    /// Sets up the points. `hazard_states` is true for each state that is a hazard.
     pub fn new(places: Vec<Place>, hazard_states: Vec<bool>) -> Result<Self, ProbingError> {
         if places.is_empty() {
             return Err(ProbingError::NoPlaces);
@@ -106,7 +108,10 @@ impl ProbeLayout {
                 (span_m / COLUMN_POINTS as f64) as f32
             })
             .collect();
-        Ok(Self { places, hazard_states, points, point_lengths_m })
+        let states = 0..hazard_states.len();
+        let same = |a: usize, b: usize| places.iter().all(|place| place.occupied_in[a] == place.occupied_in[b]);
+        let alike = states.clone().map(|a| states.clone().filter(|&b| same(a, b)).collect()).collect();
+        Ok(Self { places, hazard_states, alike, points, point_lengths_m })
     }
 
     /// Returns the places.
@@ -127,9 +132,14 @@ impl ProbeLayout {
         self.hazard_states.len()
     }
 
-    /// Returns for each state whether its right action is the hazard action.
+    /// Returns for each state whether it is a hazard.
     pub fn hazard_states(&self) -> &[bool] {
         &self.hazard_states
+    }
+
+    /// Returns the states that probing cannot distinguish from `state`, itself included: they take the same places.
+    pub fn alike(&self, state: usize) -> &[usize] {
+        self.alike.get(state).map_or(&[], Vec::as_slice)
     }
 
     /// Returns all points to query, metres, world space; the points of a place are consecutive.

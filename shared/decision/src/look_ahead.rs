@@ -128,9 +128,12 @@ impl Step {
     }
 }
 
-/// Returns the probability of the path that follows a state, from that of the path to its step (both 0..=1).
-pub fn path_probability(before: f32, state_probability: f32) -> f32 {
-    (before * state_probability).clamp(0.0, 1.0)
+/// Returns the probability of the path that follows a state, from that of the path to its step, 0..=1. The path follows
+/// the scene of the state, so states that probing cannot distinguish from it count too. `probabilities` has one entry a
+/// state.
+pub fn path_probability(before: f32, layout: &ProbeLayout, probabilities: &[f32], state: usize) -> f32 {
+    let scene: f32 = layout.alike(state).iter().filter_map(|&alike| probabilities.get(alike)).sum();
+    (before * scene).clamp(0.0, 1.0)
 }
 
 /// The depth and breadth of a look-ahead, and the names of its random streams.
@@ -180,7 +183,7 @@ pub fn look_ahead<L: Localiser>(
             _ if number > horizon => None,
             Feedback::State => {
                 let state = step.resolved.state;
-                let path = path_probability(path, step.resolved.state_probability(state));
+                let path = path_probability(path, &probe.layout, &step.resolved.state_probabilities, state);
                 let input = probe.state_posterior(state);
                 input.map(|input| (drawn(forecast(input, ForecastInput::State(state)), number), path))
             }

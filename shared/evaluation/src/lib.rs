@@ -45,6 +45,7 @@ pub use tables::{
     encoder::{EncoderTable, SvmScore, SvmTable, encoder_table},
     field::{FieldImages, ImageTable, NovelViews},
     forecast::{ForecastTable, FrequencyTable, RoleCurves},
+    horizon::{HorizonFigures, HorizonTable},
     localisation::{LocalisationFigures, LocalisationTable, MethodFigures},
     memory::{ByObserver, MemoryTable, ObserverFigures, RightFrames},
     planning::{OneImage, PlanningResults, PlanningViews, ViewCounts},

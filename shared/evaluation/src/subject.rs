@@ -4,13 +4,15 @@ use crate::trials::watches::Watch;
 use crate::{ByRole, Decoding, EvaluationError, MaskedView, PosedImages, Progress, ROLES};
 use carff_base::geometry::PinholeCamera;
 use carff_base::random::Key;
-use carff_checkpoint::{CheckpointError, CheckpointPlanning, FieldProbe, Manifest, ScenarioIdentity, TrainedWith};
+use carff_checkpoint::{
+    CalibratedWith, CheckpointError, CheckpointPlanning, FieldProbe, Manifest, ScenarioIdentity, TrainedWith,
+};
 use carff_dataset::{
     Image,
     drives::DriveKind,
     sensor::{SensorNoise, apply_noise_into},
 };
-use carff_decision::{Feedback, MemorySettings, Sampling};
+use carff_decision::{MemorySettings, Sampling};
 use carff_messages::Gaussian;
 use carff_networks::{
     decoder::Decoder,
@@ -216,8 +218,8 @@ impl Subject {
     pub fn planner(&self, sampling: Sampling) -> Result<Planner<'_>, String> {
         let probe = self.probe.as_ref().map_err(Clone::clone)?;
         let net = self.mixture.as_ref().map_err(Clone::clone)?;
-        let horizon = self.trained.calibration.horizon;
-        Ok(Planner { net, probe, sampling, feedback: Feedback::State, horizon })
+        let CalibratedWith { feedback, horizon, .. } = self.trained.calibration;
+        Ok(Planner { net, probe, sampling, feedback, horizon })
     }
 
     /// The decoder.

@@ -25,7 +25,7 @@ use serde::Deserialize;
 use toml::Spanned;
 use values::{
     Colour, box3, clearance, colour, count, default_clearance, default_ground, default_shade_reach, duration,
-    elevation, field_of_view, finite, side, softness,
+    elevation, field_of_view, finite, first_timestamp, side, softness,
 };
 
 /// A scenario file.
@@ -51,6 +51,11 @@ pub struct ScenarioConfig {
     #[serde(default)]
     #[schemars(with = "Vec<String>")]
     pub hazard_branches: Vec<Spanned<String>>,
+    /// First time step at which a hazard branch is a hazard, below `timestamps`: before it, the actor has not reached the
+    /// place where it matters. A look-ahead that ends earlier does not meet the hazard.
+    #[serde(default = "first_timestamp")]
+    #[schemars(with = "usize", range(max = 63), extend("default" = 0))]
+    pub hazard_from_timestamp: Spanned<usize>,
     /// Index of the camera pose that looks straight down.
     #[schemars(with = "Option<usize>")]
     pub bev_view: Option<Spanned<usize>>,

@@ -423,6 +423,7 @@ fn info(
         candidates,
         static_boxes: scenery.boxes.iter().cloned().chain(still_objects).collect(),
         hazard_branches,
+        hazard_from_timestamp: *config.hazard_from_timestamp.get_ref(),
         hazard_action: config.actions.hazard.clone(),
         clear_action: config.actions.clear.clone(),
     }

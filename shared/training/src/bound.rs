@@ -5,10 +5,10 @@
 
 use crate::TrainingError;
 use carff_base::random::tag;
-use carff_checkpoint::{Bound, CheckpointPlanning, PlanningMemory};
+use carff_checkpoint::{Bound, CalibratedWith, CheckpointPlanning, PlanningMemory};
 use carff_dataset::{drives::DriveKind, sensor::SensorNoise};
 use carff_decision::{
-    CalibrationTrial, Evidence, Feedback, ImageEvidence, MemorySettings, Sampling, bounded_threshold, choose_threshold,
+    CalibrationTrial, Evidence, ImageEvidence, MemorySettings, Sampling, bounded_threshold, choose_threshold,
 };
 use carff_evaluation::{KnownStates, Models, Perception, Planner, Progress, SAMPLES, TakeMemories, Trial};
 use carff_scenes::{FRAMES_PER_TIMESTAMP, Scenario};
@@ -20,8 +20,6 @@ use std::path::Path;
 const BOUND: u64 = tag("bounded");
 /// Largest number of frames of a drive; it names random draws.
 const MOST_FRAMES: usize = 1000;
-/// Steps of a decision, as in the graph.
-const HORIZON: u32 = 2;
 
 /// Input of the bound.
 #[derive(Clone, Copy)]
@@ -78,8 +76,9 @@ pub fn bound_threshold(input: BoundInput, on_progress: &dyn Fn(&Progress)) -> Re
         memory => memory.map(|memory| memory.settings),
     };
     let drives = drives(input, &models, known.as_ref(), settings, seed, on_progress)?;
-    let (sampling, feedback) = (Sampling::Stratified, Feedback::State);
-    let planner = Planner { net: &models.mixture, probe: &models.probe, sampling, feedback, horizon: HORIZON };
+    let CalibratedWith { feedback, horizon, .. } = models.manifest.trained_with(input.checkpoint)?.calibration;
+    let sampling = Sampling::Stratified;
+    let planner = Planner { net: &models.mixture, probe: &models.probe, sampling, feedback, horizon };
     let (mut hazard, mut clear) = (Vec::new(), Vec::new());
     for (kind, trials) in drives {
         let evidence = planner.evidence(&trials, SAMPLES);

@@ -15,7 +15,7 @@ use carff_dataset::{
     drives::{DriveKind, eligible_inputs},
 };
 use carff_decision::{
-    CalibrationTrial, Evidence, Feedback, Plan, ProbeCalibration, ProbeLayout, Sampling, choose_threshold, look_ahead,
+    CalibrationTrial, Evidence, Plan, ProbeCalibration, ProbeLayout, Sampling, choose_threshold, look_ahead,
     unchosen_threshold,
 };
 use carff_evaluation::{Models, Perception, Progress, Trial, trial_frame};
@@ -161,7 +161,7 @@ fn judged(context: Context, models: &mut Models, trials: &[Trial]) -> Vec<Calibr
     let settings = &context.config.calibration;
     let Models { mixture, probe, .. } = models;
     let (samples, horizon) = (settings.samples, settings.horizon);
-    let (sampling, feedback) = (Sampling::Stratified, Feedback::State);
+    let (sampling, feedback) = (Sampling::Stratified, settings.feedback);
     let judge = |trial: &Trial| {
         let plan = Plan { samples, sampling, feedback, horizon, seed: trial.seed, frame: trial.frame };
         let steps = look_ahead(|input, _| mixture.forecast(input), probe, &trial.posterior, None, plan);

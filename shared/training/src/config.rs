@@ -3,6 +3,7 @@
 use crate::{TrainingError, augmentation::Augmentation};
 use carff_checkpoint::shapes::{DecoderConfig, EncoderConfig, MixtureConfig};
 use carff_dataset::sensor::SensorNoise;
+use carff_decision::Feedback;
 use carff_field::TrainerConfig;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -76,11 +77,14 @@ pub struct CalibrationConfig {
     pub samples: usize,
     /// Steps that are looked ahead.
     pub horizon: u32,
+    /// Input of each further step of the look-ahead. Set it, as `horizon`, to the value of the graph file.
+    pub feedback: Feedback,
 }
 
 impl Default for CalibrationConfig {
     fn default() -> Self {
-        Self { free_poses: 120, repeats: 5, sensor: SensorNoise::default(), samples: 10, horizon: 2 }
+        let (sensor, feedback) = (SensorNoise::default(), Feedback::State);
+        Self { free_poses: 120, repeats: 5, sensor, samples: 10, horizon: 2, feedback }
     }
 }
 

@@ -3,6 +3,7 @@
 use crate::{
     TrainingConfig, TrainingError,
     calibrate::{calibrated_probing, choose_and_save_threshold},
+    config::CalibrationConfig,
     field::{Clouds, FieldPhase, saved_field},
     mixture::{Mdn, MixturePhase},
     one_stage::OneStagePhase,
@@ -14,7 +15,7 @@ use crate::{
 use carff_checkpoint::CheckpointPlanning;
 use carff_checkpoint::{FORMAT_VERSION, Manifest, ScenarioIdentity, SplitRecord, files, save_field};
 use carff_dataset::{Observability, PoseRole, drives::eligible_inputs};
-use carff_decision::{Feedback, Policy, Sampling};
+use carff_decision::{Policy, Sampling};
 use carff_evaluation::{
     BirdsEye, CheckpointFigures, FieldRenderer, Models, Perception, Planner, PlanningFigures, PosedImages,
     ProbingFigures, SampleFigures, SampleInput, SampleTrials, TrainedAndUnseen, ViewFigures, birds_eye, to_unit,
@@ -212,8 +213,8 @@ impl Training<'_> {
         let Models { encoder, mixture, probe, .. } = models;
         let noise = config.calibration.sensor;
         let perception = Perception { encoder, noise, seed: config.seed + 1, known: None };
-        let horizon = config.calibration.horizon;
-        let (sampling, feedback) = (Sampling::Stratified, Feedback::State);
+        let CalibrationConfig { horizon, feedback, .. } = config.calibration;
+        let sampling = Sampling::Stratified;
         let planner = Planner { net: mixture, probe, sampling, feedback, horizon };
         let table = |role| {
             let inputs = eligible_inputs(&posed.dataset, &posed.split.views(role))

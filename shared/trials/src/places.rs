@@ -89,6 +89,7 @@ mod tests {
             candidates: Vec::new(),
             static_boxes: Vec::new(),
             hazard_branches: vec![0],
+            hazard_from_timestamp: 0,
             hazard_action: "halt".into(),
             clear_action: "advance".into(),
         }

@@ -149,6 +149,7 @@ mod tests {
             branches: vec!["no actor".into(), "truck".into()],
             timestamps: 2,
             hazard_branches: vec![1],
+            hazard_from_timestamp: 0,
             poses: 1,
         };
         let mut belief = Belief::empty(Header::of_frame(12, 1, 1).at_step(1), 1);

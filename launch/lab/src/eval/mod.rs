@@ -27,6 +27,7 @@ fn table(name: TableName) -> Table {
         TableName::Recall => Table::Recall,
         TableName::Planning => Table::Planning,
         TableName::Trials => Table::Trials,
+        TableName::Horizon => Table::Horizon,
         TableName::Robustness => Table::Robustness,
         TableName::Localisation => Table::Localisation,
         TableName::Memory => Table::Memory,
@@ -63,7 +64,7 @@ pub fn run(args: &EvalArgs) -> anyhow::Result<ExitCode> {
         if wants(Table::Robustness) || wants(Table::Images) {
             subject.novelties = images::novelties(&scenario, novelty_poses, args.seed, &display)?;
         }
-        if wants(Table::Trials) || wants(Table::Robustness) {
+        if [Table::Trials, Table::Horizon, Table::Robustness].into_iter().any(wants) {
             subject.free_poses = images::free_poses(&scenario, args.free_poses, args.seed, &display)?;
         }
         if wants(Table::Robustness) {

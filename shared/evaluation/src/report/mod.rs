@@ -1,6 +1,7 @@
 //! The results of a checkpoint on a dataset: `results.json`, the images, and one page.
 
 mod gallery;
+mod horizon_page;
 mod images_page;
 mod localisation_page;
 mod markdown;
@@ -16,6 +17,7 @@ use crate::tables::{
     encoder::{EncoderTable, encoder_table},
     field::{ImageTable, image_table},
     forecast::{self, ForecastTable, FrequencyTable},
+    horizon::{self, HorizonTable},
     localisation::{self, LocalisationTable},
     memory::{self, MemoryTable},
     planning::{self, PlanningResults},
@@ -44,6 +46,8 @@ pub enum Table {
     Planning,
     /// Six kinds of trial, with baselines on the same images.
     Trials,
+    /// Decisions of several horizons.
+    Horizon,
     /// Unknown objects and corrupted images.
     Robustness,
     /// Density probing and segmentation of rendered views.
@@ -58,12 +62,13 @@ pub enum Table {
 
 impl Table {
     /// All tables.
-    pub const ALL: [Self; 10] = [
+    pub const ALL: [Self; 11] = [
         Self::Psnr,
         Self::Encoder,
         Self::Recall,
         Self::Planning,
         Self::Trials,
+        Self::Horizon,
         Self::Robustness,
         Self::Localisation,
         Self::Memory,
@@ -79,6 +84,7 @@ impl Table {
             Self::Recall => "recall",
             Self::Planning => "planning",
             Self::Trials => "trials",
+            Self::Horizon => "horizon",
             Self::Robustness => "robustness",
             Self::Localisation => "localisation",
             Self::Memory => "memory",
@@ -117,6 +123,9 @@ pub struct Results {
     /// Baselines on the images of the trials, by name.
     #[serde(skip_serializing_if = "BTreeMap::is_empty", default)]
     pub baselines: BTreeMap<String, Baseline>,
+    /// Decisions of several horizons.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub horizon: Option<HorizonTable>,
     /// Unknown objects and corrupted images.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub robustness: Option<Robustness>,
@@ -176,6 +185,9 @@ pub fn evaluate(
         && let Some((trials, baselines)) = results.kept(Table::Trials, trials::trials(subject, on_progress))
     {
         (results.trials, results.baselines) = (trials, baselines);
+    }
+    if has(Table::Horizon) {
+        results.horizon = results.kept(Table::Horizon, horizon::horizon(subject, on_progress));
     }
     if has(Table::Robustness) {
         results.robustness = results.kept(Table::Robustness, robustness::robustness(subject, on_progress));

@@ -2,6 +2,7 @@
 
 use super::{
     Results,
+    horizon_page::horizon,
     images_page::images,
     localisation_page::localisation,
     markdown::{db, head, percent, row},
@@ -53,6 +54,7 @@ pub fn page(results: &Results) -> String {
         planning(&mut page, table);
     }
     trials(&mut page, results);
+    horizon(&mut page, results);
     robustness(&mut page, results);
     localisation(&mut page, results);
     memory(&mut page, results);

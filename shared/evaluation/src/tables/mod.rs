@@ -3,6 +3,7 @@
 pub mod encoder;
 pub mod field;
 pub mod forecast;
+pub mod horizon;
 pub mod localisation;
 pub mod memory;
 pub mod planning;

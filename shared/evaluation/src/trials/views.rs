@@ -149,6 +149,12 @@ pub fn taken(perception: &Perception, views: &[TrialView]) -> Vec<Trial> {
     views.iter().filter_map(|view| perception.trial((view.camera, view.image), kind(view.hazard), view.frame)).collect()
 }
 
+/// Returns -ln of the probability given to what is true; `p` is the hazard probability, clamped to 0.001..=0.999.
+pub fn log_loss_of(p: f64, hazard: bool) -> f64 {
+    let p = p.clamp(SUREST, 1.0 - SUREST);
+    -if hazard { p.ln() } else { (1.0 - p).ln() }
+}
+
 /// Figures of the answers to looks, in the same order.
 pub fn figures(views: &[TrialView], answers: &[Answer]) -> ByTrialKind {
     let mut poses: BTreeMap<&str, BTreeSet<usize>> = BTreeMap::new();
@@ -157,11 +163,10 @@ pub fn figures(views: &[TrialView], answers: &[Answer]) -> ByTrialKind {
         let figures = table.entry(view.kind.to_owned()).or_default();
         poses.entry(view.kind).or_default().insert(view.pose);
         let truth = f64::from(u8::from(view.hazard));
-        let p = answer.hazard_probability.clamp(SUREST, 1.0 - SUREST);
         figures.images += 1;
         figures.trials += 1;
         figures.halts += usize::from(answer.halt);
-        figures.log_loss -= if view.hazard { p.ln() } else { (1.0 - p).ln() };
+        figures.log_loss += log_loss_of(answer.hazard_probability, view.hazard);
         figures.brier += (answer.hazard_probability - truth).powi(2);
     }
     for (kind, figures) in &mut table {

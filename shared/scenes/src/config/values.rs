@@ -4,6 +4,7 @@ use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::de::Error as _;
 use serde::{Deserialize, Deserializer};
 use std::borrow::Cow;
+use toml::Spanned;
 
 /// Format of colours, for the schema.
 pub(super) enum Colour {}
@@ -20,6 +21,10 @@ impl JsonSchema for Colour {
     fn json_schema(_: &mut SchemaGenerator) -> Schema {
         json_schema!({ "type": "string", "pattern": "^#[0-9a-fA-F]{6}$" })
     }
+}
+
+pub(super) fn first_timestamp() -> Spanned<usize> {
+    Spanned::new(0..0, 0)
 }
 
 pub(super) fn default_ground() -> [f32; 3] {

@@ -114,6 +114,11 @@ pub(super) fn check(source: &Source, config: &ScenarioConfig) -> Result<Checked,
     };
     let hazard_branches =
         config.hazard_branches.iter().map(|b| branch_index(b, "hazard_branches")).collect::<Result<Vec<_>, _>>()?;
+    let from = &config.hazard_from_timestamp;
+    if *from.get_ref() >= config.timestamps {
+        let problem = format!("is {}, but the time steps are 0 to {}", from.get_ref(), config.timestamps - 1);
+        return Err(source.error_at(from, "hazard_from_timestamp", problem));
+    }
     for (key, boxes) in [
         ("slab", config.slab.iter().map(|b| (b.min, b.max)).collect::<Vec<_>>()),
         ("building", config.building.iter().map(|b| (b.min, b.max)).collect()),
