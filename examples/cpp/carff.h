@@ -399,19 +399,31 @@ static_assert(offsetof(CarffOccupancy, unknown_probability) == 76, "CarffOccupan
 static_assert(offsetof(CarffOccupancy, probability) == 80, "CarffOccupancy.probability");
 static_assert(offsetof(CarffOccupancy, stage_latency_ns) == 4176, "CarffOccupancy.stage_latency_ns");
 
-#define CARFF_LOOK_GAIN_TYPE_NAME "carff.LookGain.v2"
+#define CARFF_LOOK_GAIN_TYPE_NAME "carff.LookGain.v3"
 typedef struct CarffLookGain {
     CarffHeader header;
     float gain_bits;
     float ahead_m;
     float clear_m;
+    uint32_t vehicles;
+    float vehicle_m[2];
+    float vehicle_within_m;
+    float vehicle_heading_rad;
+    float vehicle_mps;
+    uint32_t has_vehicle_mps;
 } CarffLookGain;
 
-static_assert(sizeof(CarffLookGain) == 72, "CarffLookGain");
+static_assert(sizeof(CarffLookGain) == 96, "CarffLookGain");
 static_assert(offsetof(CarffLookGain, header) == 0, "CarffLookGain.header");
 static_assert(offsetof(CarffLookGain, gain_bits) == 56, "CarffLookGain.gain_bits");
 static_assert(offsetof(CarffLookGain, ahead_m) == 60, "CarffLookGain.ahead_m");
 static_assert(offsetof(CarffLookGain, clear_m) == 64, "CarffLookGain.clear_m");
+static_assert(offsetof(CarffLookGain, vehicles) == 68, "CarffLookGain.vehicles");
+static_assert(offsetof(CarffLookGain, vehicle_m) == 72, "CarffLookGain.vehicle_m");
+static_assert(offsetof(CarffLookGain, vehicle_within_m) == 80, "CarffLookGain.vehicle_within_m");
+static_assert(offsetof(CarffLookGain, vehicle_heading_rad) == 84, "CarffLookGain.vehicle_heading_rad");
+static_assert(offsetof(CarffLookGain, vehicle_mps) == 88, "CarffLookGain.vehicle_mps");
+static_assert(offsetof(CarffLookGain, has_vehicle_mps) == 92, "CarffLookGain.has_vehicle_mps");
 
 #define CARFF_VIEW_META_TYPE_NAME "carff.ViewMeta.v1"
 typedef struct CarffViewMeta {

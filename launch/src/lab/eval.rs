@@ -60,6 +60,8 @@ pub enum TableName {
     Localisation,
     /// The belief with and without memory, on drives whose camera pans.
     Memory,
+    /// Place and speed of vehicles on the others' lane, at any place.
+    Vehicles,
     /// Frequency of each outcome where several are open.
     Frequencies,
     /// t-SNE, reconstructions, curves, beliefs, density.

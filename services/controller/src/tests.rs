@@ -286,7 +286,8 @@ fn approaches_use_what_is_fresh() {
             through_conflict_m: 26.0,
             ..EgoMotion::default()
         });
-        controller.on_look(&LookGain { header: header(looked_at), gain_bits: 0.8, ahead_m: 3.0, clear_m });
+        let look = LookGain { header: header(looked_at), gain_bits: 0.8, ahead_m: 3.0, clear_m, ..LookGain::default() };
+        controller.on_look(&look);
         controller.on_belief(&belief(frame, 1, 0.6, 6), frame * 100 * MS + MS);
         let action = controller.on_belief(&belief(frame, 2, 0.6, 6), frame * 100 * MS + 2 * MS).unwrap();
         action.validate().unwrap();

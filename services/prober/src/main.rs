@@ -35,7 +35,7 @@ fn run(stage: &mut StageContext) -> anyhow::Result<()> {
             Ok(evidence) => {
                 let mut belief = believe(&mut probe, &forecast, evidence, stage.graph.run.feedback);
                 if let (Some(outlook), Some(frames), 1) = (&mut outlook, &frames, belief.header.step) {
-                    outlook.publish(&probe, frames, &belief, stage.threads)?;
+                    outlook.publish(&probe, frames, &belief, stage)?;
                 }
                 belief.stage_latency_ns = stage.worked(&belief.header, started_ns);
                 let believed_ns = monotonic_now_ns();

@@ -5,16 +5,18 @@ use crate::Frames;
 use carff_checkpoint::FieldProbe;
 use carff_config::GraphConfig;
 use carff_decision::{Approach, Place, look_gain_bits};
-use carff_messages::{Belief, EgoMotion, LATENT_DIM, LookGain};
+use carff_messages::{Belief, EgoMotion, Header, LATENT_DIM, LookGain};
 use carff_runtime::StageContext;
 use carff_transport::{Publisher, Receiver, topics};
-use carff_unknown::{Crossing, Lanes, Sight};
+use carff_unknown::{Crossing, LaneVehicle, Lanes, Sight, Track};
 
 /// Ways ahead of the vehicle from where a look is judged, metres.
 const AHEAD_M: [f64; 4] = [1.5, 3.0, 4.5, 6.0];
 
 /// Longest way that counts as clear, metres: no lane of a field is longer.
 const MOST_CLEAR_M: f64 = 500.0;
+/// Highest speed in a message, m/s.
+const MOST_MPS: f64 = 100.0;
 
 /// Publishes the value of a look from further on with each belief about the next step.
 #[derive(Debug)]
@@ -25,6 +27,7 @@ pub struct Outlook {
     input: Receiver<EgoMotion>,
     output: Publisher<LookGain>,
     motion: Option<EgoMotion>,
+    track: Track,
 }
 
 impl Outlook {
@@ -36,7 +39,15 @@ impl Outlook {
         let (input, output) = (stage.input(&topics::EGO_MOTION)?.polled(), stage.output(&topics::LOOK)?);
         let states = probe.states().iter().map(|state| state.mean).collect();
         let hazards = probe.layout().hazard_states().to_vec();
-        Ok(Some(Self { sight: Sight::default(), states, hazards, input, output, motion: None }))
+        Ok(Some(Self {
+            sight: Sight::default(),
+            states,
+            hazards,
+            input,
+            output,
+            motion: None,
+            track: Track::default(),
+        }))
     }
 
     /// Publishes the value of a look for the vehicle's motion and the camera of the belief's frame. Without one of them
@@ -46,7 +57,7 @@ impl Outlook {
         probe: &FieldProbe,
         frames: &Frames,
         belief: &Belief,
-        threads: usize,
+        StageContext { graph, threads, .. }: &StageContext,
     ) -> anyhow::Result<()> {
         while let Some(motion) = self.input.next()? {
             self.motion = Some(*motion);
@@ -61,7 +72,7 @@ impl Outlook {
             ahead.world_from_camera[0][3] += at_m * motion.heading_rad.cos();
             ahead.world_from_camera[1][3] += at_m * motion.heading_rad.sin();
             let lanes: &Lanes = frames.lanes();
-            if !self.sight.look(probe.field(), &self.states, lanes, &ahead, threads) {
+            if !self.sight.look(probe.field(), &self.states, lanes, &ahead, *threads) {
                 continue;
             }
             let gain = look_gain_bits(probabilities, &self.hazards, |a, b| self.sight.alike(a, b));
@@ -70,8 +81,25 @@ impl Outlook {
             }
         }
         let clear_m = clear_m(probe, frames, belief, &motion).min(MOST_CLEAR_M);
-        let (gain_bits, ahead_m, clear_m) = (gain_bits as f32, ahead_m as f32, clear_m as f32);
-        Ok(self.output.send(LookGain { header: belief.header, gain_bits, ahead_m, clear_m })?)
+        let (vehicles, heading_rad) = vehicles(probe, frames, belief, &motion);
+        let Header { frame_id, capture_time_ns, .. } = belief.header;
+        let speed_mps = self.track.see(graph.frame_time_s(frame_id, capture_time_ns), vehicles.first());
+        let mut gain = LookGain {
+            header: belief.header,
+            gain_bits: gain_bits as f32,
+            ahead_m: ahead_m as f32,
+            clear_m: clear_m as f32,
+            vehicles: vehicles.len() as u32,
+            vehicle_mps: speed_mps.unwrap_or(0.0).clamp(-MOST_MPS, MOST_MPS) as f32,
+            has_vehicle_mps: speed_mps.is_some().into(),
+            ..LookGain::default()
+        };
+        if let Some(vehicle) = vehicles.first() {
+            gain.vehicle_m = vehicle.center_m.map(|at| at as f32);
+            gain.vehicle_within_m = (0.5 * (vehicle.range_m[1] - vehicle.range_m[0])) as f32;
+            gain.vehicle_heading_rad = heading_rad as f32;
+        }
+        Ok(self.output.send(gain)?)
     }
 }
 
@@ -84,6 +112,18 @@ fn clear_m(probe: &FieldProbe, frames: &Frames, belief: &Belief, motion: &EgoMot
     let places = probe.layout().hazard_places();
     let crossing = |place: &Place| Crossing { place: place.oriented_box, from_m: [x, y], heading_rad };
     places.map(|place| sighting.clear_m(&crossing(place), &place.occupied_in)).reduce(f64::min).unwrap_or(0.0)
+}
+
+/// The vehicles on the lane of the hazard's first place in a belief's frame, the next to the crossing first, and the
+/// lane's heading, radians.
+fn vehicles(probe: &FieldProbe, frames: &Frames, belief: &Belief, motion: &EgoMotion) -> (Vec<LaneVehicle>, f64) {
+    let seen = frames.sighting(&belief.header).zip(frames.camera_of(&belief.header));
+    let Some(((sighting, camera), place)) = seen.zip(probe.layout().hazard_places().next()) else {
+        return (Vec::new(), 0.0);
+    };
+    let ([x, y, _], heading_rad) = (camera.position_m(), motion.heading_rad);
+    let crossing = Crossing { place: place.oriented_box, from_m: [x, y], heading_rad };
+    (sighting.vehicles(&crossing), place.oriented_box.yaw)
 }
 
 fn is_asked(graph: &GraphConfig) -> bool {

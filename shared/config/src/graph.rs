@@ -307,6 +307,15 @@ impl GraphConfig {
         }
     }
 
+    /// Returns the time of a frame, seconds since any begin. A rendered camera's frames follow each other at the run's
+    /// rate, however fast they are rendered; a real camera's have their capture times.
+    pub fn frame_time_s(&self, frame_id: u64, capture_time_ns: u64) -> f64 {
+        match self.camera.source {
+            CameraSource::Drives | CameraSource::FreeDrives => frame_id as f64 / self.run.frame_rate_hz,
+            _ => capture_time_ns as f64 * 1e-9,
+        }
+    }
+
     /// Reads and checks a graph file.
     pub fn load(path: &Path) -> Result<Self, ConfigError> {
         Self::parse(&read(path, "graph")?, path)

@@ -51,9 +51,11 @@ pub use tables::{
     planning::{OneImage, PlanningResults, PlanningViews, ViewCounts},
     robustness::{ByCorruption, CorruptionFigures, NoveltyFigures, Robustness},
     trials::{Baseline, ByPart},
+    vehicles::{PlaceFigures, VehicleTable},
 };
 pub use trials::{
     Models,
+    lane_images::{LaneImage, Visibility},
     views::{ByTrialKind, TrialFigures},
     watches::{Watch, WatchPlan, WatchedFrame, watches},
 };

@@ -1,5 +1,6 @@
 //! Subject of an evaluation: a checkpoint, a dataset of its scenario, and the posterior of each image.
 
+use crate::trials::lane_images::LaneImage;
 use crate::trials::watches::Watch;
 use crate::{ByRole, Decoding, EvaluationError, MaskedView, PosedImages, Progress, ROLES};
 use carff_base::geometry::PinholeCamera;
@@ -136,6 +137,8 @@ pub struct Subject {
     pub other_places: Vec<OtherPlace>,
     /// Drives whose camera pans. Empty until the caller renders them.
     pub watches: Vec<Watch>,
+    /// Images of each drive with another vehicle on the lane. Empty until the caller renders them.
+    pub lane_drives: Vec<Vec<LaneImage>>,
     /// Views from above of every state, with masks. Empty until the caller renders them.
     pub masked_views: Vec<MaskedView>,
     /// Settings of this evaluation.
@@ -180,6 +183,7 @@ impl Subject {
             novelties: Vec::new(),
             other_places: Vec::new(),
             watches: Vec::new(),
+            lane_drives: Vec::new(),
             masked_views: Vec::new(),
             options,
             trained,

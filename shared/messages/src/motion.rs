@@ -84,18 +84,19 @@ impl EgoMotion {
 message!(EgoMotion);
 described!(EgoMotion { header, speed_mps, to_conflict_m, through_conflict_m, heading_rad });
 
-/// The clear part of the others' lane in one frame, and the value of a look from further on.
+/// The clear part of the others' lane in one frame, the next vehicle on it, and the value of a look from further on.
 ///
 /// ```
 /// use carff_messages::{Header, LookGain, Message};
-/// let gain = LookGain { header: Header::of_frame(0, 1, 0), gain_bits: 0.5, ahead_m: 3.0, clear_m: 12.5 };
+/// let header = Header::of_frame(0, 1, 0);
+/// let gain = LookGain { header, gain_bits: 0.5, ahead_m: 3.0, clear_m: 12.5, ..LookGain::default() };
 /// assert_eq!(gain.validate(), Ok(()));
 /// assert!(LookGain { gain_bits: 1.5, ..gain }.validate().is_err());
 /// ```
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Default, PartialEq, ZeroCopySend, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
-#[type_name("carff.LookGain.v2")]
+#[type_name("carff.LookGain.v3")]
 pub struct LookGain {
     /// Header of the frame.
     pub header: Header,
@@ -106,6 +107,24 @@ pub struct LookGain {
     /// Way along the others' lane that the frame shows clear, from the place where the vehicle crosses it, metres,
     /// 0..=1000; 0 if it was not compared.
     pub clear_m: f32,
+    /// Number of vehicles that the frame shows on that lane.
+    #[serde(default)]
+    pub vehicles: u32,
+    /// Centre of the one next to the crossing, x and y, world space, metres; 0 without one.
+    #[serde(default)]
+    pub vehicle_m: [f32; 2],
+    /// Half of the range of its place along the lane that the frame allows, metres; a part of it may be hidden.
+    #[serde(default)]
+    pub vehicle_within_m: f32,
+    /// Heading of that vehicle about +Z, radians: that of the lane.
+    #[serde(default)]
+    pub vehicle_heading_rad: f32,
+    /// Its speed along the lane by its places in the last second, m/s, -100..=100; 0 if it is not known.
+    #[serde(default)]
+    pub vehicle_mps: f32,
+    /// 1 if its speed is known, else 0.
+    #[serde(default)]
+    pub has_vehicle_mps: u32,
 }
 
 impl LookGain {
@@ -113,12 +132,28 @@ impl LookGain {
         self.header.validate()?;
         check::probability("gain_bits", self.gain_bits)?;
         check::within("ahead_m", &[self.ahead_m], 0.0, 100.0)?;
-        check::within("clear_m", &[self.clear_m], 0.0, 1000.0)
+        check::within("clear_m", &[self.clear_m], 0.0, 1000.0)?;
+        check::within("vehicle_m", &self.vehicle_m, -1e6, 1e6)?;
+        check::within("vehicle_within_m", &[self.vehicle_within_m], 0.0, 1000.0)?;
+        check::within("vehicle_heading_rad", &[self.vehicle_heading_rad], -10.0, 10.0)?;
+        check::within("vehicle_mps", &[self.vehicle_mps], -100.0, 100.0)?;
+        check::at_most("has_vehicle_mps", self.has_vehicle_mps.into(), 1)
     }
 }
 
 message!(LookGain);
-described!(LookGain { header, gain_bits, ahead_m, clear_m });
+described!(LookGain {
+    header,
+    gain_bits,
+    ahead_m,
+    clear_m,
+    vehicles,
+    vehicle_m,
+    vehicle_within_m,
+    vehicle_heading_rad,
+    vehicle_mps,
+    has_vehicle_mps
+});
 
 #[cfg(test)]
 mod tests {

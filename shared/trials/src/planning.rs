@@ -15,7 +15,7 @@ use carff_decision::{
 };
 use carff_field::Field;
 use carff_messages::{Gaussian, LATENT_DIM, Rule};
-use carff_unknown::{Comparer, Comparison, Known, Seen};
+use carff_unknown::{Comparer, Comparison, Known, Seen, Sighting};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::{cell::RefCell, collections::BTreeMap};
@@ -207,6 +207,14 @@ impl<'a> KnownStates<'a> {
     /// Evidence of an image for the known states; `None` for an image without pixels.
     pub fn evidence(&self, camera: &PinholeCamera, image: &Image) -> Option<ImageEvidence> {
         self.compare(camera, image).map(|compared| ImageEvidence::new(&compared.seen.ratios))
+    }
+
+    /// Describes what an image shows of the lanes; `None` for a view of another place, or without lanes.
+    pub fn sighting(&self, camera: &PinholeCamera, image: &Image) -> Option<Sighting> {
+        let mut comparer = self.comparer.borrow_mut();
+        let (seen, comparison) =
+            self.known.see(&mut comparer, self.field, &self.states, (camera, image.view()?), self.threads)?;
+        self.known.sighting(&comparer, &comparison, &seen)
     }
 
     /// Compares an image; `None` for an image without pixels.

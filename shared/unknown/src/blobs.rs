@@ -15,8 +15,8 @@ const HEIGHT_SHARE: [f64; 2] = [0.3, 1.2];
 pub struct Blob {
     /// Root mean square of the 25 largest residuals, in units in which 1 is the field's own error.
     pub strength: f32,
-    /// Number of pixels at the compared size.
-    pub pixels: usize,
+    /// Its pixels at the compared size, by index, row by row.
+    pub pixels: Vec<usize>,
     /// Place where it stands, x and y, metres: the nearest ground that it covers, on the lanes.
     pub foot_m: [f64; 2],
     /// The nearest ground that each of its columns covers, x and y, metres.
@@ -66,7 +66,8 @@ pub(crate) fn blobs(
         if taken[start] || relative[start] <= 1.0 {
             continue;
         }
-        let pixels = connected(start, width, &relative, &mut taken);
+        let mut pixels = connected(start, width, &relative, &mut taken);
+        pixels.sort_unstable();
         found.extend(blob(camera, &pixels, &relative, ground));
     }
     found.sort_by(|a: &Blob, b: &Blob| b.strength.total_cmp(&a.strength));
@@ -130,12 +131,12 @@ fn blob(camera: &PinholeCamera, pixels: &[usize], relative: &[f32], ground: &[Op
     let height_m = span(rows().min(), rows().max()) * foot.distance_m / camera.fl_y_px;
     Some(Blob {
         strength: (sum / STRONGEST as f32).sqrt(),
-        pixels: pixels.len(),
         foot_m: foot.at_m,
         feet_m,
         distance_m: foot.distance_m,
         width_m,
         height_m: height_m.clamp(HEIGHT_SHARE[0] * width_m, HEIGHT_SHARE[1] * width_m),
+        pixels,
     })
 }
 

@@ -10,6 +10,7 @@
 //! | `blobs` | connected residuals: their size, and the place on the ground where they stand |
 //! | `known` | the limits of the known, calibrated on images without anything unknown, and their file |
 //! | `sighting` | how far an image shows a lane clear |
+//! | `track` | the speed of a vehicle on a lane, by its places in the last images |
 //! | `sight` | which of the known states would look the same from a pose ahead |
 //! | `camera` | the condition of a camera, from its images |
 //! | `alike` | whether two images of a camera from one pose show the same |
@@ -25,6 +26,7 @@ mod lanes;
 mod residuals;
 mod sight;
 mod sighting;
+mod track;
 
 pub use alike::shows_same;
 pub use blobs::Blob;
@@ -35,4 +37,5 @@ pub use known::{KindLimits, Known, KnownError, KnownLimits, Seen};
 pub use lanes::{ErrorMap, Ground, Lanes, OwnBox};
 pub use residuals::ResidualKind;
 pub use sight::Sight;
-pub use sighting::{Crossing, Sighting};
+pub use sighting::{Crossing, LaneVehicle, Sighting};
+pub use track::Track;

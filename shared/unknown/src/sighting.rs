@@ -21,6 +21,18 @@ const DEPTH_M: f64 = 0.5;
 const EXCLUDED: f32 = 0.01;
 /// Noise from which on an image shows too little, of 1.
 const MOST_NOISE: f32 = 0.06;
+/// Step of the search for vehicles on a lane, metres, and the number of steps.
+const SCAN_M: f64 = 0.2;
+const SCANS: u32 = 200;
+/// Smallest overlap of a vehicle's outline with what is unexplained, and the shares of the best overlap from which a
+/// place counts as equally good, and as possible.
+const LEAST_OVERLAP: f64 = 0.5;
+const EQUAL: f64 = 0.98;
+const POSSIBLE: f64 = 0.9;
+/// Smallest outline, pixels at the compared size.
+const LEAST_PX: usize = 12;
+/// Pixels around an outline that count against it, as a share of its size.
+const AROUND: f64 = 0.25;
 /// Space next to a lane that still belongs to it, metres.
 const ASIDE_M: f64 = 0.5;
 
@@ -34,6 +46,8 @@ pub struct Sighting {
     depth_m: Vec<f32>,
     /// Ground points at which columns of something stand that the best state without a hazard does not have.
     feet_m: Vec<[f64; 2]>,
+    /// For each pixel, true if it shows something that the best state without a hazard does not have.
+    is_unexplained: Vec<bool>,
     /// For each known state with a hazard, true if the image excludes it.
     is_excluded: Vec<bool>,
 }
@@ -62,11 +76,14 @@ impl Sighting {
     ) -> Self {
         let is_sharp = comparison.fit.noise <= MOST_NOISE;
         let depth = |(depth, judged): (&f32, &bool)| if *judged && is_sharp { *depth } else { 0.0 };
+        let mut is_unexplained = vec![false; comparison.judged.len()];
+        unexplained.iter().flat_map(|blob| &blob.pixels).for_each(|&pixel| is_unexplained[pixel] = true);
         Self {
             camera: comparison.camera,
             ground_m,
             depth_m: depth_m.iter().zip(&comparison.judged).map(depth).collect(),
             feet_m: unexplained.iter().flat_map(|blob| blob.feet_m.iter().copied()).collect(),
+            is_unexplained,
             is_excluded: ratios.iter().map(|ratio| *ratio < EXCLUDED * best_ratio).collect(),
         }
     }
@@ -87,6 +104,81 @@ impl Sighting {
         }
         let is_possible = taken_in.iter().zip(&self.is_excluded).any(|(taken, excluded)| *taken && !excluded);
         if is_possible && lane.front_m > -lane.length_m { clear_m.min(lane.front_m.max(0.0)) } else { clear_m }
+    }
+
+    /// Returns the vehicles that the image shows on a lane, the next to the crossing first. The box of the lane's vehicle
+    /// is moved along the lane: where its outline covers what no state without a hazard has, and little else, a vehicle
+    /// stands.
+    pub fn vehicles(&self, crossing: &Crossing) -> Vec<LaneVehicle> {
+        let Some(lane) = Line::of(crossing).filter(|_| self.is_unexplained.contains(&true)) else { return Vec::new() };
+        let ways_m: Vec<f64> = (0..SCANS).map(|i| f64::from(i) * SCAN_M - lane.length_m).collect();
+        let overlaps: Vec<f64> = ways_m.iter().map(|at_m| self.overlap(&lane.vehicle_at(crossing, *at_m))).collect();
+        let near = ((lane.length_m / SCAN_M) as usize).max(1);
+        let mut found: Vec<LaneVehicle> = Vec::new();
+        for (i, &overlap) in overlaps.iter().enumerate() {
+            let rivals = &overlaps[i.saturating_sub(near)..(i + near + 1).min(overlaps.len())];
+            if overlap < LEAST_OVERLAP || rivals.iter().any(|rival| *rival > overlap) {
+                continue;
+            }
+            // Places next to it that cover nearly as much are as possible: their middle is the estimate.
+            let at_least = |share: f64| {
+                let covers = |j: &usize| overlaps[*j] >= share * overlap;
+                let low = (0..=i).rev().take_while(covers).last().unwrap_or(i);
+                let high = (i..overlaps.len()).take_while(covers).last().unwrap_or(i);
+                [ways_m[low], ways_m[high]]
+            };
+            let [low, high] = at_least(EQUAL);
+            let at_m = 0.5 * (low + high);
+            if found.last().is_none_or(|last| at_m - last.at_m > 0.5 * lane.length_m) {
+                found.push(LaneVehicle { at_m, range_m: at_least(POSSIBLE), center_m: lane.point(at_m, 0.0), overlap });
+            }
+        }
+        found
+    }
+
+    /// Share that the outline of a vehicle and what is unexplained there have in common: twice the common pixels over the
+    /// pixels of both.
+    fn overlap(&self, place: &OrientedBox) -> f64 {
+        let Some([low, high]) = self.span(place, AROUND) else { return 0.0 };
+        let (vehicle, eye) = (place.turned(), self.camera.position_m());
+        let way_m = (0..3).map(|i| (place.center[i] - eye[i]).powi(2)).sum::<f64>().sqrt() - place.half_size[0];
+        let (width, mut common, mut outline, mut seen) = (self.camera.width_px as usize, 0, 0, 0);
+        let is_empty = |row: usize| !self.is_unexplained[row * width + low[0]..=row * width + high[0]].contains(&true);
+        if (low[1]..=high[1]).all(is_empty) {
+            return 0.0;
+        }
+        for (row, column) in (low[1]..=high[1]).flat_map(|row| (low[0]..=high[0]).map(move |column| (row, column))) {
+            let pixel = row * width + column;
+            let depth_m = f64::from(self.depth_m.get(pixel).copied().unwrap_or(0.0));
+            // Where nothing was compared, or something is nearer, the vehicle cannot be seen.
+            if depth_m <= 0.0 || depth_m < DEPTH_SHARE * way_m - DEPTH_M {
+                continue;
+            }
+            let ray = self.camera.ray(column as f64 + 0.5, row as f64 + 0.5);
+            let (is_met, is_unexplained) = (vehicle.is_met_by(&ray), self.is_unexplained[pixel]);
+            outline += usize::from(is_met);
+            seen += usize::from(is_unexplained);
+            common += usize::from(is_met && is_unexplained);
+        }
+        if outline < LEAST_PX { 0.0 } else { 2.0 * common as f64 / (outline + seen) as f64 }
+    }
+
+    /// First and last column and row of the pixels that a box covers, with pixels around it as a share of its size; `None`
+    /// if it is behind the camera or out of view.
+    fn span(&self, place: &OrientedBox, around: f64) -> Option<[[usize; 2]; 2]> {
+        let (mut low, mut high) = ([f64::INFINITY; 2], [f64::NEG_INFINITY; 2]);
+        for corner in 0..8 {
+            let side = |axis: usize| if corner >> axis & 1 == 1 { 1.0 } else { -1.0 };
+            let (at_px, _) = self.camera.project(place.point([side(0), side(1), side(2)]))?;
+            for axis in 0..2 {
+                (low[axis], high[axis]) = (low[axis].min(at_px[axis]), high[axis].max(at_px[axis]));
+            }
+        }
+        let sides = [f64::from(self.camera.width_px), f64::from(self.camera.height_px)];
+        let around = [0, 1].map(|axis| around * (high[axis] - low[axis]));
+        let first = [0, 1].map(|axis| (low[axis] - around[axis]).max(0.0));
+        let last = [0, 1].map(|axis| (high[axis] + around[axis]).min(sides[axis] - 1.0));
+        (0..2).all(|axis| first[axis] <= last[axis]).then(|| [first, last].map(|at| at.map(|v| v as usize)))
     }
 
     fn eye_m(&self) -> [f64; 2] {
@@ -115,6 +207,19 @@ impl Sighting {
         let is_inside = (0.0..width).contains(&x_px) && (0.0..height).contains(&y_px);
         is_inside.then(|| y_px as usize * self.camera.width_px as usize + x_px as usize)
     }
+}
+
+/// A vehicle on a lane.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct LaneVehicle {
+    /// Way of its centre from the crossing, against the direction of travel, metres; negative behind the crossing.
+    pub at_m: f64,
+    /// Smallest and largest such way that the image allows: a part of the vehicle may be hidden or out of view.
+    pub range_m: [f64; 2],
+    /// Its centre, x and y, metres, world space.
+    pub center_m: [f64; 2],
+    /// Share that its outline has in common with what the image shows there, 0..=1.
+    pub overlap: f64,
 }
 
 /// A straight lane, seen from the place where a vehicle crosses it. Ways count against the direction of travel.
@@ -151,6 +256,12 @@ impl Line {
     fn point(&self, at_m: f64, aside_m: f64) -> [f64; 2] {
         let aside = [-self.back[1], self.back[0]];
         [0, 1].map(|i| self.crossing_m[i] + at_m * self.back[i] + aside_m * aside[i])
+    }
+
+    /// The box of the lane's vehicle with its centre at a way along the lane.
+    fn vehicle_at(&self, crossing: &Crossing, at_m: f64) -> OrientedBox {
+        let [x, y] = self.point(at_m, 0.0);
+        OrientedBox { center: [x, y, crossing.place.center[2]], ..crossing.place }
     }
 
     /// A point in the lane's own axes: the way along it, and its distance to the left of the middle.
@@ -195,7 +306,8 @@ mod tests {
             if ray.direction[2] < 0.0 { ray.origin[2] / -ray.direction[2] } else { 100.0 }
         };
         let depth_m = (0..64 * 64).map(depth_m).collect();
-        Sighting { camera, ground_m: 0.0, depth_m, feet_m: Vec::new(), is_excluded: vec![true] }
+        let is_unexplained = vec![false; 64 * 64];
+        Sighting { camera, ground_m: 0.0, depth_m, feet_m: Vec::new(), is_unexplained, is_excluded: vec![true] }
     }
 
     fn clear_m(sighting: &Sighting) -> f64 {
@@ -227,6 +339,38 @@ mod tests {
         assert!((12.0..15.0).contains(&with([9.0, 0.0])), "{}", with([9.0, 0.0]));
         assert_eq!(with([1.0, 0.0]), 0.0);
         assert_eq!(with([-7.0, -4.0]), 0.0);
+    }
+
+    /// A vehicle is found where its outline is unexplained. One with both ends hidden may be nearer or farther away; what has another outline is not a vehicle.
+    #[test]
+    fn vehicles_are_found_on_the_lane() {
+        let with = |at_m: f64| {
+            let mut sighting = sighting();
+            let vehicle = Line::of(&crossing()).unwrap().vehicle_at(&crossing(), at_m).turned();
+            for pixel in 0..64 * 64_u32 {
+                let ray = sighting.camera.ray(f64::from(pixel % 64) + 0.5, f64::from(pixel / 64) + 0.5);
+                sighting.is_unexplained[pixel as usize] = vehicle.is_met_by(&ray);
+                let is_met = sighting.is_unexplained[pixel as usize];
+                sighting.depth_m[pixel as usize] = if is_met { 30.0 } else { sighting.depth_m[pixel as usize] };
+            }
+            sighting
+        };
+        for at_m in [6.0, 7.3, 9.1, 12.4] {
+            let found = with(at_m).vehicles(&crossing());
+            assert_eq!(found.len(), 1);
+            let found = found[0];
+            assert!((found.at_m - at_m).abs() < 0.3 && (found.center_m[0] + at_m).abs() < 0.3, "{at_m} {found:?}");
+        }
+        let mut hidden = with(9.0);
+        let [left, right] = [-10.0, -8.0].map(|x| hidden.pixel([x, 0.0, 1.0]).unwrap() % 64);
+        for pixel in (0..64 * 64).filter(|pixel| !(left..right).contains(&(pixel % 64))) {
+            (hidden.depth_m[pixel], hidden.is_unexplained[pixel]) = (3.0, false);
+        }
+        let found = hidden.vehicles(&crossing())[0];
+        assert!(found.range_m[0] < 8.3 && found.range_m[1] > 9.7, "{found:?}");
+        let mut other = with(9.0);
+        (0..64 * 64).filter(|pixel| pixel / 64 % 4 > 0).for_each(|pixel| other.is_unexplained[pixel] = false);
+        assert_eq!((other.vehicles(&crossing()), sighting().vehicles(&crossing())), (vec![], vec![]));
     }
 
     /// A state with a hazard that the image does not exclude ends the way at its vehicle, unless that is past the crossing.

@@ -1,20 +1,31 @@
 //! Images of a scenario that no dataset has: free drives and poses, unknown objects, other places.
 
 use crate::train::Display;
-use carff_base::geometry::PinholeCamera;
-use carff_base::random::{Key, gaussians};
+use carff_base::geometry::{OrientedBox, PinholeCamera};
+use carff_base::random::{Key, gaussians, uniform};
 use carff_dataset::Image;
 use carff_evaluation::{
-    DecisiveImage, MaskedView, Novelty, OtherPlace, Perception, Progress, Subject, Watch, WatchPlan,
+    DecisiveImage, LaneImage, MaskedView, Novelty, OtherPlace, Perception, Progress, Subject, Visibility, Watch,
+    WatchPlan,
 };
 use carff_scenes::config::{BystanderPlace, VariationRole};
-use carff_scenes::{Detail, FRAMES_PER_TIMESTAMP, FreePose, Scenario, UnknownView};
+use carff_scenes::{ClosedLoop, Detail, FRAMES_PER_TIMESTAMP, FreePose, Scenario, UnknownView};
 use ndarray::Axis;
 use std::path::PathBuf;
 
 /// Views with masks of each state, and deviation of their cameras' positions along x and y, metres.
 const VIEWS_PER_STATE: usize = 12;
 const VIEW_SHIFT_M: f64 = 0.4;
+/// Images of a lane drive, time between two of them, and latest time of its first, seconds; speed of its ego, m/s.
+const LANE_FRAMES: usize = 12;
+const LANE_FRAME_S: f64 = 0.1;
+const LANE_DRIVE_S: f64 = 8.0;
+const LANE_EGO_MPS: f64 = 2.0;
+/// A vehicle is in sight if so many pixels differ by more than so much, of 255; it is whole if they are this share of the
+/// pixels of its box, of which a vehicle fills about three quarters.
+const IN_SIGHT_PX: usize = 100;
+const IN_SIGHT_DIFFERENCE: u8 = 25;
+const WHOLE_SHARE: f64 = 0.6;
 
 /// Decisive image of each free drive.
 pub fn free_drives(
@@ -46,6 +57,62 @@ pub fn watches(
     let perception = Perception { known: None, ..subject.perception() };
     let plan = WatchPlan { count: count as usize, seed, exact: true };
     Ok(carff_evaluation::watches(scenario, &perception, net, plan, &|p| display.show(p))?)
+}
+
+/// Drives with one other vehicle on the lane, at a random place of the ego and a random time, with a camera that moves.
+/// Empty for a scenario without closed-loop drives.
+pub fn lane_drives(
+    scenario: &Scenario,
+    count: u32,
+    seed: u64,
+    display: &Display,
+) -> anyhow::Result<Vec<Vec<LaneImage>>> {
+    let Ok(world) = ClosedLoop::new(Scenario::load(scenario.path())?) else { return Ok(Vec::new()) };
+    let (nobody, total) = (world.episode(0, seed, Some(0)), count as usize);
+    let of_drive = |number: usize| {
+        display.show(&Progress { phase: "lane drives", done: number, total, line: String::new() });
+        let episode = world.episode(number as u64, seed, Some(1));
+        let draw = |name: &str| uniform(Key::named(name, seed, number as u64));
+        let (start_m, start_s) = (draw("ego") * world.conflict_m()[0], draw("time") * LANE_DRIVE_S);
+        let image = |frame: usize| {
+            let passed_s = frame as f64 * LANE_FRAME_S;
+            let (at_m, time_s) = ((start_m + LANE_EGO_MPS * passed_s).min(world.conflict_m()[0]), start_s + passed_s);
+            let vehicle = world.actor_boxes(&episode, time_s)[0];
+            let next = world.actor_boxes(&episode, time_s + 1.0)[0];
+            let camera = world.camera(&episode, at_m);
+            let image = world.image_from(&episode, at_m, time_s, &camera);
+            let without = world.image_from(&nobody, at_m, time_s, &camera);
+            LaneImage {
+                time_s: passed_s,
+                visibility: visibility(&vehicle, &camera, &image, &without),
+                image,
+                camera,
+                heading_rad: world.ego_pose(at_m)[2],
+                vehicle_m: [vehicle.center[0], vehicle.center[1]],
+                speed_mps: (next.center[0] - vehicle.center[0]).hypot(next.center[1] - vehicle.center[1]),
+            }
+        };
+        (0..LANE_FRAMES).map(image).collect()
+    };
+    Ok((0..total).map(of_drive).collect())
+}
+
+/// Visibility of a vehicle, from an image with and without it: whole if most of the pixels of its box show it.
+fn visibility(vehicle: &OrientedBox, camera: &PinholeCamera, image: &Image, without: &Image) -> Visibility {
+    let differs = |(a, b): &(&[u8], &[u8])| a.iter().zip(*b).any(|(a, b)| a.abs_diff(*b) > IN_SIGHT_DIFFERENCE);
+    let shown = image.rgb.chunks_exact(3).zip(without.rgb.chunks_exact(3)).filter(differs).count();
+    // A larger camera with the same rays in its middle: what is out of view counts too.
+    let turned = vehicle.turned();
+    let (width, height) = (i64::from(camera.width_px), i64::from(camera.height_px));
+    let pixels = (-height..2 * height).flat_map(|y| (-width..2 * width).map(move |x| (x, y)));
+    let is_met = |(x, y): &(i64, i64)| turned.is_met_by(&camera.ray(*x as f64 + 0.5, *y as f64 + 0.5));
+    let outline = pixels.filter(is_met).count();
+    match shown {
+        0 => Visibility::None,
+        _ if shown < IN_SIGHT_PX => Visibility::Hardly,
+        _ if (shown as f64) < WHOLE_SHARE * outline as f64 => Visibility::Partial,
+        _ => Visibility::Whole,
+    }
 }
 
 /// Views from above of every state with the class of each pixel. The camera of each is moved a little.

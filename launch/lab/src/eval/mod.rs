@@ -31,6 +31,7 @@ fn table(name: TableName) -> Table {
         TableName::Robustness => Table::Robustness,
         TableName::Localisation => Table::Localisation,
         TableName::Memory => Table::Memory,
+        TableName::Vehicles => Table::Vehicles,
         TableName::Frequencies => Table::Frequencies,
         TableName::Images => Table::Images,
     }
@@ -73,6 +74,9 @@ pub fn run(args: &EvalArgs) -> anyhow::Result<ExitCode> {
         }
         if wants(Table::Localisation) {
             subject.masked_views = images::masked_views(&subject, &scenario, args.seed, &display)?;
+        }
+        if wants(Table::Vehicles) {
+            subject.lane_drives = images::lane_drives(&scenario, args.free_drives, args.seed, &display)?;
         }
         if wants(Table::Memory) && subject.memory.is_some() {
             subject.watches = images::watches(&subject, &scenario, args.free_drives, args.seed, &display)?;

@@ -12,6 +12,7 @@ mod robustness_page;
 mod targets;
 mod trials_page;
 mod unknown_sheet;
+mod vehicles_page;
 
 use crate::tables::{
     encoder::{EncoderTable, encoder_table},
@@ -23,6 +24,7 @@ use crate::tables::{
     planning::{self, PlanningResults},
     robustness::{self, Robustness},
     trials::{self, Baseline, ByPart},
+    vehicles::{self, VehicleTable},
 };
 use crate::{ByRole, CheckpointAbout, EvaluationError, Progress, Subject};
 pub use gallery::Gallery;
@@ -54,6 +56,8 @@ pub enum Table {
     Localisation,
     /// The belief with and without memory.
     Memory,
+    /// Place and speed of vehicles on the others' lane.
+    Vehicles,
     /// Frequency of each outcome where several are open.
     Frequencies,
     /// t-SNE, reconstructions, curves, beliefs, density.
@@ -62,7 +66,7 @@ pub enum Table {
 
 impl Table {
     /// All tables.
-    pub const ALL: [Self; 11] = [
+    pub const ALL: [Self; 12] = [
         Self::Psnr,
         Self::Encoder,
         Self::Recall,
@@ -72,6 +76,7 @@ impl Table {
         Self::Robustness,
         Self::Localisation,
         Self::Memory,
+        Self::Vehicles,
         Self::Frequencies,
         Self::Images,
     ];
@@ -88,6 +93,7 @@ impl Table {
             Self::Robustness => "robustness",
             Self::Localisation => "localisation",
             Self::Memory => "memory",
+            Self::Vehicles => "vehicles",
             Self::Frequencies => "frequencies",
             Self::Images => "images",
         }
@@ -135,6 +141,9 @@ pub struct Results {
     /// The belief with and without memory.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     pub memory: Option<MemoryTable>,
+    /// Place and speed of vehicles on the others' lane.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub vehicles: Option<VehicleTable>,
     /// Frequency of each outcome where several are open.
     #[serde(skip_serializing_if = "ByRole::is_empty", default)]
     pub frequencies: ByRole<FrequencyTable>,
@@ -197,6 +206,9 @@ pub fn evaluate(
     }
     if has(Table::Memory) {
         results.memory = results.kept(Table::Memory, memory::memory(subject, on_progress));
+    }
+    if has(Table::Vehicles) {
+        results.vehicles = results.kept(Table::Vehicles, vehicles::vehicles(subject, on_progress));
     }
     if has(Table::Images) {
         results.gallery = Some(gallery::gallery(subject, out, on_progress)?);

@@ -10,6 +10,7 @@ use super::{
     planning_page::planning,
     robustness_page::robustness,
     trials_page::trials,
+    vehicles_page::vehicles,
 };
 use crate::stats::draws::Frequencies;
 use crate::{ByRole, EncoderTable, FrequencyTable, Share, SvmScore};
@@ -58,6 +59,7 @@ pub fn page(results: &Results) -> String {
     robustness(&mut page, results);
     localisation(&mut page, results);
     memory(&mut page, results);
+    vehicles(&mut page, results);
     reliability(&mut page, results);
     frequencies(&mut page, &results.frequencies);
     for image in results.gallery.iter().flat_map(|g| &g.images) {

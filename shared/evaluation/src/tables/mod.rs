@@ -9,6 +9,7 @@ pub mod memory;
 pub mod planning;
 pub mod robustness;
 pub mod trials;
+pub mod vehicles;
 
 /// At most `count` entries, evenly spread.
 pub fn spread(all: &[usize], count: usize) -> Vec<usize> {

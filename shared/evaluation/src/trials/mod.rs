@@ -1,6 +1,7 @@
 //! Trials with known answers: images, baselines and watches. `carff_trials` computes with them.
 
 pub mod baselines;
+pub mod lane_images;
 pub mod views;
 pub mod watches;
 
