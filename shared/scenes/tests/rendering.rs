@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use carff_base::geometry::PinholeCamera;
-use carff_dataset::{Dataset, Observability};
+use carff_dataset::{Dataset, Observability, drives::DriveKind};
 use carff_scenes::{Detail, Extras, Scenario, ScenarioError};
 
 /// A scenario with one block, half of which a wall hides from the camera at -Y. The sun is opposite the camera, so
@@ -319,6 +319,11 @@ fn golden_errors() {
             "]",
             &["small.toml:48: key `poses`: 1 poses; one for each of the 2 timestamps is needed"],
         ),
+        (
+            "hazard_branches = [\"with\"]",
+            "hazard_branches = [\"with\"]\nhazard_from_timestamp = 2",
+            &["small.toml:7: key `hazard_from_timestamp`: is 2, but the time steps are 0 to 1"],
+        ),
         ("bev_view = 0", "bev_view = 3", &["small.toml:7: key `bev_view`: is 3, but there are 3 cameras"]),
         (
             "min = [-8.0, -4.0]",
@@ -409,9 +414,34 @@ fn every_shipped_scenario_is_whole() {
         names.push(name);
     }
     names.sort();
-    let expected =
-        ["approaching-intersection", "hand-reaching", "single-approaching-intersection", "toy", "two-lane-merge"];
+    let expected = [
+        "approaching-intersection",
+        "hand-reaching",
+        "open-branch-intersection",
+        "single-approaching-intersection",
+        "toy",
+        "two-lane-merge",
+    ];
     assert_eq!(names, expected);
+}
+
+/// In the open-branch scenario the truck looks the same in three branches at the first two time steps, and stands
+/// elsewhere in each of them afterwards. The hazard begins at the last time step.
+#[test]
+fn branches_open_after_the_look() {
+    let scenario = shipped("open-branch-intersection");
+    let info = scenario.info();
+    let boxes = |branch: usize, timestamp: usize| &info.states[info.state(branch, timestamp).unwrap()].boxes;
+    assert_eq!((info.branches.len(), &info.hazard_branches[..], info.hazard_from_timestamp), (4, &[0][..], 3));
+    for timestamp in 0..4 {
+        let equal = boxes(0, timestamp) == boxes(1, timestamp) && boxes(0, timestamp) == boxes(2, timestamp);
+        assert_eq!(equal, timestamp < 2, "time step {timestamp}");
+        assert_ne!(boxes(0, timestamp), boxes(3, timestamp));
+    }
+    let full = Some(Observability::Full);
+    let kinds = |timestamp| [0, 1, 2, 3].map(|branch| info.trial_kind(branch, timestamp, full).map(DriveKind::name));
+    assert_eq!(kinds(1), [Some("hazard"), None, None, Some("clear")]);
+    assert_eq!(kinds(2), [None, Some("clear"), Some("clear"), Some("clear")]);
 }
 
 /// Each scenario has views of the first time step that show the actor fully, and views that hide it completely.

@@ -227,9 +227,14 @@ mod tests {
     /// The figures of every shipped checkpoint are read, and written again as the same JSON.
     #[test]
     fn shipped_figures_are_read() {
-        for name in
-            ["approaching-intersection", "hand-reaching", "single-approaching-intersection", "toy", "two-lane-merge"]
-        {
+        for name in [
+            "approaching-intersection",
+            "hand-reaching",
+            "open-branch-intersection",
+            "single-approaching-intersection",
+            "toy",
+            "two-lane-merge",
+        ] {
             let manifest = shipped(name);
             let figures = CheckpointFigures::of(&manifest, Path::new(name)).unwrap();
             assert_eq!(serde_json::to_value(&figures).unwrap(), manifest.metrics, "{name}");
