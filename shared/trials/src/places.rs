@@ -1,12 +1,18 @@
 //! Places that are probed, from the boxes of a scenario's states.
 
 use crate::EvaluationError;
+use carff_base::geometry::OrientedBox;
 use carff_dataset::{NamedBox, ScenarioInfo};
 use carff_decision::Place;
 use carff_messages::{MAX_PLACES, MAX_STATES};
 
+/// Share of a place from which a state that covers it occupies it: a probe finds something there.
+const COVERED: f64 = 0.6;
+/// Points along and across a place that are tested.
+const COVERED_POINTS: [usize; 2] = [20, 5];
+
 /// Places of a scenario: every distinct box of the states, and every candidate, with the states in which it is
-/// occupied. Boxes that are the same in all states are left out. Where there are too many places, boxes that are not
+/// occupied, by its own box or by one that covers most of it. Boxes that are the same in all states are left out. Where there are too many places, boxes that are not
 /// dynamic are left out too.
 ///
 /// Too many states are an error, and so are states without any distinguishing box: there would be nothing to probe.
@@ -23,6 +29,11 @@ pub fn places(scenario: &ScenarioInfo) -> Result<Vec<Place>, EvaluationError> {
     let mut places = moved(all.iter().copied(), states);
     if places.len() > MAX_PLACES {
         places = moved(all.into_iter().filter(|(_, named)| named.dynamic), states);
+    }
+    for place in &mut places {
+        for (taken, info) in place.occupied_in.iter_mut().zip(&scenario.states) {
+            *taken |= info.boxes.iter().any(|named| covered(&place.oriented_box, &named.oriented_box) >= COVERED);
+        }
     }
     match places.len() {
         0 => Err(EvaluationError::Unfit(
@@ -61,10 +72,17 @@ fn moved<'a>(boxes: impl Iterator<Item = (Option<usize>, &'a NamedBox)>, states:
     places
 }
 
+/// Returns the share of a place that a box covers.
+fn covered(place: &OrientedBox, by: &OrientedBox) -> f64 {
+    let ([along, across], by) = (COVERED_POINTS, by.turned());
+    let at = |i: usize, n: usize| (2 * i + 1) as f64 / n as f64 - 1.0;
+    let points = (0..along).flat_map(|x| (0..across).map(move |y| [at(x, along), at(y, across), 0.0]));
+    points.filter(|point| by.contains(place.point(*point))).count() as f64 / (along * across) as f64
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
-    use carff_base::geometry::OrientedBox;
     use carff_dataset::StateInfo;
 
     fn named(name: &str, x_m: f64, dynamic: bool) -> NamedBox {
@@ -102,6 +120,20 @@ mod tests {
         let found: Vec<_> = found.unwrap().into_iter().map(|p| (p.name, p.occupied_in)).collect();
         let truck = |taken: [bool; 4]| ("truck".to_owned(), taken.to_vec());
         assert_eq!(found, [truck([true, false, true, true]), truck([false, true, false, false])]);
+    }
+
+    /// A state whose box covers most of another state's place occupies that place too: a probe finds something there.
+    #[test]
+    fn covered_places_are_occupied() {
+        // The boxes are 4 m long.
+        let occupied = |step_m: f64| -> Vec<Vec<bool>> {
+            let found = places(&scenario(3, |t| vec![named("truck", step_m * t as f64, true)])).unwrap();
+            found.into_iter().map(|place| place.occupied_in[..3].to_vec()).collect()
+        };
+        let apart = [[true, false, false], [false, true, false], [false, false, true]];
+        let close = [[true, true, false], [true, true, true], [false, true, true]];
+        assert_eq!(occupied(2.0), apart);
+        assert_eq!(occupied(1.0), close);
     }
 
     /// With too many places, boxes that are not dynamic are left out. Still too many places, and too many states, are
