@@ -115,7 +115,7 @@ fn every_table_is_made() {
     // Drives, unknown objects and masks need a scenario file.
     assert_eq!(
         results.left_out.keys().collect::<Vec<_>>(),
-        ["localisation", "memory", "robustness"],
+        ["horizon", "localisation", "memory", "robustness", "vehicles"],
         "{:?}",
         results.left_out
     );
