@@ -334,6 +334,7 @@ struct ScenarioFile<'a> {
     static_boxes: &'a [NamedBox],
 }
 
+#[allow(clippy::trivially_copy_pass_by_ref, reason = "serde passes a reference")]
 fn is_zero(number: &usize) -> bool {
     *number == 0
 }

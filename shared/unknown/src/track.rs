@@ -80,7 +80,7 @@ mod tests {
     #[test]
     fn other_vehicles_begin_anew() {
         let follow = |track: &mut Track, wobble_m: f64| {
-            let place = |i: u32| at(14.0 - 0.5 * f64::from(i) + if i % 2 == 0 { wobble_m } else { -wobble_m });
+            let place = |i: u32| at(14.0 - 0.5 * f64::from(i) + if i.is_multiple_of(2) { wobble_m } else { -wobble_m });
             (0..10).map(|i| track.see(0.1 * f64::from(i), Some(&place(i)))).last().flatten()
         };
         assert!((follow(&mut Track::default(), 0.0).unwrap() - 5.0).abs() < 1e-9);

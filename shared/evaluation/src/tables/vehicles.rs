@@ -55,26 +55,26 @@ pub struct VehicleTable {
 struct Errors {
     images: usize,
     drives: Vec<usize>,
-    errors_m: Vec<f64>,
+    along_m: Vec<f64>,
 }
 
 impl Errors {
     fn add(&mut self, drive: usize, error_m: Option<f64>) {
         self.images += 1;
-        self.errors_m.extend(error_m);
+        self.along_m.extend(error_m);
         if self.drives.last() != Some(&drive) {
             self.drives.push(drive);
         }
     }
 
     fn figures(&self) -> PlaceFigures {
-        let amounts: Vec<f64> = self.errors_m.iter().map(|error| error.abs()).collect();
+        let amounts: Vec<f64> = self.along_m.iter().map(|error| error.abs()).collect();
         PlaceFigures {
             images: self.images,
             drives: self.drives.len(),
-            found: self.errors_m.len(),
-            rmse_m: root_mean_square(&self.errors_m),
-            bias_m: mean(&self.errors_m).unwrap_or(0.0),
+            found: self.along_m.len(),
+            rmse_m: root_mean_square(&self.along_m),
+            bias_m: mean(&self.along_m).unwrap_or(0.0),
             percentiles_m: [0.5, 0.95].map(|q| percentile(&amounts, q).unwrap_or(0.0)),
         }
     }
