@@ -17,9 +17,9 @@ const STREAM: u64 = tag("drives 1");
 /// Kind of a drive: its right action.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum DriveKind {
-    /// Halt: the actor comes, but is not visible.
+    /// Halt: the hazard comes, and the image does not show it.
     Hazard,
-    /// Advance: no actor comes, and the view shows it.
+    /// Advance: no hazard comes, and the image shows it.
     Clear,
 }
 

@@ -149,4 +149,9 @@ impl ScenarioInfo {
     pub fn is_hazard(&self, branch: usize) -> bool {
         self.hazard_branches.contains(&branch)
     }
+
+    /// Returns true if the state of a branch at a time step is a hazard.
+    pub fn is_hazard_at(&self, branch: usize, timestamp: usize) -> bool {
+        self.is_hazard(branch) && timestamp >= self.hazard_from_timestamp
+    }
 }

@@ -86,6 +86,7 @@ fn whole_set() {
     let scenario = dataset.scenario().unwrap();
     assert_eq!((scenario.name.as_str(), scenario.bev_view, scenario.timestamps), ("small", Some(0), 2));
     assert_eq!((&scenario.hazard_branches[..], scenario.hazard_from_timestamp), (&[0][..], 1));
+    assert_eq!([(0, 0), (0, 1), (1, 1)].map(|(b, t)| scenario.is_hazard_at(b, t)), [false, true, false]);
     assert_eq!((scenario.hazard_action.as_str(), scenario.clear_action.as_str()), ("stop", "go"));
     assert!(scenario.is_hazard(0) && !scenario.is_hazard(1));
     assert_eq!(scenario.states[1].boxes[0].oriented_box.yaw, 0.5);

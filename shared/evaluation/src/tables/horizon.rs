@@ -129,7 +129,7 @@ fn exact_within(poses: &[FreePose], scenario: &ScenarioInfo, horizon: u32) -> Ve
     let last = scenario.timestamps.saturating_sub(1);
     let meets = |state: usize| {
         let end = (scenario.timestamp_of(state) + horizon as usize).min(last);
-        scenario.is_hazard(scenario.branch_of(state)) && end >= scenario.hazard_from_timestamp
+        scenario.is_hazard_at(scenario.branch_of(state), end)
     };
     let of_view = |alike: &[usize]| {
         let inputs: Vec<usize> = alike.iter().copied().filter(|&s| scenario.timestamp_of(s) < last).collect();

@@ -81,7 +81,7 @@ impl Artist<'_> {
             emphasis: Some(if right { RIGHT } else { WRONG }),
         };
         let above = run.scenario.bev_view;
-        let hazard = run.scenario.is_hazard(branch);
+        let hazard = run.scenario.is_hazard_at(branch, timestamp + 1);
         let truth = StripCell {
             image: match above.or(view) {
                 Some(view) => self.image(branch, timestamp + 1, view)?,
@@ -103,8 +103,8 @@ impl Artist<'_> {
     fn caption(&self, frame: &DecidedFrame, kind: DriveKind, right: bool) -> Vec<String> {
         let verdict = if right { "correct" } else { "WRONG" };
         let truth = match kind {
-            DriveKind::Hazard => "the actor comes, hidden",
-            DriveKind::Clear => "no actor comes, in full view",
+            DriveKind::Hazard => "the hazard comes, not shown",
+            DriveKind::Clear => "no hazard comes, in full view",
         };
         let rule = self.run.settings.rule;
         let mut lines = vec![

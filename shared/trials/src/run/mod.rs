@@ -153,7 +153,7 @@ impl DriveCounts {
         let [hazard, clear] = [self.hazard, self.clear].map(|count| share(Some(count)));
         format!(
             "Drives of this run, correct decisions of the rule `{}` with {} samples, 95 % interval\n  \
-             hazard, not visible: halts     {hazard}\n  clear, in full view: advances  {clear}",
+             hazard, not shown: halts       {hazard}\n  clear, in full view: advances  {clear}",
             self.rule, self.samples
         )
     }
