@@ -307,7 +307,7 @@ impl GraphConfig {
         }
     }
 
-    /// Returns the time of a frame, seconds since any begin. A rendered camera's frames follow each other at the run's
+    /// Returns the time of a frame, seconds since an arbitrary start. A rendered camera's frames follow each other at the run's
     /// rate, however fast they are rendered; a real camera's have their capture times.
     pub fn frame_time_s(&self, frame_id: u64, capture_time_ns: u64) -> f64 {
         match self.camera.source {

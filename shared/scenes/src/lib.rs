@@ -41,4 +41,4 @@ pub use free_views::{FreePose, FreeView};
 pub use scenario::{
     ActorView, Detail, Extras, FULL_FRACTION, FULL_PIXELS, NONE_FRACTION, NONE_MEAN_DIFFERENCE, Rendering, Scenario,
 };
-pub use unknown_views::{IN_SIGHT_PX, UnknownView, VISIBLE_DIFFERENCE};
+pub use unknown_views::{IN_SIGHT_PX, UnknownView, VISIBLE_DIFFERENCE, is_in_sight};

@@ -37,9 +37,14 @@ pub struct UnknownView {
 impl UnknownView {
     /// Returns true if at least [`IN_SIGHT_PX`] pixels show the unknown, in proportion to the image's size.
     pub fn in_sight(&self) -> bool {
-        let size = f64::from(self.image.width_px) * f64::from(self.image.height_px);
-        f64::from(self.visible_px) >= f64::from(IN_SIGHT_PX) * size / (128.0 * 128.0)
+        is_in_sight(self.visible_px, &self.image)
     }
+}
+
+/// Returns true if so many pixels of an image put something in sight: [`IN_SIGHT_PX`], in proportion to its size.
+pub fn is_in_sight(visible_px: u32, image: &Image) -> bool {
+    let size = f64::from(image.width_px) * f64::from(image.height_px);
+    f64::from(visible_px) >= f64::from(IN_SIGHT_PX) * size / (128.0 * 128.0)
 }
 
 impl Scenario {

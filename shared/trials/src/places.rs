@@ -12,8 +12,8 @@ const COVERED: f64 = 0.6;
 const COVERED_POINTS: [usize; 2] = [20, 5];
 
 /// Places of a scenario: every distinct box of the states, and every candidate, with the states in which it is
-/// occupied, by its own box or by one that covers most of it. Boxes that are the same in all states are left out. Where there are too many places, boxes that are not
-/// dynamic are left out too.
+/// occupied, by its own box or by one that covers most of it. Boxes that are the same in all states are left out. Where
+/// there are too many places, boxes that are not dynamic are left out too.
 ///
 /// Too many states are an error, and so are states without any distinguishing box: there would be nothing to probe.
 pub fn places(scenario: &ScenarioInfo) -> Result<Vec<Place>, EvaluationError> {

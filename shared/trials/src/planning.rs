@@ -212,19 +212,21 @@ impl<'a> KnownStates<'a> {
     /// Describes what an image shows of the lanes; `None` for a view of another place, or without lanes.
     pub fn sighting(&self, camera: &PinholeCamera, image: &Image) -> Option<Sighting> {
         let mut comparer = self.comparer.borrow_mut();
-        let (seen, comparison) =
-            self.known.see(&mut comparer, self.field, &self.states, (camera, image.view()?), self.threads)?;
+        let (seen, comparison) = self.see(&mut comparer, camera, image)?;
         self.known.sighting(&comparer, &comparison, &seen)
     }
 
     /// Compares an image; `None` for an image without pixels.
     pub fn compare(&self, camera: &PinholeCamera, image: &Image) -> Option<Compared> {
         let mut comparer = self.comparer.borrow_mut();
-        let (seen, comparison) =
-            self.known.see(&mut comparer, self.field, &self.states, (camera, image.view()?), self.threads)?;
+        let (seen, comparison) = self.see(&mut comparer, camera, image)?;
         let best = (0..seen.ratios.len()).max_by(|&a, &b| seen.ratios[a].total_cmp(&seen.ratios[b]))?;
         let rendered = comparer.rendered().nth(best)?.to_vec();
         Some(Compared { seen, comparison, best, rendered })
+    }
+
+    fn see(&self, comparer: &mut Comparer, camera: &PinholeCamera, image: &Image) -> Option<(Seen, Comparison)> {
+        self.known.see(comparer, self.field, &self.states, (camera, image.view()?), self.threads)
     }
 }
 

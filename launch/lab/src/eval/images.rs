@@ -9,7 +9,10 @@ use carff_evaluation::{
     WatchPlan,
 };
 use carff_scenes::config::{BystanderPlace, VariationRole};
-use carff_scenes::{ClosedLoop, Detail, FRAMES_PER_TIMESTAMP, FreePose, Scenario, UnknownView};
+use carff_scenes::{
+    ClosedLoop, Detail, FRAMES_PER_TIMESTAMP, FreePose, Scenario, ScenarioError, UnknownView, VISIBLE_DIFFERENCE,
+    is_in_sight,
+};
 use ndarray::Axis;
 use std::path::PathBuf;
 
@@ -21,10 +24,7 @@ const LANE_FRAMES: usize = 12;
 const LANE_FRAME_S: f64 = 0.1;
 const LANE_DRIVE_S: f64 = 8.0;
 const LANE_EGO_MPS: f64 = 2.0;
-/// A vehicle is in sight if so many pixels differ by more than so much, of 255; it is whole if they are this share of the
-/// pixels of its box, of which a vehicle fills about three quarters.
-const IN_SIGHT_PX: usize = 100;
-const IN_SIGHT_DIFFERENCE: u8 = 25;
+/// A vehicle in sight is whole if this share of the pixels of its box shows it; a vehicle fills about three quarters.
 const WHOLE_SHARE: f64 = 0.6;
 
 /// Decisive image of each free drive.
@@ -67,7 +67,10 @@ pub fn lane_drives(
     seed: u64,
     display: &Display,
 ) -> anyhow::Result<Vec<Vec<LaneImage>>> {
-    let Ok(world) = ClosedLoop::new(Scenario::load(scenario.path())?) else { return Ok(Vec::new()) };
+    let world = match ClosedLoop::new(Scenario::load(scenario.path())?) {
+        Err(ScenarioError::NoClosedLoop { .. }) => return Ok(Vec::new()),
+        world => world?,
+    };
     let (nobody, total) = (world.episode(0, seed, Some(0)), count as usize);
     let of_drive = |number: usize| {
         display.show(&Progress { phase: "lane drives", done: number, total, line: String::new() });
@@ -99,8 +102,7 @@ pub fn lane_drives(
 
 /// Visibility of a vehicle, from an image with and without it: whole if most of the pixels of its box show it.
 fn visibility(vehicle: &OrientedBox, camera: &PinholeCamera, image: &Image, without: &Image) -> Visibility {
-    let differs = |(a, b): &(&[u8], &[u8])| a.iter().zip(*b).any(|(a, b)| a.abs_diff(*b) > IN_SIGHT_DIFFERENCE);
-    let shown = image.rgb.chunks_exact(3).zip(without.rgb.chunks_exact(3)).filter(differs).count();
+    let shown = image.differing_pixels(without, VISIBLE_DIFFERENCE).count();
     // A larger camera with the same rays in its middle: what is out of view counts too.
     let turned = vehicle.turned();
     let (width, height) = (i64::from(camera.width_px), i64::from(camera.height_px));
@@ -109,7 +111,7 @@ fn visibility(vehicle: &OrientedBox, camera: &PinholeCamera, image: &Image, with
     let outline = pixels.filter(is_met).count();
     match shown {
         0 => Visibility::None,
-        _ if shown < IN_SIGHT_PX => Visibility::Hardly,
+        _ if !is_in_sight(shown as u32, image) => Visibility::Hardly,
         _ if (shown as f64) < WHOLE_SHARE * outline as f64 => Visibility::Partial,
         _ => Visibility::Whole,
     }

@@ -90,7 +90,7 @@ pub fn vehicles(subject: &Subject, on_progress: &dyn Fn(&Progress)) -> Result<Ve
     let known = subject.known.as_ref().ok_or("the checkpoint has no `known.json`")?;
     let place = probe.layout().hazard_places().next().ok_or("no place belongs to a hazard only")?.oriented_box;
     if subject.lane_drives.is_empty() {
-        return Err("the scenario has no table `closed_loop`".into());
+        return Err("the dataset has no scenario file with closed-loop drives".into());
     }
     let states = KnownStates::new(known, probe, subject.options.threads);
     let [mut near, mut far, mut partial] = [(); 3].map(|()| Errors::default());
