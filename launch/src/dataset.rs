@@ -240,6 +240,9 @@ pub fn render(scenario: &Scenario, out: &Path, extras: Extras) -> anyhow::Result
     let bar = ProgressBar::new(images);
     bar.set_style(ProgressStyle::with_template("{msg} [{bar:40}] {pos}/{len} images, {eta} left")?);
     bar.set_message(scenario.info().name.clone());
+    if bar.is_hidden() {
+        carff::say(&format!("rendering {images} images of {} into {}", scenario.info().name, out.display()));
+    }
     let rendered = scenario.render_dataset(out, extras, |done, _| {
         bar.set_position(done as u64);
         ControlFlow::Continue(())

@@ -146,8 +146,15 @@ impl World {
     ) -> anyhow::Result<()> {
         let (at_m, time_s, speed_mps) = (drive.vehicle.at_m, drive.time_s, drive.vehicle.speed_mps);
         let [x, y, heading_rad] = self.drives.ego_pose(at_m);
-        let (to_conflict_m, through_conflict_m) = (drive.to_conflict_m(), drive.through_conflict_m());
-        topics.motions.send(EgoMotion { header, speed_mps, to_conflict_m, through_conflict_m, heading_rad })?;
+        topics.motions.send(EgoMotion {
+            header,
+            speed_mps,
+            to_conflict_m: drive.to_conflict_m(),
+            through_conflict_m: drive.through_conflict_m(),
+            heading_rad,
+            crossing_m: self.drives.crossing_m(),
+            along_conflict_m: self.drives.along_conflict_m(),
+        })?;
         let mut truth = WorldTruth {
             header,
             episode: number,

@@ -293,7 +293,13 @@ mod tests {
             (1..=2).for_each(|step| judge.given(&belief(1, step, 0.9)));
             let header = Header::of_frame(1, moved_ms * MS, 1);
             let through_conflict_m = to_conflict_m + 6.0;
-            judge.moved(&EgoMotion { header, speed_mps: 1.0, to_conflict_m, through_conflict_m, heading_rad: 0.0 });
+            judge.moved(&EgoMotion {
+                header,
+                speed_mps: 1.0,
+                to_conflict_m,
+                through_conflict_m,
+                ..EgoMotion::default()
+            });
             judge.next(Action { target_speed_mps, ..action(1, code, 120) }).is_ok()
         };
         let (look, stop) = (Approach::Look, Approach::Stop);

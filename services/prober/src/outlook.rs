@@ -9,6 +9,7 @@ use carff_messages::{Belief, EgoMotion, Header, LATENT_DIM, LookGain};
 use carff_runtime::StageContext;
 use carff_transport::{Publisher, Receiver, topics};
 use carff_unknown::{Crossing, LaneVehicle, Lanes, Sight, Track};
+use std::f64::consts::FRAC_PI_2;
 
 /// Ways ahead of the vehicle from where a look is judged, metres.
 const AHEAD_M: [f64; 4] = [1.5, 3.0, 4.5, 6.0];
@@ -105,25 +106,27 @@ impl Outlook {
 
 /// The way along the lanes of the hazard's places that a belief's frame shows clear, metres: that of the least clear one.
 fn clear_m(probe: &FieldProbe, frames: &Frames, belief: &Belief, motion: &EgoMotion) -> f64 {
-    let Some((sighting, camera)) = frames.sighting(&belief.header).zip(frames.camera_of(&belief.header)) else {
+    let Some(sighting) = frames.sighting(&belief.header).filter(|_| frames.camera_of(&belief.header).is_some()) else {
         return 0.0;
     };
-    let ([x, y, _], heading_rad) = (camera.position_m(), motion.heading_rad);
     let places = probe.layout().hazard_places();
-    let crossing = |place: &Place| Crossing { place: place.oriented_box, from_m: [x, y], heading_rad };
-    places.map(|place| sighting.clear_m(&crossing(place), &place.occupied_in)).reduce(f64::min).unwrap_or(0.0)
+    places.map(|place| sighting.clear_m(&crossing(place, motion), &place.occupied_in)).reduce(f64::min).unwrap_or(0.0)
 }
 
 /// The vehicles on the lane of the hazard's first place in a belief's frame, the next to the crossing first, and the
 /// lane's heading, radians.
 fn vehicles(probe: &FieldProbe, frames: &Frames, belief: &Belief, motion: &EgoMotion) -> (Vec<LaneVehicle>, f64) {
-    let seen = frames.sighting(&belief.header).zip(frames.camera_of(&belief.header));
-    let Some(((sighting, camera), place)) = seen.zip(probe.layout().hazard_places().next()) else {
+    let seen = frames.sighting(&belief.header).filter(|_| frames.camera_of(&belief.header).is_some());
+    let Some((sighting, place)) = seen.zip(probe.layout().hazard_places().next()) else {
         return (Vec::new(), 0.0);
     };
-    let ([x, y, _], heading_rad) = (camera.position_m(), motion.heading_rad);
-    let crossing = Crossing { place: place.oriented_box, from_m: [x, y], heading_rad };
-    (sighting.vehicles(&crossing), place.oriented_box.yaw)
+    (sighting.vehicles(&crossing(place, motion)), place.oriented_box.yaw)
+}
+
+/// The lane of a place, and the point of it that is next to the place where the vehicle gets in the way of others.
+fn crossing(place: &Place, motion: &EgoMotion) -> Crossing {
+    let heading_rad = place.oriented_box.yaw + FRAC_PI_2;
+    Crossing { place: place.oriented_box, from_m: motion.crossing_m, heading_rad }
 }
 
 fn is_asked(graph: &GraphConfig) -> bool {

@@ -53,6 +53,9 @@ pub struct Motion {
     pub to_conflict_m: f64,
     /// Way until it has left that place, metres.
     pub through_conflict_m: f64,
+    /// Way along the others' lane, in their direction, that its rear has then made, metres: 0 for a vehicle that crosses
+    /// the lane, and above it for one that merges.
+    pub along_conflict_m: f64,
 }
 
 /// The view of the others' lane in one image.
@@ -86,7 +89,7 @@ impl Approach {
     /// use carff_decision::{Approach, Look, Motion, Speeds};
     /// use carff_messages::ActionCode;
     /// let speeds = Speeds { advance_mps: 5.0, creep_mps: 1.5, others_mps: 5.0 };
-    /// let far = Some(Motion { speed_mps: 5.0, to_conflict_m: 10.0, through_conflict_m: 16.0 });
+    /// let far = Some(Motion { speed_mps: 5.0, to_conflict_m: 10.0, through_conflict_m: 16.0, along_conflict_m: 0.0 });
     /// let look = Look { gain_bits: 0.8, clear_m: 9.0 };
     /// assert_eq!(Approach::Stop.drive(true, look, far, speeds), (ActionCode::Halt, 0.0));
     /// assert_eq!(Approach::Phantom.drive(true, look, far, speeds), (ActionCode::Creep, 1.5));
@@ -123,7 +126,11 @@ impl Motion {
 
     /// Reports whether the vehicle has left the others' lane before anybody arrives who is not on its clear part.
     fn crosses_first(self, clear_m: f64, speeds: Speeds) -> bool {
-        let arrival_s = (clear_m - CROSSING_MARGIN_M) / speeds.others_mps.max(f64::MIN_POSITIVE);
+        // The gap to those behind a vehicle that merges is smallest at the end if none of them is slower than it.
+        let is_merging = self.along_conflict_m > 0.0;
+        let others_mps = if is_merging { speeds.others_mps.max(speeds.advance_mps) } else { speeds.others_mps };
+        let way_m = clear_m + self.along_conflict_m - CROSSING_MARGIN_M;
+        let arrival_s = way_m / others_mps.max(f64::MIN_POSITIVE);
         speeds.others_mps > 0.0 && arrival_s >= self.crossing_s(speeds.advance_mps) + CROSSING_MARGIN_S
     }
 
@@ -162,7 +169,7 @@ mod tests {
     const SPEEDS: Speeds = Speeds { advance_mps: 5.0, creep_mps: 1.5, others_mps: 5.0 };
 
     fn at(to_conflict_m: f64, speed_mps: f64) -> Motion {
-        Motion { speed_mps, to_conflict_m, through_conflict_m: to_conflict_m + 6.0 }
+        Motion { speed_mps, to_conflict_m, through_conflict_m: to_conflict_m + 6.0, along_conflict_m: 0.0 }
     }
 
     fn gain(gain_bits: f64) -> Look {

@@ -43,8 +43,8 @@ fn limited(latent: [f32; LATENT_DIM]) -> [f32; LATENT_DIM] {
 
 impl From<&EgoMotion> for Motion {
     fn from(message: &EgoMotion) -> Self {
-        let EgoMotion { speed_mps, to_conflict_m, through_conflict_m, .. } = *message;
-        Self { speed_mps, to_conflict_m, through_conflict_m }
+        let EgoMotion { speed_mps, to_conflict_m, through_conflict_m, along_conflict_m, .. } = *message;
+        Self { speed_mps, to_conflict_m, through_conflict_m, along_conflict_m }
     }
 }
 

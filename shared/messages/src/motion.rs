@@ -47,14 +47,22 @@ described!(EgoPose { header, world_from_vehicle });
 /// ```
 /// use carff_messages::{EgoMotion, Header, Message};
 /// let header = Header::of_frame(0, 1, 0);
-/// let motion = EgoMotion { header, speed_mps: 4.0, to_conflict_m: 12.0, through_conflict_m: 18.5, heading_rad: 1.57 };
+/// let motion = EgoMotion {
+///     header,
+///     speed_mps: 4.0,
+///     to_conflict_m: 12.0,
+///     through_conflict_m: 18.5,
+///     heading_rad: 1.57,
+///     crossing_m: [1.8, -4.5],
+///     along_conflict_m: 0.0,
+/// };
 /// assert_eq!(motion.validate(), Ok(()));
 /// assert!(EgoMotion { speed_mps: -1.0, ..motion }.validate().is_err());
 /// ```
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Default, PartialEq, ZeroCopySend, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
-#[type_name("carff.EgoMotion.v2")]
+#[type_name("carff.EgoMotion.v3")]
 pub struct EgoMotion {
     /// Header; its capture time is the time of the motion.
     pub header: Header,
@@ -66,6 +74,11 @@ pub struct EgoMotion {
     pub through_conflict_m: f64,
     /// Heading about +Z, world space, radians.
     pub heading_rad: f64,
+    /// Centre of the vehicle, x and y, world space, metres, where it is first in the way of others.
+    pub crossing_m: [f64; 2],
+    /// Way along the others' lane, in their direction, that the vehicle's rear has then made when it has left the place,
+    /// metres, 0..=1000: 0 for a vehicle that crosses the lane, and above it for one that merges.
+    pub along_conflict_m: f64,
 }
 
 impl EgoMotion {
@@ -73,6 +86,8 @@ impl EgoMotion {
         self.header.validate()?;
         let numbers = [self.speed_mps, self.to_conflict_m, self.through_conflict_m, self.heading_rad];
         check::finite_f64("speed_mps, to_conflict_m, through_conflict_m, heading_rad", &numbers)?;
+        check::within("crossing_m", &self.crossing_m.map(|at_m| at_m as f32), -1e6, 1e6)?;
+        check::within("along_conflict_m", &[self.along_conflict_m as f32], 0.0, 1000.0)?;
         check::within("speed_mps", &[self.speed_mps as f32], 0.0, 100.0)?;
         let ways_m = [self.to_conflict_m, self.through_conflict_m].map(|way_m| way_m as f32);
         check::within("to_conflict_m and through_conflict_m", &ways_m, -1000.0, 1000.0)?;
@@ -82,7 +97,15 @@ impl EgoMotion {
 }
 
 message!(EgoMotion);
-described!(EgoMotion { header, speed_mps, to_conflict_m, through_conflict_m, heading_rad });
+described!(EgoMotion {
+    header,
+    speed_mps,
+    to_conflict_m,
+    through_conflict_m,
+    heading_rad,
+    crossing_m,
+    along_conflict_m
+});
 
 /// The clear part of the others' lane in one frame, the next vehicle on it, and the value of a look from further on.
 ///

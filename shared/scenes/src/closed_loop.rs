@@ -114,6 +114,23 @@ impl ClosedLoop {
         self.conflict_m
     }
 
+    /// Returns the ego's centre where it is first in the way of the others, x and y in metres.
+    pub fn crossing_m(&self) -> [f64; 2] {
+        let [x, y, _] = self.path.at(self.conflict_m[0]);
+        [x, y]
+    }
+
+    /// Returns the way along the others' lane, in their direction, that the ego's rear has made from its centre's place at
+    /// the start of the conflict to the conflict's end, metres; 0 where it crosses the lane.
+    pub fn along_conflict_m(&self) -> f64 {
+        let ([x, y], [end_x, end_y, heading]) = (self.crossing_m(), self.path.at(self.conflict_m[1]));
+        let course = self.lane.heading_near([end_x, end_y]);
+        let [length_m, width_m, _] = self.scenario.config().vehicle[self.ego].size_m;
+        let turn = heading - course;
+        let rear_m = 0.5 * (length_m * turn.cos().abs() + width_m * turn.sin().abs());
+        ((end_x - x) * course.cos() + (end_y - y) * course.sin() - rear_m).max(0.0)
+    }
+
     /// Returns the boxes that the other vehicles cover along their lane.
     pub fn lane_boxes(&self) -> &[OrientedBox] {
         &self.strips

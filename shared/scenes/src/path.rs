@@ -52,6 +52,17 @@ impl Path {
         [0.0; 3]
     }
 
+    /// Returns the heading of the segment that is nearest to a point, radians.
+    pub fn heading_near(&self, [x, y]: [f64; 2]) -> f64 {
+        let distance_m = |[from, to]: [[f64; 2]; 2]| {
+            let [along_x, along_y] = direction(from, to);
+            let along_m = ((x - from[0]) * along_x + (y - from[1]) * along_y).clamp(0.0, length_m(from, to));
+            length_m([x, y], [from[0] + along_m * along_x, from[1] + along_m * along_y])
+        };
+        let nearest = self.segments().min_by(|a, b| distance_m(*a).total_cmp(&distance_m(*b)));
+        nearest.map_or(0.0, |[from, to]| (to[1] - from[1]).atan2(to[0] - from[0]))
+    }
+
     /// Returns the boxes that something of a width covers along the way.
     pub fn strips(&self, width_m: f64) -> Vec<OrientedBox> {
         let strip = |[from, to]: [[f64; 2]; 2]| {
@@ -93,6 +104,7 @@ mod tests {
         assert_eq!(path.at(5.0), [3.0, 2.0, std::f64::consts::FRAC_PI_2]);
         assert_eq!(path.at(-1.0), [-1.0, 0.0, 0.0]);
         assert_eq!(path.at(8.0), [3.0, 5.0, std::f64::consts::FRAC_PI_2]);
+        assert_eq!((path.heading_near([1.0, 1.0]), path.heading_near([4.0, 3.0])), (0.0, std::f64::consts::FRAC_PI_2));
         let longer = path.extended(2.0);
         assert_eq!((longer.length_m(), longer.at(0.0)[0]), (11.0, -2.0));
     }

@@ -54,6 +54,21 @@ fn the_conflict_is_where_the_ways_meet() {
     assert!((gap_m(enter_m) - space_m).abs() < 0.06, "{}", gap_m(enter_m));
 }
 
+/// A vehicle that merges is in the way of others up to the end of its way, and makes way along their lane; one that crosses
+/// the lane makes none. Nobody who comes on the merge's lane is slower than the ego, or ahead of it at a standstill.
+#[test]
+fn a_merge_ends_on_the_lane() {
+    assert_eq!((drives().along_conflict_m(), drives().crossing_m()[0]), (0.0, 1.8));
+    let merge = file().with_file_name("slip-road-merge.toml");
+    let merge = ClosedLoop::new(Scenario::load(&merge).unwrap()).unwrap();
+    let ([enter_m, leave_m], [x, y]) = (merge.conflict_m(), merge.crossing_m());
+    assert!((merge.length_m() - leave_m).abs() < 0.06 && x > 0.0 && y < -4.0, "{leave_m} {x} {y}");
+    // The ego ends at x = 12.5, and is 4 m long.
+    assert!((merge.along_conflict_m() - (12.5 - 2.0 - x)).abs() < 0.06, "{}", merge.along_conflict_m());
+    assert!(merge.along_conflict_m() < leave_m - enter_m);
+    assert!(merge.config().actor_speed_mps[0] >= merge.config().speed_mps);
+}
+
 /// The ego's camera sees the others where they are: an image differs from that of an empty road while one is in sight.
 #[test]
 fn images_show_the_others() {

@@ -18,7 +18,8 @@ use carff_dataset::{Observability, PoseRole, drives::eligible_inputs};
 use carff_decision::{Policy, Sampling};
 use carff_evaluation::{
     BirdsEye, CheckpointFigures, FieldRenderer, Models, Perception, Planner, PlanningFigures, PosedImages,
-    ProbingFigures, SampleFigures, SampleInput, SampleTrials, TrainedAndUnseen, ViewFigures, birds_eye, to_unit,
+    ProbingFigures, Progress, SampleFigures, SampleInput, SampleTrials, TrainedAndUnseen, ViewFigures, birds_eye,
+    to_unit,
 };
 use carff_field::{Field, to_bytes};
 use carff_messages::{Gaussian, LATENT_DIM};
@@ -74,8 +75,16 @@ impl Training<'_> {
         tch::set_num_threads(config.threads);
         tch::manual_seed(config.seed as i64);
         let mut posed = PosedImages::open(self.dataset, config.split_seed)?;
-        for dir in self.free_poses {
+        let total = self.free_poses.len();
+        let compared = |done: usize, line: String| {
+            (run.on_progress)(&Progress { phase: "images", done, total, line });
+        };
+        for (done, dir) in self.free_poses.iter().enumerate() {
+            compared(done, format!("comparing {}", dir.display()));
             posed.add_free_poses(dir)?;
+        }
+        if total > 0 {
+            compared(total, "images compared".to_owned());
         }
         let context = Context { config, posed: &posed, run };
         let (manifest, figures) = if posed.scenario.state_count() == 1 {
