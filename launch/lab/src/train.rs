@@ -125,7 +125,7 @@ fn rendered_free_poses(config: &TrainingConfig, given: Option<&Path>) -> anyhow:
     let drawn = || Ok(scenario(config)?.with_free_cameras(count, seed)?);
     let mut all = vec![rendered(config, &format!("free-{count}-{seed}"), drawn)?];
     if on_path > 0 {
-        let drawn = || Ok(ClosedLoop::new(scenario(config)?)?.with_training_cameras(on_path, seed)?);
+        let drawn = || Ok(ClosedLoop::new(scenario(config)?, None)?.with_training_cameras(on_path, seed)?);
         all.push(rendered(config, &format!("path-{on_path}-{seed}"), drawn)?);
     }
     if per_appearance == 0 {

@@ -109,7 +109,7 @@ mod tests {
     #[test]
     fn time_passes_at_any_frame_rate() {
         let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/scenarios/approaching-intersection.toml");
-        let drives = ClosedLoop::new(Scenario::load(&file).unwrap()).unwrap();
+        let drives = ClosedLoop::new(Scenario::load(&file).unwrap(), None).unwrap();
         let speed_mps = drives.config().speed_mps;
         for frame_rate_hz in [1.0, 7.0, 10.0, 30.0, 60.0, 100.0] {
             let mut drive = Drive::begin(&drives, 0, drives.episode(0, 1, Some(0)));
@@ -125,7 +125,7 @@ mod tests {
     #[test]
     fn the_oracle_does_not_collide() {
         let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/scenarios/approaching-intersection.toml");
-        let drives = ClosedLoop::new(Scenario::load(&file).unwrap()).unwrap();
+        let drives = ClosedLoop::new(Scenario::load(&file).unwrap(), None).unwrap();
         for number in 0..40 {
             let mut drive = Drive::begin(&drives, number, drives.episode(number, 9, None));
             let result = loop {

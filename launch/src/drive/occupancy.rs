@@ -191,7 +191,7 @@ mod tests {
     #[test]
     fn grids_are_compared_with_the_truth() {
         let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/scenarios/approaching-intersection.toml");
-        let drives = ClosedLoop::new(Scenario::load(&file).unwrap()).unwrap();
+        let drives = ClosedLoop::new(Scenario::load(&file).unwrap(), None).unwrap();
         let (episode, step_s) = (drives.episode(1, 5, Some(2)), 0.6);
         let grid_at = |time_s: f64| {
             let mut grid = Occupancy::empty(Header::of_frame(7, 1, 1).at_step(2));

@@ -28,7 +28,7 @@ const MAX_TRIES: u32 = 400;
 /// Step of the search for the place where the ways meet, metres.
 const SEARCH_M: f64 = 0.05;
 
-/// The ways of a scenario's closed-loop drives.
+/// A way of a scenario's closed-loop drives.
 #[derive(Debug)]
 pub struct ClosedLoop {
     scenario: Scenario,
@@ -60,15 +60,18 @@ struct Actor {
 }
 
 impl ClosedLoop {
-    /// Prepares the drives of a scenario.
+    /// Prepares the drives on a way of a scenario: the one named `way`, or the first one.
     ///
     /// # Errors
     ///
-    /// The scenario has no `closed_loop`, no ego with a roof camera, no dynamic vehicle with a course, or ways that never
-    /// meet.
-    pub fn new(scenario: Scenario) -> Result<Self, ScenarioError> {
+    /// The scenario has no `closed_loop`, or none of this name, no ego with a roof camera, no dynamic vehicle with a
+    /// course, or ways that never meet.
+    pub fn new(scenario: Scenario, way: Option<&str>) -> Result<Self, ScenarioError> {
         let error = |problem: &'static str| ScenarioError::NoClosedLoop { path: scenario.path().to_owned(), problem };
-        let config = scenario.config().closed_loop.clone().ok_or_else(|| error("it has no table `closed_loop`"))?;
+        let ways = &scenario.config().closed_loop;
+        let first = ways.first().ok_or_else(|| error("it has no table `closed_loop`"))?;
+        let named = |name: &str| ways.iter().find(|way| way.name == name).ok_or_else(|| no_such_way(&scenario, name));
+        let config = way.map_or(Ok(first), named)?.clone();
         let vehicles = &scenario.config().vehicle;
         let ego =
             vehicles.iter().position(|v| v.role == "ego").ok_or_else(|| error("no vehicle has the role `ego`"))?;
@@ -257,6 +260,11 @@ impl Episode {
     pub fn actor_count(&self) -> usize {
         self.actors.len()
     }
+}
+
+fn no_such_way(scenario: &Scenario, name: &str) -> ScenarioError {
+    let known = scenario.config().closed_loop.iter().map(|way| way.name.clone()).collect();
+    ScenarioError::NoSuchName { path: scenario.path().to_owned(), key: "closed_loop", name: name.to_owned(), known }
 }
 
 fn upright([x, y, yaw]: [f64; 3]) -> Pose {

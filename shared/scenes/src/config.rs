@@ -106,8 +106,9 @@ pub struct ScenarioConfig {
     /// added.
     #[serde(default)]
     pub bystander: Vec<BystanderConfig>,
-    /// Drives in which the ego moves by its controller's actions (`carff drive`).
-    pub closed_loop: Option<ClosedLoopConfig>,
+    /// Drives in which the ego moves by its controller's actions (`carff drive`), one table for each way.
+    #[serde(default)]
+    pub closed_loop: Vec<ClosedLoopConfig>,
     /// Minimum distance of cameras from static things, 0.001 to 100.
     #[serde(default = "default_clearance", deserialize_with = "clearance")]
     #[schemars(range(min = 0.001, max = 100.0))]

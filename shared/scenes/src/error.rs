@@ -91,12 +91,12 @@ pub enum ScenarioError {
         /// Number of drawn poses.
         tries: u32,
     },
-    /// The scenario has no appearance or bystander of this name.
+    /// The scenario has no appearance, bystander or closed-loop way of this name.
     #[error("{}: no `{key}` named `{name}`{}", path.display(), listed(known, name))]
-    NoSuchVariation {
+    NoSuchName {
         /// Path of the scenario file.
         path: PathBuf,
-        /// Key of its table: `appearance` or `bystander`.
+        /// Key of its table: `appearance`, `bystander` or `closed_loop`.
         key: &'static str,
         /// Requested name.
         name: String,

@@ -54,6 +54,6 @@ impl Scenario {
 
     fn no_such<'a>(&self, key: &'static str, name: &str, known: impl Iterator<Item = &'a String>) -> ScenarioError {
         let (path, name) = (self.path().to_owned(), name.to_owned());
-        ScenarioError::NoSuchVariation { path, key, name, known: known.cloned().collect() }
+        ScenarioError::NoSuchName { path, key, name, known: known.cloned().collect() }
     }
 }

@@ -11,7 +11,11 @@ fn file() -> PathBuf {
 }
 
 fn drives() -> ClosedLoop {
-    ClosedLoop::new(Scenario::load(&file()).unwrap()).unwrap()
+    on_way("cross")
+}
+
+fn on_way(name: &str) -> ClosedLoop {
+    ClosedLoop::new(Scenario::load(&file()).unwrap(), Some(name)).unwrap()
 }
 
 /// An episode only depends on its number and the seed; starts and speeds are continuous and within their ranges, and no
@@ -55,16 +59,15 @@ fn the_conflict_is_where_the_ways_meet() {
 }
 
 /// A vehicle that merges is in the way of others up to the end of its way, and makes way along their lane; one that crosses
-/// the lane makes none. Nobody who comes on the merge's lane is slower than the ego, or ahead of it at a standstill.
+/// the lane makes none. Nobody who comes on the merge's lane is slower than the ego.
 #[test]
 fn a_merge_ends_on_the_lane() {
     assert_eq!((drives().along_conflict_m(), drives().crossing_m()[0]), (0.0, 1.8));
-    let merge = file().with_file_name("slip-road-merge.toml");
-    let merge = ClosedLoop::new(Scenario::load(&merge).unwrap()).unwrap();
+    let merge = on_way("merge");
     let ([enter_m, leave_m], [x, y]) = (merge.conflict_m(), merge.crossing_m());
-    assert!((merge.length_m() - leave_m).abs() < 0.06 && x > 0.0 && y < -4.0, "{leave_m} {x} {y}");
-    // The ego ends at x = 12.5, and is 4 m long.
-    assert!((merge.along_conflict_m() - (12.5 - 2.0 - x)).abs() < 0.06, "{}", merge.along_conflict_m());
+    assert!((merge.length_m() - leave_m).abs() < 0.06 && x == 1.8 && y < -6.0, "{leave_m} {x} {y}");
+    // The ego ends at x = 11, and is 4.1 m long.
+    assert!((merge.along_conflict_m() - (11.0 - 4.1 / 2.0 - x)).abs() < 0.06, "{}", merge.along_conflict_m());
     assert!(merge.along_conflict_m() < leave_m - enter_m);
     assert!(merge.config().actor_speed_mps[0] >= merge.config().speed_mps);
 }
@@ -123,7 +126,7 @@ fn what_cannot_be_driven_is_refused() {
     let refused = |from: &str, to: &str| {
         assert!(text.contains(from), "{from}");
         let scenario = Scenario::parse(&file(), &text.replace(from, to));
-        scenario.and_then(ClosedLoop::new).unwrap_err().to_string()
+        scenario.and_then(|scenario| ClosedLoop::new(scenario, None)).unwrap_err().to_string()
     };
     assert!(refused("[closed_loop]", "[closed_lop]").contains("closed_lop"));
     assert!(
@@ -133,7 +136,10 @@ fn what_cannot_be_driven_is_refused() {
     assert!(refused("actors = [0, 2]", "actors = [2, 0]").contains("lowest"));
     assert!(refused("actors = [0, 2]", "actors = [0, 9]").contains("0 to 3"));
     assert!(refused("speed_mps = 5.0", "speed_mps = 0.0").contains("0.1"));
+    assert!(refused("name = \"merge\"", "name = \"cross\"").contains("`cross` is named twice"));
+    let unknown = ClosedLoop::new(Scenario::load(&file()).unwrap(), Some("crosss")).unwrap_err().to_string();
+    assert!(unknown.contains("did you mean") && unknown.contains("cross"), "{unknown}");
     let toy = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs/scenarios/toy.toml");
-    let toy = ClosedLoop::new(Scenario::load(&toy).unwrap()).unwrap_err().to_string();
+    let toy = ClosedLoop::new(Scenario::load(&toy).unwrap(), None).unwrap_err().to_string();
     assert!(toy.contains("closed_loop"), "{toy}");
 }

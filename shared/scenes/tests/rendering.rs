@@ -419,7 +419,6 @@ fn every_shipped_scenario_is_whole() {
         "hand-reaching",
         "open-branch-intersection",
         "single-approaching-intersection",
-        "slip-road-merge",
         "toy",
         "two-lane-merge",
     ];
@@ -448,14 +447,9 @@ fn branches_open_after_the_look() {
 /// Each scenario has views of the first time step that show the actor fully, and views that hide it completely.
 #[test]
 fn every_shipped_scenario_has_seeing_and_blind_views() {
-    for name in [
-        "approaching-intersection",
-        "hand-reaching",
-        "single-approaching-intersection",
-        "slip-road-merge",
-        "toy",
-        "two-lane-merge",
-    ] {
+    for name in
+        ["approaching-intersection", "hand-reaching", "single-approaching-intersection", "toy", "two-lane-merge"]
+    {
         let scenario = shipped(name);
         let mut seen = Vec::new();
         for camera in scenario.cameras().iter().step_by(4) {

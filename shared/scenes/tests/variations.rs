@@ -9,8 +9,7 @@ use carff_scenes::config::{BystanderPlace, VariationRole};
 use carff_scenes::{Detail, Scenario, VISIBLE_DIFFERENCE};
 
 /// Scenarios on roads.
-const ROADS: [&str; 4] =
-    ["approaching-intersection", "two-lane-merge", "single-approaching-intersection", "slip-road-merge"];
+const ROADS: [&str; 3] = ["approaching-intersection", "two-lane-merge", "single-approaching-intersection"];
 
 fn file(name: &str) -> String {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs/scenarios");

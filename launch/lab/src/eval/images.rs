@@ -67,7 +67,7 @@ pub fn lane_drives(
     seed: u64,
     display: &Display,
 ) -> anyhow::Result<Vec<Vec<LaneImage>>> {
-    let world = match ClosedLoop::new(Scenario::load(scenario.path())?) {
+    let world = match ClosedLoop::new(Scenario::load(scenario.path())?, None) {
         Err(ScenarioError::NoClosedLoop { .. }) => return Ok(Vec::new()),
         world => world?,
     };

@@ -5,13 +5,15 @@ use schemars::JsonSchema;
 use serde::de::Error as _;
 use serde::{Deserialize, Deserializer};
 
-/// A drive in which the ego moves by its controller's actions.
+/// A way on which the ego moves by its controller's actions.
 ///
 /// Other vehicles look like the dynamic vehicle and follow the line of its course in the first hazard branch, extended
 /// in both directions, each at a constant speed. Starts and speeds are drawn from continuous ranges.
 #[derive(Clone, Debug, PartialEq, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ClosedLoopConfig {
+    /// Name of the way, for `carff drive --way`.
+    pub name: String,
     /// The way of the ego's centre: x and y of 2 to 64 points. A drive ends at the last one.
     #[serde(deserialize_with = "way")]
     #[schemars(length(min = 2, max = 64))]
