@@ -50,14 +50,18 @@ impl From<&EgoMotion> for Motion {
 
 impl From<&LookGain> for Look {
     fn from(message: &LookGain) -> Self {
-        Self { gain_bits: message.gain_bits.into(), clear_m: message.clear_m.into() }
+        Self { gain_bits: message.gain_bits.into(), clear_m: message.clear_m.into(), end_mps: message.end_mps.into() }
     }
 }
 
 /// The look that an action rests on.
 impl From<&Action> for Look {
     fn from(message: &Action) -> Self {
-        Self { gain_bits: message.look_gain_bits.into(), clear_m: message.clear_m.into() }
+        Self {
+            gain_bits: message.look_gain_bits.into(),
+            clear_m: message.clear_m.into(),
+            end_mps: message.end_mps.into(),
+        }
     }
 }
 

@@ -229,7 +229,8 @@ described!(Action {
     latency_ns,
     target_speed_mps,
     look_gain_bits,
-    clear_m
+    clear_m,
+    end_mps
 });
 described!(Health {
     header,
