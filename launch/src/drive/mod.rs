@@ -243,8 +243,6 @@ fn graph_text(args: &DriveArgs, scenario: &Path, drives: &ClosedLoop) -> anyhow:
             "approach": approach,
             "advance_mps": drives.config().speed_mps,
             "others_mps": drives.config().actor_speed_mps[1],
-            // The scenario's vehicles keep their speeds.
-            "others_mps2": 0.0,
         },
         "launcher": { "keep_frames": 10_000_000 },
     }))?;

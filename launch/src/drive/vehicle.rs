@@ -70,7 +70,7 @@ mod tests {
     /// Wherever a controller has the vehicle stop ahead of the place where others drive, it stops ahead of it.
     #[test]
     fn a_stop_ahead_of_the_place_is_possible() {
-        let speeds = Speeds { advance_mps: 8.0, creep_mps: 1.5, others_mps: 0.0, others_mps2: 0.0 };
+        let speeds = Speeds { advance_mps: 8.0, creep_mps: 1.5, others_mps: 0.0 };
         for (tenths_mps, tenths_m) in (1..80).flat_map(|v| (1..100).map(move |d| (v, d))) {
             let (speed_mps, to_conflict_m) = (f64::from(tenths_mps) / 10.0, f64::from(tenths_m) / 10.0);
             let through_conflict_m = to_conflict_m + 6.0;
@@ -91,7 +91,7 @@ mod tests {
     #[test]
     fn a_crossing_is_over_in_time() {
         for (others_mps, length_m, along_conflict_m) in [(6.0, 7.0, 0.0), (6.0, 10.0, 7.0), (3.0, 10.0, 7.0)] {
-            let speeds = Speeds { advance_mps: 5.0, creep_mps: 1.5, others_mps, others_mps2: 0.0 };
+            let speeds = Speeds { advance_mps: 5.0, creep_mps: 1.5, others_mps };
             let mut crossings = 0;
             for (tenths_mps, tenths_m) in (0..=50).step_by(2).flat_map(|v| (10..200).step_by(3).map(move |d| (v, d))) {
                 let (speed_mps, to_conflict_m) = (f64::from(tenths_mps) / 10.0, f64::from(tenths_m) / 10.0);

@@ -216,7 +216,7 @@ mod tests {
     use carff_messages::{ActionCode, Header, ProbeResult, Rule};
 
     const MS: u64 = 1_000_000;
-    const SPEEDS: Speeds = Speeds { advance_mps: 5.0, creep_mps: 1.5, others_mps: 5.0, others_mps2: 0.0 };
+    const SPEEDS: Speeds = Speeds { advance_mps: 5.0, creep_mps: 1.5, others_mps: 5.0 };
 
     fn judge() -> Judge {
         judge_of(Policy::new(Rule::Calibrated, 0.3), Approach::Stop)

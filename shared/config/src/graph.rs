@@ -222,9 +222,6 @@ pub struct ControllerConfig {
     /// shows it clear so far that nobody arrives in time, even if the belief has the hazard. Default 0: never.
     #[schemars(range(min = 0.0, max = 60.0))]
     pub others_mps: f64,
-    /// Highest acceleration of a vehicle on their lane whose speed is seen, m/s², 0 to 10. Default 2.
-    #[schemars(range(min = 0.0, max = 10.0))]
-    pub others_mps2: f64,
 }
 
 impl Default for ControllerConfig {
@@ -238,7 +235,6 @@ impl Default for ControllerConfig {
             advance_mps: 5.0,
             creep_mps: 1.5,
             others_mps: 0.0,
-            others_mps2: 2.0,
         }
     }
 }
@@ -246,8 +242,7 @@ impl Default for ControllerConfig {
 impl ControllerConfig {
     /// Returns the speeds of the vehicle.
     pub fn speeds(&self) -> Speeds {
-        let Self { advance_mps, creep_mps, others_mps, others_mps2, .. } = *self;
-        Speeds { advance_mps, creep_mps, others_mps, others_mps2 }
+        Speeds { advance_mps: self.advance_mps, creep_mps: self.creep_mps, others_mps: self.others_mps }
     }
 }
 

@@ -69,7 +69,7 @@ pub struct Look {
     pub end_mps: f64,
 }
 
-/// Speeds of the vehicle and of others, m/s.
+/// Speeds of a vehicle, m/s.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Speeds {
     /// Speed of [`ActionCode::Advance`].
@@ -78,8 +78,6 @@ pub struct Speeds {
     pub creep_mps: f64,
     /// Highest speed of others; 0 if it is not known.
     pub others_mps: f64,
-    /// Highest acceleration of one whose speed is seen, m/s².
-    pub others_mps2: f64,
 }
 
 /// An action with its target speed, m/s.
@@ -92,7 +90,7 @@ impl Approach {
     /// ```
     /// use carff_decision::{Approach, Look, Motion, Speeds};
     /// use carff_messages::ActionCode;
-    /// let speeds = Speeds { advance_mps: 5.0, creep_mps: 1.5, others_mps: 5.0, others_mps2: 0.0 };
+    /// let speeds = Speeds { advance_mps: 5.0, creep_mps: 1.5, others_mps: 5.0 };
     /// let far = Some(Motion { speed_mps: 5.0, to_conflict_m: 10.0, through_conflict_m: 16.0, along_conflict_m: 0.0 });
     /// let look = Look { gain_bits: 0.8, clear_m: 9.0, end_mps: 0.0 };
     /// assert_eq!(Approach::Stop.drive(true, look, far, speeds), (ActionCode::Halt, 0.0));
@@ -133,12 +131,12 @@ impl Motion {
 
     /// Reports whether the vehicle has left the others' lane before anybody arrives who is not on its clear part.
     fn crosses_first(self, look: Look, speeds: Speeds) -> bool {
-        let end_mps = if look.end_mps > 0.0 { look.end_mps } else { speeds.others_mps };
+        let end_mps = if look.end_mps > 0.0 { look.end_mps.min(speeds.others_mps) } else { speeds.others_mps };
         // The gap to those behind a vehicle that merges is smallest at the end if none of them is slower than it.
-        let least_mps = if self.along_conflict_m > 0.0 { speeds.advance_mps } else { 0.0 };
+        let is_merging = self.along_conflict_m > 0.0;
+        let others_mps = if is_merging { end_mps.max(speeds.advance_mps) } else { end_mps };
         let way_m = look.clear_m + self.along_conflict_m - CROSSING_MARGIN_M;
-        let most_mps = speeds.others_mps.max(least_mps);
-        let arrival_s = arrival_s(way_m, end_mps.max(least_mps), most_mps, speeds.others_mps2);
+        let arrival_s = way_m / others_mps.max(f64::MIN_POSITIVE);
         speeds.others_mps > 0.0 && arrival_s >= self.crossing_s(speeds.advance_mps) + CROSSING_MARGIN_S
     }
 
@@ -158,19 +156,6 @@ impl Motion {
     }
 }
 
-/// Time in which a vehicle makes a way, seconds: it accelerates up to its highest speed. Negative for a negative way.
-fn arrival_s(way_m: f64, from_mps: f64, most_mps: f64, acceleration_mps2: f64) -> f64 {
-    let from_mps = from_mps.min(most_mps).max(f64::MIN_POSITIVE);
-    let accelerating_m = (most_mps.powi(2) - from_mps.powi(2)) / (2.0 * acceleration_mps2.max(f64::MIN_POSITIVE));
-    if acceleration_mps2 <= 0.0 || way_m <= 0.0 {
-        way_m / from_mps
-    } else if way_m <= accelerating_m {
-        ((from_mps.powi(2) + 2.0 * acceleration_mps2 * way_m).sqrt() - from_mps) / acceleration_mps2
-    } else {
-        (most_mps - from_mps) / acceleration_mps2 + (way_m - accelerating_m) / most_mps
-    }
-}
-
 /// Returns the highest speed from which a vehicle stops within a distance, m/s, with planned braking after its reaction
 /// time; 0 for a negative distance.
 ///
@@ -187,7 +172,7 @@ pub fn stopping_mps(distance_m: f64) -> f64 {
 mod tests {
     use super::*;
 
-    const SPEEDS: Speeds = Speeds { advance_mps: 5.0, creep_mps: 1.5, others_mps: 5.0, others_mps2: 0.0 };
+    const SPEEDS: Speeds = Speeds { advance_mps: 5.0, creep_mps: 1.5, others_mps: 5.0 };
 
     fn at(to_conflict_m: f64, speed_mps: f64) -> Motion {
         Motion { speed_mps, to_conflict_m, through_conflict_m: to_conflict_m + 6.0, along_conflict_m: 0.0 }
@@ -195,19 +180,6 @@ mod tests {
 
     fn gain(gain_bits: f64) -> Look {
         Look { gain_bits, ..Look::default() }
-    }
-
-    /// A vehicle that accelerates up to its highest speed arrives earlier than one that keeps its speed, and later than one
-    /// that is as fast from the start.
-    #[test]
-    fn others_arrive_by_their_acceleration() {
-        assert_eq!((arrival_s(12.0, 3.0, 5.0, 0.0), arrival_s(12.0, 5.0, 5.0, 2.0)), (4.0, 2.4));
-        // 1 s from 3 to 5 m/s on 4 m, then 8 m at 5 m/s.
-        assert!((arrival_s(12.0, 3.0, 5.0, 2.0) - 2.6).abs() < 1e-9);
-        // 3 t + t^2 = 1.75.
-        assert!((arrival_s(1.75, 3.0, 5.0, 2.0) - 0.5).abs() < 1e-9);
-        assert!((arrival_s(12.0, 7.0, 5.0, 2.0) - 2.4).abs() < 1e-9 && arrival_s(-1.0, 3.0, 5.0, 2.0) < 0.0);
-        assert!(arrival_s(12.0, 0.0, 5.0, 0.0) > 1e9 && arrival_s(12.0, 0.0, 5.0, 2.0) < 4.0);
     }
 
     /// No approach lets a vehicle be faster than it can stop before the place, wherever it is; at the place it halts.
