@@ -98,7 +98,7 @@ mod tests {
                 let through_conflict_m = to_conflict_m + length_m;
                 let motion = Motion { speed_mps, to_conflict_m, through_conflict_m, along_conflict_m };
                 let crosses = |clear_m: &f64| {
-                    let look = Look { clear_m: *clear_m, ..Look::default() };
+                    let look = Look { gain_bits: 0.0, clear_m: *clear_m };
                     Approach::Look.drive(true, look, Some(motion), speeds).0 == ActionCode::Advance
                 };
                 // A vehicle that can no longer stop crosses in any case.

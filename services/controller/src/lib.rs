@@ -242,7 +242,6 @@ impl Controller {
             target_speed_mps: target_mps as f32,
             look_gain_bits: look.gain_bits as f32,
             clear_m: look.clear_m as f32,
-            end_mps: look.end_mps as f32,
         }
     }
 

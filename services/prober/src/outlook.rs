@@ -16,8 +16,6 @@ const AHEAD_M: [f64; 4] = [1.5, 3.0, 4.5, 6.0];
 
 /// Longest way that counts as clear, metres: no lane of a field is longer.
 const MOST_CLEAR_M: f64 = 500.0;
-/// Longest way between the front of a vehicle and the end of a clear way that it ends, metres: nobody fits in between.
-const AT_END_M: f64 = 1.5;
 /// Highest speed in a message, m/s.
 const MOST_MPS: f64 = 100.0;
 
@@ -30,9 +28,7 @@ pub struct Outlook {
     input: Receiver<EgoMotion>,
     output: Publisher<LookGain>,
     motion: Option<EgoMotion>,
-    /// The vehicle next to the crossing, and the one that ends the clear way.
     track: Track,
-    end: Track,
 }
 
 impl Outlook {
@@ -52,7 +48,6 @@ impl Outlook {
             output,
             motion: None,
             track: Track::default(),
-            end: Track::default(),
         }))
     }
 
@@ -89,9 +84,7 @@ impl Outlook {
         let clear_m = clear_m(probe, frames, belief, &motion).min(MOST_CLEAR_M);
         let (vehicles, heading_rad) = vehicles(probe, frames, belief, &motion);
         let Header { frame_id, capture_time_ns, .. } = belief.header;
-        let time_s = graph.frame_time_s(frame_id, capture_time_ns);
-        let speed_mps = self.track.see(time_s, vehicles.first());
-        self.end.see(time_s, at_end(&vehicles, clear_m, probe));
+        let speed_mps = self.track.see(graph.frame_time_s(frame_id, capture_time_ns), vehicles.first());
         let mut gain = LookGain {
             header: belief.header,
             gain_bits: gain_bits as f32,
@@ -100,7 +93,6 @@ impl Outlook {
             vehicles: vehicles.len() as u32,
             vehicle_mps: speed_mps.unwrap_or(0.0).clamp(-MOST_MPS, MOST_MPS) as f32,
             has_vehicle_mps: speed_mps.is_some().into(),
-            end_mps: self.end.highest_mps().unwrap_or(0.0).min(MOST_MPS) as f32,
             ..LookGain::default()
         };
         if let Some(vehicle) = vehicles.first() {
@@ -129,12 +121,6 @@ fn vehicles(probe: &FieldProbe, frames: &Frames, belief: &Belief, motion: &EgoMo
         return (Vec::new(), 0.0);
     };
     (sighting.vehicles(&crossing(place, motion)), place.oriented_box.yaw)
-}
-
-/// The vehicle that ends a clear way: its front is there.
-fn at_end<'a>(vehicles: &'a [LaneVehicle], clear_m: f64, probe: &FieldProbe) -> Option<&'a LaneVehicle> {
-    let half_m = probe.layout().hazard_places().next()?.oriented_box.half_size[0];
-    vehicles.iter().find(|vehicle| (vehicle.at_m - half_m - clear_m).abs() <= AT_END_M)
 }
 
 /// The lane of a place, and the point of it that is next to the place where the vehicle gets in the way of others.

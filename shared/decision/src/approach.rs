@@ -65,8 +65,6 @@ pub struct Look {
     pub gain_bits: f64,
     /// Way along the lane that the image shows clear, from the place where the vehicle crosses it, metres.
     pub clear_m: f64,
-    /// Highest speed of the vehicle that ends this way, m/s; 0 if it is not known.
-    pub end_mps: f64,
 }
 
 /// Speeds of a vehicle, m/s.
@@ -92,23 +90,20 @@ impl Approach {
     /// use carff_messages::ActionCode;
     /// let speeds = Speeds { advance_mps: 5.0, creep_mps: 1.5, others_mps: 5.0 };
     /// let far = Some(Motion { speed_mps: 5.0, to_conflict_m: 10.0, through_conflict_m: 16.0, along_conflict_m: 0.0 });
-    /// let look = Look { gain_bits: 0.8, clear_m: 9.0, end_mps: 0.0 };
+    /// let look = Look { gain_bits: 0.8, clear_m: 9.0 };
     /// assert_eq!(Approach::Stop.drive(true, look, far, speeds), (ActionCode::Halt, 0.0));
     /// assert_eq!(Approach::Phantom.drive(true, look, far, speeds), (ActionCode::Creep, 1.5));
     /// assert_eq!(Approach::Look.drive(true, look, far, speeds), (ActionCode::Creep, 5.0));
     /// // Nobody can arrive in the time in which the vehicle leaves the lane.
     /// let clear = Look { clear_m: 21.0, ..look };
     /// assert_eq!(Approach::Look.drive(true, clear, far, speeds), (ActionCode::Advance, 5.0));
-    /// // The vehicle at the end of the clear way is slow, and those behind it cannot pass it.
-    /// let slow = Look { clear_m: 15.0, end_mps: 3.0, ..look };
-    /// assert_eq!(Approach::Look.drive(true, slow, far, speeds), (ActionCode::Advance, 5.0));
     /// ```
     pub fn drive(self, halt: bool, look: Look, motion: Option<Motion>, speeds: Speeds) -> ActionAndSpeed {
         if !halt || motion.is_some_and(Motion::is_committed) {
             return (ActionCode::Advance, speeds.advance_mps);
         }
         let Some(motion) = motion else { return (ActionCode::Halt, 0.0) };
-        if self == Self::Look && motion.crosses_first(look, speeds) {
+        if self == Self::Look && motion.crosses_first(look.clear_m, speeds) {
             return (ActionCode::Advance, speeds.advance_mps);
         }
         let within = |limit_mps: f64, stop_m: f64| limit_mps.min(motion.stopping_mps(stop_m));
@@ -130,12 +125,11 @@ impl Motion {
     }
 
     /// Reports whether the vehicle has left the others' lane before anybody arrives who is not on its clear part.
-    fn crosses_first(self, look: Look, speeds: Speeds) -> bool {
-        let end_mps = if look.end_mps > 0.0 { look.end_mps.min(speeds.others_mps) } else { speeds.others_mps };
+    fn crosses_first(self, clear_m: f64, speeds: Speeds) -> bool {
         // The gap to those behind a vehicle that merges is smallest at the end if none of them is slower than it.
         let is_merging = self.along_conflict_m > 0.0;
-        let others_mps = if is_merging { end_mps.max(speeds.advance_mps) } else { end_mps };
-        let way_m = look.clear_m + self.along_conflict_m - CROSSING_MARGIN_M;
+        let others_mps = if is_merging { speeds.others_mps.max(speeds.advance_mps) } else { speeds.others_mps };
+        let way_m = clear_m + self.along_conflict_m - CROSSING_MARGIN_M;
         let arrival_s = way_m / others_mps.max(f64::MIN_POSITIVE);
         speeds.others_mps > 0.0 && arrival_s >= self.crossing_s(speeds.advance_mps) + CROSSING_MARGIN_S
     }
@@ -179,7 +173,7 @@ mod tests {
     }
 
     fn gain(gain_bits: f64) -> Look {
-        Look { gain_bits, ..Look::default() }
+        Look { gain_bits, clear_m: 0.0 }
     }
 
     /// No approach lets a vehicle be faster than it can stop before the place, wherever it is; at the place it halts.

@@ -50,18 +50,14 @@ impl From<&EgoMotion> for Motion {
 
 impl From<&LookGain> for Look {
     fn from(message: &LookGain) -> Self {
-        Self { gain_bits: message.gain_bits.into(), clear_m: message.clear_m.into(), end_mps: message.end_mps.into() }
+        Self { gain_bits: message.gain_bits.into(), clear_m: message.clear_m.into() }
     }
 }
 
 /// The look that an action rests on.
 impl From<&Action> for Look {
     fn from(message: &Action) -> Self {
-        Self {
-            gain_bits: message.look_gain_bits.into(),
-            clear_m: message.clear_m.into(),
-            end_mps: message.end_mps.into(),
-        }
+        Self { gain_bits: message.look_gain_bits.into(), clear_m: message.clear_m.into() }
     }
 }
 

@@ -27,14 +27,13 @@ const MAX_SPEED_MPS: f32 = 100.0;
 ///     target_speed_mps: 0.0,
 ///     look_gain_bits: 0.0,
 ///     clear_m: 0.0,
-///     end_mps: 0.0,
 /// };
 /// assert!(action.validate().is_ok() && action.is_decision());
 /// assert_eq!(action.code(), Ok(ActionCode::Halt));
 /// ```
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, ZeroCopySend)]
-#[type_name("carff.Action.v5")]
+#[type_name("carff.Action.v4")]
 pub struct Action {
     /// Header of the frame that it is based on.
     pub header: Header,
@@ -66,9 +65,6 @@ pub struct Action {
     pub look_gain_bits: f32,
     /// Way along the others' lane that the image shows clear, metres, 0..=1000; 0 if not computed.
     pub clear_m: f32,
-    /// Highest speed of the vehicle that ends the clear way, by its places in the last second, m/s, 0..=100; 0 if it is
-    /// not known.
-    pub end_mps: f32,
 }
 
 impl Action {
@@ -98,7 +94,6 @@ impl Action {
             target_speed_mps: 0.0,
             look_gain_bits: 0.0,
             clear_m: 0.0,
-            end_mps: 0.0,
         }
     }
 
@@ -128,7 +123,6 @@ impl Action {
         probability("unknown_probability", self.unknown_probability)?;
         probability("look_gain_bits", self.look_gain_bits)?;
         within("clear_m", [&self.clear_m], 0.0, 1000.0)?;
-        within("end_mps", [&self.end_mps], 0.0, MAX_SPEED_MPS)?;
         let limit = if self.action == ActionCode::Halt.code() { 0.0 } else { MAX_SPEED_MPS };
         within("target_speed_mps", [&self.target_speed_mps], 0.0, limit)?;
         probability("hazard_probability", self.hazard_probability)

@@ -229,8 +229,7 @@ described!(Action {
     latency_ns,
     target_speed_mps,
     look_gain_bits,
-    clear_m,
-    end_mps
+    clear_m
 });
 described!(Health {
     header,

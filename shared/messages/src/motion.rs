@@ -119,7 +119,7 @@ described!(EgoMotion {
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Default, PartialEq, ZeroCopySend, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
-#[type_name("carff.LookGain.v4")]
+#[type_name("carff.LookGain.v3")]
 pub struct LookGain {
     /// Header of the frame.
     pub header: Header,
@@ -148,10 +148,6 @@ pub struct LookGain {
     /// 1 if its speed is known, else 0.
     #[serde(default)]
     pub has_vehicle_mps: u32,
-    /// Highest speed of the vehicle that ends the clear way, by its places in the last second, m/s, 0..=100; 0 if it is
-    /// not known, or if something else ends the clear way.
-    #[serde(default)]
-    pub end_mps: f32,
 }
 
 impl LookGain {
@@ -164,7 +160,6 @@ impl LookGain {
         check::within("vehicle_within_m", &[self.vehicle_within_m], 0.0, 1000.0)?;
         check::within("vehicle_heading_rad", &[self.vehicle_heading_rad], -10.0, 10.0)?;
         check::within("vehicle_mps", &[self.vehicle_mps], -100.0, 100.0)?;
-        check::within("end_mps", &[self.end_mps], 0.0, 100.0)?;
         check::at_most("has_vehicle_mps", self.has_vehicle_mps.into(), 1)
     }
 }
@@ -180,8 +175,7 @@ described!(LookGain {
     vehicle_within_m,
     vehicle_heading_rad,
     vehicle_mps,
-    has_vehicle_mps,
-    end_mps
+    has_vehicle_mps
 });
 
 #[cfg(test)]

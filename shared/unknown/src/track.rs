@@ -12,9 +12,6 @@ const LEAST: usize = 5;
 const WIDEST_M: f64 = 3.0;
 /// Farthest way to the next image's place, metres, beyond that of the fastest vehicle, m/s.
 const JUMP_M: f64 = 1.0;
-/// Standard errors of a speed that its highest value is above it, and the least such distance, m/s.
-const STANDARD_ERRORS: f64 = 2.0;
-const LEAST_ERROR_MPS: f64 = 0.5;
 const FASTEST_MPS: f64 = 20.0;
 
 /// The places of one vehicle in the last images.
@@ -27,7 +24,6 @@ const FASTEST_MPS: f64 = 20.0;
 /// let speeds: Vec<_> = (0..8).map(|i| 0.1 * f64::from(i)).map(|t| track.see(t, Some(&at(12.0 - 4.0 * t)))).collect();
 /// assert_eq!(speeds[3], None);
 /// assert!((speeds[7].unwrap() - 4.0).abs() < 1e-9);
-/// assert!((track.highest_mps().unwrap() - 4.5).abs() < 1e-9);
 /// ```
 #[derive(Clone, Debug, Default)]
 pub struct Track {
@@ -58,19 +54,7 @@ impl Track {
         self.speed_mps()
     }
 
-    /// Returns the highest speed that the places of the last second allow, m/s, not negative: two standard errors, and at
-    /// least 0.5 m/s, above their speed. `None` without a speed.
-    pub fn highest_mps(&self) -> Option<f64> {
-        let [speed_mps, error_mps] = self.fit()?;
-        Some((speed_mps + (STANDARD_ERRORS * error_mps).max(LEAST_ERROR_MPS)).max(0.0))
-    }
-
     fn speed_mps(&self) -> Option<f64> {
-        self.fit().map(|[speed_mps, _]| speed_mps)
-    }
-
-    /// Least-squares speed and its standard error, m/s.
-    fn fit(&self) -> Option<[f64; 2]> {
         let n = self.places.len();
         if n < LEAST {
             return None;
@@ -78,11 +62,8 @@ impl Track {
         let mean = |of: &dyn Fn(&(f64, f64)) -> f64| self.places.iter().map(of).sum::<f64>() / n as f64;
         let (time_s, way_m) = (mean(&|p| p.0), mean(&|p| p.1));
         let common = mean(&|p| (p.0 - time_s) * (p.1 - way_m));
-        let spread = mean(&|p| (p.0 - time_s).powi(2));
-        let speed_mps = -common / spread;
-        let residual = mean(&|p| (p.1 - way_m + speed_mps * (p.0 - time_s)).powi(2));
-        let error_mps = (residual / spread / (n - 2) as f64).sqrt();
-        (speed_mps.is_finite() && error_mps.is_finite()).then_some([speed_mps, error_mps])
+        let speed_mps = -common / mean(&|p| (p.0 - time_s).powi(2));
+        speed_mps.is_finite().then_some(speed_mps)
     }
 }
 
@@ -111,9 +92,6 @@ mod tests {
             assert!(follow(&mut track, 0.0).is_some());
             assert_eq!(track.see(0.9 + after_s, next.as_ref()), None, "{next:?}");
         }
-        let mut wobbling = Track::default();
-        let speed = follow(&mut wobbling, 0.3).unwrap();
-        assert!((1.0..2.0).contains(&(wobbling.highest_mps().unwrap() - speed)), "{:?}", wobbling.highest_mps());
         let mut standing = Track::default();
         let speed = (0..10).map(|i| standing.see(0.1 * f64::from(i), Some(&at(8.0)))).last().flatten();
         assert!(speed.unwrap().abs() < 1e-9);

@@ -43,9 +43,6 @@ pub struct ActionForm {
     /// Way along the others' lane that the image shows clear, metres; recordings before it have 0.
     #[serde(default)]
     pub clear_m: f32,
-    /// Highest speed of the vehicle that ends the clear way, m/s; 0 if it is not known, and in recordings before it.
-    #[serde(default)]
-    pub end_mps: f32,
 }
 
 impl From<&Action> for ActionForm {
@@ -66,7 +63,6 @@ impl From<&Action> for ActionForm {
             target_speed_mps: action.target_speed_mps,
             look_gain_bits: action.look_gain_bits,
             clear_m: action.clear_m,
-            end_mps: action.end_mps,
         }
     }
 }
@@ -91,7 +87,6 @@ impl TryFrom<&ActionForm> for Action {
             target_speed_mps: form.target_speed_mps,
             look_gain_bits: form.look_gain_bits,
             clear_m: form.clear_m,
-            end_mps: form.end_mps,
         };
         action.validate()?;
         Ok(action)

@@ -155,7 +155,6 @@ fn messages_survive_their_forms() {
             target_speed_mps: 1.0 / 3.0,
             look_gain_bits: probability(&mut next),
             clear_m: probability(&mut next),
-            end_mps: probability(&mut next),
         };
         assert_eq!(there_and_back(&action), action);
 
