@@ -107,7 +107,7 @@ pub struct ScenarioConfig {
     #[serde(default)]
     pub bystander: Vec<BystanderConfig>,
     /// Drives in which the ego moves by its controller's actions (`carff drive`), one table for each way.
-    #[serde(default)]
+    #[serde(default, deserialize_with = "closed_loop::ways")]
     pub closed_loop: Vec<ClosedLoopConfig>,
     /// Minimum distance of cameras from static things, 0.001 to 100.
     #[serde(default = "default_clearance", deserialize_with = "clearance")]

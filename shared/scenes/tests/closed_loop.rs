@@ -140,6 +140,9 @@ fn what_cannot_be_driven_is_refused() {
     let unknown = ClosedLoop::new(Scenario::load(&file()).unwrap(), Some("crosss")).unwrap_err().to_string();
     assert!(unknown.contains("did you mean") && unknown.contains("cross"), "{unknown}");
     let toy = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs/scenarios/toy.toml");
+    let one_table = std::fs::read_to_string(&toy).unwrap() + "\n[closed_loop]\nspeed_mps = 5.0\n";
+    let one_table = Scenario::parse(&toy, &one_table).unwrap_err().to_string();
+    assert!(one_table.contains("`[[closed_loop]]`, each with a `name`"), "{one_table}");
     let toy = ClosedLoop::new(Scenario::load(&toy).unwrap(), None).unwrap_err().to_string();
     assert!(toy.contains("closed_loop"), "{toy}");
 }

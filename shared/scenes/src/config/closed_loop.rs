@@ -2,8 +2,9 @@
 
 use super::values::{clearance, in_range, range, vector, whole};
 use schemars::JsonSchema;
-use serde::de::Error as _;
+use serde::de::{Error as _, SeqAccess, Visitor};
 use serde::{Deserialize, Deserializer};
+use std::fmt;
 
 /// A way on which the ego moves by its controller's actions.
 ///
@@ -45,6 +46,27 @@ pub struct ClosedLoopConfig {
     #[serde(default = "default_limit", deserialize_with = "limit")]
     #[schemars(range(min = 1.0, max = 600.0))]
     pub limit_s: f64,
+}
+
+/// Reads the list of ways; its error names the form.
+pub(super) fn ways<'de, D: Deserializer<'de>>(d: D) -> Result<Vec<ClosedLoopConfig>, D::Error> {
+    struct Ways;
+    impl<'de> Visitor<'de> for Ways {
+        type Value = Vec<ClosedLoopConfig>;
+
+        fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+            f.write_str("a list of ways: `[[closed_loop]]`, each with a `name`")
+        }
+
+        fn visit_seq<A: SeqAccess<'de>>(self, mut list: A) -> Result<Self::Value, A::Error> {
+            let mut ways = Vec::new();
+            while let Some(way) = list.next_element()? {
+                ways.push(way);
+            }
+            Ok(ways)
+        }
+    }
+    d.deserialize_seq(Ways)
 }
 
 fn default_space() -> f64 {
