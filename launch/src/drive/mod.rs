@@ -41,9 +41,9 @@ pub struct DriveArgs {
     /// Checkpoint folder, trained for the scenario.
     #[arg(long)]
     pub checkpoint: PathBuf,
-    /// Name of the ego's way in the scenario's tables `closed_loop`. Default: the first one.
+    /// Name of the ego's route in the scenario's tables `closed_loop`. Default: the first one.
     #[arg(long)]
-    pub way: Option<String>,
+    pub route: Option<String>,
     /// The rule that the ego drives by.
     #[arg(long, value_enum, default_value_t = DriveRule::Look)]
     pub rule: DriveRule,
@@ -139,7 +139,7 @@ pub fn run(args: &DriveArgs) -> anyhow::Result<ExitCode> {
     args.decisions.as_deref().map_or(Ok(()), check_writable)?;
     let file = find_scenario(&args.scenario)?;
     check_distinct([file.as_path()], args.json.as_deref().into_iter().chain(args.decisions.as_deref()))?;
-    let drives = ClosedLoop::new(Scenario::load(&file)?, args.way.as_deref())?;
+    let drives = ClosedLoop::new(Scenario::load(&file)?, args.route.as_deref())?;
     let manifest = Manifest::load(&args.checkpoint)?;
     let scenario = drives.scenario();
     manifest.check_scenario(&args.checkpoint, &ScenarioIdentity::of(scenario.info(), scenario.cameras().len()))?;
@@ -156,7 +156,7 @@ pub fn run(args: &DriveArgs) -> anyhow::Result<ExitCode> {
     let terminal = Arc::new(Terminal::new());
     let results = Arc::new(Mutex::new(Vec::new()));
     let occupancy = Arc::new(Mutex::new(OccupancyCheck::new(drives.scenario().info().step_s)));
-    let (identity, way) = (drives.scenario().info().name.clone(), drives.config().name.clone());
+    let (identity, route) = (drives.scenario().info().name.clone(), drives.config().name.clone());
     let world = World {
         episodes: args.first..args.first + args.episodes,
         seed: args.seed,
@@ -193,7 +193,7 @@ pub fn run(args: &DriveArgs) -> anyhow::Result<ExitCode> {
         let report = DriveReport {
             figures,
             scenario: identity,
-            way,
+            route,
             rule: rule.map(|value| value.get_name().to_owned()),
             seed: args.seed,
             actors: args.actors,

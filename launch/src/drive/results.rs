@@ -83,8 +83,8 @@ pub(super) struct DriveReport {
     #[serde(flatten)]
     pub(super) figures: DriveFigures,
     pub(super) scenario: String,
-    /// Name of the ego's way.
-    pub(super) way: String,
+    /// Name of the ego's route.
+    pub(super) route: String,
     pub(super) rule: Option<String>,
     pub(super) seed: u64,
     pub(super) actors: Option<u32>,

@@ -28,7 +28,7 @@ const MAX_TRIES: u32 = 400;
 /// Step of the search for the place where the ways meet, metres.
 const SEARCH_M: f64 = 0.05;
 
-/// A way of a scenario's closed-loop drives.
+/// A route of a scenario's closed-loop drives.
 #[derive(Debug)]
 pub struct ClosedLoop {
     scenario: Scenario,
@@ -60,18 +60,19 @@ struct Actor {
 }
 
 impl ClosedLoop {
-    /// Prepares the drives on a way of a scenario: the one named `way`, or the first one.
+    /// Prepares the drives on a route of a scenario: the one named `route`, or the first one.
     ///
     /// # Errors
     ///
     /// The scenario has no `closed_loop`, or none of this name, no ego with a roof camera, no dynamic vehicle with a
-    /// course, or ways that never meet.
-    pub fn new(scenario: Scenario, way: Option<&str>) -> Result<Self, ScenarioError> {
+    /// course, or a route that never meets the others' lane.
+    pub fn new(scenario: Scenario, route: Option<&str>) -> Result<Self, ScenarioError> {
         let error = |problem: &'static str| ScenarioError::NoClosedLoop { path: scenario.path().to_owned(), problem };
-        let ways = &scenario.config().closed_loop;
-        let first = ways.first().ok_or_else(|| error("it has no table `closed_loop`"))?;
-        let named = |name: &str| ways.iter().find(|way| way.name == name).ok_or_else(|| no_such_way(&scenario, name));
-        let config = way.map_or(Ok(first), named)?.clone();
+        let routes = &scenario.config().closed_loop;
+        let first = routes.first().ok_or_else(|| error("it has no table `closed_loop`"))?;
+        let named =
+            |name: &str| routes.iter().find(|route| route.name == name).ok_or_else(|| no_such_route(&scenario, name));
+        let config = route.map_or(Ok(first), named)?.clone();
         let vehicles = &scenario.config().vehicle;
         let ego =
             vehicles.iter().position(|v| v.role == "ego").ok_or_else(|| error("no vehicle has the role `ego`"))?;
@@ -106,12 +107,12 @@ impl ClosedLoop {
         &self.scenario
     }
 
-    /// Returns the length of the ego's way, metres.
+    /// Returns the length of the ego's route, metres.
     pub fn length_m(&self) -> f64 {
         self.path.length_m()
     }
 
-    /// Returns the part of the ego's way on which it would be in the way of the others, as distances of its centre from
+    /// Returns the part of the ego's route on which it would be in the way of the others, as distances of its centre from
     /// the start, metres.
     pub fn conflict_m(&self) -> [f64; 2] {
         self.conflict_m
@@ -160,7 +161,7 @@ impl ClosedLoop {
         Episode { actors: drawn, mount: Mount::draw(&self.mounting, &mut rng) }
     }
 
-    /// Returns the scenario with `count` random cameras on the ego's roof, from the start of its way to one metre behind
+    /// Returns the scenario with `count` random cameras on the ego's roof, from the start of its route to one metre behind
     /// the stop line, and without a bird's-eye view. The ego is at the camera in the images of every state. The poses are
     /// for training an encoder that sees what a drive shows; the vehicles stand at the places of the states.
     ///
@@ -185,12 +186,12 @@ impl ClosedLoop {
         })
     }
 
-    /// Returns the ego's box at a place on its way, metres from the start.
+    /// Returns the ego's box at a place on its route, metres from the start.
     pub fn ego_box(&self, at_m: f64) -> OrientedBox {
         self.footprint(self.ego, self.path.at(at_m))
     }
 
-    /// Returns the ego's pose on the ground at a place on its way: x, y in metres, heading in radians.
+    /// Returns the ego's pose on the ground at a place on its route: x, y in metres, heading in radians.
     pub fn ego_pose(&self, at_m: f64) -> [f64; 3] {
         self.path.at(at_m)
     }
@@ -246,7 +247,7 @@ impl ClosedLoop {
         OrientedBox { center: [x, y, h / 2.0], half_size: [l / 2.0, w / 2.0, h / 2.0], yaw }
     }
 
-    /// First and last place on the ego's way at which it would be in the way of the others.
+    /// First and last place on the ego's route at which it would be in the way of the others.
     fn find_conflict(&self) -> Option<[f64; 2]> {
         let meets = |at_m: f64| self.strips.iter().any(|strip| self.ego_box(at_m).gap_m(strip) < self.config.space_m);
         let places = (0..=(self.length_m() / SEARCH_M) as usize).map(|i| i as f64 * SEARCH_M);
@@ -262,8 +263,8 @@ impl Episode {
     }
 }
 
-fn no_such_way(scenario: &Scenario, name: &str) -> ScenarioError {
-    let known = scenario.config().closed_loop.iter().map(|way| way.name.clone()).collect();
+fn no_such_route(scenario: &Scenario, name: &str) -> ScenarioError {
+    let known = scenario.config().closed_loop.iter().map(|route| route.name.clone()).collect();
     ScenarioError::NoSuchName { path: scenario.path().to_owned(), key: "closed_loop", name: name.to_owned(), known }
 }
 

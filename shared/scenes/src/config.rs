@@ -106,8 +106,8 @@ pub struct ScenarioConfig {
     /// added.
     #[serde(default)]
     pub bystander: Vec<BystanderConfig>,
-    /// Drives in which the ego moves by its controller's actions (`carff drive`), one table for each way.
-    #[serde(default, deserialize_with = "closed_loop::ways")]
+    /// Drives in which the ego moves by its controller's actions (`carff drive`), one table for each route.
+    #[serde(default, deserialize_with = "closed_loop::routes")]
     pub closed_loop: Vec<ClosedLoopConfig>,
     /// Minimum distance of cameras from static things, 0.001 to 100.
     #[serde(default = "default_clearance", deserialize_with = "clearance")]

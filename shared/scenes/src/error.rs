@@ -91,7 +91,7 @@ pub enum ScenarioError {
         /// Number of drawn poses.
         tries: u32,
     },
-    /// The scenario has no appearance, bystander or closed-loop way of this name.
+    /// The scenario has no appearance, bystander or closed-loop route of this name.
     #[error("{}: no `{key}` named `{name}`{}", path.display(), listed(known, name))]
     NoSuchName {
         /// Path of the scenario file.

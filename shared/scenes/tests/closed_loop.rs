@@ -11,10 +11,10 @@ fn file() -> PathBuf {
 }
 
 fn drives() -> ClosedLoop {
-    on_way("cross")
+    on_route("cross")
 }
 
-fn on_way(name: &str) -> ClosedLoop {
+fn on_route(name: &str) -> ClosedLoop {
     ClosedLoop::new(Scenario::load(&file()).unwrap(), Some(name)).unwrap()
 }
 
@@ -58,12 +58,12 @@ fn the_conflict_is_where_the_ways_meet() {
     assert!((gap_m(enter_m) - space_m).abs() < 0.06, "{}", gap_m(enter_m));
 }
 
-/// A vehicle that merges is in the way of others up to the end of its way, and makes way along their lane; one that crosses
-/// the lane makes none. Nobody who comes on the merge's lane is slower than the ego.
+/// A vehicle that merges is in the way of others up to the end of its route, and moves along their lane; one that crosses
+/// the lane does not. Nobody who comes on the merge's lane is slower than the ego.
 #[test]
 fn a_merge_ends_on_the_lane() {
     assert_eq!((drives().along_conflict_m(), drives().crossing_m()[0]), (0.0, 1.8));
-    let merge = on_way("merge");
+    let merge = on_route("merge");
     let ([enter_m, leave_m], [x, y]) = (merge.conflict_m(), merge.crossing_m());
     assert!((merge.length_m() - leave_m).abs() < 0.06 && x == 1.8 && y < -6.0, "{leave_m} {x} {y}");
     // The ego ends at x = 11, and is 4.1 m long.

@@ -97,7 +97,7 @@ impl Default for CalibrationConfig {
 pub struct FreePoses {
     /// Number of poses; 0 turns them off.
     pub count: usize,
-    /// Number of further poses on the ego's roof, anywhere on the first way of the scenario's closed-loop drives up to
+    /// Number of further poses on the ego's roof, anywhere on the first route of the scenario's closed-loop drives up to
     /// its stop line, with the ego at the camera. The scenario needs a table `closed_loop`.
     pub on_path: usize,
     /// Number of further poses for each appearance of the scenario file with the role `trained`: the dynamic vehicle

@@ -6,16 +6,16 @@ use serde::de::{Error as _, SeqAccess, Visitor};
 use serde::{Deserialize, Deserializer};
 use std::fmt;
 
-/// A way on which the ego moves by its controller's actions.
+/// A route on which the ego moves by its controller's actions.
 ///
 /// Other vehicles look like the dynamic vehicle and follow the line of its course in the first hazard branch, extended
 /// in both directions, each at a constant speed. Starts and speeds are drawn from continuous ranges.
 #[derive(Clone, Debug, PartialEq, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ClosedLoopConfig {
-    /// Name of the way, for `carff drive --way`.
+    /// Name of the route, for `carff drive --route`.
     pub name: String,
-    /// The way of the ego's centre: x and y of 2 to 64 points. A drive ends at the last one.
+    /// The route of the ego's centre: x and y of 2 to 64 points. A drive ends at the last one.
     #[serde(deserialize_with = "way")]
     #[schemars(length(min = 2, max = 64))]
     pub path: Vec<[f64; 2]>,
@@ -48,25 +48,25 @@ pub struct ClosedLoopConfig {
     pub limit_s: f64,
 }
 
-/// Reads the list of ways; its error names the form.
-pub(super) fn ways<'de, D: Deserializer<'de>>(d: D) -> Result<Vec<ClosedLoopConfig>, D::Error> {
-    struct Ways;
-    impl<'de> Visitor<'de> for Ways {
+/// Reads the list of routes; its error names the form.
+pub(super) fn routes<'de, D: Deserializer<'de>>(d: D) -> Result<Vec<ClosedLoopConfig>, D::Error> {
+    struct Routes;
+    impl<'de> Visitor<'de> for Routes {
         type Value = Vec<ClosedLoopConfig>;
 
         fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-            f.write_str("a list of ways: `[[closed_loop]]`, each with a `name`")
+            f.write_str("a list of routes: `[[closed_loop]]`, each with a `name`")
         }
 
         fn visit_seq<A: SeqAccess<'de>>(self, mut list: A) -> Result<Self::Value, A::Error> {
-            let mut ways = Vec::new();
-            while let Some(way) = list.next_element()? {
-                ways.push(way);
+            let mut routes = Vec::new();
+            while let Some(route) = list.next_element()? {
+                routes.push(route);
             }
-            Ok(ways)
+            Ok(routes)
         }
     }
-    d.deserialize_seq(Ways)
+    d.deserialize_seq(Routes)
 }
 
 fn default_space() -> f64 {

@@ -168,7 +168,7 @@ pub(super) fn check(source: &Source, config: &ScenarioConfig) -> Result<Checked,
     Ok((placements, actor, hazard_branches))
 }
 
-/// Checks that appearances have a dynamic vehicle, and that names of variations and ways occur once.
+/// Checks that appearances have a dynamic vehicle, and that names of variations and routes occur once.
 fn check_variations(source: &Source, config: &ScenarioConfig) -> Result<(), ScenarioError> {
     if !config.appearance.is_empty() && !config.vehicle.iter().any(|v| v.dynamic) {
         return Err(source.error_in("appearance", "no vehicle is dynamic; set `dynamic = true` of the one to replace"));
@@ -178,7 +178,7 @@ fn check_variations(source: &Source, config: &ScenarioConfig) -> Result<(), Scen
     if let Some(name) = twice(config.appearance.iter().map(|a| a.name.as_str()).collect()) {
         return Err(source.error_in("appearance", format!("`{name}` is named twice")));
     }
-    if let Some(name) = twice(config.closed_loop.iter().map(|way| way.name.as_str()).collect()) {
+    if let Some(name) = twice(config.closed_loop.iter().map(|route| route.name.as_str()).collect()) {
         return Err(source.error_in("closed_loop", format!("`{name}` is named twice")));
     }
     let objects = movers(config).map(|m| m.name()).chain(config.bystander.iter().map(|b| b.name.as_str()));
