@@ -91,6 +91,18 @@ fn rules_move_the_ego() {
     assert_eq!((&halt["stuck"], &halt["collisions"]), (&1.into(), &0.into()));
 }
 
+/// The ego merges into the others' lane on the route of this name, ahead of others or after them, and meets nobody. A
+/// route that the scenario does not have is one error with the names of those that it has.
+#[test]
+fn routes_are_chosen_by_name() {
+    let folder = tempfile::tempdir().unwrap();
+    let words = ["--route", "merge", "--episodes", "3", "--seed", "3", "--actors", "2", "--json", "merge.json"];
+    let merge = finished(drive(folder.path(), "merge", &crossing(), &words), folder.path(), "merge.json").1;
+    assert_eq!((&merge["route"], &merge["collisions"], &merge["arrived"]), (&"merge".into(), &0.into(), &3.into()));
+    let unknown = drive(folder.path(), "unknown", &crossing(), &["--route", "mergge"]).end();
+    unknown.assert_one_error(&["no `closed_loop` named `mergge`", "`cross`, `merge`", "did you mean"]);
+}
+
 /// Only observers see the truth: while the graph drives, no process subscribes to it, and the vehicle's motion is read by
 /// the stages that need it.
 #[test]
