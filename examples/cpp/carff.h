@@ -403,7 +403,7 @@ static_assert(offsetof(CarffOccupancy, unknown_probability) == 76, "CarffOccupan
 static_assert(offsetof(CarffOccupancy, probability) == 80, "CarffOccupancy.probability");
 static_assert(offsetof(CarffOccupancy, stage_latency_ns) == 4176, "CarffOccupancy.stage_latency_ns");
 
-#define CARFF_LOOK_GAIN_TYPE_NAME "carff.LookGain.v4"
+#define CARFF_LOOK_GAIN_TYPE_NAME "carff.LookGain.v3"
 typedef struct CarffLookGain {
     CarffHeader header;
     float gain_bits;
@@ -415,10 +415,9 @@ typedef struct CarffLookGain {
     float vehicle_heading_rad;
     float vehicle_mps;
     uint32_t has_vehicle_mps;
-    float end_mps;
 } CarffLookGain;
 
-static_assert(sizeof(CarffLookGain) == 104, "CarffLookGain");
+static_assert(sizeof(CarffLookGain) == 96, "CarffLookGain");
 static_assert(offsetof(CarffLookGain, header) == 0, "CarffLookGain.header");
 static_assert(offsetof(CarffLookGain, gain_bits) == 56, "CarffLookGain.gain_bits");
 static_assert(offsetof(CarffLookGain, ahead_m) == 60, "CarffLookGain.ahead_m");
@@ -429,7 +428,6 @@ static_assert(offsetof(CarffLookGain, vehicle_within_m) == 80, "CarffLookGain.ve
 static_assert(offsetof(CarffLookGain, vehicle_heading_rad) == 84, "CarffLookGain.vehicle_heading_rad");
 static_assert(offsetof(CarffLookGain, vehicle_mps) == 88, "CarffLookGain.vehicle_mps");
 static_assert(offsetof(CarffLookGain, has_vehicle_mps) == 92, "CarffLookGain.has_vehicle_mps");
-static_assert(offsetof(CarffLookGain, end_mps) == 96, "CarffLookGain.end_mps");
 
 #define CARFF_VIEW_META_TYPE_NAME "carff.ViewMeta.v1"
 typedef struct CarffViewMeta {
@@ -459,7 +457,7 @@ static_assert(offsetof(CarffViewMeta, intrinsics) == 112, "CarffViewMeta.intrins
 static_assert(offsetof(CarffViewMeta, world_from_camera) == 144, "CarffViewMeta.world_from_camera");
 static_assert(offsetof(CarffViewMeta, stage_latency_ns) == 272, "CarffViewMeta.stage_latency_ns");
 
-#define CARFF_ACTION_TYPE_NAME "carff.Action.v5"
+#define CARFF_ACTION_TYPE_NAME "carff.Action.v4"
 typedef struct CarffAction {
     CarffHeader header;
     uint32_t action;
@@ -476,7 +474,6 @@ typedef struct CarffAction {
     float target_speed_mps;
     float look_gain_bits;
     float clear_m;
-    float end_mps;
 } CarffAction;
 
 static_assert(sizeof(CarffAction) == 128, "CarffAction");
@@ -495,7 +492,6 @@ static_assert(offsetof(CarffAction, latency_ns) == 104, "CarffAction.latency_ns"
 static_assert(offsetof(CarffAction, target_speed_mps) == 112, "CarffAction.target_speed_mps");
 static_assert(offsetof(CarffAction, look_gain_bits) == 116, "CarffAction.look_gain_bits");
 static_assert(offsetof(CarffAction, clear_m) == 120, "CarffAction.clear_m");
-static_assert(offsetof(CarffAction, end_mps) == 124, "CarffAction.end_mps");
 
 #define CARFF_HEALTH_TYPE_NAME "carff.Health.v1"
 typedef struct CarffHealth {

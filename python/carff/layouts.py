@@ -345,12 +345,11 @@ class LookGain(ctypes.Structure):
         ("vehicle_heading_rad", ctypes.c_float),
         ("vehicle_mps", ctypes.c_float),
         ("has_vehicle_mps", ctypes.c_uint32),
-        ("end_mps", ctypes.c_float),
     ]
 
     @staticmethod
     def type_name() -> str:
-        return "carff.LookGain.v4"
+        return "carff.LookGain.v3"
 
 
 class ViewMeta(ctypes.Structure):
@@ -390,12 +389,11 @@ class Action(ctypes.Structure):
         ("target_speed_mps", ctypes.c_float),
         ("look_gain_bits", ctypes.c_float),
         ("clear_m", ctypes.c_float),
-        ("end_mps", ctypes.c_float),
     ]
 
     @staticmethod
     def type_name() -> str:
-        return "carff.Action.v5"
+        return "carff.Action.v4"
 
 
 class Health(ctypes.Structure):
@@ -437,9 +435,9 @@ LAYOUTS = {
     UnknownBox: (56, 8, {"center": 0, "half_size": 24, "probability": 48, "place": 52}),
     Unknowns: (824, 8, {"header": 0, "box_count": 56, "state_count": 60, "probability": 64, "residual": 68, "noise": 72, "gain": 76, "offset": 88, "explained": 100, "ratios": 104, "prior": 360, "boxes": 368, "stage_latency_ns": 816}),
     Occupancy: (4184, 8, {"header": 0, "columns": 56, "rows": 60, "cell_m": 64, "low_corner_m": 68, "unknown_probability": 76, "probability": 80, "stage_latency_ns": 4176}),
-    LookGain: (104, 8, {"header": 0, "gain_bits": 56, "ahead_m": 60, "clear_m": 64, "vehicles": 68, "vehicle_m": 72, "vehicle_within_m": 80, "vehicle_heading_rad": 84, "vehicle_mps": 88, "has_vehicle_mps": 92, "end_mps": 96}),
+    LookGain: (96, 8, {"header": 0, "gain_bits": 56, "ahead_m": 60, "clear_m": 64, "vehicles": 68, "vehicle_m": 72, "vehicle_within_m": 80, "vehicle_heading_rad": 84, "vehicle_mps": 88, "has_vehicle_mps": 92}),
     ViewMeta: (280, 8, {"header": 0, "hypothesis": 56, "kind": 60, "state": 64, "width_px": 68, "height_px": 72, "probability": 76, "latent": 80, "intrinsics": 112, "world_from_camera": 144, "stage_latency_ns": 272}),
-    Action: (128, 8, {"header": 0, "action": 56, "reason": 60, "rule": 64, "sample_count": 68, "confidence": 72, "hazard_probability": 76, "is_decision": 80, "unknown_probability": 84, "valid_until_ns": 88, "based_on_frame": 96, "latency_ns": 104, "target_speed_mps": 112, "look_gain_bits": 116, "clear_m": 120, "end_mps": 124}),
+    Action: (128, 8, {"header": 0, "action": 56, "reason": 60, "rule": 64, "sample_count": 68, "confidence": 72, "hazard_probability": 76, "is_decision": 80, "unknown_probability": 84, "valid_until_ns": 88, "based_on_frame": 96, "latency_ns": 104, "target_speed_mps": 112, "look_gain_bits": 116, "clear_m": 120}),
     Health: (144, 8, {"header": 0, "stage": 56, "state": 60, "pid": 64, "received": 72, "published": 80, "skipped": 88, "invalid": 96, "errors": 104, "last_latency_ns": 112, "max_latency_ns": 120, "last_progress_ns": 128, "rss_bytes": 136}),
 }
 
