@@ -20,7 +20,10 @@ fn the_shipped_graph_drives() {
     let graph = TestGraph::new(&set, &checkpoint, "");
     let shipped = project_root().join("configs/graphs/approaching-intersection.toml");
     let (set, checkpoint) = (set.to_str().unwrap(), checkpoint.to_str().unwrap());
+    // Slowly, so that also a busy machine decides on both drives.
+    let slowly = ["--set", "run.frame_rate_hz=3"];
     let args = ["--drives", "2", "--dataset", set, "--checkpoint", checkpoint, "--report", "report.json", "--tables"];
+    let args = [&args[..], &slowly].concat();
     let finished = Process::start(&mut graph.launch(&shipped, &args)).end();
     finished.assert_success();
     graph.assert_nothing_left();
