@@ -41,7 +41,7 @@ class Episode:
     def __init__(self, seed: int, number: int) -> None:
         rng = np.random.default_rng([seed, number])
         self.others, speed_mps, x = [], 5.0, 0.0
-        for index in range(rng.integers(0, MOST_OTHERS + 1)):
+        for index in range(int(rng.integers(0, MOST_OTHERS + 1))):
             speed_mps = min(rng.uniform(3.0, 5.0), speed_mps)
             x = rng.uniform(-40.0, -8.0) if index == 0 else x - TRUCK_SIZE_M[0] - rng.uniform(3.0, 25.0)
             self.others.append((x, speed_mps))

@@ -28,7 +28,6 @@ CROSSING_X, CROSSING_Y = 55.75, -1.75
 # Middle of the ego's lane, and of the lane of vehicles from the left.
 EGO_X, LANE_Y = 1.75, -1.75
 TRUCK_SIZE_M = (5.8, 2.3, 2.8)
-EGO_SIZE_M = (4.51, 1.852, 1.19)
 # Where vehicles wait that an episode does not have, and the time until a vehicle rests on its wheels.
 PARKED_X = -140.0
 SETTLING_FRAMES = 30
@@ -152,18 +151,28 @@ class World:
         self.sensor.lens.setAspectRatio(1.0)
         self.sensor.lens.setFov(FOV_DEG)
         self.sensor.lens.setNearFar(0.1, 500.0)
+        # Nothing is rendered while MetaDrive steps, and only the camera's buffers in `image`.
+        engine.win.setActive(False)
+        self.buffers = [self.sensor.buffer, *self.sensor.manager.buffers]
+        self._render(False)
         # In software, an anisotropic filter takes up to seconds for a view of the horizon.
         for texture in engine.render.findAllTextures():
             texture.setAnisotropicDegree(1)
+
+    def _render(self, is_on: bool) -> None:
+        for buffer in self.buffers:
+            buffer.setActive(is_on)
 
     def image(self, world_from_camera: np.ndarray) -> np.ndarray:
         """Renders the scene from a pose: (height, width, RGB)."""
         right, up, back, eye = (world_from_camera[:3, i] for i in range(4))
         # Panda3D's camera looks along +Y, with +Z up.
         self.sensor.cam.setMat(LMatrix4f(*right, 0, *-back, 0, *up, 0, *eye, 1))
+        self._render(True)
         self.env.engine.graphicsEngine.renderFrame()
         shot = self.sensor.buffer.getDisplayRegion(1).getScreenshot()
         pixels = np.frombuffer(shot.getRamImage().getData(), np.uint8).reshape(SIDE_PX, SIDE_PX, -1)
+        self._render(False)
         return np.ascontiguousarray(pixels[::-1, :, 2::-1])
 
     def put(self, vehicle, x: float, y: float, heading_deg: float, speed_mps: float) -> None:
