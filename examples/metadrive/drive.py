@@ -9,7 +9,9 @@ Each frame: the world publishes the ego's motion and image, waits for the decisi
 import argparse
 import json
 import math
+import signal
 import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -126,7 +128,7 @@ def stopping_mps(way_m: float) -> float:
 
 
 def oracle_mps(episode: Episode, time_s: float, y: float, speed_mps: float) -> float:
-    """The target speed of a planner that knows the truth: it crosses where it keeps clear of everyone, else it waits."""
+    """The target speed of a planner that knows the truth: it crosses where it keeps clear of all, else it waits."""
     at_s, at_y, mps = time_s, y, speed_mps
     passes = True
     while at_y < ROAD.clear_y:
@@ -182,7 +184,7 @@ def wilson(count: int, of: int) -> list:
     """Returns the 95 % Wilson interval of a share."""
     z, share = 1.96, count / of
     middle, half = share + z * z / (2 * of), z * math.sqrt(share * (1 - share) / of + z * z / (4 * of * of))
-    return [round((middle + sign * half) / (1 + z * z / of), 4) for sign in (-1, 1)]
+    return [round(max((middle + sign * half) / (1 + z * z / of), 0.0), 4) for sign in (-1, 1)]
 
 
 def figures(drives: list, latencies_ms: list) -> dict:
@@ -195,8 +197,8 @@ def figures(drives: list, latencies_ms: list) -> dict:
     result["missed_frames"] = sum(d["missed_frames"] for d in drives)
     for name, values in (("time_to_goal_s", times), ("latency_ms", latencies_ms)):
         if values:
-            at = dict(mean=np.mean(values), p50=np.median(values), p95=np.quantile(values, 0.95), p99=np.quantile(values, 0.99))
-            result[name] = {key: round(float(value), 3) for key, value in at.items()}
+            result[name] = dict(mean=round(float(np.mean(values)), 3))
+            result[name] |= {f"p{p}": round(float(np.percentile(values, p)), 3) for p in (50, 95, 99)}
     return result
 
 
@@ -214,6 +216,8 @@ def main() -> None:
     parser.add_argument("--run", default="metadrive", help="name of the run")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="a setting of the graph")
     args = parser.parse_args()
+    # A terminated drive ends its graph, too.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
     world = World(MOST_OTHERS)
     graph = Graph(args) if args.rule in GRAPH_RULES else None
     drives = []
