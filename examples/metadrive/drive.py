@@ -18,7 +18,7 @@ from pathlib import Path
 import carff
 import numpy as np
 
-from world import FOCAL_PX, FRAME_S, SIDE_PX, TRUCK_SIZE_M, Road, World, roof_camera
+from world import EGO_X, FOCAL_PX, FRAME_S, SIDE_PX, TRUCK_SIZE_M, Road, World, roof_camera
 
 ROAD = Road()
 ADVANCE_MPS, LIMIT_S, PATIENCE_S = 5.0, 40.0, 10.0
@@ -101,7 +101,8 @@ class Graph:
         """Publishes a frame, and returns the decision on it, or None."""
         header = carff.Header(frame_id=frame_id, capture_time_ns=time.monotonic_ns(), seed=self.seed)
         speed_mps, y = motion
-        self.motions.send(carff.EgoMotion(header, speed_mps, ROAD.stop_y - y, ROAD.clear_y - y, math.pi / 2))
+        ways, crossing = (ROAD.stop_y - y, ROAD.clear_y - y), (EGO_X, ROAD.stop_y)
+        self.motions.send(carff.EgoMotion(header, speed_mps, *ways, math.pi / 2, crossing, 0.0))
         intrinsics = carff.Intrinsics(FOCAL_PX, FOCAL_PX, SIDE_PX / 2, SIDE_PX / 2)
         view = carff.DatasetView(0, -1, -1, -1, -1, -1, -1, 0)
         meta = carff.FrameMeta(header, SIDE_PX, SIDE_PX, intrinsics, dataset_view=view, take_start=take_start)
