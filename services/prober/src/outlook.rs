@@ -106,9 +106,7 @@ impl Outlook {
 
 /// The way along the lanes of the hazard's places that a belief's frame shows clear, metres: that of the least clear one.
 fn clear_m(probe: &FieldProbe, frames: &Frames, belief: &Belief, motion: &EgoMotion) -> f64 {
-    let Some(sighting) = frames.sighting(&belief.header).filter(|_| frames.camera_of(&belief.header).is_some()) else {
-        return 0.0;
-    };
+    let Some(sighting) = frames.sighting(&belief.header) else { return 0.0 };
     let places = probe.layout().hazard_places();
     places.map(|place| sighting.clear_m(&crossing(place, motion), &place.occupied_in)).reduce(f64::min).unwrap_or(0.0)
 }
@@ -116,8 +114,7 @@ fn clear_m(probe: &FieldProbe, frames: &Frames, belief: &Belief, motion: &EgoMot
 /// The vehicles on the lane of the hazard's first place in a belief's frame, the next to the crossing first, and the
 /// lane's heading, radians.
 fn vehicles(probe: &FieldProbe, frames: &Frames, belief: &Belief, motion: &EgoMotion) -> (Vec<LaneVehicle>, f64) {
-    let seen = frames.sighting(&belief.header).filter(|_| frames.camera_of(&belief.header).is_some());
-    let Some((sighting, place)) = seen.zip(probe.layout().hazard_places().next()) else {
+    let Some((sighting, place)) = frames.sighting(&belief.header).zip(probe.layout().hazard_places().next()) else {
         return (Vec::new(), 0.0);
     };
     (sighting.vehicles(&crossing(place, motion)), place.oriented_box.yaw)

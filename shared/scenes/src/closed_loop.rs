@@ -70,8 +70,8 @@ impl ClosedLoop {
         let error = |problem: &'static str| ScenarioError::NoClosedLoop { path: scenario.path().to_owned(), problem };
         let routes = &scenario.config().closed_loop;
         let first = routes.first().ok_or_else(|| error("it has no table `closed_loop`"))?;
-        let named =
-            |name: &str| routes.iter().find(|route| route.name == name).ok_or_else(|| no_such_route(&scenario, name));
+        let unknown = |name: &str| scenario.no_such("closed_loop", name, routes.iter().map(|route| &route.name));
+        let named = |name: &str| routes.iter().find(|route| route.name == name).ok_or_else(|| unknown(name));
         let config = route.map_or(Ok(first), named)?.clone();
         let vehicles = &scenario.config().vehicle;
         let ego =
@@ -261,11 +261,6 @@ impl Episode {
     pub fn actor_count(&self) -> usize {
         self.actors.len()
     }
-}
-
-fn no_such_route(scenario: &Scenario, name: &str) -> ScenarioError {
-    let known = scenario.config().closed_loop.iter().map(|route| route.name.clone()).collect();
-    ScenarioError::NoSuchName { path: scenario.path().to_owned(), key: "closed_loop", name: name.to_owned(), known }
 }
 
 fn upright([x, y, yaw]: [f64; 3]) -> Pose {

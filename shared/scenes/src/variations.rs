@@ -52,7 +52,13 @@ impl Scenario {
         Ok(self.varied(config, Unknown { bystanders: self.unknown().bystanders + 1, ..*self.unknown() }, 1))
     }
 
-    fn no_such<'a>(&self, key: &'static str, name: &str, known: impl Iterator<Item = &'a String>) -> ScenarioError {
+    /// Returns the error of a name that a table of the file does not have.
+    pub(crate) fn no_such<'a>(
+        &self,
+        key: &'static str,
+        name: &str,
+        known: impl Iterator<Item = &'a String>,
+    ) -> ScenarioError {
         let (path, name) = (self.path().to_owned(), name.to_owned());
         ScenarioError::NoSuchName { path, key, name, known: known.cloned().collect() }
     }
