@@ -26,8 +26,8 @@ help: ## List the targets
 # films and the bridge.
 RUNNING := carff carff-launch carff-camera carff-encoder carff-forecaster carff-prober carff-renderer carff-controller
 
-# The programs of a run, without optional parts.
-BUILD_RUNNING := cargo build --release --locked --bins --no-default-features $(addprefix -p ,$(RUNNING))
+# The programs of a run, without optional parts. carff-features: `make build` then compiles none of their libraries again.
+BUILD_RUNNING := cargo build --release --locked --bins --no-default-features $(addprefix -p ,$(RUNNING) carff-features)
 
 run: onnxruntime ## Drive the shipped model through the intersection; show decisions, then write report, JSON and filmstrip
 	$(BUILD_RUNNING)

@@ -2,9 +2,9 @@
 """Checks dependencies and house rules without network, after the crates are fetched.
 
 The rules of deny.toml cover licences, banned crates, duplicate versions and sources, for each of its targets. This program
-also checks the direction of dependencies between our crates, which of them may use libtorch, and that each fetched library
-has a hash for each target. House rules: no unfinished code, no paths of one machine, `unsafe` in named modules only, one
-meaning for each name of a public type.
+also checks the direction of dependencies between our crates, which of them may use libtorch, that `make build` compiles no
+library of `make run` again, and that each fetched library has a hash for each target. House rules: no unfinished code, no
+paths of one machine, `unsafe` in named modules only, one meaning for each name of a public type.
 
 Usage: python3 .ci/check_dependencies.py      (from anywhere; exit code 1 and one line per finding)
 """
@@ -216,6 +216,31 @@ def check_tensors(metadata: dict) -> None:
         find(f".ci/check_dependencies.py: {name} does not use libtorch any more")
 
 
+def check_features(metadata: dict) -> None:
+    """Checks that `make run` compiles each library with the features that `make build` asks for, which would otherwise
+    compile it, and all that use it, again."""
+    ours = {package["name"] for package in metadata["packages"] if package["source"] is None}
+    running = re.search(r"^RUNNING := (.+)$", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)[1].split()
+
+    def features(*selection: str) -> dict[str, set[str]]:
+        """Returns for each library the sets of features with which it is compiled; more than one for some build tools."""
+        found: dict[str, set[str]] = {}
+        options = ["--locked", "--offline", "--edges=normal,build", "--prefix=none", "--format={p}|{f}", *selection]
+        for package, _, names in (line.partition("|") for line in run("cargo", "tree", *options).splitlines() if line):
+            name, version = package.split()[:2]
+            if name not in ours:
+                found.setdefault(f"{name} {version}", set()).add(names.removesuffix(" (*)"))
+        return found
+
+    part = features("--no-default-features", *(f"-p{name}" for name in [*running, "carff-features"]))
+    whole = features("--workspace")
+    for library in sorted(part):
+        if missing := part[library] - whole[library]:
+            find(f"{library}: `make run` compiles it with the features {' / '.join(sorted(missing)) or 'none'}, `make build` "
+                 f"with {' / '.join(sorted(whole[library]))}; name the difference in launch/features/Cargo.toml")
+    print(f"libraries of make run: {len(part)}, of make build: {len(whole)}")
+
+
 def check_libraries(targets: list[str]) -> None:
     """Checks that the fetched libraries have a hash for each machine."""
     sys.path.insert(0, str(ROOT / "launch/packaging"))
@@ -321,6 +346,7 @@ def main() -> None:
     check_crates(metadata, deny)
     check_arrows(metadata)
     check_tensors(metadata)
+    check_features(metadata)
     check_libraries(targets)
     check_sources()
     check_test_programs()
