@@ -5,7 +5,7 @@ use crate::train::{Display, datasets, refuse_another_configuration, stop_on_sign
 use anyhow::{Context, anyhow};
 use carff_base::files::check_writable;
 use carff_launch::lab::AblateArgs;
-use carff_training::ablation::{AblationTable, Variant, folder, row, write_table};
+use carff_training::ablation::{AblationTable, Variant, folder, row, rows, write_table};
 use carff_training::{Progress, Training, TrainingConfig, TrainingError, TrainingRun};
 use std::process::ExitCode;
 
@@ -64,11 +64,11 @@ pub fn run(args: &AblateArgs) -> anyhow::Result<ExitCode> {
         let found = row(&training, variant, &run, options);
         display.finish();
         match found {
-            Ok(row) => table.rows.push(row),
+            Ok(_) => table.rows = rows(&args.out)?,
             Err(TrainingError::Stopped) => return Ok(stopped(&args.out)),
             Err(error) => return Err(error.into()),
         }
-        // After each variant, so that the table is available early.
+        // After each variant, so that the table is available early, and with the rows of earlier runs.
         write_table(&table, &args.out)?;
     }
     println!("table: {}", args.out.join("README.md").display());

@@ -74,8 +74,8 @@ impl Dataset {
         };
         let several = set.scenario.as_ref().is_some_and(|s| s.branches.len() > 1);
         if several && set.frames.iter().all(|f| f.observability.is_none()) {
-            let told = seen::told_by_images(&set.frames, |i| set.load_image(i), |pair| set.valid_in_all(&pair))?;
-            for (frame, observability) in told.into_iter().enumerate() {
+            let seen = seen::seen_in_images(&set.frames, |i| set.load_image(i), |pair| set.valid_in_all(&pair))?;
+            for (frame, observability) in seen.into_iter().enumerate() {
                 set.frames[frame].observability = observability;
             }
             set.warnings.push(

@@ -1,12 +1,9 @@
 //! Visual equivalence of states per view, and the accuracy limit that follows from it.
 
-use rayon::prelude::*;
-
+use crate::comparison::Comparison;
 use crate::dataset::Dataset;
-use crate::image::{Image, looks_same, looks_same_where};
-
-/// Largest difference of nearly equal pixels, of 255: less than a camera's noise.
-const NEARLY: u8 = 2;
+use crate::image::{Image, looks_same};
+use rayon::prelude::*;
 
 /// Visual equivalence of states, per view.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -18,24 +15,21 @@ pub struct Equivalence {
 
 impl Equivalence {
     /// Takes the truth of `alike_states` where frames have it, and compares images where they do not. Only for
-    /// evaluation: [`Self::from_images`] is what training may know.
+    /// evaluation: [`Self::from_images`] is what training may know. `images` are those of [`Dataset::load_all_images`].
     pub fn from_dataset(dataset: &Dataset, images: &[Image]) -> Self {
+        let known = dataset.frames().iter().all(|frame| frame.alike_states.is_some());
+        let comparison = if known { Comparison::Exact } else { Comparison::of(dataset, images) };
         Self::between(dataset, images, |a, b| {
             let (of_a, of_b) = (&dataset.frames()[a], &dataset.frames()[b]);
             let known = of_a.alike_states.as_ref().zip(of_b.state).map(|(alike, state)| alike.contains(&state));
-            known.unwrap_or_else(|| looks_same_where(&images[a], &images[b], dataset.valid_in_all(&[a, b])))
+            known.unwrap_or_else(|| comparison.same(&images[a], &images[b], dataset.valid_in_all(&[a, b])))
         })
     }
 
-    /// Compares all pairs of states in each view by `alike(image, image, counts)`, where `counts` is true for the pixels
-    /// that are valid in both images. `images` are those of [`Dataset::load_all_images`]. A state without an image in a
-    /// view is only equivalent to itself.
-    pub fn from_images(
-        dataset: &Dataset,
-        images: &[Image],
-        alike: impl Fn(&Image, &Image, &dyn Fn(usize) -> bool) -> bool + Sync,
-    ) -> Self {
-        Self::between(dataset, images, |a, b| alike(&images[a], &images[b], &dataset.valid_in_all(&[a, b])))
+    /// Compares all pairs of states in each view, in the pixels that are valid in both images. `images` are those of
+    /// [`Dataset::load_all_images`]. A state without an image in a view is only equivalent to itself.
+    pub fn from_images(dataset: &Dataset, images: &[Image], comparison: Comparison) -> Self {
+        Self::between(dataset, images, |a, b| comparison.same(&images[a], &images[b], dataset.valid_in_all(&[a, b])))
     }
 
     fn between(dataset: &Dataset, images: &[Image], alike: impl Fn(usize, usize) -> bool + Sync) -> Self {
@@ -102,26 +96,6 @@ impl Equivalence {
         }
         (count > 0).then(|| sum / count as f64)
     }
-}
-
-/// Returns true if a dataset's images are those of a camera: in most pairs of images of a view, less than half of the
-/// pixels are nearly equal. Rendered images of one pose are equal wherever nothing changes.
-pub fn has_noise(dataset: &Dataset, images: &[Image]) -> bool {
-    let near = Equivalence::from_images(dataset, images, is_mostly_equal);
-    let shown = Equivalence::from_images(dataset, images, |_, _, _| true);
-    let pairs = |of: &Equivalence| of.same.iter().filter(|same| **same).count() - dataset.view_count() * of.states;
-    2 * pairs(&near) < pairs(&shown)
-}
-
-/// Returns true if at least half of the pixels that count are nearly equal.
-fn is_mostly_equal(a: &Image, b: &Image, counts: &dyn Fn(usize) -> bool) -> bool {
-    let (mut equal, mut all) = (0, 0);
-    let pixels = a.rgb.chunks_exact(3).zip(b.rgb.chunks_exact(3)).enumerate();
-    for (_, (a, b)) in pixels.filter(|(i, _)| counts(*i)) {
-        equal += usize::from(a.iter().zip(b).all(|(a, b)| a.abs_diff(*b) <= NEARLY));
-        all += 1;
-    }
-    2 * equal >= all
 }
 
 #[cfg(test)]

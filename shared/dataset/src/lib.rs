@@ -17,6 +17,7 @@
 
 mod calibration;
 mod camera;
+mod comparison;
 mod corruptions;
 mod dataset;
 mod degrade;
@@ -44,10 +45,11 @@ mod writer;
 
 pub use calibration::{CalibrationError, CameraCalibration, DistortionModel};
 pub use carff_messages::Observability;
+pub use comparison::Comparison;
 pub use corruptions::{Corruption, CorruptionError};
 pub use dataset::Dataset;
 pub use degrade::{Degradation, degrade};
-pub use equivalence::{Equivalence, has_noise};
+pub use equivalence::Equivalence;
 pub use error::DatasetError;
 pub use folder::image_files;
 pub use image::{Image, MAX_DIFFERENT_PIXELS, MAX_IMAGE_SIDE_PX, PIXEL_TOLERANCE, looks_same, looks_same_where};

@@ -1,21 +1,25 @@
 //! Derives the observability of frames from their images, for datasets that do not contain it.
 
+use crate::comparison::{Comparison, Pairs};
 use crate::error::DatasetError;
-use crate::image::{Image, looks_same_where};
+use crate::image::Image;
 use crate::scenario::Frame;
 use carff_messages::Observability;
 use rayon::prelude::*;
 
+/// Observability of each frame; `None` without an image to compare with.
+type Seen = Vec<Option<Observability>>;
+
 /// Returns the observability of each frame by comparison with the other branches' images at its time step from its
-/// view: `none` if all of them look the same, `full` if none does, else `partial`; `None` without another image. The
-/// first error of an image is returned.
+/// view: `none` if all of them look the same, `full` if none does, else `partial`; `None` without another image. Images
+/// of a camera are compared through their noise. The first error of an image is returned.
 ///
 /// `image` loads the image of a frame. `valid` returns the test for pixels that the masks of two frames include.
-pub(crate) fn told_by_images<V: Fn(usize) -> bool>(
+pub(crate) fn seen_in_images<V: Fn(usize) -> bool>(
     frames: &[Frame],
     image: impl Fn(usize) -> Result<Image, DatasetError> + Sync,
     valid: impl Fn([usize; 2]) -> V + Sync,
-) -> Result<Vec<Option<Observability>>, DatasetError> {
+) -> Result<Seen, DatasetError> {
     let view_count = frames.iter().filter_map(|frame| frame.view).max().map_or(0, |view| view + 1);
     let mut of_view: Vec<Vec<usize>> = vec![Vec::new(); view_count];
     for (i, frame) in frames.iter().enumerate() {
@@ -23,32 +27,56 @@ pub(crate) fn told_by_images<V: Fn(usize) -> bool>(
             list.push(i);
         }
     }
-    let told: Vec<Vec<(usize, Option<Observability>)>> = of_view
-        .par_iter()
-        .map(|of_view| {
-            let images: Vec<Image> = of_view.iter().map(|&i| image(i)).collect::<Result<_, _>>()?;
-            let frame_of = |place: usize| &frames[of_view[place]];
-            let tell = |own: usize| {
-                let (branch, timestamp) = (frame_of(own).branch, frame_of(own).timestamp);
-                let others = (0..of_view.len())
-                    .filter(|&other| frame_of(other).timestamp == timestamp && frame_of(other).branch != branch);
-                let (alike, different): (Vec<usize>, Vec<usize>) = others.partition(|&other| {
-                    let valid = valid([of_view[own], of_view[other]]);
-                    looks_same_where(&images[own], &images[other], valid)
-                });
-                match (alike.is_empty(), different.is_empty()) {
-                    (true, true) => None,
-                    (true, false) => Some(Observability::Full),
-                    (false, true) => Some(Observability::None),
-                    (false, false) => Some(Observability::Partial),
-                }
-            };
-            Ok((0..of_view.len()).map(|own| (of_view[own], tell(own))).collect())
-        })
-        .collect::<Result<_, DatasetError>>()?;
-    let mut all = vec![None; frames.len()];
-    for (frame, observability) in told.into_iter().flatten() {
-        all[frame] = observability;
+    let compared = |comparison: Comparison| -> Result<(Seen, Pairs), DatasetError> {
+        let of_views: Vec<(Seen, Pairs)> = of_view
+            .par_iter()
+            .map(|of_view| {
+                let images: Vec<Image> = of_view.iter().map(|&i| image(i)).collect::<Result<_, _>>()?;
+                Ok(seen_from_view(comparison, of_view, frames, &images, &valid))
+            })
+            .collect::<Result<_, DatasetError>>()?;
+        let mut all = vec![None; frames.len()];
+        for (&frame, seen) in of_view.iter().flatten().zip(of_views.iter().flat_map(|(seen, _)| seen)) {
+            all[frame] = *seen;
+        }
+        Ok((all, of_views.into_iter().map(|(_, pairs)| pairs).sum()))
+    };
+    let (seen, pairs) = compared(Comparison::Exact)?;
+    match pairs.comparison() {
+        Comparison::Exact => Ok(seen),
+        through_noise => Ok(compared(through_noise)?.0),
     }
-    Ok(all)
+}
+
+/// Returns the observability of the frames `of_view`, whose images come from one view, and the pairs that were compared.
+fn seen_from_view<V: Fn(usize) -> bool>(
+    comparison: Comparison,
+    of_view: &[usize],
+    frames: &[Frame],
+    images: &[Image],
+    valid: impl Fn([usize; 2]) -> V,
+) -> (Seen, Pairs) {
+    let mut pairs = Pairs::default();
+    let mut found = vec![(0, 0); of_view.len()];
+    for (a, &frame_a) in of_view.iter().enumerate() {
+        for (b, &frame_b) in of_view[..a].iter().enumerate() {
+            let (of_a, of_b) = (&frames[frame_a], &frames[frame_b]);
+            if of_a.timestamp != of_b.timestamp || of_a.branch == of_b.branch {
+                continue;
+            }
+            pairs = pairs + Pairs::one(&images[a], &images[b], valid([frame_a, frame_b]));
+            let same = comparison.same(&images[a], &images[b], valid([frame_a, frame_b]));
+            for i in [a, b] {
+                found[i].0 += usize::from(same);
+                found[i].1 += usize::from(!same);
+            }
+        }
+    }
+    let seen = found.into_iter().map(|(alike, different)| match (alike, different) {
+        (0, 0) => None,
+        (0, _) => Some(Observability::Full),
+        (_, 0) => Some(Observability::None),
+        _ => Some(Observability::Partial),
+    });
+    (seen.collect(), pairs)
 }

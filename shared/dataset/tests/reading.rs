@@ -6,8 +6,8 @@ use std::path::Path;
 
 use carff_base::geometry::{OrientedBox, PinholeCamera};
 use carff_dataset::{
-    Candidate, Dataset, DatasetReport, DatasetWriter, Equivalence, FrameRecord, Image, NamedBox, Observability,
-    PoseRole, PoseSplit, ScenarioInfo, SheetOptions, StateInfo, contact_sheet, has_noise, looks_same_where,
+    Candidate, Comparison, Dataset, DatasetReport, DatasetWriter, Equivalence, FrameRecord, Image, NamedBox,
+    Observability, PoseRole, PoseSplit, ScenarioInfo, SheetOptions, StateInfo, contact_sheet,
 };
 use serde_json::{Value, json};
 
@@ -608,20 +608,25 @@ fn outside_sets_if_at_hand() {
     }
 }
 
-/// A degraded copy has the states and poses of the original, other bytes, and as truth which states look the same: the
-/// images no longer show it.
+/// A degraded copy has the states and poses of the original, other bytes, and as truth which states look the same. Its
+/// images only show that through their noise, and so do they show the observability of a copy without it.
 #[test]
 fn degraded_copies_keep_the_truth() {
     use carff_dataset::{Degradation, degrade, sensor::SensorNoise};
     let folder = tempfile::tempdir().unwrap();
     let writer = DatasetWriter::create(&folder.path().join("clean")).unwrap();
-    let camera = PinholeCamera::look_at([0.0, 0.0, 5.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], 16, 16, 60.0);
+    let camera = PinholeCamera::look_at([0.0, 0.0, 5.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], 64, 64, 60.0);
     let mut records = Vec::new();
     for (branch, view) in [(0, 0), (1, 0), (0, 1), (1, 1)] {
         let path = format!("images/b{branch}_v{view}.png");
         // From pose 0 the branches look the same.
-        let grey = if view == 1 && branch == 1 { 200 } else { 90 };
-        writer.write_image(&path, &Image::filled(16, 16, [grey; 3])).unwrap();
+        let mut image = Image::filled(64, 64, [90; 3]);
+        for (x, y) in (0..64_u8).flat_map(|y| (0..64).map(move |x| (x, y))) {
+            let shown = view == 1 && branch == 1 && (20..40).contains(&x) && (30..44).contains(&y);
+            let grey = if shown { 230 } else { 80 + x / 9 % 2 * 40 + y / 16 % 2 * 20 };
+            image.paste(&Image::filled(1, 1, [grey; 3]), u32::from(x), u32::from(y));
+        }
+        writer.write_image(&path, &image).unwrap();
         let record = FrameRecord::new(path, camera);
         records.push(FrameRecord { branch_and_timestamp: Some((branch, 0)), view: Some(view), ..record });
     }
@@ -648,14 +653,24 @@ fn degraded_copies_keep_the_truth() {
     let copy = Dataset::open(&out).unwrap();
     let images = copy.load_all_images().unwrap();
     assert_eq!((count, copy.frames().len()), (4, 4));
-    let exact = |dataset: &Dataset, images: &[Image]| {
-        Equivalence::from_images(dataset, images, |a, b, counts| looks_same_where(a, b, counts))
-    };
+    let exact = |dataset: &Dataset, images: &[Image]| Equivalence::from_images(dataset, images, Comparison::Exact);
     let (truth, seen) = (Equivalence::from_dataset(&copy, &images), exact(&copy, &images));
     assert!(truth.same(0, 0, 1) && !truth.same(1, 0, 1));
     assert!(!seen.same(0, 0, 1) && !seen.same(1, 0, 1));
     let original = clean.load_all_images().unwrap();
-    assert!(has_noise(&copy, &images) && !has_noise(&clean, &original));
+    assert_eq!(Comparison::of(&copy, &images), Comparison::ThroughNoise);
+    assert_eq!(Comparison::of(&clean, &original), Comparison::Exact);
     assert_eq!(exact(&clean, &original), truth);
     assert_ne!(images[0], clean.load_image(0).unwrap());
+
+    let file = out.join("transforms.json");
+    let mut json: Value = serde_json::from_str(&std::fs::read_to_string(&file).unwrap()).unwrap();
+    for frame in json["frames"].as_array_mut().unwrap() {
+        frame.as_object_mut().unwrap().retain(|key, _| key != "observability" && key != "alike_states");
+    }
+    std::fs::write(&file, json.to_string()).unwrap();
+    let untold = Dataset::open(&out).unwrap();
+    assert_eq!(Equivalence::from_dataset(&untold, &images), truth);
+    let seen: Vec<_> = untold.frames().iter().map(|frame| frame.observability.unwrap()).collect();
+    assert_eq!(seen, [Observability::None, Observability::None, Observability::Full, Observability::Full]);
 }

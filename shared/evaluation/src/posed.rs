@@ -2,8 +2,8 @@
 
 use crate::EvaluationError;
 use carff_dataset::{
-    Dataset, Equivalence, Frame, Image, NamedBox, Observability, PoseRole, PoseSplit, ScenarioInfo, StateInfo,
-    has_noise, looks_same_where,
+    Comparison, Dataset, Equivalence, Frame, Image, NamedBox, Observability, PoseRole, PoseSplit, ScenarioInfo,
+    StateInfo,
 };
 use carff_networks::decoder::IMAGE_PX;
 use std::path::Path;
@@ -26,14 +26,6 @@ pub struct Label {
     pub role: Option<PoseRole>,
 }
 
-/// Equivalence as the images show it: exactly, or through the noise of a camera.
-fn seen_equivalence(dataset: &Dataset, images: &[Image], noisy: bool) -> Equivalence {
-    Equivalence::from_images(dataset, images, |a, b, counts| match a.view().zip(b.view()) {
-        Some((a, b)) if noisy => carff_unknown::shows_same(a, b, counts),
-        _ => looks_same_where(a, b, counts),
-    })
-}
-
 /// Images, labels, split and equivalences of one scenario. The images of free poses follow those of the dataset;
 /// their views are numbered after the dataset's views.
 pub struct PosedImages {
@@ -51,8 +43,9 @@ pub struct PosedImages {
     pub equivalence: Equivalence,
     /// Visual equivalence as the images show it, which training may use.
     pub seen_equivalence: Equivalence,
-    /// True for images of a camera. A field that was trained on them differs a little between all states.
-    noisy: bool,
+    /// Comparison of the dataset's images, and so of free poses: a field that was trained on images of a camera differs
+    /// a little between all states.
+    comparison: Comparison,
     /// Number of the first view of each dataset of free poses, and its equivalence.
     random_equivalences: Vec<(usize, Equivalence)>,
     /// Mean image of each pose over the states in which a pixel is valid, `[V, 3, 128, 128]`, 0..=1.
@@ -75,8 +68,8 @@ impl PosedImages {
             index[label.view * states + label.state] = Some(i);
         }
         let equivalence = Equivalence::from_dataset(&dataset, &images);
-        let noisy = has_noise(&dataset, &images);
-        let seen_equivalence = seen_equivalence(&dataset, &images, noisy);
+        let comparison = Comparison::of(&dataset, &images);
+        let seen_equivalence = Equivalence::from_images(&dataset, &images, comparison);
         let means: Vec<Tensor> = (0..dataset.view_count())
             .map(|view| {
                 let of_view: Vec<usize> = (0..states).filter_map(|state| index[view * states + state]).collect();
@@ -93,7 +86,7 @@ impl PosedImages {
             split,
             equivalence,
             seen_equivalence,
-            noisy,
+            comparison,
             random_equivalences: Vec::new(),
             index,
         })
@@ -110,7 +103,7 @@ impl PosedImages {
         let images = free.load_all_images()?;
         let first_view = self.view_count();
         self.labels.extend(labels(&free, first_view, |_| None).map_err(|what| unfit(&what))?);
-        self.random_equivalences.push((first_view, seen_equivalence(&free, &images, self.noisy)));
+        self.random_equivalences.push((first_view, Equivalence::from_images(&free, &images, self.comparison)));
         self.images.extend(images);
         Ok(())
     }

@@ -141,6 +141,9 @@ fn unlabelled(config: &mut TrainingConfig, other_poses: usize) {
     config.vae.other_poses = other_poses;
 }
 
+/// File of a row in its [`folder`].
+const ROW: &str = "row.json";
+
 /// A row of the table.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct AblationRow {
@@ -182,10 +185,9 @@ pub fn row(
 ) -> Result<AblationRow, TrainingError> {
     let seed = training.config.seed;
     let folder = folder(training.out, variant, seed);
-    let path = folder.join("row.json");
-    if let Ok(text) = std::fs::read_to_string(&path) {
-        return serde_json::from_str(&text)
-            .map_err(|e| TrainingError::Format { path, what: format!("{e}; remove the file to score it again") });
+    let path = folder.join(ROW);
+    if let Some(row) = read_row(&path)? {
+        return Ok(row);
     }
     let out = folder.join("checkpoint");
     let config = variant.apply(training.config);
@@ -195,6 +197,28 @@ pub fn row(
     let row = AblationRow { variant, description, seed, scores: encoder_table(&subject) };
     write(&path, &to_json(&row, &path)?)?;
     Ok(row)
+}
+
+/// Reads all rows in `out`, those of earlier runs included: by variant, then by seed.
+pub fn rows(out: &Path) -> Result<Vec<AblationRow>, TrainingError> {
+    let mut rows = Vec::new();
+    for variant in Variant::ALL {
+        let Ok(seeds) = std::fs::read_dir(out.join(variant.name())) else { continue };
+        for seed in seeds.flatten() {
+            rows.extend(read_row(&seed.path().join(ROW))?);
+        }
+    }
+    rows.sort_by_key(|row| (Variant::ALL.iter().position(|variant| *variant == row.variant), row.seed));
+    Ok(rows)
+}
+
+/// Reads a row; `None` if there is none.
+fn read_row(path: &Path) -> Result<Option<AblationRow>, TrainingError> {
+    let Ok(text) = std::fs::read_to_string(path) else { return Ok(None) };
+    serde_json::from_str(&text).map(Some).map_err(|e| TrainingError::Format {
+        path: path.to_owned(),
+        what: format!("{e}; remove the file to score it again"),
+    })
 }
 
 /// Writes `ablation.json` and `README.md` into `out`.

@@ -167,6 +167,8 @@ fn every_variant_has_a_row() {
     std::fs::remove_dir_all(&checkpoint).unwrap();
     assert_eq!(row(Variant::Full).scores.train.images, rows[0].scores.train.images);
     assert!(!checkpoint.exists(), "read, not trained again");
+    let found = ablation::rows(&out).unwrap();
+    assert_eq!(found, rows, "rows of earlier runs stay in the table");
     let mut other = rows[0].clone();
     other.seed += 1;
     (rows[0].scores.svm.trained_by_pose.accuracy, other.scores.svm.trained_by_pose.accuracy) = (0.5, 0.75);

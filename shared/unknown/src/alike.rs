@@ -2,12 +2,14 @@
 
 use crate::align::{View, align};
 use crate::compare::reduced;
-use crate::fit::fit;
+use crate::fit::{fit, fit_from_offset};
 use crate::residuals::{Pixels, ResidualKind, median_residual, with_neighbours};
 use ndarray::ArrayView3;
 
 /// Longest side of the compared images, pixels: fine texture is below the errors of the pose.
 const SIDE_PX: usize = 64;
+/// Largest gain of one image over another one from its pose.
+const MOST_GAIN: f32 = 1.5;
 /// Residual that noise does not exceed, in deviations.
 const WITHIN: f32 = 2.0;
 
@@ -52,7 +54,10 @@ pub fn shows_same(a: ArrayView3<'_, u8>, b: ArrayView3<'_, u8>, counts: impl Fn(
 /// Reports whether one image leaves no residual of another one.
 fn explains(one: &[f32], other: &[f32], judged: &[bool], width: usize) -> bool {
     let pixels: Vec<usize> = (0..judged.len()).filter(|&i| judged[i]).collect();
-    let fit = fit(other, one, &pixels);
+    let freely = fit(other, one, &pixels);
+    // A bright vehicle that only `one` has pulls the gain towards nothing, and nothing explains everything.
+    let is_plausible = freely.gain.iter().all(|gain| (1.0 / MOST_GAIN..=MOST_GAIN).contains(gain));
+    let fit = if is_plausible { freely } else { fit_from_offset(other, one, &pixels) };
     let energy = Pixels::new(other, judged, &[one], width).energy(one, &fit);
     let residual = median_residual(&energy, ResidualKind::Unexpected, judged, width, fit.noise);
     residual.iter().all(|residual| *residual <= WITHIN)
@@ -96,6 +101,21 @@ mod tests {
             let value = if in_vehicle { [200.0, 180.0, 40.0][c] } else { place };
             (gain * value + noise((y * SIDE + x) * 3 + c)).clamp(0.0, 255.0) as u8
         })
+    }
+
+    /// A bright vehicle on a road of little contrast is a difference, although a gain of nothing would explain it.
+    #[test]
+    fn contrast_does_not_vanish_in_the_gain() {
+        let road = |vehicle_px: usize| {
+            Array3::from_shape_fn((64, 64, 3), |(y, x, _)| {
+                let in_vehicle = (20..20 + vehicle_px).contains(&x) && (30..44).contains(&y);
+                if in_vehicle { 230 } else { 80 + (x / 9 % 2 * 20 + y / 16 % 2 * 20 + x * 7 % 5) as u8 }
+            })
+        };
+        for vehicle_px in [12, 20, 30] {
+            assert!(!shows_same(road(0).view(), road(vehicle_px).view(), |_| true), "{vehicle_px}");
+        }
+        assert!(shows_same(road(0).view(), road(0).view(), |_| true));
     }
 
     /// Two photos of a place from nearly one pose show the same, at any exposure; a vehicle in one of them is a

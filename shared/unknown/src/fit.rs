@@ -4,6 +4,8 @@ use carff_base::linear::solve;
 
 /// Passes of the robust fit of gain and offset.
 const PASSES: usize = 5;
+/// Rounds of choosing the pixels that agree.
+const ROUNDS: usize = 3;
 /// Pixels beyond this many robust deviations do not count in the fit.
 const TRIM: f32 = 2.5;
 /// Smallest deviation of a pixel, of 1.
@@ -63,6 +65,24 @@ pub(crate) fn fit(image: &[f32], rendered: &[f32], pixels: &[usize]) -> Fit {
     Fit { noise: noise(image, rendered, &fit, pixels), ..fit }
 }
 
+/// Fits gain and offset as [`fit`] does, where `rendered` may have outliers, too: a bright vehicle that only it has would
+/// pull the gain of [`fit`] towards nothing. This fit starts with the pixels that agree up to an offset.
+pub(crate) fn fit_from_offset(image: &[f32], rendered: &[f32], pixels: &[usize]) -> Fit {
+    let offset =
+        |c: usize| median(&mut pixels.iter().map(|&i| image[i * 3 + c] - rendered[i * 3 + c]).collect::<Vec<_>>());
+    let mut found = Fit { gain: [1.0; 3], offset: [0, 1, 2].map(offset), noise: LEAST_NOISE, explained: 1.0 };
+    for _ in 0..ROUNDS {
+        let error =
+            |i: usize, c: usize| (image[i * 3 + c] - found.gain[c] * rendered[i * 3 + c] - found.offset[c]).abs();
+        let limits = [0, 1, 2].map(|c| {
+            (TRIM * OF_MEDIAN * median(&mut pixels.iter().map(|&i| error(i, c)).collect::<Vec<_>>())).max(LEAST_NOISE)
+        });
+        let agree = |i: &usize| (0..3).all(|c| error(*i, c) <= limits[c]);
+        found = fit(image, rendered, &pixels.iter().copied().filter(agree).collect::<Vec<_>>());
+    }
+    Fit { noise: noise(image, rendered, &found, pixels), ..found }
+}
+
 /// Solves for the factors of N terms, by least squares over rows of terms and their value; `None` for too few rows or
 /// dependent terms.
 pub(crate) fn least_squares<const N: usize>(rows: impl Iterator<Item = ([f32; N], f32)>) -> Option<[f32; N]> {
@@ -97,6 +117,22 @@ mod tests {
         for c in 0..3 {
             assert!((fit.gain[c] - 0.6).abs() < 0.05 && (fit.offset[c] - 0.2).abs() < 0.05, "{fit:?}");
         }
+    }
+
+    /// A seventh of the rendered pixels are outliers at one end: they do not turn the line.
+    #[test]
+    fn outliers_of_both_images_do_not_count() {
+        let rendered: Vec<f32> =
+            (0..900).map(|i| if i / 3 % 7 < 1 { 0.95 } else { 0.3 + 0.2 * ((i * 37 % 100) as f32) / 100.0 }).collect();
+        let image: Vec<f32> =
+            rendered.iter().enumerate().map(|(i, v)| if i / 3 % 7 < 1 { 0.4 } else { 0.9 * v + 0.05 }).collect();
+        let pixels: Vec<usize> = (0..300).collect();
+        let fit = fit_from_offset(&image, &rendered, &pixels);
+        for c in 0..3 {
+            assert!((fit.gain[c] - 0.9).abs() < 0.01 && (fit.offset[c] - 0.05).abs() < 0.01, "{fit:?}");
+        }
+        let nothing = fit_from_offset(&image, &rendered, &[]);
+        assert_eq!((nothing.gain, nothing.offset), ([1.0; 3], [0.0; 3]));
     }
 
     /// Factors are found exactly where the values have no noise; too few rows and dependent terms have none.
