@@ -1,6 +1,6 @@
 //! Visual equivalence of states per view, and the accuracy limit that follows from it.
 
-use crate::comparison::Comparison;
+use crate::comparison::{ImageComparison, Pairs};
 use crate::dataset::Dataset;
 use crate::image::{Image, looks_same};
 use rayon::prelude::*;
@@ -18,7 +18,7 @@ impl Equivalence {
     /// evaluation: [`Self::from_images`] is what training may know. `images` are those of [`Dataset::load_all_images`].
     pub fn from_dataset(dataset: &Dataset, images: &[Image]) -> Self {
         let known = dataset.frames().iter().all(|frame| frame.alike_states.is_some());
-        let comparison = if known { Comparison::Exact } else { Comparison::of(dataset, images) };
+        let comparison = if known { ImageComparison::Exact } else { Self::comparison(dataset, images) };
         Self::between(dataset, images, |a, b| {
             let (of_a, of_b) = (&dataset.frames()[a], &dataset.frames()[b]);
             let known = of_a.alike_states.as_ref().zip(of_b.state).map(|(alike, state)| alike.contains(&state));
@@ -26,9 +26,24 @@ impl Equivalence {
         })
     }
 
+    /// Returns the comparison that a dataset's images need. `images` are those of [`Dataset::load_all_images`].
+    pub fn comparison(dataset: &Dataset, images: &[Image]) -> ImageComparison {
+        let mut of_view: Vec<Vec<usize>> = vec![Vec::new(); dataset.view_count()];
+        for (i, frame) in dataset.frames().iter().enumerate().take(images.len()) {
+            if let Some(view) = frame.view {
+                of_view[view].push(i);
+            }
+        }
+        let count = |frames: &Vec<usize>| -> Pairs {
+            let pairs = frames.iter().enumerate().flat_map(|(i, &a)| frames[..i].iter().map(move |&b| (a, b)));
+            pairs.map(|(a, b)| Pairs::one(&images[a], &images[b], dataset.valid_in_all(&[a, b]))).sum()
+        };
+        of_view.par_iter().map(count).sum::<Pairs>().comparison()
+    }
+
     /// Compares all pairs of states in each view, in the pixels that are valid in both images. `images` are those of
     /// [`Dataset::load_all_images`]. A state without an image in a view is only equivalent to itself.
-    pub fn from_images(dataset: &Dataset, images: &[Image], comparison: Comparison) -> Self {
+    pub fn from_images(dataset: &Dataset, images: &[Image], comparison: ImageComparison) -> Self {
         Self::between(dataset, images, |a, b| comparison.same(&images[a], &images[b], dataset.valid_in_all(&[a, b])))
     }
 

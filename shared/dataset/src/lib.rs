@@ -45,7 +45,7 @@ mod writer;
 
 pub use calibration::{CalibrationError, CameraCalibration, DistortionModel};
 pub use carff_messages::Observability;
-pub use comparison::Comparison;
+pub use comparison::ImageComparison;
 pub use corruptions::{Corruption, CorruptionError};
 pub use dataset::Dataset;
 pub use degrade::{Degradation, degrade};

@@ -1,6 +1,6 @@
 //! Derives the observability of frames from their images, for datasets that do not contain it.
 
-use crate::comparison::{Comparison, Pairs};
+use crate::comparison::{ImageComparison, Pairs};
 use crate::error::DatasetError;
 use crate::image::Image;
 use crate::scenario::Frame;
@@ -27,7 +27,7 @@ pub(crate) fn seen_in_images<V: Fn(usize) -> bool>(
             list.push(i);
         }
     }
-    let compared = |comparison: Comparison| -> Result<(Seen, Pairs), DatasetError> {
+    let compared = |comparison: ImageComparison| -> Result<(Seen, Pairs), DatasetError> {
         let of_views: Vec<(Seen, Pairs)> = of_view
             .par_iter()
             .map(|of_view| {
@@ -41,16 +41,16 @@ pub(crate) fn seen_in_images<V: Fn(usize) -> bool>(
         }
         Ok((all, of_views.into_iter().map(|(_, pairs)| pairs).sum()))
     };
-    let (seen, pairs) = compared(Comparison::Exact)?;
+    let (seen, pairs) = compared(ImageComparison::Exact)?;
     match pairs.comparison() {
-        Comparison::Exact => Ok(seen),
+        ImageComparison::Exact => Ok(seen),
         through_noise => Ok(compared(through_noise)?.0),
     }
 }
 
 /// Returns the observability of the frames `of_view`, whose images come from one view, and the pairs that were compared.
 fn seen_from_view<V: Fn(usize) -> bool>(
-    comparison: Comparison,
+    comparison: ImageComparison,
     of_view: &[usize],
     frames: &[Frame],
     images: &[Image],

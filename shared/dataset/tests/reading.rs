@@ -6,7 +6,7 @@ use std::path::Path;
 
 use carff_base::geometry::{OrientedBox, PinholeCamera};
 use carff_dataset::{
-    Candidate, Comparison, Dataset, DatasetReport, DatasetWriter, Equivalence, FrameRecord, Image, NamedBox,
+    Candidate, Dataset, DatasetReport, DatasetWriter, Equivalence, FrameRecord, Image, ImageComparison, NamedBox,
     Observability, PoseRole, PoseSplit, ScenarioInfo, SheetOptions, StateInfo, contact_sheet,
 };
 use serde_json::{Value, json};
@@ -653,13 +653,13 @@ fn degraded_copies_keep_the_truth() {
     let copy = Dataset::open(&out).unwrap();
     let images = copy.load_all_images().unwrap();
     assert_eq!((count, copy.frames().len()), (4, 4));
-    let exact = |dataset: &Dataset, images: &[Image]| Equivalence::from_images(dataset, images, Comparison::Exact);
+    let exact = |dataset: &Dataset, images: &[Image]| Equivalence::from_images(dataset, images, ImageComparison::Exact);
     let (truth, seen) = (Equivalence::from_dataset(&copy, &images), exact(&copy, &images));
     assert!(truth.same(0, 0, 1) && !truth.same(1, 0, 1));
     assert!(!seen.same(0, 0, 1) && !seen.same(1, 0, 1));
     let original = clean.load_all_images().unwrap();
-    assert_eq!(Comparison::of(&copy, &images), Comparison::ThroughNoise);
-    assert_eq!(Comparison::of(&clean, &original), Comparison::Exact);
+    assert_eq!(Equivalence::comparison(&copy, &images), ImageComparison::ThroughNoise);
+    assert_eq!(Equivalence::comparison(&clean, &original), ImageComparison::Exact);
     assert_eq!(exact(&clean, &original), truth);
     assert_ne!(images[0], clean.load_image(0).unwrap());
 

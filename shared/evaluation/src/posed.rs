@@ -2,7 +2,7 @@
 
 use crate::EvaluationError;
 use carff_dataset::{
-    Comparison, Dataset, Equivalence, Frame, Image, NamedBox, Observability, PoseRole, PoseSplit, ScenarioInfo,
+    Dataset, Equivalence, Frame, Image, ImageComparison, NamedBox, Observability, PoseRole, PoseSplit, ScenarioInfo,
     StateInfo,
 };
 use carff_networks::decoder::IMAGE_PX;
@@ -43,9 +43,9 @@ pub struct PosedImages {
     pub equivalence: Equivalence,
     /// Visual equivalence as the images show it, which training may use.
     pub seen_equivalence: Equivalence,
-    /// Comparison of the dataset's images, and so of free poses: a field that was trained on images of a camera differs
+    /// ImageComparison of the dataset's images, and so of free poses: a field that was trained on images of a camera differs
     /// a little between all states.
-    comparison: Comparison,
+    comparison: ImageComparison,
     /// Number of the first view of each dataset of free poses, and its equivalence.
     random_equivalences: Vec<(usize, Equivalence)>,
     /// Mean image of each pose over the states in which a pixel is valid, `[V, 3, 128, 128]`, 0..=1.
@@ -68,7 +68,7 @@ impl PosedImages {
             index[label.view * states + label.state] = Some(i);
         }
         let equivalence = Equivalence::from_dataset(&dataset, &images);
-        let comparison = Comparison::of(&dataset, &images);
+        let comparison = Equivalence::comparison(&dataset, &images);
         let seen_equivalence = Equivalence::from_images(&dataset, &images, comparison);
         let means: Vec<Tensor> = (0..dataset.view_count())
             .map(|view| {
