@@ -74,7 +74,7 @@ impl Sum for Pairs {
 mod tests {
     use super::*;
 
-    /// Read noise of one of 255 is found; another light on everything, and a vehicle, are no noise.
+    /// Read noise of one of 255 is found; another light on everything, or a vehicle, does not count as noise.
     #[test]
     fn noise_differs_from_pixel_to_pixel() {
         let mut state = 1_u32;
