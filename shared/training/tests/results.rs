@@ -5,7 +5,8 @@
 mod common;
 
 use carff_dataset::Image;
-use carff_evaluation::{EvalOptions, Results, Subject, Table, evaluate};
+use carff_evaluation::{EvalOptions, LocalisationTable, MaskedView, MethodFigures, Results, Subject, Table, evaluate};
+use carff_scenes::Detail;
 use carff_training::{
     Phases,
     ablation::{self, AblationTable, Variant},
@@ -127,9 +128,47 @@ fn every_table_is_made() {
         assert!(Image::load(&place.at("results").join(file)).unwrap().width_px > 100, "{file}");
     }
 
+    both_methods_localise_the_same_samples(&place);
     let again = evaluated(&place, &[Table::Recall]);
     assert_eq!(again.forecast, results.forecast);
     assert!(again.planning.is_none() && again.encoder.is_none() && again.gallery.is_none());
+}
+
+/// Localisation by density and by segmentation of views with masks: both name a state, or none, for the same samples,
+/// and the same seed gives the same counts.
+fn both_methods_localise_the_same_samples(place: &Place) {
+    let _exclusive = common::exclusive();
+    let mut subject = Subject::load(&place.at("checkpoint"), &place.at("set"), OPTIONS, &|_| {}).unwrap();
+    let probe = subject.probe.as_ref().unwrap();
+    let camera = carff_evaluation::view_camera(&subject.posed.dataset, probe.field());
+    let names = carff_evaluation::occupants(probe.layout());
+    let objects: Vec<u16> = names.iter().map(|name| place.scenario.object_of(name).unwrap()).collect();
+    let masked = |state: usize| {
+        let info = place.scenario.info();
+        let (branch, timestamp) = (info.branch_of(state), info.timestamp_of(state));
+        let rendering = place.scenario.render(branch, timestamp, &camera, Detail::Image).unwrap();
+        let class = |object: &u16| objects.iter().position(|of| of == object).map_or(0, |index| index as u8 + 1);
+        let classes = rendering.object_id.iter().map(class).collect();
+        MaskedView { rgb: carff_evaluation::to_unit(&rendering.image.rgb), classes }
+    };
+    subject.masked_views = (0..subject.posed.scenario.state_count()).map(masked).collect();
+    let tables = [(); 2].map(|()| {
+        let results = evaluate(&subject, &[Table::Localisation], &place.at("localisation"), &|_| {}).unwrap();
+        assert!(results.left_out.is_empty(), "{:?}", results.left_out);
+        results.localisation.unwrap()
+    });
+    assert_eq!(tables[0].trained_views, subject.masked_views.len());
+    let counts = |table: &LocalisationTable| {
+        let figures = table.parts.trained.unwrap();
+        let of = |method: MethodFigures| (method.possible, method.unknown, method.only_this_fails);
+        (figures.images, figures.samples, figures.agree, of(figures.density), of(figures.segmentation))
+    };
+    let (images, samples, agree, density, segmentation) = counts(&tables[0]);
+    assert_eq!(counts(&tables[1]), (images, samples, agree, density, segmentation));
+    assert!(images > 0 && samples % images == 0 && agree <= samples);
+    let possible_by_both = density.0 - segmentation.2;
+    assert_eq!(possible_by_both, segmentation.0 - density.2);
+    assert!(density.0 + density.1 <= samples && segmentation.0 + segmentation.1 <= samples);
 }
 
 /// A scenario with one branch has nothing to plan and no branch to recall. A checkpoint with only a trained VAE has no

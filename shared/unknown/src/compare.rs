@@ -88,6 +88,14 @@ impl Comparison {
     }
 }
 
+#[cfg(test)]
+impl Comparison {
+    /// Replaces the residuals of all states.
+    pub(crate) fn with_residuals(self, residuals: Vec<[Vec<f32>; 2]>) -> Self {
+        Self { residuals, ..self }
+    }
+}
+
 /// Renders the known states of one field and compares images with them. It reuses its memory, and the rendered states
 /// while the camera stands still.
 #[derive(Debug, Default)]

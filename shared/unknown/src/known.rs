@@ -377,9 +377,23 @@ mod tests {
         assert!(patched.ratios[0] < 0.1 && patched.residual > 1.0, "{patched:?}");
         let [x, y, _] = patched.boxes[0].center;
         assert!(x.abs() < 1.5 && y.abs() < 2.5, "{:?}", patched.boxes);
-        // No state explains a view of another place.
         let mut comparison =
             known.see(&mut Comparer::default(), &field, &states, (&camera, image.view()), 1).unwrap().1;
+        // What only the image has, and what only a state has, count in limits of their own.
+        let residual = comparison.residual(0, ResidualKind::Unexpected).to_vec();
+        let nothing = || vec![0.0; residual.len()];
+        let of_either = vec![[residual.clone(), nothing()], [nothing(), residual.clone()]];
+        let of_either = comparison.clone().with_residuals(of_either);
+        let excluded = |unexpected: f32, missing: f32| {
+            let mut known = Known { hazard_states: vec![false; 2], ..known.clone() };
+            (known.clear.unexpected.limit, known.clear.missing.limit) = (unexpected, missing);
+            known.judge(&of_either).ratios.into_iter().map(|ratio| ratio < 0.1).collect::<Vec<_>>()
+        };
+        let (within, beyond) = (1e6, 5.0);
+        assert_eq!(excluded(within, within), [false, false]);
+        assert_eq!(excluded(beyond, within), [true, false]);
+        assert_eq!(excluded(within, beyond), [false, true]);
+        // No state explains a view of another place.
         comparison.fit.explained = 0.4;
         let elsewhere = known.judge(&comparison);
         assert!(elsewhere.boxes.is_empty() && elsewhere.ratios == [0.0], "{elsewhere:?}");
