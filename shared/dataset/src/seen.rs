@@ -44,7 +44,7 @@ pub(crate) fn seen_in_images<V: Fn(usize) -> bool>(
     let (seen, pairs) = compared(ImageComparison::Exact)?;
     match pairs.comparison() {
         ImageComparison::Exact => Ok(seen),
-        through_noise => Ok(compared(through_noise)?.0),
+        ImageComparison::ThroughNoise => Ok(compared(ImageComparison::ThroughNoise)?.0),
     }
 }
 
