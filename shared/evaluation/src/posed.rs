@@ -43,7 +43,7 @@ pub struct PosedImages {
     pub equivalence: Equivalence,
     /// Visual equivalence as the images show it, which training may use.
     pub seen_equivalence: Equivalence,
-    /// ImageComparison of the dataset's images, and so of free poses: a field that was trained on images of a camera differs
+    /// How the dataset's images are compared, and so of free poses: a field that was trained on images of a camera differs
     /// a little between all states.
     comparison: ImageComparison,
     /// Number of the first view of each dataset of free poses, and its equivalence.
