@@ -43,8 +43,8 @@ pub struct PosedImages {
     pub equivalence: Equivalence,
     /// Visual equivalence as the images show it, which training may use.
     pub seen_equivalence: Equivalence,
-    /// How the dataset's images are compared, and so those of free poses: a field that was trained on images of a camera
-    /// differs a little between all states.
+    /// The comparison of the dataset's images, and so of those of free poses: a field that was trained on images of a
+    /// camera differs a little between all states.
     comparison: ImageComparison,
     /// Number of the first view of each dataset of free poses, and its equivalence.
     random_equivalences: Vec<(usize, Equivalence)>,
