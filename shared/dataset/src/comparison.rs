@@ -34,9 +34,15 @@ pub(crate) struct Pairs {
 }
 
 impl Pairs {
+    /// Counts all pairs of the images from one view. `valid` returns the test for pixels that count in two of them.
+    pub(crate) fn of_view<V: Fn(usize) -> bool>(images: &[&Image], valid: impl Fn([usize; 2]) -> V) -> Self {
+        let pairs = (0..images.len()).flat_map(|a| (0..a).map(move |b| [a, b]));
+        pairs.map(|[a, b]| Self::one(images[a], images[b], valid([a, b]))).sum()
+    }
+
     /// Returns the count of one pair. It is mostly equal if from at least half of the pixels that count to the next, the
     /// difference of the images hardly changes: noise differs from pixel to pixel, and another colour or light does not.
-    pub(crate) fn one(a: &Image, b: &Image, counts: impl Fn(usize) -> bool) -> Self {
+    fn one(a: &Image, b: &Image, counts: impl Fn(usize) -> bool) -> Self {
         let difference = |value: usize| i16::from(a.rgb[value]) - i16::from(b.rgb[value]);
         let width = (a.width_px as usize).max(1);
         let (mut equal, mut all) = (0, 0);

@@ -34,9 +34,9 @@ impl Equivalence {
                 of_view[view].push(i);
             }
         }
-        let count = |frames: &Vec<usize>| -> Pairs {
-            let pairs = frames.iter().enumerate().flat_map(|(i, &a)| frames[..i].iter().map(move |&b| (a, b)));
-            pairs.map(|(a, b)| Pairs::one(&images[a], &images[b], dataset.valid_in_all(&[a, b]))).sum()
+        let count = |frames: &Vec<usize>| {
+            let of_view: Vec<&Image> = frames.iter().map(|&i| &images[i]).collect();
+            Pairs::of_view(&of_view, |[a, b]| dataset.valid_in_all(&[frames[a], frames[b]]))
         };
         of_view.par_iter().map(count).sum::<Pairs>().comparison()
     }

@@ -32,7 +32,10 @@ pub(crate) fn seen_in_images<V: Fn(usize) -> bool>(
             .par_iter()
             .map(|of_view| {
                 let images: Vec<Image> = of_view.iter().map(|&i| image(i)).collect::<Result<_, _>>()?;
-                Ok(seen_from_view(comparison, of_view, frames, &images, &valid))
+                let valid = |[a, b]: [usize; 2]| valid([of_view[a], of_view[b]]);
+                let of_view: Vec<&Frame> = of_view.iter().map(|&i| &frames[i]).collect();
+                let pairs = Pairs::of_view(&images.iter().collect::<Vec<_>>(), valid);
+                Ok((seen_from_view(comparison, &of_view, &images, valid), pairs))
             })
             .collect::<Result<_, DatasetError>>()?;
         let mut all = vec![None; frames.len()];
@@ -48,28 +51,23 @@ pub(crate) fn seen_in_images<V: Fn(usize) -> bool>(
     }
 }
 
-/// Returns the observability of the frames `of_view`, whose images come from one view, and the pairs that were compared.
+/// Returns the observability of frames whose images come from one view. `valid` returns the test for pixels that count
+/// in two of the images.
 fn seen_from_view<V: Fn(usize) -> bool>(
     comparison: ImageComparison,
-    of_view: &[usize],
-    frames: &[Frame],
+    frames: &[&Frame],
     images: &[Image],
     valid: impl Fn([usize; 2]) -> V,
-) -> (Seen, Pairs) {
-    let mut pairs = Pairs::default();
-    let mut found = vec![(0, 0); of_view.len()];
-    for (a, &frame_a) in of_view.iter().enumerate() {
-        for (b, &frame_b) in of_view[..a].iter().enumerate() {
-            let (of_a, of_b) = (&frames[frame_a], &frames[frame_b]);
-            if of_a.timestamp != of_b.timestamp || of_a.branch == of_b.branch {
-                continue;
-            }
-            pairs = pairs + Pairs::one(&images[a], &images[b], valid([frame_a, frame_b]));
-            let same = comparison.same(&images[a], &images[b], valid([frame_a, frame_b]));
-            for i in [a, b] {
-                found[i].0 += usize::from(same);
-                found[i].1 += usize::from(!same);
-            }
+) -> Seen {
+    let mut found = vec![(0, 0); frames.len()];
+    for [a, b] in (0..frames.len()).flat_map(|a| (0..a).map(move |b| [a, b])) {
+        if frames[a].timestamp != frames[b].timestamp || frames[a].branch == frames[b].branch {
+            continue;
+        }
+        let same = comparison.same(&images[a], &images[b], valid([a, b]));
+        for i in [a, b] {
+            found[i].0 += usize::from(same);
+            found[i].1 += usize::from(!same);
         }
     }
     let seen = found.into_iter().map(|(alike, different)| match (alike, different) {
@@ -78,5 +76,5 @@ fn seen_from_view<V: Fn(usize) -> bool>(
         (_, 0) => Some(Observability::None),
         _ => Some(Observability::Partial),
     });
-    (seen.collect(), pairs)
+    seen.collect()
 }
