@@ -1,7 +1,7 @@
 //! The condition of a camera, from its images: no network and no pose is needed.
 
 use carff_messages::{ImageCheck, ImageCondition};
-use ndarray::{Array2, ArrayView3, s};
+use ndarray::{Array2, ArrayView3, Axis, Zip, s};
 use serde::{Deserialize, Serialize};
 
 /// Cells along each side of the grid in which covered parts are found.
@@ -60,26 +60,29 @@ impl Measured {
     /// assert_eq!(Measured::of(black.view()).luminance, 0.0);
     /// ```
     pub fn of(image: ArrayView3<'_, u8>) -> Self {
-        let (height, width, _) = image.dim();
+        Self::of_luminance(&luminances(image))
+    }
+
+    fn of_luminance(luminance: &Array2<f32>) -> Self {
+        let (height, width) = luminance.dim();
         if height < 3 || width < 3 {
             return Self::default();
         }
-        let luminance = luminances(image);
         let mean = luminance.iter().sum::<f32>() / luminance.len() as f32;
         let deviation = (luminance.iter().map(|v| (v - mean).powi(2)).sum::<f32>() / luminance.len() as f32).sqrt();
         Self {
             luminance: (mean / 255.0).clamp(0.0, 1.0),
-            sharpness: detail(&luminance) / deviation.max(1.0),
-            covered: covered(&luminance),
+            sharpness: detail(luminance) / deviation.max(1.0),
+            covered: covered(luminance),
         }
     }
 }
 
 /// Luminance of each pixel (height, width), 0..=255.
 fn luminances(image: ArrayView3<'_, u8>) -> Array2<f32> {
-    let (height, width, _) = image.dim();
-    Array2::from_shape_fn((height, width), |(y, x)| {
-        let [r, g, b] = [0, 1, 2].map(|channel| f32::from(image[[y, x, channel]]));
+    let [red, green, blue] = [0, 1, 2].map(|channel| image.index_axis(Axis(2), channel));
+    Zip::from(red).and(green).and(blue).map_collect(|&r, &g, &b| {
+        let [r, g, b] = [r, g, b].map(f32::from);
         0.299 * r + 0.587 * g + 0.114 * b
     })
 }
@@ -87,14 +90,14 @@ fn luminances(image: ArrayView3<'_, u8>) -> Array2<f32> {
 /// Mean absolute Laplacian over cells of 2 x 2 pixels, which averages the sensor's noise.
 fn detail(luminance: &Array2<f32>) -> f32 {
     let (height, width) = luminance.dim();
-    let (w, h) = (width / 2, height / 2);
-    let at = |x: usize, y: usize| 0.25 * luminance.slice(s![2 * y..2 * y + 2, 2 * x..2 * x + 2]).iter().sum::<f32>();
+    let cells = Array2::from_shape_fn((height / 2, width / 2), |(y, x)| {
+        let at = |dy, dx| luminance[[2 * y + dy, 2 * x + dx]];
+        0.25 * (at(0, 0) + at(0, 1) + at(1, 0) + at(1, 1))
+    });
     let (mut sum, mut n) = (0.0, 0);
-    for y in 1..h.saturating_sub(1) {
-        for x in 1..w.saturating_sub(1) {
-            sum += (4.0 * at(x, y) - at(x - 1, y) - at(x + 1, y) - at(x, y - 1) - at(x, y + 1)).abs();
-            n += 1;
-        }
+    for block in cells.windows((3, 3)) {
+        sum += (4.0 * block[[1, 1]] - block[[1, 0]] - block[[1, 2]] - block[[0, 1]] - block[[2, 1]]).abs();
+        n += 1;
     }
     sum / n.max(1) as f32
 }
@@ -175,8 +178,8 @@ impl CameraCheck {
 
     /// Checks a frame and writes condition and measurements to `check`.
     pub fn check(&mut self, image: ArrayView3<'_, u8>, frame: Measurement, check: &mut ImageCheck) {
-        let measured = Measured::of(image);
         let luminance = luminances(image);
+        let measured = Measured::of_luminance(&luminance);
         check.luminance = measured.luminance;
         check.covered = measured.covered;
         let median = self.limits.map_or(1.0, |limits| limits.sharpness[1]);
