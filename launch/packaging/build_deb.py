@@ -83,8 +83,13 @@ def put_program(source: Path, target: Path, machine: str) -> None:
 
 def put_tree(source: Path, target: Path) -> None:
     for name in run("git", "ls-files", "-z", str(source)).split("\0"):
-        if name:
-            put(ROOT / name, target / Path(name).relative_to(source))
+        link, to = ROOT / name, target / Path(name).relative_to(source)
+        if name and link.is_symlink():
+            # Checkpoints share a backbone.
+            to.parent.mkdir(parents=True, exist_ok=True)
+            to.symlink_to(link.readlink())
+        elif name:
+            put(link, to)
 
 
 def put_compressed(text: bytes, target: Path) -> None:

@@ -1,10 +1,22 @@
 //! The field's weights: safetensors in half precision, read without a tensor library.
 
-use crate::{CheckpointError, Manifest, files, tensors::read_tensors};
+use crate::{
+    CheckpointError, Manifest, files,
+    tensors::{StoredTensor, read_tensors},
+};
 use carff_field::{Field, FieldConfig};
+use flate2::{Compression, read::DeflateDecoder, write::DeflateEncoder};
 use half::f16;
 use safetensors::tensor::{Dtype, TensorView, serialize};
+use std::io::{Read as _, Write as _};
 use std::path::Path;
+
+/// Endings of the names of bit fields: as the field has them, and as the file stores them, compressed by DEFLATE (RFC
+/// 1951). Files of earlier versions store them as the field has them.
+const BYTES: &str = ".bytes";
+const DEFLATED: &str = ".deflate";
+/// Largest number of bytes of a bit field: 2^9 cells a side.
+const MOST_BYTES: u64 = 1 << 24;
 
 /// Reads the field of a checkpoint.
 pub fn load_field(dir: &Path, manifest: &Manifest) -> Result<Field, CheckpointError> {
@@ -21,10 +33,27 @@ fn read(dir: &Path, path: &Path, config: FieldConfig) -> Result<Field, Checkpoin
     let wrong =
         |what: String| CheckpointError::Weights { path: dir.into(), what: format!("{}: {what}", path.display()) };
     let rows = read_tensors(path, |_| true).map_err(wrong)?;
+    let rows = rows.into_iter().map(inflated).collect::<Result<Vec<_>, _>>().map_err(wrong)?;
     Field::from_tensors(config, rows).map_err(|source| CheckpointError::Field { path: dir.into(), source })
 }
 
-/// Writes the field atomically: weights in half precision, bit fields as bytes.
+/// Returns a tensor with its bit field inflated, and any other tensor unchanged.
+fn inflated((name, shape, values): StoredTensor) -> Result<StoredTensor, String> {
+    let Some(part) = name.strip_suffix(DEFLATED) else { return Ok((name, shape, values)) };
+    let stored: Vec<u8> = values.iter().map(|&v| v as u8).collect();
+    let mut bytes = Vec::new();
+    let read = DeflateDecoder::new(&stored[..]).take(MOST_BYTES).read_to_end(&mut bytes);
+    read.map_err(|e| format!("`{name}` cannot be inflated ({e}); fetch or train the checkpoint again"))?;
+    Ok((format!("{part}{BYTES}"), vec![bytes.len()], bytes.into_iter().map(f32::from).collect()))
+}
+
+fn deflated(bytes: &[u8]) -> std::io::Result<Vec<u8>> {
+    let mut encoder = DeflateEncoder::new(Vec::new(), Compression::best());
+    encoder.write_all(bytes)?;
+    encoder.finish()
+}
+
+/// Writes the field atomically: weights in half precision, bit fields compressed.
 pub fn save_field(dir: &Path, field: &Field) -> Result<(), CheckpointError> {
     let path = dir.join(files::FIELD);
     let wrong =
@@ -33,15 +62,18 @@ pub fn save_field(dir: &Path, field: &Field) -> Result<(), CheckpointError> {
     let tensors: Vec<(String, Dtype, Vec<usize>, Vec<u8>)> = field
         .tensors()
         .into_iter()
-        .map(|t| {
-            let (kind, data) = if t.name.ends_with(".bytes") {
-                (Dtype::U8, t.data.iter().map(|&v| v as u8).collect())
-            } else {
-                (Dtype::F16, t.data.iter().flat_map(|&v| f16::from_f32(v).to_le_bytes()).collect())
-            };
-            (t.name.into_owned(), kind, t.shape, data)
+        .map(|t| match t.name.strip_suffix(BYTES) {
+            Some(part) => {
+                let data = deflated(&t.data.iter().map(|&v| v as u8).collect::<Vec<_>>())?;
+                Ok((format!("{part}{DEFLATED}"), Dtype::U8, vec![data.len()], data))
+            }
+            None => {
+                let data = t.data.iter().flat_map(|&v| f16::from_f32(v).to_le_bytes()).collect();
+                Ok((t.name.into_owned(), Dtype::F16, t.shape, data))
+            }
         })
-        .collect();
+        .collect::<Result<_, _>>()
+        .map_err(file)?;
     let views = tensors
         .iter()
         .map(|(name, kind, shape, data)| {
@@ -87,6 +119,44 @@ mod tests {
         let bytes = std::fs::read(&path).unwrap();
         save_field(folder.path(), &loaded).unwrap();
         assert_eq!(std::fs::read(&path).unwrap(), bytes);
+    }
+
+    /// Bit fields are stored compressed; a file that stores them as bytes is read too. Broken ones, and ones of another
+    /// length, are refused by name.
+    #[test]
+    fn bit_fields_are_compressed() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join(files::FIELD);
+        let field = Field::new(config(), 7).unwrap();
+        save_field(folder.path(), &field).unwrap();
+        let stored = read_tensors(&path, |_| true).unwrap();
+        let loaded = read(folder.path(), &path, config()).unwrap().tensors().len();
+        let save = |change: &dyn Fn(&str, Vec<u8>) -> (String, Vec<u8>)| {
+            let tensors: Vec<_> = stored
+                .iter()
+                .map(|(name, shape, values)| match name.strip_suffix(DEFLATED) {
+                    Some(part) => {
+                        let (name, data) = change(part, values.iter().map(|&v| v as u8).collect());
+                        (name, Dtype::U8, vec![data.len()], data)
+                    }
+                    None => {
+                        let data = values.iter().flat_map(|&v| f16::from_f32(v).to_le_bytes()).collect();
+                        (name.clone(), Dtype::F16, shape.clone(), data)
+                    }
+                })
+                .collect();
+            let views = tensors.iter().map(|(n, k, s, d)| (n.as_str(), TensorView::new(*k, s.clone(), d).unwrap()));
+            std::fs::write(&path, serialize(views, &None).unwrap()).unwrap();
+            read(folder.path(), &path, config()).map(|field| field.tensors().len()).map_err(|e| e.to_string())
+        };
+        let bytes = 32 * 32 * 32 / 8;
+        assert_eq!(save(&|part, _| (format!("{part}{BYTES}"), vec![255; bytes])), Ok(loaded));
+        let deflate = |n: usize| deflated(&vec![255; n]).unwrap();
+        assert_eq!(save(&|part, _| (format!("{part}{DEFLATED}"), deflate(bytes))), Ok(loaded));
+        for data in [deflate(bytes + 1), deflate(1 << 26), vec![255; 9], Vec::new()] {
+            let error = save(&|part, _| (format!("{part}{DEFLATED}"), data.clone())).unwrap_err();
+            assert!(error.contains("`occupancy.") || error.contains("`changing."), "{error}");
+        }
     }
 
     /// Each known type of weights is read with its values; another type is refused by its name.

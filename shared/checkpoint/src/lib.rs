@@ -275,6 +275,8 @@ pub mod files {
     pub const MIXTURE: &str = "mixture.safetensors";
     /// Name of the field's weights.
     pub const FIELD: &str = "field.safetensors";
+    /// Names of all files with weights. Checkpoints may share them through links.
+    pub const WEIGHTS: [&str; 5] = [BACKBONE, ENCODER, DECODER, MIXTURE, FIELD];
 }
 
 impl Manifest {
@@ -283,6 +285,10 @@ impl Manifest {
         let path = dir.join(files::MANIFEST);
         let file = |source| CheckpointError::File { path: path.clone(), source };
         let wrong = |what: String| CheckpointError::Manifest { path: path.clone(), what };
+        let is_broken = |name: &&&str| dir.join(name).is_symlink() && !dir.join(name).exists();
+        if let Some(name) = files::WEIGHTS.iter().find(is_broken) {
+            return Err(wrong(format!("`{name}` is a link to a missing file; copy checkpoints with `cp -rL`")));
+        }
         let size = std::fs::metadata(&path).map_err(file)?.len();
         if size > MAX_MANIFEST_BYTES {
             return Err(wrong(format!("{size} bytes; at most {MAX_MANIFEST_BYTES} are allowed")));
@@ -381,5 +387,19 @@ impl Manifest {
             return Err(show("scenario.poses", &trained.poses, &given.poses));
         }
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A checkpoint that was copied without the files that its links name is refused, with the remedy.
+    #[test]
+    fn a_broken_link_is_named() {
+        let folder = tempfile::tempdir().unwrap();
+        std::os::unix::fs::symlink("../backbones/none.safetensors", folder.path().join(files::BACKBONE)).unwrap();
+        let error = Manifest::load(folder.path()).unwrap_err().to_string();
+        assert!(error.contains("`backbone.safetensors` is a link") && error.contains("cp -rL"), "{error}");
     }
 }
