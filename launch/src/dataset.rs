@@ -92,6 +92,9 @@ Example: a ROS 2 bag with images, camera_info and transforms
         /// Standard deviation of the pose's error, as a shift of the image's centre, pixels.
         #[arg(long, default_value_t = 1.0)]
         pose_jitter_px: f64,
+        /// Keep one state of each pose, drawn at random: a camera that drives by takes each image from another pose.
+        #[arg(long)]
+        one_state: bool,
         /// Seed of all draws.
         #[arg(long, default_value_t = 1)]
         seed: u64,
@@ -156,7 +159,7 @@ pub fn run(command: DatasetCommand) -> anyhow::Result<()> {
             imported.warnings.iter().for_each(|warning| println!("warning: {warning}"));
             Ok(())
         }
-        DatasetCommand::Degrade { dir, out, read_noise, gain, white_balance, pose_jitter_px, seed } => {
+        DatasetCommand::Degrade { dir, out, read_noise, gain, white_balance, pose_jitter_px, one_state, seed } => {
             ensure!((0.0..=32.0).contains(&pose_jitter_px), "--pose-jitter-px {pose_jitter_px}: 0 to 32 are allowed");
             let noise = SensorNoise {
                 sigma: read_noise,
@@ -165,7 +168,8 @@ pub fn run(command: DatasetCommand) -> anyhow::Result<()> {
                 channel_offset_sigma: 0.0,
             };
             noise.validate()?;
-            let images = degrade(&Dataset::open(&dir)?, &out, &Degradation { noise, pose_jitter_px, seed })?;
+            let degradation = Degradation { noise, pose_jitter_px, one_state, seed };
+            let images = degrade(&Dataset::open(&dir)?, &out, &degradation)?;
             println!("{images} images in {}", out.display());
             Ok(())
         }

@@ -13,6 +13,7 @@ use crate::lens::Lens;
 use crate::scenario::{Frame, ScenarioInfo};
 use crate::seen;
 use crate::transforms::{self, Transforms};
+use crate::views::Views;
 
 /// A posed image dataset; images are loaded on demand.
 #[derive(Clone, Debug)]
@@ -34,20 +35,30 @@ impl Dataset {
     ///
     /// Names file, frame and key. All missing images and masks are listed.
     pub fn open(dir: &Path) -> Result<Self, DatasetError> {
-        let mut read = transforms::read(dir)?;
+        Self::open_with(dir, Views::InEveryState)
+    }
+
+    /// Opens a dataset as [`Self::open`] does, but a view of a scenario may be missing in some states: a camera that
+    /// drives by takes each image from another pose.
+    pub fn open_partial(dir: &Path) -> Result<Self, DatasetError> {
+        Self::open_with(dir, Views::InSomeStates)
+    }
+
+    fn open_with(dir: &Path, views: Views) -> Result<Self, DatasetError> {
+        let mut read = transforms::read(dir, views)?;
         DatasetError::of_all(read.faults.drain(..).map(|(_, fault)| fault).collect())?;
         Self::of(dir, read)
     }
 
     /// Reads a dataset and all of its images for a check. Images and masks that are missing or broken are listed, and
     /// the dataset is without their frames; a scenario is without their views, and its other views are renumbered. It is
-    /// `None` if nothing remains.
+    /// `None` if nothing remains. A scenario's views may be missing in some states, with a warning.
     ///
     /// # Errors
     ///
     /// Errors of the transforms file, as in [`Self::open`].
     pub fn survey(dir: &Path) -> Result<(Option<Self>, Vec<DatasetError>), DatasetError> {
-        let mut read = transforms::read(dir)?;
+        let mut read = transforms::read(dir, Views::InSomeStates)?;
         let mut faults: Vec<Option<DatasetError>> = read.frames.iter().map(|_| None).collect();
         for (frame, fault) in read.faults.drain(..) {
             faults[frame] = Some(fault);
@@ -60,6 +71,7 @@ impl Dataset {
         drop_broken(&mut read, |frame| faults[frame].is_some());
         let faults = faults.into_iter().flatten().collect();
         let remains = !read.frames.is_empty();
+        read.warnings.extend(missing_states(&read));
         Ok((remains.then(|| Self::of(dir, read)).transpose()?, faults))
     }
 
@@ -225,6 +237,21 @@ pub(crate) fn collected<T>(results: Vec<Result<T, DatasetError>>) -> Result<Vec<
         }
     }
     DatasetError::of_all(errors).map(|()| values)
+}
+
+/// Returns the warning about views of a scenario that are missing in some states.
+fn missing_states(read: &Transforms) -> Option<String> {
+    let states = read.scenario.as_ref()?.state_count();
+    let mut of_view: HashMap<usize, usize> = HashMap::new();
+    for view in read.frames.iter().filter_map(|frame| frame.view) {
+        *of_view.entry(view).or_default() += 1;
+    }
+    let partial = of_view.values().filter(|&&count| count < states).count();
+    let warning = format!(
+        "{partial} of {} views are missing in some states: `carff train` accepts that, `carff launch` does not",
+        of_view.len()
+    );
+    (partial > 0).then_some(warning)
 }
 
 /// Removes frames, and in a scenario their views, because it needs every view in every state.

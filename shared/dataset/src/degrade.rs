@@ -5,7 +5,7 @@ use crate::{
     sensor::{SensorNoise, apply_noise_into},
 };
 use carff_base::{geometry::PinholeCamera, random::Key};
-use rand::Rng;
+use rand::{Rng, seq::SliceRandom};
 use rand_distr::StandardNormal;
 use std::path::Path;
 
@@ -17,19 +17,25 @@ pub struct Degradation {
     /// Standard deviation of the error of the pose's rotation, as the shift of the image's centre along each axis,
     /// pixels. The recorded pose is the one without the error.
     pub pose_jitter_px: f64,
+    /// Keeps the image of one state from each pose, as a camera that drives by takes it.
+    pub one_state: bool,
     /// Seed of all draws.
     pub seed: u64,
 }
 
 /// Writes a degraded copy of a dataset of known states into `out`. Each image gets its own draws. The states that look
-/// the same in the original are recorded as `alike_states`, because the degraded images cannot show it. Returns the
-/// number of images.
+/// the same in the original are recorded as `alike_states`, because the degraded images cannot show it. With
+/// `one_state`, states have equal numbers of poses, as far as possible. Returns the number of images.
 pub fn degrade(dataset: &Dataset, out: &Path, degradation: &Degradation) -> Result<usize, DatasetError> {
     let images = dataset.load_all_images()?;
     let equivalence = Equivalence::from_dataset(dataset, &images);
+    let kept = degradation.one_state.then(|| one_state_of_each_pose(dataset, degradation.seed));
     let writer = DatasetWriter::create(out)?;
     let mut records = Vec::with_capacity(images.len());
     for (i, (frame, image)) in dataset.frames().iter().zip(&images).enumerate() {
+        if kept.as_ref().zip(frame.view).is_some_and(|(kept, view)| frame.state != Some(kept[view])) {
+            continue;
+        }
         let file_path = format!("images/{i:06}.png");
         writer.write_image(&file_path, &degraded(image, &frame.camera, degradation, i as u64))?;
         let mask_path = dataset.valid_pixels(i).map(|_| format!("masks/{i:06}.png"));
@@ -50,6 +56,17 @@ pub fn degrade(dataset: &Dataset, out: &Path, degradation: &Degradation) -> Resu
     }
     writer.finish(&records, dataset.scenario())?;
     Ok(records.len())
+}
+
+/// A state for each pose: all states in turn, over the poses in random order.
+fn one_state_of_each_pose(dataset: &Dataset, seed: u64) -> Vec<usize> {
+    let mut poses: Vec<usize> = (0..dataset.view_count()).collect();
+    poses.shuffle(&mut carff_base::random::stream(Key::named("stat", seed, 0)));
+    let mut states = vec![0; poses.len()];
+    for (i, &pose) in poses.iter().enumerate() {
+        states[pose] = i % dataset.state_count();
+    }
+    states
 }
 
 /// The image behind a camera that is rotated by a random error, with sensor noise.
@@ -117,7 +134,7 @@ mod tests {
     #[test]
     fn draws_are_named_by_number() {
         let image = Image::filled(16, 16, [100; 3]);
-        let degradation = Degradation { noise: SensorNoise::default(), pose_jitter_px: 1.0, seed: 3 };
+        let degradation = Degradation { noise: SensorNoise::default(), pose_jitter_px: 1.0, one_state: false, seed: 3 };
         let made = |number| degraded(&image, &camera(), &degradation, number);
         assert_eq!(made(1), made(1));
         assert_ne!(made(1), made(2));

@@ -19,11 +19,37 @@ impl Equivalence {
     pub fn from_dataset(dataset: &Dataset, images: &[Image]) -> Self {
         let known = dataset.frames().iter().all(|frame| frame.alike_states.is_some());
         let comparison = if known { ImageComparison::Exact } else { Self::comparison(dataset, images) };
-        Self::between(dataset, images, |a, b| {
+        let mut all = Self::between(dataset, images, |a, b| {
             let (of_a, of_b) = (&dataset.frames()[a], &dataset.frames()[b]);
             let known = of_a.alike_states.as_ref().zip(of_b.state).map(|(alike, state)| alike.contains(&state));
             known.unwrap_or_else(|| comparison.same(&images[a], &images[b], dataset.valid_in_all(&[a, b])))
-        })
+        });
+        // States without an image of their own from the view.
+        for frame in dataset.frames() {
+            if let (Some(view), Some(alike)) = (frame.view, &frame.alike_states) {
+                all.join(view, alike);
+            }
+        }
+        all
+    }
+
+    /// Makes states look the same from a view.
+    fn join(&mut self, view: usize, alike: &[usize]) {
+        for (&a, &b) in alike.iter().flat_map(|a| alike.iter().map(move |b| (a, b))) {
+            if let Some(same) = self.same.get_mut((view * self.states + a) * self.states + b) {
+                *same = true;
+            }
+        }
+    }
+
+    /// Takes over what `other` has for its view `from`, which is of the same pose and the same states.
+    pub fn adopt(&mut self, view: usize, other: &Self, from: usize) {
+        let row = self.states * self.states;
+        if let Some(of_other) = other.same.get(from * row..(from + 1) * row)
+            && let Some(own) = self.same.get_mut(view * row..(view + 1) * row)
+        {
+            own.copy_from_slice(of_other);
+        }
     }
 
     /// Returns the comparison that a dataset's images need. `images` are those of [`Dataset::load_all_images`].
@@ -127,5 +153,21 @@ mod tests {
         assert!((ceiling - 2.0 / 3.0).abs() < 1e-12);
         assert_eq!(e.ceiling([]), None);
         assert!(e.same(0, 0, 1) && !e.same(0, 0, 2) && e.same(9, 5, 5) && !e.same(9, 0, 1));
+    }
+
+    /// A view takes over another's classes; a view that is not there changes nothing.
+    #[test]
+    fn a_view_takes_over_another() {
+        let other = Equivalence { states: 2, same: vec![true, false, false, true, true, true, true, true] };
+        let mut own = Equivalence { states: 2, same: vec![true, false, false, true] };
+        own.adopt(0, &other, 1);
+        assert!(own.same(0, 0, 1));
+        own.adopt(0, &other, 2);
+        own.adopt(1, &other, 0);
+        assert!(own.same(0, 0, 1));
+        own.adopt(0, &other, 0);
+        assert!(!own.same(0, 0, 1));
+        own.join(0, &[0, 1, 7]);
+        assert!(own.same(0, 1, 0));
     }
 }

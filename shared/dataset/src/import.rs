@@ -16,6 +16,7 @@ use crate::image::{Image, load_any, load_mask};
 use crate::lens::Lens;
 use crate::scenario::{Frame, ScenarioInfo, StateInfo};
 use crate::transforms::{read, warning_of_turned};
+use crate::views::Views;
 use crate::writer::{DatasetWriter, FrameRecord};
 
 /// Options of an import.
@@ -56,7 +57,7 @@ pub struct Imported {
 /// Reads a dataset from `from` and writes a dataset of one state to `out`, which must be new, empty, or a dataset that
 /// this program wrote. A dataset that names its scenario is an error.
 pub fn import(from: &Path, out: &Path, options: &ImportOptions) -> Result<Imported, DatasetError> {
-    let mut set = read(from)?;
+    let mut set = read(from, Views::InSomeStates)?;
     if set.scenario.is_some() {
         let problem = "the dataset names its scenario: it can be used directly, and need not be imported".to_owned();
         return Err(DatasetError::Image { path: from.to_owned(), problem });

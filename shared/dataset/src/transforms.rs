@@ -16,7 +16,7 @@ use crate::scenario::MAX_FRAMES;
 use crate::scenario::{Frame, ScenarioInfo};
 use crate::scenario_keys::{read_scenario, read_state};
 use crate::unique::Unique;
-use crate::views::{check_views, derive_states_without_scenario, number_views_by_pose, number_views_of_parts};
+use crate::views::{Views, check_views, derive_states_without_scenario, number_views_by_pose, number_views_of_parts};
 
 /// Maximum size of a transforms file, bytes.
 pub const MAX_TRANSFORMS_BYTES: u64 = 1 << 29;
@@ -29,7 +29,7 @@ pub(crate) struct Transforms {
     pub faults: Vec<(usize, DatasetError)>,
 }
 
-pub(crate) fn read(dir: &Path) -> Result<Transforms, DatasetError> {
+pub(crate) fn read(dir: &Path, views: Views) -> Result<Transforms, DatasetError> {
     let mut documents = Vec::new();
     for path in files(dir)? {
         documents.push(Document { root: parse(&path)?, path });
@@ -91,7 +91,7 @@ pub(crate) fn read(dir: &Path) -> Result<Transforms, DatasetError> {
             number_views_of_parts(&mut frames, &places);
         }
     }
-    check_views(&frames, &places, scenario.as_ref())?;
+    check_views(&frames, &places, scenario.as_ref(), views)?;
     Ok(Transforms { frames, scenario, warnings, faults })
 }
 

@@ -76,11 +76,20 @@ pub(crate) fn number_views_of_parts(frames: &mut [Frame], places: &[(PathBuf, St
     }
 }
 
-/// Checks that a view is one pose that occurs once in every state of the scenario, and that indices have no gaps.
+/// States in which each view of a scenario must have a frame.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Views {
+    InEveryState,
+    InSomeStates,
+}
+
+/// Checks that a view is one pose that occurs at most once in a state of the scenario, and where `views` demands it, in
+/// every state; and that indices have no gaps.
 pub(crate) fn check_views(
     frames: &[Frame],
     places: &[(PathBuf, String)],
     scenario: Option<&ScenarioInfo>,
+    views: Views,
 ) -> Result<(), DatasetError> {
     let place = |i: usize| Place { path: &places[i].0, place: places[i].1.clone() };
     let Some(scenario) = scenario else { return Ok(()) };
@@ -111,13 +120,13 @@ pub(crate) fn check_views(
         if !first_of_view.contains_key(&view) {
             return Err(file.error("view_id", format!("no frame has view {view}, though {} is used", view_count - 1)));
         }
-        for state in 0..scenario.state_count() {
+        for state in (0..scenario.state_count()).filter(|_| views == Views::InEveryState) {
             if !by_state_and_view.contains_key(&(state, view)) {
                 return Err(file.error(
                     "view_id",
                     format!(
                         "view {view} is missing in state {state} (branch `{}`, timestamp {}); every view is needed in \
-                         every state",
+                         every state, except for `carff train` and `carff eval`",
                         scenario.branches[state / scenario.timestamps],
                         state % scenario.timestamps
                     ),

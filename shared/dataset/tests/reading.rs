@@ -333,7 +333,7 @@ fn golden_errors() {
         ),
         (
             at("/frames/3/view_id", json!(2)),
-            "SET/transforms.json: frames: key `view_id`: view 1 is missing in state 1 (branch `with`, timestamp 1); every view is needed in every state".into(),
+            "SET/transforms.json: frames: key `view_id`: view 1 is missing in state 1 (branch `with`, timestamp 1); every view is needed in every state, except for `carff train` and `carff eval`".into(),
         ),
         (
             at("/frames/3/transform_matrix/2/3", json!(5.5)),
@@ -649,7 +649,8 @@ fn degraded_copies_keep_the_truth() {
     let clean = Dataset::open(&folder.path().join("clean")).unwrap();
     let noise = SensorNoise { sigma: 8.0, ..SensorNoise::OFF };
     let out = folder.path().join("degraded");
-    let count = degrade(&clean, &out, &Degradation { noise, pose_jitter_px: 1.0, seed: 1 }).unwrap();
+    let degradation = Degradation { noise, pose_jitter_px: 1.0, one_state: false, seed: 1 };
+    let count = degrade(&clean, &out, &degradation).unwrap();
     let copy = Dataset::open(&out).unwrap();
     let images = copy.load_all_images().unwrap();
     assert_eq!((count, copy.frames().len()), (4, 4));
@@ -673,4 +674,17 @@ fn degraded_copies_keep_the_truth() {
     assert_eq!(Equivalence::from_dataset(&untold, &images), truth);
     let seen: Vec<_> = untold.frames().iter().map(|frame| frame.observability.unwrap()).collect();
     assert_eq!(seen, [Observability::None, Observability::None, Observability::Full, Observability::Full]);
+
+    // With one state of each pose, the truth still names the states without an image; stages refuse such a dataset.
+    let out = folder.path().join("partial");
+    assert_eq!(degrade(&clean, &out, &Degradation { one_state: true, ..degradation }).unwrap(), 2);
+    let error = Dataset::open(&out).unwrap_err().to_string();
+    assert!(error.contains("is missing in state") && error.contains("`carff train`"), "{error}");
+    let partial = Dataset::open_partial(&out).unwrap();
+    let mut found: Vec<_> = partial.frames().iter().map(|frame| (frame.view.unwrap(), frame.state.unwrap())).collect();
+    found.sort_unstable();
+    assert!([[(0, 0), (1, 1)], [(0, 1), (1, 0)]].iter().any(|wanted| found == wanted), "{found:?}");
+    assert_eq!(Equivalence::from_dataset(&partial, &partial.load_all_images().unwrap()), truth);
+    let (survey, faults) = Dataset::survey(&out).unwrap();
+    assert!(faults.is_empty() && survey.unwrap().warnings().iter().any(|w| w.starts_with("2 of 2 views are missing")));
 }

@@ -6,6 +6,7 @@ use carff_dataset::{
     StateInfo,
 };
 use carff_networks::decoder::IMAGE_PX;
+use std::collections::HashMap;
 use std::path::Path;
 use tch::{Kind, Tensor};
 
@@ -48,15 +49,18 @@ pub struct PosedImages {
     comparison: ImageComparison,
     /// Number of the first view of each dataset of free poses, and its equivalence.
     random_equivalences: Vec<(usize, Equivalence)>,
+    /// Rendered images of all states, for each view that is missing in some states and was completed.
+    rendered: HashMap<usize, Vec<usize>>,
     /// Mean image of each pose over the states in which a pixel is valid, `[V, 3, 128, 128]`, 0..=1.
     pub pose_means: Tensor,
     index: Vec<Option<usize>>,
 }
 
 impl PosedImages {
-    /// Opens a dataset. It must have a scenario, and each frame must have a state and a view.
+    /// Opens a dataset. It must have a scenario, and each frame must have a state and a view, which may be missing in
+    /// some states.
     pub fn open(dir: &Path, split_seed: u64) -> Result<Self, EvaluationError> {
-        let dataset = Dataset::open(dir)?;
+        let dataset = Dataset::open_partial(dir)?;
         let unfit = |what: &str| EvaluationError::Unfit(format!("{}: {what}", dir.display()));
         let scenario = dataset.scenario().cloned().ok_or_else(|| unfit(NO_SCENARIO))?;
         let images = dataset.load_all_images()?;
@@ -68,13 +72,17 @@ impl PosedImages {
             index[label.view * states + label.state] = Some(i);
         }
         let equivalence = Equivalence::from_dataset(&dataset, &images);
-        let comparison = Equivalence::comparison(&dataset, &images);
+        // Without two images of one pose, nothing shows whether they have noise.
+        let comparison = match index.contains(&None) {
+            true => ImageComparison::ThroughNoise,
+            false => Equivalence::comparison(&dataset, &images),
+        };
         let seen_equivalence = Equivalence::from_images(&dataset, &images, comparison);
         let means: Vec<Tensor> = (0..dataset.view_count())
             .map(|view| {
                 let of_view: Vec<usize> = (0..states).filter_map(|state| index[view * states + state]).collect();
-                let targets = Tensor::stack(&of_view.iter().map(|&i| target(&images[i])).collect::<Vec<_>>(), 0);
-                mean_of_valid(&targets, valid_targets(&dataset, &of_view).as_ref())
+                let targets: Vec<Tensor> = of_view.iter().map(|&i| target(&images[i])).collect();
+                mean_of_valid(&Tensor::stack(&targets, 0), valid_targets(&dataset, &of_view).as_ref())
             })
             .collect();
         Ok(Self {
@@ -88,6 +96,7 @@ impl PosedImages {
             seen_equivalence,
             comparison,
             random_equivalences: Vec::new(),
+            rendered: HashMap::new(),
             index,
         })
     }
@@ -102,10 +111,78 @@ impl PosedImages {
         }
         let images = free.load_all_images()?;
         let first_view = self.view_count();
-        self.labels.extend(labels(&free, first_view, |_| None).map_err(|what| unfit(&what))?);
-        self.random_equivalences.push((first_view, Equivalence::from_images(&free, &images, self.comparison)));
+        let of_free = labels(&free, first_view, |_| None).map_err(|what| unfit(&what))?;
+        let equivalence = Equivalence::from_images(&free, &images, self.comparison);
+        for (view, from) in self.same_poses(&free) {
+            self.complete(view, from, &of_free, &images, &equivalence);
+        }
+        self.labels.extend(of_free);
+        self.random_equivalences.push((first_view, equivalence));
         self.images.extend(images);
         Ok(())
+    }
+
+    /// Views of the dataset that are missing in some states, each with the free pose that is the same.
+    fn same_poses(&self, free: &Dataset) -> Vec<(usize, usize)> {
+        let of = |frame: &Frame| frame.view.map(|view| (frame.camera.world_from_camera, view));
+        let mut found: Vec<(usize, usize)> = Vec::new();
+        let poses: Vec<_> = free.frames().iter().filter(|frame| frame.state == Some(0)).filter_map(of).collect();
+        for (pose, view) in self.dataset.frames().iter().filter_map(of).filter(|(_, view)| !self.is_whole(*view)) {
+            if let Some((_, from)) = poses.iter().find(|(other, _)| same_pose(other, &pose)) {
+                found.push((view, *from));
+            }
+        }
+        found.sort_unstable();
+        found.dedup();
+        found
+    }
+
+    /// Completes a view that is missing in some states with rendered images of all states from its pose: which states
+    /// look the same, the mean image, the pixels that change, and the visibility of the actor's place if the dataset
+    /// does not name it.
+    fn complete(&mut self, view: usize, from: usize, free: &[Label], images: &[Image], equivalence: &Equivalence) {
+        let first_view = self.view_count();
+        let of_view: Vec<usize> = (0..free.len()).filter(|&i| free[i].view == first_view + from).collect();
+        self.seen_equivalence.adopt(view, equivalence, from);
+        if self.dataset.frames().iter().all(|frame| frame.alike_states.is_none()) {
+            self.equivalence.adopt(view, equivalence, from);
+        }
+        for (label, frame) in self.labels.iter_mut().zip(self.dataset.frames()).filter(|(label, _)| label.view == view)
+        {
+            let rendered = of_view.iter().find(|&&i| free[i].state == label.state);
+            if let (None, Some(&i)) = (frame.observability, rendered) {
+                label.observability = free[i].observability;
+            }
+        }
+        let targets: Vec<Tensor> = of_view.iter().map(|&i| target(&images[i])).collect();
+        self.pose_means.get(view as i64).copy_(&mean_of_valid(&Tensor::stack(&targets, 0), None));
+        self.rendered.insert(view, of_view.iter().map(|i| self.images.len() + i).collect());
+    }
+
+    /// Returns true if a view of the dataset has an image of every state.
+    fn is_whole(&self, view: usize) -> bool {
+        (0..self.scenario.state_count()).all(|state| self.at(state, view).is_some())
+    }
+
+    /// Returns the first trained view that neither has an image of every state nor was completed by
+    /// [`Self::add_free_poses`].
+    pub fn incomplete_view(&self) -> Option<usize> {
+        let views = self.trained().into_iter().map(|i| self.labels[i].view);
+        views.filter(|&view| !self.is_whole(view) && !self.rendered.contains_key(&view)).min()
+    }
+
+    /// Returns true if each view of the dataset has an image of every state.
+    pub fn has_all_states(&self) -> bool {
+        !self.index.contains(&None)
+    }
+
+    /// Images of the states from a view of the dataset: its own, or for a view that is missing in some states, rendered
+    /// images of all of them where they were added.
+    pub fn of_view(&self, view: usize) -> Vec<usize> {
+        match self.rendered.get(&view) {
+            Some(rendered) => rendered.clone(),
+            None => (0..self.scenario.state_count()).filter_map(|state| self.at(state, view)).collect(),
+        }
     }
 
     /// Number of poses, including free poses.
@@ -162,6 +239,11 @@ impl PosedImages {
     pub fn valid_targets(&self, chosen: &[usize]) -> Option<Tensor> {
         valid_targets(&self.dataset, chosen)
     }
+}
+
+/// Returns true for two poses that are equal up to the rounding of a transforms file.
+fn same_pose(one: &[[f64; 4]; 4], other: &[[f64; 4]; 4]) -> bool {
+    one.iter().flatten().zip(other.iter().flatten()).all(|(a, b)| (a - b).abs() < 1e-6)
 }
 
 fn valid_targets(dataset: &Dataset, chosen: &[usize]) -> Option<Tensor> {

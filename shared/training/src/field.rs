@@ -265,9 +265,13 @@ pub fn views(posed: &PosedImages, chosen: &[usize]) -> Vec<TrainingView> {
         .iter()
         .map(|&i| {
             let label = posed.labels[i];
-            let same_view: Vec<&[u8]> = (0..posed.scenario.state_count())
-                .filter_map(|s| posed.at(s, label.view))
-                .map(|j| &posed.images[j].rgb[..])
+            let own = &posed.images[i];
+            let same_view: Vec<&[u8]> = posed
+                .of_view(label.view)
+                .into_iter()
+                .map(|j| &posed.images[j])
+                .filter(|image| (image.width_px, image.height_px) == (own.width_px, own.height_px))
+                .map(|image| &image.rgb[..])
                 .collect();
             let mut changed = changed_pixels(&same_view, PIXEL_TOLERANCE);
             let mut valid = Vec::new();
@@ -275,7 +279,7 @@ pub fn views(posed: &PosedImages, chosen: &[usize]) -> Vec<TrainingView> {
                 changed.retain(|&pixel| mask[pixel as usize]);
                 valid = (0..mask.len() as u32).filter(|&pixel| mask[pixel as usize]).collect();
             }
-            TrainingView { camera: posed.dataset.frames()[i].camera, rgb: posed.images[i].rgb.clone(), changed, valid }
+            TrainingView { camera: posed.dataset.frames()[i].camera, rgb: own.rgb.clone(), changed, valid }
         })
         .collect()
 }

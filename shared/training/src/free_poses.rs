@@ -3,6 +3,9 @@
 //! An encoder memorises the poses of a dataset of a hundred poses. A field that is trained only on the trained poses,
 //! with one latent for each state, renders every state from any pose between them. This field is not part of the
 //! checkpoint: the checkpoint's field is conditioned on the latents of the encoder that learns from these images.
+//!
+//! Where a dataset's poses are missing in some states, the field also renders all states from each trained pose. Only
+//! these images show which states look the same from there.
 
 use crate::{
     TrainingError,
@@ -88,7 +91,11 @@ fn render(context: Context, dir: &Path) -> Result<bool, TrainingError> {
     let together: Vec<[f32; LATENT_DIM]> = latents.first().into_iter().chain(&latents).copied().collect();
     let mut buffer = HypothesisBuffer::default();
 
-    let cameras = cameras(config, posed, &field, &latents, &options);
+    let mut cameras = cameras(config, posed, &field, &latents, &options);
+    if !posed.has_all_states() {
+        let input_px = config.encoder.backbone.input_px as u32;
+        cameras.extend(trained_poses(posed).iter().map(|(_, camera)| fitted(camera, input_px)));
+    }
     if cameras.is_empty() {
         return Ok(false);
     }
@@ -145,9 +152,7 @@ fn settle(of_states: &mut [Vec<u8>]) {
 /// One random latent for each state. States that look the same from every trained pose share a latent.
 fn codes(posed: &PosedImages, seed: u64) -> Vec<Gaussian> {
     let states = posed.scenario.state_count();
-    let mut views: Vec<usize> = posed.trained().into_iter().map(|i| posed.labels[i].view).collect();
-    views.sort_unstable();
-    views.dedup();
+    let views: Vec<usize> = trained_poses(posed).into_iter().map(|(view, _)| view).collect();
     (0..states)
         .map(|state| {
             let same = |other: &usize| views.iter().all(|&view| posed.seen_equivalence.same(view, state, *other));
@@ -167,11 +172,7 @@ fn cameras(
     latents: &[[f32; LATENT_DIM]],
     options: &RenderOptions,
 ) -> Vec<PinholeCamera> {
-    let mut known: Vec<(usize, PinholeCamera)> =
-        posed.trained().into_iter().map(|i| (posed.labels[i].view, posed.dataset.frames()[i].camera)).collect();
-    known.sort_by_key(|(view, _)| *view);
-    known.dedup_by_key(|(view, _)| *view);
-    let known: Vec<PinholeCamera> = known.into_iter().map(|(_, camera)| camera).collect();
+    let known: Vec<PinholeCamera> = trained_poses(posed).into_iter().map(|(_, camera)| camera).collect();
     if known.is_empty() {
         return Vec::new();
     }
@@ -199,6 +200,15 @@ fn cameras(
         }
     }
     found
+}
+
+/// The trained poses by number, each with its camera.
+fn trained_poses(posed: &PosedImages) -> Vec<(usize, PinholeCamera)> {
+    let mut known: Vec<(usize, PinholeCamera)> =
+        posed.trained().into_iter().map(|i| (posed.labels[i].view, posed.dataset.frames()[i].camera)).collect();
+    known.sort_by_key(|(view, _)| *view);
+    known.dedup_by_key(|(view, _)| *view);
+    known
 }
 
 /// Distance of the nearest surface of a depth image without its nearest pixels, metres; infinite without surfaces.

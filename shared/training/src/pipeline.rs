@@ -86,6 +86,12 @@ impl Training<'_> {
         if total > 0 {
             compared(total, "images compared".to_owned());
         }
+        if let Some(view) = posed.incomplete_view() {
+            return Err(TrainingError::Unfit(format!(
+                "pose {view} has no image of some states; set `count` and `field_steps` of `[free_poses]`, as \
+                 `configs/training/posed-set.toml` does: a field then renders what is missing"
+            )));
+        }
         let context = Context { config, posed: &posed, run };
         let (manifest, figures) = if posed.scenario.state_count() == 1 {
             self.train_one_state(context, phases)?

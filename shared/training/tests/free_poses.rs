@@ -4,7 +4,8 @@
 
 mod common;
 
-use carff_dataset::{Dataset, Equivalence, Image, PoseRole, PoseSplit};
+use carff_dataset::{Dataset, Degradation, Equivalence, Image, PoseRole, PoseSplit, degrade, sensor::SensorNoise};
+use carff_evaluation::PosedImages;
 use carff_scenes::Detail;
 use carff_training::{Phases, TrainingError, render_free_poses};
 use common::{Place, SCENARIO};
@@ -108,6 +109,41 @@ fn states_that_look_the_same_stay_the_same() {
     for name in names {
         assert!(made[name] == made[&name.replace("b0_t0", "b1_t0")], "{name}");
     }
+}
+
+/// From each pose, only one state was seen. The field renders all states from the trained poses, and these images show
+/// which states look the same there. Without them, a training is refused.
+#[test]
+fn poses_of_one_state_are_completed() {
+    let mut place = place();
+    place.config.free_poses.field_steps = 1500;
+    let [whole, partial] = ["set", "partial"].map(|name| place.at(name));
+    let degradation = Degradation { noise: SensorNoise::OFF, pose_jitter_px: 0.0, one_state: true, seed: 1 };
+    degrade(&Dataset::open(&whole).unwrap(), &partial, &degradation).unwrap();
+    let path = partial.join("transforms.json");
+    let mut set: serde_json::Value = serde_json::from_str(&std::fs::read_to_string(&path).unwrap()).unwrap();
+    for frame in set["frames"].as_array_mut().unwrap() {
+        frame.as_object_mut().unwrap().retain(|key, _| key != "observability" && key != "alike_states");
+    }
+    std::fs::write(&path, set.to_string()).unwrap();
+    let out = place.at("out");
+    let refused = place.run("run", None, |run| place.training(&partial, &out).run(Phases::All, run)).unwrap_err();
+    assert!(refused.to_string().contains("no image of some states"), "{refused}");
+
+    let made = place.run("made", None, |run| render_free_poses(&place.config, &partial, run)).unwrap().unwrap();
+    let open = |dir: &Path| PosedImages::open(dir, place.config.split_seed).unwrap();
+    let (truth, mut posed) = (open(&whole), open(&partial));
+    posed.add_free_poses(&made).unwrap();
+    assert_eq!(posed.incomplete_view(), None);
+    let trained = posed.trained();
+    let own = trained.iter().map(|&i| posed.labels[i]);
+    let agree = own.filter(|label| {
+        let (seen, true_ones) = (posed.seen_alike(label.view, label.state), truth.seen_alike(label.view, label.state));
+        seen == true_ones
+            && label.observability == truth.labels[truth.at(label.state, label.view).unwrap()].observability
+    });
+    let agree = agree.count();
+    assert!(5 * agree > 4 * trained.len(), "{agree} of {}", trained.len());
 }
 
 /// A dataset whose boxes are the same in several states cannot be probed, and is refused before any work.
