@@ -56,9 +56,14 @@ impl Pairs {
     }
 
     /// Returns the comparison that such images need: through noise if most pairs are not mostly equal. Rendered images of
-    /// one pose are equal wherever nothing changes.
+    /// one pose are equal wherever nothing changes. No pair shows whether images from different poses have noise; a camera
+    /// takes such images, so they are compared through it.
     pub(crate) fn comparison(self) -> ImageComparison {
-        if 2 * self.mostly_equal < self.all { ImageComparison::ThroughNoise } else { ImageComparison::Exact }
+        if self.all == 0 || 2 * self.mostly_equal < self.all {
+            ImageComparison::ThroughNoise
+        } else {
+            ImageComparison::Exact
+        }
     }
 }
 
@@ -106,5 +111,6 @@ mod tests {
             let (one, other) = (photo(noise, 0, false), photo(noise, light, vehicle));
             assert_eq!(Pairs::one(&one, &other, |_| true).comparison(), comparison, "{noise} {light} {vehicle}");
         }
+        assert_eq!(Pairs::default().comparison(), ImageComparison::ThroughNoise);
     }
 }

@@ -90,11 +90,13 @@ impl Dataset {
             for (frame, observability) in seen.into_iter().enumerate() {
                 set.frames[frame].observability = observability;
             }
-            set.warnings.push(
-                "no frame has an `observability`, so it is derived from the images: `none` if each other branch looks \
-                 the same at that timestamp, `full` if none does, else `partial`"
-                    .into(),
-            );
+            if set.frames.iter().any(|frame| frame.observability.is_some()) {
+                set.warnings.push(
+                    "no frame has an `observability`, so it is derived from the images: `none` if each other branch \
+                     looks the same at that timestamp, `full` if none does, else `partial`"
+                        .into(),
+                );
+            }
         }
         Ok(set)
     }

@@ -6,7 +6,7 @@ use std::fmt;
 use crate::dataset::Dataset;
 use crate::equivalence::Equivalence;
 use crate::image::Image;
-use crate::scenario::ScenarioInfo;
+use crate::scenario::{Frame, ScenarioInfo};
 use crate::transforms::warning_of_turned;
 use carff_messages::Observability;
 
@@ -86,10 +86,20 @@ impl DatasetReport {
         }
         let bev_view = dataset.scenario().and_then(|s| s.bev_view);
         let equivalence = Equivalence::from_dataset(dataset, images);
+        let mut states_of_view: BTreeMap<usize, usize> = BTreeMap::new();
+        for view in dataset.frames().iter().filter_map(|frame| frame.view) {
+            *states_of_view.entry(view).or_insert(0) += 1;
+        }
+        // Of a view that is missing in some states, it is unknown which states look the same.
+        let is_known = |frame: &&Frame| {
+            let count = frame.view.and_then(|view| states_of_view.get(&view));
+            frame.alike_states.is_some() || count == Some(&dataset.state_count())
+        };
         let pairs_where = |wanted: Option<Observability>| {
             dataset
                 .frames()
                 .iter()
+                .filter(is_known)
                 .filter(move |f| wanted.is_none() || f.observability == wanted)
                 .filter_map(|f| f.view.zip(f.state))
         };

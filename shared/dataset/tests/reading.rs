@@ -686,5 +686,8 @@ fn degraded_copies_keep_the_truth() {
     assert!([[(0, 0), (1, 1)], [(0, 1), (1, 0)]].iter().any(|wanted| found == wanted), "{found:?}");
     assert_eq!(Equivalence::from_dataset(&partial, &partial.load_all_images().unwrap()), truth);
     let (survey, faults) = Dataset::survey(&out).unwrap();
-    assert!(faults.is_empty() && survey.unwrap().warnings().iter().any(|w| w.starts_with("2 of 2 views are missing")));
+    let survey = survey.unwrap();
+    assert!(faults.is_empty() && survey.warnings().iter().any(|w| w.starts_with("2 of 2 views are missing")));
+    let images = survey.load_all_images().unwrap();
+    assert_eq!(carff_dataset::DatasetReport::of(&survey, &images).ceiling, Some(0.75));
 }

@@ -72,11 +72,7 @@ impl PosedImages {
             index[label.view * states + label.state] = Some(i);
         }
         let equivalence = Equivalence::from_dataset(&dataset, &images);
-        // Without two images of one pose, nothing shows whether they have noise.
-        let comparison = match index.contains(&None) {
-            true => ImageComparison::ThroughNoise,
-            false => Equivalence::comparison(&dataset, &images),
-        };
+        let comparison = Equivalence::comparison(&dataset, &images);
         let seen_equivalence = Equivalence::from_images(&dataset, &images, comparison);
         let means: Vec<Tensor> = (0..dataset.view_count())
             .map(|view| {
