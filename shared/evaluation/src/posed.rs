@@ -167,6 +167,11 @@ impl PosedImages {
         views.filter(|&view| !self.is_whole(view) && !self.rendered.contains_key(&view)).min()
     }
 
+    /// Returns true if a camera took the images: they have noise, and their poses have errors.
+    pub fn is_of_camera(&self) -> bool {
+        self.comparison == ImageComparison::ThroughNoise
+    }
+
     /// Returns true if each view of the dataset has an image of every state.
     pub fn has_all_states(&self) -> bool {
         !self.index.contains(&None)

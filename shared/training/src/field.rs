@@ -4,7 +4,7 @@
 //! that state. More and more often it is a draw from that posterior, so that the field learns all latents of the state.
 
 use crate::{
-    TrainingError,
+    TrainingError, alignment,
     config::TrainingConfig,
     records::{FieldRecord, names},
     run::{Context, Phase, PhaseReport, drive, part, prefixed},
@@ -14,8 +14,8 @@ use carff_base::random::Key;
 use carff_dataset::PIXEL_TOLERANCE;
 use carff_evaluation::PosedImages;
 use carff_field::{
-    Field, FieldConfig, FieldTrainer, NamedTensor, RayBatch, RaySampler, StepReport, TrainerConfig, TrainingView,
-    changed_pixels,
+    Field, FieldConfig, FieldTrainer, HypothesisBuffer, NamedTensor, RayBatch, RaySampler, RenderOptions, StepReport,
+    TrainerConfig, TrainingView, changed_pixels,
 };
 use carff_messages::{Gaussian, LATENT_DIM};
 use carff_networks::weights::Tensors;
@@ -109,6 +109,9 @@ fn middle_width_m(posed: &PosedImages) -> f32 {
 const LINE_EVERY: usize = 20;
 const RECORD_EVERY: usize = 100;
 
+/// Name of the views' displacements in a saved state.
+const DISPLACEMENTS: &str = "displacements";
+
 /// Share of a new value in the running means.
 const NEW_SHARE: f64 = 0.02;
 
@@ -178,6 +181,24 @@ impl<'a> FieldPhase<'a> {
         })
     }
 
+    /// Aligns every image with the field. An image that does not fit keeps its displacement.
+    fn align(&mut self) {
+        let states = self.clouds.states();
+        let options = RenderOptions { threads: self.settings.threads, ..RenderOptions::default() };
+        let mut buffer = HypothesisBuffer::default();
+        let posed = self.context.posed;
+        for (i, &image) in posed.trained().iter().enumerate() {
+            let latent = states[posed.labels[image].state].mean;
+            let found = self.sampler.views().get(i).and_then(|view| {
+                let image = &posed.images[image];
+                alignment::against(self.trainer.field(), view, image, latent, &options, &mut buffer)
+            });
+            if let Some(displacement) = found {
+                self.sampler.displace(i, displacement);
+            }
+        }
+    }
+
     /// Trains to the end, or resumes, and returns the field.
     pub fn trained(mut self) -> Result<Field, TrainingError> {
         let run = self.context.run;
@@ -203,11 +224,19 @@ impl Phase for FieldPhase<'_> {
         trainer.set_state_latents(&state_latents(self.clouds, config.seed));
         self.sampler.set_drawn(trainer.step_count());
         self.trainer = trainer;
+        if let Some(saved) = state.get(DISPLACEMENTS) {
+            let mut values = vec![0.0_f32; saved.numel()];
+            let count = values.len();
+            saved.to_kind(Kind::Float).copy_data(&mut values, count);
+            for (i, &[u, du_x, du_y, v, dv_x, dv_y]) in values.as_chunks().0.iter().enumerate() {
+                self.sampler.displace(i, [[u, du_x, du_y], [v, dv_x, dv_y]]);
+            }
+        }
         true
     }
 
     fn step(&mut self, step: usize) {
-        let Context { config, .. } = self.context;
+        let Context { config, posed, .. } = self.context;
         let settings = &config.nerf;
         let at = step as f64 / self.total() as f64;
         let resampled = settings.resampled_share * (at / settings.resampled_ramp.max(1e-9)).min(1.0);
@@ -218,6 +247,9 @@ impl Phase for FieldPhase<'_> {
         });
         self.last = self.trainer.step(&self.batch);
         self.means.add(&self.last);
+        if posed.is_of_camera() && alignment::is_due(step + 1, self.total()) {
+            self.align();
+        }
     }
 
     fn report(&mut self, done: usize) -> Result<PhaseReport<FieldRecord>, TrainingError> {
@@ -235,7 +267,10 @@ impl Phase for FieldPhase<'_> {
     }
 
     fn state(&self) -> Tensors {
-        state_of(&self.trainer)
+        let mut state = state_of(&self.trainer);
+        let all: Vec<f32> = self.sampler.views().iter().flat_map(|view| view.displacement).flatten().collect();
+        state.insert(DISPLACEMENTS.into(), Tensor::from_slice(&all));
+        state
     }
 }
 
@@ -279,7 +314,13 @@ pub fn views(posed: &PosedImages, chosen: &[usize]) -> Vec<TrainingView> {
                 changed.retain(|&pixel| mask[pixel as usize]);
                 valid = (0..mask.len() as u32).filter(|&pixel| mask[pixel as usize]).collect();
             }
-            TrainingView { camera: posed.dataset.frames()[i].camera, rgb: own.rgb.clone(), changed, valid }
+            TrainingView {
+                camera: posed.dataset.frames()[i].camera,
+                rgb: own.rgb.clone(),
+                changed,
+                valid,
+                displacement: [[0.0; 3]; 2],
+            }
         })
         .collect()
 }

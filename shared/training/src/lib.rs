@@ -17,6 +17,7 @@
 //! | module | content |
 //! |---|---|
 //! | `config`, `augmentation` | the training file |
+//! | `alignment` | errors of the recorded poses, which a field finds |
 //! | `pipeline`, `calibrate` | from images to a checkpoint |
 //! | `run` | the loop of all phases, and the folder of a run |
 //! | `vae`, `field`, `mixture` | the training phases |
@@ -26,6 +27,7 @@
 //! | [`ablation`] | the encoder ablation |
 
 pub mod ablation;
+mod alignment;
 mod augmentation;
 mod bound;
 mod calibrate;

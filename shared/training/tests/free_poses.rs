@@ -4,11 +4,14 @@
 
 mod common;
 
+use carff_base::random::Key;
 use carff_dataset::{Dataset, Degradation, Equivalence, Image, PoseRole, PoseSplit, degrade, sensor::SensorNoise};
 use carff_evaluation::PosedImages;
 use carff_scenes::Detail;
-use carff_training::{Phases, TrainingError, render_free_poses};
+use carff_training::{FreePoses, Phases, TrainingError, render_free_poses};
 use common::{Place, SCENARIO};
+use rand::Rng;
+use rand_distr::StandardNormal;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
@@ -198,4 +201,39 @@ fn making_free_poses_resumes() {
     assert_eq!(make(&place, "halting", None).unwrap(), Some(halting));
     place.config.free_poses.field_steps = 0;
     assert_eq!(make(&place, "none", None).unwrap(), None);
+}
+
+/// The field finds the errors of the poses of a camera's images.
+#[test]
+fn errors_of_poses_are_found() {
+    const JITTER_PX: f64 = 1.5;
+    let mut place = place();
+    place.config.free_poses = FreePoses { field_steps: 3000, count: 1, ..place.config.free_poses };
+    let [whole, degraded] = ["set", "degraded"].map(|name| place.at(name));
+    let noise = SensorNoise { sigma: 2.0, ..SensorNoise::OFF };
+    let degradation = Degradation { noise, pose_jitter_px: JITTER_PX, one_state: false, seed: 1 };
+    degrade(&Dataset::open(&whole).unwrap(), &degraded, &degradation).unwrap();
+    place.run("run", None, |run| render_free_poses(&place.config, &degraded, run)).unwrap().unwrap();
+    let state = tch::Tensor::read_safetensors(place.at("run/free.state.safetensors")).unwrap();
+    let found = &state.iter().find(|(name, _)| name == "displacements").unwrap().1;
+    let found = Vec::<f32>::try_from(found).unwrap();
+    let posed = PosedImages::open(&degraded, place.config.split_seed).unwrap();
+    let side_px = f64::from(posed.images[0].width_px);
+    // The image shows its place shifted by the error of its pose.
+    let errors = posed.trained().into_iter().zip(found.chunks(6)).flat_map(|(image, found)| {
+        let mut rng = carff_base::random::stream(Key::named("jitt", 1, image as u64));
+        [found[0], found[3]].map(|share| {
+            let shift_px = JITTER_PX * rng.sample::<f64, _>(StandardNormal);
+            [(f64::from(share) * side_px + shift_px).abs(), shift_px.abs()]
+        })
+    });
+    let errors: Vec<[f64; 2]> = errors.collect();
+    // Images of little more than road do not show where they are from.
+    let [left, before] = [0, 1].map(|i| median(errors.iter().map(|e| e[i]).collect()));
+    assert!(left < 0.4 * before, "{left:.2} of {before:.2} px");
+}
+
+fn median(mut values: Vec<f64>) -> f64 {
+    values.sort_by(f64::total_cmp);
+    values[values.len() / 2]
 }

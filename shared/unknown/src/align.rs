@@ -1,6 +1,8 @@
 //! Moves an image to where its place is rendered: small errors of the camera's pose, or of its lens.
 
+use crate::compare::reduced;
 use crate::fit::least_squares;
+use ndarray::ArrayView3;
 
 /// Terms of the affine map from rendered to seen pixels, for each axis.
 const TERMS: usize = 3;
@@ -36,6 +38,15 @@ struct Brightness {
     values: Vec<f32>,
     width: usize,
     height: usize,
+}
+
+/// The maps that are searched.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Maps {
+    /// All affine maps: errors of a lens too.
+    Affine,
+    /// Shifts and turns: small rotations of the camera.
+    Rigid,
 }
 
 /// Affine map from a rendered pixel to the seen one: for each axis the shift, and its change along both axes from the
@@ -98,16 +109,61 @@ impl AffineMap {
     }
 }
 
+/// Where an image's pixels are seen, against a rendered image of the same camera that is turned a little: for each axis
+/// the shift, and its change along both axes from the middle of the view to the end of its longer side, as shares of the
+/// longer side.
+pub type Displacement = [[f32; 3]; 2];
+
+/// Returns the displacement of an image (height, width, channel) against a rendered one (RGB, 0..=1, row by row, `width` x
+/// `height`), up to gain and offset; `None` if no small displacement fits. `counts` is true for the rendered pixels that
+/// count, by index row by row.
+///
+/// ```
+/// use ndarray::Array3;
+/// let scene = |x: f32, y: f32| 0.5 + 0.2 * (0.3 * x).sin() * (0.23 * y).cos() + 0.1 * (0.2 * y - 0.1 * x).sin();
+/// let rendered: Vec<f32> = (0..48 * 48).flat_map(|i| [scene((i % 48) as f32, (i / 48) as f32); 3]).collect();
+/// // Seen two pixels farther right.
+/// let seen = Array3::from_shape_fn((48, 48, 3), |(y, x, _)| (255.0 * scene(x as f32 - 2.0, y as f32)) as u8);
+/// let [across, down] = carff_unknown::displacement(seen.view(), &rendered, 48, 48, |_| true).unwrap();
+/// assert!((48.0 * across[0] - 2.0).abs() < 0.1 && down.iter().all(|term| (48.0 * term).abs() < 0.1));
+/// ```
+pub fn displacement(
+    image: ArrayView3<'_, u8>,
+    rendered: &[f32],
+    width: usize,
+    height: usize,
+    counts: impl Fn(usize) -> bool,
+) -> Option<Displacement> {
+    if rendered.len() != width * height * 3 || width == 0 || height == 0 {
+        return None;
+    }
+    let counting: Vec<usize> = (0..width * height).filter(|&i| counts(i)).collect();
+    let image = Brightness::of(&reduced(image, width, height), width, height);
+    let map = fitted(&image, &Brightness::of(rendered, width, height), &counting, Maps::Rigid)?;
+    Some(map.0.map(|axis| axis.map(|term| term / width.max(height) as f32)))
+}
+
 /// Returns the view as the rendered pixels would show it, with values that are not numbers where it was not seen; `None`
 /// if no small affine map moves it there. `still` are the rendered pixels of the place that never change.
 pub(crate) fn align(view: View, rendered: &[f32], still: &[usize]) -> Option<Vec<f32>> {
     let size = (view.width, view.height);
     let (image, place) = (Brightness::of(view.rgb, size.0, size.1), Brightness::of(rendered, size.0, size.1));
+    let map = fitted(&image, &place, still, Maps::Affine)?;
+    let moved = |i: usize| {
+        let colour = |of: Between| [0, 1, 2].map(|c| of.iter().map(|&(i, weight)| weight * view.rgb[i * 3 + c]).sum());
+        between(map.seen(i, size).0, size.0, size.1).map_or([f32::NAN; 3], colour)
+    };
+    Some((0..size.0 * size.1).flat_map(moved).collect())
+}
+
+/// The small map from the place to the image that fits best.
+fn fitted(image: &Brightness, place: &Brightness, still: &[usize], maps: Maps) -> Option<AffineMap> {
+    let size = (image.width, image.height);
     let farthest = FARTHEST * size.0.max(size.1) as f32;
-    let (mut map, mut light) = guess(&image, &place, still, farthest)?;
+    let (mut map, mut light) = guess(image, place, still, farthest)?;
     let mut scale = COARSE;
     for _ in 0..STEPS {
-        let step = step(&map, &mut light, &image, &place, still, scale)?;
+        let step = step(&map, &mut light, image, place, still, (maps, scale))?;
         for (term, change) in map.0.iter_mut().flatten().zip(step) {
             *term += change.clamp(-LARGE_STEP_PX, LARGE_STEP_PX);
         }
@@ -119,22 +175,18 @@ pub(crate) fn align(view: View, rendered: &[f32], still: &[usize]) -> Option<Vec
         }
         scale = [0, 1].map(|i| (scale[i] * FINER).max(FINE[i]));
     }
-    let moved = |i: usize| {
-        let colour = |of: Between| [0, 1, 2].map(|c| of.iter().map(|&(i, weight)| weight * view.rgb[i * 3 + c]).sum());
-        between(map.seen(i, size).0, size.0, size.1).map_or([f32::NAN; 3], colour)
-    };
-    (map.farthest() <= farthest).then(|| (0..size.0 * size.1).flat_map(moved).collect())
+    (map.farthest() <= farthest).then_some(map)
 }
 
 /// A step of Gauss and Newton towards a better map, after one towards a better gain and offset. Differences beyond the
-/// first value of `scale` do not count; slopes are measured over the second one.
+/// first value of the scale do not count; slopes are measured over the second one.
 fn step(
     map: &AffineMap,
     light: &mut [f32; 2],
     image: &Brightness,
     place: &Brightness,
     still: &[usize],
-    [cap, slope_px]: [f32; 2],
+    (maps, [cap, slope_px]): (Maps, [f32; 2]),
 ) -> Option<[f32; 2 * TERMS]> {
     let size = (image.width, image.height);
     let seen = still.iter().filter_map(|&i| {
@@ -146,10 +198,18 @@ fn step(
     let counts = |&&(shown, seen, ..): &&(f32, f32, _, _)| left(*light, shown, seen).abs() <= cap;
     *light = least_squares(seen.iter().filter(counts).map(|&(shown, seen, ..)| ([shown, 1.0], seen)))?;
     let counting = seen.iter().filter(|&&(shown, seen, ..)| left(*light, shown, seen).abs() <= cap);
-    least_squares(counting.map(|&(shown, seen, at, [_, x, y])| {
-        let [du, dv] = image.slopes(at, slope_px);
-        ([du, du * x, du * y, dv, dv * x, dv * y], left(*light, shown, seen))
-    }))
+    let slopes =
+        counting.map(|&(shown, seen, at, terms)| (image.slopes(at, slope_px), terms, left(*light, shown, seen)));
+    match maps {
+        Maps::Affine => {
+            least_squares(slopes.map(|([du, dv], [_, x, y], left)| ([du, du * x, du * y, dv, dv * x, dv * y], left)))
+        }
+        Maps::Rigid => {
+            let rows = slopes.map(|([du, dv], [_, x, y], left)| ([du, dv, du * y - dv * x], left));
+            let [across, down, turn] = least_squares(rows)?;
+            Some([across, 0.0, turn, down, -turn, 0.0])
+        }
+    }
 }
 
 /// The shift by whole pixels under which the image fits the place best, with its gain and offset.

@@ -28,6 +28,7 @@ mod sight;
 mod sighting;
 mod track;
 
+pub use align::{Displacement, displacement};
 pub use alike::shows_same;
 pub use blobs::Blob;
 pub use camera::{CameraCheck, CameraLimits, Measured, Measurement};

@@ -20,6 +20,20 @@ pub struct TrainingView {
     pub changed: Vec<u32>,
     /// Pixels that rays are drawn from; empty: all.
     pub valid: Vec<u32>,
+    /// Where the pixels are seen, against those of the camera, whose pose has an error: for each axis the shift, and its
+    /// change along both axes from the middle of the image to the end of its longer side, as shares of the longer side.
+    pub displacement: [[f32; 3]; 2],
+}
+
+impl TrainingView {
+    /// Position of a pixel's centre in the camera's image, pixels.
+    fn in_camera(&self, x: u64, y: u64) -> [f64; 2] {
+        let (width, height) = (f64::from(self.camera.width_px), f64::from(self.camera.height_px));
+        let (longer, seen) = (width.max(height), [x as f64 + 0.5, y as f64 + 0.5]);
+        let terms = [longer, 2.0 * seen[0] - width, 2.0 * seen[1] - height];
+        let by = self.displacement.map(|axis| axis.iter().zip(terms).map(|(a, b)| f64::from(*a) * b).sum::<f64>());
+        [seen[0] - by[0], seen[1] - by[1]]
+    }
 }
 
 /// Returns the pixels that differ by more than `threshold` (0..=255) in any channel between any two images: RGB of equal
@@ -49,7 +63,7 @@ pub fn changed_pixels(images: &[&[u8]], threshold: u8) -> Vec<u32> {
 /// use carff_field::{RAYS_PER_GROUP, RayBatch, RaySampler, TrainingView};
 /// use carff_base::geometry::PinholeCamera;
 /// let camera = PinholeCamera::look_at([0.0, -5.0, 1.0], [0.0; 3], [0.0, 0.0, 1.0], 4, 4, 60.0);
-/// let view = TrainingView { camera, rgb: vec![255; 4 * 4 * 3], changed: Vec::new(), valid: Vec::new() };
+/// let view = TrainingView { camera, rgb: vec![255; 4 * 4 * 3], changed: Vec::new(), valid: Vec::new(), displacement: [[0.0; 3]; 2] };
 /// let mut sampler = RaySampler::new(vec![view], 0.5, 1);
 /// let mut batch = RayBatch::default();
 /// sampler.next_batch(2 * RAYS_PER_GROUP, &mut batch, |_view, _draw| [0.0; 8]);
@@ -78,6 +92,13 @@ impl RaySampler {
     /// Returns the views in use.
     pub fn views(&self) -> &[TrainingView] {
         &self.views
+    }
+
+    /// Sets the displacement of a view's pixels.
+    pub fn displace(&mut self, view: usize, displacement: [[f32; 3]; 2]) {
+        if let Some(view) = self.views.get_mut(view) {
+            view.displacement = displacement;
+        }
     }
 
     /// Sets the number of batches drawn so far, to continue a resumed training.
@@ -123,7 +144,8 @@ impl RaySampler {
                     one_of(&view.valid)
                 };
                 let (x, y) = (pixel % width, pixel / width);
-                batch.rays.push(view.camera.ray(x as f64 + 0.5, y as f64 + 0.5));
+                let [u, v] = view.in_camera(x, y);
+                batch.rays.push(view.camera.ray(u, v));
                 let rgb = &view.rgb[pixel as usize * 3..][..3];
                 batch.target_rgb.push([0, 1, 2].map(|c| f32::from(rgb[c]) / 255.0));
                 batch.latent_index.push(group as u32);
@@ -137,13 +159,31 @@ impl RaySampler {
 mod tests {
     use super::*;
 
+    /// A pixel that is seen displaced has the ray of the camera's pixel that it shows; a turn moves opposite edges apart.
+    #[test]
+    fn displaced_pixels_have_other_rays() {
+        let camera = PinholeCamera::look_at([0.0, -5.0, 1.0], [0.0; 3], [0.0, 0.0, 1.0], 8, 4, 60.0);
+        let of = |displacement| TrainingView {
+            camera,
+            rgb: vec![0; 96],
+            changed: Vec::new(),
+            valid: Vec::new(),
+            displacement,
+        };
+        assert_eq!(of([[0.0; 3]; 2]).in_camera(3, 2), [3.5, 2.5]);
+        assert_eq!(of([[0.25, 0.0, 0.0], [-0.125, 0.0, 0.0]]).in_camera(3, 2), [1.5, 3.5]);
+        let turned = of([[0.0, 0.0, 0.5], [0.0, -0.25, 0.0]]);
+        assert_eq!(turned.in_camera(0, 0), [0.5 + 0.5 * 3.0, 0.5 - 0.25 * 7.0]);
+        assert_eq!(turned.in_camera(7, 3), [7.5 - 0.5 * 3.0, 3.5 + 0.25 * 7.0]);
+    }
+
     /// Rays go through valid pixels only; with all pixels, the draws are those of a view without a list.
     #[test]
     fn rays_go_through_valid_pixels() {
         let camera = PinholeCamera::look_at([0.0, -5.0, 1.0], [0.0; 3], [0.0, 0.0, 1.0], 8, 8, 60.0);
         let rgb: Vec<u8> = (0..64).flat_map(|i| [i; 3]).collect();
         let drawn = |changed: Vec<u32>, valid: Vec<u32>| {
-            let view = TrainingView { camera, rgb: rgb.clone(), changed, valid };
+            let view = TrainingView { camera, rgb: rgb.clone(), changed, valid, displacement: [[0.0; 3]; 2] };
             let mut batch = RayBatch::default();
             RaySampler::new(vec![view], 0.5, 1).next_batch(16 * RAYS_PER_GROUP, &mut batch, |_, _| [0.0; 8]);
             batch.target_rgb.iter().map(|rgb| (rgb[0] * 255.0).round() as u32).collect::<Vec<_>>()
