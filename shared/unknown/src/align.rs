@@ -1,8 +1,7 @@
 //! Moves an image to where its place is rendered: small errors of the camera's pose, or of its lens.
 
-use crate::compare::reduced;
 use crate::fit::least_squares;
-use ndarray::ArrayView3;
+use ndarray::{ArrayView3, Axis, s};
 
 /// Terms of the affine map from rendered to seen pixels, for each axis.
 const TERMS: usize = 3;
@@ -31,6 +30,26 @@ pub(crate) struct View<'a> {
     pub rgb: &'a [f32],
     pub width: usize,
     pub height: usize,
+}
+
+/// Means over the cells of a grid of `width` x `height`, 0..=1.
+pub(crate) fn reduced(image: ArrayView3<'_, u8>, width: usize, height: usize) -> Vec<f32> {
+    let (rows, columns, _) = image.dim();
+    let cell = |i: usize, n: usize, all: usize| {
+        let start = (i * all / n).min(all.saturating_sub(1));
+        start..((i + 1) * all / n).clamp(start + 1, all.max(start + 1))
+    };
+    let mut out = Vec::with_capacity(width * height * 3);
+    for y in 0..height {
+        for x in 0..width {
+            let part = image.slice(s![cell(y, height, rows), cell(x, width, columns), ..]);
+            let n = (part.len() / 3).max(1) as f32 * 255.0;
+            for channel in part.axis_iter(Axis(2)).take(3) {
+                out.push(channel.iter().map(|&v| f32::from(v)).sum::<f32>() / n);
+            }
+        }
+    }
+    out
 }
 
 /// Brightness of an image, row by row.
@@ -109,8 +128,8 @@ impl AffineMap {
     }
 }
 
-/// Where an image's pixels are seen, against a rendered image of the same camera that is turned a little: for each axis
-/// the shift, and its change along both axes from the middle of the view to the end of its longer side, as shares of the
+/// The places at which an image's pixels are seen, against a rendered image of the same camera that is turned a little:
+/// for each axis the shift, and its change along both axes from the middle of the view to the end of its longer side, as shares of the
 /// longer side.
 pub type Displacement = [[f32; 3]; 2];
 

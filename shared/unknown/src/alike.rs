@@ -1,7 +1,6 @@
 //! Whether two images from one pose show the same, through the noise, the exposure and the small pose errors of a camera.
 
-use crate::align::{View, align};
-use crate::compare::reduced;
+use crate::align::{View, align, reduced};
 use crate::fit::{fit, fit_from_offset};
 use crate::residuals::{Pixels, ResidualKind, median_residual, with_neighbours};
 use ndarray::ArrayView3;

@@ -1,6 +1,6 @@
 //! Render and compare: every known state is rendered from the camera's own pose and compared with the image.
 
-use crate::align::{View, align};
+use crate::align::{View, align, reduced};
 use crate::blobs::{Blob, blobs};
 use crate::fit::{Fit, LEAST_NOISE, fit, median, noise};
 use crate::lanes::{ErrorMap, Ground, Lanes};
@@ -8,7 +8,7 @@ use crate::residuals::{BothResiduals, Pixels, ResidualKind, explain_own, median_
 use carff_base::geometry::PinholeCamera;
 use carff_field::{Field, HypothesisBuffer, RenderOptions};
 use carff_messages::LATENT_DIM;
-use ndarray::{ArrayView3, s};
+use ndarray::ArrayView3;
 
 /// Longest side of the compared images, pixels.
 const SIDE_PX: u32 = 64;
@@ -210,26 +210,6 @@ fn reduced_camera(camera: &PinholeCamera) -> PinholeCamera {
     let longest = u64::from(camera.width_px.max(camera.height_px).max(1));
     let scaled = |side: u32| ((u64::from(side) * u64::from(SIDE_PX) / longest) as u32).max(1);
     camera.resized(scaled(camera.width_px), scaled(camera.height_px))
-}
-
-/// Means over the cells of a grid of `width` x `height`, 0..=1.
-pub(crate) fn reduced(image: ArrayView3<'_, u8>, width: usize, height: usize) -> Vec<f32> {
-    let (rows, columns, _) = image.dim();
-    let cell = |i: usize, n: usize, all: usize| {
-        let start = (i * all / n).min(all.saturating_sub(1));
-        start..((i + 1) * all / n).clamp(start + 1, all.max(start + 1))
-    };
-    let mut out = Vec::with_capacity(width * height * 3);
-    for y in 0..height {
-        for x in 0..width {
-            let part = image.slice(s![cell(y, height, rows), cell(x, width, columns), ..]);
-            let n = (part.len() / 3).max(1) as f32 * 255.0;
-            for channel in part.axis_iter(ndarray::Axis(2)).take(3) {
-                out.push(channel.iter().map(|&v| f32::from(v)).sum::<f32>() / n);
-            }
-        }
-    }
-    out
 }
 
 /// Pixels at most `margin` rows and columns away from a marked one.

@@ -20,7 +20,7 @@ pub struct TrainingView {
     pub changed: Vec<u32>,
     /// Pixels that rays are drawn from; empty: all.
     pub valid: Vec<u32>,
-    /// Where the pixels are seen, against those of the camera, whose pose has an error: for each axis the shift, and its
+    /// The places at which the pixels are seen, against those of the camera, whose pose has an error: for each axis the shift, and its
     /// change along both axes from the middle of the image to the end of its longer side, as shares of the longer side.
     pub displacement: [[f32; 3]; 2],
 }
