@@ -62,12 +62,11 @@ pub fn save_field(dir: &Path, field: &Field) -> Result<(), CheckpointError> {
     let tensors: Vec<(String, Dtype, Vec<usize>, Vec<u8>)> = field
         .tensors()
         .into_iter()
-        .map(|t| match t.name.strip_suffix(BYTES) {
-            Some(part) => {
+        .map(|t| {
+            if let Some(part) = t.name.strip_suffix(BYTES) {
                 let data = deflated(&t.data.iter().map(|&v| v as u8).collect::<Vec<_>>())?;
                 Ok((format!("{part}{DEFLATED}"), Dtype::U8, vec![data.len()], data))
-            }
-            None => {
+            } else {
                 let data = t.data.iter().flat_map(|&v| f16::from_f32(v).to_le_bytes()).collect();
                 Ok((t.name.into_owned(), Dtype::F16, t.shape, data))
             }
@@ -131,15 +130,13 @@ mod tests {
         save_field(folder.path(), &field).unwrap();
         let stored = read_tensors(&path, |_| true).unwrap();
         let loaded = read(folder.path(), &path, config()).unwrap().tensors().len();
-        let save = |change: &dyn Fn(&str, Vec<u8>) -> (String, Vec<u8>)| {
+        let save = |ending: &str, bits: &[u8]| {
             let tensors: Vec<_> = stored
                 .iter()
-                .map(|(name, shape, values)| match name.strip_suffix(DEFLATED) {
-                    Some(part) => {
-                        let (name, data) = change(part, values.iter().map(|&v| v as u8).collect());
-                        (name, Dtype::U8, vec![data.len()], data)
-                    }
-                    None => {
+                .map(|(name, shape, values)| {
+                    if let Some(part) = name.strip_suffix(DEFLATED) {
+                        (format!("{part}{ending}"), Dtype::U8, vec![bits.len()], bits.to_vec())
+                    } else {
                         let data = values.iter().flat_map(|&v| f16::from_f32(v).to_le_bytes()).collect();
                         (name.clone(), Dtype::F16, shape.clone(), data)
                     }
@@ -150,11 +147,11 @@ mod tests {
             read(folder.path(), &path, config()).map(|field| field.tensors().len()).map_err(|e| e.to_string())
         };
         let bytes = 32 * 32 * 32 / 8;
-        assert_eq!(save(&|part, _| (format!("{part}{BYTES}"), vec![255; bytes])), Ok(loaded));
+        assert_eq!(save(BYTES, &vec![255; bytes]), Ok(loaded));
         let deflate = |n: usize| deflated(&vec![255; n]).unwrap();
-        assert_eq!(save(&|part, _| (format!("{part}{DEFLATED}"), deflate(bytes))), Ok(loaded));
-        for data in [deflate(bytes + 1), deflate(1 << 26), vec![255; 9], Vec::new()] {
-            let error = save(&|part, _| (format!("{part}{DEFLATED}"), data.clone())).unwrap_err();
+        assert_eq!(save(DEFLATED, &deflate(bytes)), Ok(loaded));
+        for bits in [deflate(bytes + 1), deflate(1 << 26), vec![255; 9], Vec::new()] {
+            let error = save(DEFLATED, &bits).unwrap_err();
             assert!(error.contains("`occupancy.") || error.contains("`changing."), "{error}");
         }
     }
