@@ -324,7 +324,8 @@ fn forecasts_agree() {
             let (found, wanted) = (numbers(&found), numbers(&wanted));
             assert_eq!(found.len(), wanted.len());
             for (found, wanted) in found.iter().zip(&wanted) {
-                let off = (found - wanted).abs() / wanted.abs().max(1e-2);
+                // Sums of 512 terms of both signs: near zero, their rounding counts against the terms.
+                let off = (found - wanted).abs() / wanted.abs().max(0.1);
                 assert!(off <= 1e-4, "{found} in place of {wanted} ({})", folder.display());
             }
         }

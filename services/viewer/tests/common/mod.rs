@@ -40,10 +40,11 @@ pub fn image(branch: usize, timestamp: usize, view: usize) -> Arc<ChosenImage> {
 pub fn copy_without(files: &[&str]) -> tempfile::TempDir {
     let folder = tempfile::tempdir().unwrap();
     for entry in std::fs::read_dir(checkpoint()).unwrap() {
-        let path = entry.unwrap().path().canonicalize().unwrap();
-        let name = path.file_name().unwrap();
+        let entry = entry.unwrap();
+        let name = entry.file_name();
         if !files.iter().any(|f| name == *f) {
-            std::os::unix::fs::symlink(&path, folder.path().join(name)).unwrap();
+            let target = entry.path().canonicalize().unwrap();
+            std::os::unix::fs::symlink(target, folder.path().join(name)).unwrap();
         }
     }
     folder
