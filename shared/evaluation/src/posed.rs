@@ -167,9 +167,10 @@ impl PosedImages {
         views.filter(|&view| !self.is_whole(view) && !self.rendered.contains_key(&view)).min()
     }
 
-    /// Returns true if a camera took the images: they have noise, and their poses have errors.
+    /// Returns true if a camera took the images: they have noise, or poses that are missing in some states. Their poses
+    /// then have errors. Images of one state show neither.
     pub fn is_of_camera(&self) -> bool {
-        self.comparison == ImageComparison::ThroughNoise
+        self.comparison == ImageComparison::ThroughNoise && self.scenario.state_count() > 1
     }
 
     /// Returns true if each view of the dataset has an image of every state.

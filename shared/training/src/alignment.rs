@@ -1,9 +1,9 @@
 //! Alignment of a camera's images with the field that learns from them: the recorded poses have small errors.
 
 use carff_dataset::Image;
-use carff_field::{Field, HypothesisBuffer, RenderOptions, TrainingView};
+use carff_field::{Displacement, Field, HypothesisBuffer, RenderOptions, TrainingView};
 use carff_messages::LATENT_DIM;
-use carff_unknown::{Displacement, displacement};
+use carff_unknown::displacement;
 
 /// Shares of a field's training after which its images are aligned.
 const AFTER: [f64; 3] = [0.25, 0.4, 0.6];

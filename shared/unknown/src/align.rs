@@ -1,6 +1,7 @@
 //! Moves an image to where its place is rendered: small errors of the camera's pose, or of its lens.
 
 use crate::fit::least_squares;
+use carff_field::Displacement;
 use ndarray::{ArrayView3, Axis, s};
 
 /// Terms of the affine map from rendered to seen pixels, for each axis.
@@ -128,14 +129,9 @@ impl AffineMap {
     }
 }
 
-/// The places at which an image's pixels are seen, against a rendered image of the same camera that is turned a little:
-/// for each axis the shift, and its change along both axes from the middle of the view to the end of its longer side, as shares of the
-/// longer side.
-pub type Displacement = [[f32; 3]; 2];
-
 /// Returns the displacement of an image (height, width, channel) against a rendered one (RGB, 0..=1, row by row, `width` x
-/// `height`), up to gain and offset; `None` if no small displacement fits. `counts` is true for the rendered pixels that
-/// count, by index row by row.
+/// `height`) of the same camera: a shift and a turn, up to gain and offset. `None` if no small displacement fits. `counts`
+/// is true for the rendered pixels that count, by index row by row.
 ///
 /// ```
 /// use ndarray::Array3;

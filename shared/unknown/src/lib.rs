@@ -4,7 +4,7 @@
 //! |---|---|
 //! | `compare` | every known state, rendered from the camera's own pose and compared with the image |
 //! | `residuals` | how far each pixel of an image is from what a state renders there |
-//! | `align` | errors of pose and lens, and veils, that a comparison takes out of an image |
+//! | `align` | errors of pose and lens, and veils: a comparison takes them out of an image, and a training out of its rays |
 //! | `fit` | robust fits of an image to a rendered one |
 //! | `lanes` | the ground on which something unknown counts |
 //! | `blobs` | connected residuals: their size, and the place on the ground where they stand |
@@ -28,7 +28,7 @@ mod sight;
 mod sighting;
 mod track;
 
-pub use align::{Displacement, displacement};
+pub use align::displacement;
 pub use alike::shows_same;
 pub use blobs::Blob;
 pub use camera::{CameraCheck, CameraLimits, Measured, Measurement};

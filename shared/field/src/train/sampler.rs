@@ -9,6 +9,11 @@ use crate::kernels::math::hash;
 /// Rays of a batch that come from one image and share its latent.
 pub const RAYS_PER_GROUP: usize = 32;
 
+/// The places at which an image's pixels are seen, against the pixels of its camera: for each axis (right, down) the shift,
+/// and its change along both axes from the middle of the image to the end of its longer side, as shares of the longer
+/// side. All zeros for an exact pose.
+pub type Displacement = [[f32; 3]; 2];
+
 /// One posed image.
 #[derive(Clone, Debug)]
 pub struct TrainingView {
@@ -20,9 +25,8 @@ pub struct TrainingView {
     pub changed: Vec<u32>,
     /// Pixels that rays are drawn from; empty: all.
     pub valid: Vec<u32>,
-    /// The places at which the pixels are seen, against those of the camera, whose pose has an error: for each axis the shift, and its
-    /// change along both axes from the middle of the image to the end of its longer side, as shares of the longer side.
-    pub displacement: [[f32; 3]; 2],
+    /// Displacement of the image's pixels, by the error of the camera's pose.
+    pub displacement: Displacement,
 }
 
 impl TrainingView {
@@ -63,7 +67,8 @@ pub fn changed_pixels(images: &[&[u8]], threshold: u8) -> Vec<u32> {
 /// use carff_field::{RAYS_PER_GROUP, RayBatch, RaySampler, TrainingView};
 /// use carff_base::geometry::PinholeCamera;
 /// let camera = PinholeCamera::look_at([0.0, -5.0, 1.0], [0.0; 3], [0.0, 0.0, 1.0], 4, 4, 60.0);
-/// let view = TrainingView { camera, rgb: vec![255; 4 * 4 * 3], changed: Vec::new(), valid: Vec::new(), displacement: [[0.0; 3]; 2] };
+/// let (rgb, exact) = (vec![255; 4 * 4 * 3], [[0.0; 3]; 2]);
+/// let view = TrainingView { camera, rgb, changed: Vec::new(), valid: Vec::new(), displacement: exact };
 /// let mut sampler = RaySampler::new(vec![view], 0.5, 1);
 /// let mut batch = RayBatch::default();
 /// sampler.next_batch(2 * RAYS_PER_GROUP, &mut batch, |_view, _draw| [0.0; 8]);
@@ -95,7 +100,7 @@ impl RaySampler {
     }
 
     /// Sets the displacement of a view's pixels.
-    pub fn displace(&mut self, view: usize, displacement: [[f32; 3]; 2]) {
+    pub fn displace(&mut self, view: usize, displacement: Displacement) {
         if let Some(view) = self.views.get_mut(view) {
             view.displacement = displacement;
         }
