@@ -26,7 +26,7 @@ fn external() -> String {
 
 fn camera(graph: &TestGraph) -> Process {
     let mut command = Command::new(program("external-camera"));
-    Process::start(command.arg(scenario_set().join("images")).args([graph.run().name(), "5"]))
+    Process::start(command.arg(scenario_set()).args([graph.run().name(), "5"]))
 }
 
 fn info(graph: &TestGraph) -> Value {

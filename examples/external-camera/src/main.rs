@@ -1,23 +1,21 @@
-//! A camera in a process of its own: publishes the images of a folder, again and again, to a graph with
-//! `camera.source = "external"`. Usage: `external-camera FOLDER [RUN] [FRAMES_PER_SECOND]`.
+//! A camera in a process of its own: publishes the images of a dataset, again and again, to a graph with
+//! `camera.source = "external"`. Usage: `external-camera DATASET [RUN] [FRAMES_PER_SECOND]`.
 
 use anyhow::{Context, ensure};
-use carff_base::geometry::PinholeCamera;
-use carff_dataset::{Image, image_files};
+use carff_dataset::Dataset;
 use carff_messages::{DatasetView, FrameMeta, Header, ImageMeta, Stage};
 use carff_observe::{Attached, attach};
 use carff_transport::{Stop, Waiter, Woken, monotonic_now_ns, topics};
 
 fn main() -> anyhow::Result<()> {
     let mut args = std::env::args().skip(1);
-    let folder = args.next().context("usage: external-camera FOLDER [RUN] [FRAMES_PER_SECOND]")?;
+    let folder = args.next().context("usage: external-camera DATASET [RUN] [FRAMES_PER_SECOND]")?;
     let run = args.next();
     let rate_hz: f64 = args.next().map_or(Ok(10.0), |text| text.parse()).context("FRAMES_PER_SECOND")?;
     ensure!((0.1..=1000.0).contains(&rate_hz), "FRAMES_PER_SECOND is {rate_hz}; allowed: 0.1 to 1000");
-    let paths = image_files(folder.as_ref()).with_context(|| format!("cannot read {folder}"))?;
-    let images = paths.iter().map(|path| Image::load(path)).collect::<Result<Vec<_>, _>>()?;
-    let largest =
-        images.iter().map(|image| image.rgb.len()).max().with_context(|| format!("{folder} has no images"))?;
+    let dataset = Dataset::open(folder.as_ref())?;
+    let images = dataset.load_all_images()?;
+    let largest = images.iter().map(|image| image.rgb.len()).max().context("the dataset has no images")?;
 
     let Attached { node, live } = attach(run.as_deref(), "external-camera")?;
     let mut frames = node.image_publisher(&topics::FRAME, largest)?;
@@ -36,15 +34,13 @@ fn main() -> anyhow::Result<()> {
     };
     println!("joined run `{}`", live.name);
     let mut next_ns = monotonic_now_ns();
-    for (frame_id, image) in (first_id..).zip(images.iter().cycle()) {
+    for (frame_id, (image, frame)) in (first_id..).zip(images.iter().zip(dataset.frames()).cycle()) {
         if waiter.wait_until(&[], next_ns)? == Woken::Stopped || !live.is_alive() {
             break;
         }
         next_ns = monotonic_now_ns() + (1e9 / rate_hz) as u64;
-        // The pose and the lens: a camera at the origin with a field of view of 60 degrees.
-        let [eye, ahead, up] = [[0.0; 3], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
-        let camera = PinholeCamera::look_at(eye, ahead, up, image.width_px, image.height_px, 60.0);
-        let mut meta = FrameMeta::of_camera(&camera, DatasetView::UNKNOWN);
+        // Lens and pose. A camera's own come from its calibration, and from how it is mounted.
+        let mut meta = FrameMeta::of_camera(&frame.camera, DatasetView::UNKNOWN);
         meta.header = Header::of_frame(frame_id, monotonic_now_ns(), 0);
         let mut loan = frames.loan(meta.image_bytes())?;
         loan.bytes_mut().copy_from_slice(&image.rgb);

@@ -4,7 +4,7 @@ use anyhow::Context;
 use carff_checkpoint::load_policy;
 use carff_controller::{Controller, Settings};
 use carff_decision::{Approach, Policy};
-use carff_messages::Stage;
+use carff_messages::{ImageCheck, ImageCondition, Stage};
 use carff_runtime::{StageContext, frame_span};
 use carff_transport::{Receiver, Woken, monotonic_now_ns, topics};
 
@@ -28,6 +28,7 @@ fn run(stage: &mut StageContext) -> anyhow::Result<()> {
     stage.ready();
 
     let mut invalid = 0;
+    let mut condition = ImageCondition::Usable.code();
     let mut tick_ns = monotonic_now_ns();
     loop {
         // The expiry of a decision is handled at once, not at the next tick.
@@ -39,7 +40,9 @@ fn run(stage: &mut StageContext) -> anyhow::Result<()> {
             let Some(check) = checks.next()? else { break };
             if let Some(action) = controller.on_check(&check, monotonic_now_ns()) {
                 actions.send(action)?;
-                tracing::warn!(frame = check.header.frame_id, condition = check.condition, "the image is not usable");
+            }
+            if check.condition != std::mem::replace(&mut condition, check.condition) {
+                report_condition(&check);
             }
         }
         for _ in 0..MOST_AT_ONCE {
@@ -71,6 +74,15 @@ fn run(stage: &mut StageContext) -> anyhow::Result<()> {
                 tick_ns = (tick_ns + settings.period_ns).max(now_ns);
             }
         }
+    }
+}
+
+fn report_condition(check: &ImageCheck) {
+    let frame = check.header.frame_id;
+    match check.condition() {
+        Ok(ImageCondition::Usable) => tracing::info!(frame, "the image is usable again"),
+        Ok(condition) => tracing::warn!(frame, "the image is not usable: {condition}"),
+        Err(_) => {} // The receiver drops checks that are not valid.
     }
 }
 
