@@ -34,6 +34,6 @@ pub use render::buffers::{HypothesisBuffer, RenderBuffer, to_byte, to_bytes};
 pub use space::contraction::Contraction;
 pub use space::occupancy::OccupancyGrid;
 pub use train::batch::{RayBatch, StepReport};
-pub use train::sampler::{Displacement, RAYS_PER_GROUP, RaySampler, TrainingView, changed_pixels};
+pub use train::sampler::{Correction, Displacement, RAYS_PER_GROUP, RaySampler, TrainingView, changed_pixels};
 pub use train::state::TrainerState;
 pub use train::trainer::FieldTrainer;

@@ -14,8 +14,8 @@ use carff_base::random::Key;
 use carff_dataset::PIXEL_TOLERANCE;
 use carff_evaluation::PosedImages;
 use carff_field::{
-    Field, FieldConfig, FieldTrainer, HypothesisBuffer, NamedTensor, RayBatch, RaySampler, RenderOptions, StepReport,
-    TrainerConfig, TrainingView, changed_pixels,
+    Correction, Field, FieldConfig, FieldTrainer, HypothesisBuffer, NamedTensor, RayBatch, RaySampler, RenderOptions,
+    StepReport, TrainerConfig, TrainingView, changed_pixels,
 };
 use carff_messages::{Gaussian, LATENT_DIM};
 use carff_networks::weights::Tensors;
@@ -109,8 +109,8 @@ fn middle_width_m(posed: &PosedImages) -> f32 {
 const LINE_EVERY: usize = 20;
 const RECORD_EVERY: usize = 100;
 
-/// Name of the views' displacements in a saved state.
-const DISPLACEMENTS: &str = "displacements";
+/// Name of the corrections of the views' images in a saved state.
+const CORRECTIONS: &str = "corrections";
 
 /// Share of a new value in the running means.
 const NEW_SHARE: f64 = 0.02;
@@ -181,22 +181,24 @@ impl<'a> FieldPhase<'a> {
         })
     }
 
-    /// Aligns every image with the field. An image that does not fit keeps its displacement.
+    /// Aligns every image with the field.
     fn align(&mut self) {
         let states = self.clouds.states();
         let options = RenderOptions { threads: self.settings.threads, ..RenderOptions::default() };
         let mut buffer = HypothesisBuffer::default();
         let posed = self.context.posed;
-        for (i, &image) in posed.trained().iter().enumerate() {
+        let of = posed.trained();
+        let aligned = of.iter().zip(self.sampler.views()).map(|(&image, view)| {
             let latent = states[posed.labels[image].state].mean;
-            let found = self.sampler.views().get(i).and_then(|view| {
-                let image = &posed.images[image];
-                alignment::against(self.trainer.field(), view, image, latent, &options, &mut buffer)
-            });
-            if let Some(displacement) = found {
-                self.sampler.displace(i, displacement);
-            }
-        }
+            alignment::against(self.trainer.field(), view, &posed.images[image], latent, &options, &mut buffer)
+        });
+        let mut corrections: Vec<Correction> = aligned.collect();
+        alignment::balance(&mut corrections);
+        self.correct(&corrections);
+    }
+
+    fn correct(&mut self, corrections: &[Correction]) {
+        corrections.iter().enumerate().for_each(|(view, correction)| self.sampler.correct(view, *correction));
     }
 
     /// Trains to the end, or resumes, and returns the field.
@@ -224,13 +226,12 @@ impl Phase for FieldPhase<'_> {
         trainer.set_state_latents(&state_latents(self.clouds, config.seed));
         self.sampler.set_drawn(trainer.step_count());
         self.trainer = trainer;
-        if let Some(saved) = state.get(DISPLACEMENTS) {
+        if let Some(saved) = state.get(CORRECTIONS) {
             let mut values = vec![0.0_f32; saved.numel()];
             let count = values.len();
             saved.to_kind(Kind::Float).copy_data(&mut values, count);
-            for (i, &[u, du_x, du_y, v, dv_x, dv_y]) in values.as_chunks().0.iter().enumerate() {
-                self.sampler.displace(i, [[u, du_x, du_y], [v, dv_x, dv_y]]);
-            }
+            let corrections: Vec<Correction> = values.as_chunks().0.iter().map(|&numbers| numbers.into()).collect();
+            self.correct(&corrections);
         }
         true
     }
@@ -268,8 +269,8 @@ impl Phase for FieldPhase<'_> {
 
     fn state(&self) -> Tensors {
         let mut state = state_of(&self.trainer);
-        let all: Vec<f32> = self.sampler.views().iter().flat_map(|view| view.displacement).flatten().collect();
-        state.insert(DISPLACEMENTS.into(), Tensor::from_slice(&all));
+        let all: Vec<f32> = self.sampler.views().iter().flat_map(|view| view.correction.to_array()).collect();
+        state.insert(CORRECTIONS.into(), Tensor::from_slice(&all));
         state
     }
 }
@@ -319,7 +320,7 @@ pub fn views(posed: &PosedImages, chosen: &[usize]) -> Vec<TrainingView> {
                 rgb: own.rgb.clone(),
                 changed,
                 valid,
-                displacement: [[0.0; 3]; 2],
+                correction: Correction::default(),
             }
         })
         .collect()

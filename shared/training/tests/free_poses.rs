@@ -7,6 +7,7 @@ mod common;
 use carff_base::random::Key;
 use carff_dataset::{Dataset, Degradation, Equivalence, Image, PoseRole, PoseSplit, degrade, sensor::SensorNoise};
 use carff_evaluation::PosedImages;
+use carff_field::Correction;
 use carff_scenes::Detail;
 use carff_training::{FreePoses, Phases, TrainingError, render_free_poses};
 use common::{Place, SCENARIO};
@@ -203,24 +204,24 @@ fn making_free_poses_resumes() {
     assert_eq!(make(&place, "none", None).unwrap(), None);
 }
 
-/// The field finds the errors of the poses of a camera's images.
+/// The field finds the errors of the poses of a camera's images, and their gains.
 #[test]
-fn errors_of_poses_are_found() {
+fn errors_of_poses_and_gains_are_found() {
     const JITTER_PX: f64 = 1.5;
     let mut place = place();
     place.config.free_poses = FreePoses { field_steps: 3000, count: 1, ..place.config.free_poses };
     let [whole, degraded] = ["set", "degraded"].map(|name| place.at(name));
-    let noise = SensorNoise { sigma: 2.0, ..SensorNoise::OFF };
+    let noise = SensorNoise { sigma: 2.0, gain_sigma: 0.05, channel_gain_sigma: 0.03, ..SensorNoise::OFF };
     let degradation = Degradation { noise, pose_jitter_px: JITTER_PX, one_state: false, seed: 1 };
     degrade(&Dataset::open(&whole).unwrap(), &degraded, &degradation).unwrap();
     place.run("run", None, |run| render_free_poses(&place.config, &degraded, run)).unwrap().unwrap();
     let state = tch::Tensor::read_safetensors(place.at("run/free.state.safetensors")).unwrap();
-    let found = &state.iter().find(|(name, _)| name == "displacements").unwrap().1;
+    let found = &state.iter().find(|(name, _)| name == "corrections").unwrap().1;
     let found = Vec::<f32>::try_from(found).unwrap();
     let posed = PosedImages::open(&degraded, place.config.split_seed).unwrap();
     let side_px = f64::from(posed.images[0].width_px);
     // The image shows its place shifted by the error of its pose.
-    let errors = posed.trained().into_iter().zip(found.chunks(6)).flat_map(|(image, found)| {
+    let errors = posed.trained().into_iter().zip(found.chunks(Correction::LEN)).flat_map(|(image, found)| {
         let mut rng = carff_base::random::stream(Key::named("jitt", 1, image as u64));
         [found[0], found[3]].map(|share| {
             let shift_px = JITTER_PX * rng.sample::<f64, _>(StandardNormal);
@@ -231,6 +232,22 @@ fn errors_of_poses_are_found() {
     // Images of little more than road do not show where they are from.
     let [left, before] = [0, 1].map(|i| median(errors.iter().map(|e| e[i]).collect()));
     assert!(left < 0.4 * before, "{left:.2} of {before:.2} px");
+
+    // The same gains at exact poses: the sums of the colours change by them only.
+    let brighter = place.at("brighter");
+    degrade(&Dataset::open(&whole).unwrap(), &brighter, &Degradation { pose_jitter_px: 0.0, ..degradation }).unwrap();
+    let [exact, brighter] = [&whole, &brighter].map(|set| PosedImages::open(set, place.config.split_seed).unwrap());
+    let sum =
+        |image: &Image, channel: usize| image.rgb.iter().skip(channel).step_by(3).map(|&v| f64::from(v)).sum::<f64>();
+    let gains = posed.trained().into_iter().zip(found.chunks(Correction::LEN)).flat_map(|(image, found)| {
+        [0, 1, 2].map(|channel| {
+            let gain = sum(&brighter.images[image], channel) / sum(&exact.images[image], channel);
+            [(f64::from(found[6 + channel]) - gain).abs(), (gain - 1.0).abs()]
+        })
+    });
+    let gains: Vec<[f64; 2]> = gains.collect();
+    let [left, before] = [0, 1].map(|i| median(gains.iter().map(|e| e[i]).collect()));
+    assert!(left < 0.6 * before, "{left:.4} of {before:.4}");
 }
 
 fn median(mut values: Vec<f64>) -> f64 {

@@ -33,8 +33,9 @@ pub(crate) struct View<'a> {
     pub height: usize,
 }
 
-/// Means over the cells of a grid of `width` x `height`, 0..=1.
-pub(crate) fn reduced(image: ArrayView3<'_, u8>, width: usize, height: usize) -> Vec<f32> {
+/// Returns the means of an image (height, width, channel) over the cells of a grid: RGB, 0..=1, row by row, `width` x
+/// `height`.
+pub fn reduced(image: ArrayView3<'_, u8>, width: usize, height: usize) -> Vec<f32> {
     let (rows, columns, _) = image.dim();
     let cell = |i: usize, n: usize, all: usize| {
         let start = (i * all / n).min(all.saturating_sub(1));

@@ -28,7 +28,7 @@ mod sight;
 mod sighting;
 mod track;
 
-pub use align::displacement;
+pub use align::{displacement, reduced};
 pub use alike::shows_same;
 pub use blobs::Blob;
 pub use camera::{CameraCheck, CameraLimits, Measured, Measurement};

@@ -14,6 +14,38 @@ pub const RAYS_PER_GROUP: usize = 32;
 /// side. All zeros for an exact pose.
 pub type Displacement = [[f32; 3]; 2];
 
+/// How an image differs from what its camera sees at its recorded pose. The default is no difference.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Correction {
+    /// Displacement of the pixels, by the error of the camera's pose.
+    pub displacement: Displacement,
+    /// Brightness of each colour channel relative to the other images: exposure and white balance.
+    pub gain: [f32; 3],
+}
+
+impl Correction {
+    /// Count of the numbers of a correction.
+    pub const LEN: usize = 9;
+
+    /// Returns the numbers: both axes of the displacement, then the gains.
+    pub fn to_array(self) -> [f32; Self::LEN] {
+        let ([[u, du_x, du_y], [v, dv_x, dv_y]], [red, green, blue]) = (self.displacement, self.gain);
+        [u, du_x, du_y, v, dv_x, dv_y, red, green, blue]
+    }
+}
+
+impl From<[f32; Correction::LEN]> for Correction {
+    fn from([u, du_x, du_y, v, dv_x, dv_y, red, green, blue]: [f32; Correction::LEN]) -> Self {
+        Self { displacement: [[u, du_x, du_y], [v, dv_x, dv_y]], gain: [red, green, blue] }
+    }
+}
+
+impl Default for Correction {
+    fn default() -> Self {
+        Self { displacement: [[0.0; 3]; 2], gain: [1.0; 3] }
+    }
+}
+
 /// One posed image.
 #[derive(Clone, Debug)]
 pub struct TrainingView {
@@ -25,8 +57,8 @@ pub struct TrainingView {
     pub changed: Vec<u32>,
     /// Pixels that rays are drawn from; empty: all.
     pub valid: Vec<u32>,
-    /// Displacement of the image's pixels, by the error of the camera's pose.
-    pub displacement: Displacement,
+    /// Difference between the image and what the camera sees.
+    pub correction: Correction,
 }
 
 impl TrainingView {
@@ -35,8 +67,17 @@ impl TrainingView {
         let (width, height) = (f64::from(self.camera.width_px), f64::from(self.camera.height_px));
         let (longer, seen) = (width.max(height), [x as f64 + 0.5, y as f64 + 0.5]);
         let terms = [longer, 2.0 * seen[0] - width, 2.0 * seen[1] - height];
-        let by = self.displacement.map(|axis| axis.iter().zip(terms).map(|(a, b)| f64::from(*a) * b).sum::<f64>());
+        let by = self
+            .correction
+            .displacement
+            .map(|axis| axis.iter().zip(terms).map(|(a, b)| f64::from(*a) * b).sum::<f64>());
         [seen[0] - by[0], seen[1] - by[1]]
+    }
+
+    /// Colour of a pixel without the image's gains, 0..=1.
+    fn colour(&self, pixel: u64) -> [f32; 3] {
+        let rgb = &self.rgb[pixel as usize * 3..][..3];
+        [0, 1, 2].map(|c| (f32::from(rgb[c]) / 255.0 / self.correction.gain[c]).min(1.0))
     }
 }
 
@@ -64,11 +105,11 @@ pub fn changed_pixels(images: &[&[u8]], threshold: u8) -> Vec<u32> {
 /// Draws batches: groups of rays, each group from one image. Draw number n only depends on the seed and n.
 ///
 /// ```
-/// use carff_field::{RAYS_PER_GROUP, RayBatch, RaySampler, TrainingView};
+/// use carff_field::{Correction, RAYS_PER_GROUP, RayBatch, RaySampler, TrainingView};
 /// use carff_base::geometry::PinholeCamera;
 /// let camera = PinholeCamera::look_at([0.0, -5.0, 1.0], [0.0; 3], [0.0, 0.0, 1.0], 4, 4, 60.0);
-/// let (rgb, exact) = (vec![255; 4 * 4 * 3], [[0.0; 3]; 2]);
-/// let view = TrainingView { camera, rgb, changed: Vec::new(), valid: Vec::new(), displacement: exact };
+/// let (rgb, correction) = (vec![255; 4 * 4 * 3], Correction::default());
+/// let view = TrainingView { camera, rgb, changed: Vec::new(), valid: Vec::new(), correction };
 /// let mut sampler = RaySampler::new(vec![view], 0.5, 1);
 /// let mut batch = RayBatch::default();
 /// sampler.next_batch(2 * RAYS_PER_GROUP, &mut batch, |_view, _draw| [0.0; 8]);
@@ -99,10 +140,10 @@ impl RaySampler {
         &self.views
     }
 
-    /// Sets the displacement of a view's pixels.
-    pub fn displace(&mut self, view: usize, displacement: Displacement) {
+    /// Sets the correction of a view's image.
+    pub fn correct(&mut self, view: usize, correction: Correction) {
         if let Some(view) = self.views.get_mut(view) {
-            view.displacement = displacement;
+            view.correction = correction;
         }
     }
 
@@ -151,8 +192,7 @@ impl RaySampler {
                 let (x, y) = (pixel % width, pixel / width);
                 let [u, v] = view.in_camera(x, y);
                 batch.rays.push(view.camera.ray(u, v));
-                let rgb = &view.rgb[pixel as usize * 3..][..3];
-                batch.target_rgb.push([0, 1, 2].map(|c| f32::from(rgb[c]) / 255.0));
+                batch.target_rgb.push(view.colour(pixel));
                 batch.latent_index.push(group as u32);
             }
         }
@@ -173,7 +213,7 @@ mod tests {
             rgb: vec![0; 96],
             changed: Vec::new(),
             valid: Vec::new(),
-            displacement,
+            correction: Correction { displacement, ..Correction::default() },
         };
         assert_eq!(of([[0.0; 3]; 2]).in_camera(3, 2), [3.5, 2.5]);
         assert_eq!(of([[0.25, 0.0, 0.0], [-0.125, 0.0, 0.0]]).in_camera(3, 2), [1.5, 3.5]);
@@ -182,13 +222,25 @@ mod tests {
         assert_eq!(turned.in_camera(7, 3), [7.5 - 0.5 * 3.0, 3.5 + 0.25 * 7.0]);
     }
 
+    /// Colours are those at the gains of the other images, and never beyond white.
+    #[test]
+    fn gains_are_taken_out() {
+        let camera = PinholeCamera::look_at([0.0, -5.0, 1.0], [0.0; 3], [0.0, 0.0, 1.0], 1, 1, 60.0);
+        let correction = Correction { gain: [0.5, 1.0, 2.0], ..Correction::default() };
+        let (rgb, changed, valid) = (vec![51, 51, 51, 204, 204, 204], Vec::new(), Vec::new());
+        let view = TrainingView { camera, rgb, changed, valid, correction };
+        assert_eq!(view.colour(0), [0.4, 0.2, 0.1]);
+        assert_eq!(view.colour(1), [1.0, 0.8, 0.4]);
+        assert_eq!(Correction::from(correction.to_array()), correction);
+    }
+
     /// Rays go through valid pixels only; with all pixels, the draws are those of a view without a list.
     #[test]
     fn rays_go_through_valid_pixels() {
         let camera = PinholeCamera::look_at([0.0, -5.0, 1.0], [0.0; 3], [0.0, 0.0, 1.0], 8, 8, 60.0);
         let rgb: Vec<u8> = (0..64).flat_map(|i| [i; 3]).collect();
         let drawn = |changed: Vec<u32>, valid: Vec<u32>| {
-            let view = TrainingView { camera, rgb: rgb.clone(), changed, valid, displacement: [[0.0; 3]; 2] };
+            let view = TrainingView { camera, rgb: rgb.clone(), changed, valid, correction: Correction::default() };
             let mut batch = RayBatch::default();
             RaySampler::new(vec![view], 0.5, 1).next_batch(16 * RAYS_PER_GROUP, &mut batch, |_, _| [0.0; 8]);
             batch.target_rgb.iter().map(|rgb| (rgb[0] * 255.0).round() as u32).collect::<Vec<_>>()
