@@ -14,7 +14,7 @@ pub const RAYS_PER_GROUP: usize = 32;
 /// side. All zeros for an exact pose.
 pub type Displacement = [[f32; 3]; 2];
 
-/// How an image differs from what its camera sees at its recorded pose. The default is no difference.
+/// Difference between an image and what its camera sees at the recorded pose. The default is an exact image.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Correction {
     /// Displacement of the pixels, by the error of the camera's pose.
