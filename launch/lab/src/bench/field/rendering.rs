@@ -64,7 +64,9 @@ impl Bench {
             bf16_against_f32([fast, field], states, &camera, [&seconds[0], &in_f32], report);
         }
         hypotheses_together(shared, &together.images[0].changing, report);
+        println!("one hypothesis: {} rays a second\n", number(rays.len() as f64 / native));
         report.set("field.render_alone_fps", 1.0 / native);
+        report.set("field.render_alone_rays_s", rays.len() as f64 / native);
         report.set("field.render_samples", count);
         report.set("field.render_colored_samples", kept);
         self.breakdown(fast, states, &camera, &samples, report);
@@ -171,14 +173,17 @@ fn out_of_the_field(rays: &[Ray]) -> Vec<Ray> {
 /// Prints and records the time of each of the hypotheses that are rendered together, seconds, and the share of the rays
 /// that meet what changes.
 fn hypotheses_together(each_s: f64, changing: &[bool], report: &mut Report) {
+    let rays_s = changing.len() as f64 / each_s;
     let changing = changing.iter().filter(|c| **c).count() as f64 / changing.len() as f64;
     println!(
-        "{HYPOTHESES} hypotheses together: {} ms, {} frames a second, each; {} of the rays meet what changes\n",
+        "{HYPOTHESES} hypotheses together: {} ms, {} frames a second, each; {} rays a second; {} of the rays meet what changes",
         number(each_s * 1e3),
         number(1.0 / each_s),
+        number(rays_s),
         percent(changing)
     );
     report.set("field.render_fps", 1.0 / each_s);
+    report.set("field.render_rays_s", rays_s);
     report.set("field.render_changing_rays", changing);
 }
 
