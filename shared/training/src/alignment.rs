@@ -47,7 +47,7 @@ pub fn against(
         is_valid[(y * width + x) as usize]
     };
     let (columns, rows) = (columns as usize, rows as usize);
-    let gain = gains(&reduced(seen, columns, rows), &rendered.rgb, &counts);
+    let gain = gains(&reduced(seen, columns, rows), &rendered.rgb, counts);
     let displacement = displacement(seen, &rendered.rgb, columns, rows, counts);
     Correction {
         displacement: displacement.unwrap_or(view.correction.displacement),
@@ -76,6 +76,8 @@ fn gains(seen: &[f32], rendered: &[f32], counts: impl Fn(usize) -> bool) -> Opti
 pub fn balance(corrections: &mut [Correction]) {
     for channel in 0..3 {
         let mean = corrections.iter().map(|c| c.gain[channel]).sum::<f32>() / corrections.len().max(1) as f32;
-        corrections.iter_mut().for_each(|c| c.gain[channel] /= mean);
+        for correction in corrections.iter_mut() {
+            correction.gain[channel] /= mean;
+        }
     }
 }
