@@ -31,8 +31,8 @@ def main() -> None:
     parser.add_argument("--side", type=int, default=128, help="width and height, pixels")
     args = parser.parse_args()
     side = args.side
-    focal = side / 2 / math.tan(math.radians(60) / 2)  # the field of view of the trained camera
-    intrinsics = carff.Intrinsics(fl_x_px=focal, fl_y_px=focal, cx_px=side / 2, cy_px=side / 2)
+    focal_px = side / 2 / math.tan(math.radians(60) / 2)  # the field of view of the trained camera
+    intrinsics = carff.Intrinsics(fl_x_px=focal_px, fl_y_px=focal_px, cx_px=side / 2, cy_px=side / 2)
     unknown = carff.DatasetView(0, -1, -1, -1, -1, -1, -1, 0)
     with carff.join(args.run, "camera") as node:
         frames = node.publisher(carff.topic("camera/frame"), side * side * 3)

@@ -1,5 +1,5 @@
-//! A camera in a process of its own: publishes the images of a dataset, again and again, to a graph with
-//! `camera.source = "external"`. Usage: `external-camera DATASET [RUN] [FRAMES_PER_SECOND]`.
+//! A camera in a process of its own: publishes the images of a dataset with their poses, again and again, to a
+//! graph with `camera.source = "external"`. Usage: `external-camera DATASET [RUN] [FRAMES_PER_SECOND]`.
 
 use anyhow::{Context, ensure};
 use carff_dataset::Dataset;

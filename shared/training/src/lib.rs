@@ -17,7 +17,7 @@
 //! | module | content |
 //! |---|---|
 //! | `config`, `augmentation` | the training file |
-//! | `alignment` | errors of the recorded poses, which a field finds |
+//! | `alignment` | errors of the recorded poses, and gains of the images, which a field finds |
 //! | `pipeline`, `calibrate` | from images to a checkpoint |
 //! | `run` | the loop of all phases, and the folder of a run |
 //! | `vae`, `field`, `mixture` | the training phases |
