@@ -2,7 +2,9 @@
 
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
-use carff_messages::{Action, ActionCode, Belief, Header, Health, HealthState, Message, Reason, Stage};
+use carff_messages::{
+    Action, ActionCode, Belief, Header, Health, HealthState, ImageCheck, ImageCondition, Message, Reason, Stage,
+};
 use carff_tests::{Process, TestGraph, eventually};
 use carff_transport::{Node, Publisher, Receiver, monotonic_now_ns, topics};
 use rustix::process::Signal;
@@ -39,7 +41,7 @@ struct Controlled {
     seen: Vec<Action>,
     health: Option<Health>,
     // This field is dropped last: it closes the run.
-    _node: Node,
+    node: Node,
 }
 
 impl Controlled {
@@ -53,8 +55,7 @@ impl Controlled {
         let actions = node.receiver(&topics::ACTION).unwrap();
         let healths = node.receiver(topics::health(Stage::Controller)).unwrap();
         let process = graph.stage(Stage::Controller);
-        let mut controlled =
-            Self { graph, process, beliefs, actions, healths, seen: Vec::new(), health: None, _node: node };
+        let mut controlled = Self { graph, process, beliefs, actions, healths, seen: Vec::new(), health: None, node };
         controlled.until("it is ready", |c| c.health.is_some_and(|h| h.state == HealthState::Ok.code()));
         controlled
     }
@@ -148,4 +149,26 @@ fn what_is_not_valid_halts() {
     controller.until("it halts on an invalid belief", halts(Reason::InvalidBelief));
     assert!(controller.seen.iter().all(|a| a.code().unwrap() == ActionCode::Halt && !a.is_decision()));
     controller.stop();
+}
+
+/// The condition of an image is logged by its name, once for all images that have it. Each of them is decided on.
+#[test]
+fn conditions_of_images_are_logged_when_they_change() {
+    let mut controller = Controlled::start(60_000);
+    let mut checks = controller.node.publisher(&topics::CHECK).unwrap();
+    let (covered, usable) = (ImageCondition::Covered, ImageCondition::Usable);
+    for (frame_id, condition) in (1_u64..).zip([covered, covered, covered, usable, usable, covered]) {
+        let mut header = Header::of_frame(frame_id, monotonic_now_ns(), 1);
+        header.run_id = controller.graph.run().id();
+        checks.send(ImageCheck { condition: condition.code(), ..ImageCheck::of_frame(header) }).unwrap();
+        if condition == covered {
+            assert_eq!(controller.until_decided(frame_id).reason().unwrap(), Reason::CoveredLens);
+        }
+    }
+    drop(checks);
+    controller.process.signal(Signal::TERM);
+    let text = controller.process.end().text;
+    let logged: Vec<&str> = text.lines().filter(|line| line.contains("the image is")).collect();
+    assert_eq!(logged.len(), 3, "{text}");
+    assert!(logged[0].contains("not usable: covered") && logged[1].contains("usable again"), "{text}");
 }
