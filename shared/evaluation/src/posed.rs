@@ -44,12 +44,11 @@ pub struct PosedImages {
     pub equivalence: Equivalence,
     /// Visual equivalence as the images show it, which training may use.
     pub seen_equivalence: Equivalence,
-    /// The comparison of the dataset's images, and so of those of free poses: a field that was trained on images of a
-    /// camera differs a little between all states.
+    /// The comparison of the dataset's images.
     comparison: ImageComparison,
     /// Number of the first view of each dataset of free poses, and its equivalence.
     random_equivalences: Vec<(usize, Equivalence)>,
-    /// Rendered images of all states, for each view that is missing in some states and was completed.
+    /// Rendered images of all states, for each view whose own images cannot be compared.
     rendered: HashMap<usize, Vec<usize>>,
     /// Mean image of each pose over the states in which a pixel is valid, `[V, 3, 128, 128]`, 0..=1.
     pub pose_means: Tensor,
@@ -98,7 +97,7 @@ impl PosedImages {
     }
 
     /// Adds the images of a dataset of free poses of the same scenario, in which the dynamic vehicle may look
-    /// different. Several calls add several datasets.
+    /// different. They are rendered, so they are compared exactly. Several calls add several datasets.
     pub fn add_free_poses(&mut self, dir: &Path) -> Result<(), EvaluationError> {
         let unfit = |what: &str| EvaluationError::Unfit(format!("{}: {what}", dir.display()));
         let free = Dataset::open(dir)?;
@@ -108,9 +107,9 @@ impl PosedImages {
         let images = free.load_all_images()?;
         let first_view = self.view_count();
         let of_free = labels(&free, first_view, |_| None).map_err(|what| unfit(&what))?;
-        let equivalence = Equivalence::from_images(&free, &images, self.comparison);
-        for (view, from) in self.same_poses(&free) {
-            self.complete(view, from, &of_free, &images, &equivalence);
+        let equivalence = Equivalence::from_images(&free, &images, ImageComparison::Exact);
+        for (view, from) in self.rendered_poses(&free) {
+            self.compare_rendered(view, from, &of_free, &images, &equivalence);
         }
         self.labels.extend(of_free);
         self.random_equivalences.push((first_view, equivalence));
@@ -118,12 +117,12 @@ impl PosedImages {
         Ok(())
     }
 
-    /// Views of the dataset that are missing in some states, each with the free pose that is the same.
-    fn same_poses(&self, free: &Dataset) -> Vec<(usize, usize)> {
+    /// Views of the dataset whose own images cannot be compared, each with the free pose that is the same.
+    fn rendered_poses(&self, free: &Dataset) -> Vec<(usize, usize)> {
         let of = |frame: &Frame| frame.view.map(|view| (frame.camera.world_from_camera, view));
         let mut found: Vec<(usize, usize)> = Vec::new();
         let poses: Vec<_> = free.frames().iter().filter(|frame| frame.state == Some(0)).filter_map(of).collect();
-        for (pose, view) in self.dataset.frames().iter().filter_map(of).filter(|(_, view)| !self.is_whole(*view)) {
+        for (pose, view) in self.dataset.frames().iter().filter_map(of).filter(|(_, view)| !self.is_comparable(*view)) {
             if let Some((_, from)) = poses.iter().find(|(other, _)| same_pose(other, &pose)) {
                 found.push((view, *from));
             }
@@ -133,14 +132,20 @@ impl PosedImages {
         found
     }
 
-    /// Completes a view that is missing in some states with rendered images of all states from its pose: which states
-    /// look the same, the mean image, the pixels that change, and the visibility of the actor's place if the dataset
-    /// does not name it.
-    fn complete(&mut self, view: usize, from: usize, free: &[Label], images: &[Image], equivalence: &Equivalence) {
+    /// Compares rendered images of all states in place of a view's own images: which states look the same, the mean
+    /// image, the pixels that change, and the visibility of the actor's place if the dataset does not name it.
+    fn compare_rendered(
+        &mut self,
+        view: usize,
+        from: usize,
+        free: &[Label],
+        images: &[Image],
+        equivalence: &Equivalence,
+    ) {
         let first_view = self.view_count();
         let of_view: Vec<usize> = (0..free.len()).filter(|&i| free[i].view == first_view + from).collect();
         self.seen_equivalence.adopt(view, equivalence, from);
-        if self.dataset.frames().iter().all(|frame| frame.alike_states.is_none()) {
+        if !self.is_whole(view) && self.dataset.frames().iter().all(|frame| frame.alike_states.is_none()) {
             self.equivalence.adopt(view, equivalence, from);
         }
         for (label, frame) in self.labels.iter_mut().zip(self.dataset.frames()).filter(|(label, _)| label.view == view)
@@ -160,8 +165,13 @@ impl PosedImages {
         (0..self.scenario.state_count()).all(|state| self.at(state, view).is_some())
     }
 
-    /// Returns the first trained view that neither has an image of every state nor was completed by
-    /// [`Self::add_free_poses`].
+    /// Returns true if the images of a view show which states look the same: an image of every state, without noise.
+    fn is_comparable(&self, view: usize) -> bool {
+        self.is_whole(view) && !self.is_of_camera()
+    }
+
+    /// Returns the first trained view that neither has an image of every state nor rendered images, which
+    /// [`Self::add_free_poses`] adds.
     pub fn incomplete_view(&self) -> Option<usize> {
         let views = self.trained().into_iter().map(|i| self.labels[i].view);
         views.filter(|&view| !self.is_whole(view) && !self.rendered.contains_key(&view)).min()
@@ -173,13 +183,13 @@ impl PosedImages {
         self.comparison == ImageComparison::ThroughNoise && self.scenario.state_count() > 1
     }
 
-    /// Returns true if each view of the dataset has an image of every state.
-    pub fn has_all_states(&self) -> bool {
-        !self.index.contains(&None)
+    /// Returns true if the images of each view show which states look the same: an image of every state, without noise.
+    pub fn are_comparable(&self) -> bool {
+        (0..self.dataset.view_count()).all(|view| self.is_comparable(view))
     }
 
-    /// Images of the states from a view of the dataset: its own, or for a view that is missing in some states, rendered
-    /// images of all of them where they were added.
+    /// Images of the states from a view of the dataset: its own, or where these cannot be compared and rendered images
+    /// were added, the rendered ones.
     pub fn of_view(&self, view: usize) -> Vec<usize> {
         match self.rendered.get(&view) {
             Some(rendered) => rendered.clone(),
