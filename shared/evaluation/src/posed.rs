@@ -46,6 +46,8 @@ pub struct PosedImages {
     pub seen_equivalence: Equivalence,
     /// The comparison of the dataset's images.
     comparison: ImageComparison,
+    /// Standard deviation of the read noise of the dataset's images, of 255; 0 for images that are compared exactly.
+    read_noise: f64,
     /// Number of the first view of each dataset of free poses, and its equivalence.
     random_equivalences: Vec<(usize, Equivalence)>,
     /// Rendered images of all states, for each view whose own images cannot be compared.
@@ -73,6 +75,10 @@ impl PosedImages {
         let equivalence = Equivalence::from_dataset(&dataset, &images);
         let comparison = Equivalence::comparison(&dataset, &images);
         let seen_equivalence = Equivalence::from_images(&dataset, &images, comparison);
+        let read_noise = match comparison {
+            ImageComparison::Exact => 0.0,
+            ImageComparison::ThroughNoise => carff_dataset::sensor::read_noise(&images),
+        };
         let means: Vec<Tensor> = (0..dataset.view_count())
             .map(|view| {
                 let of_view: Vec<usize> = (0..states).filter_map(|state| index[view * states + state]).collect();
@@ -90,6 +96,7 @@ impl PosedImages {
             equivalence,
             seen_equivalence,
             comparison,
+            read_noise,
             random_equivalences: Vec::new(),
             rendered: HashMap::new(),
             index,
@@ -181,6 +188,16 @@ impl PosedImages {
     /// then have errors. Images of one state show neither.
     pub fn is_of_camera(&self) -> bool {
         self.comparison == ImageComparison::ThroughNoise && self.scenario.state_count() > 1
+    }
+
+    /// Standard deviation of the read noise, of 255, that an image lacks compared with the dataset's: a rendered image has
+    /// none. Where it is smaller than the dataset's images, these lose noise as they are reduced to the encoder's input.
+    pub fn missing_noise(&self, image: usize) -> f64 {
+        let of_dataset = self.images.first().map_or(0, |image| image.width_px);
+        match self.labels[image].role {
+            Some(_) => 0.0,
+            None => self.read_noise * (f64::from(self.images[image].width_px) / f64::from(of_dataset.max(1))).min(1.0),
+        }
     }
 
     /// Returns true if the images of each view show which states look the same: an image of every state, without noise.

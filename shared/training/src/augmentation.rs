@@ -10,7 +10,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use tch::Tensor;
 
-/// Augmentation of the encoder's training images. The decoder's target is always the clean image.
+/// Augmentation of the encoder's training images. The decoder's target is always the unchanged image.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Augmentation {
@@ -20,7 +20,8 @@ pub struct Augmentation {
     /// Further copies of the training images of the dataset's own poses, which are few compared with those of free
     /// poses: the first copy is unchanged, the others are augmented.
     pub own_copies: usize,
-    /// Sensor noise and colour errors, on every copy.
+    /// Sensor noise and colour errors, on every copy. Rendered images of free poses also get the noise of a camera's
+    /// images.
     pub sensor: SensorNoise,
     /// Largest shift, as a share of the image's side.
     pub shift: f64,
@@ -83,6 +84,13 @@ impl Augmentation {
         kind.apply(image, severity, key).ok()
     }
 
+    /// Sensor noise of an image: that of the configuration, and on a rendered image also the noise of the camera that took
+    /// the dataset's images.
+    fn sensor_of(&self, posed: &PosedImages, image: usize) -> SensorNoise {
+        let sigma = f64::from(self.sensor.sigma).hypot(posed.missing_noise(image)) as f32;
+        SensorNoise { sigma: sigma.min(SensorNoise::LARGEST_SIGMA), ..self.sensor }
+    }
+
     /// Encoder inputs `[N, 3, H, W]`, 0..=1: augmented copy number `copy` of each chosen image. Copy 0 has only sensor
     /// noise. Equal seeds give equal copies.
     pub fn inputs(&self, posed: &PosedImages, chosen: &[usize], copy: usize, seed: u64) -> Tensor {
@@ -94,7 +102,7 @@ impl Augmentation {
             let weathered = if copy == 0 { None } else { self.weathered(image, Key { sample: WEATHER, ..key }) };
             let image = weathered.as_ref().unwrap_or(image);
             let mut noisy = vec![0_u8; image.rgb.len()];
-            if apply_noise_into(&image.rgb, &mut noisy, &self.sensor, key).is_err() {
+            if apply_noise_into(&image.rgb, &mut noisy, &self.sensor_of(posed, i), key).is_err() {
                 // Cannot happen: the configuration was validated, and the lengths are equal.
                 noisy.copy_from_slice(&image.rgb);
             }
