@@ -204,7 +204,9 @@ mod tests {
             let (x, y) = (i % 96, i / 96);
             let step = if x + y < 50 { 40 } else { 0 };
             let object = if (40..60).contains(&x) && (20..41).contains(&y) { 25 } else { 0 };
-            pixel.iter_mut().for_each(|value| *value = (usize::from(*value) + x / 3 + step - object) as u8);
+            for value in pixel {
+                *value = (usize::from(*value) + x / 3 + step - object) as u8;
+            }
         }
         for sigma in [2.0_f32, 4.0, 8.0, 16.0] {
             let mut noisy = scene.clone();

@@ -53,8 +53,8 @@ const LEAST_NEAR: f32 = 0.5;
 const HAZE: u8 = 24;
 
 /// The same for a field of images of a camera: noise and errors of the poses leave more fog. States that show the same
-/// differ by more in at most [`MAX_DIFFERENT_PIXELS`] pixels. Chosen on 200 trained poses with one state each: labels of
-/// 30 of 3000 pairs of states are then wrong, and of 184 with a limit of 24.
+/// differ by more in at most [`MAX_DIFFERENT_PIXELS`] pixels. On 200 trained poses with one state each, labels of 29 of
+/// 3000 pairs of states are then wrong, and of 184 with a limit of 24.
 const CAMERA_HAZE: u8 = 48;
 
 /// Largest number of draws for each requested pose.
