@@ -204,7 +204,8 @@ fn making_free_poses_resumes() {
     assert_eq!(make(&place, "none", None).unwrap(), None);
 }
 
-/// The field finds the errors of the poses of a camera's images, and their gains.
+/// The field finds the errors of the poses of a camera's images, and their gains. Its images, and not the camera's, show
+/// which states look the same, and get the camera's noise.
 #[test]
 fn errors_of_poses_and_gains_are_found() {
     const JITTER_PX: f64 = 1.5;
@@ -214,11 +215,11 @@ fn errors_of_poses_and_gains_are_found() {
     let noise = SensorNoise { sigma: 2.0, gain_sigma: 0.05, channel_gain_sigma: 0.03, ..SensorNoise::OFF };
     let degradation = Degradation { noise, pose_jitter_px: JITTER_PX, one_state: false, seed: 1 };
     degrade(&Dataset::open(&whole).unwrap(), &degraded, &degradation).unwrap();
-    place.run("run", None, |run| render_free_poses(&place.config, &degraded, run)).unwrap().unwrap();
+    let made = place.run("run", None, |run| render_free_poses(&place.config, &degraded, run)).unwrap().unwrap();
     let state = tch::Tensor::read_safetensors(place.at("run/free.state.safetensors")).unwrap();
     let found = &state.iter().find(|(name, _)| name == "corrections").unwrap().1;
     let found = Vec::<f32>::try_from(found).unwrap();
-    let posed = PosedImages::open(&degraded, place.config.split_seed).unwrap();
+    let mut posed = PosedImages::open(&degraded, place.config.split_seed).unwrap();
     let side_px = f64::from(posed.images[0].width_px);
     // The image shows its place shifted by the error of its pose.
     let errors = posed.trained().into_iter().zip(found.chunks(Correction::LEN)).flat_map(|(image, found)| {
@@ -248,6 +249,24 @@ fn errors_of_poses_and_gains_are_found() {
     let gains: Vec<[f64; 2]> = gains.collect();
     let [left, before] = [0, 1].map(|i| median(gains.iter().map(|e| e[i]).collect()));
     assert!(left < 0.6 * before, "{left:.4} of {before:.4}");
+
+    let agreeing = |posed: &PosedImages| {
+        let alike = |images: &PosedImages, i: usize| images.seen_alike(posed.labels[i].view, posed.labels[i].state);
+        posed.trained().into_iter().filter(|&i| alike(posed, i) == alike(&exact, i)).count()
+    };
+    let through_noise = agreeing(&posed);
+    posed.add_free_poses(&made).unwrap();
+    let (rendered, trained) = (agreeing(&posed), posed.trained());
+    assert!(rendered >= through_noise && 5 * rendered > 4 * trained.len(), "{rendered}, {through_noise}");
+    for image in trained {
+        let of_view = posed.of_view(posed.labels[image].view);
+        assert!(of_view.iter().all(|&other| other >= posed.dataset.frames().len()), "{of_view:?}");
+        assert_eq!(posed.missing_noise(image), 0.0);
+        // Rendered images have half the side, as the encoder's input, to which the camera's images are reduced.
+        let reduced = f64::from(posed.images[of_view[0]].width_px) / side_px;
+        let share = posed.missing_noise(of_view[0]) / (f64::from(noise.sigma) * reduced);
+        assert!((0.85..1.3).contains(&share), "{share}");
+    }
 }
 
 fn median(mut values: Vec<f64>) -> f64 {
