@@ -237,7 +237,7 @@ static_assert(offsetof(CarffImageCheck, change) == 68, "CarffImageCheck.change")
 static_assert(offsetof(CarffImageCheck, covered) == 72, "CarffImageCheck.covered");
 static_assert(offsetof(CarffImageCheck, repeats_s) == 76, "CarffImageCheck.repeats_s");
 
-#define CARFF_FORECAST_TYPE_NAME "carff.Forecast.v2"
+#define CARFF_FORECAST_TYPE_NAME "carff.Forecast.v3"
 typedef struct CarffForecast {
     CarffHeader header;
     uint32_t source;
@@ -247,6 +247,8 @@ typedef struct CarffForecast {
     int32_t resolved_state;
     float path_probability;
     uint64_t images;
+    uint64_t state_count;
+    float state_weights[64];
     float weights[8];
     CarffGaussian components[8];
     float samples[64][8];
@@ -255,7 +257,7 @@ typedef struct CarffForecast {
     uint64_t stage_latency_ns;
 } CarffForecast;
 
-static_assert(sizeof(CarffForecast) == 2760, "CarffForecast");
+static_assert(sizeof(CarffForecast) == 3024, "CarffForecast");
 static_assert(offsetof(CarffForecast, header) == 0, "CarffForecast.header");
 static_assert(offsetof(CarffForecast, source) == 56, "CarffForecast.source");
 static_assert(offsetof(CarffForecast, component_count) == 60, "CarffForecast.component_count");
@@ -264,12 +266,14 @@ static_assert(offsetof(CarffForecast, horizon) == 68, "CarffForecast.horizon");
 static_assert(offsetof(CarffForecast, resolved_state) == 72, "CarffForecast.resolved_state");
 static_assert(offsetof(CarffForecast, path_probability) == 76, "CarffForecast.path_probability");
 static_assert(offsetof(CarffForecast, images) == 80, "CarffForecast.images");
-static_assert(offsetof(CarffForecast, weights) == 88, "CarffForecast.weights");
-static_assert(offsetof(CarffForecast, components) == 120, "CarffForecast.components");
-static_assert(offsetof(CarffForecast, samples) == 632, "CarffForecast.samples");
-static_assert(offsetof(CarffForecast, sample_component) == 2680, "CarffForecast.sample_component");
-static_assert(offsetof(CarffForecast, encoder_ns) == 2744, "CarffForecast.encoder_ns");
-static_assert(offsetof(CarffForecast, stage_latency_ns) == 2752, "CarffForecast.stage_latency_ns");
+static_assert(offsetof(CarffForecast, state_count) == 88, "CarffForecast.state_count");
+static_assert(offsetof(CarffForecast, state_weights) == 96, "CarffForecast.state_weights");
+static_assert(offsetof(CarffForecast, weights) == 352, "CarffForecast.weights");
+static_assert(offsetof(CarffForecast, components) == 384, "CarffForecast.components");
+static_assert(offsetof(CarffForecast, samples) == 896, "CarffForecast.samples");
+static_assert(offsetof(CarffForecast, sample_component) == 2944, "CarffForecast.sample_component");
+static_assert(offsetof(CarffForecast, encoder_ns) == 3008, "CarffForecast.encoder_ns");
+static_assert(offsetof(CarffForecast, stage_latency_ns) == 3016, "CarffForecast.stage_latency_ns");
 
 #define CARFF_PROBE_RESULT_TYPE_NAME "carff.ProbeResult.v2"
 typedef struct CarffProbeResult {
@@ -349,11 +353,12 @@ static_assert(offsetof(CarffUnknownBox, half_size) == 24, "CarffUnknownBox.half_
 static_assert(offsetof(CarffUnknownBox, probability) == 48, "CarffUnknownBox.probability");
 static_assert(offsetof(CarffUnknownBox, place) == 52, "CarffUnknownBox.place");
 
-#define CARFF_UNKNOWNS_TYPE_NAME "carff.Unknowns.v2"
+#define CARFF_UNKNOWNS_TYPE_NAME "carff.Unknowns.v3"
 typedef struct CarffUnknowns {
     CarffHeader header;
     uint32_t box_count;
     uint32_t state_count;
+    uint32_t place_count;
     float probability;
     float residual;
     float noise;
@@ -361,25 +366,28 @@ typedef struct CarffUnknowns {
     float offset[3];
     float explained;
     float ratios[64];
+    float places[48];
     float prior;
     CarffUnknownBox boxes[8];
     uint64_t stage_latency_ns;
 } CarffUnknowns;
 
-static_assert(sizeof(CarffUnknowns) == 824, "CarffUnknowns");
+static_assert(sizeof(CarffUnknowns) == 1016, "CarffUnknowns");
 static_assert(offsetof(CarffUnknowns, header) == 0, "CarffUnknowns.header");
 static_assert(offsetof(CarffUnknowns, box_count) == 56, "CarffUnknowns.box_count");
 static_assert(offsetof(CarffUnknowns, state_count) == 60, "CarffUnknowns.state_count");
-static_assert(offsetof(CarffUnknowns, probability) == 64, "CarffUnknowns.probability");
-static_assert(offsetof(CarffUnknowns, residual) == 68, "CarffUnknowns.residual");
-static_assert(offsetof(CarffUnknowns, noise) == 72, "CarffUnknowns.noise");
-static_assert(offsetof(CarffUnknowns, gain) == 76, "CarffUnknowns.gain");
-static_assert(offsetof(CarffUnknowns, offset) == 88, "CarffUnknowns.offset");
-static_assert(offsetof(CarffUnknowns, explained) == 100, "CarffUnknowns.explained");
-static_assert(offsetof(CarffUnknowns, ratios) == 104, "CarffUnknowns.ratios");
-static_assert(offsetof(CarffUnknowns, prior) == 360, "CarffUnknowns.prior");
-static_assert(offsetof(CarffUnknowns, boxes) == 368, "CarffUnknowns.boxes");
-static_assert(offsetof(CarffUnknowns, stage_latency_ns) == 816, "CarffUnknowns.stage_latency_ns");
+static_assert(offsetof(CarffUnknowns, place_count) == 64, "CarffUnknowns.place_count");
+static_assert(offsetof(CarffUnknowns, probability) == 68, "CarffUnknowns.probability");
+static_assert(offsetof(CarffUnknowns, residual) == 72, "CarffUnknowns.residual");
+static_assert(offsetof(CarffUnknowns, noise) == 76, "CarffUnknowns.noise");
+static_assert(offsetof(CarffUnknowns, gain) == 80, "CarffUnknowns.gain");
+static_assert(offsetof(CarffUnknowns, offset) == 92, "CarffUnknowns.offset");
+static_assert(offsetof(CarffUnknowns, explained) == 104, "CarffUnknowns.explained");
+static_assert(offsetof(CarffUnknowns, ratios) == 108, "CarffUnknowns.ratios");
+static_assert(offsetof(CarffUnknowns, places) == 364, "CarffUnknowns.places");
+static_assert(offsetof(CarffUnknowns, prior) == 556, "CarffUnknowns.prior");
+static_assert(offsetof(CarffUnknowns, boxes) == 560, "CarffUnknowns.boxes");
+static_assert(offsetof(CarffUnknowns, stage_latency_ns) == 1008, "CarffUnknowns.stage_latency_ns");
 
 #define CARFF_OCCUPANCY_TYPE_NAME "carff.Occupancy.v1"
 typedef struct CarffOccupancy {

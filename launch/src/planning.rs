@@ -6,9 +6,9 @@ use carff_checkpoint::{CheckpointPlanning, load_policy};
 use carff_config::{CameraSource, CompareImages, GraphConfig};
 use carff_dataset::{ScenarioInfo, drives::DriveKind};
 use carff_decision::{ImageEvidence, TakeFrame};
-use carff_messages::{ActionCode, Gaussian, Reason, Rule, Stage};
+use carff_messages::{ActionCode, Reason, Rule, Stage};
 use carff_scenes::Scenario;
-use carff_trials::run::{DecidedFrame, JudgedRun, RunPlanning, RunSettings, decisive_frames};
+use carff_trials::run::{DecidedFrame, JudgedRun, RunPlanning, RunSettings, TakenImage, decisive_frames};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
@@ -52,8 +52,8 @@ impl Planning {
         if decisive.iter().all(|(frame, _)| frame.posterior.is_none()) {
             return Ok(None);
         }
-        let posteriors: Vec<_> = outcome.records.frames.values().filter_map(taken).collect();
-        Ok(Some(Self { run: JudgedRun::load(settings(outcome)?, &posteriors)?, decisive }))
+        let images: Vec<_> = outcome.records.frames.values().filter_map(taken).collect();
+        Ok(Some(Self { run: JudgedRun::load(settings(outcome)?, &images)?, decisive }))
     }
 
     /// Computes every rule over the run's drives and over every eligible view.
@@ -88,10 +88,11 @@ fn image_before(frames: &BTreeMap<u64, FrameHistory>, frame: &FrameHistory, stat
     compared.map_or_else(|| Some(ImageEvidence::unexplained(states)), |(_, before)| before.image.clone())
 }
 
-/// Posterior of a frame, with its place in its take.
-fn taken(frame: &FrameHistory) -> Option<(TakeFrame, Gaussian)> {
+/// The image of a frame, with its place in its take.
+fn taken(frame: &FrameHistory) -> Option<TakenImage> {
     let FrameHistory { take_start, frame_id, capture_time_ns, .. } = *frame;
-    Some((TakeFrame { take_start, frame: frame_id, capture_time_ns }, frame.posterior?))
+    let place = TakeFrame { take_start, frame: frame_id, capture_time_ns };
+    Some(TakenImage { frame: place, posterior: frame.posterior?, image: frame.image.clone() })
 }
 
 /// Settings of a run, from its graph file and checkpoint.
@@ -117,6 +118,7 @@ fn settings(outcome: &RunOutcome) -> anyhow::Result<RunSettings> {
         feedback: graph.run.feedback,
         horizon: graph.run.horizon,
         compares: graph.checks.compare != CompareImages::Off,
+        compares_late: graph.checks.compare == CompareImages::NextFrame,
         ignores_unknown: graph.checks.ignores_unknown(),
         remembers: graph.step_length(None).filter(|_| graph.remembers()),
         noise: graph.camera.noise,

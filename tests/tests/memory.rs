@@ -1,9 +1,9 @@
-//! Test of the forecaster's memory on the shipped checkpoint, with a test in place of the encoder.
+//! Test of the forecaster's memory on the shipped checkpoint, with a test in place of encoder and prober.
 
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
 use carff_checkpoint::Manifest;
-use carff_messages::{Forecast, Gaussian, Header, Health, HealthState, Posterior, Stage};
+use carff_messages::{Forecast, Gaussian, Header, Health, HealthState, Posterior, Stage, Unknowns};
 use carff_tests::{Process, TestGraph, eventually, shipped_checkpoint};
 use carff_transport::{Node, Publisher, Receiver, topics};
 use rustix::process::Signal;
@@ -18,6 +18,7 @@ const KILLED_AFTER: u64 = 8;
 struct Bench {
     graph: TestGraph,
     posteriors: Publisher<Posterior>,
+    comparisons: Publisher<Unknowns>,
     forecasts: Receiver<Forecast>,
     health: Receiver<Health>,
     forecaster: Process,
@@ -30,6 +31,7 @@ impl Bench {
         let node = Node::open(graph.run(), "test").unwrap();
         let mut bench = Self {
             posteriors: node.publisher(&topics::POSTERIOR).unwrap(),
+            comparisons: node.publisher(&topics::UNKNOWN).unwrap(),
             forecasts: node.receiver(&topics::FORECAST).unwrap(),
             health: node.receiver(topics::health(Stage::Forecaster)).unwrap(),
             forecaster: graph.stage(Stage::Forecaster),
@@ -70,27 +72,46 @@ impl Bench {
         assert!(came, "no forecast of frame {frame}:\n{}", self.forecaster.text());
         found.unwrap()
     }
+
+    /// Publishes the comparison of a frame: an image that shows each place as `shown`.
+    fn compare(&mut self, frame: u64, shown: &[f32]) {
+        let header = Header::of_frame(frame, 1 + frame * 100_000_000, 1);
+        let mut unknowns = Unknowns { place_count: shown.len() as u32, ..Unknowns::of_frame(header) };
+        unknowns.places[..shown.len()].copy_from_slice(shown);
+        self.comparisons.send(unknowns).unwrap();
+    }
 }
 
-/// A forecaster that is killed in mid-take takes the belief up again from shared memory: it continues with the same
-/// forecasts, bit for bit, as one that was not killed.
+/// A forecaster that is killed in mid-take takes the belief up again from shared memory, with the comparisons of its images:
+/// it continues with the same forecasts, bit for bit, as one that was not killed.
 #[test]
 fn a_killed_forecaster_remembers_its_take() {
-    let states = Manifest::load(&shipped_checkpoint()).unwrap().states;
-    // One state in sight, then views between two states.
+    let manifest = Manifest::load(&shipped_checkpoint()).unwrap();
+    let (states, hazards) = (manifest.states, manifest.scenario.hazard_states());
+    // Views between two states, of which the images show one: the place that the first state takes, and the other does not.
     let between = Gaussian {
         mean: std::array::from_fn(|i| f32::midpoint(states[0].mean[i], states[3].mean[i])),
         log_variance: [0.0; 8],
     };
-    let image = |frame: u64| if frame < 3 { states[0] } else { between };
+    let shown = manifest.places.iter().map(|place| place.occupied_in[0] && !place.occupied_in[3]);
+    let shown: Vec<f32> = shown.map(f32::from).collect();
+    assert!(shown.contains(&1.0));
     let (mut killed, mut undisturbed) = (Bench::new(), Bench::new());
     for frame in 0..IMAGES {
         if frame == KILLED_AFTER {
             killed.kill();
         }
-        let [one, other] = [&mut killed, &mut undisturbed].map(|bench| bench.forecast(frame, image(frame)));
+        let [one, other] = [&mut killed, &mut undisturbed].map(|bench| bench.forecast(frame, between));
         assert_eq!((one.images, other.images), (frame + 1, frame + 1), "{}", killed.forecaster.text());
         assert_eq!((one.weights, one.components), (other.weights, other.components), "frame {frame}");
         assert_eq!(one.samples, other.samples, "frame {frame}");
+        assert_eq!(one.state_weights(), other.state_weights(), "frame {frame}");
+        // The comparison of an image counts from the next image on.
+        let hazard: f32 = one.state_weights().iter().zip(&hazards).filter(|(_, hazard)| **hazard).map(|(w, _)| w).sum();
+        let expected = if frame > 2 { 0.9..=1.0 } else { 0.4..=0.6 };
+        assert!(expected.contains(&hazard), "frame {frame}: {:?}", one.state_weights());
+        let nothing = vec![0.0; shown.len()];
+        let image = if frame == 2 { &shown } else { &nothing };
+        [&mut killed, &mut undisturbed].map(|bench| bench.compare(frame, image));
     }
 }

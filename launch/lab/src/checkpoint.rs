@@ -5,6 +5,7 @@ use anyhow::Context;
 use carff_base::files::check_writable;
 use carff_base::statistics::percentile_of_sorted;
 use carff_checkpoint::Manifest;
+use carff_decision::MemorySettings;
 use carff_launch::lab::{BoundArgs, CheckpointCommand, KnownArgs, MemoryArgs};
 use carff_scenes::Scenario;
 use carff_training::{BoundInput, KnownInput, MemoryInput, bound_threshold, calibrate_known, learn_memory};
@@ -78,10 +79,12 @@ fn memory(args: &MemoryArgs) -> anyhow::Result<()> {
     check_output(&args.checkpoint)?;
     let scenario = Scenario::load(&args.scenario)?;
     let display = Display::default();
-    let input = MemoryInput { checkpoint: &args.checkpoint, scenario: &scenario, drives: args.drives };
+    let MemoryArgs { checkpoint, drives, threads, .. } = args;
+    let input = MemoryInput { checkpoint, scenario: &scenario, drives: *drives, threads: *threads };
     let learned = learn_memory(input, &|p| display.show(p)).context("cannot learn the memory")?;
     display.finish();
-    println!("share of repeated evidence {}, distrust {}", learned.settings.repeated_share, learned.settings.distrust);
+    let MemorySettings { repeated_share, distrust, place_strength } = learned.settings;
+    println!("share of repeated evidence {repeated_share}, distrust {distrust}, strength of places {place_strength}");
     println!("log loss a frame {:.4}, without memory {:.4}", learned.log_loss, learned.without_memory);
     Ok(())
 }

@@ -89,6 +89,9 @@ pub struct MemoryArgs {
     /// Drives; branches take turns.
     #[arg(long, default_value_t = 200)]
     pub drives: usize,
+    /// Threads that render.
+    #[arg(long, default_value_t = 2)]
+    pub threads: usize,
 }
 
 fn share(text: &str) -> Result<f64, String> {

@@ -3,11 +3,16 @@
 use carff_checkpoint::{CheckpointPlanning, Manifest};
 use carff_config::GraphConfig;
 use carff_decision::{
-    Draw, Memory, Mixture, ProbeLayout, Sampling, TakeMemory, continue_samples, path_probability, set_mixture_and_draws,
+    Draw, ImageEvidence, Memory, Mixture, ProbeLayout, Sampling, TakeMemory, continue_samples, path_probability,
+    set_mixture_and_draws,
 };
 use carff_inference::MixtureNet;
-use carff_messages::{Belief, Forecast, ForecastSource, Gaussian, Header, Posterior};
+use carff_messages::{Belief, Forecast, ForecastSource, Gaussian, Header, MAX_STATES, Posterior, Unknowns};
+use std::collections::VecDeque;
 use std::path::Path;
+
+/// Number of comparisons that wait for the posterior after them: those that a restarted forecaster gets.
+const WAITING: usize = 64;
 
 /// The forecaster's model and settings.
 #[derive(Debug)]
@@ -19,6 +24,8 @@ pub struct Forecaster {
     horizon: u32,
     /// Belief over the frames of a take; `None` if each image counts by itself.
     memory: Option<TakeMemory>,
+    /// Comparisons that the memory has not taken yet, the newest last.
+    compared: VecDeque<Unknowns>,
     /// Forecast from the last image and those before it, and the number of images.
     remembered: Option<(Mixture, u64)>,
 }
@@ -34,7 +41,7 @@ impl Forecaster {
         let learned = if graph.remembers() { CheckpointPlanning::load(checkpoint)?.memory } else { None };
         let memory = learned.zip(graph.step_length(manifest.step_s)).map(|(learned, step)| {
             let forecast = |state: &Gaussian| net.forecast(state);
-            TakeMemory::new(Memory::new(manifest.states.clone(), forecast, learned.settings), step)
+            TakeMemory::new(Memory::new(&layout, manifest.states.clone(), forecast, learned.settings), step)
         });
         Ok(Self {
             net,
@@ -43,6 +50,7 @@ impl Forecaster {
             sampling: run.sampling,
             horizon: run.horizon,
             memory,
+            compared: VecDeque::new(),
             remembered: None,
         })
     }
@@ -52,10 +60,25 @@ impl Forecaster {
         (self.samples, self.horizon) = (samples, horizon);
     }
 
+    /// Takes the comparison of an image, which the memory counts before the next image. Called for each comparison in
+    /// order, before the posteriors that follow it.
+    pub fn compare(&mut self, unknowns: &Unknowns) {
+        if self.memory.is_some() {
+            if self.compared.len() == WAITING {
+                self.compared.pop_front();
+            }
+            self.compared.push_back(*unknowns);
+        }
+    }
+
     /// Takes an image into the memory. Called for each posterior in order, also for those that are too old for a
     /// forecast: a restarted forecaster gets the last ones from shared memory.
     pub fn remember(&mut self, posterior: &Posterior) {
         let Some(memory) = &mut self.memory else { return };
+        let frame_id = posterior.header.frame_id;
+        while let Some(before) = self.compared.pop_front_if(|compared| compared.header.frame_id < frame_id) {
+            memory.compare(before.header.frame_id, ImageEvidence::from(&before).places());
+        }
         let (mixture, images) = memory.see(posterior.into(), &self.net.forecast(&posterior.gaussian));
         if images == 1 {
             tracing::debug!(take_start = posterior.take_start, "the memory starts anew");
@@ -70,6 +93,9 @@ impl Forecaster {
         match &self.remembered {
             Some((mixture, images)) => {
                 forecast.images = *images;
+                let states = self.memory.as_ref().map_or_else(Vec::new, TakeMemory::states);
+                forecast.state_count = states.len().min(MAX_STATES) as u64;
+                forecast.state_weights.iter_mut().zip(states).for_each(|(to, weight)| *to = weight as f32);
                 self.fill(&mut forecast, mixture);
             }
             None => self.fill(&mut forecast, &self.net.forecast(&posterior.gaussian)),

@@ -1,9 +1,9 @@
-//! The forecaster stage: posteriors and fed-back beliefs in, forecasts out.
+//! The forecaster stage: posteriors, comparisons of images and fed-back beliefs in, forecasts out.
 
 use carff_forecaster::Forecaster;
 use carff_messages::Stage;
 use carff_runtime::{Overload, StageContext, frame_span};
-use carff_transport::{monotonic_now_ns, topics};
+use carff_transport::{Receiver, monotonic_now_ns, topics};
 
 fn main() -> std::process::ExitCode {
     carff_runtime::main(Stage::Forecaster, run)
@@ -12,6 +12,7 @@ fn main() -> std::process::ExitCode {
 fn run(stage: &mut StageContext) -> anyhow::Result<()> {
     let mut posteriors = stage.input(&topics::POSTERIOR)?;
     let mut beliefs = stage.input(&topics::BELIEF)?;
+    let mut comparisons = stage.graph.remembers().then(|| stage.input(&topics::UNKNOWN)).transpose()?;
     let mut forecasts = stage.output(&topics::FORECAST)?;
     let mut overload = Overload::new(&stage.graph);
     let mut forecaster = Forecaster::load(&stage.checkpoint, &stage.graph)?;
@@ -19,6 +20,10 @@ fn run(stage: &mut StageContext) -> anyhow::Result<()> {
     stage.ready();
     while stage.wait(&[&posteriors, &beliefs])? {
         let started_ns = monotonic_now_ns();
+        // Before the posteriors: the memory counts the comparison of an image before the next image.
+        while let Some(unknowns) = comparisons.as_mut().map_or(Ok(None), Receiver::next)? {
+            forecaster.compare(&unknowns);
+        }
         if let Some(posterior) = posteriors.newest_of(|posterior| forecaster.remember(posterior))? {
             let _span = frame_span(&posterior.header);
             newest_frame = posterior.header.frame_id;

@@ -5,8 +5,8 @@ use anyhow::Context;
 use carff_base::geometry::PinholeCamera;
 use carff_checkpoint::FieldProbe;
 use carff_config::CompareImages;
-use carff_decision::ImageEvidence;
-use carff_messages::{Belief, FrameMeta, Header, UnknownBox, Unknowns};
+use carff_decision::{ImageEvidence, ProbeLayout};
+use carff_messages::{Belief, Forecast, FrameMeta, Header, UnknownBox, Unknowns};
 use carff_runtime::StageContext;
 use carff_transport::{ImagePayload, Input, Publisher, Receiver, Sample, monotonic_now_ns, topics};
 use carff_unknown::{Lanes, Sighting};
@@ -151,8 +151,8 @@ impl Frames {
     /// # Errors
     ///
     /// The frame has not been taken: it did not arrive, or was overwritten by newer ones.
-    pub fn evidence(&self, forecast: &Header) -> anyhow::Result<Option<&ImageEvidence>> {
-        let taken = self.of(forecast).with_context(|| {
+    pub fn evidence(&self, forecast: &Forecast, layout: &ProbeLayout) -> anyhow::Result<Option<ImageEvidence>> {
+        let taken = self.of(&forecast.header).with_context(|| {
             format!(
                 "a forecast without its frame on `{}`: its image cannot be compared; set `checks.compare = \"off\"` \
                  for forecasts of another source",
@@ -160,9 +160,9 @@ impl Frames {
             )
         })?;
         Ok(if self.is_late {
-            self.images.evidence_before(forecast.frame_id, taken.take_start)
+            self.images.evidence_before(forecast.header.frame_id, taken.take_start)
         } else {
-            self.images.evidence(forecast)
+            self.images.evidence(forecast, layout)
         })
     }
 }

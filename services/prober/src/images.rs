@@ -1,9 +1,9 @@
 //! The comparison of camera images with the known states.
 
 use carff_checkpoint::{CheckpointPlanning, FieldProbe};
-use carff_decision::{ImageEvidence, ImageMemory, Place};
-use carff_messages::{FrameMeta, Header, LATENT_DIM, MAX_STATES, Unknowns};
-use carff_unknown::{Comparer, Known, Lanes, Seen, Sighting};
+use carff_decision::{ImageEvidence, ImageMemory, MemorySettings, Place, ProbeLayout};
+use carff_messages::{Forecast, FrameMeta, Header, LATENT_DIM, MAX_PLACES, MAX_STATES, Unknowns};
+use carff_unknown::{Comparer, Known, Lanes, PlaceViews, Seen, Sighting};
 use ndarray::ArrayView3;
 use std::collections::VecDeque;
 use std::path::Path;
@@ -23,8 +23,19 @@ pub struct Images {
     sighting: Option<(u64, Sighting)>,
     /// Evidence while no image of a take has been compared.
     nothing_yet: ImageEvidence,
+    /// `None` if each image counts by itself.
+    memory: Option<Remembered>,
+}
+
+/// What a belief with a memory needs of the images.
+#[derive(Debug)]
+struct Remembered {
+    settings: MemorySettings,
+    /// The places that each image is searched for.
+    places: PlaceViews,
     /// Comparisons of the take so far, and the take's first frame.
-    memory: Option<(ImageMemory, u64)>,
+    images: ImageMemory,
+    take_start: u64,
 }
 
 /// A compared frame.
@@ -47,14 +58,21 @@ impl Images {
         let Some(known) = Known::load(checkpoint)? else { return Ok(None) };
         let learned = if remembers { CheckpointPlanning::load(checkpoint)?.memory } else { None };
         let hazards = probe.layout().hazard_states().to_vec();
+        let places = probe.layout().places().iter();
+        let boxes = places.map(|place| (place.oriented_box, place.occupied_in.as_slice()));
         Ok(Some(Self {
-            known,
             comparer: Comparer::default(),
             states: probe.states().iter().map(|state| state.mean).collect(),
             compared: VecDeque::with_capacity(REMEMBERED),
             sighting: None,
             nothing_yet: ImageEvidence::unexplained(hazards.len()),
-            memory: learned.map(|learned| (ImageMemory::new(hazards, learned.settings), 0)),
+            memory: learned.map(|learned| Remembered {
+                settings: learned.settings,
+                places: PlaceViews::new(boxes, &known.lanes.own),
+                images: ImageMemory::new(hazards, learned.settings),
+                take_start: 0,
+            }),
+            known,
         }))
     }
 
@@ -68,7 +86,7 @@ impl Images {
     ) -> Option<Unknowns> {
         let mut unknowns = self.unknowns(probe, frame, image, threads);
         let evidence = unknowns.as_mut().map(|unknowns| {
-            let evidence = self.remembered(frame.take_start, ImageEvidence::new(unknowns.ratios()));
+            let evidence = self.remembered(frame.take_start, ImageEvidence::from(&*unknowns));
             let hazards = probe.layout().hazard_states();
             unknowns.prior = evidence.prior_or_even(hazards) as f32;
             unknowns.probability = evidence.unknown_probability(hazards) as f32;
@@ -100,17 +118,22 @@ impl Images {
         (unknowns.noise, unknowns.explained) = (comparison.fit.noise, comparison.fit.explained);
         (unknowns.gain, unknowns.offset) = (comparison.fit.gain, comparison.fit.offset);
         describe(&seen, probe.layout().places(), &mut unknowns);
+        if let Some(memory) = &mut self.memory {
+            let shown = memory.places.look(probe.field(), &self.states, view, &comparison.fit, threads);
+            unknowns.place_count = shown.len().min(MAX_PLACES) as u32;
+            unknowns.places.iter_mut().zip(shown).for_each(|(place, shown)| *place = shown);
+        }
         Some(unknowns)
     }
 
     /// The evidence of an image after the earlier images of its take.
     fn remembered(&mut self, take_start: u64, evidence: ImageEvidence) -> ImageEvidence {
-        let Some((memory, take)) = &mut self.memory else { return evidence };
-        if *take != take_start {
-            memory.clear();
-            *take = take_start;
+        let Some(memory) = &mut self.memory else { return evidence };
+        if memory.take_start != take_start {
+            memory.images.clear();
+            memory.take_start = take_start;
         }
-        memory.see(evidence)
+        memory.images.see(evidence)
     }
 
     /// The ground on which something counts.
@@ -123,19 +146,24 @@ impl Images {
         self.sighting.as_ref().filter(|(at_ns, _)| *at_ns == header.capture_time_ns).map(|(_, sighting)| sighting)
     }
 
-    /// The evidence of a compared frame; `None` also for a frame without a valid pose.
-    pub fn evidence(&self, header: &Header) -> Option<&ImageEvidence> {
-        self.compared.iter().rev().find(|compared| compared.at_ns == header.capture_time_ns)?.evidence.as_ref()
+    /// The evidence of a forecast's frame; `None` also for a frame without a valid pose.
+    pub fn evidence(&self, forecast: &Forecast, layout: &ProbeLayout) -> Option<ImageEvidence> {
+        let at_ns = forecast.header.capture_time_ns;
+        let evidence = self.compared.iter().rev().find(|compared| compared.at_ns == at_ns)?.evidence.clone()?;
+        Some(match &self.memory {
+            Some(memory) => evidence.for_states(forecast.state_weights(), layout, &memory.settings),
+            None => evidence,
+        })
     }
 
     /// The evidence of the frame of a take that was compared last before frame `frame_id`; `None` if it has no valid
     /// pose. Without a comparison in the take, or after a pause, something unknown is nearly certain.
-    pub fn evidence_before(&self, frame_id: u64, take_start: u64) -> Option<&ImageEvidence> {
+    pub fn evidence_before(&self, frame_id: u64, take_start: u64) -> Option<ImageEvidence> {
         let counts = |compared: &&Compared| {
             compared.take_start == take_start && ImageEvidence::counts_later(compared.frame_id, frame_id)
         };
         let before = self.compared.iter().rev().find(counts);
-        before.map_or(Some(&self.nothing_yet), |compared| compared.evidence.as_ref())
+        before.map_or_else(|| Some(self.nothing_yet.clone()), |compared| compared.evidence.clone())
     }
 }
 

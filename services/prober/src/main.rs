@@ -30,10 +30,10 @@ fn run(stage: &mut StageContext) -> anyhow::Result<()> {
         }
         let Some(forecast) = forecast else { continue };
         let _span = frame_span(&forecast.header);
-        let evidence = frames.as_ref().map_or(Ok(None), |frames| frames.evidence(&forecast.header));
+        let evidence = frames.as_ref().map_or(Ok(None), |frames| frames.evidence(&forecast, probe.layout()));
         match evidence {
             Ok(evidence) => {
-                let mut belief = believe(&mut probe, &forecast, evidence, stage.graph.run.feedback);
+                let mut belief = believe(&mut probe, &forecast, evidence.as_ref(), stage.graph.run.feedback);
                 if let (Some(outlook), Some(frames), 1) = (&mut outlook, &frames, belief.header.step) {
                     outlook.publish(&probe, frames, &belief, stage)?;
                 }

@@ -2,12 +2,15 @@
 
 use crate::calibration::most_probable;
 use crate::{MemorySettings, ProbeLayout, Resolved};
+use carff_messages::Unknowns;
 
 /// Prior probability of something that no known state explains.
 const UNKNOWN_PRIOR: f64 = 0.01;
 /// Share of the belief that trusts the encoder's path; the rest starts from equally probable states. The encoder can
 /// be wrong with certainty, for example in rain. Rendering the states shows what this image can distinguish at all.
 const ENCODER_SHARE: f64 = 0.5;
+/// Smallest weight of a state: a belief without the states of one side still weighs its states.
+const LEAST_WEIGHT: f64 = 1e-9;
 /// Ratios are limited to this and its inverse, so that no image decides against everything else.
 const MAX_RATIO: f64 = 1e4;
 
@@ -24,8 +27,12 @@ const MAX_RATIO: f64 = 1e4;
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct ImageEvidence {
     ratios: Vec<f64>,
+    /// What the image shows of each place: -1 for free, 1 for taken, 0 for nothing. Empty if no place was looked at.
+    places: Vec<f64>,
     /// Hazard probability before the image; `None` for equally probable states.
     prior: Option<f64>,
+    /// Weights of the states before the image; `None` for equally probable states.
+    weights: Option<Vec<f64>>,
 }
 
 /// Most frames between an image and a later one whose belief may rest on its comparison: longer without a comparison, for
@@ -44,7 +51,35 @@ impl ImageEvidence {
         let limited = |ratio: &f32| {
             if ratio.is_nan() { 1.0 / MAX_RATIO } else { f64::from(*ratio).clamp(1.0 / MAX_RATIO, MAX_RATIO) }
         };
-        Self { ratios: ratios.iter().map(limited).collect(), prior: None }
+        Self { ratios: ratios.iter().map(limited).collect(), ..Self::default() }
+    }
+
+    /// Returns the same evidence with what the image shows of each place, -1 (free) to 1 (taken). A value that is not a
+    /// number shows nothing.
+    #[must_use]
+    pub fn with_places(self, places: &[f32]) -> Self {
+        let shown = |place: &f32| if place.is_nan() { 0.0 } else { f64::from(*place) };
+        Self { places: places.iter().map(shown).collect(), ..self }
+    }
+
+    /// Returns what the image shows of each place: -1 for free, 1 for taken, 0 for nothing.
+    pub fn places(&self) -> &[f64] {
+        &self.places
+    }
+
+    /// Returns the same evidence for a belief with a memory: `states` are the weights of the present states before this
+    /// image's comparison. The places count too, with the strength of `settings`. Without weights, nothing changes.
+    #[must_use]
+    pub fn for_states(mut self, states: &[f32], layout: &ProbeLayout, settings: &MemorySettings) -> Self {
+        if states.len() != self.ratios.len() || states.len() != layout.state_count() {
+            return self;
+        }
+        for (place, shown) in layout.places().iter().zip(&self.places) {
+            let factor = (settings.place_strength * shown).clamp(-MAX_RATIO.ln(), MAX_RATIO.ln()).exp();
+            let taken = self.ratios.iter_mut().zip(&place.occupied_in).filter(|(_, taken)| **taken);
+            taken.for_each(|(ratio, _)| *ratio = (*ratio * factor).clamp(1.0 / MAX_RATIO, MAX_RATIO));
+        }
+        Self { weights: Some(states.iter().map(|weight| f64::from(*weight)).collect()), ..self }
     }
 
     /// Returns the hazard probability that stays where the encoder excludes the hazard, and the image is explained by every
@@ -117,10 +152,18 @@ impl ImageEvidence {
         (pooled(trusting.0, doubting.0).max(encoder * (1.0 - unknown)), unknown)
     }
 
-    /// Likelihood ratio of the states with or without a hazard: their mean, or 0 where there is none.
+    /// Likelihood ratio of the states with or without a hazard: their weighted mean, or 0 where there is none.
     fn ratio(&self, hazard: bool, hazard_states: &[bool]) -> f64 {
-        let of = || self.ratios.iter().zip(hazard_states).filter(|(_, h)| **h == hazard).map(|(r, _)| *r);
-        of().sum::<f64>() / of().count().max(1) as f64
+        let weight = |state: usize| self.weights.as_ref().map_or(1.0, |weights| weights[state].max(LEAST_WEIGHT));
+        let of = || (0..self.ratios.len()).filter(|&state| hazard_states.get(state) == Some(&hazard));
+        let sum: f64 = of().map(|state| weight(state) * self.ratios[state]).sum();
+        sum / of().map(weight).sum::<f64>().max(f64::MIN_POSITIVE)
+    }
+}
+
+impl From<&Unknowns> for ImageEvidence {
+    fn from(unknowns: &Unknowns) -> Self {
+        Self::new(unknowns.ratios()).with_places(unknowns.places())
     }
 }
 
@@ -139,7 +182,7 @@ fn in_message(probability: f64) -> f64 {
 /// ```
 /// use carff_decision::{ImageEvidence, ImageMemory, MemorySettings};
 /// let hazards = [true, false];
-/// let mut memory = ImageMemory::new(hazards.to_vec(), MemorySettings { repeated_share: 0.0, distrust: 0.0 });
+/// let mut memory = ImageMemory::new(hazards.to_vec(), MemorySettings::default());
 /// memory.see(ImageEvidence::new(&[0.001, 80.0]));
 /// // The place was seen clear. It is hidden now: both states explain the image.
 /// let hidden = memory.see(ImageEvidence::new(&[50.0, 50.0]));
@@ -214,6 +257,8 @@ impl Resolved {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::Place;
+    use carff_base::geometry::OrientedBox;
 
     const STATES: [bool; 4] = [true, true, false, false];
 
@@ -263,6 +308,25 @@ mod tests {
         assert!(visible > 0.99, "{visible}");
     }
 
+    /// With a memory, a vehicle of which the image shows only a part is a hazard; at the place of a state that is excluded
+    /// already, it is none.
+    #[test]
+    fn places_count_for_a_belief_with_a_memory() {
+        let oriented_box = OrientedBox { center: [0.0; 3], half_size: [1.0; 3], yaw: 0.0 };
+        let place =
+            |state| Place { name: "actor".into(), oriented_box, occupied_in: (0..4).map(|s| s == state).collect() };
+        let layout = ProbeLayout::new(vec![place(0), place(1)], STATES.to_vec()).unwrap();
+        let settings = MemorySettings { place_strength: 8.0, ..MemorySettings::default() };
+        let hazard = |states: [f32; 4]| {
+            let evidence = ImageEvidence::new(&[50.0; 4]).with_places(&[1.0, f32::NAN]);
+            evidence.for_states(&states, &layout, &settings).weigh(0.5, &STATES).0
+        };
+        assert!(hazard([0.5, 0.0, 0.5, 0.0]) > 0.98);
+        assert!(hazard([0.0, 0.5, 0.0, 0.5]) < 0.6);
+        let plain = ImageEvidence::new(&[50.0; 4]).with_places(&[1.0, 0.0]);
+        assert_eq!(plain.clone().for_states(&[], &layout, &settings), plain, "no memory");
+    }
+
     /// An image that no state explains is unknown; ratios that are not numbers explain nothing.
     #[test]
     fn what_nothing_explains_is_unknown() {
@@ -284,7 +348,7 @@ mod tests {
     /// even. Ten like images are not ten observations.
     #[test]
     fn comparisons_are_remembered() {
-        let settings = MemorySettings { repeated_share: 0.0, distrust: 0.0 };
+        let settings = MemorySettings::default();
         let hidden = || ImageEvidence::new(&[50.0; 4]);
         for (seen, low, high) in [([1e-3, 1e-3, 80.0, 80.0], 0.0, 0.01), ([80.0, 80.0, 1e-3, 1e-3], 0.99, 1.0)] {
             let mut memory = ImageMemory::new(STATES.to_vec(), settings);

@@ -1,11 +1,11 @@
-//! Memory: the belief over the next state, given all frames of a take so far (paper section 3.2, with observations).
+//! Memory: the belief over the present state, given all frames of a take so far (paper section 3.2, with observations).
 //!
 //! The belief is carried from frame to frame as weighted samples: the posteriors that represent the known states. A new
-//! image weighs them by its forecast, and when a time step has passed, the mixture density network moves them. An image's
-//! forecast holds the prior, by which it is divided. Images that follow each other err alike, so evidence that repeats
-//! that of the image before counts by a learned share only.
+//! image weighs them by its forecast, and by what it shows of the places that they take. When a time step has passed, the
+//! mixture density network moves them. An image's forecast holds the prior, by which it is divided. Images that follow
+//! each other err alike, so evidence that repeats that of the image before counts by a learned share only.
 
-use crate::Mixture;
+use crate::{Mixture, ProbeLayout};
 use carff_messages::{Gaussian, LATENT_DIM, MAX_COMPONENTS};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -16,7 +16,7 @@ const LARGEST_DISTANCE: f64 = 26.0;
 /// Smallest weight of a state in the belief: no evidence excludes a state forever.
 const SMALLEST: f64 = 1e-6;
 
-/// The two learned numbers of the memory.
+/// The learned numbers of the memory.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct MemorySettings {
@@ -27,6 +27,9 @@ pub struct MemorySettings {
     /// Share of the images whose forecast is not related to the scene, 0 to 1.
     #[schemars(range(min = 0.0, max = 1.0))]
     pub distrust: f64,
+    /// Logarithm of the likelihood ratio of a place that an image shows clearly as taken, 0 to 100; 0 counts no places.
+    #[schemars(range(min = 0.0, max = 100.0))]
+    pub place_strength: f64,
 }
 
 impl MemorySettings {
@@ -44,73 +47,86 @@ impl MemorySettings {
 /// Memory of one camera's frames.
 ///
 /// ```
-/// use carff_decision::{Memory, Mixture, MemorySettings};
+/// use carff_base::geometry::OrientedBox;
+/// use carff_decision::{Memory, MemorySettings, Mixture, Place, ProbeLayout};
 /// use carff_messages::Gaussian;
 /// let at = |x: f32| Gaussian { mean: [x; 8], log_variance: [-4.0; 8] };
-/// // Two states that stay unchanged.
+/// // Two states that stay unchanged. Something stands at the place in the second one.
 /// let stays = |state: &Gaussian| Mixture { weights: vec![1.0], components: vec![*state] };
-/// let settings = MemorySettings { repeated_share: 0.1, distrust: 0.001 };
-/// let mut memory = Memory::new(vec![at(-1.0), at(1.0)], stays, settings);
+/// let oriented_box = OrientedBox { center: [0.0; 3], half_size: [1.0; 3], yaw: 0.0 };
+/// let place = Place { name: "actor".into(), oriented_box, occupied_in: vec![false, true] };
+/// let layout = ProbeLayout::new(vec![place], vec![false, true])?;
+/// let settings = MemorySettings { repeated_share: 0.1, distrust: 0.001, place_strength: 5.0 };
+/// let mut memory = Memory::new(&layout, vec![at(-1.0), at(1.0)], stays, settings);
 /// let image = |second: f32| Mixture { weights: vec![1.0 - second, second], components: vec![at(-1.0), at(1.0)] };
 /// // The second state is in sight, then hidden.
 /// memory.see(&image(0.999));
 /// let hidden = memory.see(&image(0.5));
 /// assert!(hidden.weights[0] > 0.99 && hidden.components[0] == at(1.0));
+/// // Two images show the place free, which the encoder does not see.
+/// memory.compare(&[-1.0]);
+/// memory.see(&image(0.5));
+/// memory.compare(&[-1.0]);
+/// assert!(memory.states()[1] < 0.9);
+/// # Ok::<(), carff_decision::ProbingError>(())
 /// ```
 #[derive(Clone, Debug)]
 pub struct Memory {
     states: Vec<Gaussian>,
+    /// For each place, the states that take it.
+    taken_in: Vec<Vec<bool>>,
     /// For each state, the probabilities of the next one.
     moves: Vec<Vec<f64>>,
     /// Probability of each next state before any image.
     prior: Vec<f64>,
     settings: MemorySettings,
-    /// Natural logarithms of the weight of each next state, and of the last image's likelihood ratio of it.
+    /// Natural logarithm of the weight of each present state.
     log_weight: Vec<f64>,
-    last: Vec<f64>,
+    /// The last image's evidence for each state, by its forecast and by the places.
+    last: [Vec<f64>; 2],
+    /// The last image's components that are far from all known states, with their weights.
+    far: Vec<(f64, Gaussian)>,
 }
 
 impl Memory {
-    /// An empty memory. `states` are the posteriors that represent the known states, equally probable before any image;
-    /// `forecast` is the mixture density network.
-    pub fn new(states: Vec<Gaussian>, forecast: impl Fn(&Gaussian) -> Mixture, settings: MemorySettings) -> Self {
+    /// An empty memory. `states` are the posteriors that represent the known states of `layout`, equally probable before
+    /// any image; `forecast` is the mixture density network.
+    pub fn new(
+        layout: &ProbeLayout,
+        states: Vec<Gaussian>,
+        forecast: impl Fn(&Gaussian) -> Mixture,
+        settings: MemorySettings,
+    ) -> Self {
         let share = |state| {
             let (shares, other) = shares(&states, &forecast(state));
             // A forecast that is near no state moves to all of them.
             shares.iter().map(|s| s + other / shares.len() as f64).collect::<Vec<f64>>()
         };
         let moves: Vec<Vec<f64>> = states.iter().map(share).collect();
+        let taken_in = layout.places().iter().map(|place| place.occupied_in.clone()).collect();
         let count = states.len();
-        let prior = (0..count).map(|to| moves.iter().map(|from| from[to]).sum::<f64>() / count as f64).collect();
-        let (log_weight, last) = (vec![0.0; count], vec![0.0; count]);
-        let mut memory = Self { states, moves, prior, settings, log_weight, last };
-        memory.clear();
-        memory
+        let prior = moved(&moves, &vec![1.0 / count.max(1) as f64; count]);
+        let (log_weight, last) = (vec![0.0; count], [vec![0.0; count], vec![0.0; count]]);
+        Self { states, taken_in, moves, prior, settings, log_weight, last, far: Vec::new() }
     }
 
     /// Forgets everything: the next image starts a new take.
     pub fn clear(&mut self) {
-        self.last.fill(0.0);
-        for (weight, prior) in self.log_weight.iter_mut().zip(&self.prior) {
-            *weight = prior.max(SMALLEST).ln();
-        }
+        self.log_weight.fill(0.0);
+        self.last.iter_mut().for_each(|last| last.fill(0.0));
+        self.far.clear();
     }
 
     /// Moves the belief by one time step.
     pub fn advance(&mut self) {
-        let weights = self.weights();
-        let count = weights.len();
-        let (mut moved, mut last) = (vec![0.0; count], vec![0.0; count]);
-        for (from, row) in self.moves.iter().enumerate() {
-            for (to, share) in row.iter().enumerate() {
-                moved[to] += weights[from] * share;
-                last[to] += weights[from] * share * self.last[from];
-            }
+        let weights = self.states();
+        let after = moved(&self.moves, &weights);
+        for last in &mut self.last {
+            let carried: Vec<f64> = weights.iter().zip(last.iter()).map(|(weight, last)| weight * last).collect();
+            let sums = moved(&self.moves, &carried);
+            *last = sums.iter().zip(&after).map(|(sum, weight)| sum / weight.max(f64::MIN_POSITIVE)).collect();
         }
-        for to in 0..count {
-            self.last[to] = last[to] / moved[to].max(f64::MIN_POSITIVE);
-            self.log_weight[to] = moved[to].max(SMALLEST).ln();
-        }
+        self.log_weight = after.iter().map(|weight| weight.max(SMALLEST).ln()).collect();
     }
 
     /// Weighs the belief by the forecast of a new image, and returns the forecast from all images so far. Components
@@ -119,41 +135,75 @@ impl Memory {
         let distrust = self.settings.distrust;
         let (shares, other) = shares(&self.states, image);
         let known = (1.0 - other).max(f64::MIN_POSITIVE);
-        for (state, share) in shares.iter().enumerate() {
-            let ratio = share / known / self.prior[state].max(SMALLEST);
-            let evidence = (ratio * (1.0 - distrust) + distrust).ln();
-            // An image that shows no known state is evidence for none.
-            let evidence = known * evidence;
-            self.log_weight[state] += evidence - self.settings.repeated(evidence, self.last[state]);
-            self.last[state] = evidence;
-        }
-        let weights = self.weights();
-        for (log_weight, weight) in self.log_weight.iter_mut().zip(&weights) {
-            *log_weight = weight.max(SMALLEST).ln();
-        }
-        self.forecast(&weights, image, other)
+        let of_next: Vec<f64> =
+            shares.iter().zip(&self.prior).map(|(share, prior)| share / known / prior.max(SMALLEST)).collect();
+        // An image that shows no known state is evidence for none.
+        let evidence = |row: &Vec<f64>| {
+            let ratio: f64 = row.iter().zip(&of_next).map(|(share, ratio)| share * ratio).sum();
+            known * (ratio * (1.0 - distrust) + distrust).ln()
+        };
+        let evidence = self.moves.iter().map(evidence).collect();
+        self.count(0, evidence);
+        let far = |(_, component): &(&f32, &Gaussian)| nearest(&self.states, component) > LARGEST_DISTANCE;
+        let components = image.weights.iter().zip(&image.components).filter(far);
+        self.far = components.map(|(weight, component)| (f64::from(*weight), *component)).collect();
+        self.forecast()
     }
 
-    /// Weights of the next states; they sum to 1.
-    pub fn weights(&self) -> Vec<f64> {
+    /// Weighs the belief by what the last image shows of each place: -1 for free, 1 for taken, 0 for nothing. Returns the
+    /// forecast from all images so far.
+    pub fn compare(&mut self, places: &[f64]) -> Mixture {
+        let mut evidence = vec![0.0; self.states.len()];
+        for (taken_in, shown) in self.taken_in.iter().zip(places) {
+            let of_place = self.settings.place_strength * shown;
+            evidence.iter_mut().zip(taken_in).filter(|(_, taken)| **taken).for_each(|(sum, _)| *sum += of_place);
+        }
+        // Relative to the mean likelihood, so that evidence that repeats is the same for all states.
+        let largest = evidence.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+        let mean = evidence.iter().map(|e| (e - largest).exp()).sum::<f64>() / evidence.len().max(1) as f64;
+        evidence.iter_mut().for_each(|e| *e -= largest + mean.ln());
+        self.count(1, evidence);
+        self.forecast()
+    }
+
+    /// Counts evidence of one kind for each state.
+    fn count(&mut self, kind: usize, evidence: Vec<f64>) {
+        for ((log_weight, new), last) in self.log_weight.iter_mut().zip(&evidence).zip(&self.last[kind]) {
+            *log_weight += new - self.settings.repeated(*new, *last);
+        }
+        self.last[kind] = evidence;
+        let weights = self.states();
+        self.log_weight = weights.iter().map(|weight| weight.max(SMALLEST).ln()).collect();
+    }
+
+    /// Weights of the present states; they sum to 1.
+    pub fn states(&self) -> Vec<f64> {
         normalised_exp(&self.log_weight)
     }
 
-    /// The carried samples by weight, and the image's own components that are far from all of them.
-    fn forecast(&self, weights: &[f64], image: &Mixture, other: f64) -> Mixture {
-        let mut terms: Vec<(f64, Gaussian)> =
-            weights.iter().zip(&self.states).map(|(w, state)| (w * (1.0 - other), *state)).collect();
-        for (weight, component) in image.weights.iter().zip(&image.components) {
-            if nearest(&self.states, component) > LARGEST_DISTANCE {
-                terms.push((f64::from(*weight), *component));
-            }
-        }
+    /// Weights of the next states; they sum to 1.
+    pub fn next(&self) -> Vec<f64> {
+        moved(&self.moves, &self.states())
+    }
+
+    /// The carried samples by weight, and the last image's own components that are far from all of them.
+    fn forecast(&self) -> Mixture {
+        let other: f64 = self.far.iter().map(|(weight, _)| weight).sum();
+        let next = self.next();
+        let known = next.iter().zip(&self.states).map(|(w, state)| (w * (1.0 - other).max(0.0), *state));
+        let mut terms: Vec<(f64, Gaussian)> = known.chain(self.far.iter().copied()).filter(|(w, _)| *w > 0.0).collect();
         terms.sort_by(|a, b| b.0.total_cmp(&a.0));
         terms.truncate(MAX_COMPONENTS);
         let sum: f64 = terms.iter().map(|(w, _)| w).sum();
         let (weights, components) = terms.into_iter().map(|(w, g)| ((w / sum) as f32, g)).unzip();
         Mixture { weights, components }
     }
+}
+
+/// Weights after a time step.
+fn moved(moves: &[Vec<f64>], weights: &[f64]) -> Vec<f64> {
+    let to = |next: usize| moves.iter().zip(weights).map(|(row, weight)| weight * row[next]).sum();
+    (0..weights.len()).map(to).collect()
 }
 
 /// Shares of the known states in a mixture, by the overlap of their Gaussians, and the share of components that are far

@@ -36,13 +36,18 @@ impl From<&Posterior> for TakeFrame {
 /// The belief over the frames of a take. It starts anew with each take, and after a gap of more than a time step.
 ///
 /// ```
-/// use carff_decision::{Memory, MemorySettings, Mixture, StepLength, TakeFrame, TakeMemory};
+/// use carff_base::geometry::OrientedBox;
+/// use carff_decision::{Memory, MemorySettings, Mixture, Place, ProbeLayout, StepLength, TakeFrame, TakeMemory};
 /// use carff_messages::Gaussian;
 /// let [left, right] = [-3.0, 3.0].map(|x| Gaussian { mean: [x; 8], log_variance: [-4.0; 8] });
 /// // Each state stays.
 /// let stays = |state: &Gaussian| Mixture { weights: vec![1.0], components: vec![*state] };
-/// let settings = MemorySettings { repeated_share: 0.0, distrust: 0.01 };
-/// let mut memory = TakeMemory::new(Memory::new(vec![left, right], stays, settings), StepLength::Frames(6));
+/// let settings = MemorySettings { repeated_share: 0.0, distrust: 0.01, place_strength: 5.0 };
+/// let oriented_box = OrientedBox { center: [0.0; 3], half_size: [1.0; 3], yaw: 0.0 };
+/// let place = Place { name: "actor".into(), oriented_box, occupied_in: vec![false, true] };
+/// let layout = ProbeLayout::new(vec![place], vec![false, true])?;
+/// let memory = Memory::new(&layout, vec![left, right], stays, settings);
+/// let mut memory = TakeMemory::new(memory, StepLength::Frames(6));
 /// let image = |weight: f32| Mixture { weights: vec![weight, 1.0 - weight], components: vec![left, right] };
 /// let frame = |frame| TakeFrame { take_start: 0, frame, capture_time_ns: 100 * frame };
 /// memory.see(frame(0), &image(0.999));
@@ -50,6 +55,10 @@ impl From<&Posterior> for TakeFrame {
 /// let (belief, images) = memory.see(frame(1), &image(0.5));
 /// let of_left = belief.weights.iter().zip(&belief.components).filter(|(_, c)| c.mean[0] < 0.0);
 /// assert!(of_left.map(|(weight, _)| weight).sum::<f32>() > 0.9 && images == 2);
+/// // This image shows that the place is taken.
+/// memory.compare(1, &[1.0]);
+/// assert!(memory.states()[1] > 0.1);
+/// # Ok::<(), carff_decision::ProbingError>(())
 /// ```
 #[derive(Clone, Debug)]
 pub struct TakeMemory {
@@ -95,6 +104,19 @@ impl TakeMemory {
         (self.memory.see(image), progress.images)
     }
 
+    /// Weighs the belief by what frame `frame` shows of each place ([`Memory::compare`]). A frame that is not the last one
+    /// counts for nothing: the comparison came too late.
+    pub fn compare(&mut self, frame: u64, places: &[f64]) {
+        if self.progress.is_some_and(|progress| progress.last.frame == frame) {
+            self.memory.compare(places);
+        }
+    }
+
+    /// Weights of the present states; they sum to 1.
+    pub fn states(&self) -> Vec<f64> {
+        self.memory.states()
+    }
+
     /// Time steps from the start of the take to a frame.
     fn steps(&self, first_ns: u64, frame: TakeFrame) -> u64 {
         match self.step {
@@ -116,7 +138,8 @@ impl TakeMemory {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::MemorySettings;
+    use crate::{MemorySettings, Place, ProbeLayout};
+    use carff_base::geometry::OrientedBox;
     use carff_messages::Gaussian;
 
     fn at(x: f32) -> Gaussian {
@@ -130,7 +153,11 @@ mod tests {
             let next = if state.mean[0] < 0.0 { at(-1.0) } else { at(3.0) };
             Mixture { weights: vec![1.0], components: vec![next] }
         };
-        TakeMemory::new(Memory::new(states, forecast, MemorySettings { repeated_share: 0.2, distrust: 0.01 }), step)
+        let oriented_box = OrientedBox { center: [0.0; 3], half_size: [1.0; 3], yaw: 0.0 };
+        let place = Place { name: "actor".into(), oriented_box, occupied_in: vec![true, true, false, false] };
+        let layout = ProbeLayout::new(vec![place], vec![true, true, false, false]).unwrap();
+        let settings = MemorySettings { repeated_share: 0.2, distrust: 0.01, place_strength: 5.0 };
+        TakeMemory::new(Memory::new(&layout, states, forecast, settings), step)
     }
 
     fn image(first_branch: f32) -> Mixture {
@@ -173,6 +200,23 @@ mod tests {
         memory.see(frame(0, 1), &image(0.001));
         let (mixture, _) = memory.see(frame(0, 2), &image(0.001));
         assert!(first_branch(&mixture) < 0.5, "{mixture:?}");
+    }
+
+    /// A place that an image shows taken decides for its states, over later images that show nothing. A comparison that
+    /// comes after the next image counts for nothing.
+    #[test]
+    fn a_place_is_remembered() {
+        for (compared, low, high) in [(1, 0.98, 1.0), (0, 0.49, 0.51)] {
+            let mut memory = memory(StepLength::Frames(3));
+            memory.see(frame(0, 0), &image(0.5));
+            memory.see(frame(0, 1), &image(0.5));
+            memory.compare(compared, &[1.0]);
+            let (mixture, _) = memory.see(frame(0, 2), &image(0.5));
+            assert!((low..=high).contains(&first_branch(&mixture)), "{mixture:?}");
+            memory.compare(2, &[0.0]);
+            let (later, _) = memory.see(frame(0, 3), &image(0.5));
+            assert!((low..=high).contains(&first_branch(&later)), "{later:?}");
+        }
     }
 
     /// A component far from all known states passes through unchanged.

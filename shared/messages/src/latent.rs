@@ -91,7 +91,7 @@ message!(Posterior);
 /// ```
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, ZeroCopySend)]
-#[type_name("carff.Forecast.v2")]
+#[type_name("carff.Forecast.v3")]
 pub struct Forecast {
     /// Header, at step 1 or more.
     pub header: Header,
@@ -109,6 +109,10 @@ pub struct Forecast {
     pub path_probability: f32,
     /// Number of images that the forecast rests on; 1 without a memory.
     pub images: u64,
+    /// Number of states of the scenario, at most 64; 0 without a memory, and after step 1.
+    pub state_count: u64,
+    /// Weights of the present states by the images so far, without this frame's comparison; they sum to 1.
+    pub state_weights: [f32; MAX_STATES],
     /// Mixture weights.
     pub weights: [f32; MAX_COMPONENTS],
     /// Mixture components.
@@ -135,6 +139,8 @@ impl Forecast {
             resolved_state: -1,
             path_probability: 1.0,
             images: 1,
+            state_count: 0,
+            state_weights: [0.0; MAX_STATES],
             weights: [0.0; MAX_COMPONENTS],
             components: [Gaussian::standard(); MAX_COMPONENTS],
             samples: [[0.0; LATENT_DIM]; MAX_SAMPLES],
@@ -155,6 +161,10 @@ impl Forecast {
         probability("path_probability", self.path_probability)?;
         let (components, samples) = (self.component_count as usize, self.sample_count as usize);
         distribution("weights", &self.weights[..components])?;
+        at_most("state_count", self.state_count, MAX_STATES as u64)?;
+        if self.state_count > 0 {
+            distribution("state_weights", self.state_weights())?;
+        }
         for component in &self.components[..components] {
             component.check()?;
         }
@@ -165,6 +175,11 @@ impl Forecast {
             at_most("sample_component", component.into(), components as u64 - 1)?;
         }
         Ok(())
+    }
+
+    /// Returns the weights of the present states; empty without a memory.
+    pub fn state_weights(&self) -> &[f32] {
+        &self.state_weights[..(self.state_count as usize).min(MAX_STATES)]
     }
 
     /// Returns the used samples.

@@ -151,6 +151,7 @@ described!(Unknowns {
     header,
     box_count,
     state_count,
+    place_count,
     probability,
     residual,
     noise,
@@ -158,6 +159,7 @@ described!(Unknowns {
     offset,
     explained,
     ratios,
+    places,
     prior,
     boxes,
     stage_latency_ns
@@ -182,6 +184,8 @@ described!(Forecast {
     resolved_state,
     path_probability,
     images,
+    state_count,
+    state_weights,
     weights,
     components,
     samples,
@@ -285,7 +289,7 @@ mod tests {
         let pose = &frame.fields[4];
         assert_eq!((pose.name, pose.offset_bytes, &pose.shape[..]), ("world_from_camera", 96, &[16][..]));
         assert_eq!((pose.kind.type_name.as_str(), pose.kind.size_bytes), ("f64", 8));
-        let samples = Forecast::layout().fields.remove(10);
+        let samples = Forecast::layout().fields.remove(12);
         assert_eq!((samples.name, &samples.shape[..]), ("samples", &[64, 8][..]));
     }
 }

@@ -113,7 +113,7 @@ pub struct UnknownBox {
 /// ```
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, ZeroCopySend)]
-#[type_name("carff.Unknowns.v2")]
+#[type_name("carff.Unknowns.v3")]
 pub struct Unknowns {
     /// Header, at step 0.
     pub header: Header,
@@ -121,6 +121,8 @@ pub struct Unknowns {
     pub box_count: u32,
     /// Number of states of the scenario, at most 64.
     pub state_count: u32,
+    /// Number of probed places that were looked at, at most 48; 0 without a memory.
+    pub place_count: u32,
     /// Probability that something unknown stands on the lanes, 0..=1.
     pub probability: f32,
     /// Smallest residual of a known state, in units in which 1 is the limit of the explained.
@@ -137,6 +139,8 @@ pub struct Unknowns {
     /// For each known state, how much better it explains the image than something unknown does; 0 for a view of another
     /// place.
     pub ratios: [f32; MAX_STATES],
+    /// For each place, what the image shows of it: -1 for free, 1 for taken, 0 for nothing; -2..=2.
+    pub places: [f32; MAX_PLACES],
     /// Hazard probability before this image, from the comparisons of the take's earlier images, 0..=1.
     pub prior: f32,
     /// Boxes, the most probable first.
@@ -152,6 +156,7 @@ impl Unknowns {
             header,
             box_count: 0,
             state_count: 0,
+            place_count: 0,
             probability: 0.0,
             residual: 0.0,
             noise: 0.0,
@@ -159,6 +164,7 @@ impl Unknowns {
             offset: [0.0; 3],
             explained: 1.0,
             ratios: [1.0; MAX_STATES],
+            places: [0.0; MAX_PLACES],
             prior: 0.5,
             boxes: [UnknownBox::default(); MAX_UNKNOWNS],
             stage_latency_ns: 0,
@@ -170,6 +176,11 @@ impl Unknowns {
         &self.boxes[..(self.box_count as usize).min(MAX_UNKNOWNS)]
     }
 
+    /// Returns what the image shows of each place.
+    pub fn places(&self) -> &[f32] {
+        &self.places[..(self.place_count as usize).min(MAX_PLACES)]
+    }
+
     /// Returns the ratios of the scenario's states.
     pub fn ratios(&self) -> &[f32] {
         &self.ratios[..(self.state_count as usize).min(MAX_STATES)]
@@ -179,6 +190,8 @@ impl Unknowns {
         self.header.validate()?;
         at_most("state_count", self.state_count.into(), MAX_STATES as u64)?;
         within("ratios", self.ratios(), 0.0, f32::MAX)?;
+        at_most("place_count", self.place_count.into(), MAX_PLACES as u64)?;
+        within("places", self.places(), -2.0, 2.0)?;
         at_most("box_count", self.box_count.into(), MAX_UNKNOWNS as u64)?;
         probability("probability", self.probability)?;
         probability("prior", self.prior)?;

@@ -128,7 +128,10 @@ fn drives(
         encoder: &models.encoder,
         noise: SensorNoise::default(),
         seed,
-        known: known.map(|known| KnownStates::new(known, probe, input.threads)),
+        known: known.map(|known| match memory {
+            Some(_) => KnownStates::with_places(known, probe, input.threads),
+            None => KnownStates::new(known, probe, input.threads),
+        }),
     };
     let memories = memory.map(|settings| TakeMemories::new(net, probe, settings, FRAMES_PER_TIMESTAMP as u64));
     let mut all = Vec::with_capacity(input.drives);

@@ -93,8 +93,8 @@ flow! {
     FORECAST: Forecast = "forecaster/forecast", MESSAGES, 500;
     /// Beliefs from prober to controller, renderer, and back to the forecaster.
     BELIEF: Belief = "prober/belief", MESSAGES, 500;
-    /// Comparisons of images with the known states, from prober to observers.
-    UNKNOWN: Unknowns = "prober/unknown", MESSAGES, 500;
+    /// Comparisons of images with the known states, from prober to observers, and back to the forecaster.
+    UNKNOWN: Unknowns = "prober/unknown", REMEMBERED, 500;
     /// Occupancy grids of beliefs, from prober to observers and planners.
     OCCUPANCY: Occupancy = "prober/occupancy", MESSAGES, 500;
     /// Values of a look from further on, from prober to controller; published with `controller.approach = "look"`.

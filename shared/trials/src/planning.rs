@@ -11,11 +11,11 @@ use carff_dataset::{
 };
 use carff_decision::{
     Evidence, Feedback, ForecastInput, ImageEvidence, ImageMemory, Memory, MemorySettings, Mixture, Plan, Policy,
-    Sampling, StepLength, TakeFrame, TakeMemory, look_ahead,
+    ProbeLayout, Sampling, StepLength, TakeFrame, TakeMemory, look_ahead,
 };
 use carff_field::Field;
 use carff_messages::{Gaussian, LATENT_DIM, Rule};
-use carff_unknown::{Comparer, Comparison, Known, Seen, Sighting};
+use carff_unknown::{Comparer, Comparison, Known, PlaceViews, Seen, Sighting};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::{cell::RefCell, collections::BTreeMap};
@@ -195,18 +195,33 @@ pub struct KnownStates<'a> {
     states: Vec<[f32; LATENT_DIM]>,
     threads: usize,
     comparer: RefCell<Comparer>,
+    /// The places that images are searched for, for a belief with a memory.
+    places: Option<RefCell<PlaceViews>>,
 }
 
 impl<'a> KnownStates<'a> {
     /// The known states of a probe's field. `threads` render.
     pub fn new(known: &'a Known, probe: &'a FieldProbe, threads: usize) -> Self {
         let states = probe.states().iter().map(|state| state.mean).collect();
-        Self { known, field: probe.field(), states, threads, comparer: RefCell::default() }
+        Self { known, field: probe.field(), states, threads, comparer: RefCell::default(), places: None }
+    }
+
+    /// As [`Self::new`], for a belief with a memory: evidence has what an image shows of each place, too.
+    pub fn with_places(known: &'a Known, probe: &'a FieldProbe, threads: usize) -> Self {
+        let places = probe.layout().places().iter().map(|place| (place.oriented_box, place.occupied_in.as_slice()));
+        let places = PlaceViews::new(places, &known.lanes.own);
+        Self { places: Some(RefCell::new(places)), ..Self::new(known, probe, threads) }
     }
 
     /// Evidence of an image for the known states; `None` for an image without pixels.
     pub fn evidence(&self, camera: &PinholeCamera, image: &Image) -> Option<ImageEvidence> {
-        self.compare(camera, image).map(|compared| ImageEvidence::new(&compared.seen.ratios))
+        let compared = self.compare(camera, image)?;
+        let evidence = ImageEvidence::new(&compared.seen.ratios);
+        let Some(places) = &self.places else { return Some(evidence) };
+        let view = (camera, image.view()?);
+        let fit = &compared.comparison.fit;
+        let shown = places.borrow_mut().look(self.field, &self.states, view, fit, self.threads);
+        Some(evidence.with_places(&shown))
     }
 
     /// Describes what an image shows of the lanes; `None` for a view of another place, or without lanes.
@@ -304,6 +319,8 @@ impl Perception<'_> {
 /// The belief's memory and that of the comparisons, for the frames of a drive.
 #[derive(Clone, Debug)]
 pub struct TakeMemories {
+    layout: ProbeLayout,
+    settings: MemorySettings,
     forecasts: TakeMemory,
     images: ImageMemory,
 }
@@ -311,10 +328,13 @@ pub struct TakeMemories {
 impl TakeMemories {
     /// Memories with the learned numbers; a time step takes `frames_per_timestamp` frames.
     pub fn new(net: &dyn Forecasts, probe: &FieldProbe, settings: MemorySettings, frames_per_timestamp: u64) -> Self {
-        let memory = Memory::new(probe.states().to_vec(), |state| net.forecast(state), settings);
+        let layout = probe.layout().clone();
+        let memory = Memory::new(&layout, probe.states().to_vec(), |state| net.forecast(state), settings);
         Self {
+            settings,
             forecasts: TakeMemory::new(memory, StepLength::Frames(frames_per_timestamp)),
-            images: ImageMemory::new(probe.layout().hazard_states().to_vec(), settings),
+            images: ImageMemory::new(layout.hazard_states().to_vec(), settings),
+            layout,
         }
     }
 
@@ -322,7 +342,11 @@ impl TakeMemories {
     pub fn remember(&mut self, net: &dyn Forecasts, trial: Trial, frame_in_drive: u64) -> Trial {
         let frame = TakeFrame { take_start: 0, frame: frame_in_drive, capture_time_ns: 0 };
         let (remembered, _) = self.forecasts.see(frame, &net.forecast(&trial.posterior));
-        let image = trial.image.map(|image| self.images.see(image));
+        let states: Vec<f32> = self.forecasts.states().iter().map(|weight| *weight as f32).collect();
+        let image = trial.image.map(|image| {
+            self.forecasts.compare(frame_in_drive, image.places());
+            self.images.see(image).for_states(&states, &self.layout, &self.settings)
+        });
         Trial { image, remembered: Some(remembered), ..trial }
     }
 }

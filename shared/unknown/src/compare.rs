@@ -17,7 +17,7 @@ const SIDE_PX: u32 = 64;
 const MARGIN_PX: usize = 3;
 /// Fewer samples than for images to look at: errors of a few per cent are below the noise. Half the resolution was
 /// tried: cars of the road's colour stay within the range of the coarser pixels.
-const QUICK: RenderOptions =
+pub(crate) const QUICK: RenderOptions =
     RenderOptions { threads: 1, max_samples_per_ray: 128, min_transmittance: 0.1, min_weight: 0.1, step_scale: 2.0 };
 /// Every so many rows and columns, a pixel of the whole view is compared, to find out whether the view is of this place.
 const PLACE_STEP_PX: usize = 4;

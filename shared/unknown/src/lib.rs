@@ -8,6 +8,7 @@
 //! | `fit` | robust fits of an image to a rendered one |
 //! | `lanes` | the ground on which something unknown counts |
 //! | `blobs` | connected residuals: their size, and the place on the ground where they stand |
+//! | `places` | what an image shows of the places of the known states |
 //! | `known` | the limits of the known, calibrated on images without anything unknown, and their file |
 //! | `sighting` | how far an image shows a lane clear |
 //! | `track` | the speed of a vehicle on a lane, by its places in the last images |
@@ -23,6 +24,7 @@ mod compare;
 mod fit;
 mod known;
 mod lanes;
+mod places;
 mod residuals;
 mod sight;
 mod sighting;
@@ -36,6 +38,7 @@ pub use compare::{Comparer, Comparison, KnownScene};
 pub use fit::Fit;
 pub use known::{KindLimits, Known, KnownError, KnownLimits, Seen};
 pub use lanes::{ErrorMap, Ground, Lanes, OwnBox};
+pub use places::PlaceViews;
 pub use residuals::ResidualKind;
 pub use sight::Sight;
 pub use sighting::{Crossing, LaneVehicle, Sighting};

@@ -5,8 +5,8 @@ use carff_base::geometry::{OrientedBox, PinholeCamera};
 use carff_base::random::{Key, gaussians, uniform};
 use carff_dataset::Image;
 use carff_evaluation::{
-    DecisiveImage, LaneImage, MaskedView, Novelty, OtherPlace, Perception, Progress, Subject, Visibility, Watch,
-    WatchPlan,
+    DecisiveImage, KnownStates, LaneImage, MaskedView, Novelty, OtherPlace, Perception, Progress, Subject, Visibility,
+    Watch, WatchPlan,
 };
 use carff_scenes::config::{BystanderPlace, VariationRole};
 use carff_scenes::{
@@ -54,7 +54,9 @@ pub fn watches(
     display: &Display,
 ) -> anyhow::Result<Vec<Watch>> {
     let Ok(net) = &subject.mixture else { return Ok(Vec::new()) };
-    let perception = Perception { known: None, ..subject.perception() };
+    let known = subject.known.as_ref().zip(subject.probe.as_ref().ok());
+    let known = known.map(|(known, probe)| KnownStates::with_places(known, probe, subject.options.threads));
+    let perception = Perception { known, ..subject.perception() };
     let plan = WatchPlan { count: count as usize, seed, exact: true };
     Ok(carff_evaluation::watches(scenario, &perception, net, plan, &|p| display.show(p))?)
 }

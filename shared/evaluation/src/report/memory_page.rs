@@ -9,9 +9,10 @@ use crate::tables::memory::{ObserverFigures, RightFrames};
 use std::fmt::Write;
 
 /// Observers, in the order of the page.
-const OBSERVERS: [(&str, &str); 4] = [
+const OBSERVERS: [(&str, &str); 5] = [
     ("none", "each image by itself"),
     ("filter", "with memory"),
+    ("graph", "with memory, and with the comparison of each image"),
     ("exact", "exact posterior, each image by itself"),
     ("exact_filter", "exact posterior of all images: the ceiling"),
 ];
@@ -22,9 +23,13 @@ pub fn memory(page: &mut String, results: &Results) {
     let _ = writeln!(
         page,
         "## Memory\n\n{} drives with {} frames; the camera pans, so that the place passes in and out of sight. The exact \
-         posterior knows scenario and pose, with equally probable states. Counts are frames, with their drives. Without \
-         the comparison of images. Share of repeated evidence {}, distrust {}.\n",
-        table.drives, table.frames, table.settings.repeated_share, table.settings.distrust
+         posterior knows scenario and pose, with equally probable states. Counts are frames, with their drives. Share of \
+         repeated evidence {}, distrust {}, strength of places {}.\n",
+        table.drives,
+        table.frames,
+        table.settings.repeated_share,
+        table.settings.distrust,
+        table.settings.place_strength
     );
     head(
         page,

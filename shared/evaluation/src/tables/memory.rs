@@ -6,7 +6,9 @@ use crate::trials::{
 };
 use crate::{Progress, Subject};
 use carff_checkpoint::FieldProbe;
-use carff_decision::{Evidence, Memory, MemorySettings, Mixture, Sampling, is_likely};
+use carff_decision::{
+    Evidence, ImageEvidence, ImageMemory, Memory, MemorySettings, Mixture, ProbeLayout, Sampling, is_likely,
+};
 use carff_trials::{RELIABILITY_BINS, SAMPLES, reliability};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -48,8 +50,8 @@ pub struct ObserverFigures {
     pub corrected: RightFrames,
 }
 
-/// Figures by observer: `none` (each image by itself), `filter` (with memory), and the exact observers `exact` (each
-/// image by itself) and `exact_filter`.
+/// Figures by observer: `none` (each image by itself), `filter` (with memory), `graph` (with memory, and with the comparison
+/// of each image, as the graph decides), and the exact observers `exact` (each image by itself) and `exact_filter`.
 pub type ByObserver = BTreeMap<String, ObserverFigures>;
 
 /// The table.
@@ -75,18 +77,22 @@ pub fn memory(subject: &Subject, on_progress: &dyn Fn(&Progress)) -> Result<Memo
     let planner = subject.planner(Sampling::Stratified)?;
     let settings = subject.memory.ok_or("the checkpoint has no memory (`carff checkpoint memory` learns it)")?;
     let forecast = |state: &_| planner.net.forecast(state);
-    let memory = Memory::new(planner.probe.states().to_vec(), forecast, settings);
+    let states = planner.probe.states().to_vec();
+    let memory = Memory::new(planner.probe.layout(), states, forecast, settings);
     let mut probe = planner.probe.clone();
     let mut observers: BTreeMap<&str, Vec<Vec<f64>>> = BTreeMap::new();
     let total = subject.watches.len();
     for (done, watch) in subject.watches.iter().enumerate() {
         let seed = subject.options.seed;
-        let mut probability = |mixture: &Mixture, frame: &WatchedFrame| hazard(&mut probe, mixture, frame, seed);
-        let filtered = with_memory(&memory, watch);
-        let none = watch.frames.iter().map(|f| probability(&f.forecast, f)).collect();
-        let filter = watch.frames.iter().zip(&filtered).map(|(f, mixture)| probability(mixture, f)).collect();
-        observers.entry("none").or_default().push(none);
-        observers.entry("filter").or_default().push(filter);
+        let mut of = |beliefs: Vec<Belief>| -> Vec<f64> {
+            let frames = watch.frames.iter().zip(&beliefs);
+            frames.map(|(frame, (mixture, image))| hazard(&mut probe, mixture, image.as_ref(), frame, seed)).collect()
+        };
+        let by_itself = watch.frames.iter().map(|frame| (frame.forecast.clone(), None)).collect();
+        let (filter, graph) = with_memory(&memory, planner.probe.layout(), &settings, watch);
+        for (name, beliefs) in [("none", by_itself), ("filter", filter), ("graph", graph)] {
+            observers.entry(name).or_default().push(of(beliefs));
+        }
         observers.entry("exact").or_default().push(watch.frames.iter().map(|f| f.exact).collect());
         let exact = watch.frames.iter().map(|f| f.exact_with_memory).collect();
         observers.entry("exact_filter").or_default().push(exact);
@@ -101,23 +107,44 @@ pub fn memory(subject: &Subject, on_progress: &dyn Fn(&Progress)) -> Result<Memo
     })
 }
 
-/// The forecast of each frame of a watch from all its images so far.
-fn with_memory(memory: &Memory, watch: &Watch) -> Vec<Mixture> {
+/// The forecast of a frame, and the evidence that weighs it.
+type Belief = (Mixture, Option<ImageEvidence>);
+
+/// The belief of each frame of a watch from all its images so far: the memory's own, and that of the graph, in which the
+/// prober weighs the frame's own image.
+fn with_memory(
+    memory: &Memory,
+    layout: &ProbeLayout,
+    settings: &MemorySettings,
+    watch: &Watch,
+) -> (Vec<Belief>, Vec<Belief>) {
     let mut memory = memory.clone();
     memory.clear();
+    let mut images = ImageMemory::new(layout.hazard_states().to_vec(), *settings);
     let mut step = watch.frames.first().map_or(0, |frame| frame.timestamp);
     let seen = watch.frames.iter().map(|frame| {
         (step..frame.timestamp).for_each(|_| memory.advance());
         step = frame.timestamp;
-        memory.see(&frame.forecast)
+        let before = memory.see(&frame.forecast);
+        let states: Vec<f32> = memory.states().iter().map(|weight| *weight as f32).collect();
+        let Some(image) = &frame.image else { return ((before.clone(), None), (before, None)) };
+        let after = memory.compare(image.places());
+        let image = images.see(image.clone()).for_states(&states, layout, settings);
+        ((after, None), (before, Some(image)))
     });
-    seen.collect()
+    seen.unzip()
 }
 
 /// Hazard probability of the next state, as the prober reads it.
-fn hazard(probe: &mut FieldProbe, mixture: &Mixture, frame: &WatchedFrame, seed: u64) -> f64 {
+fn hazard(
+    probe: &mut FieldProbe,
+    mixture: &Mixture,
+    image: Option<&ImageEvidence>,
+    frame: &WatchedFrame,
+    seed: u64,
+) -> f64 {
     let draws = mixture.draw(SAMPLES, Sampling::Stratified, seed, frame.frame, 1);
-    let step = probe.step(mixture.clone(), draws, 1.0, frame.image.as_ref());
+    let step = probe.step(mixture.clone(), draws, 1.0, image);
     Evidence::of_steps(&[step]).hazard_or_unknown_probability()
 }
 

@@ -44,6 +44,8 @@ pub struct ForecastForm {
     pub path_probability: f32,
     /// Number of images that the forecast rests on; 1 without a memory.
     pub images: u64,
+    /// Weights of the present states; empty without a memory.
+    pub state_weights: Vec<f32>,
     /// The mixture.
     pub components: Vec<ComponentForm>,
     /// The drawn latents.
@@ -64,6 +66,7 @@ impl From<&Forecast> for ForecastForm {
             resolved_state: index(f.resolved_state),
             path_probability: f.path_probability,
             images: f.images,
+            state_weights: f.state_weights().to_vec(),
             components: f.weights[..components]
                 .iter()
                 .zip(&f.components)
@@ -102,6 +105,8 @@ impl TryFrom<&ForecastForm> for Forecast {
             resolved_state: signed(form.resolved_state),
             path_probability: form.path_probability,
             images: form.images,
+            state_count: form.state_weights.len() as u64,
+            state_weights: begin("state_weights", &form.state_weights, 0.0)?,
             weights: begin("components", &weights, 0.0)?,
             components: begin("components", &components, Gaussian::standard())?,
             samples: begin("samples", &latents, [0.0; LATENT_DIM])?,

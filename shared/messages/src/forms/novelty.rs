@@ -25,6 +25,8 @@ pub struct UnknownsForm {
     pub explained: f32,
     /// For each known state, how much better it explains the image than something unknown does.
     pub ratios: Vec<f32>,
+    /// For each place, what the image shows of it: -1 for free, 1 for taken, 0 for nothing. Empty without a memory.
+    pub places: Vec<f32>,
     /// Hazard probability before this image, from the comparisons of the take's earlier images.
     pub prior: f32,
     /// Boxes, the most probable first.
@@ -44,6 +46,7 @@ impl From<&Unknowns> for UnknownsForm {
             offset: unknowns.offset,
             explained: unknowns.explained,
             ratios: unknowns.ratios().to_vec(),
+            places: unknowns.places().to_vec(),
             prior: unknowns.prior,
             boxes: unknowns.boxes().to_vec(),
             stage_latency_ns: unknowns.stage_latency_ns,
@@ -59,6 +62,7 @@ impl TryFrom<&UnknownsForm> for Unknowns {
             header: form.header,
             box_count: form.boxes.len() as u32,
             state_count: form.ratios.len() as u32,
+            place_count: form.places.len() as u32,
             probability: form.probability,
             residual: form.residual,
             noise: form.noise,
@@ -66,6 +70,7 @@ impl TryFrom<&UnknownsForm> for Unknowns {
             offset: form.offset,
             explained: form.explained,
             ratios: begin("ratios", &form.ratios, 1.0)?,
+            places: begin("places", &form.places, 0.0)?,
             prior: form.prior,
             boxes: begin("boxes", &form.boxes, UnknownBox::default())?,
             stage_latency_ns: form.stage_latency_ns,

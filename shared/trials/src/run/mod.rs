@@ -2,6 +2,9 @@
 //! are those of the stages: the encoder in ONNX Runtime, the mixture density network in native code.
 
 mod filmstrip;
+mod memory;
+
+pub use memory::TakenImage;
 
 use crate::onnx::OnnxEncoder;
 use crate::planning::{KnownStates, LEAST_TRIALS, MOST_REPEATS, Perception, Planner};
@@ -13,13 +16,13 @@ use carff_dataset::{
     sensor::SensorNoise,
 };
 use carff_decision::{
-    Evidence, Feedback, ForecastInput, ImageEvidence, Memory, Mixture, Plan, Policy, Sampling, Step, StepLength,
-    TakeFrame, TakeMemory, look_ahead,
+    Evidence, Feedback, ForecastInput, ImageEvidence, Plan, Policy, Sampling, Step, StepLength, look_ahead,
 };
 use carff_inference::MixtureNet;
 use carff_messages::{Gaussian, Rule};
 use carff_scenes::Scenario;
 use carff_unknown::Known;
+use memory::RunMemory;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::fmt::Write;
@@ -52,6 +55,8 @@ pub struct RunSettings {
     pub horizon: u32,
     /// True if images were compared with the known states.
     pub compares: bool,
+    /// True if a belief rests on the comparison of the image before.
+    pub compares_late: bool,
     /// True if something unknown means nothing to the rules.
     pub ignores_unknown: bool,
     /// Length of a time step, if the forecaster has a memory.
@@ -241,15 +246,15 @@ pub struct JudgedRun {
     known: Option<Known>,
     /// The forecaster as the graph computes it: the same bits.
     forecaster: MixtureNet,
-    /// Forecasts of the run's frames from all images of their takes, by frame; `None` without a memory.
-    remembered: Option<BTreeMap<u64, Mixture>>,
+    /// What the memory holds at each frame of the run; `None` without a memory.
+    remembered: Option<RunMemory>,
 }
 
 impl JudgedRun {
     /// Reads dataset and models of a run.
     ///
-    /// `posteriors` are those of the run, in the order of their frames: a memory rests on all images of a take.
-    pub fn load(settings: RunSettings, posteriors: &[(TakeFrame, Gaussian)]) -> Result<Self, EvaluationError> {
+    /// `images` are those of the run, in the order of their frames: a memory rests on all images of a take.
+    pub fn load(settings: RunSettings, images: &[TakenImage]) -> Result<Self, EvaluationError> {
         let dataset = Dataset::open(&settings.dataset)?;
         let scenario =
             dataset.scenario().cloned().ok_or_else(|| EvaluationError::Unfit("it has no scenario".into()))?;
@@ -258,16 +263,9 @@ impl JudgedRun {
         let forecaster = MixtureNet::load(&settings.checkpoint, &manifest)?;
         let known = if settings.compares { Known::load(&settings.checkpoint)? } else { None };
         let learned = CheckpointPlanning::load(&settings.checkpoint)?.memory;
-        let remembered = learned.zip(settings.remembers).map(|(learned, step)| {
-            let states = probe.states().to_vec();
-            let memory = Memory::new(states, |state| forecaster.forecast(state), learned.settings);
-            let mut memory = TakeMemory::new(memory, step);
-            let see = |(frame, posterior): &(TakeFrame, Gaussian)| {
-                let forecast = forecaster.forecast(posterior);
-                (frame.frame, memory.see(*frame, &forecast).0)
-            };
-            posteriors.iter().map(see).collect()
-        });
+        let remembered = learned
+            .zip(settings.remembers)
+            .map(|(learned, step)| RunMemory::new(&forecaster, &probe, learned.settings, step, images));
         Ok(Self { settings, dataset, scenario, manifest, probe, known, forecaster, remembered })
     }
 
@@ -312,14 +310,20 @@ impl JudgedRun {
         let RunSettings { sampling, feedback, horizon, seed, .. } = self.settings;
         let plan = Plan { samples, sampling, feedback, horizon, seed, frame: frame.frame };
         let remembered = match &self.remembered {
-            Some(all) => Some(all.get(&frame.frame)?),
+            Some(memory) => Some((memory, memory.of(frame.frame)?)),
             None => None,
         };
         let forecast = |input: &Gaussian, source| match (source, remembered) {
-            (ForecastInput::Image, Some(remembered)) => remembered.clone(),
+            (ForecastInput::Image, Some((_, remembered))) => remembered.forecast.clone(),
             _ => self.forecaster.forecast(input),
         };
-        Some(look_ahead(forecast, probe, &frame.posterior?, frame.image.as_ref(), plan))
+        let image = frame.image.clone().map(|image| match remembered {
+            Some((memory, remembered)) if !self.settings.compares_late => {
+                memory.weighed(image, remembered, probe.layout())
+            }
+            _ => image,
+        });
+        Some(look_ahead(forecast, probe, &frame.posterior?, image.as_ref(), plan))
     }
 
     /// Every rule with the run's settings.
