@@ -1,5 +1,7 @@
 //! The forecaster stage's arithmetic: from a posterior, observed or fed back, to a mixture and its samples.
 
+mod history;
+
 use carff_checkpoint::{CheckpointPlanning, Manifest};
 use carff_config::GraphConfig;
 use carff_decision::{
@@ -8,11 +10,8 @@ use carff_decision::{
 };
 use carff_inference::MixtureNet;
 use carff_messages::{Belief, Forecast, ForecastSource, Gaussian, Header, MAX_STATES, Posterior, Unknowns};
-use std::collections::VecDeque;
+use history::{History, Remembered};
 use std::path::Path;
-
-/// Number of comparisons that wait for the posterior after them: those that a restarted forecaster gets.
-const WAITING: usize = 64;
 
 /// The forecaster's model and settings.
 #[derive(Debug)]
@@ -23,11 +22,9 @@ pub struct Forecaster {
     sampling: Sampling,
     horizon: u32,
     /// Belief over the frames of a take; `None` if each image counts by itself.
-    memory: Option<TakeMemory>,
-    /// Comparisons that the memory has not taken yet, the newest last.
-    compared: VecDeque<Unknowns>,
-    /// Forecast from the last image and those before it, and the number of images.
-    remembered: Option<(Mixture, u64)>,
+    memory: Option<History>,
+    /// What the memory holds at the last image.
+    remembered: Option<Remembered>,
 }
 
 impl Forecaster {
@@ -41,7 +38,8 @@ impl Forecaster {
         let learned = if graph.remembers() { CheckpointPlanning::load(checkpoint)?.memory } else { None };
         let memory = learned.zip(graph.step_length(manifest.step_s)).map(|(learned, step)| {
             let forecast = |state: &Gaussian| net.forecast(state);
-            TakeMemory::new(Memory::new(&layout, manifest.states.clone(), forecast, learned.settings), step)
+            let memory = Memory::new(&layout, manifest.states.clone(), forecast, learned.settings);
+            History::new(TakeMemory::new(memory, step))
         });
         Ok(Self {
             net,
@@ -50,7 +48,6 @@ impl Forecaster {
             sampling: run.sampling,
             horizon: run.horizon,
             memory,
-            compared: VecDeque::new(),
             remembered: None,
         })
     }
@@ -60,14 +57,10 @@ impl Forecaster {
         (self.samples, self.horizon) = (samples, horizon);
     }
 
-    /// Takes the comparison of an image, which the memory counts before the next image. Called for each comparison in
-    /// order, before the posteriors that follow it.
+    /// Takes the comparison of an image, which the memory counts for later images.
     pub fn compare(&mut self, unknowns: &Unknowns) {
-        if self.memory.is_some() {
-            if self.compared.len() == WAITING {
-                self.compared.pop_front();
-            }
-            self.compared.push_back(*unknowns);
+        if let Some(memory) = &mut self.memory {
+            memory.compare(unknowns.header.frame_id, ImageEvidence::from(unknowns).places().to_vec());
         }
     }
 
@@ -75,15 +68,11 @@ impl Forecaster {
     /// forecast: a restarted forecaster gets the last ones from shared memory.
     pub fn remember(&mut self, posterior: &Posterior) {
         let Some(memory) = &mut self.memory else { return };
-        let frame_id = posterior.header.frame_id;
-        while let Some(before) = self.compared.pop_front_if(|compared| compared.header.frame_id < frame_id) {
-            memory.compare(before.header.frame_id, ImageEvidence::from(&before).places());
-        }
-        let (mixture, images) = memory.see(posterior.into(), &self.net.forecast(&posterior.gaussian));
-        if images == 1 {
+        let remembered = memory.see(posterior.into(), self.net.forecast(&posterior.gaussian));
+        if remembered.images == 1 {
             tracing::debug!(take_start = posterior.take_start, "the memory starts anew");
         }
-        self.remembered = Some((mixture, images));
+        self.remembered = Some(remembered);
     }
 
     /// Returns the forecast from the last remembered posterior: step 1.
@@ -91,11 +80,10 @@ impl Forecaster {
         let mut forecast = Forecast::empty(posterior.header.at_step(1), ForecastSource::Observed, self.horizon);
         forecast.encoder_ns = posterior.stage_latency_ns;
         match &self.remembered {
-            Some((mixture, images)) => {
+            Some(Remembered { forecast: mixture, states, images }) => {
                 forecast.images = *images;
-                let states = self.memory.as_ref().map_or_else(Vec::new, TakeMemory::states);
                 forecast.state_count = states.len().min(MAX_STATES) as u64;
-                forecast.state_weights.iter_mut().zip(states).for_each(|(to, weight)| *to = weight as f32);
+                forecast.state_weights.iter_mut().zip(states).for_each(|(to, weight)| *to = *weight as f32);
                 self.fill(&mut forecast, mixture);
             }
             None => self.fill(&mut forecast, &self.net.forecast(&posterior.gaussian)),

@@ -20,7 +20,6 @@ fn run(stage: &mut StageContext) -> anyhow::Result<()> {
     stage.ready();
     while stage.wait(&[&posteriors, &beliefs])? {
         let started_ns = monotonic_now_ns();
-        // Before the posteriors: the memory counts the comparison of an image before the next image.
         while let Some(unknowns) = comparisons.as_mut().map_or(Ok(None), Receiver::next)? {
             forecaster.compare(&unknowns);
         }

@@ -119,7 +119,7 @@ impl Images {
         (unknowns.gain, unknowns.offset) = (comparison.fit.gain, comparison.fit.offset);
         describe(&seen, probe.layout().places(), &mut unknowns);
         if let Some(memory) = &mut self.memory {
-            let shown = memory.places.look(probe.field(), &self.states, view, &comparison.fit, threads);
+            let shown = memory.places.look(probe.field(), &self.states, view, (&seen, &comparison), threads);
             unknowns.place_count = shown.len().min(MAX_PLACES) as u32;
             unknowns.places.iter_mut().zip(shown).for_each(|(place, shown)| *place = shown);
         }

@@ -219,8 +219,8 @@ impl<'a> KnownStates<'a> {
         let evidence = ImageEvidence::new(&compared.seen.ratios);
         let Some(places) = &self.places else { return Some(evidence) };
         let view = (camera, image.view()?);
-        let fit = &compared.comparison.fit;
-        let shown = places.borrow_mut().look(self.field, &self.states, view, fit, self.threads);
+        let judged = (&compared.seen, &compared.comparison);
+        let shown = places.borrow_mut().look(self.field, &self.states, view, judged, self.threads);
         Some(evidence.with_places(&shown))
     }
 

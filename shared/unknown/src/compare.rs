@@ -52,6 +52,8 @@ pub struct Comparison {
     pub ground: Vec<Option<Ground>>,
     /// True for pixels that were compared.
     pub judged: Vec<bool>,
+    /// True for an image that was moved to where its place is rendered.
+    pub is_moved: bool,
     /// For each state and kind, the residual of each pixel, in deviations; 0 where it was not compared.
     residuals: Vec<[Vec<f32>; 2]>,
 }
@@ -154,7 +156,7 @@ impl Comparer {
         let left = |of: &Comparison| 1.0 - of.fit.explained;
         let on_lanes = |of: &Comparison| of.on_lanes(0, ResidualKind::Unexpected).count();
         let is_better = left(&aligned) < BETTER * left(last) && 2 * on_lanes(&aligned) >= on_lanes(last);
-        is_better.then_some(aligned)
+        is_better.then_some(Comparison { is_moved: true, ..aligned })
     }
 
     /// Compares an image at the compared size with the rendered states. Pixels whose values are not numbers do not count.
@@ -186,7 +188,7 @@ impl Comparer {
         explain_own(&mut energies, &own, scene.hazard_states);
         let residual = |energy: &[BothResiduals], kind| median_residual(energy, kind, &judged, width, fit.noise);
         let residuals = energies.iter().map(|energy| ResidualKind::ALL.map(|kind| residual(energy, kind))).collect();
-        Comparison { camera, image, fit, ground, judged, residuals }
+        Comparison { camera, image, fit, ground, judged, is_moved: false, residuals }
     }
 
     /// The rendered depth of a state in the last comparison, metres, row by row.

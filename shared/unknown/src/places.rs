@@ -4,8 +4,9 @@
 //! count, and only the part of the image's error along this difference: errors that both images have cancel. So a few
 //! pixels of a vehicle that is mostly hidden count, although the encoder does not see them.
 
-use crate::compare::QUICK;
+use crate::compare::{Comparison, QUICK};
 use crate::fit::Fit;
+use crate::known::Seen;
 use crate::lanes::OwnBox;
 use carff_base::geometry::{OrientedBox, PinholeCamera, TurnedBox};
 use carff_field::{Field, HypothesisBuffer, RenderOptions};
@@ -59,16 +60,20 @@ impl PlaceViews {
     }
 
     /// Returns what an image (height, width, channel) shows of each place: -1 for free, 1 for taken, 0 for nothing;
-    /// -2 to 2. `fit` relates rendered to seen values.
+    /// -2 to 2. `compared` is its comparison: a view of another place shows nothing, nor does one from another pose than
+    /// the camera's.
     pub fn look(
         &mut self,
         field: &Field,
         states: &[[f32; LATENT_DIM]],
         (camera, image): (&PinholeCamera, ArrayView3<'_, u8>),
-        fit: &Fit,
+        (seen, compared): (&Seen, &Comparison),
         threads: usize,
     ) -> Vec<f32> {
         let Self { pairs, buffer } = self;
+        if compared.is_moved || seen.ratios.iter().all(|ratio| *ratio == 0.0) {
+            return vec![0.0; pairs.len()];
+        }
         let options = RenderOptions { threads: threads.max(1), ..QUICK };
         let size = (camera.height_px as usize, camera.width_px as usize, 3);
         let mut look = |pair: &PlacePair| {
@@ -81,8 +86,8 @@ impl PlaceViews {
             pixels.iter().for_each(|&pixel| selected[pixel] = true);
             field.render_hypotheses_where(camera, &latents, |pixel| selected[pixel], &options, buffer);
             let [taken, free] = [0, 1].map(|of| buffer.images[of].rgb.as_slice());
-            let seen = |i: usize| f32::from(image[[i / 3 / size.1, i / 3 % size.1, i % 3]]) / 255.0;
-            Some(shown(&pixels, step, [taken, free], seen, fit))
+            let value = |i: usize| f32::from(image[[i / 3 / size.1, i / 3 % size.1, i % 3]]) / 255.0;
+            Some(shown(&pixels, step, [taken, free], value, &compared.fit))
         };
         pairs.iter().map(|pair| pair.as_ref().and_then(&mut look).unwrap_or(0.0)).collect()
     }

@@ -9,9 +9,11 @@ use crate::tables::memory::{ObserverFigures, RightFrames};
 use std::fmt::Write;
 
 /// Observers, in the order of the page.
-const OBSERVERS: [(&str, &str); 5] = [
+const OBSERVERS: [(&str, &str); 7] = [
     ("none", "each image by itself"),
-    ("filter", "with memory"),
+    ("compared", "each image by itself, with its comparison"),
+    ("weights", "with memory, by its weights"),
+    ("filter", "with memory, as the prober reads it"),
     ("graph", "with memory, and with the comparison of each image"),
     ("exact", "exact posterior, each image by itself"),
     ("exact_filter", "exact posterior of all images: the ceiling"),

@@ -50,8 +50,16 @@ pub struct ObserverFigures {
     pub corrected: RightFrames,
 }
 
-/// Figures by observer: `none` (each image by itself), `filter` (with memory), `graph` (with memory, and with the comparison
-/// of each image, as the graph decides), and the exact observers `exact` (each image by itself) and `exact_filter`.
+/// Figures by observer:
+///
+/// | name | belief |
+/// |---|---|
+/// | `none` | each image by itself |
+/// | `compared` | each image by itself, with its comparison |
+/// | `weights` | the memory's weights of the known states |
+/// | `filter` | with memory, as the prober reads it |
+/// | `graph` | with memory and with the comparison of each image, as the graph decides |
+/// | `exact`, `exact_filter` | the exact posterior, of each image by itself and of all images |
 pub type ByObserver = BTreeMap<String, ObserverFigures>;
 
 /// The table.
@@ -88,9 +96,15 @@ pub fn memory(subject: &Subject, on_progress: &dyn Fn(&Progress)) -> Result<Memo
             let frames = watch.frames.iter().zip(&beliefs);
             frames.map(|(frame, (mixture, image))| hazard(&mut probe, mixture, image.as_ref(), frame, seed)).collect()
         };
-        let by_itself = watch.frames.iter().map(|frame| (frame.forecast.clone(), None)).collect();
-        let (filter, graph) = with_memory(&memory, planner.probe.layout(), &settings, watch);
-        for (name, beliefs) in [("none", by_itself), ("filter", filter), ("graph", graph)] {
+        let by_itself = |compares: bool| {
+            let of_frame = |f: &WatchedFrame| (f.forecast.clone(), f.image.clone().filter(|_| compares));
+            watch.frames.iter().map(of_frame).collect()
+        };
+        let Remembered { weights, filter, graph } = Remembered::of(&memory, planner.probe.layout(), &settings, watch);
+        observers.entry("weights").or_default().push(weights);
+        for (name, beliefs) in
+            [("none", by_itself(false)), ("compared", by_itself(true)), ("filter", filter), ("graph", graph)]
+        {
             observers.entry(name).or_default().push(of(beliefs));
         }
         observers.entry("exact").or_default().push(watch.frames.iter().map(|f| f.exact).collect());
@@ -110,29 +124,38 @@ pub fn memory(subject: &Subject, on_progress: &dyn Fn(&Progress)) -> Result<Memo
 /// The forecast of a frame, and the evidence that weighs it.
 type Belief = (Mixture, Option<ImageEvidence>);
 
-/// The belief of each frame of a watch from all its images so far: the memory's own, and that of the graph, in which the
-/// prober weighs the frame's own image.
-fn with_memory(
-    memory: &Memory,
-    layout: &ProbeLayout,
-    settings: &MemorySettings,
-    watch: &Watch,
-) -> (Vec<Belief>, Vec<Belief>) {
-    let mut memory = memory.clone();
-    memory.clear();
-    let mut images = ImageMemory::new(layout.hazard_states().to_vec(), *settings);
-    let mut step = watch.frames.first().map_or(0, |frame| frame.timestamp);
-    let seen = watch.frames.iter().map(|frame| {
-        (step..frame.timestamp).for_each(|_| memory.advance());
-        step = frame.timestamp;
-        let before = memory.see(&frame.forecast);
-        let states: Vec<f32> = memory.states().iter().map(|weight| *weight as f32).collect();
-        let Some(image) = &frame.image else { return ((before.clone(), None), (before, None)) };
-        let after = memory.compare(image.places());
-        let image = images.see(image.clone()).for_states(&states, layout, settings);
-        ((after, None), (before, Some(image)))
-    });
-    seen.unzip()
+/// The belief of each frame of a watch from all its images so far.
+#[derive(Default)]
+struct Remembered {
+    /// Hazard probability by the memory's weights.
+    weights: Vec<f64>,
+    /// The memory's forecast.
+    filter: Vec<Belief>,
+    /// The forecast before the comparison of the frame's own image, by which the prober weighs it.
+    graph: Vec<Belief>,
+}
+
+impl Remembered {
+    fn of(memory: &Memory, layout: &ProbeLayout, settings: &MemorySettings, watch: &Watch) -> Self {
+        let (mut memory, mut remembered) = (memory.clone(), Self::default());
+        memory.clear();
+        let mut images = ImageMemory::new(layout.hazard_states().to_vec(), *settings);
+        let mut step = watch.frames.first().map_or(0, |frame| frame.timestamp);
+        for frame in &watch.frames {
+            (step..frame.timestamp).for_each(|_| memory.advance());
+            step = frame.timestamp;
+            let before = memory.see(&frame.forecast);
+            let states: Vec<f32> = memory.states().iter().map(|weight| *weight as f32).collect();
+            let after = frame.image.as_ref().map_or_else(|| before.clone(), |image| memory.compare(image.places()));
+            let image = frame.image.clone().map(|image| images.see(image).for_states(&states, layout, settings));
+            let next = memory.next();
+            let hazards = next.iter().zip(layout.hazard_states()).filter(|(_, hazard)| **hazard);
+            remembered.weights.push(hazards.map(|(weight, _)| weight).sum());
+            remembered.filter.push((after, None));
+            remembered.graph.push((before, image));
+        }
+        remembered
+    }
 }
 
 /// Hazard probability of the next state, as the prober reads it.
