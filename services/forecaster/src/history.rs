@@ -11,7 +11,7 @@ const KEPT: usize = 48;
 struct Seen {
     frame: TakeFrame,
     forecast: Mixture,
-    /// What the image shows of each place; `None` until its comparison comes.
+    /// Values of the places in the image; `None` until its comparison comes.
     places: Option<Vec<f64>>,
 }
 
@@ -25,7 +25,7 @@ impl Seen {
     }
 }
 
-/// What the memory holds at an image, without the image's own comparison.
+/// State of the memory at an image, without the image's own comparison.
 #[derive(Clone, Debug)]
 pub struct Remembered {
     /// Forecast from all images of the take so far.
@@ -38,7 +38,7 @@ pub struct Remembered {
 
 /// A memory whose result does not depend on when the comparisons come, up to [`KEPT`] images later.
 #[derive(Clone, Debug)]
-pub struct History {
+pub struct TakeHistory {
     /// The memory before the oldest kept image.
     before: TakeMemory,
     /// The memory after the newest one.
@@ -48,7 +48,7 @@ pub struct History {
     early: VecDeque<(u64, Vec<f64>)>,
 }
 
-impl History {
+impl TakeHistory {
     /// A history without images.
     pub fn new(memory: TakeMemory) -> Self {
         Self { before: memory.clone(), memory, seen: VecDeque::new(), early: VecDeque::new() }
@@ -103,14 +103,14 @@ mod tests {
     }
 
     /// Two states that stay; the second one takes the place.
-    fn history() -> History {
+    fn history() -> TakeHistory {
         let stays = |state: &Gaussian| Mixture { weights: vec![1.0], components: vec![*state] };
         let oriented_box = OrientedBox { center: [0.0; 3], half_size: [1.0; 3], yaw: 0.0 };
         let place = Place { name: "actor".into(), oriented_box, occupied_in: vec![false, true] };
         let layout = ProbeLayout::new(vec![place], vec![false, true]).unwrap();
         let settings = MemorySettings { repeated_share: 0.3, distrust: 0.1, place_strength: 4.0 };
         let memory = Memory::new(&layout, vec![at(-3.0), at(3.0)], stays, settings);
-        History::new(TakeMemory::new(memory, StepLength::Frames(6)))
+        TakeHistory::new(TakeMemory::new(memory, StepLength::Frames(6)))
     }
 
     fn image(frame: u64) -> (TakeFrame, Mixture) {

@@ -10,7 +10,7 @@ use carff_decision::{
 };
 use carff_inference::MixtureNet;
 use carff_messages::{Belief, Forecast, ForecastSource, Gaussian, Header, MAX_STATES, Posterior, Unknowns};
-use history::{History, Remembered};
+use history::{Remembered, TakeHistory};
 use std::path::Path;
 
 /// The forecaster's model and settings.
@@ -22,8 +22,8 @@ pub struct Forecaster {
     sampling: Sampling,
     horizon: u32,
     /// Belief over the frames of a take; `None` if each image counts by itself.
-    memory: Option<History>,
-    /// What the memory holds at the last image.
+    memory: Option<TakeHistory>,
+    /// State of the memory at the last image.
     remembered: Option<Remembered>,
 }
 
@@ -39,7 +39,7 @@ impl Forecaster {
         let memory = learned.zip(graph.step_length(manifest.step_s)).map(|(learned, step)| {
             let forecast = |state: &Gaussian| net.forecast(state);
             let memory = Memory::new(&layout, manifest.states.clone(), forecast, learned.settings);
-            History::new(TakeMemory::new(memory, step))
+            TakeHistory::new(TakeMemory::new(memory, step))
         });
         Ok(Self {
             net,

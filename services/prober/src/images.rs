@@ -27,7 +27,7 @@ pub struct Images {
     memory: Option<Remembered>,
 }
 
-/// What a belief with a memory needs of the images.
+/// The part of the images that a belief with a memory rests on.
 #[derive(Debug)]
 struct Remembered {
     settings: MemorySettings,

@@ -27,7 +27,7 @@ const MAX_RATIO: f64 = 1e4;
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct ImageEvidence {
     ratios: Vec<f64>,
-    /// What the image shows of each place: -1 for free, 1 for taken, 0 for nothing. Empty if no place was looked at.
+    /// Value of each place in the image: -1 for free, 1 for taken, 0 for nothing. Empty if no place was looked at.
     places: Vec<f64>,
     /// Hazard probability before the image; `None` for equally probable states.
     prior: Option<f64>,

@@ -1,4 +1,4 @@
-//! What an image shows of the places of the known states: each place is rendered with and without what stands there.
+//! What an image shows of the places of the known states: each place is rendered with and without what is there.
 //!
 //! Two known states that differ at one place look the same elsewhere. Only pixels in which their rendered images differ
 //! count, and only the part of the image's error along this difference: errors that both images have cancel. So a few
@@ -13,7 +13,7 @@ use carff_field::{Field, HypothesisBuffer, RenderOptions};
 use carff_messages::LATENT_DIM;
 use ndarray::ArrayView3;
 
-/// Margin of a place's box, metres: what stands there reaches a little beyond it.
+/// Margin of a place's box, metres: what is there reaches a little beyond it.
 const MARGIN_M: f64 = 0.3;
 /// Most pixels of a place that are rendered; of more, every second, third, ... is.
 const MOST_PX: usize = 256;
@@ -123,7 +123,7 @@ fn extent_px(place: &OrientedBox, camera: &PinholeCamera) -> [[usize; 2]; 2] {
     })
 }
 
-/// Where the image is between two rendered ones, over some pixels: -1 at `free`, 1 at `taken`, and nearer to 0 the less
+/// Position of the image between two rendered ones, over some pixels: -1 at `free`, 1 at `taken`, and nearer to 0 the less
 /// they differ. `step` pixels stand for one.
 fn shown(pixels: &[usize], step: usize, [taken, free]: [&[f32]; 2], seen: impl Fn(usize) -> f32, fit: &Fit) -> f32 {
     let (mut along, mut energy) = (0.0, 0.0);

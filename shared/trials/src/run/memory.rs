@@ -17,13 +17,13 @@ pub struct TakenImage {
     pub image: Option<ImageEvidence>,
 }
 
-/// What the memory holds at each frame of a run.
+/// The memory at each frame of a run.
 pub struct RunMemory {
     settings: MemorySettings,
     frames: BTreeMap<u64, RememberedFrame>,
 }
 
-/// What the memory holds at a frame, without the comparison of its image.
+/// The memory at a frame, without the comparison of its image.
 pub struct RememberedFrame {
     /// Forecast from all images of the take so far.
     pub forecast: Mixture,

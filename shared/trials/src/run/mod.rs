@@ -246,7 +246,7 @@ pub struct JudgedRun {
     known: Option<Known>,
     /// The forecaster as the graph computes it: the same bits.
     forecaster: MixtureNet,
-    /// What the memory holds at each frame of the run; `None` without a memory.
+    /// The memory at each frame of the run; `None` without a memory.
     remembered: Option<RunMemory>,
 }
 
