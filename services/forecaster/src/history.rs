@@ -86,7 +86,9 @@ impl TakeHistory {
             self.memory.compare(frame, self.seen[at].places.as_deref().unwrap_or_default());
         } else {
             self.memory = self.before.clone();
-            self.seen.iter().for_each(|seen| drop(seen.count_in(&mut self.memory)));
+            for seen in &self.seen {
+                seen.count_in(&mut self.memory);
+            }
         }
     }
 }

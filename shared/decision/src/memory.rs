@@ -113,7 +113,9 @@ impl Memory {
     /// Forgets everything: the next image starts a new take.
     pub fn clear(&mut self) {
         self.log_weight.fill(0.0);
-        self.last.iter_mut().for_each(|last| last.fill(0.0));
+        for last in &mut self.last {
+            last.fill(0.0);
+        }
         self.far.clear();
     }
 
@@ -161,7 +163,9 @@ impl Memory {
         // Relative to the mean likelihood, so that evidence that repeats is the same for all states.
         let largest = evidence.iter().copied().fold(f64::NEG_INFINITY, f64::max);
         let mean = evidence.iter().map(|e| (e - largest).exp()).sum::<f64>() / evidence.len().max(1) as f64;
-        evidence.iter_mut().for_each(|e| *e -= largest + mean.ln());
+        for of_state in &mut evidence {
+            *of_state -= largest + mean.ln();
+        }
         self.count(1, evidence);
         self.forecast()
     }

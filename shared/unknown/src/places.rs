@@ -83,7 +83,9 @@ impl PlaceViews {
                 return None;
             }
             let mut selected = vec![false; size.0 * size.1];
-            pixels.iter().for_each(|&pixel| selected[pixel] = true);
+            for &pixel in &pixels {
+                selected[pixel] = true;
+            }
             field.render_hypotheses_where(camera, &latents, |pixel| selected[pixel], &options, buffer);
             let [taken, free] = [0, 1].map(|of| buffer.images[of].rgb.as_slice());
             let value = |i: usize| f32::from(image[[i / 3 / size.1, i / 3 % size.1, i % 3]]) / 255.0;
