@@ -31,7 +31,7 @@ pub struct Remembered {
     /// Forecast from all images of the take so far.
     pub forecast: Mixture,
     /// Weights of the present states.
-    pub states: Vec<f64>,
+    pub states: Vec<f32>,
     /// Number of these images.
     pub images: u64,
 }
@@ -63,7 +63,7 @@ impl TakeHistory {
             oldest.count_in(&mut self.before);
         }
         let (all, images) = self.memory.see(frame, &forecast);
-        let states = self.memory.states();
+        let states = self.memory.state_weights();
         let places = self.early.iter().position(|(of, _)| *of == frame.frame).and_then(|i| self.early.remove(i));
         let places = places.map(|(_, places)| places);
         if let Some(places) = &places {
@@ -138,11 +138,11 @@ mod tests {
                 (frame - 9..=frame).rev().for_each(|frame| late.compare(frame, places(frame)));
             }
         }
-        let [a, b, c] = [early, in_time, late].map(|history| history.memory.states());
+        let [a, b, c] = [early, in_time, late].map(|history| history.memory.state_weights());
         assert_eq!((&a, &a), (&b, &c));
         let mut first = history();
         first.compare(0, vec![1.0]);
         let (taken, forecast) = image(0);
-        assert!(first.see(taken, forecast).states[1] < 0.65 && first.memory.states()[1] > 0.9);
+        assert!(first.see(taken, forecast).states[1] < 0.65 && first.memory.state_weights()[1] > 0.9);
     }
 }

@@ -83,7 +83,7 @@ impl Forecaster {
             Some(Remembered { forecast: mixture, states, images }) => {
                 forecast.images = *images;
                 forecast.state_count = states.len().min(MAX_STATES) as u64;
-                forecast.state_weights.iter_mut().zip(states).for_each(|(to, weight)| *to = *weight as f32);
+                forecast.state_weights.iter_mut().zip(states).for_each(|(to, weight)| *to = *weight);
                 self.fill(&mut forecast, mixture);
             }
             None => self.fill(&mut forecast, &self.net.forecast(&posterior.gaussian)),

@@ -185,6 +185,11 @@ impl Memory {
         normalised_exp(&self.log_weight)
     }
 
+    /// Weights of the present states as messages carry them.
+    pub fn state_weights(&self) -> Vec<f32> {
+        self.states().iter().map(|weight| *weight as f32).collect()
+    }
+
     /// Weights of the next states; they sum to 1.
     pub fn next(&self) -> Vec<f64> {
         moved(&self.moves, &self.states())

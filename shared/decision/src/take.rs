@@ -57,7 +57,7 @@ impl From<&Posterior> for TakeFrame {
 /// assert!(of_left.map(|(weight, _)| weight).sum::<f32>() > 0.9 && images == 2);
 /// // This image shows that the place is taken.
 /// memory.compare(1, &[1.0]);
-/// assert!(memory.states()[1] > 0.1);
+/// assert!(memory.state_weights()[1] > 0.1);
 /// # Ok::<(), carff_decision::ProbingError>(())
 /// ```
 #[derive(Clone, Debug)]
@@ -112,9 +112,9 @@ impl TakeMemory {
         }
     }
 
-    /// Weights of the present states; they sum to 1.
-    pub fn states(&self) -> Vec<f64> {
-        self.memory.states()
+    /// Weights of the present states as messages carry them; they sum to 1.
+    pub fn state_weights(&self) -> Vec<f32> {
+        self.memory.state_weights()
     }
 
     /// Time steps from the start of the take to a frame.

@@ -342,7 +342,7 @@ impl TakeMemories {
     pub fn remember(&mut self, net: &dyn Forecasts, trial: Trial, frame_in_drive: u64) -> Trial {
         let frame = TakeFrame { take_start: 0, frame: frame_in_drive, capture_time_ns: 0 };
         let (remembered, _) = self.forecasts.see(frame, &net.forecast(&trial.posterior));
-        let states: Vec<f32> = self.forecasts.states().iter().map(|weight| *weight as f32).collect();
+        let states = self.forecasts.state_weights();
         let image = trial.image.map(|image| {
             self.forecasts.compare(frame_in_drive, image.places());
             self.images.see(image).for_states(&states, &self.layout, &self.settings)

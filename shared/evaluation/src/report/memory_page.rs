@@ -9,11 +9,10 @@ use crate::tables::memory::{ObserverFigures, RightFrames};
 use std::fmt::Write;
 
 /// Observers, in the order of the page.
-const OBSERVERS: [(&str, &str); 7] = [
+const OBSERVERS: [(&str, &str); 6] = [
     ("none", "each image by itself"),
     ("compared", "each image by itself, with its comparison"),
-    ("weights", "with memory, by its weights"),
-    ("filter", "with memory, as the prober reads it"),
+    ("filter", "with memory"),
     ("graph", "with memory, and with the comparison of each image"),
     ("exact", "exact posterior, each image by itself"),
     ("exact_filter", "exact posterior of all images: the ceiling"),

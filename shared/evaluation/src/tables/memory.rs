@@ -56,8 +56,7 @@ pub struct ObserverFigures {
 /// |---|---|
 /// | `none` | each image by itself |
 /// | `compared` | each image by itself, with its comparison |
-/// | `weights` | the memory's weights of the known states |
-/// | `filter` | with memory, as the prober reads it |
+/// | `filter` | with memory |
 /// | `graph` | with memory and with the comparison of each image, as the graph decides |
 /// | `exact`, `exact_filter` | the exact posterior, of each image by itself and of all images |
 pub type ByObserver = BTreeMap<String, ObserverFigures>;
@@ -92,7 +91,7 @@ pub fn memory(subject: &Subject, on_progress: &dyn Fn(&Progress)) -> Result<Memo
     let total = subject.watches.len();
     for (done, watch) in subject.watches.iter().enumerate() {
         let seed = subject.options.seed;
-        let mut of = |beliefs: Vec<Belief>| -> Vec<f64> {
+        let mut of = |beliefs: Vec<Weighed>| -> Vec<f64> {
             let frames = watch.frames.iter().zip(&beliefs);
             frames.map(|(frame, (mixture, image))| hazard(&mut probe, mixture, image.as_ref(), frame, seed)).collect()
         };
@@ -100,8 +99,7 @@ pub fn memory(subject: &Subject, on_progress: &dyn Fn(&Progress)) -> Result<Memo
             let of_frame = |f: &WatchedFrame| (f.forecast.clone(), f.image.clone().filter(|_| compares));
             watch.frames.iter().map(of_frame).collect()
         };
-        let Remembered { weights, filter, graph } = Remembered::of(&memory, planner.probe.layout(), &settings, watch);
-        observers.entry("weights").or_default().push(weights);
+        let (filter, graph) = with_memory(&memory, planner.probe.layout(), &settings, watch);
         for (name, beliefs) in
             [("none", by_itself(false)), ("compared", by_itself(true)), ("filter", filter), ("graph", graph)]
         {
@@ -122,40 +120,29 @@ pub fn memory(subject: &Subject, on_progress: &dyn Fn(&Progress)) -> Result<Memo
 }
 
 /// The forecast of a frame, and the evidence that weighs it.
-type Belief = (Mixture, Option<ImageEvidence>);
+type Weighed = (Mixture, Option<ImageEvidence>);
 
-/// The belief of each frame of a watch from all its images so far.
-#[derive(Default)]
-struct Remembered {
-    /// Hazard probability by the memory's weights.
-    weights: Vec<f64>,
-    /// The memory's forecast.
-    filter: Vec<Belief>,
-    /// The forecast before the comparison of the frame's own image, by which the prober weighs it.
-    graph: Vec<Belief>,
-}
-
-impl Remembered {
-    fn of(memory: &Memory, layout: &ProbeLayout, settings: &MemorySettings, watch: &Watch) -> Self {
-        let (mut memory, mut remembered) = (memory.clone(), Self::default());
-        memory.clear();
-        let mut images = ImageMemory::new(layout.hazard_states().to_vec(), *settings);
-        let mut step = watch.frames.first().map_or(0, |frame| frame.timestamp);
-        for frame in &watch.frames {
-            (step..frame.timestamp).for_each(|_| memory.advance());
-            step = frame.timestamp;
-            let before = memory.see(&frame.forecast);
-            let states: Vec<f32> = memory.states().iter().map(|weight| *weight as f32).collect();
-            let after = frame.image.as_ref().map_or_else(|| before.clone(), |image| memory.compare(image.places()));
-            let image = frame.image.clone().map(|image| images.see(image).for_states(&states, layout, settings));
-            let next = memory.next();
-            let hazards = next.iter().zip(layout.hazard_states()).filter(|(_, hazard)| **hazard);
-            remembered.weights.push(hazards.map(|(weight, _)| weight).sum());
-            remembered.filter.push((after, None));
-            remembered.graph.push((before, image));
-        }
-        remembered
-    }
+/// The forecast of each frame of a watch from all its images so far: the memory's own, and that of the graph, whose prober
+/// weighs it by the frame's own image.
+fn with_memory(
+    memory: &Memory,
+    layout: &ProbeLayout,
+    settings: &MemorySettings,
+    watch: &Watch,
+) -> (Vec<Weighed>, Vec<Weighed>) {
+    let mut memory = memory.clone();
+    memory.clear();
+    let mut images = ImageMemory::new(layout.hazard_states().to_vec(), *settings);
+    let mut step = watch.frames.first().map_or(0, |frame| frame.timestamp);
+    let seen = watch.frames.iter().map(|frame| {
+        (step..frame.timestamp).for_each(|_| memory.advance());
+        step = frame.timestamp;
+        let (before, states) = (memory.see(&frame.forecast), memory.state_weights());
+        let after = frame.image.as_ref().map_or_else(|| before.clone(), |image| memory.compare(image.places()));
+        let image = frame.image.clone().map(|image| images.see(image).for_states(&states, layout, settings));
+        ((after, None), (before, image))
+    });
+    seen.unzip()
 }
 
 /// Hazard probability of the next state, as the prober reads it.

@@ -44,7 +44,7 @@ impl RunMemory {
         let mut memory = TakeMemory::new(memory, step);
         let see = |taken: &TakenImage| {
             let (forecast, _) = memory.see(taken.frame, &net.forecast(&taken.posterior));
-            let states = memory.states().iter().map(|weight| *weight as f32).collect();
+            let states = memory.state_weights();
             if let Some(image) = &taken.image {
                 memory.compare(taken.frame.frame, image.places());
             }
