@@ -3,7 +3,7 @@
 #![allow(clippy::unwrap_used, reason = "a helper of a test fails it by panicking")]
 
 use carff_checkpoint::Manifest;
-use carff_messages::{Forecast, Gaussian, Header, Health, HealthState, Posterior, Stage, Unknowns};
+use carff_messages::{Belief, Forecast, Gaussian, Header, Health, HealthState, Posterior, Stage, Unknowns};
 use carff_tests::{Process, TestGraph, eventually, shipped_checkpoint};
 use carff_transport::{Node, Publisher, Receiver, topics};
 use rustix::process::Signal;
@@ -19,6 +19,7 @@ struct Bench {
     graph: TestGraph,
     posteriors: Publisher<Posterior>,
     comparisons: Publisher<Unknowns>,
+    beliefs: Publisher<Belief>,
     forecasts: Receiver<Forecast>,
     health: Receiver<Health>,
     forecaster: Process,
@@ -32,6 +33,7 @@ impl Bench {
         let mut bench = Self {
             posteriors: node.publisher(&topics::POSTERIOR).unwrap(),
             comparisons: node.publisher(&topics::UNKNOWN).unwrap(),
+            beliefs: node.publisher(&topics::BELIEF).unwrap(),
             forecasts: node.receiver(&topics::FORECAST).unwrap(),
             health: node.receiver(topics::health(Stage::Forecaster)).unwrap(),
             forecaster: graph.stage(Stage::Forecaster),
@@ -60,10 +62,15 @@ impl Bench {
     fn forecast(&mut self, frame: u64, gaussian: Gaussian) -> Forecast {
         let header = Header::of_frame(frame, 1 + frame * 100_000_000, 1);
         self.posteriors.send(Posterior { header, gaussian, take_start: 0, stage_latency_ns: 0 }).unwrap();
+        self.next(frame, 1)
+    }
+
+    /// Waits for the forecast of a frame's step.
+    fn next(&mut self, frame: u64, step: u32) -> Forecast {
         let mut found = None;
         let came = eventually(|| {
             while let Some(forecast) = self.forecasts.next().unwrap() {
-                if forecast.header.frame_id == frame {
+                if (forecast.header.frame_id, forecast.header.step) == (frame, step) {
                     found = Some(*forecast);
                 }
             }
@@ -119,4 +126,20 @@ fn a_killed_forecaster_remembers_its_take() {
             bench.compare(frame, image);
         }
     }
+}
+
+/// All steps of a frame have the same weights of the present states: the prober weighs each by the frame's image.
+#[test]
+fn all_steps_have_the_weights() {
+    let states = Manifest::load(&shipped_checkpoint()).unwrap().states;
+    let mut bench = Bench::new();
+    let first = bench.forecast(0, states[1]);
+    assert_eq!(first.state_weights().len(), states.len());
+    let mut belief = Belief::empty(Header::of_frame(0, 1, 1).at_step(1), 2);
+    (belief.state_count, belief.place_count) = (states.len() as u32, 1);
+    (belief.component_count, belief.sample_count) = (1, 1);
+    (belief.component_weights[0], belief.state_probability[2]) = (1.0, 1.0);
+    (belief.resolved_state, belief.resolved) = (2, states[2]);
+    bench.beliefs.send(belief).unwrap();
+    assert_eq!(bench.next(0, 2).state_weights(), first.state_weights());
 }

@@ -28,6 +28,8 @@ impl Seen {
 /// State of the memory at an image, without the image's own comparison.
 #[derive(Clone, Debug)]
 pub struct Remembered {
+    /// Number of the image's frame.
+    pub frame: u64,
     /// Forecast from all images of the take so far.
     pub forecast: Mixture,
     /// Weights of the present states.
@@ -70,7 +72,7 @@ impl TakeHistory {
             self.memory.compare(frame.frame, places);
         }
         self.seen.push_back(Seen { frame, forecast, places });
-        Remembered { forecast: all, states, images }
+        Remembered { frame: frame.frame, forecast: all, states, images }
     }
 
     /// Counts what the image of a frame shows of each place.

@@ -79,11 +79,10 @@ impl Forecaster {
     pub fn from_observation(&self, posterior: &Posterior) -> Forecast {
         let mut forecast = Forecast::empty(posterior.header.at_step(1), ForecastSource::Observed, self.horizon);
         forecast.encoder_ns = posterior.stage_latency_ns;
+        self.set_states(&mut forecast);
         match &self.remembered {
-            Some(Remembered { forecast: mixture, states, images }) => {
+            Some(Remembered { forecast: mixture, images, .. }) => {
                 forecast.images = *images;
-                forecast.state_count = states.len().min(MAX_STATES) as u64;
-                forecast.state_weights.iter_mut().zip(states).for_each(|(to, weight)| *to = *weight);
                 self.fill(&mut forecast, mixture);
             }
             None => self.fill(&mut forecast, &self.net.forecast(&posterior.gaussian)),
@@ -100,6 +99,7 @@ impl Forecaster {
         let header: Header = belief.header.at_step(belief.header.step + 1);
         let mut forecast = Forecast::empty(header, ForecastSource::Probed, belief.horizon);
         forecast.encoder_ns = belief.encoder_ns;
+        self.set_states(&mut forecast);
         if belief.fed_back().is_empty() {
             let state = usize::try_from(belief.resolved_state).ok()?;
             forecast.resolved_state = belief.resolved_state;
@@ -118,6 +118,15 @@ impl Forecaster {
         let forecasts: Vec<Mixture> = inputs.iter().map(|input| self.net.forecast(input)).collect();
         let Header { seed, frame_id, step, .. } = header;
         continue_samples(&forecasts, self.samples, self.sampling, seed, frame_id, step)
+    }
+
+    /// Sets the weights of the present states, which all steps of the frame share.
+    fn set_states(&self, forecast: &mut Forecast) {
+        let frame = forecast.header.frame_id;
+        if let Some(Remembered { states, .. }) = self.remembered.as_ref().filter(|last| last.frame == frame) {
+            forecast.state_count = states.len().min(MAX_STATES) as u64;
+            forecast.state_weights.iter_mut().zip(states).for_each(|(to, weight)| *to = *weight);
+        }
     }
 
     fn fill(&self, forecast: &mut Forecast, mixture: &Mixture) {

@@ -6,6 +6,7 @@ use carff_base::geometry::PinholeCamera;
 use carff_checkpoint::FieldProbe;
 use carff_config::CompareImages;
 use carff_decision::{ImageEvidence, ProbeLayout};
+use carff_field::Field;
 use carff_messages::{Belief, Forecast, FrameMeta, Header, UnknownBox, Unknowns};
 use carff_runtime::StageContext;
 use carff_transport::{ImagePayload, Input, Publisher, Receiver, Sample, monotonic_now_ns, topics};
@@ -139,6 +140,11 @@ impl Frames {
     /// The clear lanes of a frame, if it is the one compared last.
     pub fn sighting(&self, header: &Header) -> Option<&Sighting> {
         self.images.sighting(header)
+    }
+
+    /// The field that renders the states without the vehicle itself.
+    pub fn without_own<'a>(&'a self, probe: &'a FieldProbe) -> &'a Field {
+        self.images.without_own(probe)
     }
 
     /// The ground on which something counts.

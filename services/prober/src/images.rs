@@ -2,6 +2,7 @@
 
 use carff_checkpoint::{CheckpointPlanning, FieldProbe};
 use carff_decision::{ImageEvidence, ImageMemory, MemorySettings, Place, ProbeLayout};
+use carff_field::Field;
 use carff_messages::{Forecast, FrameMeta, Header, LATENT_DIM, MAX_PLACES, MAX_STATES, Unknowns};
 use carff_unknown::{Comparer, Known, Lanes, PlaceViews, Seen, Sighting};
 use ndarray::ArrayView3;
@@ -61,7 +62,7 @@ impl Images {
         let places = probe.layout().places().iter();
         let boxes = places.map(|place| (place.oriented_box, place.occupied_in.as_slice()));
         Ok(Some(Self {
-            comparer: Comparer::default(),
+            comparer: Comparer::new(probe.field(), &known.lanes),
             states: probe.states().iter().map(|state| state.mean).collect(),
             compared: VecDeque::with_capacity(REMEMBERED),
             sighting: None,
@@ -119,7 +120,8 @@ impl Images {
         (unknowns.gain, unknowns.offset) = (comparison.fit.gain, comparison.fit.offset);
         describe(&seen, probe.layout().places(), &mut unknowns);
         if let Some(memory) = &mut self.memory {
-            let shown = memory.places.look(probe.field(), &self.states, view, (&seen, &comparison), threads);
+            let field = self.comparer.without_own(probe.field());
+            let shown = memory.places.look(field, &self.states, view, (&seen, &comparison), threads);
             unknowns.place_count = shown.len().min(MAX_PLACES) as u32;
             unknowns.places.iter_mut().zip(shown).for_each(|(place, shown)| *place = shown);
         }
@@ -134,6 +136,11 @@ impl Images {
             memory.take_start = take_start;
         }
         memory.images.see(evidence)
+    }
+
+    /// The field that renders the states without the vehicle itself.
+    pub fn without_own<'a>(&'a self, probe: &'a FieldProbe) -> &'a Field {
+        self.comparer.without_own(probe.field())
     }
 
     /// The ground on which something counts.

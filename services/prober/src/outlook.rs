@@ -73,7 +73,7 @@ impl Outlook {
             ahead.world_from_camera[0][3] += at_m * motion.heading_rad.cos();
             ahead.world_from_camera[1][3] += at_m * motion.heading_rad.sin();
             let lanes: &Lanes = frames.lanes();
-            if !self.sight.look(probe.field(), &self.states, lanes, &ahead, *threads) {
+            if !self.sight.look(frames.without_own(probe), &self.states, lanes, &ahead, *threads) {
                 continue;
             }
             let gain = look_gain_bits(probabilities, &self.hazards, |a, b| self.sight.alike(a, b));

@@ -109,7 +109,7 @@ pub struct Forecast {
     pub path_probability: f32,
     /// Number of images that the forecast rests on; 1 without a memory.
     pub images: u64,
-    /// Number of states of the scenario, at most 64; 0 without a memory, and after step 1.
+    /// Number of states of the scenario, at most 64; 0 without a memory.
     pub state_count: u64,
     /// Weights of the present states by the images so far, without this frame's comparison; they sum to 1.
     pub state_weights: [f32; MAX_STATES],

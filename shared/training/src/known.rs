@@ -1,7 +1,7 @@
 //! The limits of the known: calibrated on images of known states, for a checkpoint whose field is trained.
 //!
-//! The images come from free poses of the scenario, from a seed that no evaluation uses. A dataset without a scenario
-//! file uses its trained poses, on which the field errs less than elsewhere.
+//! The images come from free poses of the scenario and from drives whose camera pans, as many of each, from a seed that no
+//! evaluation uses. A dataset without a scenario file uses its trained poses, on which the field errs less than elsewhere.
 
 use crate::TrainingError;
 use carff_base::geometry::{OrientedBox, PinholeCamera};
@@ -14,7 +14,7 @@ use carff_dataset::{
 use carff_evaluation::{PosedImages, Progress};
 use carff_field::{Field, InstructionSet};
 use carff_messages::LATENT_DIM;
-use carff_scenes::Scenario;
+use carff_scenes::{FRAMES_PER_TIMESTAMP, Scenario};
 use carff_unknown::{CameraLimits, Comparer, Comparison, Known, KnownScene, Lanes, Measured, OwnBox};
 use std::path::Path;
 
@@ -40,7 +40,7 @@ pub struct KnownInput<'a> {
     pub dataset: &'a Path,
     /// Scenario of the dataset; `None` for any other dataset.
     pub scenario: Option<&'a Scenario>,
-    /// Free poses of the scenario, each with an image of each branch.
+    /// Free poses of the scenario, each with an image of each branch, and as many images of drives.
     pub free_poses: usize,
     /// Threads that render.
     pub threads: usize,
@@ -62,6 +62,7 @@ pub fn calibrate_known(input: KnownInput, on_progress: &dyn Fn(&Progress)) -> Re
         threads: input.threads,
         comparer: Comparer::default(),
     };
+    work.comparer = Comparer::new(&work.field, &work.lanes);
     let comparisons = match input.scenario {
         Some(scenario) => work.free_poses(scenario, input.free_poses, on_progress)?,
         None => work.trained_poses(&posed, on_progress),
@@ -99,9 +100,28 @@ impl Work {
                 let Some(state) = scenario.info().state(branch, pose.timestamp) else { continue };
                 all.extend(self.compare(&pose.camera, &view.image, all.len()).map(|compared| (state, compared)));
             }
+            for branch in 0..pose.views.len() {
+                let drive = number * pose.views.len() + branch;
+                all.extend(self.of_drive(scenario, drive as u64, number, all.len())?);
+            }
             on_progress(&Progress { phase: "known", done: number + 1, total: count, line: String::new() });
         }
         Ok(all)
+    }
+
+    /// Compares one image of a drive, whose camera is also where the vehicle is in no known state.
+    fn of_drive(
+        &mut self,
+        scenario: &Scenario,
+        drive: u64,
+        frame: usize,
+        image: usize,
+    ) -> Result<Option<(usize, Comparison)>, TrainingError> {
+        let drive = scenario.watch(drive, FRAMES_PER_TIMESTAMP, self.seed)?;
+        let frame = frame % drive.frame_count();
+        let Some(state) = scenario.info().state(drive.branch(), drive.timestamp_of(frame)) else { return Ok(None) };
+        let (camera, rendered) = scenario.free_image(&drive, frame);
+        Ok(self.compare(&camera, &rendered, image).map(|compared| (state, compared)))
     }
 
     fn trained_poses(&mut self, posed: &PosedImages, on_progress: &dyn Fn(&Progress)) -> Vec<(usize, Comparison)> {
@@ -156,13 +176,7 @@ fn lanes(manifest: &Manifest, field: &Field, scenario: Option<&Scenario>) -> Lan
 fn own_boxes(manifest: &Manifest, scenario: Option<&Scenario>) -> Vec<OwnBox> {
     let ego = scenario.and_then(Scenario::ego_name);
     let places = manifest.places.iter().filter(|place| Some(place.name.as_str()) == ego);
-    places
-        .map(|place| OwnBox {
-            oriented_box: place.oriented_box,
-            margin_m: POSE_MARGIN_M,
-            states: place.occupied_in.clone(),
-        })
-        .collect()
+    places.map(|place| OwnBox { oriented_box: place.oriented_box, margin_m: POSE_MARGIN_M }).collect()
 }
 
 /// Limits of a camera in order, from the trained images with sensor noise.

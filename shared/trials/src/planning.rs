@@ -203,7 +203,8 @@ impl<'a> KnownStates<'a> {
     /// The known states of a probe's field. `threads` render.
     pub fn new(known: &'a Known, probe: &'a FieldProbe, threads: usize) -> Self {
         let states = probe.states().iter().map(|state| state.mean).collect();
-        Self { known, field: probe.field(), states, threads, comparer: RefCell::default(), places: None }
+        let comparer = RefCell::new(Comparer::new(probe.field(), &known.lanes));
+        Self { known, field: probe.field(), states, threads, comparer, places: None }
     }
 
     /// As [`Self::new`], for a belief with a memory: evidence has what an image shows of each place, too.
@@ -220,7 +221,9 @@ impl<'a> KnownStates<'a> {
         let Some(places) = &self.places else { return Some(evidence) };
         let view = (camera, image.view()?);
         let judged = (&compared.seen, &compared.comparison);
-        let shown = places.borrow_mut().look(self.field, &self.states, view, judged, self.threads);
+        let comparer = self.comparer.borrow();
+        let field = comparer.without_own(self.field);
+        let shown = places.borrow_mut().look(field, &self.states, view, judged, self.threads);
         Some(evidence.with_places(&shown))
     }
 

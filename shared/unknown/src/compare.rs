@@ -4,9 +4,9 @@ use crate::align::{View, align, reduced};
 use crate::blobs::{Blob, blobs};
 use crate::fit::{Fit, LEAST_NOISE, fit, median, noise};
 use crate::lanes::{ErrorMap, Ground, Lanes};
-use crate::residuals::{BothResiduals, Pixels, ResidualKind, explain_own, median_residual};
+use crate::residuals::{BothResiduals, Pixels, ResidualKind, explain_together, median_residual, smaller};
 use carff_base::geometry::PinholeCamera;
-use carff_field::{Field, HypothesisBuffer, RenderOptions};
+use carff_field::{Field, HypothesisBuffer, RenderBuffer, RenderOptions};
 use carff_messages::LATENT_DIM;
 use ndarray::ArrayView3;
 
@@ -100,14 +100,33 @@ impl Comparison {
 
 /// Renders the known states of one field and compares images with them. It reuses its memory, and the rendered states
 /// while the camera stands still.
+///
+/// The vehicle itself moves between its places in the known states, and carries the camera. So the states are rendered
+/// without it, and the pixels that would show it are rendered with it, too: either may explain an image.
 #[derive(Debug, Default)]
 pub struct Comparer {
+    /// The field without the vehicle itself; `None` if no state has it.
+    without_own: Option<Field>,
+    /// The states without the vehicle itself.
     buffer: HypothesisBuffer,
+    /// The states with it, in the pixels that look at it.
+    with_own: HypothesisBuffer,
+    own_pixels: Vec<usize>,
     /// The camera, the judged pixels and the states that the buffer shows.
     shown: Option<(PinholeCamera, Vec<bool>, Vec<[f32; LATENT_DIM]>)>,
 }
 
 impl Comparer {
+    /// A comparer for the states of `field`, with the vehicle itself as `lanes` have it.
+    pub fn new(field: &Field, lanes: &Lanes) -> Self {
+        Self { without_own: lanes.without_own(field), ..Self::default() }
+    }
+
+    /// Returns the field that renders the states without the vehicle itself: `field`, unless a state has the vehicle.
+    pub fn without_own<'a>(&'a self, field: &'a Field) -> &'a Field {
+        self.without_own.as_ref().unwrap_or(field)
+    }
+
     /// Compares an image (height, width, channel) with each state. A camera that sees no lane by its pose only shows
     /// whether the view is of this place. `None` without states.
     pub fn compare(
@@ -131,13 +150,15 @@ impl Comparer {
         };
         if !self.shown.as_ref().is_some_and(is_shown) {
             let options = RenderOptions { threads: threads.max(1), ..QUICK };
-            field.render_hypotheses_where(
-                &small,
-                states,
-                |i| judged[i] || is_sample(i, width),
-                &options,
-                &mut self.buffer,
-            );
+            let pixels: Vec<usize> = (0..judged.len()).filter(|&i| judged[i]).collect();
+            self.own_pixels = lanes.own_pixels(&small, &pixels);
+            let without_own = self.without_own.as_ref().unwrap_or(field);
+            let compared = |i| judged[i] || is_sample(i, width);
+            without_own.render_hypotheses_where(&small, states, compared, &options, &mut self.buffer);
+            let is_own = |i| self.own_pixels.binary_search(&i).is_ok();
+            if !self.own_pixels.is_empty() {
+                field.render_hypotheses_where(&small, states, is_own, &options, &mut self.with_own);
+            }
             self.shown = Some((small, judged.clone(), states.to_vec()));
         }
         Some(self.compared(small, reduced(image, width, height), ground, judged, scene))
@@ -183,12 +204,46 @@ impl Comparer {
         let pixels = Pixels::new(&image, &judged, &rendered, width);
         let mut energies: Vec<Vec<BothResiduals>> =
             rendered.iter().map(|rendered| pixels.energy(rendered, &fit)).collect();
-        let pixels: Vec<usize> = (0..judged.len()).filter(|&i| judged[i]).collect();
-        let own = scene.lanes.own_pixels(&camera, images.len(), &pixels);
-        explain_own(&mut energies, &own, scene.hazard_states);
+        explain_together(&mut energies, &self.own_pixels, scene.hazard_states);
+        self.explain_own((&image, &judged, width), &fit, &mut energies);
         let residual = |energy: &[BothResiduals], kind| median_residual(energy, kind, &judged, width, fit.noise);
         let residuals = energies.iter().map(|energy| ResidualKind::ALL.map(|kind| residual(energy, kind))).collect();
         Comparison { camera, image, fit, ground, judged, is_moved: false, residuals }
+    }
+
+    /// Lets the vehicle itself explain the pixels that look at it.
+    fn explain_own(
+        &self,
+        (image, judged, width): (&[f32], &[bool], usize),
+        fit: &Fit,
+        energies: &mut [Vec<BothResiduals>],
+    ) {
+        let own = &self.own_pixels;
+        if own.is_empty() {
+            return;
+        }
+        let with_own = |(without, with): (&RenderBuffer, &RenderBuffer)| {
+            let mut rgb = without.rgb.clone();
+            for &i in own {
+                rgb[i * 3..i * 3 + 3].copy_from_slice(&with.rgb[i * 3..i * 3 + 3]);
+            }
+            rgb
+        };
+        let rendered: Vec<Vec<f32>> = self.buffer.images.iter().zip(&self.with_own.images).map(with_own).collect();
+        let rendered: Vec<&[f32]> = rendered.iter().map(Vec::as_slice).collect();
+        let mut near = vec![false; judged.len()];
+        for &i in own {
+            near[i] = true;
+        }
+        let mut near = grown(&near, width, 1);
+        near.iter_mut().zip(judged).for_each(|(near, judged)| *near &= judged);
+        let pixels = Pixels::new(image, &near, &rendered, width);
+        for (energy, rendered) in energies.iter_mut().zip(&rendered) {
+            let with = pixels.energy(rendered, fit);
+            for &i in own.iter().filter(|i| judged[**i]) {
+                energy[i] = smaller(energy[i], with[i]);
+            }
+        }
     }
 
     /// The rendered depth of a state in the last comparison, metres, row by row.
@@ -259,7 +314,6 @@ fn explained(image: &[f32], rendered: &[f32], fit: &Fit, pixels: &[usize]) -> f3
 #[cfg(test)]
 mod tests {
     use super::*;
-    use carff_field::RenderBuffer;
     use ndarray::Array3;
 
     /// A view of this place is explained in any exposure and with a ninth of it covered; another image, a negative and a

@@ -16,7 +16,7 @@ use std::path::{Path, PathBuf};
 /// File name in a checkpoint.
 const FILE: &str = "known.json";
 /// Version of the file's format. The limits of earlier versions are for other residuals.
-const FORMAT_VERSION: u32 = 3;
+const FORMAT_VERSION: u32 = 4;
 /// Steepness of the evidence against a state beyond the limit: at 1.5 times the limit, something unknown explains the
 /// image 58 times better.
 const STEEPNESS: f64 = 10.0;
@@ -34,7 +34,7 @@ const ELSEWHERE: f32 = 100.0;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Known {
-    /// Format of this file; 3.
+    /// Format of this file; 4.
     pub format_version: u32,
     /// The ground on which something unknown counts.
     pub lanes: Lanes,

@@ -1,13 +1,16 @@
 //! The ground on which something unknown counts, and the field's own errors there.
 
 use carff_base::geometry::{OrientedBox, PinholeCamera, TurnedBox};
+use carff_field::Field;
 use serde::{Deserialize, Serialize};
 
 /// Side of a cell of the error map, as a share of the bounds' longer side.
 const CELL_SHARE: f64 = 1.0 / 32.0;
 
-/// Height above the vehicle itself in which a camera is mounted on it, metres.
-const ABOVE_ROOF_M: f64 = 1.0;
+/// Margin of the vehicle itself in the field, metres: its surface is not sharp.
+const SURFACE_M: f64 = 0.5;
+/// Height above the ground that stays when the vehicle itself is left out of images, metres.
+const GROUND_M: f64 = 0.12;
 
 /// The parts of the ground on which something unknown is a hazard: roads, or the surroundings of the probed places.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -21,21 +24,18 @@ pub struct Lanes {
     pub bounds_m: [[f64; 2]; 2],
     /// Distance from the camera below which nothing is judged, metres: the vehicle that carries the camera.
     pub nearest_m: f64,
-    /// Boxes of the vehicle itself. Its place varies by a margin, so a state may explain the pixels behind them in two
-    /// ways: with the vehicle there, or elsewhere.
+    /// Boxes of the vehicle itself in the known states.
     pub own: Vec<OwnBox>,
 }
 
-/// The vehicle itself in some of the known states.
+/// A place of the vehicle itself in some of the known states.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct OwnBox {
     /// Box of the vehicle, metres, world space.
     pub oriented_box: OrientedBox,
-    /// Margin of its pose, metres.
+    /// Margin of its pose, metres: the place varies.
     pub margin_m: f64,
-    /// For each known state, true if the vehicle is there.
-    pub states: Vec<bool>,
 }
 
 impl Lanes {
@@ -49,34 +49,35 @@ impl Lanes {
         }
     }
 
-    /// For each of some states, returns those of the pixels (by index, row by row) that look at the vehicle itself, or
-    /// past its margin, in this state.
-    pub fn own_pixels(&self, camera: &PinholeCamera, states: usize, pixels: &[usize]) -> Vec<Vec<usize>> {
-        let [x, y, z] = camera.position_m();
-        let holds_camera = |own: &OrientedBox| {
-            let top_m = own.center[2] + own.half_size[2] + ABOVE_ROOF_M;
-            z < top_m && own.contains([x, y, own.center[2]])
+    /// Returns a copy of a field whose images do not show the vehicle itself; `None` if no state has it. The ground under
+    /// it stays.
+    pub fn without_own(&self, field: &Field) -> Option<Field> {
+        let above_ground = |own: &OwnBox| {
+            let OrientedBox { center, half_size, .. } = own.oriented_box;
+            let (low, high) = (self.ground_m + GROUND_M, center[2] + half_size[2] + SURFACE_M);
+            let center = [center[0], center[1], f64::midpoint(low, high)];
+            let half_size = [half_size[0] + SURFACE_M, half_size[1] + SURFACE_M, 0.5 * (high - low)];
+            OrientedBox { center, half_size, ..own.oriented_box }.turned()
         };
+        let boxes: Vec<TurnedBox> = self.own.iter().map(above_ground).collect();
+        let is_own = |at_m: [f32; 3]| boxes.iter().any(|own| own.contains(at_m.map(f64::from)));
+        (!boxes.is_empty()).then(|| field.without(is_own))
+    }
+
+    /// Returns those of some pixels (by index, row by row, ascending) that look at a place of the vehicle itself, or past its
+    /// margin.
+    pub(crate) fn own_pixels(&self, camera: &PinholeCamera, pixels: &[usize]) -> Vec<usize> {
+        let holds_camera = |own: &OrientedBox| own.contains(camera.position_m());
         // Every pixel of a camera inside a box looks past that box: a camera next to the vehicle has no margin, and one
-        // on it sees none of it beyond the nearest distance.
+        // in its place none of it.
         let outside = |own: &OwnBox| [own.with_margin(), own.oriented_box].into_iter().find(|own| !holds_camera(own));
-        let boxes = self.own.iter().filter_map(|own| Some((outside(own)?.turned(), &own.states)));
-        let boxes: Vec<(TurnedBox, &Vec<bool>)> = boxes.collect();
+        let boxes: Vec<TurnedBox> = self.own.iter().filter_map(|own| Some(outside(own)?.turned())).collect();
         let width = camera.width_px.max(1) as usize;
-        let mut of_states = vec![Vec::new(); states];
-        for &pixel in if boxes.is_empty() { &[] } else { pixels } {
+        let shows_it = |pixel: &usize| {
             let ray = camera.ray((pixel % width) as f64 + 0.5, (pixel / width) as f64 + 0.5);
-            let mut shows_it = vec![false; states];
-            for (_, stands) in boxes.iter().filter(|(own, _)| own.is_met_by(&ray)) {
-                shows_it.iter_mut().zip(*stands).for_each(|(shows, stands)| *shows |= stands);
-            }
-            of_states
-                .iter_mut()
-                .zip(shows_it)
-                .filter(|(_, shows)| *shows)
-                .for_each(|(of_state, _)| of_state.push(pixel));
-        }
-        of_states
+            boxes.iter().any(|own| own.is_met_by(&ray))
+        };
+        pixels.iter().copied().filter(shows_it).collect()
     }
 
     /// Returns the points of the ground that the pixels of a camera look at, row by row: distance along the ray and
@@ -101,8 +102,10 @@ impl Lanes {
 }
 
 impl OwnBox {
+    /// The box with its margin to the sides: the vehicle's height does not vary.
     fn with_margin(&self) -> OrientedBox {
-        OrientedBox { half_size: self.oriented_box.half_size.map(|half| half + self.margin_m), ..self.oriented_box }
+        let [length, width, height] = self.oriented_box.half_size;
+        OrientedBox { half_size: [length + self.margin_m, width + self.margin_m, height], ..self.oriented_box }
     }
 }
 
@@ -226,24 +229,24 @@ mod tests {
         assert_eq!(points[16], None);
     }
 
-    /// The pixels of the vehicle itself are those that its box with its margin covers, in the states in which it is
-    /// there. A camera next to it has no margin, and a camera on it no such pixels.
+    /// The pixels of the vehicle itself are those that its box with its margin covers. A camera next to it has no margin,
+    /// one on it sees what is below, and one in its place none of it.
     #[test]
     fn own_pixels_are_those_of_the_vehicle() {
         let oriented_box = OrientedBox { center: [0.0, 0.0, 0.5], half_size: [2.0, 1.0, 0.5], yaw: 0.0 };
-        let own = OwnBox { oriented_box, margin_m: 0.5, states: vec![true, false] };
+        let own = OwnBox { oriented_box, margin_m: 0.5 };
         let lanes = Lanes { own: vec![own], ..lanes() };
-        let share = |from_m: [f64; 3], state: usize| {
-            let camera = PinholeCamera::look_at(from_m, [0.0, 0.0, 0.0], [0.0, 1.0, 0.0], 32, 32, 90.0);
+        let share = |from_m: [f64; 3], to_m: [f64; 3]| {
+            let camera = PinholeCamera::look_at(from_m, to_m, [0.0, 1.0, 0.0], 32, 32, 90.0);
             let all: Vec<usize> = (0..32 * 32).collect();
-            lanes.own_pixels(&camera, 2, &all)[state].len() as f64 / all.len() as f64
+            lanes.own_pixels(&camera, &all).len() as f64 / all.len() as f64
         };
-        // Seen from above: 5 m x 3 m at the height of the roof, of 17 m x 17 m.
-        let above = share([0.0, 0.0, 10.0], 0);
-        assert!((above - 15.0 / 289.0).abs() < 0.02, "{above}");
-        assert_eq!(share([0.0, 0.0, 10.0], 1), 0.0, "it stands elsewhere");
-        assert!((0.1..0.9).contains(&share([2.2, 0.0, 1.2], 0)), "beside it");
-        assert_eq!(share([1.9, 0.0, 1.2], 0), 0.0, "on it");
+        // Seen from above: 5 m x 3 m at the height of the roof, of 18 m x 18 m.
+        let above = share([0.0, 0.0, 10.0], [0.0; 3]);
+        assert!((above - 15.0 / 324.0).abs() < 0.02, "{above}");
+        assert!((0.1..0.9).contains(&share([2.2, 0.0, 0.8], [0.0; 3])), "beside it");
+        assert!((0.3..0.7).contains(&share([0.0, 0.0, 1.2], [9.0, 0.0, 1.2])), "on it, ahead");
+        assert_eq!(share([1.9, 0.0, 0.8], [0.0; 3]), 0.0, "in its place");
     }
 
     /// A cell with large residuals tolerates more than the others, which tolerate the median.

@@ -196,7 +196,7 @@ mod tests {
         let taken_in: [[bool; 4]; 3] =
             [[true, false, false, false], [true, false, true, false], [false, true, false, true]];
         let places = [0.0, 1.0, 2.0].map(place);
-        let own = OwnBox { oriented_box: places[2], margin_m: 0.5, states: taken_in[2].to_vec() };
+        let own = OwnBox { oriented_box: places[2], margin_m: 0.5 };
         let views = PlaceViews::new(places.into_iter().zip(taken_in.iter().map(<[bool; 4]>::as_slice)), &[own]);
         let pairs: Vec<_> = views.pairs.iter().map(|pair| pair.map(|pair| (pair.taken, pair.free))).collect();
         assert_eq!(pairs, [Some((0, 2)), Some((2, 1)), None]);

@@ -134,20 +134,24 @@ fn told_apart(states: &[&[f32]]) -> Vec<bool> {
     low.chunks_exact(CHANNELS).zip(high.chunks_exact(CHANNELS)).map(differs).collect()
 }
 
-/// Lets each state explain the pixels of the vehicle itself as the other states do that have it elsewhere, but agree about
-/// the hazard: the vehicle's place varies. `energies` and `own` have one entry a state, and `own` is sorted.
-pub fn explain_own(energies: &mut [Vec<BothResiduals>], own: &[Vec<usize>], hazard_states: &[bool]) {
-    let before = energies.to_vec();
-    for (state, pixels) in own.iter().enumerate() {
-        for &i in pixels {
-            let elsewhere = |other: &usize| {
-                hazard_states.get(*other) == hazard_states.get(state) && own[*other].binary_search(&i).is_err()
-            };
-            let others = (0..own.len()).filter(elsewhere).map(|other| before[other][i]);
-            let smaller = |a: BothResiduals, b: BothResiduals| if b[0] + b[1] < a[0] + a[1] { b } else { a };
-            energies[state][i] = others.fold(before[state][i], smaller);
+/// Lets each state explain some pixels as any state does that agrees about the hazard. `energies` has one entry a state.
+pub fn explain_together(energies: &mut [Vec<BothResiduals>], pixels: &[usize], hazard_states: &[bool]) {
+    for &i in pixels {
+        for hazard in [false, true] {
+            let is_of_side = |state: usize| hazard_states.get(state).copied().unwrap_or(false) == hazard;
+            let side = || (0..energies.len()).filter(|state| is_of_side(*state));
+            let Some(least) = side().map(|state| energies[state][i]).reduce(smaller) else { continue };
+            let side: Vec<usize> = side().collect();
+            for state in side {
+                energies[state][i] = least;
+            }
         }
     }
+}
+
+/// The smaller one of two residuals, by the sum of both kinds.
+pub fn smaller(a: BothResiduals, b: BothResiduals) -> BothResiduals {
+    if b[0] + b[1] < a[0] + a[1] { b } else { a }
 }
 
 /// Root of the median over 3 x 3 pixels (the lower one of an even number), of the mean over channels, in deviations: a
@@ -252,17 +256,14 @@ mod tests {
         assert_eq!(residual(&[&with_it, &with_it]), [unexpected, 0.0]);
     }
 
-    /// The place where a state has the vehicle itself hides nothing: its pixels must be explained with the vehicle there, or
-    /// as by a state of the same side that has it elsewhere.
+    /// States of one side explain pixels together, and nothing that only the other side has.
     #[test]
-    fn the_own_place_hides_nothing() {
-        // Pixel 0: the vehicle is there. Pixel 1: the road is seen. Pixel 2: something else. Pixel 3: the hazard.
+    fn a_side_explains_together() {
+        // Pixel 0: not shared. Pixel 1: the other state has it. Pixel 2: no state has it. Pixel 3: the hazard.
         let energy = |values: [f32; 4]| values.map(|v| [v, 0.0]).to_vec();
-        let with_it = energy([0.0, 4.0, 4.0, 4.0]);
-        let without = energy([4.0, 0.0, 4.0, 4.0]);
-        let hazard = energy([4.0, 0.0, 4.0, 0.0]);
-        let mut energies = [with_it, without.clone(), hazard.clone()];
-        explain_own(&mut energies, &[vec![0, 1, 2, 3], vec![], vec![]], &[false, false, true]);
-        assert_eq!(energies, [energy([0.0, 0.0, 4.0, 4.0]), without, hazard]);
+        let mut energies = [energy([0.0, 4.0, 4.0, 4.0]), energy([4.0, 0.0, 4.0, 4.0]), energy([4.0, 4.0, 4.0, 0.0])];
+        explain_together(&mut energies, &[1, 2, 3], &[false, false, true]);
+        let expected = [energy([0.0, 0.0, 4.0, 4.0]), energy([4.0, 0.0, 4.0, 4.0]), energy([4.0, 4.0, 4.0, 0.0])];
+        assert_eq!(energies, expected);
     }
 }

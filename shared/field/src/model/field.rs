@@ -125,6 +125,17 @@ impl Field {
         &self.changing
     }
 
+    /// Returns a copy whose images leave out what is at some world points, metres, by cells of the grid. Densities stay.
+    #[must_use]
+    pub fn without(&self, is_left_out: impl Fn([f32; 3]) -> bool) -> Self {
+        let (r, mut copy) = (self.occupancy.resolution(), self.clone());
+        copy.occupancy.set_from(|i| {
+            let middle = [i % r, i / r % r, i / (r * r)].map(|v| (v as f32 + 0.5) / r as f32);
+            self.occupancy.cell(i) && !is_left_out(self.contraction.uncontract(middle))
+        });
+        copy
+    }
+
     /// Returns the number of trained parameters in the tables and the networks.
     pub fn parameter_count(&self) -> usize {
         self.table.len() + self.networks.len()

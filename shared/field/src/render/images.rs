@@ -226,6 +226,28 @@ mod tests {
         assert!(buffer.images.is_empty());
     }
 
+    /// A copy without a part of space shows nothing of it, and everything else as before; densities stay.
+    #[test]
+    fn a_part_of_space_is_left_out() {
+        let field = field();
+        let render = |field: &Field| {
+            let mut out = RenderBuffer::new();
+            field.render(&camera(), &[0.3; LATENT_DIM], &RenderOptions::default(), &mut out);
+            (out.rgb, out.opacity)
+        };
+        assert_eq!(render(&field.without(|_| false)), render(&field));
+        let (_, opacity) = render(&field.without(|_| true));
+        assert!(opacity.iter().all(|opacity| *opacity == 0.0));
+        let without = field.without(|[x, _, _]| x < 0.0);
+        let ((all, _), (some, _)) = (render(&field), render(&without));
+        let differ = all.iter().zip(&some).filter(|(a, b)| (*a - *b).abs() > 1e-3).count();
+        assert!(differ > 100 && differ < all.len(), "{differ} of {}", all.len());
+        let (at, mut before, mut after) = ([[-1.0, 2.0, 0.5]], [0.0], [0.0]);
+        field.density(&at, &[0.3; LATENT_DIM], &mut before);
+        without.density(&at, &[0.3; LATENT_DIM], &mut after);
+        assert_eq!(before, after);
+    }
+
     /// Samples of low weight take the mean colour of their ray's other samples: that hardly changes an image.
     #[test]
     fn samples_of_low_weight_take_the_mean_color() {
