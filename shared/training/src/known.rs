@@ -16,6 +16,7 @@ use carff_field::{Field, InstructionSet};
 use carff_messages::LATENT_DIM;
 use carff_scenes::{FRAMES_PER_TIMESTAMP, Scenario};
 use carff_unknown::{CameraLimits, Comparer, Comparison, Known, KnownScene, Lanes, Measured, OwnBox};
+use std::collections::BTreeSet;
 use std::path::Path;
 
 /// Part of the seed of these images, so that they share no draws with training, thresholds or evaluation.
@@ -67,13 +68,34 @@ pub fn calibrate_known(input: KnownInput, on_progress: &dyn Fn(&Progress)) -> Re
         Some(scenario) => work.free_poses(scenario, input.free_poses, on_progress)?,
         None => work.trained_poses(&posed, on_progress),
     };
-    let mut known = Known::fit(work.lanes.clone(), hazard_states, &comparisons, camera_limits(&posed, work.seed));
+    let camera = camera_limits(&posed, work.seed);
+    let fit = |comparisons: &[(usize, Comparison)]| {
+        Known::fit(work.lanes.clone(), hazard_states.clone(), comparisons, camera)
+    };
+    let mut known = fit(&comparisons.all);
+    // A view of a drive may show hardly anything of the place: it does not lower the limit for other places.
+    known.least_explained = fit(&comparisons.of_poses()).least_explained;
     if input.scenario.is_none() {
         known.clear = known.clear.times(TRAINED_POSES);
         known.hazard = known.hazard.times(TRAINED_POSES);
     }
     known.save(input.checkpoint)?;
     Ok(known)
+}
+
+/// Comparisons of images, each with the state that it shows.
+#[derive(Default)]
+struct Compared {
+    all: Vec<(usize, Comparison)>,
+    /// Indices of the images of drives.
+    of_drives: BTreeSet<usize>,
+}
+
+impl Compared {
+    fn of_poses(&self) -> Vec<(usize, Comparison)> {
+        let is_of_pose = |(i, _): &(usize, &(usize, Comparison))| !self.of_drives.contains(i);
+        self.all.iter().enumerate().filter(is_of_pose).map(|(_, compared)| compared.clone()).collect()
+    }
 }
 
 struct Work {
@@ -92,8 +114,8 @@ impl Work {
         scenario: &Scenario,
         count: usize,
         on_progress: &dyn Fn(&Progress),
-    ) -> Result<Vec<(usize, Comparison)>, TrainingError> {
-        let mut all = Vec::new();
+    ) -> Result<Compared, TrainingError> {
+        let Compared { mut all, mut of_drives } = Compared::default();
         for number in 0..count {
             let pose = scenario.free_pose(number as u64, self.seed)?;
             for (branch, view) in pose.views.iter().enumerate() {
@@ -102,11 +124,14 @@ impl Work {
             }
             for branch in 0..pose.views.len() {
                 let drive = number * pose.views.len() + branch;
-                all.extend(self.of_drive(scenario, drive as u64, number, all.len())?);
+                if let Some(compared) = self.of_drive(scenario, drive as u64, number, all.len())? {
+                    of_drives.insert(all.len());
+                    all.push(compared);
+                }
             }
             on_progress(&Progress { phase: "known", done: number + 1, total: count, line: String::new() });
         }
-        Ok(all)
+        Ok(Compared { all, of_drives })
     }
 
     /// Compares one image of a drive, whose camera is also where the vehicle is in no known state.
@@ -124,7 +149,7 @@ impl Work {
         Ok(self.compare(&camera, &rendered, image).map(|compared| (state, compared)))
     }
 
-    fn trained_poses(&mut self, posed: &PosedImages, on_progress: &dyn Fn(&Progress)) -> Vec<(usize, Comparison)> {
+    fn trained_poses(&mut self, posed: &PosedImages, on_progress: &dyn Fn(&Progress)) -> Compared {
         let images = posed.with_roles(&[PoseRole::Rest]);
         let mut all = Vec::new();
         for (done, &i) in images.iter().enumerate() {
@@ -132,7 +157,7 @@ impl Work {
             all.extend(compared.map(|compared| (posed.labels[i].state, compared)));
             on_progress(&Progress { phase: "known", done: done + 1, total: images.len(), line: String::new() });
         }
-        all
+        Compared { all, ..Compared::default() }
     }
 
     /// Compares an image with sensor noise; `None` if the camera sees no lane.

@@ -150,13 +150,14 @@ impl Comparer {
         };
         if !self.shown.as_ref().is_some_and(is_shown) {
             let options = RenderOptions { threads: threads.max(1), ..QUICK };
-            let pixels: Vec<usize> = (0..judged.len()).filter(|&i| judged[i]).collect();
+            let compared = |i| judged[i] || is_sample(i, width);
+            let pixels: Vec<usize> = (0..judged.len()).filter(|&i| compared(i)).collect();
             self.own_pixels = lanes.own_pixels(&small, &pixels);
             let without_own = self.without_own.as_ref().unwrap_or(field);
-            let compared = |i| judged[i] || is_sample(i, width);
             without_own.render_hypotheses_where(&small, states, compared, &options, &mut self.buffer);
-            let is_own = |i| self.own_pixels.binary_search(&i).is_ok();
-            if !self.own_pixels.is_empty() {
+            let own = &self.own_pixels;
+            let is_own = |i| judged[i] && own.binary_search(&i).is_ok();
+            if !own.is_empty() {
                 field.render_hypotheses_where(&small, states, is_own, &options, &mut self.with_own);
             }
             self.shown = Some((small, judged.clone(), states.to_vec()));
@@ -170,7 +171,8 @@ impl Comparer {
     pub fn align(&self, last: &Comparison, scene: KnownScene) -> Option<Comparison> {
         let shown = self.buffer.images.first().filter(|shown| shown.changing.len() >= last.judged.len())?;
         let (width, height) = (last.camera.width_px as usize, last.camera.height_px as usize);
-        let is_still = |&i: &usize| (last.judged[i] || is_sample(i, width)) && !shown.changing[i];
+        let is_compared = |i: usize| last.judged[i] || is_sample(i, width);
+        let is_still = |&i: &usize| is_compared(i) && !shown.changing[i] && !self.is_own(i);
         let still: Vec<usize> = (0..last.judged.len()).filter(is_still).collect();
         let moved = align(View { rgb: &last.image, width, height }, &shown.rgb, &still)?;
         let aligned = self.compared(last.camera, moved, last.ground.clone(), last.judged.clone(), scene);
@@ -192,7 +194,8 @@ impl Comparer {
         let (images, width) = (&self.buffer.images, camera.width_px as usize);
         judged.iter_mut().zip(image.chunks_exact(3)).for_each(|(judged, rgb)| *judged &= !rgb[0].is_nan());
         let still = |counts: &dyn Fn(usize) -> bool| -> Vec<usize> {
-            let is_still = |&i: &usize| counts(i) && !images[0].changing[i] && !image[i * 3].is_nan();
+            let is_still =
+                |&i: &usize| counts(i) && !images[0].changing[i] && !self.is_own(i) && !image[i * 3].is_nan();
             (0..judged.len()).filter(is_still).collect()
         };
         let samples = still(&|i| is_sample(i, width));
@@ -209,6 +212,11 @@ impl Comparer {
         let residual = |energy: &[BothResiduals], kind| median_residual(energy, kind, &judged, width, fit.noise);
         let residuals = energies.iter().map(|energy| ResidualKind::ALL.map(|kind| residual(energy, kind))).collect();
         Comparison { camera, image, fit, ground, judged, is_moved: false, residuals }
+    }
+
+    /// Reports whether a compared pixel looks at a place of the vehicle itself.
+    fn is_own(&self, pixel: usize) -> bool {
+        self.own_pixels.binary_search(&pixel).is_ok()
     }
 
     /// Lets the vehicle itself explain the pixels that look at it.
@@ -232,7 +240,7 @@ impl Comparer {
         let rendered: Vec<Vec<f32>> = self.buffer.images.iter().zip(&self.with_own.images).map(with_own).collect();
         let rendered: Vec<&[f32]> = rendered.iter().map(Vec::as_slice).collect();
         let mut near = vec![false; judged.len()];
-        for &i in own {
+        for &i in own.iter().filter(|i| judged[**i]) {
             near[i] = true;
         }
         let mut near = grown(&near, width, 1);

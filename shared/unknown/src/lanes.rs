@@ -244,7 +244,7 @@ mod tests {
         // Seen from above: 5 m x 3 m at the height of the roof, of 18 m x 18 m.
         let above = share([0.0, 0.0, 10.0], [0.0; 3]);
         assert!((above - 15.0 / 324.0).abs() < 0.02, "{above}");
-        assert!((0.1..0.9).contains(&share([2.2, 0.0, 0.8], [0.0; 3])), "beside it");
+        assert!(share([2.2, 0.0, 0.8], [0.0; 3]) > 0.9, "beside it");
         assert!((0.3..0.7).contains(&share([0.0, 0.0, 1.2], [9.0, 0.0, 1.2])), "on it, ahead");
         assert_eq!(share([1.9, 0.0, 0.8], [0.0; 3]), 0.0, "in its place");
     }
