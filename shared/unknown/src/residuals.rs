@@ -136,13 +136,12 @@ fn told_apart(states: &[&[f32]]) -> Vec<bool> {
 
 /// Lets each state explain some pixels as any state does that agrees about the hazard. `energies` has one entry a state.
 pub fn explain_together(energies: &mut [Vec<BothResiduals>], pixels: &[usize], hazard_states: &[bool]) {
-    for &i in pixels {
-        for hazard in [false, true] {
-            let is_of_side = |state: usize| hazard_states.get(state).copied().unwrap_or(false) == hazard;
-            let side = || (0..energies.len()).filter(|state| is_of_side(*state));
-            let Some(least) = side().map(|state| energies[state][i]).reduce(smaller) else { continue };
-            let side: Vec<usize> = side().collect();
-            for state in side {
+    for hazard in [false, true] {
+        let is_of_side = |state: &usize| hazard_states.get(*state).copied().unwrap_or(false) == hazard;
+        let side: Vec<usize> = (0..energies.len()).filter(is_of_side).collect();
+        for &i in pixels {
+            let Some(least) = side.iter().map(|&state| energies[state][i]).reduce(smaller) else { break };
+            for &state in &side {
                 energies[state][i] = least;
             }
         }
