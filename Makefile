@@ -86,8 +86,8 @@ EVAL = $(TARGET)/release/carff eval configs/checkpoints/$(CHECKPOINT) --out repo
 results: build ## Make the tables of docs/RESULTS.md for CHECKPOINT (default approaching-intersection) in reports/results (hours)
 	$(EVAL)/tables $(addprefix --only ,psnr encoder recall planning frequencies images) --seed $(SEED)
 	$(EVAL)/trials --only trials --seed 29
-	$(EVAL)/robustness --only robustness --free-poses 40 --free-drives 1000 --seed 53
-	$(EVAL)/memory --only memory --free-drives 400 --seed 71
+	$(EVAL)/robustness --only robustness --free-poses 40 --free-drives 1000 --seed 71
+	$(EVAL)/memory --only memory --free-drives 400 --seed 163
 	$(EVAL)/localisation --only localisation --seed 7 --threads 1
 	for rule in always-halt always-advance calibrated phantom peek look oracle; do \
 		$(TARGET)/release/carff drive $(CHECKPOINT) --checkpoint configs/checkpoints/$(CHECKPOINT) --rule $$rule \

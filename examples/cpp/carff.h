@@ -237,7 +237,7 @@ static_assert(offsetof(CarffImageCheck, change) == 68, "CarffImageCheck.change")
 static_assert(offsetof(CarffImageCheck, covered) == 72, "CarffImageCheck.covered");
 static_assert(offsetof(CarffImageCheck, repeats_s) == 76, "CarffImageCheck.repeats_s");
 
-#define CARFF_FORECAST_TYPE_NAME "carff.Forecast.v3"
+#define CARFF_FORECAST_TYPE_NAME "carff.Forecast.v4"
 typedef struct CarffForecast {
     CarffHeader header;
     uint32_t source;
@@ -247,7 +247,8 @@ typedef struct CarffForecast {
     int32_t resolved_state;
     float path_probability;
     uint64_t images;
-    uint64_t state_count;
+    uint32_t state_count;
+    float hazard_by_places;
     float state_weights[64];
     float weights[8];
     CarffGaussian components[8];
@@ -267,6 +268,7 @@ static_assert(offsetof(CarffForecast, resolved_state) == 72, "CarffForecast.reso
 static_assert(offsetof(CarffForecast, path_probability) == 76, "CarffForecast.path_probability");
 static_assert(offsetof(CarffForecast, images) == 80, "CarffForecast.images");
 static_assert(offsetof(CarffForecast, state_count) == 88, "CarffForecast.state_count");
+static_assert(offsetof(CarffForecast, hazard_by_places) == 92, "CarffForecast.hazard_by_places");
 static_assert(offsetof(CarffForecast, state_weights) == 96, "CarffForecast.state_weights");
 static_assert(offsetof(CarffForecast, weights) == 352, "CarffForecast.weights");
 static_assert(offsetof(CarffForecast, components) == 384, "CarffForecast.components");
@@ -353,10 +355,10 @@ static_assert(offsetof(CarffUnknownBox, half_size) == 24, "CarffUnknownBox.half_
 static_assert(offsetof(CarffUnknownBox, probability) == 48, "CarffUnknownBox.probability");
 static_assert(offsetof(CarffUnknownBox, place) == 52, "CarffUnknownBox.place");
 
-#define CARFF_UNKNOWNS_TYPE_NAME "carff.Unknowns.v3"
+#define CARFF_UNKNOWNS_TYPE_NAME "carff.Unknowns.v4"
 typedef struct CarffUnknowns {
     CarffHeader header;
-    uint32_t box_count;
+    uint64_t box_count;
     uint32_t state_count;
     uint32_t place_count;
     float probability;
@@ -367,7 +369,6 @@ typedef struct CarffUnknowns {
     float explained;
     float ratios[64];
     float places[48];
-    float prior;
     CarffUnknownBox boxes[8];
     uint64_t stage_latency_ns;
 } CarffUnknowns;
@@ -375,17 +376,16 @@ typedef struct CarffUnknowns {
 static_assert(sizeof(CarffUnknowns) == 1016, "CarffUnknowns");
 static_assert(offsetof(CarffUnknowns, header) == 0, "CarffUnknowns.header");
 static_assert(offsetof(CarffUnknowns, box_count) == 56, "CarffUnknowns.box_count");
-static_assert(offsetof(CarffUnknowns, state_count) == 60, "CarffUnknowns.state_count");
-static_assert(offsetof(CarffUnknowns, place_count) == 64, "CarffUnknowns.place_count");
-static_assert(offsetof(CarffUnknowns, probability) == 68, "CarffUnknowns.probability");
-static_assert(offsetof(CarffUnknowns, residual) == 72, "CarffUnknowns.residual");
-static_assert(offsetof(CarffUnknowns, noise) == 76, "CarffUnknowns.noise");
-static_assert(offsetof(CarffUnknowns, gain) == 80, "CarffUnknowns.gain");
-static_assert(offsetof(CarffUnknowns, offset) == 92, "CarffUnknowns.offset");
-static_assert(offsetof(CarffUnknowns, explained) == 104, "CarffUnknowns.explained");
-static_assert(offsetof(CarffUnknowns, ratios) == 108, "CarffUnknowns.ratios");
-static_assert(offsetof(CarffUnknowns, places) == 364, "CarffUnknowns.places");
-static_assert(offsetof(CarffUnknowns, prior) == 556, "CarffUnknowns.prior");
+static_assert(offsetof(CarffUnknowns, state_count) == 64, "CarffUnknowns.state_count");
+static_assert(offsetof(CarffUnknowns, place_count) == 68, "CarffUnknowns.place_count");
+static_assert(offsetof(CarffUnknowns, probability) == 72, "CarffUnknowns.probability");
+static_assert(offsetof(CarffUnknowns, residual) == 76, "CarffUnknowns.residual");
+static_assert(offsetof(CarffUnknowns, noise) == 80, "CarffUnknowns.noise");
+static_assert(offsetof(CarffUnknowns, gain) == 84, "CarffUnknowns.gain");
+static_assert(offsetof(CarffUnknowns, offset) == 96, "CarffUnknowns.offset");
+static_assert(offsetof(CarffUnknowns, explained) == 108, "CarffUnknowns.explained");
+static_assert(offsetof(CarffUnknowns, ratios) == 112, "CarffUnknowns.ratios");
+static_assert(offsetof(CarffUnknowns, places) == 368, "CarffUnknowns.places");
 static_assert(offsetof(CarffUnknowns, boxes) == 560, "CarffUnknowns.boxes");
 static_assert(offsetof(CarffUnknowns, stage_latency_ns) == 1008, "CarffUnknowns.stage_latency_ns");
 

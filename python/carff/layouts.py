@@ -224,7 +224,8 @@ class Forecast(ctypes.Structure):
         ("resolved_state", ctypes.c_int32),
         ("path_probability", ctypes.c_float),
         ("images", ctypes.c_uint64),
-        ("state_count", ctypes.c_uint64),
+        ("state_count", ctypes.c_uint32),
+        ("hazard_by_places", ctypes.c_float),
         ("state_weights", (ctypes.c_float * 64)),
         ("weights", (ctypes.c_float * 8)),
         ("components", (Gaussian * 8)),
@@ -236,7 +237,7 @@ class Forecast(ctypes.Structure):
 
     @staticmethod
     def type_name() -> str:
-        return "carff.Forecast.v3"
+        return "carff.Forecast.v4"
 
 
 class ProbeResult(ctypes.Structure):
@@ -299,7 +300,7 @@ class UnknownBox(ctypes.Structure):
 class Unknowns(ctypes.Structure):
     _fields_ = [
         ("header", Header),
-        ("box_count", ctypes.c_uint32),
+        ("box_count", ctypes.c_uint64),
         ("state_count", ctypes.c_uint32),
         ("place_count", ctypes.c_uint32),
         ("probability", ctypes.c_float),
@@ -310,14 +311,13 @@ class Unknowns(ctypes.Structure):
         ("explained", ctypes.c_float),
         ("ratios", (ctypes.c_float * 64)),
         ("places", (ctypes.c_float * 48)),
-        ("prior", ctypes.c_float),
         ("boxes", (UnknownBox * 8)),
         ("stage_latency_ns", ctypes.c_uint64),
     ]
 
     @staticmethod
     def type_name() -> str:
-        return "carff.Unknowns.v3"
+        return "carff.Unknowns.v4"
 
 
 class Occupancy(ctypes.Structure):
@@ -433,11 +433,11 @@ LAYOUTS = {
     Gaussian: (64, 4, {"mean": 0, "log_variance": 32}),
     Posterior: (136, 8, {"header": 0, "gaussian": 56, "take_start": 120, "stage_latency_ns": 128}),
     ImageCheck: (80, 8, {"header": 0, "condition": 56, "luminance": 60, "sharpness": 64, "change": 68, "covered": 72, "repeats_s": 76}),
-    Forecast: (3024, 8, {"header": 0, "source": 56, "component_count": 60, "sample_count": 64, "horizon": 68, "resolved_state": 72, "path_probability": 76, "images": 80, "state_count": 88, "state_weights": 96, "weights": 352, "components": 384, "samples": 896, "sample_component": 2944, "encoder_ns": 3008, "stage_latency_ns": 3016}),
+    Forecast: (3024, 8, {"header": 0, "source": 56, "component_count": 60, "sample_count": 64, "horizon": 68, "resolved_state": 72, "path_probability": 76, "images": 80, "state_count": 88, "hazard_by_places": 92, "state_weights": 96, "weights": 352, "components": 384, "samples": 896, "sample_component": 2944, "encoder_ns": 3008, "stage_latency_ns": 3016}),
     ProbeResult: (204, 4, {"state": 0, "confidence": 4, "hazard_likelihood": 8, "occupancies": 12}),
     Belief: (19328, 8, {"header": 0, "horizon": 56, "state_count": 60, "place_count": 64, "component_count": 68, "sample_count": 72, "is_final": 76, "state_probability": 80, "hazard_probability": 336, "path_probability": 340, "component_weights": 344, "components": 376, "samples": 2008, "sample_component": 15064, "resolved_state": 15128, "unknown_probability": 15132, "resolved": 15136, "fed_back": 15200, "fed_back_count": 19296, "encoder_ns": 19304, "forecaster_ns": 19312, "stage_latency_ns": 19320}),
     UnknownBox: (56, 8, {"center": 0, "half_size": 24, "probability": 48, "place": 52}),
-    Unknowns: (1016, 8, {"header": 0, "box_count": 56, "state_count": 60, "place_count": 64, "probability": 68, "residual": 72, "noise": 76, "gain": 80, "offset": 92, "explained": 104, "ratios": 108, "places": 364, "prior": 556, "boxes": 560, "stage_latency_ns": 1008}),
+    Unknowns: (1016, 8, {"header": 0, "box_count": 56, "state_count": 64, "place_count": 68, "probability": 72, "residual": 76, "noise": 80, "gain": 84, "offset": 96, "explained": 108, "ratios": 112, "places": 368, "boxes": 560, "stage_latency_ns": 1008}),
     Occupancy: (4184, 8, {"header": 0, "columns": 56, "rows": 60, "cell_m": 64, "low_corner_m": 68, "unknown_probability": 76, "probability": 80, "stage_latency_ns": 4176}),
     LookGain: (96, 8, {"header": 0, "gain_bits": 56, "ahead_m": 60, "clear_m": 64, "vehicles": 68, "vehicle_m": 72, "vehicle_within_m": 80, "vehicle_heading_rad": 84, "vehicle_mps": 88, "has_vehicle_mps": 92}),
     ViewMeta: (280, 8, {"header": 0, "hypothesis": 56, "kind": 60, "state": 64, "width_px": 68, "height_px": 72, "probability": 76, "latent": 80, "intrinsics": 112, "world_from_camera": 144, "stage_latency_ns": 272}),

@@ -268,7 +268,7 @@ impl Records {
         self.unknown.take(unknowns);
         Self::note_time(&mut self.compare_ns, unknowns.stage_latency_ns, self.wanted.keep);
         if let Some(frame) = self.frames.get_mut(&unknowns.header.frame_id) {
-            frame.image = Some(ImageEvidence::from(unknowns).after(f64::from(unknowns.prior)));
+            frame.image = Some(ImageEvidence::from(unknowns));
         }
     }
 

@@ -1,6 +1,6 @@
 //! The last images of a take, so that a comparison that comes late still counts.
 
-use carff_decision::{Mixture, TakeFrame, TakeMemory};
+use carff_decision::{Mixture, RememberedStates, TakeFrame, TakeMemory};
 use std::collections::VecDeque;
 
 /// Number of images that are kept: those that a restarted forecaster gets from shared memory.
@@ -32,8 +32,8 @@ pub struct Remembered {
     pub frame: u64,
     /// Forecast from all images of the take so far.
     pub forecast: Mixture,
-    /// Weights of the present states.
-    pub states: Vec<f32>,
+    /// The states.
+    pub states: RememberedStates,
     /// Number of these images.
     pub images: u64,
 }
@@ -65,7 +65,7 @@ impl TakeHistory {
             oldest.count_in(&mut self.before);
         }
         let (all, images) = self.memory.see(frame, &forecast);
-        let states = self.memory.state_weights();
+        let states = self.memory.remembered();
         let places = self.early.iter().position(|(of, _)| *of == frame.frame).and_then(|i| self.early.remove(i));
         let places = places.map(|(_, places)| places);
         if let Some(places) = &places {
@@ -140,11 +140,14 @@ mod tests {
                 (frame - 9..=frame).rev().for_each(|frame| late.compare(frame, places(frame)));
             }
         }
-        let [a, b, c] = [early, in_time, late].map(|history| history.memory.state_weights());
+        let [a, b, c] = [early, in_time, late].map(|history| history.memory.remembered());
         assert_eq!((&a, &a), (&b, &c));
         let mut first = history();
         first.compare(0, vec![1.0]);
         let (taken, forecast) = image(0);
-        assert!(first.see(taken, forecast).states[1] < 0.65 && first.memory.state_weights()[1] > 0.9);
+        let before = first.see(taken, forecast).states;
+        assert!(before.weights[1] < 0.65 && before.hazard_by_places == 0.5);
+        let after = first.memory.remembered();
+        assert!(after.weights[1] > 0.9 && after.hazard_by_places > 0.9);
     }
 }

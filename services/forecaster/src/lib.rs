@@ -124,8 +124,9 @@ impl Forecaster {
     fn set_states(&self, forecast: &mut Forecast) {
         let frame = forecast.header.frame_id;
         if let Some(Remembered { states, .. }) = self.remembered.as_ref().filter(|last| last.frame == frame) {
-            forecast.state_count = states.len().min(MAX_STATES) as u64;
-            forecast.state_weights.iter_mut().zip(states).for_each(|(to, weight)| *to = *weight);
+            forecast.state_count = states.weights.len().min(MAX_STATES) as u32;
+            forecast.hazard_by_places = states.hazard_by_places;
+            forecast.state_weights.iter_mut().zip(&states.weights).for_each(|(to, weight)| *to = *weight);
         }
     }
 

@@ -166,7 +166,7 @@ impl Frames {
             )
         })?;
         Ok(if self.is_late {
-            self.images.evidence_before(forecast.header.frame_id, taken.take_start)
+            self.images.evidence_before(forecast, taken.take_start, layout)
         } else {
             self.images.evidence(forecast, layout)
         })

@@ -1,7 +1,7 @@
 //! The comparison of camera images with the known states.
 
 use carff_checkpoint::{CheckpointPlanning, FieldProbe};
-use carff_decision::{ImageEvidence, ImageMemory, MemorySettings, Place, ProbeLayout};
+use carff_decision::{ImageEvidence, MemorySettings, Place, ProbeLayout, RememberedStates};
 use carff_field::Field;
 use carff_messages::{Forecast, FrameMeta, Header, LATENT_DIM, MAX_PLACES, MAX_STATES, Unknowns};
 use carff_unknown::{Comparer, Known, Lanes, PlaceViews, Seen, Sighting};
@@ -24,19 +24,8 @@ pub struct Images {
     sighting: Option<(u64, Sighting)>,
     /// Evidence while no image of a take has been compared.
     nothing_yet: ImageEvidence,
-    /// `None` if each image counts by itself.
-    memory: Option<Remembered>,
-}
-
-/// The part of the images that a belief with a memory rests on.
-#[derive(Debug)]
-struct Remembered {
-    settings: MemorySettings,
-    /// The places that each image is searched for.
-    places: PlaceViews,
-    /// Comparisons of the take so far, and the take's first frame.
-    images: ImageMemory,
-    take_start: u64,
+    /// For a belief with a memory: its learned numbers, and the places that each image is searched for.
+    memory: Option<(MemorySettings, PlaceViews)>,
 }
 
 /// A compared frame.
@@ -58,7 +47,6 @@ impl Images {
     pub fn load(checkpoint: &Path, probe: &FieldProbe, remembers: bool) -> anyhow::Result<Option<Self>> {
         let Some(known) = Known::load(checkpoint)? else { return Ok(None) };
         let learned = if remembers { CheckpointPlanning::load(checkpoint)?.memory } else { None };
-        let hazards = probe.layout().hazard_states().to_vec();
         let places = probe.layout().places().iter();
         let boxes = places.map(|place| (place.oriented_box, place.occupied_in.as_slice()));
         Ok(Some(Self {
@@ -66,13 +54,8 @@ impl Images {
             states: probe.states().iter().map(|state| state.mean).collect(),
             compared: VecDeque::with_capacity(REMEMBERED),
             sighting: None,
-            nothing_yet: ImageEvidence::unexplained(hazards.len()),
-            memory: learned.map(|learned| Remembered {
-                settings: learned.settings,
-                places: PlaceViews::new(boxes, &known.lanes.own),
-                images: ImageMemory::new(hazards, learned.settings),
-                take_start: 0,
-            }),
+            nothing_yet: ImageEvidence::unexplained(probe.layout().state_count()),
+            memory: learned.map(|learned| (learned.settings, PlaceViews::new(boxes, &known.lanes.own))),
             known,
         }))
     }
@@ -87,10 +70,8 @@ impl Images {
     ) -> Option<Unknowns> {
         let mut unknowns = self.unknowns(probe, frame, image, threads);
         let evidence = unknowns.as_mut().map(|unknowns| {
-            let evidence = self.remembered(frame.take_start, ImageEvidence::from(&*unknowns));
-            let hazards = probe.layout().hazard_states();
-            unknowns.prior = evidence.prior_or_even(hazards) as f32;
-            unknowns.probability = evidence.unknown_probability(hazards) as f32;
+            let evidence = ImageEvidence::from(&*unknowns);
+            unknowns.probability = evidence.unknown_probability(probe.layout().hazard_states()) as f32;
             evidence
         });
         if self.compared.len() == REMEMBERED {
@@ -119,23 +100,13 @@ impl Images {
         (unknowns.noise, unknowns.explained) = (comparison.fit.noise, comparison.fit.explained);
         (unknowns.gain, unknowns.offset) = (comparison.fit.gain, comparison.fit.offset);
         describe(&seen, probe.layout().places(), &mut unknowns);
-        if let Some(memory) = &mut self.memory {
+        if let Some((_, places)) = &mut self.memory {
             let field = self.comparer.without_own(probe.field());
-            let shown = memory.places.look(field, &self.states, view, (&seen, &comparison), threads);
+            let shown = places.look(field, &self.states, view, (&seen, &comparison), threads);
             unknowns.place_count = shown.len().min(MAX_PLACES) as u32;
             unknowns.places.iter_mut().zip(shown).for_each(|(place, shown)| *place = shown);
         }
         Some(unknowns)
-    }
-
-    /// The evidence of an image after the earlier images of its take.
-    fn remembered(&mut self, take_start: u64, evidence: ImageEvidence) -> ImageEvidence {
-        let Some(memory) = &mut self.memory else { return evidence };
-        if memory.take_start != take_start {
-            memory.images.clear();
-            memory.take_start = take_start;
-        }
-        memory.images.see(evidence)
     }
 
     /// The field that renders the states without the vehicle itself.
@@ -157,20 +128,28 @@ impl Images {
     pub fn evidence(&self, forecast: &Forecast, layout: &ProbeLayout) -> Option<ImageEvidence> {
         let at_ns = forecast.header.capture_time_ns;
         let evidence = self.compared.iter().rev().find(|compared| compared.at_ns == at_ns)?.evidence.clone()?;
-        Some(match &self.memory {
-            Some(memory) => evidence.for_states(forecast.state_weights(), layout, &memory.settings),
-            None => evidence,
-        })
+        Some(self.with_memory(evidence, forecast, layout))
     }
 
-    /// The evidence of the frame of a take that was compared last before frame `frame_id`; `None` if it has no valid
+    /// The evidence of the frame of a take that was compared last before a forecast's frame; `None` if it has no valid
     /// pose. Without a comparison in the take, or after a pause, something unknown is nearly certain.
-    pub fn evidence_before(&self, frame_id: u64, take_start: u64) -> Option<ImageEvidence> {
+    pub fn evidence_before(&self, forecast: &Forecast, take_start: u64, layout: &ProbeLayout) -> Option<ImageEvidence> {
+        let frame_id = forecast.header.frame_id;
         let counts = |compared: &&Compared| {
             compared.take_start == take_start && ImageEvidence::counts_later(compared.frame_id, frame_id)
         };
         let before = self.compared.iter().rev().find(counts);
-        before.map_or_else(|| Some(self.nothing_yet.clone()), |compared| compared.evidence.clone())
+        let evidence = before.map_or_else(|| Some(self.nothing_yet.clone()), |compared| compared.evidence.clone());
+        // The memory has counted the places of earlier images.
+        evidence.map(|evidence| self.with_memory(evidence.with_places(&[]), forecast, layout))
+    }
+
+    /// Evidence for the belief of a forecast: with what the forecaster's memory holds, if there is one.
+    fn with_memory(&self, evidence: ImageEvidence, forecast: &Forecast, layout: &ProbeLayout) -> ImageEvidence {
+        let Some((settings, _)) = &self.memory else { return evidence };
+        let weights = forecast.state_weights().to_vec();
+        let remembered = RememberedStates { weights, hazard_by_places: forecast.hazard_by_places };
+        evidence.with_memory(remembered, layout, settings)
     }
 }
 
@@ -181,7 +160,7 @@ fn describe(seen: &Seen, places: &[Place], unknowns: &mut Unknowns) {
     for (to, from) in unknowns.ratios.iter_mut().zip(&seen.ratios) {
         *to = *from;
     }
-    unknowns.box_count = seen.boxes.len() as u32;
+    unknowns.box_count = seen.boxes.len() as u64;
     for (to, from) in unknowns.boxes.iter_mut().zip(&seen.boxes) {
         let is_inside = |place: &Place| {
             let [x, y, _] = from.center;

@@ -144,7 +144,8 @@ fn places_weigh_a_belief_with_a_memory() {
     images.compare(&probe, &of_lane(1), image_from(&lane(), &probe, hazard).view(), 1).unwrap();
     let with_memory = |weights: &[f32]| {
         let mut forecast = forecast(1, 100);
-        forecast.state_count = weights.len() as u64;
+        forecast.state_count = weights.len() as u32;
+        forecast.hazard_by_places = 0.5;
         forecast.state_weights[..weights.len()].copy_from_slice(weights);
         images.evidence(&forecast, probe.layout()).unwrap().weigh(0.1, probe.layout().hazard_states()).0
     };
@@ -164,7 +165,7 @@ fn evidence_of_the_frame_before() {
         assert!(images.compare(&probe, &meta, image.view(), 1).is_some());
     }
     let own = |id: u64| images.evidence(&forecast(id, 100 * id), probe.layout());
-    let before = |frame_id, take_start| images.evidence_before(frame_id, take_start);
+    let before = |id: u64, take_start| images.evidence_before(&forecast(id, 100 * id), take_start, probe.layout());
     assert!(own(1).is_some() && own(1) != own(2));
     assert_eq!([before(2, 1), before(3, 1), before(7, 1), before(4, 3)], [own(1), own(2), own(2), own(3)]);
     let nothing = ImageEvidence::unexplained(probe.states().len());

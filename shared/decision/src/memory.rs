@@ -44,6 +44,15 @@ impl MemorySettings {
     }
 }
 
+/// Content of a memory at an image, before the image is compared with the known states.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct RememberedStates {
+    /// Weights of the present states; they sum to 1. Empty without a memory.
+    pub weights: Vec<f32>,
+    /// Hazard probability of the next state by the places only, 0..=1: what the field has seen, without the encoder.
+    pub hazard_by_places: f32,
+}
+
 /// Memory of one camera's frames.
 ///
 /// ```
@@ -73,17 +82,16 @@ impl MemorySettings {
 #[derive(Clone, Debug)]
 pub struct Memory {
     states: Vec<Gaussian>,
-    /// For each place, the states that take it.
-    taken_in: Vec<Vec<bool>>,
+    layout: ProbeLayout,
     /// For each state, the probabilities of the next one.
     moves: Vec<Vec<f64>>,
     /// Probability of each next state before any image.
     prior: Vec<f64>,
     settings: MemorySettings,
-    /// Natural logarithm of the weight of each present state.
-    log_weight: Vec<f64>,
-    /// The last image's evidence for each state, by its forecast and by the places.
-    last: [Vec<f64>; 2],
+    /// By all evidence.
+    all: Carried,
+    /// By the places only.
+    by_places: Carried,
     /// The last image's components that are far from all known states, with their weights.
     far: Vec<(f64, Gaussian)>,
 }
@@ -103,32 +111,25 @@ impl Memory {
             shares.iter().map(|s| s + other / shares.len() as f64).collect::<Vec<f64>>()
         };
         let moves: Vec<Vec<f64>> = states.iter().map(share).collect();
-        let taken_in = layout.places().iter().map(|place| place.occupied_in.clone()).collect();
         let count = states.len();
         let prior = moved(&moves, &vec![1.0 / count.max(1) as f64; count]);
-        let (log_weight, last) = (vec![0.0; count], [vec![0.0; count], vec![0.0; count]]);
-        Self { states, taken_in, moves, prior, settings, log_weight, last, far: Vec::new() }
+        let (all, by_places) = (Carried::even(count), Carried::even(count));
+        Self { states, layout: layout.clone(), moves, prior, settings, all, by_places, far: Vec::new() }
     }
 
     /// Forgets everything: the next image starts a new take.
     pub fn clear(&mut self) {
-        self.log_weight.fill(0.0);
-        for last in &mut self.last {
-            last.fill(0.0);
+        for carried in [&mut self.all, &mut self.by_places] {
+            *carried = Carried::even(self.states.len());
         }
         self.far.clear();
     }
 
     /// Moves the belief by one time step.
     pub fn advance(&mut self) {
-        let weights = self.states();
-        let after = moved(&self.moves, &weights);
-        for last in &mut self.last {
-            let carried: Vec<f64> = weights.iter().zip(last.iter()).map(|(weight, last)| weight * last).collect();
-            let sums = moved(&self.moves, &carried);
-            *last = sums.iter().zip(&after).map(|(sum, weight)| sum / weight.max(f64::MIN_POSITIVE)).collect();
+        for carried in [&mut self.all, &mut self.by_places] {
+            carried.advance(&self.moves);
         }
-        self.log_weight = after.iter().map(|weight| weight.max(SMALLEST).ln()).collect();
     }
 
     /// Weighs the belief by the forecast of a new image, and returns the forecast from all images so far. Components
@@ -145,7 +146,7 @@ impl Memory {
             known * (ratio * (1.0 - distrust) + distrust).ln()
         };
         let evidence = self.moves.iter().map(evidence).collect();
-        self.count(0, evidence);
+        self.all.count(FORECAST, evidence, &self.settings);
         let far = |(_, component): &(&f32, &Gaussian)| nearest(&self.states, component) > LARGEST_DISTANCE;
         let components = image.weights.iter().zip(&image.components).filter(far);
         self.far = components.map(|(weight, component)| (f64::from(*weight), *component)).collect();
@@ -156,9 +157,13 @@ impl Memory {
     /// forecast from all images so far.
     pub fn compare(&mut self, places: &[f64]) -> Mixture {
         let mut evidence = vec![0.0; self.states.len()];
-        for (taken_in, shown) in self.taken_in.iter().zip(places) {
+        for (place, shown) in self.layout.places().iter().zip(places) {
             let of_place = self.settings.place_strength * shown;
-            evidence.iter_mut().zip(taken_in).filter(|(_, taken)| **taken).for_each(|(sum, _)| *sum += of_place);
+            evidence
+                .iter_mut()
+                .zip(&place.occupied_in)
+                .filter(|(_, taken)| **taken)
+                .for_each(|(sum, _)| *sum += of_place);
         }
         // Relative to the mean likelihood, so that evidence that repeats is the same for all states.
         let largest = evidence.iter().copied().fold(f64::NEG_INFINITY, f64::max);
@@ -166,28 +171,24 @@ impl Memory {
         for of_state in &mut evidence {
             *of_state -= largest + mean.ln();
         }
-        self.count(1, evidence);
+        self.by_places.count(PLACES, evidence.clone(), &self.settings);
+        self.all.count(PLACES, evidence, &self.settings);
         self.forecast()
-    }
-
-    /// Counts evidence of one kind for each state.
-    fn count(&mut self, kind: usize, evidence: Vec<f64>) {
-        for ((log_weight, new), last) in self.log_weight.iter_mut().zip(&evidence).zip(&self.last[kind]) {
-            *log_weight += new - self.settings.repeated(*new, *last);
-        }
-        self.last[kind] = evidence;
-        let weights = self.states();
-        self.log_weight = weights.iter().map(|weight| weight.max(SMALLEST).ln()).collect();
     }
 
     /// Weights of the present states; they sum to 1.
     pub fn states(&self) -> Vec<f64> {
-        normalised_exp(&self.log_weight)
+        self.all.weights()
     }
 
-    /// Weights of the present states as messages carry them.
-    pub fn state_weights(&self) -> Vec<f32> {
-        self.states().iter().map(|weight| *weight as f32).collect()
+    /// Returns the memory's content, as messages carry it.
+    pub fn remembered(&self) -> RememberedStates {
+        let next = moved(&self.moves, &self.by_places.weights());
+        let hazards = next.iter().zip(self.layout.hazard_states()).filter(|(_, hazard)| **hazard);
+        RememberedStates {
+            weights: self.states().iter().map(|weight| *weight as f32).collect(),
+            hazard_by_places: hazards.map(|(weight, _)| weight).sum::<f64>().min(1.0) as f32,
+        }
     }
 
     /// Weights of the next states; they sum to 1.
@@ -206,6 +207,56 @@ impl Memory {
         let sum: f64 = terms.iter().map(|(w, _)| w).sum();
         let (weights, components) = terms.into_iter().map(|(w, g)| ((w / sum) as f32, g)).unzip();
         Mixture { weights, components }
+    }
+}
+
+/// Kinds of evidence of an image: its forecast, and the places that it shows.
+const FORECAST: usize = 0;
+const PLACES: usize = 1;
+
+/// Weights of the present states, carried from image to image.
+#[derive(Clone, Debug)]
+struct Carried {
+    /// Natural logarithm of the weight of each state.
+    log_weight: Vec<f64>,
+    /// The last image's evidence of each kind for each state.
+    last: [Vec<f64>; 2],
+}
+
+impl Carried {
+    /// Equally probable states.
+    fn even(count: usize) -> Self {
+        Self { log_weight: vec![0.0; count], last: [vec![0.0; count], vec![0.0; count]] }
+    }
+
+    /// Moves the weights, and the evidence that later images may repeat, by one time step.
+    fn advance(&mut self, moves: &[Vec<f64>]) {
+        let weights = self.weights();
+        let after = moved(moves, &weights);
+        for last in &mut self.last {
+            let carried: Vec<f64> = weights.iter().zip(last.iter()).map(|(weight, last)| weight * last).collect();
+            let sums = moved(moves, &carried);
+            *last = sums.iter().zip(&after).map(|(sum, weight)| sum / weight.max(f64::MIN_POSITIVE)).collect();
+        }
+        self.set(&after);
+    }
+
+    /// Counts evidence of one kind for each state.
+    fn count(&mut self, kind: usize, evidence: Vec<f64>, settings: &MemorySettings) {
+        for ((log_weight, new), last) in self.log_weight.iter_mut().zip(&evidence).zip(&self.last[kind]) {
+            *log_weight += new - settings.repeated(*new, *last);
+        }
+        self.last[kind] = evidence;
+        self.set(&self.weights());
+    }
+
+    fn set(&mut self, weights: &[f64]) {
+        self.log_weight = weights.iter().map(|weight| weight.max(SMALLEST).ln()).collect();
+    }
+
+    /// Weights that sum to 1.
+    fn weights(&self) -> Vec<f64> {
+        normalised_exp(&self.log_weight)
     }
 }
 

@@ -1,6 +1,6 @@
 //! The memory of a take: its steps in time, and its cuts.
 
-use crate::{Memory, Mixture};
+use crate::{Memory, Mixture, RememberedStates};
 use carff_messages::Posterior;
 
 /// Length of a time step.
@@ -57,7 +57,8 @@ impl From<&Posterior> for TakeFrame {
 /// assert!(of_left.map(|(weight, _)| weight).sum::<f32>() > 0.9 && images == 2);
 /// // This image shows that the place is taken.
 /// memory.compare(1, &[1.0]);
-/// assert!(memory.state_weights()[1] > 0.1);
+/// let now = memory.remembered();
+/// assert!(now.weights[1] > 0.1 && now.hazard_by_places > 0.9);
 /// # Ok::<(), carff_decision::ProbingError>(())
 /// ```
 #[derive(Clone, Debug)]
@@ -112,9 +113,9 @@ impl TakeMemory {
         }
     }
 
-    /// Weights of the present states as messages carry them; they sum to 1.
-    pub fn state_weights(&self) -> Vec<f32> {
-        self.memory.state_weights()
+    /// Returns the memory's content, as messages carry it.
+    pub fn remembered(&self) -> RememberedStates {
+        self.memory.remembered()
     }
 
     /// Time steps from the start of the take to a frame.

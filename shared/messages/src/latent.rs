@@ -91,7 +91,7 @@ message!(Posterior);
 /// ```
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, ZeroCopySend)]
-#[type_name("carff.Forecast.v3")]
+#[type_name("carff.Forecast.v4")]
 pub struct Forecast {
     /// Header, at step 1 or more.
     pub header: Header,
@@ -110,7 +110,9 @@ pub struct Forecast {
     /// Number of images that the forecast rests on; 1 without a memory.
     pub images: u64,
     /// Number of states of the scenario, at most 64; 0 without a memory.
-    pub state_count: u64,
+    pub state_count: u32,
+    /// Hazard probability of the next state by what earlier images showed of the places, without the encoder, 0..=1.
+    pub hazard_by_places: f32,
     /// Weights of the present states by the images so far, without this frame's comparison; they sum to 1.
     pub state_weights: [f32; MAX_STATES],
     /// Mixture weights.
@@ -140,6 +142,7 @@ impl Forecast {
             path_probability: 1.0,
             images: 1,
             state_count: 0,
+            hazard_by_places: 0.0,
             state_weights: [0.0; MAX_STATES],
             weights: [0.0; MAX_COMPONENTS],
             components: [Gaussian::standard(); MAX_COMPONENTS],
@@ -161,7 +164,8 @@ impl Forecast {
         probability("path_probability", self.path_probability)?;
         let (components, samples) = (self.component_count as usize, self.sample_count as usize);
         distribution("weights", &self.weights[..components])?;
-        at_most("state_count", self.state_count, MAX_STATES as u64)?;
+        at_most("state_count", self.state_count.into(), MAX_STATES as u64)?;
+        probability("hazard_by_places", self.hazard_by_places)?;
         if self.state_count > 0 {
             distribution("state_weights", self.state_weights())?;
         }

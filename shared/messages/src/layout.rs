@@ -160,7 +160,6 @@ described!(Unknowns {
     explained,
     ratios,
     places,
-    prior,
     boxes,
     stage_latency_ns
 });
@@ -185,6 +184,7 @@ described!(Forecast {
     path_probability,
     images,
     state_count,
+    hazard_by_places,
     state_weights,
     weights,
     components,
@@ -289,7 +289,7 @@ mod tests {
         let pose = &frame.fields[4];
         assert_eq!((pose.name, pose.offset_bytes, &pose.shape[..]), ("world_from_camera", 96, &[16][..]));
         assert_eq!((pose.kind.type_name.as_str(), pose.kind.size_bytes), ("f64", 8));
-        let samples = Forecast::layout().fields.remove(12);
+        let samples = Forecast::layout().fields.remove(13);
         assert_eq!((samples.name, &samples.shape[..]), ("samples", &[64, 8][..]));
     }
 }

@@ -113,12 +113,12 @@ pub struct UnknownBox {
 /// ```
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, ZeroCopySend)]
-#[type_name("carff.Unknowns.v3")]
+#[type_name("carff.Unknowns.v4")]
 pub struct Unknowns {
     /// Header, at step 0.
     pub header: Header,
     /// Number of used boxes, at most 8.
-    pub box_count: u32,
+    pub box_count: u64,
     /// Number of states of the scenario, at most 64.
     pub state_count: u32,
     /// Number of probed places that were looked at, at most 48; 0 without a memory.
@@ -141,8 +141,6 @@ pub struct Unknowns {
     pub ratios: [f32; MAX_STATES],
     /// For each place, what the image shows of it: -1 for free, 1 for taken, 0 for nothing; -2..=2.
     pub places: [f32; MAX_PLACES],
-    /// Hazard probability before this image, from the comparisons of the take's earlier images, 0..=1.
-    pub prior: f32,
     /// Boxes, the most probable first.
     pub boxes: [UnknownBox; MAX_UNKNOWNS],
     /// Time from the arrival of the frame to sending, nanoseconds.
@@ -165,7 +163,6 @@ impl Unknowns {
             explained: 1.0,
             ratios: [1.0; MAX_STATES],
             places: [0.0; MAX_PLACES],
-            prior: 0.5,
             boxes: [UnknownBox::default(); MAX_UNKNOWNS],
             stage_latency_ns: 0,
         }
@@ -192,9 +189,8 @@ impl Unknowns {
         within("ratios", self.ratios(), 0.0, f32::MAX)?;
         at_most("place_count", self.place_count.into(), MAX_PLACES as u64)?;
         within("places", self.places(), -2.0, 2.0)?;
-        at_most("box_count", self.box_count.into(), MAX_UNKNOWNS as u64)?;
+        at_most("box_count", self.box_count, MAX_UNKNOWNS as u64)?;
         probability("probability", self.probability)?;
-        probability("prior", self.prior)?;
         finite("residual, noise and explained", [&self.residual, &self.noise, &self.explained])?;
         finite("gain and offset", self.gain.iter().chain(&self.offset))?;
         for unknown in self.boxes() {

@@ -10,8 +10,8 @@ use carff_dataset::{
     sensor::{SensorNoise, apply_noise_into},
 };
 use carff_decision::{
-    Evidence, Feedback, ForecastInput, ImageEvidence, ImageMemory, Memory, MemorySettings, Mixture, Plan, Policy,
-    ProbeLayout, Sampling, StepLength, TakeFrame, TakeMemory, look_ahead,
+    Evidence, Feedback, ForecastInput, ImageEvidence, Memory, MemorySettings, Mixture, Plan, Policy, ProbeLayout,
+    Sampling, StepLength, TakeFrame, TakeMemory, look_ahead,
 };
 use carff_field::Field;
 use carff_messages::{Gaussian, LATENT_DIM, Rule};
@@ -319,13 +319,12 @@ impl Perception<'_> {
     }
 }
 
-/// The belief's memory and that of the comparisons, for the frames of a drive.
+/// The memory over the frames of a drive.
 #[derive(Clone, Debug)]
 pub struct TakeMemories {
     layout: ProbeLayout,
     settings: MemorySettings,
-    forecasts: TakeMemory,
-    images: ImageMemory,
+    memory: TakeMemory,
 }
 
 impl TakeMemories {
@@ -333,22 +332,17 @@ impl TakeMemories {
     pub fn new(net: &dyn Forecasts, probe: &FieldProbe, settings: MemorySettings, frames_per_timestamp: u64) -> Self {
         let layout = probe.layout().clone();
         let memory = Memory::new(&layout, probe.states().to_vec(), |state| net.forecast(state), settings);
-        Self {
-            settings,
-            forecasts: TakeMemory::new(memory, StepLength::Frames(frames_per_timestamp)),
-            images: ImageMemory::new(layout.hazard_states().to_vec(), settings),
-            layout,
-        }
+        Self { settings, memory: TakeMemory::new(memory, StepLength::Frames(frames_per_timestamp)), layout }
     }
 
     /// Adds the trial of the next frame of a drive, and returns it with its memory.
     pub fn remember(&mut self, net: &dyn Forecasts, trial: Trial, frame_in_drive: u64) -> Trial {
         let frame = TakeFrame { take_start: 0, frame: frame_in_drive, capture_time_ns: 0 };
-        let (remembered, _) = self.forecasts.see(frame, &net.forecast(&trial.posterior));
-        let states = self.forecasts.state_weights();
+        let (remembered, _) = self.memory.see(frame, &net.forecast(&trial.posterior));
+        let states = self.memory.remembered();
         let image = trial.image.map(|image| {
-            self.forecasts.compare(frame_in_drive, image.places());
-            self.images.see(image).for_states(&states, &self.layout, &self.settings)
+            self.memory.compare(frame_in_drive, image.places());
+            image.with_memory(states, &self.layout, &self.settings)
         });
         Trial { image, remembered: Some(remembered), ..trial }
     }

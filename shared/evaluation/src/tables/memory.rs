@@ -6,9 +6,7 @@ use crate::trials::{
 };
 use crate::{Progress, Subject};
 use carff_checkpoint::FieldProbe;
-use carff_decision::{
-    Evidence, ImageEvidence, ImageMemory, Memory, MemorySettings, Mixture, ProbeLayout, Sampling, is_likely,
-};
+use carff_decision::{Evidence, ImageEvidence, Memory, MemorySettings, Mixture, ProbeLayout, Sampling, is_likely};
 use carff_trials::{RELIABILITY_BINS, SAMPLES, reliability};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -132,14 +130,13 @@ fn with_memory(
 ) -> (Vec<Weighed>, Vec<Weighed>) {
     let mut memory = memory.clone();
     memory.clear();
-    let mut images = ImageMemory::new(layout.hazard_states().to_vec(), *settings);
     let mut step = watch.frames.first().map_or(0, |frame| frame.timestamp);
     let seen = watch.frames.iter().map(|frame| {
         (step..frame.timestamp).for_each(|_| memory.advance());
         step = frame.timestamp;
-        let (before, states) = (memory.see(&frame.forecast), memory.state_weights());
+        let (before, states) = (memory.see(&frame.forecast), memory.remembered());
         let after = frame.image.as_ref().map_or_else(|| before.clone(), |image| memory.compare(image.places()));
-        let image = frame.image.clone().map(|image| images.see(image).for_states(&states, layout, settings));
+        let image = frame.image.clone().map(|image| image.with_memory(states, layout, settings));
         ((after, None), (before, image))
     });
     seen.unzip()

@@ -46,6 +46,8 @@ pub struct ForecastForm {
     pub images: u64,
     /// Weights of the present states; empty without a memory.
     pub state_weights: Vec<f32>,
+    /// Hazard probability of the next state by what earlier images showed of the places, without the encoder.
+    pub hazard_by_places: f32,
     /// The mixture.
     pub components: Vec<ComponentForm>,
     /// The drawn latents.
@@ -67,6 +69,7 @@ impl From<&Forecast> for ForecastForm {
             path_probability: f.path_probability,
             images: f.images,
             state_weights: f.state_weights().to_vec(),
+            hazard_by_places: f.hazard_by_places,
             components: f.weights[..components]
                 .iter()
                 .zip(&f.components)
@@ -105,7 +108,8 @@ impl TryFrom<&ForecastForm> for Forecast {
             resolved_state: signed(form.resolved_state),
             path_probability: form.path_probability,
             images: form.images,
-            state_count: form.state_weights.len() as u64,
+            state_count: form.state_weights.len() as u32,
+            hazard_by_places: form.hazard_by_places,
             state_weights: begin("state_weights", &form.state_weights, 0.0)?,
             weights: begin("components", &weights, 0.0)?,
             components: begin("components", &components, Gaussian::standard())?,

@@ -27,8 +27,6 @@ pub struct UnknownsForm {
     pub ratios: Vec<f32>,
     /// For each place, what the image shows of it: -1 for free, 1 for taken, 0 for nothing. Empty without a memory.
     pub places: Vec<f32>,
-    /// Hazard probability before this image, from the comparisons of the take's earlier images.
-    pub prior: f32,
     /// Boxes, the most probable first.
     pub boxes: Vec<UnknownBox>,
     /// Time from the arrival of the frame to sending, nanoseconds.
@@ -47,7 +45,6 @@ impl From<&Unknowns> for UnknownsForm {
             explained: unknowns.explained,
             ratios: unknowns.ratios().to_vec(),
             places: unknowns.places().to_vec(),
-            prior: unknowns.prior,
             boxes: unknowns.boxes().to_vec(),
             stage_latency_ns: unknowns.stage_latency_ns,
         }
@@ -60,7 +57,7 @@ impl TryFrom<&UnknownsForm> for Unknowns {
     fn try_from(form: &UnknownsForm) -> Result<Self, FormError> {
         let unknowns = Self {
             header: form.header,
-            box_count: form.boxes.len() as u32,
+            box_count: form.boxes.len() as u64,
             state_count: form.ratios.len() as u32,
             place_count: form.places.len() as u32,
             probability: form.probability,
@@ -71,7 +68,6 @@ impl TryFrom<&UnknownsForm> for Unknowns {
             explained: form.explained,
             ratios: begin("ratios", &form.ratios, 1.0)?,
             places: begin("places", &form.places, 0.0)?,
-            prior: form.prior,
             boxes: begin("boxes", &form.boxes, UnknownBox::default())?,
             stage_latency_ns: form.stage_latency_ns,
         };

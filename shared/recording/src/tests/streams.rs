@@ -130,7 +130,7 @@ fn boxes_are_all_shown() {
 fn unknown_boxes_replace_the_earlier_ones() {
     let unknowns = |frame_id: u64, probabilities: &[f32]| {
         let mut unknowns = Unknowns::of_frame(late(frame_id, 0));
-        unknowns.box_count = probabilities.len() as u32;
+        unknowns.box_count = probabilities.len() as u64;
         for (unknown, &probability) in unknowns.boxes.iter_mut().zip(probabilities) {
             *unknown = UnknownBox { center: [1.0, 2.0, 0.5], half_size: [1.0; 3], probability, place: -1 };
         }

@@ -1,7 +1,9 @@
 //! The memory over the frames of a run.
 
 use carff_checkpoint::FieldProbe;
-use carff_decision::{ImageEvidence, Memory, MemorySettings, Mixture, ProbeLayout, StepLength, TakeFrame, TakeMemory};
+use carff_decision::{
+    ImageEvidence, Memory, MemorySettings, Mixture, ProbeLayout, RememberedStates, StepLength, TakeFrame, TakeMemory,
+};
 use carff_inference::MixtureNet;
 use carff_messages::Gaussian;
 use std::collections::BTreeMap;
@@ -27,8 +29,8 @@ pub struct RunMemory {
 pub struct RememberedFrame {
     /// Forecast from all images of the take so far.
     pub forecast: Mixture,
-    /// Weights of the present states, as messages carry them.
-    states: Vec<f32>,
+    /// The states.
+    states: RememberedStates,
 }
 
 impl RunMemory {
@@ -44,7 +46,7 @@ impl RunMemory {
         let mut memory = TakeMemory::new(memory, step);
         let see = |taken: &TakenImage| {
             let (forecast, _) = memory.see(taken.frame, &net.forecast(&taken.posterior));
-            let states = memory.state_weights();
+            let states = memory.remembered();
             if let Some(image) = &taken.image {
                 memory.compare(taken.frame.frame, image.places());
             }
@@ -60,6 +62,6 @@ impl RunMemory {
 
     /// Returns the evidence of a frame's own image for the belief with this memory.
     pub fn weighed(&self, image: ImageEvidence, frame: &RememberedFrame, layout: &ProbeLayout) -> ImageEvidence {
-        image.for_states(&frame.states, layout, &self.settings)
+        image.with_memory(frame.states.clone(), layout, &self.settings)
     }
 }

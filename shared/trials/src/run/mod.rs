@@ -318,10 +318,12 @@ impl JudgedRun {
             _ => self.forecaster.forecast(input),
         };
         let image = frame.image.clone().map(|image| match remembered {
-            Some((memory, remembered)) if !self.settings.compares_late => {
+            Some((memory, remembered)) => {
+                // The memory has counted the places of earlier images.
+                let image = if self.settings.compares_late { image.with_places(&[]) } else { image };
                 memory.weighed(image, remembered, probe.layout())
             }
-            _ => image,
+            None => image,
         });
         Some(look_ahead(forecast, probe, &frame.posterior?, image.as_ref(), plan))
     }
