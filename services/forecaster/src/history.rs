@@ -32,7 +32,7 @@ pub struct Remembered {
     pub frame: u64,
     /// Forecast from all images of the take so far.
     pub forecast: Mixture,
-    /// The states.
+    /// Weights of the states.
     pub states: RememberedStates,
     /// Number of these images.
     pub images: u64,

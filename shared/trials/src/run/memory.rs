@@ -29,7 +29,7 @@ pub struct RunMemory {
 pub struct RememberedFrame {
     /// Forecast from all images of the take so far.
     pub forecast: Mixture,
-    /// The states.
+    /// Weights of the states.
     states: RememberedStates,
 }
 
