@@ -7,7 +7,7 @@ use carff_dataset::{Image, Observability};
 use carff_decision::{Evidence, Feedback, Plan, Sampling, look_ahead};
 use carff_evaluation::{KnownStates, Models};
 use carff_scenes::{Detail, FRAMES_PER_TIMESTAMP, Scenario};
-use carff_unknown::Known;
+use carff_unknown::{Comparer, Known, KnownScene};
 use std::path::Path;
 
 /// The branches with and without the actor, at the first step.
@@ -85,4 +85,36 @@ fn the_vehicle_itself_is_not_unknown() {
     }
     assert!(explained * 10 >= images * 8, "{explained} of {images} images have nothing unknown");
     assert!(patched >= 10 && found == patched, "something is found in {found} of {patched} images");
+}
+
+/// The vehicle itself is not unknown where another camera sees it: the states without it leave it unexplained, and those
+/// with it explain it. The result does not depend on images that the camera took before.
+#[test]
+fn the_vehicle_itself_is_explained_where_it_is_seen() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).ancestors().nth(2).unwrap();
+    let scenario = Scenario::load(&root.join(SCENARIO)).unwrap();
+    let models = Models::load(&root.join(CHECKPOINT)).unwrap();
+    let known = Known::load(&root.join(CHECKPOINT)).unwrap().unwrap();
+    let (field, lanes) = (models.probe.field(), &known.lanes);
+    let states: Vec<_> = models.probe.states().iter().map(|state| state.mean).collect();
+    let scene = KnownScene { field, states: &states, hazard_states: &known.hazard_states, lanes };
+    let [mut seen, mut explained] = [0; 2];
+    for pose in scenario.cameras().iter().filter(|pose| pose.view_kind != "dash").step_by(4) {
+        let mut reused = Comparer::new(field, lanes);
+        for timestamp in 0..3 {
+            let image = scenario.render(BRANCHES[1], timestamp, &pose.camera, Detail::default()).unwrap().image;
+            let mut judge = |comparer: &mut Comparer| {
+                let compared = comparer.compare(scene, &pose.camera, image.view().unwrap(), 2).unwrap();
+                let with_own = comparer.explain_own(&compared, scene, 2);
+                [Some(&compared), with_own.as_ref()].map(|compared| compared.map(|c| known.judge(c)))
+            };
+            let [without, with] = judge(&mut reused);
+            assert_eq!([without.clone(), with.clone()], judge(&mut Comparer::new(field, lanes)));
+            if without.unwrap().residual > 1.0 {
+                seen += 1;
+                explained += usize::from(with.is_some_and(|with| with.residual <= 1.0));
+            }
+        }
+    }
+    assert!(seen >= 5 && explained * 10 >= seen * 8, "it is explained in {explained} of {seen} images that show it");
 }

@@ -165,7 +165,8 @@ impl Work {
         let noisy = noisy(image, Key::named("knwn", self.seed, number as u64));
         let Self { lanes, states, hazard_states, field, threads, comparer, .. } = self;
         let scene = KnownScene { field, states, hazard_states, lanes };
-        comparer.compare(scene, camera, noisy.view()?, *threads).filter(Comparison::sees_lanes)
+        let compared = comparer.compare(scene, camera, noisy.view()?, *threads).filter(Comparison::sees_lanes)?;
+        Some(comparer.explain_own(&compared, scene, *threads).unwrap_or(compared))
     }
 }
 

@@ -25,6 +25,8 @@ const PLACE_STEP_PX: usize = 4;
 const PLACE_CAP: f32 = 0.25;
 /// A moved image counts if it leaves less than this share of what the image leaves unexplained.
 const BETTER: f32 = 0.7;
+/// Residual from which on the vehicle itself may explain a pixel, in deviations. Below it nothing is unknown.
+const OWN_FROM: f32 = 1.0;
 
 /// A field with what is known about it: the known states, and the lanes on which something unknown counts.
 #[derive(Clone, Copy, Debug)]
@@ -102,15 +104,18 @@ impl Comparison {
 /// while the camera stands still.
 ///
 /// The vehicle itself moves between its places in the known states, and carries the camera. So the states are rendered
-/// without it, and the pixels that would show it are rendered with it, too: either may explain an image.
+/// without it. Where they leave something unexplained at one of its places, they are rendered with it, too: either may
+/// explain an image.
 #[derive(Debug, Default)]
 pub struct Comparer {
     /// The field without the vehicle itself; `None` if no state has it.
     without_own: Option<Field>,
     /// The states without the vehicle itself.
     buffer: HypothesisBuffer,
-    /// The states with it, in the pixels that look at it.
+    /// The states with it, in the pixels of `shown_with_own`.
     with_own: HypothesisBuffer,
+    shown_with_own: Vec<usize>,
+    /// The pixels that look at its places.
     own_pixels: Vec<usize>,
     /// The camera, the judged pixels and the states that the buffer shows.
     shown: Option<(PinholeCamera, Vec<bool>, Vec<[f32; LATENT_DIM]>)>,
@@ -155,14 +160,34 @@ impl Comparer {
             self.own_pixels = lanes.own_pixels(&small, &pixels);
             let without_own = self.without_own.as_ref().unwrap_or(field);
             without_own.render_hypotheses_where(&small, states, compared, &options, &mut self.buffer);
-            let own = &self.own_pixels;
-            let is_own = |i| judged[i] && own.binary_search(&i).is_ok();
-            if !own.is_empty() {
-                field.render_hypotheses_where(&small, states, is_own, &options, &mut self.with_own);
-            }
+            self.shown_with_own.clear();
             self.shown = Some((small, judged.clone(), states.to_vec()));
         }
-        Some(self.compared(small, reduced(image, width, height), ground, judged, scene))
+        Some(self.compared(small, reduced(image, width, height), ground, judged, (scene, &[])))
+    }
+
+    /// Compares the image of the last comparison again, and lets the vehicle itself explain what no state explains at its
+    /// places. `None` if it leaves nothing unexplained there.
+    pub fn explain_own(&mut self, last: &Comparison, scene: KnownScene, threads: usize) -> Option<Comparison> {
+        let width = last.camera.width_px as usize;
+        let is_left = |i: usize| last.residuals.iter().flatten().any(|residual| residual[i] > OWN_FROM);
+        let mut left = vec![false; last.judged.len()];
+        self.own_pixels.iter().filter(|i| is_left(**i)).for_each(|i| left[*i] = true);
+        // A residual rests on its neighbours.
+        let near = grown(&left, width, 2);
+        let own: Vec<usize> = self.own_pixels.iter().copied().filter(|&i| near[i] && last.judged[i]).collect();
+        if own.is_empty() {
+            return None;
+        }
+        // Rendered pixels depend in their last bits on those that are rendered with them: only the same ones are kept.
+        if own != self.shown_with_own {
+            let options = RenderOptions { threads: threads.max(1), ..QUICK };
+            let is_own = |i: usize| own.binary_search(&i).is_ok();
+            scene.field.render_hypotheses_where(&last.camera, scene.states, is_own, &options, &mut self.with_own);
+            self.shown_with_own.clone_from(&own);
+        }
+        let Comparison { camera, image, ground, judged, is_moved, .. } = last.clone();
+        Some(Comparison { is_moved, ..self.compared(camera, image, ground, judged, (scene, &own)) })
     }
 
     /// Compares the image of the last comparison again, moved to where its place is rendered: the pose or the lens may
@@ -175,21 +200,22 @@ impl Comparer {
         let is_still = |&i: &usize| is_compared(i) && !shown.changing[i] && !self.is_own(i);
         let still: Vec<usize> = (0..last.judged.len()).filter(is_still).collect();
         let moved = align(View { rgb: &last.image, width, height }, &shown.rgb, &still)?;
-        let aligned = self.compared(last.camera, moved, last.ground.clone(), last.judged.clone(), scene);
+        let aligned = self.compared(last.camera, moved, last.ground.clone(), last.judged.clone(), (scene, &[]));
         let left = |of: &Comparison| 1.0 - of.fit.explained;
         let on_lanes = |of: &Comparison| of.on_lanes(0, ResidualKind::Unexpected).count();
         let is_better = left(&aligned) < BETTER * left(last) && 2 * on_lanes(&aligned) >= on_lanes(last);
         is_better.then_some(Comparison { is_moved: true, ..aligned })
     }
 
-    /// Compares an image at the compared size with the rendered states. Pixels whose values are not numbers do not count.
+    /// Compares an image at the compared size with the rendered states, in the pixels `own` also with the vehicle itself.
+    /// Pixels whose values are not numbers do not count.
     fn compared(
         &self,
         camera: PinholeCamera,
         image: Vec<f32>,
         ground: Vec<Option<Ground>>,
         mut judged: Vec<bool>,
-        scene: KnownScene,
+        (scene, own): (KnownScene, &[usize]),
     ) -> Comparison {
         let (images, width) = (&self.buffer.images, camera.width_px as usize);
         judged.iter_mut().zip(image.chunks_exact(3)).for_each(|(judged, rgb)| *judged &= !rgb[0].is_nan());
@@ -208,7 +234,7 @@ impl Comparer {
         let mut energies: Vec<Vec<BothResiduals>> =
             rendered.iter().map(|rendered| pixels.energy(rendered, &fit)).collect();
         explain_together(&mut energies, &self.own_pixels, scene.hazard_states);
-        self.explain_own((&image, &judged, width), &fit, &mut energies);
+        self.count_own((&image, &judged, width), &fit, own, &mut energies);
         let residual = |energy: &[BothResiduals], kind| median_residual(energy, kind, &judged, width, fit.noise);
         let residuals = energies.iter().map(|energy| ResidualKind::ALL.map(|kind| residual(energy, kind))).collect();
         Comparison { camera, image, fit, ground, judged, is_moved: false, residuals }
@@ -219,14 +245,14 @@ impl Comparer {
         self.own_pixels.binary_search(&pixel).is_ok()
     }
 
-    /// Lets the vehicle itself explain the pixels that look at it.
-    fn explain_own(
+    /// Lets the vehicle itself explain the pixels `own`, which are rendered with it.
+    fn count_own(
         &self,
         (image, judged, width): (&[f32], &[bool], usize),
         fit: &Fit,
+        own: &[usize],
         energies: &mut [Vec<BothResiduals>],
     ) {
-        let own = &self.own_pixels;
         if own.is_empty() {
             return;
         }
@@ -239,11 +265,9 @@ impl Comparer {
         };
         let rendered: Vec<Vec<f32>> = self.buffer.images.iter().zip(&self.with_own.images).map(with_own).collect();
         let rendered: Vec<&[f32]> = rendered.iter().map(Vec::as_slice).collect();
-        let mut near = vec![false; judged.len()];
-        for &i in own.iter().filter(|i| judged[**i]) {
-            near[i] = true;
-        }
-        let mut near = grown(&near, width, 1);
+        let mut is_own = vec![false; judged.len()];
+        own.iter().for_each(|i| is_own[*i] = true);
+        let mut near = grown(&is_own, width, 1);
         near.iter_mut().zip(judged).for_each(|(near, judged)| *near &= judged);
         let pixels = Pixels::new(image, &near, &rendered, width);
         for (energy, rendered) in energies.iter_mut().zip(&rendered) {
@@ -376,7 +400,7 @@ mod tests {
             let is_lane = |i: usize| lane_px.contains(&(i % side));
             let ground = |i| is_lane(i).then_some(Ground { distance_m: 5.0, at_m: [0.0; 2], on_lanes: true });
             let (ground, judged) = (0..side * side).map(|i| (ground(i), is_lane(i))).unzip();
-            let last = comparer.compared(camera, image, ground, judged, scene);
+            let last = comparer.compared(camera, image, ground, judged, (scene, &[]));
             (last.fit.explained, comparer.align(&last, scene).map(|moved| moved.fit.explained))
         };
         let (before, after) = aligned(view(4.0), 0..48);

@@ -143,13 +143,31 @@ impl Known {
     ) -> Option<(Seen, Comparison)> {
         let scene = KnownScene { field, states, hazard_states: &self.hazard_states, lanes: &self.lanes };
         let comparison = comparer.compare(scene, camera, image, threads)?;
-        let seen = self.judge(&comparison);
-        if seen.residual <= 1.0 {
-            return Some((seen, comparison));
+        let found = self.judge_with_own(comparer, comparison, scene, threads);
+        if found.0.residual <= 1.0 {
+            return Some(found);
         }
         // Before something unknown is suspected, the pose is: a camera that has turned a little leaves residuals, too.
-        let Some(aligned) = comparer.align(&comparison, scene) else { return Some((seen, comparison)) };
-        Some((self.judge(&aligned), aligned))
+        let Some(aligned) = comparer.align(&found.1, scene) else { return Some(found) };
+        Some(self.judge_with_own(comparer, aligned, scene, threads))
+    }
+
+    /// Judges a comparison; what it leaves unexplained may be the vehicle itself.
+    fn judge_with_own(
+        &self,
+        comparer: &mut Comparer,
+        comparison: Comparison,
+        scene: KnownScene,
+        threads: usize,
+    ) -> (Seen, Comparison) {
+        let seen = self.judge(&comparison);
+        if seen.residual <= SUSPICIOUS {
+            return (seen, comparison);
+        }
+        match comparer.explain_own(&comparison, scene, threads) {
+            Some(explained) => (self.judge(&explained), explained),
+            None => (seen, comparison),
+        }
     }
 
     /// Describes what the last comparison shows of the lanes. `None` for a view of another place, or without lanes.
