@@ -266,7 +266,9 @@ impl Comparer {
         let rendered: Vec<Vec<f32>> = self.buffer.images.iter().zip(&self.with_own.images).map(with_own).collect();
         let rendered: Vec<&[f32]> = rendered.iter().map(Vec::as_slice).collect();
         let mut is_own = vec![false; judged.len()];
-        own.iter().for_each(|i| is_own[*i] = true);
+        for &i in own {
+            is_own[i] = true;
+        }
         let mut near = grown(&is_own, width, 1);
         near.iter_mut().zip(judged).for_each(|(near, judged)| *near &= judged);
         let pixels = Pixels::new(image, &near, &rendered, width);
