@@ -103,7 +103,7 @@ fn the_vehicle_itself_is_explained_where_it_is_seen() {
         let mut reused = Comparer::new(field, lanes);
         for timestamp in 0..3 {
             let image = scenario.render(BRANCHES[1], timestamp, &pose.camera, Detail::default()).unwrap().image;
-            let mut judge = |comparer: &mut Comparer| {
+            let judge = |comparer: &mut Comparer| {
                 let compared = comparer.compare(scene, &pose.camera, image.view().unwrap(), 2).unwrap();
                 let with_own = comparer.explain_own(&compared, scene, 2);
                 [Some(&compared), with_own.as_ref()].map(|compared| compared.map(|c| known.judge(c)))
