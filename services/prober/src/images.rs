@@ -71,7 +71,7 @@ impl Images {
         let mut unknowns = self.unknowns(probe, frame, image, threads);
         let evidence = unknowns.as_mut().map(|unknowns| {
             let evidence = ImageEvidence::from(&*unknowns);
-            unknowns.probability = evidence.unknown_probability(probe.layout().hazard_states()) as f32;
+            unknowns.probability = evidence.unknown_probability() as f32;
             evidence
         });
         if self.compared.len() == REMEMBERED {

@@ -5,7 +5,7 @@ use crate::{MemorySettings, ProbeLayout, RememberedStates, Resolved};
 use carff_messages::Unknowns;
 
 /// Prior probability of something that no known state explains.
-const UNKNOWN_PRIOR: f64 = 0.01;
+const UNKNOWN_PRIOR: f64 = 0.02;
 /// Share of the belief that trusts the encoder's path; the rest starts from equally probable states. The encoder can
 /// be wrong with certainty, for example in rain. Rendering the states shows what this image can distinguish at all.
 const ENCODER_SHARE: f64 = 0.5;
@@ -96,8 +96,8 @@ impl ImageEvidence {
     /// ```
     /// use carff_decision::ImageEvidence;
     /// let states = [true, true, true, false, false, false];
-    /// assert!((ImageEvidence::hidden_hazard(&states, 3) - 0.2475).abs() < 1e-6);
-    /// assert!((ImageEvidence::hidden_hazard(&states, 1) - 0.124).abs() < 1e-3);
+    /// assert!((ImageEvidence::hidden_hazard(&states, 3) - 0.245).abs() < 1e-6);
+    /// assert!((ImageEvidence::hidden_hazard(&states, 1) - 0.098).abs() < 1e-3);
     /// ```
     pub fn hidden_hazard(hazard_states: &[bool], hidden: usize) -> f64 {
         let hazards = (0..hazard_states.len()).filter(|state| hazard_states[*state]);
@@ -117,35 +117,38 @@ impl ImageEvidence {
         &self.ratios
     }
 
-    /// Returns the probability of something unknown, from equally probable states.
-    pub fn unknown_probability(&self, hazard_states: &[bool]) -> f64 {
-        let hazards = hazard_states.iter().filter(|h| **h).count() as f32 / hazard_states.len().max(1) as f32;
-        self.weigh(hazards, hazard_states).1
+    /// Returns the probability of something unknown, 0..=1. It is weighed against the state that explains the image best:
+    /// an image that one state explains leaves its prior probability only, however many states the scenario has.
+    ///
+    /// ```
+    /// use carff_decision::ImageEvidence;
+    /// let unknown = |ratios: &[f32]| ImageEvidence::new(ratios).unknown_probability();
+    /// assert!(unknown(&[1.0, 0.0, 0.0, 0.0]) < 0.03);
+    /// assert!(unknown(&[0.0; 4]) > 0.99);
+    /// ```
+    pub fn unknown_probability(&self) -> f64 {
+        let best = self.ratios.iter().fold(0.0, |best: f64, ratio| best.max(*ratio)).min(EXPLAINED);
+        UNKNOWN_PRIOR / (UNKNOWN_PRIOR + (1.0 - UNKNOWN_PRIOR) * best)
     }
 
     /// Returns the probability of a hazard and of something unknown, from the encoder's hazard probability (0..=1).
     /// `hazard_states` marks the states with a hazard, and must have one entry a state.
     ///
-    /// Two opinions are pooled with equal weights: one starts from the encoder's probability, the other from what a
-    /// memory has seen of the places, or else from equally probable states. Each is weighed by the image (Bayes' rule), with the
-    /// states of each side, with and without a hazard, equally probable: a hazard that is hidden in one of three states
-    /// and excluded in the others weighs a third of one that is hidden in all. The image adds to the hazard and never
-    /// takes from it: a hazard may be hidden at a place where no known state has it.
+    /// The hazard's prior probability is the mean of two: that of the encoder, and what a memory has seen of the places, or
+    /// else that of equally probable states. The image weighs it (Bayes' rule), with the states of each side, with and
+    /// without a hazard, equally probable: a hazard that is hidden in one of three states and excluded in the others
+    /// weighs a third of one that is hidden in all. The image adds to the encoder's hazard and never takes from it: a hazard
+    /// may be hidden at a place where no known state has it.
     pub fn weigh(&self, hazard_probability: f32, hazard_states: &[bool]) -> (f64, f64) {
-        let (with, without) = (self.ratio(true, hazard_states), self.ratio(false, hazard_states));
-        let even = || share_of_hazards(hazard_states);
-        let hazards = self.remembered.as_ref().map_or_else(even, |states| f64::from(states.hazard_by_places));
-        let posterior = |hazard: f64| {
-            let known = 1.0 - UNKNOWN_PRIOR;
-            let (h, c) = (known * hazard * with, known * (1.0 - hazard) * without);
-            let all = h + c + UNKNOWN_PRIOR;
-            (h / all, UNKNOWN_PRIOR / all)
-        };
-        let (trusting, doubting) = (posterior(f64::from(hazard_probability).clamp(0.0, 1.0)), posterior(hazards));
-        let pooled = |a: f64, b: f64| ENCODER_SHARE * a + (1.0 - ENCODER_SHARE) * b;
-        let unknown = pooled(trusting.1, doubting.1);
         let encoder = f64::from(hazard_probability).clamp(0.0, 1.0);
-        (pooled(trusting.0, doubting.0).max(encoder * (1.0 - unknown)), unknown)
+        let even = || share_of_hazards(hazard_states);
+        let doubt = self.remembered.as_ref().map_or_else(even, |states| f64::from(states.hazard_by_places));
+        let prior = ENCODER_SHARE * encoder + (1.0 - ENCODER_SHARE) * doubt;
+        let with = prior * self.ratio(true, hazard_states);
+        let without = (1.0 - prior) * self.ratio(false, hazard_states);
+        let unknown = self.unknown_probability();
+        let hazard = (with / (with + without).max(f64::MIN_POSITIVE)).max(encoder);
+        (hazard * (1.0 - unknown), unknown)
     }
 
     /// Likelihood ratio of the states with or without a hazard: their weighted mean, or 0 where there is none.
@@ -209,7 +212,7 @@ mod tests {
     #[test]
     fn hidden_views_stay_even() {
         let (hazard, unknown) = ImageEvidence::new(&[50.0; 4]).weigh(0.5, &STATES);
-        assert!((hazard - 0.495).abs() < 1e-6 && (unknown - 0.01).abs() < 1e-6, "{hazard} {unknown}");
+        assert!((hazard - 0.49).abs() < 1e-6 && (unknown - 0.02).abs() < 1e-6, "{hazard} {unknown}");
         // How far below its limit a state is does not count.
         assert_eq!(ImageEvidence::new(&[50.0, 1.0, 9.0, 1.0]), ImageEvidence::new(&[1.0; 4]));
     }
@@ -218,14 +221,14 @@ mod tests {
     #[test]
     fn a_visible_hazard_overrules_the_encoder() {
         let (hazard, unknown) = ImageEvidence::new(&[1e-3, 80.0, 1e-3, 1e-3]).weigh(0.0, &STATES);
-        assert!(hazard + unknown > 0.7, "{hazard} {unknown}");
+        assert!(hazard > 0.9, "{hazard} {unknown}");
     }
 
     /// An image that the hazard states do not explain leaves the encoder's probability unchanged.
     #[test]
     fn no_hazard_is_argued_away() {
         let (hazard, unknown) = ImageEvidence::new(&[1e-3, 1e-3, 80.0, 80.0]).weigh(0.3, &STATES);
-        assert!((hazard - 0.3).abs() < 0.01 && unknown < 0.02, "{hazard} {unknown}");
+        assert!((hazard - 0.3).abs() < 0.01 && unknown < 0.03, "{hazard} {unknown}");
     }
 
     /// An encoder that is wrongly sure leaves a quarter of the probability to the hazard, where the image shows no
@@ -246,11 +249,11 @@ mod tests {
     fn a_hazard_hidden_in_one_state_weighs_one_state() {
         let evidence = ImageEvidence::new(&[80.0, 1e-3, 1e-3, 80.0, 80.0, 80.0]);
         let states = [true, true, true, false, false, false];
-        // One of the four states that explain the image has a hazard; the encoder, which excludes it, has half of the weight.
+        // The prior probability is a quarter with an encoder that excludes the hazard; a third of it is left.
         let (hazard, unknown) = evidence.weigh(0.0, &states);
-        assert!((hazard - 0.124).abs() < 1e-3 && unknown < 0.013, "{hazard} {unknown}");
+        assert!((hazard - 0.098).abs() < 1e-3 && unknown < 0.021, "{hazard} {unknown}");
         let (visible, unknown) = ImageEvidence::new(&[1e-3, 80.0, 1e-3, 1e-3, 1e-3, 1e-3]).weigh(0.5, &states);
-        assert!(visible > 0.9 && visible + unknown > 0.99, "{visible} {unknown}");
+        assert!(visible > 0.95 && unknown < 0.03, "{visible} {unknown}");
     }
 
     /// With a memory, a vehicle of which the image shows only a part is a hazard; at the place of a state that is excluded
@@ -267,7 +270,7 @@ mod tests {
             let remembered = RememberedStates { weights: weights.to_vec(), hazard_by_places };
             evidence.with_memory(remembered, &layout, &settings).weigh(encoder, &STATES).0
         };
-        assert!(weighed([0.5, 0.0, 0.5, 0.0], 0.5, 0.5) > 0.98);
+        assert!(weighed([0.5, 0.0, 0.5, 0.0], 0.5, 0.5) > 0.97);
         assert!(weighed([0.0, 0.5, 0.0, 0.5], 0.5, 0.5) < 0.6);
         let plain = ImageEvidence::new(&[50.0; 4]).with_places(&[1.0, 0.0]);
         assert_eq!(plain.clone().with_memory(RememberedStates::default(), &layout, &settings), plain, "no memory");
@@ -276,7 +279,21 @@ mod tests {
             let remembered = RememberedStates { weights: vec![0.25; 4], hazard_by_places };
             ImageEvidence::new(&[1.0; 4]).with_memory(remembered, &layout, &settings).weigh(0.0, &STATES).0
         };
-        assert!(hidden(0.01) < 0.01 && (hidden(0.5) - 0.2475).abs() < 1e-3, "{} {}", hidden(0.01), hidden(0.5));
+        assert!(hidden(0.01) < 0.01 && (hidden(0.5) - 0.245).abs() < 1e-3, "{} {}", hidden(0.01), hidden(0.5));
+    }
+
+    /// An image that one state explains leaves nothing for something unknown, however many states do not explain it.
+    #[test]
+    fn one_state_explains_an_image() {
+        let mut ratios = [0.0; 16];
+        ratios[3] = 1.0;
+        let mut states = [false; 16];
+        states[15] = true;
+        let (hazard, unknown) = ImageEvidence::new(&ratios).weigh(0.0, &states);
+        assert!(hazard < 0.01 && (unknown - 0.02).abs() < 1e-6, "{hazard} {unknown}");
+        // A known vehicle in full sight, in one state.
+        let (hazard, unknown) = ImageEvidence::new(&[1.0, 0.0, 0.0, 0.0]).weigh(0.9, &STATES);
+        assert!(hazard > 0.95 && (unknown - 0.02).abs() < 1e-6, "{hazard} {unknown}");
     }
 
     /// An image that no state explains is unknown; ratios that are not numbers explain nothing.

@@ -82,13 +82,15 @@ impl StageContext {
     /// Joins the run and starts the heartbeat. [`main`] calls this; tests call it in their own process.
     pub fn new(stage: Stage, args: StageArgs, graph: GraphConfig) -> anyhow::Result<Self> {
         // This comes first, so that all threads inherit the settings.
-        realtime::schedule(graph.stage(stage), graph.stage_nice(stage));
+        realtime::schedule(graph.stage(stage));
         let stop = Stop::on_signals().context("cannot handle signals")?;
         let run = Run::new(args.run.as_deref().unwrap_or(&graph.run.name), args.run_id)?;
         let node = Node::open(&run, stage.name())?;
         let vitals = Arc::new(Vitals::new());
         let counters = node.counters().clone();
         let heartbeat = Heartbeat::start(&run, stage, graph.run.seed, vitals.clone(), counters)?;
+        // The heartbeat keeps its own priority: a stage that yields to all others must not seem to hang.
+        realtime::renice(graph.stage_nice(stage));
         Ok(Self {
             dataset: graph.resolve(args.dataset.as_ref().unwrap_or(&graph.run.dataset)),
             checkpoint: graph.resolve(args.checkpoint.as_ref().unwrap_or(&graph.run.checkpoint)),

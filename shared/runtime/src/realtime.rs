@@ -8,16 +8,20 @@ use std::io;
 /// Distance of touched addresses, bytes: no page is smaller.
 const PAGE_BYTES: usize = 4096;
 
-/// Sets processors, niceness and scheduling policy of the calling thread; threads that it starts inherit them.
-pub(crate) fn schedule(settings: &StageConfig, nice: Option<i32>) {
+/// Sets processors and scheduling policy of the calling thread; threads that it starts inherit them.
+pub(crate) fn schedule(settings: &StageConfig) {
     if !settings.cpus.is_empty() {
         warn_if_refused("cpus", pin(&settings.cpus));
     }
-    if let Some(nice) = nice {
-        warn_if_refused("nice", rustix::process::setpriority_process(None, nice).map_err(Into::into));
-    }
     if let Some(priority) = settings.fifo_priority {
         warn_if_refused("fifo_priority", use_fifo(priority));
+    }
+}
+
+/// Sets the niceness of the calling thread; threads that it starts afterwards inherit it.
+pub(crate) fn renice(nice: Option<i32>) {
+    if let Some(nice) = nice {
+        warn_if_refused("nice", rustix::process::setpriority_process(None, nice).map_err(Into::into));
     }
 }
 
@@ -101,12 +105,13 @@ mod tests {
         std::thread::spawn(|| {
             let all = rustix::thread::sched_getaffinity(None).unwrap();
             let first = (0..1024).find(|&cpu| all.is_set(cpu)).unwrap();
-            schedule(&StageConfig { cpus: vec![first as u32], ..StageConfig::default() }, Some(19));
+            schedule(&StageConfig { cpus: vec![first as u32], ..StageConfig::default() });
+            renice(Some(19));
             let pinned = rustix::thread::sched_getaffinity(None).unwrap();
             assert_eq!((pinned.count(), pinned.is_set(first)), (1, true));
             assert_eq!(rustix::process::getpriority_process(None).unwrap(), 19);
             // No machine has this processor.
-            schedule(&StageConfig { cpus: vec![1023], fifo_priority: Some(99), ..StageConfig::default() }, None);
+            schedule(&StageConfig { cpus: vec![1023], fifo_priority: Some(99), ..StageConfig::default() });
             assert!(rustix::thread::sched_getaffinity(None).unwrap().is_set(first));
             settle(&StageConfig { prefault_mb: 2, ..StageConfig::default() });
         })

@@ -72,6 +72,29 @@ fn ready_is_said_before_work_begins() {
     assert_eq!(states.last(), Some(&HealthState::Ok), "{states:?}");
 }
 
+/// A stage that yields to all others keeps the priority of its heartbeat: under load, it does not seem to hang.
+#[test]
+fn heartbeats_do_not_yield() {
+    // `None` for a task that has ended.
+    let niceness = |task: &str| {
+        let stat = std::fs::read_to_string(format!("/proc/self/task/{task}/stat")).ok()?;
+        // Field 19 of the line; the name of the thread, field 2, may contain spaces.
+        stat.rsplit_once(')')?.1.split_whitespace().nth(16)?.parse::<i32>().ok()
+    };
+    let own = || std::fs::read_link("/proc/thread-self").unwrap().file_name().unwrap().to_str().unwrap().to_owned();
+    let before = niceness(&own()).unwrap();
+    let fixture = Fixture::new("nice");
+    let _stage = fixture.context(Stage::Renderer);
+    assert_eq!(niceness(&own()), Some(19));
+    let tasks = std::fs::read_dir("/proc/self/task").unwrap().map(|task| task.unwrap());
+    let name = |task: &std::fs::DirEntry| std::fs::read_to_string(task.path().join("comm")).unwrap_or_default();
+    let beating: Vec<_> = tasks.filter(|task| name(task).trim() == "heartbeat").collect();
+    assert!(!beating.is_empty());
+    for task in beating {
+        assert!(niceness(task.file_name().to_str().unwrap()).is_none_or(|nice| nice <= before));
+    }
+}
+
 /// Health goes from starting to ok, with counts of received, skipped and invalid messages, while the stage's loop is
 /// idle.
 #[test]

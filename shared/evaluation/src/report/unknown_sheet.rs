@@ -24,7 +24,7 @@ const STEPS_PER_PX: f64 = 2.0;
 /// Draws one row for each of at most eight objects; returns false if nothing is compared.
 pub fn unknown_objects(subject: &Subject, path: &Path) -> Result<bool, EvaluationError> {
     let perception = subject.perception();
-    let (Some(known), Ok(probe)) = (&perception.known, &subject.probe) else { return Ok(false) };
+    let Some(known) = &perception.known else { return Ok(false) };
     let mut rows = Vec::new();
     // The first pose that has each in sight, with any result.
     let in_sight: Vec<usize> =
@@ -34,7 +34,7 @@ pub fn unknown_objects(subject: &Subject, path: &Path) -> Result<bool, Evaluatio
         let Some(view) = novelty.views.first() else { continue };
         let Some(compared) = known.compare(&view.camera, &view.image) else { continue };
         let evidence = ImageEvidence::new(&compared.seen.ratios);
-        let unknown = evidence.unknown_probability(probe.layout().hazard_states());
+        let unknown = evidence.unknown_probability();
         let place = if novelty.beside { "next to the road" } else { "on the road" };
         let boxes = compared.seen.boxes.len();
         let image = StripCell {
