@@ -63,9 +63,12 @@ impl TestGraph {
 
     /// Returns the command `carff launch` on its graph file, or on another one under its run name.
     pub fn launch(&self, file: &Path, args: &[&str]) -> Command {
-        let mut command = Command::new(program("carff"));
+        // Also where the tests themselves run under `nohup`.
+        let mut command = Command::new("env");
         command
             .current_dir(self.folder.path())
+            .arg("--default-signal=HUP")
+            .arg(program("carff"))
             .args(["launch", "--verbose"])
             .arg(file)
             .args(["--run", self.run.name()])

@@ -8,8 +8,8 @@ use signal_hook::{flag, low_level};
 use std::io::Write;
 use std::os::fd::AsFd;
 use std::os::unix::net::UnixStream;
-use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
-use std::sync::{Arc, LazyLock};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, LazyLock, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 /// Exit code after a signal, as in shells after Ctrl-C: 128 plus the signal's number.
@@ -17,8 +17,8 @@ pub const INTERRUPTED: u8 = 130;
 
 /// True while no [`Stop`] of a signal exists: a signal then ends a process of [`exit_on_signals`] at once.
 static AT_ONCE: LazyLock<Arc<AtomicBool>> = LazyLock::new(|| Arc::new(AtomicBool::new(true)));
-/// Number of stops that signals trigger.
-static STOPS: AtomicUsize = AtomicUsize::new(0);
+/// Number of stops that signals trigger. [`AT_ONCE`] is only changed under this lock.
+static STOPS: Mutex<usize> = Mutex::new(0);
 /// True after the first signal that a stop has taken.
 static INTERRUPT: LazyLock<Arc<AtomicBool>> = LazyLock::new(Arc::default);
 
@@ -115,27 +115,37 @@ struct Signals(Vec<SigId>);
 impl Signals {
     fn of(stop: &Stop) -> std::io::Result<Self> {
         // From here on, `drop` balances the count.
+        *stops() += 1;
         let mut signals = Self(Vec::new());
-        STOPS.fetch_add(1, Ordering::AcqRel);
-        AT_ONCE.store(false, Ordering::Release);
         for signal in stop_signals() {
             signals.0.push(flag::register(signal, Arc::clone(&INTERRUPT))?);
             signals.0.push(flag::register(signal, Arc::clone(&stop.flag))?);
             signals.0.push(low_level::pipe::register(signal, stop.write.try_clone()?)?);
         }
+        // Only now, so that no signal is lost: one that comes before this ends the process at once.
+        let _held = stops();
+        AT_ONCE.store(false, Ordering::Release);
         Ok(signals)
     }
 }
 
 impl Drop for Signals {
     fn drop(&mut self) {
+        let mut stops = stops();
+        *stops -= 1;
+        // First, for the same reason.
+        if *stops == 0 {
+            AT_ONCE.store(true, Ordering::Release);
+        }
+        drop(stops);
         for id in self.0.drain(..) {
             low_level::unregister(id);
         }
-        if STOPS.fetch_sub(1, Ordering::AcqRel) == 1 {
-            AT_ONCE.store(true, Ordering::Release);
-        }
     }
+}
+
+fn stops() -> MutexGuard<'static, usize> {
+    STOPS.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 /// Returns the signals that end a process: without SIGHUP if its caller has it ignored.

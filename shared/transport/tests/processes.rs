@@ -5,8 +5,12 @@
 use crate::common;
 
 use crate::common::{Role, TestRun, frame, in_seconds, posterior};
-use carff_transport::{Node, Stop, Waiter, Woken, cleanup_dead, topics};
+use carff_transport::{
+    INTERRUPTED, Node, Stop, Waiter, Woken, cleanup_dead, exit_on_signals, is_interrupted, monotonic_now_ns, topics,
+};
+use rustix::process::Signal;
 use std::io::{BufRead, BufReader, Write};
+use std::time::Duration;
 
 const SIDE: u32 = 32;
 const BYTES: usize = (SIDE * SIDE * 3) as usize;
@@ -15,6 +19,9 @@ const BYTES: usize = (SIDE * SIDE * 3) as usize;
 #[test]
 fn role() {
     let Some((role, run)) = common::role() else { return };
+    if role == "hasty" {
+        take_and_give_back_signals();
+    }
     let stop = Stop::on_signals().unwrap();
     let waiter = Waiter::new(stop.clone());
     let node = Node::open(&run, &role).unwrap();
@@ -48,6 +55,36 @@ fn role() {
             println!("stopped {}", stop.is_stopped());
         }
         other => panic!("unknown role {other}"),
+    }
+}
+
+/// Takes the signals and gives them back over and over, until one has come.
+fn take_and_give_back_signals() -> ! {
+    exit_on_signals().unwrap();
+    println!("ready");
+    while !is_interrupted() {
+        drop(Stop::on_signals().unwrap());
+    }
+    std::process::exit(i32::from(INTERRUPTED));
+}
+
+/// No signal is lost while a stop takes the signals or gives them back.
+#[test]
+fn signals_are_never_lost() {
+    let run = TestRun::new();
+    for _ in 0..10 {
+        let mut hasty = Role::start("hasty", &run.0);
+        wait_for(&mut lines(&mut hasty), "ready");
+        hasty.signal(Signal::TERM);
+        let watchdog_ns = in_seconds(30);
+        let status = loop {
+            if let Some(status) = hasty.0.try_wait().unwrap() {
+                break status;
+            }
+            assert!(monotonic_now_ns() < watchdog_ns, "the signal is lost");
+            std::thread::sleep(Duration::from_millis(1));
+        };
+        assert_eq!(status.code(), Some(i32::from(INTERRUPTED)));
     }
 }
 
@@ -134,16 +171,16 @@ fn no_subscriber_delays_a_publisher_and_signals_end_waits() {
     for lines in &mut printed {
         wait_for(lines, "ready");
     }
-    readers[0].signal(rustix::process::Signal::STOP);
+    readers[0].signal(Signal::STOP);
     readers[1].kill();
     for frame_id in 0..2000 {
         output.send(posterior(frame_id)).unwrap();
     }
     wait_for(&mut printed[2], "frame 1999");
-    readers[2].signal(rustix::process::Signal::TERM);
+    readers[2].signal(Signal::TERM);
     wait_for(&mut printed[2], "stopped true");
     assert!(readers[2].0.wait().unwrap().success());
-    readers[0].signal(rustix::process::Signal::CONT);
+    readers[0].signal(Signal::CONT);
     wait_for(&mut printed[0], "frame 1999");
 }
 
