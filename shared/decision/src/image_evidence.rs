@@ -228,7 +228,7 @@ mod tests {
     #[test]
     fn no_hazard_is_argued_away() {
         let (hazard, unknown) = ImageEvidence::new(&[1e-3, 1e-3, 80.0, 80.0]).weigh(0.3, &STATES);
-        assert!((hazard - 0.3).abs() < 0.01 && unknown < 0.03, "{hazard} {unknown}");
+        assert!((hazard - 0.3).abs() < 0.01 && (unknown - 0.02).abs() < 1e-3, "{hazard} {unknown}");
     }
 
     /// An encoder that is wrongly sure leaves a quarter of the probability to the hazard, where the image shows no
@@ -253,7 +253,7 @@ mod tests {
         let (hazard, unknown) = evidence.weigh(0.0, &states);
         assert!((hazard - 0.098).abs() < 1e-3 && unknown < 0.021, "{hazard} {unknown}");
         let (visible, unknown) = ImageEvidence::new(&[1e-3, 80.0, 1e-3, 1e-3, 1e-3, 1e-3]).weigh(0.5, &states);
-        assert!(visible > 0.95 && unknown < 0.03, "{visible} {unknown}");
+        assert!(visible > 0.95 && visible + unknown > 0.99, "{visible} {unknown}");
     }
 
     /// With a memory, a vehicle of which the image shows only a part is a hazard; at the place of a state that is excluded
@@ -270,7 +270,7 @@ mod tests {
             let remembered = RememberedStates { weights: weights.to_vec(), hazard_by_places };
             evidence.with_memory(remembered, &layout, &settings).weigh(encoder, &STATES).0
         };
-        assert!(weighed([0.5, 0.0, 0.5, 0.0], 0.5, 0.5) > 0.97);
+        assert!(weighed([0.5, 0.0, 0.5, 0.0], 0.5, 0.5) > 0.979);
         assert!(weighed([0.0, 0.5, 0.0, 0.5], 0.5, 0.5) < 0.6);
         let plain = ImageEvidence::new(&[50.0; 4]).with_places(&[1.0, 0.0]);
         assert_eq!(plain.clone().with_memory(RememberedStates::default(), &layout, &settings), plain, "no memory");
@@ -282,7 +282,7 @@ mod tests {
         assert!(hidden(0.01) < 0.01 && (hidden(0.5) - 0.245).abs() < 1e-3, "{} {}", hidden(0.01), hidden(0.5));
     }
 
-    /// An image that one state explains leaves nothing for something unknown, however many states do not explain it.
+    /// An image that one state explains leaves something unknown its prior probability only, with any number of states.
     #[test]
     fn one_state_explains_an_image() {
         let mut ratios = [0.0; 16];
