@@ -1,6 +1,6 @@
 //! The last images of a take, so that a comparison that comes late still counts.
 
-use carff_decision::{Mixture, RememberedStates, TakeFrame, TakeMemory};
+use carff_decision::{Mixture, Remembered, TakeFrame, TakeMemory};
 use std::collections::VecDeque;
 
 /// Number of images that are kept: those that a restarted forecaster gets from shared memory.
@@ -16,26 +16,12 @@ struct Seen {
 }
 
 impl Seen {
-    fn count_in(&self, memory: &mut TakeMemory) -> (Mixture, u64) {
-        let seen = memory.see(self.frame, &self.forecast);
+    fn count_in(&self, memory: &mut TakeMemory) {
+        memory.see(self.frame, &self.forecast);
         if let Some(places) = &self.places {
             memory.compare(self.frame.frame, places);
         }
-        seen
     }
-}
-
-/// State of the memory at an image, without the image's own comparison.
-#[derive(Clone, Debug)]
-pub struct Remembered {
-    /// Number of the image's frame.
-    pub frame: u64,
-    /// Forecast from all images of the take so far.
-    pub forecast: Mixture,
-    /// Weights of the states.
-    pub states: RememberedStates,
-    /// Number of these images.
-    pub images: u64,
 }
 
 /// A memory whose result does not depend on when the comparisons come, up to [`KEPT`] images later.
@@ -64,15 +50,14 @@ impl TakeHistory {
         {
             oldest.count_in(&mut self.before);
         }
-        let (all, images) = self.memory.see(frame, &forecast);
-        let states = self.memory.remembered();
+        let remembered = self.memory.see(frame, &forecast);
         let places = self.early.iter().position(|(of, _)| *of == frame.frame).and_then(|i| self.early.remove(i));
         let places = places.map(|(_, places)| places);
         if let Some(places) = &places {
             self.memory.compare(frame.frame, places);
         }
         self.seen.push_back(Seen { frame, forecast, places });
-        Remembered { frame: frame.frame, forecast: all, states, images }
+        remembered
     }
 
     /// Counts what the image of a frame shows of each place.
@@ -133,21 +118,25 @@ mod tests {
             let (taken, forecast) = image(frame);
             early.compare(frame, places(frame));
             let [a, b] = [&mut early, &mut in_time].map(|history| history.see(taken, forecast.clone()));
-            assert_eq!((a.states, a.forecast, a.images), (b.states, b.forecast, b.images));
+            assert_eq!(a, b);
             in_time.compare(frame, places(frame));
             late.see(taken, forecast);
             if frame % 10 == 9 {
                 (frame - 9..=frame).rev().for_each(|frame| late.compare(frame, places(frame)));
             }
         }
-        let [a, b, c] = [early, in_time, late].map(|history| history.memory.remembered());
+        let next = |mut history: TakeHistory, frame| {
+            let (taken, forecast) = image(frame);
+            history.see(taken, forecast)
+        };
+        let [a, b, c] = [early, in_time, late].map(|history| next(history, 100));
         assert_eq!((&a, &a), (&b, &c));
         let mut first = history();
         first.compare(0, vec![1.0]);
         let (taken, forecast) = image(0);
         let before = first.see(taken, forecast).states;
         assert!(before.weights[1] < 0.65 && before.hazard_by_places == 0.5);
-        let after = first.memory.remembered();
+        let after = next(first, 1).states;
         assert!(after.weights[1] > 0.9 && after.hazard_by_places > 0.9);
     }
 }

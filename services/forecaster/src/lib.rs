@@ -5,12 +5,12 @@ mod history;
 use carff_checkpoint::{CheckpointPlanning, Manifest};
 use carff_config::GraphConfig;
 use carff_decision::{
-    Draw, ImageEvidence, Memory, Mixture, ProbeLayout, Sampling, TakeMemory, continue_samples, path_probability,
-    set_mixture_and_draws,
+    Draw, ImageEvidence, Memory, Mixture, ProbeLayout, Remembered, Sampling, TakeMemory, continue_samples,
+    path_probability, set_mixture_and_draws,
 };
 use carff_inference::MixtureNet;
 use carff_messages::{Belief, Forecast, ForecastSource, Gaussian, Header, MAX_STATES, Posterior, Unknowns};
-use history::{Remembered, TakeHistory};
+use history::TakeHistory;
 use std::path::Path;
 
 /// The forecaster's model and settings.
@@ -23,7 +23,7 @@ pub struct Forecaster {
     horizon: u32,
     /// Belief over the frames of a take; `None` if each image counts by itself.
     memory: Option<TakeHistory>,
-    /// State of the memory at the last image.
+    /// Content of the memory at the last image.
     remembered: Option<Remembered>,
 }
 

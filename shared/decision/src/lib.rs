@@ -42,5 +42,5 @@ pub use look_ahead::{Localiser, Plan, Probed, SceneProbe, Step, look_ahead, path
 pub use memory::{Memory, MemorySettings, RememberedStates};
 pub use mixture::{Draw, Mixture, Sampling};
 pub use rule::{Decision, Policy, is_likely};
-pub use take::{StepLength, TakeFrame, TakeMemory, TakeProgress};
+pub use take::{Remembered, StepLength, TakeFrame, TakeMemory};
 pub use threshold::{CalibrationTrial, bounded_threshold, choose_threshold, unchosen_threshold};

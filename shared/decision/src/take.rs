@@ -52,13 +52,13 @@ impl From<&Posterior> for TakeFrame {
 /// let frame = |frame| TakeFrame { take_start: 0, frame, capture_time_ns: 100 * frame };
 /// memory.see(frame(0), &image(0.999));
 /// // The next image shows nothing: the belief is still that of the first one.
-/// let (belief, images) = memory.see(frame(1), &image(0.5));
-/// let of_left = belief.weights.iter().zip(&belief.components).filter(|(_, c)| c.mean[0] < 0.0);
-/// assert!(of_left.map(|(weight, _)| weight).sum::<f32>() > 0.9 && images == 2);
-/// // This image shows that the place is taken.
+/// let now = memory.see(frame(1), &image(0.5));
+/// let of_left = now.forecast.weights.iter().zip(&now.forecast.components).filter(|(_, c)| c.mean[0] < 0.0);
+/// assert!(of_left.map(|(weight, _)| weight).sum::<f32>() > 0.9 && now.images == 2);
+/// // This image shows that the place is taken, which counts from the next one on.
 /// memory.compare(1, &[1.0]);
-/// let now = memory.remembered();
-/// assert!(now.weights[1] > 0.1 && now.hazard_by_places > 0.9);
+/// let next = memory.see(frame(2), &image(0.5));
+/// assert!(next.states.weights[1] > 0.1 && next.states.hazard_by_places > 0.9);
 /// # Ok::<(), carff_decision::ProbingError>(())
 /// ```
 #[derive(Clone, Debug)]
@@ -69,15 +69,28 @@ pub struct TakeMemory {
 }
 
 /// Progress of a take.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct TakeProgress {
+#[derive(Clone, Copy, Debug)]
+struct TakeProgress {
     /// Capture time of the first image that was seen, nanoseconds.
-    pub first_ns: u64,
+    first_ns: u64,
     /// Time steps that the belief has been moved by.
-    pub steps: u64,
+    steps: u64,
     /// The last image.
-    pub last: TakeFrame,
+    last: TakeFrame,
     /// Images so far.
+    images: u64,
+}
+
+/// Content of the memory at an image, without the comparison of this image.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Remembered {
+    /// Number of the image's frame.
+    pub frame: u64,
+    /// Forecast from all images of the take so far.
+    pub forecast: Mixture,
+    /// Weights of the states.
+    pub states: RememberedStates,
+    /// Number of images so far, 1 if the memory starts anew.
     pub images: u64,
 }
 
@@ -87,9 +100,8 @@ impl TakeMemory {
         Self { memory, step, progress: None }
     }
 
-    /// Returns the forecast from all images of the take so far, given that of its newest image, and their number: 1 if
-    /// the memory starts anew.
-    pub fn see(&mut self, frame: TakeFrame, image: &Mixture) -> (Mixture, u64) {
+    /// Counts the forecast from the newest image, and returns what the memory then holds.
+    pub fn see(&mut self, frame: TakeFrame, image: &Mixture) -> Remembered {
         let fits = |p: &TakeProgress| p.last.take_start == frame.take_start && !self.is_gap(p.last, frame);
         let mut progress = if let Some(progress) = self.progress.filter(fits) {
             progress
@@ -102,7 +114,8 @@ impl TakeMemory {
         (progress.steps..steps).for_each(|_| self.memory.advance());
         progress = TakeProgress { steps, last: frame, images: progress.images + 1, ..progress };
         self.progress = Some(progress);
-        (self.memory.see(image), progress.images)
+        let forecast = self.memory.see(image);
+        Remembered { frame: frame.frame, forecast, states: self.memory.remembered(), images: progress.images }
     }
 
     /// Weighs the belief by what frame `frame` shows of each place ([`Memory::compare`]). A frame that is not the last one
@@ -111,11 +124,6 @@ impl TakeMemory {
         if self.progress.is_some_and(|progress| progress.last.frame == frame) {
             self.memory.compare(places);
         }
-    }
-
-    /// Returns the memory's content, as messages carry it.
-    pub fn remembered(&self) -> RememberedStates {
-        self.memory.remembered()
     }
 
     /// Time steps from the start of the take to a frame.
@@ -179,13 +187,13 @@ mod tests {
     fn a_take_is_remembered() {
         for step in [StepLength::Frames(3), StepLength::TimeNs(300)] {
             let mut memory = memory(step);
-            let even = |(mixture, images)| ((first_branch(&mixture) - 0.5).abs() < 0.01, images);
+            let even = |now: Remembered| ((first_branch(&now.forecast) - 0.5).abs() < 0.01, now.images);
             assert_eq!(even(memory.see(frame(0, 0), &image(0.5))), (true, 1));
             memory.see(frame(0, 1), &image(0.999));
             for later in 2..9 {
-                let (mixture, images) = memory.see(frame(0, later), &image(0.5));
-                assert!(first_branch(&mixture) > 0.95, "{mixture:?}");
-                assert_eq!(images, later + 1);
+                let now = memory.see(frame(0, later), &image(0.5));
+                assert!(first_branch(&now.forecast) > 0.95, "{now:?}");
+                assert_eq!(now.images, later + 1);
             }
             assert_eq!(even(memory.see(frame(9, 9), &image(0.5))), (true, 1), "a new take");
             memory.see(frame(9, 10), &image(0.001));
@@ -199,8 +207,8 @@ mod tests {
         let mut memory = memory(StepLength::Frames(6));
         memory.see(frame(0, 0), &image(0.999));
         memory.see(frame(0, 1), &image(0.001));
-        let (mixture, _) = memory.see(frame(0, 2), &image(0.001));
-        assert!(first_branch(&mixture) < 0.5, "{mixture:?}");
+        let now = memory.see(frame(0, 2), &image(0.001));
+        assert!(first_branch(&now.forecast) < 0.5, "{now:?}");
     }
 
     /// A place that an image shows taken decides for its states, over later images that show nothing. A comparison that
@@ -212,11 +220,11 @@ mod tests {
             memory.see(frame(0, 0), &image(0.5));
             memory.see(frame(0, 1), &image(0.5));
             memory.compare(compared, &[1.0]);
-            let (mixture, _) = memory.see(frame(0, 2), &image(0.5));
-            assert!((low..=high).contains(&first_branch(&mixture)), "{mixture:?}");
+            let now = memory.see(frame(0, 2), &image(0.5));
+            assert!((low..=high).contains(&first_branch(&now.forecast)), "{now:?}");
             memory.compare(2, &[0.0]);
-            let (later, _) = memory.see(frame(0, 3), &image(0.5));
-            assert!((low..=high).contains(&first_branch(&later)), "{later:?}");
+            let later = memory.see(frame(0, 3), &image(0.5));
+            assert!((low..=high).contains(&first_branch(&later.forecast)), "{later:?}");
         }
     }
 
@@ -225,7 +233,7 @@ mod tests {
     fn the_unknown_passes_through() {
         let mut memory = memory(StepLength::Frames(6));
         let image = Mixture { weights: vec![0.25, 0.75], components: vec![at(-1.0), at(40.0)] };
-        let (mixture, _) = memory.see(frame(0, 0), &image);
+        let mixture = memory.see(frame(0, 0), &image).forecast;
         let far: f32 =
             mixture.weights.iter().zip(&mixture.components).filter(|(_, c)| c.mean[0] > 9.0).map(|x| x.0).sum();
         assert!((far - 0.75).abs() < 1e-6, "{mixture:?}");

@@ -11,7 +11,7 @@ use carff_dataset::{
 };
 use carff_decision::{
     Evidence, Feedback, ForecastInput, ImageEvidence, Memory, MemorySettings, Mixture, Plan, Policy, ProbeLayout,
-    Sampling, StepLength, TakeFrame, TakeMemory, look_ahead,
+    Remembered, Sampling, StepLength, TakeFrame, TakeMemory, look_ahead,
 };
 use carff_field::Field;
 use carff_messages::{Gaussian, LATENT_DIM, Rule};
@@ -338,13 +338,12 @@ impl TakeMemories {
     /// Adds the trial of the next frame of a drive, and returns it with its memory.
     pub fn remember(&mut self, net: &dyn Forecasts, trial: Trial, frame_in_drive: u64) -> Trial {
         let frame = TakeFrame { take_start: 0, frame: frame_in_drive, capture_time_ns: 0 };
-        let (remembered, _) = self.memory.see(frame, &net.forecast(&trial.posterior));
-        let states = self.memory.remembered();
+        let Remembered { forecast, states, .. } = self.memory.see(frame, &net.forecast(&trial.posterior));
         let image = trial.image.map(|image| {
             self.memory.compare(frame_in_drive, image.places());
             image.with_memory(states, &self.layout, &self.settings)
         });
-        Trial { image, remembered: Some(remembered), ..trial }
+        Trial { image, remembered: Some(forecast), ..trial }
     }
 }
 

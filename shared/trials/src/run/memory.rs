@@ -2,7 +2,7 @@
 
 use carff_checkpoint::FieldProbe;
 use carff_decision::{
-    ImageEvidence, Memory, MemorySettings, Mixture, ProbeLayout, RememberedStates, StepLength, TakeFrame, TakeMemory,
+    ImageEvidence, Memory, MemorySettings, ProbeLayout, Remembered, StepLength, TakeFrame, TakeMemory,
 };
 use carff_inference::MixtureNet;
 use carff_messages::Gaussian;
@@ -22,15 +22,7 @@ pub struct TakenImage {
 /// The memory at each frame of a run.
 pub struct RunMemory {
     settings: MemorySettings,
-    frames: BTreeMap<u64, RememberedFrame>,
-}
-
-/// The memory at a frame, without the comparison of its image.
-pub struct RememberedFrame {
-    /// Forecast from all images of the take so far.
-    pub forecast: Mixture,
-    /// Weights of the states.
-    states: RememberedStates,
+    frames: BTreeMap<u64, Remembered>,
 }
 
 impl RunMemory {
@@ -45,23 +37,22 @@ impl RunMemory {
         let memory = Memory::new(probe.layout(), probe.states().to_vec(), |state| net.forecast(state), settings);
         let mut memory = TakeMemory::new(memory, step);
         let see = |taken: &TakenImage| {
-            let (forecast, _) = memory.see(taken.frame, &net.forecast(&taken.posterior));
-            let states = memory.remembered();
+            let remembered = memory.see(taken.frame, &net.forecast(&taken.posterior));
             if let Some(image) = &taken.image {
                 memory.compare(taken.frame.frame, image.places());
             }
-            (taken.frame.frame, RememberedFrame { forecast, states })
+            (taken.frame.frame, remembered)
         };
         Self { settings, frames: images.iter().map(see).collect() }
     }
 
     /// Returns what the memory holds at a frame; `None` if the frame has no posterior.
-    pub fn of(&self, frame: u64) -> Option<&RememberedFrame> {
+    pub fn of(&self, frame: u64) -> Option<&Remembered> {
         self.frames.get(&frame)
     }
 
     /// Returns the evidence of a frame's own image for the belief with this memory.
-    pub fn weighed(&self, image: ImageEvidence, frame: &RememberedFrame, layout: &ProbeLayout) -> ImageEvidence {
+    pub fn weighed(&self, image: ImageEvidence, frame: &Remembered, layout: &ProbeLayout) -> ImageEvidence {
         image.with_memory(frame.states.clone(), layout, &self.settings)
     }
 }
