@@ -60,8 +60,8 @@ impl Carried {
     }
 
     /// Returns the frames whose results the recording determines, of all recorded ones in their order (number, and
-    /// number of the first frame of the take) and of those that the graph has `answered`. A replay answers each frame:
-    /// where the graph has skipped one, it carried something else.
+    /// number of the first frame of the take) and of those that the graph has `answered`, up to the last step. A replay
+    /// answers each frame: where the graph has skipped one, or its last step, it carried something else.
     fn determined(self, recorded: &[(u64, u64)], answered: &BTreeSet<u64>) -> BTreeSet<u64> {
         let mut frames = BTreeSet::new();
         // The frame before, its take, and whether the take is complete up to it.
@@ -122,7 +122,8 @@ impl Replayed {
             if let Some(frame) = message.get::<FrameMeta>() {
                 recorded.push((frame.header.frame_id, frame.take_start));
             }
-            answered.extend(timeless(message).map(|((_, frame, _), _)| frame));
+            let last_step = message.get::<Belief>().filter(|belief| belief.is_final());
+            answered.extend(last_step.map(|belief| belief.header.frame_id));
         }
         let frames = carried.determined(&recorded, &answered);
         let left_out = (recorded.len() - frames.len()) as u64;
@@ -236,11 +237,16 @@ mod tests {
         belief
     }
 
-    /// Writes a recording with `frames` frames, the last one first, and each belief ahead of its frame.
-    fn recorded(path: &Path, frames: u64) {
+    /// Writes a recording with `frames` frames, the last one first, and each belief ahead of its frame. Those of
+    /// `unfinished` are not of the last step.
+    fn recorded(path: &Path, frames: u64, unfinished: &[u64]) {
         let mut writer = Writer::create(path, &RecordingAbout::default(), &[]).unwrap();
         for frame in (0..frames).rev() {
-            writer.write(TopicId::BELIEF, AnyMessage::new(&a_belief(frame, 0.25), &[])).unwrap();
+            let mut belief = a_belief(frame, 0.25);
+            if unfinished.contains(&frame) {
+                (belief.horizon, belief.is_final) = (2, 0);
+            }
+            writer.write(TopicId::BELIEF, AnyMessage::new(&belief, &[])).unwrap();
             let mut meta = FrameMeta {
                 header: Header::of_frame(frame, frame, 1),
                 width_px: 1,
@@ -269,13 +275,23 @@ mod tests {
         }
     }
 
+    /// A frame after one whose last step the graph did not reach rests on an earlier comparison.
+    #[test]
+    fn an_unfinished_frame_determines_none() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("r.mcap");
+        recorded(&path, 5, &[1, 3]);
+        let left_out = |carried| Replayed::default().compare(&path, carried).unwrap().left_out;
+        assert_eq!([Carried::Nothing, Carried::LastFrame, Carried::Take].map(left_out), [0, 2, 3]);
+    }
+
     /// Beliefs that differ only in time are equal, in whichever order they are recorded. The first different belief by
     /// its frame is reported with its field, and an absent one is missing.
     #[test]
     fn differences_are_reported() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("r.mcap");
-        recorded(&path, 3);
+        recorded(&path, 3, &[]);
         let mut replayed = Replayed::default();
         for frame in 0..3 {
             let mut belief = a_belief(frame, 0.25);

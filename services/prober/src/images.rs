@@ -98,7 +98,7 @@ impl Images {
         self.sighting = sighting.map(|sighting| (frame.header.capture_time_ns, sighting));
         let mut unknowns = Unknowns::of_frame(frame.header);
         (unknowns.noise, unknowns.explained) = (comparison.fit.noise, comparison.fit.explained);
-        (unknowns.gain, unknowns.offset) = (comparison.fit.gain, comparison.fit.offset);
+        (unknowns.gain, unknowns.offset) = (comparison.fit.gain(), comparison.fit.offset);
         describe(&seen, probe.layout().places(), &mut unknowns);
         if let Some((_, places)) = &mut self.memory {
             let field = self.comparer.without_own(probe.field());

@@ -19,19 +19,14 @@ fn checkpoint() -> PathBuf {
     root.join("configs/checkpoints/approaching-intersection")
 }
 
-/// A camera over the actor's lane, and a frame that it took at a time.
-fn frame(id: u64, at_ms: u64) -> FrameMeta {
-    let camera = PinholeCamera::look_at([-8.0, -12.0, 9.0], [-8.0, -1.0, 0.0], [0.0, 0.0, 1.0], 128, 128, 60.0);
-    FrameMeta { header: Header::of_frame(id, at_ms * MS, 1), ..FrameMeta::of_camera(&camera, DatasetView::UNKNOWN) }
-}
-
-/// A camera across the road, which has the actor's places in full view.
+/// A camera across the road, which has the actor's places in full view. Its image's middle shows the lane at (-10, -2).
 fn lane() -> PinholeCamera {
     PinholeCamera::look_at([-10.0, 10.0, 7.0], [-10.0, -2.0, 0.0], [0.0, 0.0, 1.0], 128, 128, 70.0)
 }
 
-fn of_lane(id: u64) -> FrameMeta {
-    FrameMeta { header: Header::of_frame(id, 100 * MS, 1), ..FrameMeta::of_camera(&lane(), DatasetView::UNKNOWN) }
+/// A frame that this camera took at a time.
+fn frame(id: u64, at_ms: u64) -> FrameMeta {
+    FrameMeta { header: Header::of_frame(id, at_ms * MS, 1), ..FrameMeta::of_camera(&lane(), DatasetView::UNKNOWN) }
 }
 
 /// A forecast of a frame's image, without a memory.
@@ -41,7 +36,7 @@ fn forecast(id: u64, at_ms: u64) -> Forecast {
 
 /// An image of a known state, as the field renders it.
 fn image_of(probe: &FieldProbe, state: usize) -> Array3<u8> {
-    image_from(&frame(1, 0).camera(), probe, state)
+    image_from(&lane(), probe, state)
 }
 
 fn image_from(camera: &PinholeCamera, probe: &FieldProbe, state: usize) -> Array3<u8> {
@@ -75,7 +70,7 @@ fn a_patch_on_the_lane_is_unknown() {
     after.validate().unwrap();
     assert!(after.probability > 0.5 && after.residual > 1.0, "{after:?}");
     let [x, y, _] = after.boxes()[0].center;
-    assert!((x + 8.0).abs() < 2.5 && (y + 1.0).abs() < 3.0, "{:?}", after.boxes());
+    assert!((x + 10.0).abs() < 2.5 && (y + 2.0).abs() < 3.0, "{:?}", after.boxes());
 
     let evidence = |images: &Images, id, at_ms: u64| images.evidence(&forecast(id, at_ms), probe.layout());
     assert!(evidence(&images, 2, 200).is_some());
@@ -119,8 +114,8 @@ fn an_image_shows_its_places() {
     assert_eq!(actors.len(), 3);
     let (mut taken, mut free) = (0, 0);
     for state in 0..probe.states().len() {
-        let image = image_from(&lane(), &probe, state).mapv(|v| (0.6 * f32::from(v) + 20.0) as u8);
-        let unknowns = images.compare(&probe, &of_lane(state as u64), image.view(), 1).unwrap();
+        let image = image_of(&probe, state).mapv(|v| (0.6 * f32::from(v) + 20.0) as u8);
+        let unknowns = images.compare(&probe, &frame(state as u64, 100), image.view(), 1).unwrap();
         for &place in &actors {
             let shown = unknowns.places()[place];
             let is_taken = probe.layout().places()[place].occupied_in[state];
@@ -131,7 +126,7 @@ fn an_image_shows_its_places() {
     }
     assert!(taken >= 2 && free >= 8, "{taken} {free}");
     let mut forgets = Images::load(&checkpoint(), &probe, false).unwrap().unwrap();
-    let unknowns = forgets.compare(&probe, &of_lane(1), image_from(&lane(), &probe, 0).view(), 1).unwrap();
+    let unknowns = forgets.compare(&probe, &frame(1, 100), image_of(&probe, 0).view(), 1).unwrap();
     assert_eq!(unknowns.places(), [0.0; 0]);
 }
 
@@ -141,7 +136,7 @@ fn places_weigh_a_belief_with_a_memory() {
     let (probe, _) = load(&checkpoint()).unwrap();
     let mut images = Images::load(&checkpoint(), &probe, true).unwrap().unwrap();
     let hazard = probe.layout().hazard_states().iter().position(|hazard| *hazard).unwrap();
-    images.compare(&probe, &of_lane(1), image_from(&lane(), &probe, hazard).view(), 1).unwrap();
+    images.compare(&probe, &frame(1, 100), image_of(&probe, hazard).view(), 1).unwrap();
     let with_memory = |weights: &[f32]| {
         let mut forecast = forecast(1, 100);
         forecast.state_count = weights.len() as u32;

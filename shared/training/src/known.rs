@@ -166,7 +166,7 @@ impl Work {
         let Self { lanes, states, hazard_states, field, threads, comparer, .. } = self;
         let scene = KnownScene { field, states, hazard_states, lanes };
         let compared = comparer.compare(scene, camera, noisy.view()?, *threads).filter(Comparison::sees_lanes)?;
-        Some(comparer.explain_own(&compared, scene, *threads).unwrap_or(compared))
+        Some(comparer.look_closer(&compared, scene, *threads).unwrap_or(compared))
     }
 }
 

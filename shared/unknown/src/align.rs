@@ -2,7 +2,7 @@
 
 use crate::fit::least_squares;
 use carff_field::Displacement;
-use ndarray::{ArrayView3, Axis, s};
+use ndarray::{ArrayView2, ArrayView3, Axis, s};
 
 /// Terms of the affine map from rendered to seen pixels, for each axis.
 const TERMS: usize = 3;
@@ -36,6 +36,23 @@ pub(crate) struct View<'a> {
 /// Returns the means of an image (height, width, channel) over the cells of a grid: RGB, 0..=1, row by row, `width` x
 /// `height`.
 pub fn reduced(image: ArrayView3<'_, u8>, width: usize, height: usize) -> Vec<f32> {
+    let mean = |values: ArrayView2<'_, u8>| {
+        values.iter().map(|v| f32::from(*v)).sum::<f32>() / (values.len().max(1) as f32 * 255.0)
+    };
+    of_cells(image, width, height, mean)
+}
+
+/// Returns what [`reduced`] does, without the largest and the smallest value of a cell: a dead pixel does not count.
+pub(crate) fn reduced_without_specks(image: ArrayView3<'_, u8>, width: usize, height: usize) -> Vec<f32> {
+    of_cells(image, width, height, trimmed_mean)
+}
+
+fn of_cells(
+    image: ArrayView3<'_, u8>,
+    width: usize,
+    height: usize,
+    value: impl Fn(ArrayView2<'_, u8>) -> f32,
+) -> Vec<f32> {
     let (rows, columns, _) = image.dim();
     let cell = |i: usize, n: usize, all: usize| {
         let start = (i * all / n).min(all.saturating_sub(1));
@@ -45,13 +62,21 @@ pub fn reduced(image: ArrayView3<'_, u8>, width: usize, height: usize) -> Vec<f3
     for y in 0..height {
         for x in 0..width {
             let part = image.slice(s![cell(y, height, rows), cell(x, width, columns), ..]);
-            let n = (part.len() / 3).max(1) as f32 * 255.0;
-            for channel in part.axis_iter(Axis(2)).take(3) {
-                out.push(channel.iter().map(|&v| f32::from(v)).sum::<f32>() / n);
-            }
+            out.extend(part.axis_iter(Axis(2)).take(3).map(&value));
         }
     }
     out
+}
+
+/// Mean of values, 0..=1, without the largest and the smallest one of at least four: a dead pixel does not count.
+fn trimmed_mean(values: ArrayView2<'_, u8>) -> f32 {
+    let sum: u32 = values.iter().map(|v| u32::from(*v)).sum();
+    let ends = values.iter().fold([u8::MAX, 0], |[low, high], v| [low.min(*v), high.max(*v)]).map(u32::from);
+    let (sum, count) = match values.len() {
+        0..4 => (sum, values.len()),
+        all => (sum - ends[0] - ends[1], all - 2),
+    };
+    sum as f32 / (255.0 * count.max(1) as f32)
 }
 
 /// Brightness of an image, row by row.

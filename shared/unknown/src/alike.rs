@@ -55,15 +55,15 @@ fn explains(one: &[f32], other: &[f32], judged: &[bool], width: usize) -> bool {
     let pixels: Vec<usize> = (0..judged.len()).filter(|&i| judged[i]).collect();
     let freely = fit(other, one, &pixels);
     // A bright vehicle that only `one` has pulls the gain towards nothing, and nothing explains everything.
-    let is_plausible = freely.gain.iter().all(|gain| (1.0 / MOST_GAIN..=MOST_GAIN).contains(gain));
+    let is_plausible = freely.gain().iter().all(|gain| (1.0 / MOST_GAIN..=MOST_GAIN).contains(gain));
     let fit = if is_plausible { freely } else { fit_from_offset(other, one, &pixels) };
-    let energy = Pixels::new(other, judged, &[one], width).energy(one, &fit);
+    let energy = Pixels::new(other, judged, &[one], width).energy(one, &[], &fit);
     let residual = median_residual(&energy, ResidualKind::Unexpected, judged, width, fit.noise);
     residual.iter().all(|residual| *residual <= WITHIN)
 }
 
 /// Means over 3 x 3 pixels.
-fn smooth(image: &[f32], width: usize) -> Vec<f32> {
+pub(crate) fn smooth(image: &[f32], width: usize) -> Vec<f32> {
     let everywhere = vec![true; image.len() / 3];
     let sums = with_neighbours(image, &everywhere, width, 0.0, |a, b| a + b);
     let counts = with_neighbours(&vec![1.0; image.len()], &everywhere, width, 0.0, |a, b| a + b);

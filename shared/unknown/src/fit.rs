@@ -8,6 +8,8 @@ const PASSES: usize = 5;
 const ROUNDS: usize = 3;
 /// Pixels beyond this many robust deviations do not count in the fit.
 const TRIM: f32 = 2.5;
+/// Seen value from which on a sensor may be saturated, of 1.
+const SATURATED: f32 = 0.98;
 /// Smallest deviation of a pixel, of 1.
 pub(crate) const LEAST_NOISE: f32 = 0.015;
 /// Fewest points of a fit.
@@ -15,11 +17,12 @@ const FEWEST: f64 = 16.0;
 /// A robust deviation is the median times this, for normally distributed values.
 const OF_MEDIAN: f32 = 1.4826;
 
-/// Gain and offset of a camera against the field, by channel, and what is left.
+/// Colours of a camera against the field, and what is left.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Fit {
-    /// Factor from rendered to seen values.
-    pub gain: [f32; 3],
+    /// For each seen channel, the factors of the rendered ones. Those of other channels are 0, unless the camera mixes
+    /// colours, as a monochrome one does.
+    pub mix: [[f32; 3]; 3],
     /// Offset from rendered to seen values, of 1.
     pub offset: [f32; 3],
     /// Robust deviation of a pixel, of 1.
@@ -27,6 +30,31 @@ pub struct Fit {
     /// Share of the view's variation that the still parts of the field explain, at most 1; 0 or below for a view of
     /// another place, or from another pose. 1 where the view shows lanes, but no still part.
     pub explained: f32,
+}
+
+impl Fit {
+    /// A camera that shows what is rendered.
+    pub(crate) const EXACT: Self = Self {
+        mix: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
+        offset: [0.0; 3],
+        noise: LEAST_NOISE,
+        explained: 1.0,
+    };
+
+    /// Returns the colour, 0..=1, that the camera shows for a rendered one. A sensor saturates: nothing is brighter than 1.
+    pub fn seen(&self, rgb: &[f32]) -> [f32; 3] {
+        [0, 1, 2].map(|c| (self.difference(c, rgb) + self.offset[c]).clamp(0.0, 1.0))
+    }
+
+    /// Returns the difference in a channel that the camera shows for a rendered difference.
+    pub fn difference(&self, channel: usize, rgb: &[f32]) -> f32 {
+        self.mix[channel].iter().zip(rgb).map(|(factor, v)| factor * v).sum()
+    }
+
+    /// Returns the gain of each channel, for grey.
+    pub fn gain(&self) -> [f32; 3] {
+        self.mix.map(|factors| factors.iter().sum())
+    }
 }
 
 pub(crate) fn median(values: &mut [f32]) -> f32 {
@@ -37,11 +65,11 @@ pub(crate) fn median(values: &mut [f32]) -> f32 {
     *values.select_nth_unstable_by(middle, f32::total_cmp).1
 }
 
-/// Robust deviation of pixels from a gain and an offset of the rendered image, of 1: the root mean square over the
+/// Robust deviation of pixels from the rendered image as the camera would show it, of 1: the root mean square over the
 /// channels, at least [`LEAST_NOISE`].
 pub(crate) fn noise(image: &[f32], rendered: &[f32], fit: &Fit, pixels: &[usize]) -> f32 {
     let of_channel = |c: usize| {
-        let error = |&i: &usize| (image[i * 3 + c] - fit.gain[c] * rendered[i * 3 + c] - fit.offset[c]).abs();
+        let error = |&i: &usize| (image[i * 3 + c] - fit.seen(&rendered[i * 3..i * 3 + 3])[c]).abs();
         OF_MEDIAN * median(&mut pixels.iter().map(error).collect::<Vec<_>>())
     };
     ((0..3).map(|c| of_channel(c).powi(2)).sum::<f32>() / 3.0).sqrt().max(LEAST_NOISE)
@@ -49,17 +77,56 @@ pub(crate) fn noise(image: &[f32], rendered: &[f32], fit: &Fit, pixels: &[usize]
 
 /// Fits gain and offset of each channel by least squares over some pixels, without outliers.
 pub(crate) fn fit(image: &[f32], rendered: &[f32], pixels: &[usize]) -> Fit {
-    let mut fit = Fit { gain: [1.0; 3], offset: [0.0; 3], noise: LEAST_NOISE, explained: 1.0 };
+    fit_terms(
+        image,
+        rendered,
+        pixels,
+        |c, rgb| [rgb[c], 1.0],
+        |c, [gain, offset]| {
+            let mut mix = [0.0; 3];
+            mix[c] = gain;
+            (mix, offset)
+        },
+    )
+}
+
+/// Fits each seen channel by least squares as a mixture of the rendered ones, as [`fit`] does for one.
+pub(crate) fn fit_mixed(image: &[f32], rendered: &[f32], pixels: &[usize]) -> Fit {
+    fit_terms(
+        image,
+        rendered,
+        pixels,
+        |_, rgb| [rgb[0], rgb[1], rgb[2], 1.0],
+        |_, [r, g, b, offset]| ([r, g, b], offset),
+    )
+}
+
+/// Fits factors of terms of the rendered colour to each seen channel. Saturated values do not count.
+fn fit_terms<const N: usize>(
+    image: &[f32],
+    rendered: &[f32],
+    pixels: &[usize],
+    terms: impl Fn(usize, &[f32]) -> [f32; N],
+    factors: impl Fn(usize, [f32; N]) -> ([f32; 3], f32),
+) -> Fit {
+    let mut fit = Fit::EXACT;
     for c in 0..3 {
-        let pairs: Vec<(f32, f32)> = pixels.iter().map(|&i| (rendered[i * 3 + c], image[i * 3 + c])).collect();
+        let row = |&i: &usize| (terms(c, &rendered[i * 3..i * 3 + 3]), image[i * 3 + c]);
+        let rows: Vec<([f32; N], f32)> = pixels.iter().map(row).filter(|(_, seen)| *seen < SATURATED).collect();
         let mut limit = f32::INFINITY;
+        let mut found: Option<[f32; N]> = None;
         for _ in 0..PASSES {
-            let error = |(x, y): (f32, f32)| (y - fit.gain[c] * x - fit.offset[c]).abs();
-            let within = pairs.iter().copied().filter(|pair| error(*pair) <= limit);
-            let Some(line) = least_squares(within.map(|(x, y)| ([x, 1.0], y))) else { break };
-            [fit.gain[c], fit.offset[c]] = line;
-            let mut errors: Vec<f32> = pairs.iter().map(|(x, y)| (y - line[0] * x - line[1]).abs()).collect();
+            let error = |(terms, seen): &([f32; N], f32), by: &[f32; N]| {
+                (seen - terms.iter().zip(by).map(|(term, factor)| term * factor).sum::<f32>()).abs()
+            };
+            let within = rows.iter().filter(|row| found.is_none_or(|by| error(row, &by) <= limit));
+            let Some(by) = least_squares(within.copied()) else { break };
+            let mut errors: Vec<f32> = rows.iter().map(|row| error(row, &by)).collect();
             limit = (TRIM * OF_MEDIAN * median(&mut errors)).max(LEAST_NOISE);
+            found = Some(by);
+        }
+        if let Some(by) = found {
+            (fit.mix[c], fit.offset[c]) = factors(c, by);
         }
     }
     Fit { noise: noise(image, rendered, &fit, pixels), ..fit }
@@ -70,10 +137,9 @@ pub(crate) fn fit(image: &[f32], rendered: &[f32], pixels: &[usize]) -> Fit {
 pub(crate) fn fit_from_offset(image: &[f32], rendered: &[f32], pixels: &[usize]) -> Fit {
     let offset =
         |c: usize| median(&mut pixels.iter().map(|&i| image[i * 3 + c] - rendered[i * 3 + c]).collect::<Vec<_>>());
-    let mut found = Fit { gain: [1.0; 3], offset: [0, 1, 2].map(offset), noise: LEAST_NOISE, explained: 1.0 };
+    let mut found = Fit { offset: [0, 1, 2].map(offset), ..Fit::EXACT };
     for _ in 0..ROUNDS {
-        let error =
-            |i: usize, c: usize| (image[i * 3 + c] - found.gain[c] * rendered[i * 3 + c] - found.offset[c]).abs();
+        let error = |i: usize, c: usize| (image[i * 3 + c] - found.seen(&rendered[i * 3..i * 3 + 3])[c]).abs();
         let limits = [0, 1, 2].map(|c| {
             (TRIM * OF_MEDIAN * median(&mut pixels.iter().map(|&i| error(i, c)).collect::<Vec<_>>())).max(LEAST_NOISE)
         });
@@ -115,7 +181,7 @@ mod tests {
             rendered.iter().enumerate().map(|(i, v)| if i / 3 % 9 < 1 { 0.95 } else { 0.6 * v + 0.2 }).collect();
         let fit = fit(&image, &rendered, &(0..300).collect::<Vec<_>>());
         for c in 0..3 {
-            assert!((fit.gain[c] - 0.6).abs() < 0.05 && (fit.offset[c] - 0.2).abs() < 0.05, "{fit:?}");
+            assert!((fit.gain()[c] - 0.6).abs() < 0.05 && (fit.offset[c] - 0.2).abs() < 0.05, "{fit:?}");
         }
     }
 
@@ -129,10 +195,10 @@ mod tests {
         let pixels: Vec<usize> = (0..300).collect();
         let fit = fit_from_offset(&image, &rendered, &pixels);
         for c in 0..3 {
-            assert!((fit.gain[c] - 0.9).abs() < 0.01 && (fit.offset[c] - 0.05).abs() < 0.01, "{fit:?}");
+            assert!((fit.gain()[c] - 0.9).abs() < 0.01 && (fit.offset[c] - 0.05).abs() < 0.01, "{fit:?}");
         }
         let nothing = fit_from_offset(&image, &rendered, &[]);
-        assert_eq!((nothing.gain, nothing.offset), ([1.0; 3], [0.0; 3]));
+        assert_eq!((nothing.gain(), nothing.offset), ([1.0; 3], [0.0; 3]));
     }
 
     /// Factors are found exactly where the values have no noise; too few rows and dependent terms have none.

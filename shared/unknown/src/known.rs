@@ -16,12 +16,14 @@ use std::path::{Path, PathBuf};
 /// File name in a checkpoint.
 const FILE: &str = "known.json";
 /// Version of the file's format. The limits of earlier versions are for other residuals.
-const FORMAT_VERSION: u32 = 4;
+const FORMAT_VERSION: u32 = 5;
 /// Steepness of the evidence against a state beyond the limit: at 1.5 times the limit, something unknown explains the
 /// image 58 times better.
 const STEEPNESS: f64 = 10.0;
 /// Share of the known images that leave less than the limit of a kind.
 const WITHIN: f64 = 0.97;
+/// Smallest limit of a kind, in errors of the field: below it, a slightly corrupted image leaves more than a clean one.
+const LEAST_LIMIT: f32 = 2.0;
 /// Share of the known images' smallest explained share below which a view is of another place.
 const OF_LEAST_EXPLAINED: f32 = 0.8;
 
@@ -34,7 +36,7 @@ const ELSEWHERE: f32 = 100.0;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Known {
-    /// Format of this file; 4.
+    /// Format of this file; 5.
     pub format_version: u32,
     /// The ground on which something unknown counts.
     pub lanes: Lanes,
@@ -68,7 +70,7 @@ pub struct KnownLimits {
 pub struct KindLimits {
     /// The field's own errors on the lanes.
     pub errors: ErrorMap,
-    /// Strength of a blob that 97 of 100 images stay below.
+    /// Strength of a blob that 97 of 100 images stay below, at least 2.
     pub limit: f32,
 }
 
@@ -164,7 +166,7 @@ impl Known {
         if seen.residual <= SUSPICIOUS {
             return (seen, comparison);
         }
-        match comparer.explain_own(&comparison, scene, threads) {
+        match comparer.look_closer(&comparison, scene, threads) {
             Some(explained) => (self.judge(&explained), explained),
             None => (seen, comparison),
         }
@@ -274,7 +276,7 @@ impl KnownLimits {
         let of_kind = |errors, mut strengths: Vec<f32>| {
             strengths.sort_by(f32::total_cmp);
             let at = ((strengths.len() as f64 * WITHIN).ceil() as usize).saturating_sub(1);
-            KindLimits { errors, limit: strengths.get(at).copied().unwrap_or(1.0).max(1.0) }
+            KindLimits { errors, limit: strengths.get(at).copied().unwrap_or_default().max(LEAST_LIMIT) }
         };
         let ([unexpected_errors, missing_errors], [unexpected, missing]) = (errors, strengths);
         Self { unexpected: of_kind(unexpected_errors, unexpected), missing: of_kind(missing_errors, missing), images }
@@ -415,6 +417,36 @@ mod tests {
         comparison.fit.explained = 0.4;
         let elsewhere = known.judge(&comparison);
         assert!(elsewhere.boxes.is_empty() && elsewhere.ratios == [0.0], "{elsewhere:?}");
+    }
+
+    /// Images that leave nothing have the smallest limits; those that leave more have larger ones.
+    #[test]
+    fn limits_have_a_floor() {
+        let known = known();
+        let config = FieldConfig {
+            log2_table_size: 10,
+            occupancy_resolution: 16,
+            density_offset: -9.0,
+            ..FieldConfig::default()
+        };
+        let field = Field::new(config, 4).unwrap();
+        let camera = PinholeCamera::look_at([0.0, -8.0, 6.0], [0.0; 3], [0.0, 0.0, 1.0], 64, 64, 60.0);
+        let image = ndarray::Array3::from_elem((64, 64, 3), 90);
+        let states = [[0.0; LATENT_DIM]];
+        let any = known.see(&mut Comparer::default(), &field, &states, (&camera, image.view()), 1).unwrap().1;
+        let on_lane = |i: usize| (27..35).contains(&(i / 64)) && (27..39).contains(&(i % 64));
+        let comparison = |left: f32| {
+            let residual = (0..64 * 64).map(|i| if on_lane(i) { left } else { 0.0 }).collect();
+            any.clone().with_residuals(vec![[residual, vec![0.0; 64 * 64]]])
+        };
+        let limit = |left: f32| {
+            let (for_errors, for_limit) = (comparison(1.0), comparison(left));
+            let images: Vec<&Comparison> = (0..40).map(|i| if i < 20 { &for_errors } else { &for_limit }).collect();
+            KnownLimits::fit(&known.lanes, &[0], &images).unexpected.limit
+        };
+        assert_eq!(limit(1.5), LEAST_LIMIT);
+        assert!((limit(4.0) - 4.0).abs() < 0.5, "{}", limit(4.0));
+        assert_eq!(KnownLimits::fit(&known.lanes, &[0], &[]).unexpected.limit, LEAST_LIMIT);
     }
 
     /// An image is not explained if by its pose the camera sees no lane, and nothing by which to recognise the place.

@@ -12,6 +12,15 @@ const SURFACE_M: f64 = 0.5;
 /// Height above the ground that stays when the vehicle itself is left out of images, metres.
 const GROUND_M: f64 = 0.12;
 
+/// A rendered depth hides what is more than this share, and this many metres, behind it: the field's surfaces are not sharp.
+const DEPTH_SHARE: f64 = 0.85;
+const DEPTH_M: f64 = 0.5;
+
+/// Reports whether a surface at the rendered depth hides what is at a distance along the same ray, metres.
+pub(crate) fn is_nearer(depth_m: f64, distance_m: f64) -> bool {
+    depth_m < DEPTH_SHARE * distance_m - DEPTH_M
+}
+
 /// The parts of the ground on which something unknown is a hazard: roads, or the surroundings of the probed places.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -98,6 +107,23 @@ impl Lanes {
                 })
             })
             .collect()
+    }
+
+    /// Takes those points off the lanes that something next to the lanes hides in every known state, such as a building.
+    /// `depths` has the rendered distance of each pixel in each state, metres, 0 where nothing was rendered.
+    pub(crate) fn leave_out_hidden(&self, camera: &PinholeCamera, depths: &[&[f32]], ground: &mut [Option<Ground>]) {
+        let (width, is_judged) = (camera.width_px.max(1) as usize, self.judged_ground());
+        for (pixel, ground) in ground.iter_mut().enumerate() {
+            let Some(ground) = ground.as_mut().filter(|ground| ground.on_lanes) else { continue };
+            let ray = camera.ray((pixel % width) as f64 + 0.5, (pixel / width) as f64 + 0.5);
+            let at = |depth_m: f64, axis: usize| f64::from(ray.origin[axis]) + depth_m * f64::from(ray.direction[axis]);
+            let is_hidden = |depths: &&[f32]| {
+                let depth_m = depths.get(pixel).map_or(0.0, |depth| f64::from(*depth));
+                let is_rendered = depth_m > 0.0;
+                is_rendered && is_nearer(depth_m, ground.distance_m) && !is_judged([0, 1].map(|i| at(depth_m, i)))
+            };
+            ground.on_lanes = depths.is_empty() || !depths.iter().all(is_hidden);
+        }
     }
 }
 
@@ -227,6 +253,25 @@ mod tests {
         assert!(middle.on_lanes && middle.at_m.iter().all(|v| v.abs() < 0.3), "{middle:?}");
         assert!((middle.distance_m - 45.0_f64.sqrt()).abs() < 0.5);
         assert_eq!(points[16], None);
+    }
+
+    /// A wall next to the lane hides the lane behind it if every state has the wall. A vehicle on the lane hides no lane:
+    /// something else may be in its place.
+    #[test]
+    fn a_wall_hides_the_lane_behind_it() {
+        let camera = PinholeCamera::look_at([0.0, -6.0, 3.0], [0.0, 0.0, 0.0], [0.0, 0.0, 1.0], 33, 33, 100.0);
+        let (lanes, middle) = (lanes(), 16 * 33 + 16);
+        let in_sight = |depths_m: &[f32]| {
+            let images: Vec<Vec<f32>> = depths_m.iter().map(|depth_m| vec![*depth_m; 33 * 33]).collect();
+            let mut ground = lanes.ground_points(&camera);
+            lanes.leave_out_hidden(&camera, &images.iter().map(Vec::as_slice).collect::<Vec<_>>(), &mut ground);
+            ground[middle].is_some_and(|ground| ground.on_lanes)
+        };
+        // The ground is 6.7 m away along this ray, and the edge of the lane 4.5 m.
+        assert!(!in_sight(&[3.0, 2.0]), "a wall");
+        assert!(in_sight(&[3.0, 6.7]), "a state without the wall");
+        assert!(in_sight(&[5.0, 5.0]), "a vehicle on the lane");
+        assert!(in_sight(&[6.6, 6.8]) && in_sight(&[0.0, 0.0]) && in_sight(&[]), "nothing");
     }
 
     /// The pixels of the vehicle itself are those that its box with its margin covers. A camera next to it has no margin,

@@ -130,14 +130,13 @@ fn extent_px(place: &OrientedBox, camera: &PinholeCamera) -> [[usize; 2]; 2] {
 fn shown(pixels: &[usize], step: usize, [taken, free]: [&[f32]; 2], seen: impl Fn(usize) -> f32, fit: &Fit) -> f32 {
     let (mut along, mut energy) = (0.0, 0.0);
     for &pixel in pixels {
-        let difference = [0, 1, 2].map(|c| fit.gain[c] * (taken[pixel * 3 + c] - free[pixel * 3 + c]));
+        let of = |rendered: &[f32]| fit.seen(&rendered[pixel * 3..pixel * 3 + 3]);
+        let (taken, free) = (of(taken), of(free));
+        let difference = [0, 1, 2].map(|c| taken[c] - free[c]);
         if difference.iter().all(|d| d.abs() < LEAST_DIFFERENCE) {
             continue;
         }
-        let error = |c: usize| {
-            let i = pixel * 3 + c;
-            seen(i) - fit.offset[c] - 0.5 * fit.gain[c] * (taken[i] + free[i])
-        };
+        let error = |c: usize| seen(pixel * 3 + c) - 0.5 * (taken[c] + free[c]);
         let squared: f32 = difference.iter().map(|d| d * d).sum();
         let at = (0..3).map(|c| difference[c] * error(c)).sum::<f32>() / squared;
         along += squared * at.clamp(-LIMIT, LIMIT);
@@ -151,7 +150,12 @@ fn shown(pixels: &[usize], step: usize, [taken, free]: [&[f32]; 2], seen: impl F
 mod tests {
     use super::*;
 
-    const FIT: Fit = Fit { gain: [0.5; 3], offset: [0.25; 3], noise: 0.02, explained: 1.0 };
+    const FIT: Fit = Fit {
+        mix: [[0.5, 0.0, 0.0], [0.0, 0.5, 0.0], [0.0, 0.0, 0.5]],
+        offset: [0.25; 3],
+        noise: 0.02,
+        explained: 1.0,
+    };
 
     /// An image of the vehicle is at 1, one of the road at -1, one in which both look alike or of which a half shows each
     /// at 0; a few pixels count less than many. A brighter camera changes nothing.

@@ -49,6 +49,13 @@ impl Ranges {
         }
     }
 
+    /// The ranges of both images together.
+    fn joined(mut self, other: &Self) -> Self {
+        self.low.iter_mut().zip(&other.low).for_each(|(low, v)| *low = low.min(*v));
+        self.high.iter_mut().zip(&other.high).for_each(|(high, v)| *high = high.max(*v));
+        self
+    }
+
     /// Distance of a value from its range.
     fn beyond(&self, i: usize, value: f32) -> f32 {
         (value - self.high[i]).max(self.low[i] - value).max(0.0)
@@ -101,15 +108,20 @@ impl<'a> Pixels<'a> {
     }
 
     /// Squared distance of each pixel from the range of its neighbours' rendered values, summed over the channels. The
-    /// range forgives what a blurred edge, or a pose that is off by half a pixel, changes.
+    /// range forgives what a blurred edge, or a pose that is off by half a pixel, changes. `rays` are further rendered
+    /// values of each pixel, which count in the ranges, too.
     ///
     /// It also forgives a vehicle that the state has and the image does not show: the vehicle's edges, windows and
     /// wheels span the road's values. So where the states do not look alike, the distance of the rendered value from the
     /// range of the image's neighbours counts too, as the second kind.
-    pub fn energy(&self, rendered: &[f32], fit: &Fit) -> Vec<BothResiduals> {
-        let in_image = |pixel: &[f32]| [0, 1, 2].map(|c| fit.gain[c] * pixel[c] + fit.offset[c]);
-        let expected: Vec<f32> = rendered.chunks_exact(CHANNELS).flat_map(in_image).collect();
-        let ranges = Ranges::of(&expected, self.judged, self.width);
+    pub fn energy(&self, rendered: &[f32], rays: &[Vec<f32>], fit: &Fit) -> Vec<BothResiduals> {
+        let expected = |rendered: &[f32]| -> Vec<f32> {
+            rendered.chunks_exact(CHANNELS).flat_map(|pixel| fit.seen(pixel)).collect()
+        };
+        let ranges_of = |image: &[f32]| Ranges::of(image, self.judged, self.width);
+        let of_rays = rays.iter().map(|rays| ranges_of(&expected(rays)));
+        let expected = expected(rendered);
+        let ranges = of_rays.fold(ranges_of(&expected), |all, rays| all.joined(&rays));
         let of_pixel = |pixel: usize| {
             let values = pixel * CHANNELS..(pixel + 1) * CHANNELS;
             let both = |i: usize| {
@@ -184,7 +196,6 @@ fn lower_median(mut values: [f32; 9], count: usize) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::fit::LEAST_NOISE;
 
     /// A patch that the rendered image does not have is the only residual; a shift by one pixel and a thin line leave none.
     #[test]
@@ -205,14 +216,34 @@ mod tests {
                 }
             })
             .collect();
-        let fit = Fit { gain: [1.0; 3], offset: [0.0; 3], noise: LEAST_NOISE, explained: 1.0 };
+        let fit = Fit::EXACT;
         let judged = vec![true; width * width];
-        let energy = Pixels::new(&seen, &judged, &[&rendered], width).energy(&rendered, &fit);
+        let energy = Pixels::new(&seen, &judged, &[&rendered], width).energy(&rendered, &[], &fit);
         let out = median_residual(&energy, ResidualKind::Unexpected, &judged, width, fit.noise);
         assert!(out[22 * width + 6] > 20.0);
         let elsewhere =
             (0..width * width).filter(|i| !(2..11).contains(&(i % width)) || !(18..27).contains(&(i / width)));
         assert!(elsewhere.map(|i| out[i]).fold(0.0, f32::max) < 1e-3);
+    }
+
+    /// A line that the pixels' middles miss is explained by further rays that meet it; something of another colour is not.
+    #[test]
+    fn further_rays_explain_what_one_misses() {
+        let width = 16;
+        let image = |value: f32| vec![value; width * width * CHANNELS];
+        let is_line = |i: usize| (7..9).contains(&(i / CHANNELS / width));
+        let with_line = |line: f32| (0..image(0.0).len()).map(|i| if is_line(i) { line } else { 0.3 }).collect();
+        let (road, line): (Vec<f32>, Vec<f32>) = (image(0.3), with_line(0.9));
+        let fit = Fit::EXACT;
+        let judged = vec![true; width * width];
+        let residual = |seen: f32, rays: &[Vec<f32>]| {
+            let seen: Vec<f32> = with_line(seen);
+            let energy = Pixels::new(&seen, &judged, &[&road], width).energy(&road, rays, &fit);
+            median_residual(&energy, ResidualKind::Unexpected, &judged, width, fit.noise)[8 * width + 8]
+        };
+        let rays = [road.clone(), line];
+        assert!(residual(0.5, &[]) > 5.0 && residual(0.5, &rays) == 0.0, "a grey line in place of a white one");
+        assert!(residual(0.1, &rays) > 5.0, "something darker than both");
     }
 
     /// The range of a pixel is that of its compared neighbours, to the edges of the image.
@@ -244,10 +275,10 @@ mod tests {
         let with_it: Vec<f32> =
             (0..width * width * 3).map(|i| if is_vehicle(i / 3) { vehicle(i / 3) } else { 0.5 }).collect();
         let road = vec![0.5; width * width * 3];
-        let fit = Fit { gain: [1.0; 3], offset: [0.0; 3], noise: LEAST_NOISE, explained: 1.0 };
+        let fit = Fit::EXACT;
         let judged = vec![true; width * width];
         let residual = |states: &[&[f32]]| {
-            let energy = Pixels::new(&road, &judged, states, width).energy(&with_it, &fit);
+            let energy = Pixels::new(&road, &judged, states, width).energy(&with_it, &[], &fit);
             ResidualKind::ALL.map(|kind| median_residual(&energy, kind, &judged, width, fit.noise)[7 * width + 7])
         };
         let [unexpected, missing] = residual(&[&with_it, &road]);

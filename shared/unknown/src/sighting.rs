@@ -3,6 +3,7 @@
 //! A vehicle that crosses the lane then knows when anybody can arrive first: from the end of that way, at the highest
 //! speed (reachable sets behind the edge of sight, Orzechowski et al. 2018).
 
+use crate::lanes::is_nearer;
 use crate::{Blob, Comparison};
 use carff_base::geometry::{OrientedBox, PinholeCamera};
 
@@ -14,9 +15,6 @@ const MOST_STEPS: u32 = 400;
 const ACROSS: [f64; 3] = [-0.6, 0.0, 0.6];
 /// Way next to the crossing that a camera may not have in view, metres: shorter than a vehicle.
 const BLIND_M: f64 = 3.0;
-/// Rendered depth that counts as the ground behind it: a share of its distance, and a way, metres.
-const DEPTH_SHARE: f64 = 0.85;
-const DEPTH_M: f64 = 0.5;
 /// Ratio of a state with a hazard, against the best state without one, below which the image excludes it.
 const EXCLUDED: f32 = 0.01;
 /// Noise from which on an image shows too little, of 1.
@@ -151,7 +149,7 @@ impl Sighting {
             let pixel = row * width + column;
             let depth_m = f64::from(self.depth_m.get(pixel).copied().unwrap_or(0.0));
             // Where nothing was compared, or something is nearer, the vehicle cannot be seen.
-            if depth_m <= 0.0 || depth_m < DEPTH_SHARE * way_m - DEPTH_M {
+            if depth_m <= 0.0 || is_nearer(depth_m, way_m) {
                 continue;
             }
             let ray = self.camera.ray(column as f64 + 0.5, row as f64 + 0.5);
@@ -195,7 +193,7 @@ impl Sighting {
             let distance_m = (0..3).map(|i| (point_m[i] - eye_m[i]).powi(2)).sum::<f64>().sqrt();
             match self.pixel(point_m).and_then(|pixel| self.depth_m.get(pixel)) {
                 None => at_m <= BLIND_M,
-                Some(&depth_m) => f64::from(depth_m) >= DEPTH_SHARE * distance_m - DEPTH_M,
+                Some(&depth_m) => !is_nearer(f64::from(depth_m), distance_m),
             }
         })
     }

@@ -93,11 +93,11 @@ fn line(image: &mut Image, [from, to]: [[f64; 2]; 2]) {
 /// The best state under the image's gain and offset.
 fn rendered(compared: &Compared) -> Image {
     let fit = &compared.comparison.fit;
-    let pixel = |(i, value): (usize, &f32)| {
-        let seen = if compared.comparison.judged[i / 3] { fit.gain[i % 3] * value + fit.offset[i % 3] } else { 0.0 };
-        (255.0 * seen.clamp(0.0, 1.0)) as u8
+    let pixel = |(rgb, judged): (&[f32], &bool)| {
+        let seen = if *judged { fit.seen(rgb) } else { [0.0; 3] };
+        seen.map(|v| (255.0 * v) as u8)
     };
-    of_size(compared, compared.rendered.iter().enumerate().map(pixel).collect())
+    of_size(compared, compared.rendered.chunks_exact(3).zip(&compared.comparison.judged).flat_map(pixel).collect())
 }
 
 /// The residual of the best state, the larger one of both kinds, black to white.
