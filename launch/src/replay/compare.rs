@@ -237,11 +237,11 @@ mod tests {
         belief
     }
 
-    /// Writes a recording with `frames` frames, the last one first, and each belief ahead of its frame. Those of
-    /// `unfinished` are not of the last step.
-    fn recorded(path: &Path, frames: u64, unfinished: &[u64]) {
+    /// Writes a recording with frames in this order, and each belief ahead of its frame. Those of `unfinished` are not of the
+    /// last step.
+    fn recorded(path: &Path, frames: impl IntoIterator<Item = u64>, unfinished: &[u64]) {
         let mut writer = Writer::create(path, &RecordingAbout::default(), &[]).unwrap();
-        for frame in (0..frames).rev() {
+        for frame in frames {
             let mut belief = a_belief(frame, 0.25);
             if unfinished.contains(&frame) {
                 (belief.horizon, belief.is_final) = (2, 0);
@@ -280,7 +280,7 @@ mod tests {
     fn an_unfinished_frame_determines_none() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("r.mcap");
-        recorded(&path, 5, &[1, 3]);
+        recorded(&path, 0..5, &[1, 3]);
         let left_out = |carried| Replayed::default().compare(&path, carried).unwrap().left_out;
         assert_eq!([Carried::Nothing, Carried::LastFrame, Carried::Take].map(left_out), [0, 2, 3]);
     }
@@ -291,7 +291,7 @@ mod tests {
     fn differences_are_reported() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("r.mcap");
-        recorded(&path, 3, &[]);
+        recorded(&path, (0..3).rev(), &[]);
         let mut replayed = Replayed::default();
         for frame in 0..3 {
             let mut belief = a_belief(frame, 0.25);
