@@ -349,6 +349,17 @@ mod tests {
         }
     }
 
+    /// A small field with little density anywhere.
+    fn thin_field() -> Field {
+        let config = FieldConfig {
+            log2_table_size: 10,
+            occupancy_resolution: 16,
+            density_offset: -9.0,
+            ..FieldConfig::default()
+        };
+        Field::new(config, 4).unwrap()
+    }
+
     /// A written file is read back; a missing file is not an error; another version and damaged limits are refused.
     #[test]
     fn the_file_is_checked() {
@@ -373,13 +384,7 @@ mod tests {
     /// is explained by none, and the patch has a box on the ground where it stands.
     #[test]
     fn a_patch_on_the_lane_is_unknown() {
-        let config = FieldConfig {
-            log2_table_size: 10,
-            occupancy_resolution: 16,
-            density_offset: -9.0,
-            ..FieldConfig::default()
-        };
-        let field = Field::new(config, 4).unwrap();
+        let field = thin_field();
         let camera = PinholeCamera::look_at([0.0, -8.0, 6.0], [0.0; 3], [0.0, 0.0, 1.0], 96, 96, 60.0);
         let (known, states, mut comparer) = (known(), [[0.0; LATENT_DIM]], Comparer::default());
         let mut rendered = carff_field::RenderBuffer::new();
@@ -423,13 +428,7 @@ mod tests {
     #[test]
     fn limits_have_a_floor() {
         let known = known();
-        let config = FieldConfig {
-            log2_table_size: 10,
-            occupancy_resolution: 16,
-            density_offset: -9.0,
-            ..FieldConfig::default()
-        };
-        let field = Field::new(config, 4).unwrap();
+        let field = thin_field();
         let camera = PinholeCamera::look_at([0.0, -8.0, 6.0], [0.0; 3], [0.0, 0.0, 1.0], 64, 64, 60.0);
         let image = ndarray::Array3::from_elem((64, 64, 3), 90);
         let states = [[0.0; LATENT_DIM]];
